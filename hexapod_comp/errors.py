@@ -1,0 +1,173 @@
+"""Every error that the package raises on bad input, each with the offending value and what is allowed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+
+class HexapodError(Exception):
+    """Root of all errors that this package raises on purpose.
+
+    Attributes
+    ----------
+    reason : str
+        Short name of the cause; diagnostics count refused commands under it.
+    """
+
+    reason = "error"
+
+
+class InputFileError(HexapodError):
+    """A file cannot be used: what is wrong, at which key, with which value.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    key : str
+        Key path or ``row 3, column x_mm``; empty when the whole file is meant.
+    problem : str
+        What is wrong and what is allowed.
+    value : object, optional
+        The value found there.
+    """
+
+    reason = "bad_file"
+
+    def __init__(self, path: str | Path, key: str, problem: str, value: Any = None):
+        self.path, self.key, self.value, self.problem = str(path), key, value, problem
+        where = f"{path}: {key}" if key else str(path)
+        found = "" if value is None else f" (found {shorten(value)})"
+        super().__init__(f"{where}: {problem}{found}")
+
+
+class GeometryError(HexapodError):
+    """A geometry that no hexapod can have: which quantity, which value, what is allowed."""
+
+    reason = "bad_geometry"
+
+    def __init__(self, key: str, problem: str, value: Any = None):
+        self.key, self.problem, self.value = key, problem, value
+        found = "" if value is None else f" (found {shorten(value)})"
+        super().__init__(f"{key}: {problem}{found}")
+
+
+class ModelError(GeometryError):
+    """A machine model whose numbers cannot describe a machine."""
+
+    reason = "bad_model"
+
+
+class PoseError(HexapodError):
+    """A pose that is not one: not finite, or its rotation is not a rotation."""
+
+    reason = "bad_pose"
+
+    def __init__(self, problem: str, value: Any = None):
+        self.value = value
+        found = "" if value is None else f" (found {shorten(value)})"
+        super().__init__(f"{problem}{found}")
+
+
+class KinematicsError(HexapodError):
+    """Forward or inverse kinematics has no usable answer.
+
+    Parameters
+    ----------
+    problem : str
+        What happened and what is allowed.
+    value, limit : optional
+        The offending quantity and the bound it broke.
+    """
+
+    reason = "kinematics"
+
+    def __init__(self, problem: str, value: Any = None, limit: Any = None):
+        self.value, self.limit = value, limit
+        super().__init__(problem)
+
+
+class NotFiniteError(KinematicsError):
+    """A length or pose is NaN, infinite, or a length is not positive."""
+
+    reason = "not_finite"
+
+
+class NotConvergedError(KinematicsError):
+    """Newton did not settle within the allowed number of iterations."""
+
+    reason = "not_converged"
+
+
+class SingularError(KinematicsError):
+    """The Jacobian is singular, or its condition number is above the limit."""
+
+    reason = "singular"
+
+
+class UnreachableError(KinematicsError):
+    """No pose of the machine has these strut lengths."""
+
+    reason = "unreachable"
+
+
+class OtherAssemblyModeError(KinematicsError):
+    """The pose found belongs to another assembly mode than the machine's working one."""
+
+    reason = "other_assembly_mode"
+
+
+class LimitError(HexapodError):
+    """A command breaks a machine limit; it is refused, never clamped.
+
+    Parameters
+    ----------
+    reason : str
+        Which limit: ``stroke``, ``base_cone``, ``platform_cone``, ``condition``,
+        ``correction``, ``step`` or ``assembly``.
+    problem : str
+        Sentence with value, limit and units.
+    value, limit : float
+        In SI units.
+    strut : int or None
+        Index 0..5 of the strut concerned.
+    stage : str
+        ``nominal`` or ``compensated``: which of the two values broke it.
+    """
+
+    def __init__(self, reason: str, problem: str, value: float, limit: float, strut: int | None, stage: str):
+        self.reason, self.value, self.limit, self.strut, self.stage = reason, value, limit, strut, stage
+        super().__init__(problem)
+
+
+class OutsideFieldError(HexapodError):
+    """A pose lies outside the measured box of a field that refuses extrapolation."""
+
+    reason = "outside_field"
+
+    def __init__(self, problem: str, value: Any = None, limit: Any = None):
+        self.value, self.limit = value, limit
+        super().__init__(problem)
+
+
+class CommandError(HexapodError):
+    """A command message that cannot be taken; `reason` says which rule it broke.
+
+    Parameters
+    ----------
+    reason : str
+        Name under which diagnostics count it.
+    problem : str
+        What was found and what is allowed.
+    """
+
+    def __init__(self, reason: str, problem: str):
+        self.reason = reason
+        super().__init__(problem)
+
+
+def shorten(value: Any, limit: int = 80) -> str:
+    """Return ``repr(value)`` cut to `limit` characters, so that a message stays readable."""
+    text = repr(value)
+    return text if len(text) <= limit else text[: limit - 1] + "…"

@@ -1,0 +1,342 @@
+"""The nominal machine: where the twelve joints should be, how far everything may go, and its file.
+
+Frames: ``base`` is fixed, ``platform`` moves; joints are given each in the frame of the body that carries
+them. Struts are numbered 1..6 in the file's order and named ``strut_1`` … ``strut_6``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from . import kernels
+from .errors import GeometryError, InputFileError, PoseError
+from .files import Section, read_yaml
+from .pose import Pose
+
+GEOMETRY_FORMAT = "hexapod_comp/geometry"
+GEOMETRY_VERSION = 1
+
+STRUT_NAMES = tuple(f"strut_{i}" for i in range(1, 7))
+"""Names of the six struts, in order, as they stand in messages."""
+
+COINCIDENT = 1e-6
+"""Base joints closer than this, m, are one joint given twice."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the machine may do; every check refuses, none clamps.
+
+    Parameters
+    ----------
+    stroke : ndarray, shape (6, 2)
+        Shortest and longest strut length, m.
+    base_cone, platform_cone : ndarray, shape (6,)
+        Largest angle of each strut to the joint's neutral direction, rad.
+    condition : float
+        Largest condition number of the Jacobian (see :func:`hexapod_comp.kinematics.condition_number`).
+    correction : float
+        Largest magnitude of a strut correction, m.
+    step : float
+        Largest change of a strut command between two commands, m.
+    speed : float
+        Largest strut speed, m/s; used by ``check`` and by the trajectories that this package makes.
+    """
+
+    stroke: np.ndarray
+    base_cone: np.ndarray
+    platform_cone: np.ndarray
+    condition: float
+    correction: float
+    step: float
+    speed: float
+
+    def __post_init__(self) -> None:
+        for name, shape in (("stroke", (6, 2)), ("base_cone", (6,)), ("platform_cone", (6,))):
+            object.__setattr__(self, name, _frozen_array(getattr(self, name), shape, f"limits.{name}"))
+        for index, (shortest, longest) in enumerate(self.stroke):
+            if not 0.0 < shortest < longest:
+                problem = "shortest length must be positive and below the longest"
+                raise GeometryError(f"limits.stroke[{index}]", problem, [float(shortest), float(longest)])
+        for name in ("base_cone", "platform_cone"):
+            for index, angle in enumerate(getattr(self, name)):
+                if not 0.0 < angle <= np.pi:
+                    raise GeometryError(f"limits.{name}[{index}]", "must lie in (0, π] rad", float(angle))
+        for name, least in (("condition", 1.0), ("correction", 0.0), ("step", 0.0), ("speed", 0.0)):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > least):
+                raise GeometryError(f"limits.{name}", f"must be finite and above {least:g}", value)
+
+
+@dataclass(frozen=True)
+class HexapodGeometry:
+    """A general 6-6 hexapod as designed.
+
+    Parameters
+    ----------
+    name : str
+        Machine name; a model file must carry the same.
+    base_joints : ndarray, shape (6, 3)
+        Joint centres in ``base``, m.
+    platform_joints : ndarray, shape (6, 3)
+        Joint centres in ``platform``, m.
+    home : Pose
+        ``pose_platform_in_base`` at which the machine is known to work; it picks the assembly mode.
+    limits : Limits
+        What the machine may do.
+    base_axes, platform_axes : ndarray, shape (6, 3), optional
+        Unit vectors of the cardan axis fixed to each body, in that body's frame; needed when a lead is given.
+    base_cone_axes, platform_cone_axes : ndarray, shape (6, 3), optional
+        Neutral direction of each joint, from base to platform, in its body's frame; the default is the
+        strut's direction at home.
+    screw_lead : ndarray, shape (6,), optional
+        Advance of each screw per turn, m; positive as LinuxCNC's genhexkins counts it, zero for struts
+        that cannot turn.
+    tool : Pose, optional
+        ``pose_tool_in_platform``.
+    work : Pose, optional
+        ``pose_work_in_base``.
+
+    Raises
+    ------
+    GeometryError
+        With key, value and what is allowed.
+    """
+
+    name: str
+    base_joints: np.ndarray
+    platform_joints: np.ndarray
+    home: Pose
+    limits: Limits
+    base_axes: np.ndarray | None = None
+    platform_axes: np.ndarray | None = None
+    base_cone_axes: np.ndarray | None = None
+    platform_cone_axes: np.ndarray | None = None
+    screw_lead: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    tool: Pose = field(default_factory=Pose.identity)
+    work: Pose = field(default_factory=Pose.identity)
+    home_sign: float = field(init=False)
+    """Sign of det J at home: the other sign is another assembly mode."""
+    kernel_joints: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False)
+    """Private writable copies of the joints for compiled kernels, which would compile twice for read-only ones."""
+    characteristic_length: float = field(init=False)
+    """RMS radius of the platform joints about their centroid, m; makes the condition number unit-free."""
+
+    def __post_init__(self) -> None:
+        def put(name: str, value: object) -> None:
+            object.__setattr__(self, name, value)
+
+        put("base_joints", _frozen_array(self.base_joints, (6, 3), "base.joints"))
+        put("platform_joints", _frozen_array(self.platform_joints, (6, 3), "platform.joints"))
+        put("kernel_joints", (self.base_joints.copy(), self.platform_joints.copy()))
+        put("screw_lead", _frozen_array(self.screw_lead, (6,), "screw.lead"))
+        _refuse_coincident(self.base_joints)
+        spread = self.platform_joints - self.platform_joints.mean(axis=0)
+        put("characteristic_length", float(np.sqrt((spread**2).sum(axis=1).mean())))
+        if self.characteristic_length < COINCIDENT:
+            raise GeometryError("platform.joints", "must not all coincide", self.platform_joints.tolist())
+        self._fill_axes(put)
+        self._check_home(put)
+
+    def _fill_axes(self, put) -> None:
+        """Normalise the joint axes and take the missing cone axes from the struts at home."""
+        at_home = self.home.position + self.platform_joints @ self.home.rotation.T - self.base_joints
+        cones = {"base_cone_axes": at_home, "platform_cone_axes": at_home @ self.home.rotation}
+        for name in ("base_axes", "platform_axes", *cones):
+            body, _, kind = name.partition("_")
+            key = f"{body}.{'joint_axes' if kind == 'axes' else 'cone_axes'}"
+            vectors = getattr(self, name)
+            if vectors is None:
+                vectors = cones.get(name)
+            if vectors is not None:
+                put(name, _unit_vectors(vectors, key))
+            elif self.screw_lead.any():
+                raise GeometryError(key, "are needed when a screw lead is given")
+
+    @property
+    def kernel_axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Writable copies of the cardan axes for compiled kernels, zeros where the machine gives none."""
+        missing = np.zeros((6, 3))
+        return tuple(np.array(missing if a is None else a) for a in (self.base_axes, self.platform_axes))
+
+    def _check_home(self, put) -> None:
+        """Refuse a home pose that the machine could not stand in."""
+        pose = (self.home.position, self.home.rotation)
+        lengths = np.empty(6)
+        kernels.strut_lengths_one(*self.kernel_joints, *pose, lengths)
+        for index, (length, stroke) in enumerate(zip(lengths, self.limits.stroke, strict=True)):
+            if not stroke[0] <= length <= stroke[1]:
+                problem = (
+                    f"{STRUT_NAMES[index]} would be {length * 1e3:.3f} mm long, "
+                    f"outside its stroke {stroke[0] * 1e3:.3f}…{stroke[1] * 1e3:.3f} mm"
+                )
+                raise GeometryError("home", problem)
+        condition, sign = kernels.condition_one(*self.kernel_joints, *pose, self.characteristic_length)
+        if not condition <= self.limits.condition:
+            problem = f"condition number there must be at most {self.limits.condition:g}"
+            raise GeometryError("home", problem, float(condition))
+        put("home_sign", float(sign))
+
+    @property
+    def strut_names(self) -> tuple[str, ...]:
+        """Names of the struts in order."""
+        return STRUT_NAMES
+
+
+def paper_joints(a: float, b: float, d: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the joints of the paper's 6-3 machine from its three dimensions.
+
+    Parameters
+    ----------
+    a : float
+        Side of the platform triangle, m.
+    b, d : float
+        Long and short side of the semi-regular base hexagon, m.
+
+    Returns
+    -------
+    base_joints, platform_joints : ndarray, shape (6, 3)
+        000, Figure 3, with its misprint in X_B5 mended (see doc/theory.md).
+    """
+    for key, value in (("a", a), ("b", b), ("d", d)):
+        if not (np.isfinite(value) and value > 0.0):
+            raise GeometryError(key, "must be finite and positive, m", value)
+    third = np.sqrt(3.0) / 6.0
+    half = np.array(
+        [
+            [third * (2 * b + d), d / 2, 0.0],
+            [-third * (b - d), (b + d) / 2, 0.0],
+            [-third * (b + 2 * d), b / 2, 0.0],
+        ]
+    )
+    mirror = np.array([1.0, -1.0, 1.0])
+    base = np.vstack([half, half[::-1] * mirror])
+    angles = np.deg2rad([60.0, 180.0, -60.0])
+    triangle = a / np.sqrt(3.0) * np.stack([np.cos(angles), np.sin(angles), np.zeros(3)], axis=1)
+    return base, np.repeat(triangle, 2, axis=0)
+
+
+def load_geometry(path: str | Path) -> HexapodGeometry:
+    """Read a geometry file (format ``hexapod_comp/geometry``, described in the README).
+
+    Parameters
+    ----------
+    path : str or Path
+        YAML file.
+
+    Returns
+    -------
+    HexapodGeometry
+
+    Raises
+    ------
+    InputFileError
+        Naming file, key and value.
+    """
+    top = read_yaml(path, GEOMETRY_FORMAT, GEOMETRY_VERSION)
+    name = top.text("machine")
+    base, platform, axes = _read_joints(top)
+    home = read_pose(top, "home")
+    limits = _read_limits(top.section("limits"), path)
+    lead = np.zeros(6)
+    if "screw" in top:
+        screw = top.section("screw")
+        lead = screw.per_strut("lead", "length")
+        screw.finish()
+    tool = read_pose(top, "tool") if "tool" in top else Pose.identity()
+    work = read_pose(top, "work") if "work" in top else Pose.identity()
+    top.finish()
+    try:
+        return HexapodGeometry(
+            name, base, platform, home, limits, screw_lead=lead, tool=tool, work=work, **axes
+        )
+    except GeometryError as error:
+        raise InputFileError(path, error.key, error.problem, error.value) from error
+
+
+def read_pose(parent: Section, key: str) -> Pose:
+    """Read a pose section: ``position_*`` and the paper's angles ``rotation_*`` (default zero)."""
+    section = parent.section(key)
+    position = section.quantity("position", "length", (3,))
+    angles = section.quantity("rotation", "angle", (3,), np.zeros(3))
+    section.finish()
+    try:
+        return Pose.from_angles(position, angles)
+    except PoseError as error:
+        raise parent.error(key, str(error)) from error
+
+
+def _read_joints(top: Section) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Return base joints, platform joints and the axes that the file gives."""
+    axes: dict[str, np.ndarray] = {}
+    joints = {}
+    if "paper_dimensions" in top:
+        section = top.section("paper_dimensions")
+        a, b, d = (float(section.quantity(key, "length")) for key in "abd")
+        section.finish()
+        try:
+            joints["base"], joints["platform"] = paper_joints(a, b, d)
+        except GeometryError as error:
+            raise section.error(error.key, error.problem, error.value) from error
+    for body in ("base", "platform"):
+        if body not in top and body in joints:
+            continue
+        section = top.section(body)
+        if body not in joints:
+            joints[body] = section.quantity("joints", "length", (6, 3))
+        for key, name in (("joint_axes", f"{body}_axes"), ("cone_axes", f"{body}_cone_axes")):
+            if key in section:
+                axes[name] = section.array(key, (6, 3))
+        section.finish()
+    return joints["base"], joints["platform"], axes
+
+
+def _read_limits(section: Section, path: str | Path) -> Limits:
+    stroke = section.pairs_per_strut("stroke", "length")
+    values = dict(
+        stroke=stroke,
+        base_cone=section.per_strut("base_cone", "angle"),
+        platform_cone=section.per_strut("platform_cone", "angle"),
+        condition=float(section.array("condition_number")),
+        correction=float(section.quantity("correction", "length")),
+        step=float(section.quantity("step", "length")),
+        speed=float(section.quantity("speed", "speed")),
+    )
+    section.finish()
+    try:
+        return Limits(**values)  # type: ignore[arg-type]
+    except GeometryError as error:
+        raise InputFileError(path, error.key, error.problem, error.value) from error
+
+
+def _refuse_coincident(base_joints: np.ndarray) -> None:
+    for i in range(6):
+        for j in range(i):
+            if np.linalg.norm(base_joints[i] - base_joints[j]) < COINCIDENT:
+                problem = f"coincides with base joint {j + 1}; every strut needs a base joint of its own"
+                raise GeometryError(f"base.joints[{i}]", problem, base_joints[i].tolist())
+
+
+def _frozen_array(values: object, shape: tuple[int, ...], key: str) -> np.ndarray:
+    """Return a private read-only float copy of the given shape."""
+    array = np.array(values, dtype=float, order="C")
+    if array.shape != shape:
+        raise GeometryError(key, f"must have shape {shape}, not {array.shape}")
+    if not np.isfinite(array).all():
+        raise GeometryError(key, "must be finite", array.tolist())
+    array.flags.writeable = False
+    return array
+
+
+def _unit_vectors(values: object, key: str) -> np.ndarray:
+    vectors = _frozen_array(values, (6, 3), key)
+    norms = np.linalg.norm(vectors, axis=1)
+    if norms.min() < COINCIDENT:
+        index = int(norms.argmin())
+        raise GeometryError(f"{key}[{index}]", "must not be the zero vector", vectors[index].tolist())
+    unit = vectors / norms[:, None]
+    unit.flags.writeable = False
+    return unit

@@ -1,0 +1,144 @@
+"""Poses: a position and a rotation that is known to be one, and the conversions at the edges.
+
+Inside, a pose is a position of shape (3,) in metres and a rotation matrix of shape (3, 3) whose columns
+are the moving frame's axes. The paper's angles (degrees or radians) and quaternions appear only here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .errors import PoseError
+
+QUATERNION_NORM_TOLERANCE = 1e-3
+"""A quaternion whose norm is further from 1 than this is refused: it was never a rotation."""
+
+ROTATION_TOLERANCE = 1e-9
+"""Largest deviation of RᵀR from the identity that passes as rounding."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A rigid-body pose, e.g. ``pose_platform_in_base``.
+
+    Parameters
+    ----------
+    position : array_like, shape (3,)
+        Origin of the moving frame, m.
+    rotation : array_like, shape (3, 3)
+        Rotation matrix; its columns are the moving frame's axes.
+
+    Raises
+    ------
+    PoseError
+        Wrong shape, not finite, or not a proper rotation.
+    """
+
+    position: np.ndarray
+    rotation: np.ndarray
+
+    def __post_init__(self) -> None:
+        position = _finite(self.position, (3,), "position")
+        rotation = _finite(self.rotation, (3, 3), "rotation matrix")
+        deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
+        if deviation > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0.0:
+            raise PoseError("rotation matrix must be orthonormal and right-handed", rotation.tolist())
+        object.__setattr__(self, "position", position)
+        object.__setattr__(self, "rotation", rotation)
+
+    @staticmethod
+    def identity() -> Pose:
+        """Return the pose of a frame in itself."""
+        return Pose(np.zeros(3), np.eye(3))
+
+    @staticmethod
+    def from_angles(position: np.ndarray, angles: np.ndarray) -> Pose:
+        """Make a pose from the paper's angles.
+
+        Parameters
+        ----------
+        position : array_like, shape (3,)
+            m.
+        angles : array_like, shape (3,)
+            α, β, γ in radians; R = Ry(β)·Rx(α)·Rz(γ) (000, T_BASE^TOP).
+        """
+        return Pose(position, rotation_from_angles(_finite(angles, (3,), "angles")))
+
+    @staticmethod
+    def from_quaternion(position: np.ndarray, quaternion: np.ndarray) -> Pose:
+        """Make a pose from a unit quaternion (x, y, z, w).
+
+        Raises
+        ------
+        PoseError
+            Not finite, or its norm is not 1 within :data:`QUATERNION_NORM_TOLERANCE`.
+        """
+        quaternion = _finite(quaternion, (4,), "quaternion")
+        norm = float(np.linalg.norm(quaternion))
+        if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
+            raise PoseError(f"quaternion must have norm 1, not {norm:.6g}", quaternion.tolist())
+        return Pose(position, Rotation.from_quat(quaternion).as_matrix())
+
+    def angles(self) -> np.ndarray:
+        """Return the paper's α, β, γ, radians, shape (3,)."""
+        return angles_from_rotation(self.rotation)
+
+    def quaternion(self) -> np.ndarray:
+        """Return the unit quaternion (x, y, z, w) with w ≥ 0, shape (4,)."""
+        return Rotation.from_matrix(self.rotation).as_quat(canonical=True)
+
+    def inverse(self) -> Pose:
+        """Return the pose of the outer frame seen from this one."""
+        return Pose(-self.rotation.T @ self.position, self.rotation.T)
+
+    def __matmul__(self, other: Pose) -> Pose:
+        return Pose(self.position + self.rotation @ other.position, self.rotation @ other.rotation)
+
+
+def rotation_from_angles(angles: np.ndarray) -> np.ndarray:
+    """Return R = Ry(β)·Rx(α)·Rz(γ) (000, T_BASE^TOP).
+
+    Parameters
+    ----------
+    angles : array_like, shape (..., 3)
+        α, β, γ in radians.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+    """
+    angles = np.asarray(angles, dtype=float)
+    return Rotation.from_euler("YXZ", angles[..., [1, 0, 2]]).as_matrix()
+
+
+def angles_from_rotation(rotation: np.ndarray) -> np.ndarray:
+    """Return α, β, γ of R = Ry(β)·Rx(α)·Rz(γ); radians, shape (..., 3).
+
+    At α = ±90° only β ± γ is determined; β is then whatever rounding leaves, and γ fits it.
+    """
+    r = np.asarray(rotation, dtype=float)
+    alpha = np.arctan2(-r[..., 1, 2], np.hypot(r[..., 1, 0], r[..., 1, 1]))
+    beta = np.arctan2(r[..., 0, 2], r[..., 2, 2])
+    # From the first row of Ry(−β)·R = Rx(α)·Rz(γ), which keeps its digits where cos α vanishes.
+    cosine, sine = np.cos(beta), np.sin(beta)
+    gamma = np.arctan2(
+        sine * r[..., 2, 1] - cosine * r[..., 0, 1], cosine * r[..., 0, 0] - sine * r[..., 2, 0]
+    )
+    return np.stack([alpha, beta, gamma], axis=-1)
+
+
+def rotation_angle(rotation: np.ndarray) -> float:
+    """Return the angle of a rotation matrix, radians in [0, π]."""
+    return float(Rotation.from_matrix(rotation).magnitude())
+
+
+def _finite(values: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:
+    array = np.array(values, dtype=float, order="C")
+    if array.shape != shape:
+        raise PoseError(f"{name} must have shape {shape}, not {array.shape}")
+    if not np.isfinite(array).all():
+        raise PoseError(f"{name} must be finite", array.tolist())
+    return array
