@@ -1,0 +1,53 @@
+"""Direction of motion with a reversal threshold, so that noise at standstill does not flip a backlash.
+
+Nine values are followed: the measured point's x, y, z and the six struts. Each drags a window as wide as
+the threshold behind it, like a nut its lost motion; only a value that leaves its window has a direction.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .kernels import compiled
+
+FOLLOWED = 9
+"""Three axes of the measured point, then six struts."""
+
+
+class MotionState:
+    """Windows and directions of motion of the nine followed values.
+
+    Attributes
+    ----------
+    low : ndarray, shape (9,)
+        Lower end of each window, m; NaN before the first value.
+    sense : ndarray, shape (9,)
+        +1 forward (increasing), −1 backward, 0 not yet known.
+    """
+
+    __slots__ = ("low", "sense")
+
+    def __init__(self) -> None:
+        self.low = np.full(FOLLOWED, math.nan)
+        self.sense = np.zeros(FOLLOWED)
+
+    def copy_from(self, other: MotionState) -> None:
+        """Take over the state of another."""
+        self.low[:] = other.low
+        self.sense[:] = other.sense
+
+
+@compiled
+def follow(value, threshold, low, sense, index):
+    """Update window and direction number `index` for a new value and return the direction."""
+    if math.isnan(low[index]):
+        low[index] = value - 0.5 * threshold
+    elif value > low[index] + threshold:
+        low[index] = value - threshold
+        sense[index] = 1.0
+    elif value < low[index]:
+        low[index] = value
+        sense[index] = -1.0
+    return sense[index]
