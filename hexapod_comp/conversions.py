@@ -1,0 +1,196 @@
+"""ROS messages to core types and back; the only module beside ``nodes`` that knows ROS."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import JointState
+
+from .errors import CommandError
+from .geometry import STRUT_NAMES
+from .kernels import compiled
+from .pose import QUATERNION_NORM_TOLERANCE, Pose
+
+POSE_OK, POSE_NOT_FINITE, POSE_NOT_UNIT = range(3)
+
+
+class PoseReader:
+    """Reads PoseStamped messages into one preallocated pose, without garbage.
+
+    Attributes
+    ----------
+    position, rotation : ndarray, shape (3,), (3, 3)
+        The pose last read, m and rotation matrix.
+    """
+
+    def __init__(self) -> None:
+        self.position, self.rotation = np.zeros(3), np.eye(3)
+
+    def read(self, message: PoseStamped) -> None:
+        """Read a message.
+
+        Raises
+        ------
+        CommandError
+            ``not_finite`` or ``quaternion``: its norm is not 1.
+        """
+        p, q = message.pose.position, message.pose.orientation
+        outcome = read_pose(p.x, p.y, p.z, q.x, q.y, q.z, q.w, self.position, self.rotation)
+        if outcome == POSE_NOT_FINITE:
+            values = [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
+            raise CommandError("not_finite", f"pose must be finite, not {values}")
+        if outcome == POSE_NOT_UNIT:
+            norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
+            raise CommandError(
+                "quaternion", f"quaternion must have norm 1 within {QUATERNION_NORM_TOLERANCE:g}, not {norm:.6g}"
+            )
+
+    def pose(self) -> Pose:
+        """Return the pose last read as a value of its own."""
+        return Pose(self.position, self.rotation)
+
+
+@compiled
+def read_pose(x, y, z, qx, qy, qz, qw, position, rotation):
+    """Write position and rotation of a message's numbers; return the outcome."""
+    square = qx * qx + qy * qy + qz * qz + qw * qw
+    if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z) and math.isfinite(square)):
+        return POSE_NOT_FINITE
+    if abs(math.sqrt(square) - 1.0) > QUATERNION_NORM_TOLERANCE:
+        return POSE_NOT_UNIT
+    s = 2.0 / square
+    position[0], position[1], position[2] = x, y, z
+    rotation[0, 0] = 1.0 - s * (qy * qy + qz * qz)
+    rotation[0, 1] = s * (qx * qy - qz * qw)
+    rotation[0, 2] = s * (qx * qz + qy * qw)
+    rotation[1, 0] = s * (qx * qy + qz * qw)
+    rotation[1, 1] = 1.0 - s * (qx * qx + qz * qz)
+    rotation[1, 2] = s * (qy * qz - qx * qw)
+    rotation[2, 0] = s * (qx * qz - qy * qw)
+    rotation[2, 1] = s * (qy * qz + qx * qw)
+    rotation[2, 2] = 1.0 - s * (qx * qx + qy * qy)
+    return POSE_OK
+
+
+@compiled
+def quaternion_of(rotation):
+    """Return the unit quaternion (x, y, z, w) of a rotation matrix, from its largest component."""
+    trace = rotation[0, 0] + rotation[1, 1] + rotation[2, 2]
+    best, largest = 3, trace
+    for i in range(3):
+        if rotation[i, i] > largest:
+            best, largest = i, rotation[i, i]
+    if best == 3:
+        root = 2.0 * math.sqrt(1.0 + trace)
+        return (
+            (rotation[2, 1] - rotation[1, 2]) / root,
+            (rotation[0, 2] - rotation[2, 0]) / root,
+            (rotation[1, 0] - rotation[0, 1]) / root,
+            0.25 * root,
+        )
+    i, j, k = best, (best + 1) % 3, (best + 2) % 3
+    root = 2.0 * math.sqrt(1.0 + rotation[i, i] - rotation[j, j] - rotation[k, k])
+    values = np.empty(3)
+    values[i] = 0.25 * root
+    values[j] = (rotation[j, i] + rotation[i, j]) / root
+    values[k] = (rotation[k, i] + rotation[i, k]) / root
+    return values[0], values[1], values[2], (rotation[k, j] - rotation[j, k]) / root
+
+
+def write_pose(message: PoseStamped, position: np.ndarray, rotation: np.ndarray) -> None:
+    """Fill a message's pose from position (m) and rotation matrix."""
+    p, q = message.pose.position, message.pose.orientation
+    p.x, p.y, p.z = position.tolist()
+    q.x, q.y, q.z, q.w = quaternion_of(rotation)
+
+
+def pose_message(pose: Pose, frame_id: str) -> PoseStamped:
+    """Return a new message with a zero stamp."""
+    message = PoseStamped()
+    message.header.frame_id = frame_id
+    write_pose(message, pose.position, pose.rotation)
+    return message
+
+
+def message_pose(message: PoseStamped) -> Pose:
+    """Return a message's pose.
+
+    Raises
+    ------
+    CommandError
+        As :meth:`PoseReader.read`.
+    """
+    reader = PoseReader()
+    reader.read(message)
+    return reader.pose()
+
+
+class StrutMessage:
+    """A JointState of the six struts whose numbers are written in place, to be published again and again.
+
+    The velocity field is filled too: an empty one makes bags that some readers refuse.
+
+    Attributes
+    ----------
+    message : JointState
+        The message.
+    position, velocity : ndarray, shape (6,)
+        Views of the message's numbers, m and m/s.
+    """
+
+    def __init__(self, frame_id: str = "") -> None:
+        self.message = JointState(name=list(STRUT_NAMES), position=[0.0] * 6, velocity=[0.0] * 6)
+        self.message.header.frame_id = frame_id
+        self.position = np.frombuffer(self.message.position, dtype=float)
+        self.velocity = np.frombuffer(self.message.velocity, dtype=float)
+
+
+class StrutReader:
+    """Reads JointState messages of six struts, matched by name.
+
+    Attributes
+    ----------
+    lengths : ndarray, shape (6,)
+        Lengths last read, in strut order, m.
+    """
+
+    def __init__(self) -> None:
+        self.lengths = np.zeros(6)
+        self._names: list[str] = []
+        self._order = np.arange(6)
+
+    def read(self, message: JointState) -> None:
+        """Read a message.
+
+        Raises
+        ------
+        CommandError
+            ``strut_names``, ``strut_count`` or ``not_finite``; the lengths last read stay.
+        """
+        if message.name != self._names:
+            self._order = strut_order(message.name)
+            self._names = list(message.name)
+        if len(message.position) != 6:
+            raise CommandError("strut_count", f"six positions are needed, not {len(message.position)}")
+        lengths = np.frombuffer(message.position, dtype=float)[self._order]
+        if not math.isfinite(lengths.sum()):
+            raise CommandError("not_finite", f"strut lengths must be finite, not {lengths.tolist()}")
+        self.lengths[:] = lengths
+
+
+def strut_order(names: Sequence[str]) -> np.ndarray:
+    """Return where each of the six struts stands in a list of names.
+
+    Raises
+    ------
+    CommandError
+        ``strut_names`` or ``strut_count``.
+    """
+    if len(names) != 6:
+        raise CommandError("strut_count", f"six strut names are needed, not {len(names)}")
+    if sorted(names) != sorted(STRUT_NAMES):
+        raise CommandError("strut_names", f"names must be {', '.join(STRUT_NAMES)}, not {', '.join(names)}")
+    return np.array([list(names).index(name) for name in STRUT_NAMES])

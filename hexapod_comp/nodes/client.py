@@ -1,0 +1,239 @@
+"""A client of the two nodes: sends poses, keeps what comes back. Used by ``run``, ``demo`` and benchmarks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rclpy.experimental import EventsExecutor
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool
+
+from ..conversions import StrutReader, message_pose, pose_message
+from ..errors import HexapodError
+from ..pose import Pose
+from ..trajectory import Path
+from .runtime import COMMAND_QOS, STATE_QOS
+
+ANSWER_TIMEOUT = 0.25
+"""A command without an answer after this long is lost or refused, s."""
+
+
+class NoAnswerError(HexapodError):
+    """Something that must happen has not happened in time."""
+
+    reason = "timeout"
+
+
+@dataclass
+class Sent:
+    """One command on its way.
+
+    Attributes
+    ----------
+    sent_at, answered_at : float
+        Monotonic times, s; NaN while unanswered.
+    command, correction : ndarray, shape (6,)
+        The answer, m.
+    """
+
+    sent_at: float
+    answered_at: float = float("nan")
+    command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))
+    correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))
+
+
+class LoopClient:
+    """Commands the compensator and listens to everything around it.
+
+    Parameters
+    ----------
+    frame_id : str
+        Frame of the commanded poses.
+    """
+
+    def __init__(self, frame_id: str = "base") -> None:
+        self.context = rclpy.Context()
+        rclpy.init(args=[], context=self.context, signal_handler_options=SignalHandlerOptions.NO)
+        self.node = rclpy.create_node("hexapod_comp_client", context=self.context)
+        self._executor = EventsExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self._message = pose_message(Pose.identity(), frame_id)
+        self._commands, self._corrections, self._states = StrutReader(), StrutReader(), StrutReader()
+        self.sent: dict[int, Sent] = {}
+        self.state_speeds = np.full(6, np.nan)
+        self._true: PoseStamped | None = None
+        self._estimate: PoseStamped | None = None
+        self.true_count = 0
+        node = self.node
+        self._publisher = node.create_publisher(PoseStamped, "tool_pose_command", COMMAND_QOS)
+        node.create_subscription(JointState, "strut_commands", self._on_command, COMMAND_QOS)
+        node.create_subscription(JointState, "strut_corrections", self._on_correction, COMMAND_QOS)
+        node.create_subscription(JointState, "strut_states", self._on_state, STATE_QOS)
+        node.create_subscription(PoseStamped, "tool_pose_true", self._on_true, STATE_QOS)
+        node.create_subscription(PoseStamped, "tool_pose_estimate", self._on_estimate, STATE_QOS)
+        self._enable = node.create_client(SetBool, "compensator/enable_compensation")
+
+    def close(self) -> None:
+        """Leave ROS."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+    def _on_command(self, message: JointState) -> None:
+        entry = self.sent.get(_key(message))
+        if entry is not None:
+            entry.answered_at = time.monotonic()
+            self._commands.read(message)
+            entry.command = self._commands.lengths.copy()
+
+    def _on_correction(self, message: JointState) -> None:
+        entry = self.sent.get(_key(message))
+        if entry is not None:
+            self._corrections.read(message)
+            entry.correction = self._corrections.lengths.copy()
+
+    def _on_state(self, message: JointState) -> None:
+        self._states.read(message)
+        self.state_speeds = np.array(message.velocity)
+
+    def _on_true(self, message: PoseStamped) -> None:
+        self._true = message
+        self.true_count += 1
+
+    def _on_estimate(self, message: PoseStamped) -> None:
+        self._estimate = message
+
+    @property
+    def true_pose(self) -> Pose:
+        """The newest true tool pose in ``base``."""
+        if self._true is None:
+            raise NoAnswerError("no tool_pose_true has been received")
+        return message_pose(self._true)
+
+    @property
+    def estimate(self) -> Pose:
+        """The newest estimated tool pose in ``base``."""
+        if self._estimate is None:
+            raise NoAnswerError("no tool_pose_estimate has been received")
+        return message_pose(self._estimate)
+
+    def spin_until(self, condition: Callable[[], bool], timeout: float, what: str) -> None:
+        """Handle messages until a condition holds.
+
+        Raises
+        ------
+        NoAnswerError
+            It does not within `timeout` seconds; names `what`.
+        """
+        end = time.monotonic() + timeout
+        while not condition():
+            left = end - time.monotonic()
+            if left <= 0.0:
+                raise NoAnswerError(f"waited {timeout:g} s in vain for {what}")
+            self._executor.spin_once(timeout_sec=min(left, 0.02))
+
+    def connected(self) -> bool:
+        """Return whether commands reach a compensator and a drive's true pose and estimates come back."""
+        node = self.node
+        return (
+            self._publisher.get_subscription_count() > 0
+            and node.count_publishers("strut_commands") > 0
+            and self._true is not None
+            and self._estimate is not None
+            and self._enable.service_is_ready()
+        )
+
+    def enable(self, enabled: bool) -> None:
+        """Switch compensation on or off."""
+        future = self._enable.call_async(SetBool.Request(data=enabled))
+        self.spin_until(future.done, 5.0, "the service enable_compensation")
+
+    def send(self, pose: Pose) -> Sent:
+        """Send one command and return its record, which the answer will fill."""
+        return self._send(pose_message(pose, self._message.header.frame_id))
+
+    def _send(self, message: PoseStamped) -> Sent:
+        stamp = self.node.get_clock().now()
+        message.header.stamp = stamp.to_msg()
+        entry = self.sent[stamp.nanoseconds] = Sent(time.monotonic())
+        self._publisher.publish(message)
+        return entry
+
+    def wait_for_answer(self, entry: Sent, timeout: float = ANSWER_TIMEOUT) -> None:
+        """Wait until command and correction have come back.
+
+        Raises
+        ------
+        NoAnswerError
+            The command was lost or refused.
+        """
+        self.spin_until(lambda: _answered(entry), timeout, "the answer to a command: lost or refused")
+
+    def stream(self, path: Path, each: Callable[[int], None] | None = None) -> list[Sent]:
+        """Send a path at its rate and return the records.
+
+        Parameters
+        ----------
+        path : Path
+            Poses and rate.
+        each : callable, optional
+            Called with the index after every pose sent.
+        """
+        entries = []
+        messages = [pose_message(path.pose(n), self._message.header.frame_id) for n in range(len(path))]
+        due = time.monotonic()
+        for index, message in enumerate(messages):
+            while (left := due - time.monotonic()) > 0.0:
+                self._executor.spin_once(timeout_sec=left)
+            entries.append(self._send(message))
+            if each is not None:
+                each(index)
+            due = max(due + 1.0 / path.rate, time.monotonic() - 1.0 / path.rate)
+        end = time.monotonic() + ANSWER_TIMEOUT
+        while not all(_answered(entry) for entry in entries[-3:]) and time.monotonic() < end:
+            self._executor.spin_once(timeout_sec=0.01)
+        return entries
+
+    def hold(self, pose: Pose, rate: float, until: Callable[[], bool], timeout: float, what: str) -> Sent:
+        """Send one pose again and again, as a controller at standstill does, until a condition holds."""
+        end = time.monotonic() + timeout
+        while True:
+            entry = self.send(pose)
+            self.wait_for_answer(entry)
+            next_due = entry.sent_at + 1.0 / rate
+            while (left := next_due - time.monotonic()) > 0.0:
+                self._executor.spin_once(timeout_sec=left)
+            if until():
+                return entry
+            if time.monotonic() > end:
+                raise NoAnswerError(f"waited {timeout:g} s in vain for {what}")
+
+    def settled(self) -> Callable[[], bool]:
+        """Return a condition: the true tool has not moved by more than 20 nm over the last 25 readings."""
+        history: list[np.ndarray] = []
+        seen = self.true_count
+
+        def quiet() -> bool:
+            nonlocal seen
+            if self.true_count == seen:
+                return False
+            seen = self.true_count
+            history.append(self.true_pose.position)
+            recent = np.array(history[-25:])
+            return len(recent) == 25 and float(np.ptp(recent, axis=0).max()) < 20e-9
+
+        return quiet
+
+
+def _answered(entry: Sent) -> bool:
+    return bool(np.isfinite(entry.command[0]) and np.isfinite(entry.correction[0]))
+
+
+def _key(message: JointState) -> int:
+    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec

@@ -1,0 +1,419 @@
+"""The compensator node: tool pose commands in, compensated strut commands and pose estimates out.
+
+It holds no mathematics: it converts, calls :class:`~hexapod_comp.compensation.Compensator`, publishes, and
+reports what it refused. Run it with ``ros2 run hexapod_comp compensator`` or
+``python -m hexapod_comp.nodes.compensator``; the README lists topics, services and parameters.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from sensor_msgs.msg import JointState, Temperature
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import SetBool, Trigger
+from visualization_msgs.msg import MarkerArray
+
+from .. import kernels
+from ..compensation import Compensator
+from ..conversions import PoseReader, StrutMessage, StrutReader, write_pose
+from ..errors import CommandError, HexapodError
+from ..geometry import load_geometry
+from ..kinematics import forward_error
+from ..machine import MachineModel
+from ..model_file import load_model
+from ..paths import config_file
+from ..pose import Pose
+from .health import ERROR, OK, WARN, Flow, HealthReport, Refusals, seconds
+from .markers import machine_markers
+from .runtime import (
+    COMMAND_QOS,
+    EVENT_QOS,
+    STATE_QOS,
+    Parameter,
+    Throttle,
+    declare,
+    keep_discovery_local,
+    qos_overridable,
+    run,
+)
+
+PARAMETERS = (
+    Parameter("autostart", True, "configure and activate at start"),
+    Parameter("geometry_file", "paper.yaml", "geometry file: a path or the name of a shipped one"),
+    Parameter("model_file", "paper_machine.yaml", "model file: a path or the name of a shipped one; ideal = none"),
+    Parameter("base_frame", "base", "frame_id of poses in the machine base"),
+    Parameter("work_frame", "work", "frame_id of poses in the geometry file's work frame"),
+    Parameter("command_timeout", 0.1, "without a command for this long the state is stale, s; 0 = off", 0.0, 3600.0),
+    Parameter("max_command_age", 0.5, "older (or newer) stamps are refused, s; 0 = off", 0.0, 3600.0),
+    Parameter("feedback_timeout", 0.1, "without measured struts for this long there is no feedback, s", 1e-3, 3600.0),
+    Parameter("require_feedback", False, "refuse commands while there is no feedback"),
+    Parameter("ramp_rate", 1e-3, "strut speed at which a change of model or enabling is taken up, m/s", 1e-6, 1.0),
+    Parameter("enable_compensation", True, "compensate from the start"),
+    Parameter("marker_rate", 10.0, "markers per second, Hz; 0 = none", 0.0, 10.0),
+    Parameter("publish_array", False, "also publish strut_commands_array for ros2_controllers"),
+)
+
+CHECK_PERIOD = 0.05
+"""How often the node looks whether its state has changed, s."""
+
+FORGET_ORDER_AFTER = 1.0
+"""After a pause this long, s, stamps may start again earlier: the sender or its clock was restarted."""
+
+
+class CompensatorNode(LifecycleNode):
+    """Lifecycle node around one :class:`Compensator`; arguments are those of ``rclpy`` nodes."""
+
+    def __init__(self, **options) -> None:
+        super().__init__("compensator", **options)
+        self._options = declare(self, PARAMETERS)
+        self.wants_autostart: bool = self._options["autostart"]
+        self._active = False
+        self._throttle = Throttle()
+        self._refusals, self._feedback_refusals = Refusals(), Refusals()
+        self._commands, self._feedback = Flow(), Flow()
+        self._reader, self._struts = PoseReader(), StrutReader()
+        self._last_stamp = 0
+        self._fresh_start = True
+        self.compensator: Compensator | None = None
+
+    # ---- lifecycle ----
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Load geometry and model, compile, open topics."""
+        began = time.perf_counter()
+        self.get_logger().info("loading; the first start on a machine compiles its kernels, some 30 s")
+        try:
+            geometry = load_geometry(config_file(self._options["geometry_file"]))
+            self.compensator = Compensator(geometry, self._load_model(geometry), self._options["ramp_rate"])
+        except HexapodError as error:
+            self.get_logger().error(f"cannot configure: {error}")
+            return TransitionCallbackReturn.FAILURE
+        self._warm_up()
+        self._frames = {self._options["base_frame"]: Pose.identity(), self._options["work_frame"]: geometry.work}
+        self._open_topics()
+        name = f"{self.get_fully_qualified_name()[1:]}: {geometry.name}"
+        self._report = HealthReport(name, geometry.name)
+        self.get_logger().info(
+            f"configured machine {geometry.name!r} with model {self.compensator.model.name!r} "
+            f"in {time.perf_counter() - began:.2f} s"
+        )
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Start to take commands; nothing that came before is replayed."""
+        self._forget()
+        self._active = True
+        self.get_logger().info("ready")
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop taking commands; the struts keep their last one."""
+        self._active = False
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close topics and forget the machine."""
+        self._active = False
+        self._close_topics()
+        self.compensator = None
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop taking commands for good."""
+        self._active = False
+        return super().on_shutdown(state)
+
+    def say_goodbye(self) -> None:
+        """Publish a last status and wait until it has arrived."""
+        if self.compensator is None:
+            return
+        self._active = False
+        self._check_state()
+        self._diagnostics_pub.wait_for_all_acked()
+        self._command_pub.wait_for_all_acked()
+
+    def _load_model(self, geometry) -> MachineModel:
+        name = self._options["model_file"]
+        return MachineModel(geometry.name) if name == "ideal" else load_model(config_file(name), geometry)
+
+    def _warm_up(self) -> None:
+        """Run every kernel of the loop once, so that none compiles while the machine moves."""
+        compensator = self.compensator
+        home = compensator.tool_pose(compensator.geometry.home)
+        reader = PoseReader()
+        message = PoseStamped()
+        write_pose(message, home.position, home.rotation)
+        reader.read(message)
+        compensator.step(reader.position, reader.rotation, 0.0)
+        self._guess = compensator.geometry.home.position.copy(), compensator.geometry.home.rotation.copy()
+        self._actual = np.empty(3), np.empty((3, 3))
+        compensator.machine.forward(compensator.command, compensator.motion.sense, *self._guess, *self._actual)
+        compensator.enable(self._options["enable_compensation"])
+        compensator.reset()
+
+    def _open_topics(self) -> None:
+        qos = dict(qos_overriding_options=qos_overridable())
+        self._command_pub = self.create_publisher(JointState, "strut_commands", COMMAND_QOS, **qos)
+        self._correction_pub = self.create_publisher(JointState, "strut_corrections", COMMAND_QOS, **qos)
+        self._estimate_pub = self.create_publisher(PoseStamped, "tool_pose_estimate", STATE_QOS, **qos)
+        self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", EVENT_QOS)
+        self._marker_pub = self.create_publisher(MarkerArray, "~/markers", EVENT_QOS)
+        self._array_pub = None
+        if self._options["publish_array"]:
+            self._array_pub = self.create_publisher(Float64MultiArray, "strut_commands_array", COMMAND_QOS, **qos)
+            self._array_out = Float64MultiArray(data=[0.0] * 6)
+            self._array_view = np.frombuffer(self._array_out.data, dtype=float)
+        self._command_out, self._correction_out = StrutMessage(), StrutMessage()
+        self._estimate_out = PoseStamped()
+        self._estimate_out.header.frame_id = self._options["base_frame"]
+        self._entities = [
+            self.create_subscription(PoseStamped, "tool_pose_command", self._on_command, COMMAND_QOS, **qos),
+            self.create_subscription(JointState, "strut_states", self._on_states, STATE_QOS, **qos),
+            self.create_subscription(Temperature, "temperatures", self._on_temperature, EVENT_QOS, **qos),
+        ]
+        self._own_services = [
+            self.create_service(SetBool, "~/enable_compensation", self._on_enable),
+            self.create_service(Trigger, "~/reload_model", self._on_reload),
+            self.create_service(Trigger, "~/reset", self._on_reset),
+        ]
+        self._timers_open = [self.create_timer(CHECK_PERIOD, self._check_state)]
+        if self._options["marker_rate"] > 0.0:
+            self._timers_open.append(self.create_timer(1.0 / self._options["marker_rate"], self._publish_markers))
+
+    def _close_topics(self) -> None:
+        for timer in self._timers_open:
+            self.destroy_timer(timer)
+        for service in self._own_services:
+            self.destroy_service(service)
+        for subscription in self._entities:
+            self.destroy_subscription(subscription)
+        for publisher in (
+            self._command_pub,
+            self._correction_pub,
+            self._estimate_pub,
+            self._diagnostics_pub,
+            self._marker_pub,
+            self._array_pub,
+        ):
+            if publisher is not None:
+                self.destroy_publisher(publisher)
+
+    # ---- messages in ----
+
+    def _on_command(self, message: PoseStamped) -> None:
+        if not self._active:
+            return
+        now = time.monotonic()
+        try:
+            stamp = self._checked_stamp(message.header.stamp, now)
+            frame = self._frame(message.header.frame_id)
+            self._reader.read(message)
+            if self._fresh_start or self._options["require_feedback"]:
+                self._consult_feedback(now)
+            self.compensator.step(self._reader.position, self._reader.rotation, now, frame)
+        except HexapodError as error:
+            self._refuse(error, now)
+            return
+        self._fresh_start = False
+        self._publish_command(stamp, now - self._commands.last)
+        self._commands.tick(now)
+        if self._feedback.age(now) > self._options["feedback_timeout"]:
+            self._publish_estimate(self.compensator.command, stamp)
+
+    def _checked_stamp(self, stamp, now: float):
+        """Return the stamp to copy, or refuse one too old, too new or out of order; zero means now."""
+        nanoseconds = stamp.sec * 1_000_000_000 + stamp.nanosec
+        clock = self.get_clock().now()
+        if nanoseconds == 0:
+            return clock.to_msg()
+        age = (clock.nanoseconds - nanoseconds) * 1e-9
+        allowed = self._options["max_command_age"]
+        if 0.0 < allowed < abs(age):
+            reason, word = ("stamp_past", "old") if age > 0.0 else ("stamp_future", "in the future")
+            raise CommandError(reason, f"stamp is {abs(age):.3f} s {word}, allowed {allowed:g} s")
+        if nanoseconds < self._last_stamp and self._commands.age(now) < FORGET_ORDER_AFTER:
+            raise CommandError("stamp_order", "stamp is earlier than the last command's")
+        self._last_stamp = nanoseconds
+        return stamp
+
+    def _frame(self, frame_id: str) -> Pose:
+        frame = self._frames.get(frame_id)
+        if frame is None:
+            raise CommandError("frame_id", f"frame_id must be one of {', '.join(self._frames)}, not {frame_id!r}")
+        return frame
+
+    def _consult_feedback(self, now: float) -> None:
+        """Take the measured struts as the state to start from, or refuse when they are required and absent."""
+        fresh = self._feedback.age(now) <= self._options["feedback_timeout"]
+        if self._options["require_feedback"] and not fresh:
+            raise CommandError("no_feedback", f"no strut_states for {seconds(self._feedback.age(now))} s")
+        if self._fresh_start:
+            self.compensator.reset(self._struts.lengths if fresh else None)
+
+    def _on_states(self, message: JointState) -> None:
+        if not self._active:
+            return
+        now = time.monotonic()
+        try:
+            self._struts.read(message)
+        except CommandError as error:
+            self._feedback_refusals.add(error.reason, str(error), now)
+            self._log("feedback " + error.reason, f"strut_states ignored: {error}")
+            return
+        self._feedback.tick(now)
+        self._publish_estimate(self._struts.lengths, message.header.stamp)
+
+    def _on_temperature(self, message: Temperature) -> None:
+        if not self._active:
+            return
+        try:
+            self.compensator.set_temperature(message.header.frame_id, message.temperature)
+        except HexapodError as error:
+            self._feedback_refusals.add("temperature", str(error), time.monotonic())
+            self._log("temperature", f"temperature ignored: {error}")
+
+    # ---- services ----
+
+    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self.compensator.enable(request.data)
+        response.success = True
+        response.message = f"compensation ramps {'in' if request.data else 'out'}"
+        return response
+
+    def _on_reload(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            self.compensator.set_model(self._load_model(self.compensator.geometry))
+        except HexapodError as error:
+            response.success, response.message = False, f"the old model stays: {error}"
+            return response
+        response.success, response.message = True, f"model {self.compensator.model.name!r} ramps in"
+        return response
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._forget()
+        response.success = True
+        response.message = "the next command may be one allowed step from the measured struts"
+        return response
+
+    # ---- messages out ----
+
+    def _publish_command(self, stamp, since_last: float) -> None:
+        out, correction, compensator = self._command_out, self._correction_out, self.compensator
+        np.subtract(compensator.command, out.position, out=out.velocity)
+        out.velocity *= 1.0 / since_last if since_last < FORGET_ORDER_AFTER else 0.0
+        out.position[:] = compensator.command
+        out.message.header.stamp = stamp
+        self._command_pub.publish(out.message)
+        correction.position[:] = compensator.correction
+        correction.message.header.stamp = stamp
+        self._correction_pub.publish(correction.message)
+        if self._array_pub is not None:
+            self._array_view[:] = compensator.command
+            self._array_pub.publish(self._array_out)
+
+    def _publish_estimate(self, struts: np.ndarray, stamp) -> None:
+        compensator = self.compensator
+        outcome, _, condition, _ = compensator.machine.forward(
+            struts, compensator.motion.sense, *self._guess, *self._actual
+        )
+        if outcome != kernels.OK:
+            error = forward_error(outcome, condition, compensator.geometry.limits.condition)
+            self._feedback_refusals.add(error.reason, str(error), time.monotonic())
+            self._log("estimate " + error.reason, f"no pose estimate: {error}")
+            return
+        tool = compensator.geometry.tool
+        position = self._actual[0] + self._actual[1] @ tool.position
+        write_pose(self._estimate_out, position, self._actual[1] @ tool.rotation)
+        self._estimate_out.header.stamp = stamp
+        self._estimate_pub.publish(self._estimate_out)
+
+    def _publish_markers(self) -> None:
+        if not self._active or not self._marker_pub.get_subscription_count():
+            return
+        now = self.get_clock().now().to_msg()
+        correction = np.zeros(6) if self._fresh_start else self.compensator.correction
+        frame = self._options["base_frame"]
+        markers = machine_markers(self.compensator.geometry, *self._guess, correction, frame, now)
+        self._marker_pub.publish(markers)
+
+    # ---- state ----
+
+    def _forget(self) -> None:
+        self.compensator.reset()
+        self._fresh_start = True
+        self._last_stamp = 0
+
+    def _refuse(self, error: HexapodError, now: float) -> None:
+        self._refusals.add(error.reason, str(error), now)
+        self._log(error.reason, f"command refused ({error.reason}): {error}")
+
+    def _log(self, cause: str, text: str) -> None:
+        held = self._throttle.passes(cause)
+        if held is not None:
+            self.get_logger().warning(text + (f" ({held} more like it)" if held else ""))
+
+    def _state(self, now: float) -> tuple[bytes, str]:
+        """Return level and message of the diagnostics."""
+        if not self._active:
+            return WARN, "not active"
+        if self._refusals.recent(now):
+            return ERROR, f"refusing commands: {self._refusals.last_reason}"
+        if self._feedback_refusals.recent(now):
+            return ERROR, f"bad feedback: {self._feedback_refusals.last_reason}"
+        timeout = self._options["command_timeout"]
+        if not self._commands.count:
+            return OK, "waiting for the first command"
+        if 0.0 < timeout < self._commands.age(now):
+            return WARN, "no new command"
+        if self._feedback.age(now) > self._options["feedback_timeout"]:
+            return OK, "running, pose estimated from own commands"
+        return OK, "running"
+
+    def _check_state(self) -> None:
+        now = time.monotonic()
+        level, text = self._state(now)
+        if not self._report.due(level, text, now):
+            return
+        stamp = self.get_clock().now().to_msg()
+        self._diagnostics_pub.publish(self._report.message(level, text, self._values(now), stamp))
+
+    def _values(self, now: float) -> dict[str, str]:
+        compensator = self.compensator
+        feedback = self._feedback.age(now) <= self._options["feedback_timeout"]
+        correction = 0.0 if self._fresh_start else float(np.abs(compensator.correction).max())
+        values = {
+            "model": compensator.model.name,
+            "compensation": "on" if compensator.enabled else "off",
+            "ramping": str(compensator.ramping).lower(),
+            "pose_estimated_from": "strut_states" if feedback else "own commands",
+            "commands": str(self._commands.count),
+            "command_rate_hz": f"{self._commands.rate(now):.1f}",
+            "command_age_s": seconds(self._commands.age(now)),
+            "feedback_rate_hz": f"{self._feedback.rate(now):.1f}",
+            "feedback_age_s": seconds(self._feedback.age(now)),
+            "largest_correction_m": f"{correction:.9f}",
+            "outside_field": str(compensator.outside_field).lower(),
+            "last_refusal": self._refusals.last_text,
+            "last_bad_feedback": self._feedback_refusals.last_text,
+            "bad_feedback": str(sum(self._feedback_refusals.counts.values())),
+        }
+        values.update({f"temperature.{k}_degC": f"{v:.2f}" for k, v in compensator.temperatures.values.items()})
+        values.update(self._refusals.values())
+        return values
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node; the entry of the executable ``compensator``."""
+    keep_discovery_local()
+    return run(CompensatorNode, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,105 @@
+"""Counters, rates and ages of a node, and the diagnostics message made of them."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+REFUSAL_SHOWN_FOR = 1.0
+"""A refusal colours the status for this long, s."""
+
+
+class Flow:
+    """Counts events and tells their rate and the age of the last one."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.last = -float("inf")
+        self._window_start = time.monotonic()
+        self._window_count = 0
+        self._rate = 0.0
+
+    def tick(self, now: float) -> None:
+        """Count one event at the monotonic time `now`, s."""
+        self.count += 1
+        self.last = now
+
+    def age(self, now: float) -> float:
+        """Return the time since the last event, s; infinite before the first."""
+        return now - self.last
+
+    def rate(self, now: float) -> float:
+        """Return events per second over the last full second or so."""
+        span = now - self._window_start
+        if span >= 1.0:
+            self._rate = (self.count - self._window_count) / span
+            self._window_start, self._window_count = now, self.count
+        return self._rate
+
+
+class Refusals:
+    """Refused messages, counted by reason."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self.last_reason = ""
+        self.last_text = ""
+        self.last_time = -float("inf")
+
+    def add(self, reason: str, text: str, now: float) -> None:
+        """Count one refusal."""
+        self.counts[reason] += 1
+        self.last_reason, self.last_text, self.last_time = reason, text, now
+
+    def recent(self, now: float) -> bool:
+        """Return whether one is recent enough to be shown as an error."""
+        return now - self.last_time < REFUSAL_SHOWN_FOR
+
+    def values(self) -> dict[str, str]:
+        """Return the counters as key and value."""
+        values = {"refused": str(sum(self.counts.values()))}
+        values.update({f"refused.{reason}": str(count) for reason, count in sorted(self.counts.items())})
+        return values
+
+
+class HealthReport:
+    """Publishes a status once a second, and at once when level or message change.
+
+    Parameters
+    ----------
+    name : str
+        Status name, ``node: machine``.
+    hardware_id : str
+        Machine name.
+    period : float
+        Longest time between two messages, s.
+    """
+
+    def __init__(self, name: str, hardware_id: str, period: float = 1.0) -> None:
+        self._name, self._hardware_id, self._period = name, hardware_id, period
+        self._shown: tuple[bytes, str] | None = None
+        self._last = -float("inf")
+
+    def due(self, level: bytes, message: str, now: float) -> bool:
+        """Return whether a message must go out, and take it as sent."""
+        if (level, message) == self._shown and now - self._last < self._period:
+            return False
+        self._shown, self._last = (level, message), now
+        return True
+
+    def message(self, level: bytes, text: str, values: dict[str, str], stamp) -> DiagnosticArray:
+        """Return the diagnostics message."""
+        status = DiagnosticStatus(level=level, name=self._name, message=text, hardware_id=self._hardware_id)
+        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = stamp
+        return array
+
+
+def seconds(value: float) -> str:
+    """Return an age for people: ``never`` when it is infinite."""
+    return "never" if value == float("inf") else f"{value:.3f}"

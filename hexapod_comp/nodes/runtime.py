@@ -1,0 +1,205 @@
+"""What both nodes share: parameters, the spin loop, signals, log throttling."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import rclpy
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.experimental import EventsExecutor
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.signals import SignalHandlerOptions
+
+from ..errors import HexapodError
+
+SPIN_PERIOD = 0.1
+"""Longest wait of one spin, s: how soon a signal is noticed (EventsExecutor.spin itself never returns)."""
+
+COMMAND_QOS = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
+"""Commands: only the newest counts, and it must arrive."""
+
+STATE_QOS = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Measured states: only the newest counts, and an old one is not worth repeating."""
+
+EVENT_QOS = QoSProfile(depth=10, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
+"""Rare messages, each of which counts: temperatures, diagnostics, markers."""
+
+
+class ParameterError(HexapodError):
+    """A parameter's value is not allowed."""
+
+    reason = "bad_parameter"
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a node.
+
+    Parameters
+    ----------
+    name : str
+        Its name.
+    default : bool, int, float or str
+        Default, which also fixes the type; an int is accepted for a float.
+    description : str
+        What it means, with its unit.
+    low, high : float, optional
+        Allowed range of a number.
+    read_only : bool
+        Fixed at start; the others may be set while the node runs.
+    """
+
+    name: str
+    default: bool | int | float | str
+    description: str
+    low: float | None = None
+    high: float | None = None
+    read_only: bool = True
+
+
+def declare(node: LifecycleNode, parameters: Sequence[Parameter]) -> dict[str, Any]:
+    """Declare parameters and return their checked values.
+
+    Raises
+    ------
+    ParameterError
+        Wrong type or out of range; names parameter, value and what is allowed.
+    """
+    values = {}
+    for parameter in parameters:
+        descriptor = ParameterDescriptor(
+            description=_described(parameter), read_only=parameter.read_only, dynamic_typing=True
+        )
+        if isinstance(parameter.default, float) and parameter.low is not None:
+            bounds = FloatingPointRange(from_value=float(parameter.low), to_value=float(parameter.high or 1e9))
+            descriptor.floating_point_range = [bounds]
+        try:
+            found = node.declare_parameter(parameter.name, parameter.default, descriptor).value
+        except rclpy.exceptions.InvalidParameterValueException as error:
+            raise ParameterError(f"parameter {parameter.name}: {error}") from error
+        values[parameter.name] = checked(parameter, found)
+    _warn_of_strangers(node)
+    return values
+
+
+def _described(parameter: Parameter) -> str:
+    if parameter.low is None:
+        return parameter.description
+    upper = "" if parameter.high is None else f" to {parameter.high:g}"
+    return f"{parameter.description} (from {parameter.low:g}{upper})"
+
+
+def checked(parameter: Parameter, value: Any) -> Any:
+    """Return `value` as the parameter's type, or refuse it.
+
+    Raises
+    ------
+    ParameterError
+        Wrong type or out of range; an int is taken for a float.
+    """
+    wanted = type(parameter.default)
+    if wanted is float and type(value) is int:
+        value = float(value)
+    if type(value) is not wanted:
+        raise ParameterError(f"parameter {parameter.name}: must be {wanted.__name__}, not {value!r}")
+    if wanted in (int, float):
+        low = -float("inf") if parameter.low is None else parameter.low
+        high = float("inf") if parameter.high is None else parameter.high
+        if not low <= value <= high:
+            raise ParameterError(f"parameter {parameter.name}: must lie in {low:g}…{high:g}, not {value!r}")
+    return value
+
+
+def _warn_of_strangers(node: LifecycleNode) -> None:
+    """Warn of overrides that no declared parameter takes: most likely misspelt."""
+    declared = {name for name in node.get_parameters_by_prefix("")}
+    for name in getattr(node, "_parameter_overrides", {}):
+        if name not in declared and not name.startswith("qos_overrides."):
+            near = difflib.get_close_matches(name, declared, 1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            node.get_logger().warning(f"there is no parameter {name}, it is ignored{hint}")
+
+
+def qos_overridable() -> QoSOverridingOptions:
+    """Return the options that let a user override a topic's QoS by parameters."""
+    return QoSOverridingOptions.with_default_policies()
+
+
+class Throttle:
+    """Lets one message per cause and second through, and counts what it held back."""
+
+    def __init__(self, period: float = 1.0) -> None:
+        self._period = period
+        self._last: dict[str, float] = {}
+        self._held: dict[str, int] = {}
+
+    def passes(self, cause: str) -> int | None:
+        """Return how many of this cause were held back since the last, or None to hold this one back."""
+        now = time.monotonic()
+        if now - self._last.get(cause, -1e9) < self._period:
+            self._held[cause] = self._held.get(cause, 0) + 1
+            return None
+        self._last[cause] = now
+        return self._held.pop(cause, 0)
+
+
+def autostart(node: LifecycleNode) -> bool:
+    """Configure and activate a node; return whether both went well."""
+    done = TransitionCallbackReturn.SUCCESS
+    return node.trigger_configure() == done and node.trigger_activate() == done
+
+
+def keep_discovery_local() -> None:
+    """Keep discovery to this machine unless the user's environment says otherwise."""
+    if "ROS_STATIC_PEERS" not in os.environ:
+        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+def run(make_node: Callable[[], LifecycleNode], argv: Sequence[str] | None = None) -> int:
+    """Run a node until SIGINT or SIGTERM.
+
+    Signals only set a flag, since rclpy's own handling loses the last message and exits non-zero on a
+    second Ctrl-C, which ``ros2 launch`` sends.
+
+    Returns
+    -------
+    int
+        0 after a signal, 1 when the node could not start.
+    """
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    try:
+        rclpy.init(args=list(argv) if argv is not None else None, signal_handler_options=SignalHandlerOptions.NO)
+    except (rclpy.exceptions.ROSInterruptException, RuntimeError, ValueError) as error:
+        print(f"cannot start ROS: {error}", file=sys.stderr)
+        return 1
+    try:
+        node = make_node()
+    except HexapodError as error:
+        print(f"cannot start: {error}", file=sys.stderr)
+        rclpy.try_shutdown()
+        return 1
+    executor = EventsExecutor()
+    executor.add_node(node)
+    try:
+        if node.wants_autostart and not autostart(node):
+            return 1
+        while not stop.is_set() and rclpy.ok():
+            executor.spin_once(timeout_sec=SPIN_PERIOD)
+        node.say_goodbye()
+        return 0
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()
