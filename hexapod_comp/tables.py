@@ -1,0 +1,204 @@
+"""CSV files of poses and of strut lengths: units in the column names, errors that name row and column."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .errors import InputFileError, PoseError
+from .files import UNITS, read_text
+from .pose import Pose, angles_from_rotation
+
+LABEL_COLUMNS = ("sequence", "name")
+POSITION_COLUMNS = ("x", "y", "z")
+ANGLE_COLUMNS = ("alpha", "beta", "gamma")
+QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
+LENGTH_COLUMNS = tuple(f"L{i}" for i in range(1, 7))
+
+
+@dataclass(frozen=True)
+class Row:
+    """Where a value comes from.
+
+    Attributes
+    ----------
+    line : int
+        Line in the file, the header being line 1.
+    label : str
+        The row's ``sequence`` or ``name``, or its number.
+    """
+
+    line: int
+    label: str
+
+
+class _Table:
+    """A CSV file with its header understood."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = path
+        lines = csv.reader(io.StringIO(read_text(path)), skipinitialspace=True)
+        try:
+            numbered = [(lines.line_num, row) for row in lines if row and not row[0].startswith("#")]
+        except csv.Error as error:
+            raise InputFileError(path, f"line {lines.line_num}", f"is not CSV: {error}") from error
+        self.header = [name.strip() for name in numbered[0][1]] if numbered else []
+        twice = [name for name in self.header if self.header.count(name) > 1]
+        if twice:
+            raise InputFileError(path, "header", "column is given twice", twice[0])
+        self.rows = numbered[1:]
+        if not self.rows:
+            raise InputFileError(path, "", "has a header but no rows" if self.header else "has no header")
+        self._known: set[str] = {name for name in LABEL_COLUMNS if name in self.header}
+
+    def column(self, name: str, dimension: str | None) -> tuple[int, float] | None:
+        """Return index and unit of a column, or None when there is none of that name."""
+        wanted = {name: 1.0} if dimension is None else {f"{name}_{u}": s for u, s in UNITS[dimension].items()}
+        found = [key for key in wanted if key in self.header]
+        if len(found) > 1:
+            raise InputFileError(self.path, "header", f"{name} is given twice", found)
+        if not found:
+            return None
+        self._known.add(found[0])
+        return self.header.index(found[0]), wanted[found[0]]
+
+    def columns(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]] | None:
+        """Return all columns of a group, None when the whole group is absent."""
+        found = [self.column(name, dimension) for name in names]
+        if all(entry is None for entry in found):
+            return None
+        for name, entry in zip(names, found, strict=True):
+            if entry is None:
+                raise InputFileError(self.path, "header", f"column {_column_names(name, dimension)} is missing")
+        return [entry for entry in found if entry is not None]
+
+    def required(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]]:
+        """Return all columns of a group that must be there."""
+        found = self.columns(names, dimension)
+        if found is None:
+            raise InputFileError(self.path, "header", f"column {_column_names(names[0], dimension)} is missing")
+        return found
+
+    def refuse_unknown(self) -> None:
+        """Raise on a column that nobody asked for."""
+        for name in self.header:
+            if name not in self._known:
+                raise InputFileError(self.path, "header", "is not a known column", name)
+
+    def numbers(self, columns: list[tuple[int, float]]) -> np.ndarray:
+        """Return the finite numbers of some columns in SI, shape (rows, columns)."""
+        values = np.empty((len(self.rows), len(columns)))
+        for n, (line, row) in enumerate(self.rows):
+            if len(row) != len(self.header):
+                problem = f"has {len(row)} columns, the header has {len(self.header)}"
+                raise InputFileError(self.path, f"line {line}", problem)
+            for k, (index, unit) in enumerate(columns):
+                values[n, k] = unit * self._number(line, index, row[index])
+        return values
+
+    def _number(self, line: int, index: int, text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            where = f"line {line}, column {self.header[index]}"
+            raise InputFileError(self.path, where, "must be a finite number", text)
+        return value
+
+    def labels(self) -> list[Row]:
+        """Return line and label of every row."""
+        columns = [self.header.index(name) for name in LABEL_COLUMNS if name in self.header]
+        return [
+            Row(line, row[columns[0]].strip() if columns else str(n + 1))
+            for n, (line, row) in enumerate(self.rows)
+        ]
+
+
+def _column_names(name: str, dimension: str | None) -> str:
+    if dimension is None:
+        return name
+    return " or ".join(f"{name}_{unit}" for unit in UNITS[dimension])
+
+
+def read_poses(path: str | Path) -> tuple[list[Row], list[Pose]]:
+    """Read poses from a CSV file.
+
+    Columns: ``x_mm``, ``y_mm``, ``z_mm`` (or ``_m``, ``_um``, ``_in``); optionally ``alpha_deg``,
+    ``beta_deg``, ``gamma_deg`` (the paper's angles; or ``_rad``, …) or ``qx``, ``qy``, ``qz``, ``qw``;
+    optionally ``sequence`` or ``name``. Lines that start with ``#`` are skipped.
+
+    Returns
+    -------
+    rows : list of Row
+        Where each pose stands.
+    poses : list of Pose
+        m and rotation matrices.
+
+    Raises
+    ------
+    InputFileError
+        Naming file, line and column.
+    """
+    table = _Table(path)
+    positions = table.numbers(table.required(POSITION_COLUMNS, "length"))
+    angle_columns = table.columns(ANGLE_COLUMNS, "angle")
+    quaternion_columns = table.columns(QUATERNION_COLUMNS, None)
+    table.refuse_unknown()
+    if angle_columns and quaternion_columns:
+        raise InputFileError(path, "header", "give either angles or a quaternion, not both")
+    rows = table.labels()
+    if quaternion_columns:
+        quaternions = table.numbers(quaternion_columns)
+        return rows, [
+            _pose_from_quaternion(path, row, p, q)
+            for row, p, q in zip(rows, positions, quaternions, strict=True)
+        ]
+    angles = table.numbers(angle_columns) if angle_columns else np.zeros((len(rows), 3))
+    return rows, [Pose.from_angles(p, a) for p, a in zip(positions, angles, strict=True)]
+
+
+def _pose_from_quaternion(path: str | Path, row: Row, position: np.ndarray, quaternion: np.ndarray) -> Pose:
+    try:
+        return Pose.from_quaternion(position, quaternion)
+    except PoseError as error:
+        raise InputFileError(path, f"line {row.line}, columns qx…qw", str(error)) from error
+
+
+def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
+    """Read strut lengths from a CSV file with the columns ``L1_mm`` … ``L6_mm`` (or ``_m``, ``_um``, ``_in``).
+
+    Returns
+    -------
+    rows : list of Row
+        Where each set stands.
+    lengths : ndarray, shape (N, 6)
+        m.
+
+    Raises
+    ------
+    InputFileError
+        Naming file, line and column.
+    """
+    table = _Table(path)
+    lengths = table.numbers(table.required(LENGTH_COLUMNS, "length"))
+    table.refuse_unknown()
+    return table.labels(), lengths
+
+
+def pose_values(pose: Pose) -> dict[str, float]:
+    """Return a pose as the columns that :func:`read_poses` reads: mm and degrees."""
+    x, y, z = pose.position * 1e3
+    alpha, beta, gamma = np.degrees(angles_from_rotation(pose.rotation))
+    names = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
+    return {name: float(value) for name, value in zip(names, (x, y, z, alpha, beta, gamma), strict=True)}
+
+
+def length_values(lengths: np.ndarray) -> dict[str, float]:
+    """Return six lengths as the columns that :func:`read_lengths` reads, mm."""
+    return {f"{name}_mm": float(value) * 1e3 for name, value in zip(LENGTH_COLUMNS, lengths, strict=True)}
