@@ -15,7 +15,8 @@ import math
 
 import numpy as np
 
-from .linalg6 import compiled, frobenius_condition, internal, solve_six
+from .compiling import compiled
+from .linalg6 import frobenius_condition, inlined, internal, norm, solve_six
 from .lockstep import (
     CONDITION,
     COUNT,
@@ -30,9 +31,11 @@ from .lockstep import (
     closure_error,
     fill_lane,
     rotation_error,
+    row_of,
     six_rows,
     solve_lanes,
     straightened,
+    strut_between,
     struts,
     take_lane,
     three_rows,
@@ -48,20 +51,26 @@ ONE = np.int64(1)
 @compiled
 def strut_lengths_one(base, platform, position, rotation, lengths):
     """Write |P + R·t_i − b_i| into `lengths`, shape (6,), m (000, inverse kinematics)."""
-    for i in range(6):
-        sx, sy, sz = strut_vector(base, platform, position, rotation, i)
-        lengths[i] = math.sqrt(sx * sx + sy * sy + sz * sz)
+    _write_lengths(six_rows(base), six_rows(platform), position, rotation, lengths)
+
+
+@inlined
+def _write_lengths(base, platform, position, rotation, lengths):
+    """Write six strut lengths; joints come as tuples, so that a batch loads them once."""
+    p, r = (position[0], position[1], position[2]), three_rows(rotation)
+    lengths[0] = norm(strut_between(base[0], platform[0], p, r))
+    lengths[1] = norm(strut_between(base[1], platform[1], p, r))
+    lengths[2] = norm(strut_between(base[2], platform[2], p, r))
+    lengths[3] = norm(strut_between(base[3], platform[3], p, r))
+    lengths[4] = norm(strut_between(base[4], platform[4], p, r))
+    lengths[5] = norm(strut_between(base[5], platform[5], p, r))
 
 
 @compiled
 def strut_vector(base, platform, position, rotation, i):
     """Return the vector from base joint to platform joint of strut `i` in ``base``, m."""
-    tx, ty, tz = platform[i, 0], platform[i, 1], platform[i, 2]
-    return (
-        position[0] + rotation[0, 0] * tx + rotation[0, 1] * ty + rotation[0, 2] * tz - base[i, 0],
-        position[1] + rotation[1, 0] * tx + rotation[1, 1] * ty + rotation[1, 2] * tz - base[i, 1],
-        position[2] + rotation[2, 0] * tx + rotation[2, 1] * ty + rotation[2, 2] * tz - base[i, 2],
-    )
+    p, r = (position[0], position[1], position[2]), three_rows(rotation)
+    return strut_between(row_of(base, i), row_of(platform, i), p, r)
 
 
 @compiled
@@ -283,8 +292,9 @@ def _closes(base, platform, lengths, p, r):
 @compiled
 def strut_lengths_many(base, platform, positions, rotations, lengths):
     """Batch of :func:`strut_lengths_one`: (N, 3), (N, 3, 3) → (N, 6)."""
+    base, platform = six_rows(base), six_rows(platform)
     for n in range(positions.shape[0]):
-        strut_lengths_one(base, platform, positions[n], rotations[n], lengths[n])
+        _write_lengths(base, platform, positions[n], rotations[n], lengths[n])
 
 
 @compiled

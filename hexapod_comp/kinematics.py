@@ -215,12 +215,12 @@ def solve_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> Pose:
     NotFiniteError, UnreachableError, SingularError, NotConvergedError, OtherAssemblyModeError
         Each says what was found and what is allowed.
     """
-    lengths = _six_lengths(lengths)
+    lengths = six_lengths(lengths)
     position, rotation = guess.position.copy(), guess.rotation.copy()
-    outcome, iterations, condition = _solve_one(structure, lengths, position, rotation)
+    outcome, _, condition = _solve_one(structure, lengths, position, rotation)
     if outcome == kernels.NOT_CONVERGED or (outcome == kernels.SINGULAR and not np.isfinite(condition)):
         position, rotation = _closest_pose(structure, lengths, guess)
-        outcome, iterations, condition = _solve_one(structure, lengths, position, rotation)
+        outcome, _, condition = _solve_one(structure, lengths, position, rotation)
     if outcome != kernels.OK:
         raise forward_error(outcome, condition, structure.max_condition)
     return Pose(position, rotation)
@@ -333,6 +333,8 @@ def _closest_pose(
     ------
     UnreachableError
         The minimum is not a closure; carries the remaining length error.
+    NotConvergedError
+        The guess is so far away that numbers overflow.
     """
 
     def pose_at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -344,6 +346,9 @@ def _closest_pose(
         kernels.strut_lengths_one(structure.base_joints, structure.platform_joints, *pose_at(x), found)
         return found - lengths
 
+    first = misfit(np.zeros(6))
+    if not np.isfinite(first @ first):
+        raise NotConvergedError(f"the guess {guess.position.tolist()} m is too far away to start from")
     fit = least_squares(misfit, np.zeros(6), xtol=1e-12, ftol=1e-12, gtol=1e-12, max_nfev=200)
     rest = float(np.abs(fit.fun).max())
     if rest > 1e-6:
@@ -353,7 +358,7 @@ def _closest_pose(
     return pose_at(fit.x)
 
 
-def _six_lengths(lengths: np.ndarray) -> np.ndarray:
+def six_lengths(lengths: np.ndarray) -> np.ndarray:
     lengths = np.ascontiguousarray(lengths, dtype=float)
     if lengths.shape != (6,):
         raise KinematicsError(f"six strut lengths are needed, not shape {lengths.shape}", lengths.shape)

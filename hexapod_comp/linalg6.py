@@ -13,8 +13,7 @@ import math
 import numpy as np
 from numba import njit
 
-compiled = njit(cache=True, nogil=True, error_model="numpy")
-"""Decorator of every kernel: cached on disk, releases the GIL, IEEE division."""
+from .compiling import compiled
 
 internal = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 """Decorator of what only kernels call: it is cached within them, and has no entry from Python."""
@@ -23,7 +22,7 @@ inlined = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=Tr
 """… and of small parts that must become part of their caller, or its loop cannot become SIMD."""
 
 SMALLEST_PIVOT = 1e-14
-"""A pivot below this, relative to rows of order one, is rounding: the matrix is singular."""
+"""A pivot not above this, in a matrix of unit vectors and moments, is rounding: the matrix is singular."""
 
 
 @inlined
@@ -166,42 +165,18 @@ def solve_six(matrix, right):
 
 @compiled
 def frobenius_condition(matrix):
-    """Return (‖A‖·‖A⁻¹‖/6, sign of det A) of a 6×6 matrix, which is destroyed."""
-    norm = 0.0
-    for i in range(6):
-        for j in range(6):
-            norm += matrix[i, j] * matrix[i, j]
-    if not norm < math.inf:
-        return math.inf, 0.0
-    inverse = np.eye(6)
-    sign = 1.0
+    """Return (‖A‖·‖A⁻¹‖/6, sign of det A) of a 6×6 matrix; (∞, 0.0) when it is singular or not finite."""
+    factors, column = np.empty((6, 6)), np.empty(6)
+    square, inverse_square, sign = 0.0, 0.0, 0.0
     for k in range(6):
-        pivot = k
-        for i in range(k + 1, 6):
-            if abs(matrix[i, k]) > abs(matrix[pivot, k]):
-                pivot = i
-        value = matrix[pivot, k]
-        if not abs(value) > SMALLEST_PIVOT:
-            return math.inf, 0.0
-        if value < 0.0:
-            sign = -sign
-        if pivot != k:
-            sign = -sign
-            for j in range(6):
-                matrix[k, j], matrix[pivot, j] = matrix[pivot, j], matrix[k, j]
-                inverse[k, j], inverse[pivot, j] = inverse[pivot, j], inverse[k, j]
-        reciprocal = 1.0 / value
-        for j in range(6):
-            matrix[k, j] *= reciprocal
-            inverse[k, j] *= reciprocal
         for i in range(6):
-            if i != k:
-                factor = matrix[i, k]
-                for j in range(6):
-                    matrix[i, j] -= factor * matrix[k, j]
-                    inverse[i, j] -= factor * inverse[k, j]
-    inverse_norm = 0.0
-    for i in range(6):
-        for j in range(6):
-            inverse_norm += inverse[i, j] * inverse[i, j]
-    return math.sqrt(norm * inverse_norm) / 6.0, sign
+            column[i] = 1.0 if i == k else 0.0
+            square += matrix[i, k] * matrix[i, k]
+            for j in range(6):
+                factors[i, j] = matrix[i, j]
+        sign = solve_six(factors, column)
+        for i in range(6):
+            inverse_square += column[i] * column[i]
+    if sign == 0.0 or not square * inverse_square < math.inf:
+        return math.inf, 0.0
+    return math.sqrt(square * inverse_square) / 6.0, sign

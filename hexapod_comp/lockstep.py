@@ -5,7 +5,7 @@ the end are what it vectorises. The arithmetic is IEEE either way, so that a pos
 the same bits as one among others. A lane that fails any test is only marked: :mod:`hexapod_comp.kernels` then
 solves it with pivoting and finds the reason.
 
-Rows of a rotation matrix are passed as three tuples, strut vectors and moments as six.
+Rotations `r` are passed as three tuples, the rows of R; joints, strut vectors and moments as six.
 """
 
 from __future__ import annotations
@@ -54,29 +54,39 @@ flat so that the compiler knows every distance and needs no overlap checks."""
 
 
 @inlined
-def _row(rows, i):
+def row_of(rows, i):
     """Return row `i` of an (N, 3) array as a tuple, which the compiler keeps out of memory."""
     return rows[i, 0], rows[i, 1], rows[i, 2]
 
 
 @inlined
 def three_rows(rows):
-    """Return the rows of a (3, 3) array as tuples."""
-    return _row(rows, 0), _row(rows, 1), _row(rows, 2)
+    """Return the first three rows of an (N, 3) array as tuples."""
+    return row_of(rows, 0), row_of(rows, 1), row_of(rows, 2)
 
 
 @inlined
 def six_rows(rows):
     """Return the rows of a (6, 3) array as tuples."""
-    return _row(rows, 0), _row(rows, 1), _row(rows, 2), _row(rows, 3), _row(rows, 4), _row(rows, 5)
+    a, b, c = three_rows(rows)
+    return a, b, c, row_of(rows, 3), row_of(rows, 4), row_of(rows, 5)
+
+
+@inlined
+def strut_between(b, t, p, r):
+    """Return P + R·t − b: the vector from a base joint to a platform joint in ``base``, m."""
+    return (
+        p[0] + r[0][0] * t[0] + r[0][1] * t[1] + r[0][2] * t[2] - b[0],
+        p[1] + r[1][0] * t[0] + r[1][1] * t[1] + r[1][2] * t[2] - b[1],
+        p[2] + r[2][0] * t[0] + r[2][1] * t[1] + r[2][2] * t[2] - b[2],
+    )
 
 
 @inlined
 def _strut(b, t, p, r):
-    """Return strut vector s and moment R·t × s, both in ``base``; `r` holds the rows of R."""
-    arm = (dot(r[0], t), dot(r[1], t), dot(r[2], t))
-    s = subtract(add(p, arm), b)
-    return s, cross(arm, s)
+    """Return a strut vector s and its moment R·t × s about the platform's origin, both in ``base``."""
+    s = strut_between(b, t, p, r)
+    return s, cross((dot(r[0], t), dot(r[1], t), dot(r[2], t)), s)
 
 
 @inlined

@@ -6,11 +6,13 @@ are the moving frame's axes. The paper's angles (degrees or radians) and quatern
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from .compiling import compiled
 from .errors import PoseError
 
 QUATERNION_NORM_TOLERANCE = 1e-3
@@ -43,8 +45,7 @@ class Pose:
     def __post_init__(self) -> None:
         position = _finite(self.position, (3,), "position")
         rotation = _finite(self.rotation, (3, 3), "rotation matrix")
-        deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
-        if deviation > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0.0:
+        if not rotation_flaw(rotation) <= ROTATION_TOLERANCE:
             raise PoseError("rotation matrix must be orthonormal and right-handed", rotation.tolist())
         object.__setattr__(self, "position", position)
         object.__setattr__(self, "rotation", rotation)
@@ -135,10 +136,28 @@ def rotation_angle(rotation: np.ndarray) -> float:
     return float(Rotation.from_matrix(rotation).magnitude())
 
 
+@compiled
+def rotation_flaw(r):
+    """Return the largest element of |RᵀR − 1|, infinite for a left-handed matrix, NaN for one with NaN in it."""
+    flaw = 0.0
+    for i in range(3):
+        for j in range(i + 1):
+            dot = r[0, i] * r[0, j] + r[1, i] * r[1, j] + r[2, i] * r[2, j]
+            part = abs(dot - (1.0 if i == j else 0.0))
+            if not part <= flaw:
+                flaw = part
+    x = r[1, 0] * r[2, 1] - r[2, 0] * r[1, 1]
+    y = r[2, 0] * r[0, 1] - r[0, 0] * r[2, 1]
+    z = r[0, 0] * r[1, 1] - r[1, 0] * r[0, 1]
+    if x * r[0, 2] + y * r[1, 2] + z * r[2, 2] < 0.0:
+        return math.inf
+    return flaw
+
+
 def _finite(values: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:
     array = np.array(values, dtype=float, order="C")
     if array.shape != shape:
         raise PoseError(f"{name} must have shape {shape}, not {array.shape}")
-    if not np.isfinite(array).all():
+    if not math.isfinite(array.sum()) and not np.isfinite(array).all():
         raise PoseError(f"{name} must be finite", array.tolist())
     return array

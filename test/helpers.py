@@ -1,0 +1,123 @@
+"""What the kinematics tests share: the paper's tables in SI, central differences, machines for a purpose."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hexapod_comp.geometry import HexapodGeometry, Limits
+from hexapod_comp.pose import Pose
+
+DATA = Path(__file__).parent / "data"
+
+FACTORS = {"mm": 1e-3, "deg": np.pi / 180.0}
+"""What one unit of a table column, named after its last underscore, is in SI."""
+
+
+def read_table(name: str) -> dict[str, np.ndarray]:
+    """Return a table of test/data (000's tables as printed) as SI columns, keyed without the unit."""
+    with (DATA / name).open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    columns = {}
+    for title in rows[0]:
+        key, _, unit = title.rpartition("_")
+        if unit in FACTORS:
+            columns[key] = np.array([float(row[title]) * FACTORS[unit] for row in rows])
+    return columns
+
+
+def table_poses() -> list[Pose]:
+    """Return the ten commanded poses of 000, Table 1."""
+    table = read_table("table1_commanded_poses.csv")
+    positions = np.stack([table[key] for key in "xyz"], axis=1)
+    angles = np.stack([table[key] for key in ("alpha", "beta", "gamma")], axis=1)
+    return [Pose.from_angles(p, a) for p, a in zip(positions, angles, strict=True)]
+
+
+def table_lengths() -> np.ndarray:
+    """Return the ideal strut lengths of 000, Table 2, shape (10, 6), m."""
+    table = read_table("table2_strut_lengths_ideal.csv")
+    return np.stack([table[f"L{i}"] for i in range(1, 7)], axis=1)
+
+
+def central_difference(
+    function: Callable[[np.ndarray], np.ndarray], at: np.ndarray, step: float = 1e-5
+) -> np.ndarray:
+    """Return the derivative of `function` at a point by central differences.
+
+    Parameters
+    ----------
+    function : callable
+        (n,) → (m,).
+    at : ndarray, shape (n,)
+        Where.
+    step : float
+        Half the distance of the two evaluations. The error is about step²·f‴/6 + 1e-16·f/step: with
+        lengths and radii below a metre and 1e-5, a few 1e-11.
+
+    Returns
+    -------
+    ndarray, shape (m, n)
+    """
+    columns = [(function(at + h) - function(at - h)) / (2.0 * step) for h in step * np.eye(len(at))]
+    return np.stack(columns, axis=1)
+
+
+def moved(pose: Pose, twist: np.ndarray) -> Pose:
+    """Return a pose displaced by (v, ω) in ``base``: shifted by v, turned by exp(ω) about its own origin."""
+    return Pose(pose.position + twist[:3], Rotation.from_rotvec(twist[3:]).as_matrix() @ pose.rotation)
+
+
+def twist_between(start: Pose, end: Pose) -> np.ndarray:
+    """Return the (v, ω) with which :func:`moved` takes one pose to the other, shape (6,), m and rad."""
+    turn = Rotation.from_matrix(end.rotation @ start.rotation.T)
+    return np.concatenate([end.position - start.position, turn.as_rotvec()])
+
+
+def poses_about(
+    home: Pose, count: int, seed: int, reach: float = 0.05, tilt_deg: float = 30.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions within ±`reach` m and rotations with each of α, β, γ within ±`tilt_deg` of home."""
+    rng = np.random.default_rng(seed)
+    positions = home.position + rng.uniform(-reach, reach, (count, 3))
+    alpha, beta, gamma = np.deg2rad(rng.uniform(-tilt_deg, tilt_deg, (3, count)))
+    turns = Rotation.from_euler("YXZ", np.stack([beta, alpha, gamma], axis=1))
+    return positions, np.ascontiguousarray(turns.as_matrix() @ home.rotation)
+
+
+def wide_limits(condition: float) -> Limits:
+    """Return limits that only the condition number can break."""
+    return Limits(np.tile([0.01, 5.0], (6, 1)), np.full(6, 3.0), np.full(6, 3.0), condition, 1e-2, 1.0, 1.0)
+
+
+def three_two_one_machine() -> HexapodGeometry:
+    """Return a 6-6 machine with three vertical, two sideways and one lengthways strut.
+
+    No two joints coincide, and the vertical ones are struts 1, 3, 5: parallel at home, which leaves
+    elimination by blocks without a pivot.
+    """
+    vertical = np.array([[0.2, 0.0, 0.0], [-0.1, 0.17, 0.02], [-0.12, -0.15, -0.01]])
+    sideways = np.array([[0.15, 0.05, 0.03], [-0.14, 0.02, 0.05], [0.03, -0.12, 0.04]])
+    directions = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    platform, base = np.empty((6, 3)), np.empty((6, 3))
+    platform[::2], base[::2] = vertical, vertical - [0.0, 0.0, 0.5]
+    platform[1::2], base[1::2] = sideways, sideways - 0.4 * directions
+    home = Pose([0.0, 0.0, 0.5], np.eye(3))
+    return HexapodGeometry("3-2-1", base + home.position, platform, home, wide_limits(20.0))
+
+
+def general_machine() -> HexapodGeometry:
+    """Return a 6-6 machine with twelve separate joints off any plane, 2.5 times the paper's size."""
+    rng = np.random.default_rng(66)
+    around = np.deg2rad([25.0, 95.0, 145.0, 215.0, 265.0, 335.0])
+    ring = np.stack([np.cos(around), np.sin(around), np.zeros(6)], axis=1)
+    above = np.deg2rad([45.0, 75.0, 165.0, 195.0, 285.0, 315.0])
+    inner = np.stack([np.cos(above), np.sin(above), np.zeros(6)], axis=1)
+    base = 1.1 * ring + rng.uniform(-0.06, 0.06, (6, 3))
+    platform = 0.5 * inner + rng.uniform(-0.05, 0.05, (6, 3))
+    home = Pose.from_angles([0.03, -0.05, 1.0], np.deg2rad([3.0, -4.0, 5.0]))
+    return HexapodGeometry("general", base, platform, home, wide_limits(20.0))
