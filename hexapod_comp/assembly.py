@@ -24,10 +24,10 @@ import math
 import numpy as np
 
 from . import kernels
+from .compiling import compiled
 from .errors import KinematicsError, OtherAssemblyModeError, SingularError, UnreachableError
 from .geometry import HexapodGeometry
-from .kernels import compiled
-from .kinematics import Structure, _six_lengths, condition_number, solve_pose
+from .kinematics import Structure, condition_number, six_lengths, solve_pose
 from .pose import Pose, rotation_angle
 
 CLOSURE = 1e-12
@@ -92,7 +92,7 @@ def assembly_modes(structure: Structure, lengths: np.ndarray) -> list[Pose]:
     pairs' midpoints are continued by Newton. With deviations of a few tenths of a per cent of the platform's
     size, modes within a hair of a singular pose (condition numbers above 100) can be missed there.
     """
-    lengths = _six_lengths(lengths)
+    lengths = six_lengths(lengths)
     _refuse_degenerate(structure)
     if platform_pair_gap(structure) <= EXACT_GAP * structure.characteristic_length:
         poses = _exact_poses(structure, lengths)

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from . import kernels
+from .compiling import compiled
 from .errors import HexapodError, NotConvergedError, NotFiniteError, OutsideFieldError
 from .geometry import HexapodGeometry
-from .kernels import compiled
 from .limits import CORRECTION, STEP, WITHIN, LimitTable, check_change, check_stage
 from .machine import MachineModel, RealMachine, Temperatures, command_one
 from .motion import MotionState
@@ -226,7 +226,7 @@ class Compensator:
             machine.axes[1],
             *machine.strut_arrays,
             *machine.field_arrays,
-            machine.model.reversal_threshold,
+            machine.thresholds,
             1.0 if self.enabled else 0.0,
             self._changed,
             max(ramp, 0.0) * self.ramp_rate,
@@ -376,7 +376,7 @@ def compensate_one(
     lx,
     ly,
     lz,
-    threshold,
+    thresholds,
     share,
     changed,
     ramp,
@@ -435,7 +435,7 @@ def compensate_one(
     solved, outside = command_one(
         platform_position,
         platform_rotation,
-        threshold,
+        thresholds,
         next_low,
         next_sense,
         base,

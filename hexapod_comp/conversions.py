@@ -9,9 +9,9 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
 
+from .compiling import compiled
 from .errors import CommandError
 from .geometry import STRUT_NAMES
-from .kernels import compiled
 from .pose import QUATERNION_NORM_TOLERANCE, Pose
 
 POSE_OK, POSE_NOT_FINITE, POSE_NOT_UNIT = range(3)

@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .compiling import compiled
 from .errors import ModelError
 from .geometry import STRUT_NAMES
-from .kernels import compiled
 from .machine import RealMachine, lever
 from .motion import MotionState, follow
 
@@ -52,8 +52,9 @@ class DriveParameters:
     lag : float
         Distance behind a steadily moving command, per speed, s. Holds up to a speed of
         max_acceleration·lag/2; faster, the drive keeps the distance in which it can stop. A command
-        that comes in steps of a period T lags T/2 more on average. 0 is a drive without dynamics, which
-        is on its command at once; speed and acceleration must then be ``inf``.
+        that comes in steps of a period T lags T/2 more on average. On a circle of radius r the tool runs
+        (lag·speed)²/4r inside it. 0 is a drive without dynamics, which is on its command at once; speed
+        and acceleration must then be ``inf``.
     stops : ndarray, shape (6, 2), or None
         Lengths at which the motors are stopped, m; None: the geometry's stroke.
     encoder_resolution : float
@@ -74,7 +75,7 @@ class DriveParameters:
     step: float = 0.1e-6
     max_speed: float | None = None
     max_acceleration: float = 10.0
-    lag: float = 0.01
+    lag: float = 0.005
     stops: np.ndarray | None = None
     encoder_resolution: float = 0.1e-6
     encoder_noise: float = 0.05e-6
@@ -200,20 +201,19 @@ def move_reference(target, tick, lag, max_speed, max_acceleration, position, spe
     if abs(distance) < SETTLED and abs(speed[i]) * lag < SETTLED:
         position[i], speed[i] = target, 0.0
         return
-    change = (wanted_speed(distance, lag, max_speed, max_acceleration) - speed[i]) * 4.0 * tick / lag
+    change = (wanted_speed(distance, lag, max_speed, max_acceleration) - speed[i]) * (4.0 * tick / lag)
     most = max_acceleration * tick
     speed[i] += min(most, max(-most, change))
     position[i] += tick * speed[i]
 
 
 @compiled
-def place_motor(step, low, high, half_play, position, motor, play, sense, i):
+def place_motor(step, low, high, half_play, position, motor, play, i):
     """Put motor `i` onto the step nearest to its reference, and let the nut follow with play."""
     before = motor[i]
     stepped = np.rint(position[i] / step) * step if step > 0.0 else position[i]
     motor[i] = min(high, max(low, stepped))
     play[i] = min(half_play[i], max(-half_play[i], play[i] + motor[i] - before))
-    sense[3 + i] = play[i] / half_play[i] if half_play[i] > 0.0 else 0.0
 
 
 @compiled
@@ -237,8 +237,8 @@ def run_struts(
 ):
     """Run the six drives for some ticks; position, speed, motor, play, stopped and sense are updated.
 
-    A drive brakes for its stops as for any command; what still runs into one (a jump, a command turned
-    round too late) is stopped there dead.
+    What `stopped` already says stays. A drive brakes for its stops as for any command; what still runs
+    into one (a jump, a command turned round too late) is stopped there dead.
     """
     for i in range(6):
         low, high = stops[i, 0], stops[i, 1]
@@ -247,24 +247,17 @@ def run_struts(
         for _ in range(ticks):
             if not stuck[i]:
                 move_reference(target, tick, lag, max_speed, max_acceleration, position, speed, i)
-            hit = position[i] < low or position[i] > high
-            if hit:
+            if position[i] < low or position[i] > high:
+                hit = True
                 position[i], speed[i] = min(high, max(low, position[i])), 0.0
-            place_motor(step, low, high, half_play, position, motor, play, sense, i)
-        stopped[i] = hit or (commands[i] != target and abs(motor[i] - target) <= CONTACT)
+            place_motor(step, low, high, half_play, position, motor, play, i)
+        sense[3 + i] = play[i] / half_play[i] if half_play[i] > 0.0 else 0.0
+        stopped[i] = stopped[i] or hit or (commands[i] != target and abs(motor[i] - target) <= CONTACT)
 
 
 @compiled
-def follow_point(position, rotation, probe, shift, threshold, low, sense, last):
-    """Follow the true measured point, kept in `last` (3,); return whether a direction has changed.
-
-    With `shift` 1.0 the point has not moved but was put elsewhere, and its windows go with it.
-    """
-    lever_arm = lever(rotation, probe)
-    changed = False
+def follow_point(position, rotation, probe, threshold, low, sense):
+    """Follow the measured point of a platform pose along the three axes, see :mod:`hexapod_comp.motion`."""
+    arm = lever(rotation, probe)
     for axis in range(3):
-        value, before = position[axis] + lever_arm[axis], sense[axis]
-        low[axis] += shift * (value - last[axis]) if shift != 0.0 else 0.0
-        changed = (follow(value, threshold, low, sense, axis) != before) or changed
-        last[axis] = value
-    return changed
+        follow(position[axis] + arm[axis], threshold, low, sense, axis)

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from .compiling import compiled
 from .errors import ModelError
-from .kernels import compiled
 
 COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")
 """Order of the six error components."""
@@ -41,6 +41,9 @@ class GridField:
         box along the line. Shape (2, n, m, 6, 0) when a family was not measured. m and rad.
     probe : ndarray, shape (3,)
         The measured point in ``platform``, m.
+    reversal_threshold : float
+        How far the measured point must come back along an axis before its direction counts as reversed, m:
+        above what the struts' backlash moves it along an axis that is told to stand still.
     outside : str
         ``hold`` keeps the value at the boundary of the box, ``refuse`` makes the compensator refuse.
 
@@ -54,6 +57,7 @@ class GridField:
     lines: tuple[np.ndarray, np.ndarray, np.ndarray]
     probe: np.ndarray = field(default_factory=lambda: np.zeros(3))
     outside: str = "hold"
+    reversal_threshold: float = 10e-6
 
     def __post_init__(self) -> None:
         grid = tuple(np.array(nodes, dtype=float) for nodes in self.grid)
@@ -72,6 +76,8 @@ class GridField:
             raise ModelError("field.probe", "must be three finite numbers, m", probe.tolist())
         if self.outside not in OUTSIDE_POLICIES:
             raise ModelError("field.outside", f"must be one of {', '.join(OUTSIDE_POLICIES)}", self.outside)
+        if not (math.isfinite(self.reversal_threshold) and self.reversal_threshold >= 0.0):
+            raise ModelError("field.reversal_threshold", "must be finite and not negative, m", self.reversal_threshold)
         object.__setattr__(self, "grid", grid)
         object.__setattr__(self, "lines", lines)
         object.__setattr__(self, "probe", probe)

@@ -7,10 +7,12 @@ remembers where it stood, so that every complaint names file, key and value.
 from __future__ import annotations
 
 import difflib
+import math
 import os
 import re
 import tempfile
 from collections.abc import Iterator
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -311,9 +313,16 @@ class Section:
 
 
 def in_si(values: Any, factor: float) -> Any:
-    """Return numbers times their unit's size in SI, rounded once: 350 mm is the 0.35 that source code means."""
-    parts = round(1.0 / factor)
-    return values / parts if parts > 1 and parts * factor == 1.0 else values * factor
+    """Return numbers in SI from their unit's size, moving the decimal point where that is all there is to do.
+
+    So 12.3 µm in a file is the very float that 12.3e-6 is in source code, not its neighbour.
+    """
+    digits = round(math.log10(factor))
+    if digits == 0 or 10.0**digits != factor:
+        return values * factor
+    array = np.asarray(values, dtype=float)
+    moved = [float(Decimal(repr(number)).scaleb(digits)) for number in array.ravel().tolist()]
+    return np.array(moved).reshape(array.shape)[()]
 
 
 def _refuse_non_numbers(section: Section, key: str, value: Any) -> None:

@@ -6,6 +6,7 @@ them. Struts are numbered 1..6 in the file's order and named ``strut_1`` … ``s
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -93,8 +94,8 @@ class HexapodGeometry:
         Neutral direction of each joint, from base to platform, in its body's frame; the default is the
         strut's direction at home.
     screw_lead : ndarray, shape (6,), optional
-        Advance of each screw per turn, m; positive as LinuxCNC's genhexkins counts it, zero for struts
-        that cannot turn.
+        Advance of each screw per turn, m; positive for a right-hand thread, zero for struts whose screw
+        cannot turn with the joints.
     tool : Pose, optional
         ``pose_tool_in_platform``.
     work : Pose, optional
@@ -141,7 +142,7 @@ class HexapodGeometry:
         self._fill_axes(put)
         self._check_home(put)
 
-    def _fill_axes(self, put) -> None:
+    def _fill_axes(self, put: Callable[[str, object], None]) -> None:
         """Normalise the joint axes and take the missing cone axes from the struts at home."""
         at_home = self.home.position + self.platform_joints @ self.home.rotation.T - self.base_joints
         cones = {"base_cone_axes": at_home, "platform_cone_axes": at_home @ self.home.rotation}
@@ -160,9 +161,10 @@ class HexapodGeometry:
     def kernel_axes(self) -> tuple[np.ndarray, np.ndarray]:
         """Writable copies of the cardan axes for compiled kernels, zeros where the machine gives none."""
         missing = np.zeros((6, 3))
-        return tuple(np.array(missing if a is None else a) for a in (self.base_axes, self.platform_axes))
+        base, platform = self.base_axes, self.platform_axes
+        return np.array(missing if base is None else base), np.array(missing if platform is None else platform)
 
-    def _check_home(self, put) -> None:
+    def _check_home(self, put: Callable[[str, object], None]) -> None:
         """Refuse a home pose that the machine could not stand in."""
         pose = (self.home.position, self.home.rotation)
         lengths = np.empty(6)
@@ -296,15 +298,15 @@ def _read_joints(top: Section) -> tuple[np.ndarray, np.ndarray, dict[str, np.nda
 
 def _read_limits(section: Section, path: str | Path) -> Limits:
     stroke = section.pairs_per_strut("stroke", "length")
-    values = dict(
-        stroke=stroke,
-        base_cone=section.per_strut("base_cone", "angle"),
-        platform_cone=section.per_strut("platform_cone", "angle"),
-        condition=float(section.array("condition_number")),
-        correction=float(section.quantity("correction", "length")),
-        step=float(section.quantity("step", "length")),
-        speed=float(section.quantity("speed", "speed")),
-    )
+    values = {
+        "stroke": stroke,
+        "base_cone": section.per_strut("base_cone", "angle"),
+        "platform_cone": section.per_strut("platform_cone", "angle"),
+        "condition": float(section.array("condition_number")),
+        "correction": float(section.quantity("correction", "length")),
+        "step": float(section.quantity("step", "length")),
+        "speed": float(section.quantity("speed", "speed")),
+    }
     section.finish()
     try:
         return Limits(**values)  # type: ignore[arg-type]

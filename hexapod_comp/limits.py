@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 
+from .compiling import compiled
 from .errors import KinematicsError, LimitError, NotFiniteError
 from .geometry import STRUT_NAMES, HexapodGeometry
-from .kernels import compiled, condition_one, strut_vector
+from .kernels import condition_one, strut_vector
 
 WITHIN, NOT_FINITE, STROKE, BASE_CONE, PLATFORM_CONE, CONDITION, ASSEMBLY, CORRECTION, STEP = range(9)
 """What a check found; the order is the order of the checks."""

@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from . import kernels
+from .compiling import compiled
 from .errors import ModelError, NotConvergedError, UnreachableError
 from .field import GridField, field_one, no_field
 from .geometry import STRUT_NAMES, HexapodGeometry
-from .kernels import compiled
 from .kinematics import Structure, forward_error
 from .motion import MotionState, follow
 from .pose import Pose
@@ -74,7 +74,8 @@ class MachineModel:
     base_expansion, platform_expansion : float
         Thermal expansion of the two bodies about their origins, 1/K.
     reversal_threshold : float
-        How far an axis or strut must come back before its direction counts as reversed, m.
+        How far a strut must come back before its direction counts as reversed, m: above the noise of the
+        commands, and as far below the backlash as that allows. The field has a threshold of its own.
     valid_box : ndarray, shape (2, 3) or None
         Lowest and highest platform position for which the model was measured, m in ``base``; None: anywhere.
     origin : ModelOrigin
@@ -94,7 +95,7 @@ class MachineModel:
     field: GridField = field(default_factory=no_field)
     base_expansion: float = 0.0
     platform_expansion: float = 0.0
-    reversal_threshold: float = 2e-6
+    reversal_threshold: float = 0.2e-6
     valid_box: np.ndarray | None = None
     origin: ModelOrigin = ModelOrigin()
 
@@ -201,6 +202,7 @@ class RealMachine:
             model.struts.map_knots.copy(),
             model.struts.spline_coefficients(),
         )
+        self.thresholds = np.array([model.field.reversal_threshold, model.reversal_threshold])
         self.field_arrays = (model.field.probe, *model.field.grid, *model.field.lines)
 
     def _displacement(
@@ -241,7 +243,7 @@ class RealMachine:
         solved, outside = command_one(
             target.position,
             target.rotation,
-            self.model.reversal_threshold,
+            self.thresholds,
             motion.low,
             motion.sense,
             self.structure.base_joints,
@@ -401,7 +403,7 @@ def lever(rotation, offset):
 def command_one(
     position,
     rotation,
-    threshold,
+    thresholds,
     low,
     sense,
     base,
@@ -424,18 +426,19 @@ def command_one(
 ):
     """Run the model backwards for one platform pose; return (solved, outside).
 
-    `low` and `sense` (9,) are the motion state, updated in place; q and `commands` are written.
+    `thresholds` are those of the axes and of the struts, m; `low` and `sense` (9,) are the motion state,
+    updated in place; q and `commands` are written.
     """
     point = lever(rotation, probe)
     for axis in range(3):
-        follow(position[axis] + point[axis], threshold, low, sense, axis)
+        follow(position[axis] + point[axis], thresholds[0], low, sense, axis)
     solved, outside = undo_field(
         position, rotation, sense, probe, gx, gy, gz, lx, ly, lz, q_position, q_rotation
     )
     for i in range(6):
         sx, sy, sz = kernels.strut_vector(base, platform, q_position, q_rotation, i)
         length = math.sqrt(sx * sx + sy * sy + sz * sz)
-        direction = follow(length, threshold, low, sense, 3 + i)
+        direction = follow(length, thresholds[1], low, sense, 3 + i)
         shift = screw_shift(base, platform, base_axes, platform_axes, q_position, q_rotation, table, i)
         commands[i] = command_for_length(length, direction, shift, table, knots, pieces, i)
     return solved, outside

@@ -15,7 +15,7 @@ all six or a list of six. Everything marked optional may be left out and is then
     valid_box_mm: [[-200, -200, 350], [200, 200, 550]]  # optional: lowest, highest platform position, base
     held_out_residual_um: 4.2         # optional: RMS tool error left on data not used for the fit
     note: one line for people         # optional
-    reversal_threshold_um: 2.0        # optional (2): way back until a direction counts as reversed
+    reversal_threshold_um: 0.2        # optional (0.2): way back until a strut's direction counts as reversed
 
     structure:                        # optional: real − nominal joint position
       base_deviation_um:              # optional, 6×3, in base
@@ -44,6 +44,7 @@ all six or a list of six. Everything marked optional may be left out and is then
       grid_y_mm: [-200, 0, 200]
       grid_z_mm: [350, 450, 550]
       probe_mm: [0, 0, 0]             # optional: the measured point in platform
+      reversal_threshold_um: 10.0     # optional (10): way back until an axis' direction counts as reversed
       outside: hold                   # optional: hold or refuse
       lines:                          # [] for none
       - axis: x                       # the line runs along this axis …
@@ -270,6 +271,7 @@ def _read_struts(section: Section) -> StrutErrors:
 def _read_field(section: Section) -> GridField:
     grid = tuple(section.quantity(f"grid_{axis}", "length", (None,)) for axis in "xyz")
     probe = section.quantity("probe", "length", (3,), np.zeros(3))
+    threshold = float(section.quantity("reversal_threshold", "length", (), no_field().reversal_threshold))
     outside = section.choice("outside", OUTSIDE_POLICIES, "hold")
     families: dict[str, dict[Line, np.ndarray]] = {axis: {} for axis in "xyz"}
     for entry in section.sections("lines"):
@@ -279,7 +281,8 @@ def _read_field(section: Section) -> GridField:
         for axis, (first, second) in zip("xyz", CROSS_AXES, strict=True)
     ]
     section.finish()
-    return GridField((grid[0], grid[1], grid[2]), (lines[0], lines[1], lines[2]), probe, outside)
+    families_in_order = (lines[0], lines[1], lines[2])
+    return GridField((grid[0], grid[1], grid[2]), families_in_order, probe, outside, threshold)
 
 
 def _read_line(
@@ -364,11 +367,20 @@ def _map_numbers(function: Callable[[float], float], values: Any) -> Any:
 
 
 def _in_unit(value: float, factor: float) -> float:
-    """Return the shortest number that reads back as `value`, or the nearest where none does."""
+    """Return the shortest number that reads back as `value`, or as its neighbour where no number does."""
+    exact = _exact_in_unit(value, factor)
+    if exact is None:
+        nearest = value / factor
+        exact = _exact_in_unit(float(in_si(nearest, factor)), factor)  # what will be read is written alike
+        return nearest if exact is None else exact
+    return exact
+
+
+def _exact_in_unit(value: float, factor: float) -> float | None:
     quotient = value / factor
     candidates = [float(f"{quotient:.{digits}g}") for digits in (15, 16, 17)]
     candidates += [math.nextafter(quotient, math.inf), math.nextafter(quotient, -math.inf)]
-    return next((number + 0.0 for number in candidates if in_si(number, factor) == value), quotient)
+    return next((number + 0.0 for number in candidates if in_si(number, factor) == value), None)
 
 
 def _per_strut(values: np.ndarray, kind: str, unit: str) -> Any:
@@ -410,6 +422,7 @@ def _field_block(field: GridField) -> dict[str, Any]:
     for axis, nodes in zip("xyz", field.grid, strict=True):
         block[f"grid_{axis}_mm"] = _written(nodes, "length", "mm")
     block["probe_mm"] = _written(field.probe, "length", "mm")
+    block["reversal_threshold_um"] = _written(field.reversal_threshold, "length", "um")
     block["outside"] = field.outside
     block["lines"] = [
         line for axis, family in zip("xyz", field.lines, strict=True) for line in _family_lines(axis, family)
@@ -425,6 +438,7 @@ def _is_no_field(field: GridField) -> bool:
         and all(np.array_equal(mine, its) for mine, its in zip(field.grid, nothing.grid, strict=True))
         and not field.probe.any()
         and field.outside == nothing.outside
+        and field.reversal_threshold == nothing.reversal_threshold
     )
 
 

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from .kernels import compiled
+from .compiling import compiled
 
 FOLLOWED = 9
 """Three axes of the measured point, then six struts."""

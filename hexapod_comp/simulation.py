@@ -26,8 +26,8 @@ __all__ = ["DriveParameters", "Faults", "StrutDrive"]
 LONGEST_ADVANCE = 60.0
 """Longest time advanced in one call, s; more is a unit error."""
 
-PATH_STEP = 4e-3
-"""The true pose is followed at least this often, s, so that no reversal between two calls is missed."""
+LONGEST_TICK = 0.25e-3
+"""Integration step of the drives, s; shorter for a shorter lag."""
 
 
 class StrutDrive:
@@ -56,8 +56,7 @@ class StrutDrive:
         self.machine = machine
         self.parameters = (parameters or DriveParameters()).completed(machine)
         self._rng = np.random.default_rng(seed)
-        self._tick = min(PATH_STEP / 16.0, self.parameters.lag / 40.0) or PATH_STEP
-        self._ticks_per_path_step = round(PATH_STEP / self._tick)
+        self._tick = min(LONGEST_TICK, self.parameters.lag / 40.0) or LONGEST_TICK
         self._left_over, self._time = 0.0, 0.0
         self._set_up_struts()
         self._set_up_pose(machine.geometry)
@@ -65,6 +64,7 @@ class StrutDrive:
         self._last_reading = np.full(6, np.nan)
         self.feedback_arrived = True
         self.faults = Faults()
+        self._follow_commanded_point()
         self._run(0)
         self._read_encoders(0.0)
 
@@ -83,7 +83,7 @@ class StrutDrive:
         self._motion = MotionState()
         self._model_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
         self._true_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
-        self._point = np.zeros(3)
+        self._commanded_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
         self._outcome, self._condition = kernels.OK, math.nan
         work = geometry.work.inverse()
         self._work = work.position, work.rotation
@@ -117,7 +117,7 @@ class StrutDrive:
 
     @property
     def stopped(self) -> np.ndarray:
-        """Which motors stand at their travel stops although asked to go further, bool, shape (6,)."""
+        """Which motors the last advance found at a stop, asked or knocked to go on; bool, shape (6,)."""
         return self._stopped.copy()
 
     def set_command(self, lengths: np.ndarray) -> None:
@@ -141,6 +141,7 @@ class StrutDrive:
             problem = f"{STRUT_NAMES[index]}: length must be finite, not {lengths[index]} m"
             raise CommandError("not_finite", problem)
         self._commands[:] = lengths
+        self._follow_commanded_point()
 
     def advance(self, dt: float) -> None:
         """Let time pass and read the encoders once at its end.
@@ -163,10 +164,9 @@ class StrutDrive:
         self._left_over -= ticks * self._tick
         if self.parameters.lag == 0.0:
             ticks = 1
-        while ticks > 0:
-            now = min(ticks, self._ticks_per_path_step)
-            self._run(now)
-            ticks -= now
+        if ticks > 0:
+            self._stopped[:] = False
+            self._run(ticks)
         self._time += dt
         self._read_encoders(dt)
 
@@ -191,23 +191,26 @@ class StrutDrive:
             self._stopped,
             self._motion.sense,
         )
-        if self._locate() and self._follow_true_point(0.0):
-            # The field has another value in the new direction. That step is the field's, not a motion:
-            # the windows move along, or the direction could flip to and fro for ever.
-            self._locate()
-            self._follow_true_point(1.0)
+        self._locate(self._motor, self._model_pose)
 
-    def _locate(self) -> bool:
-        """Find the true pose from the motors and senses; return whether there is one."""
+    def _locate(self, lengths: np.ndarray, model_pose: tuple[np.ndarray, np.ndarray]) -> None:
+        """Find the true pose for motor positions, starting from, and updating, a model pose."""
         self._outcome, _, self._condition, _ = self.machine.forward(
-            self._motor, self._motion.sense, *self._model_pose, *self._true_pose
+            lengths, self._motion.sense, *model_pose, *self._true_pose
         )
-        return self._outcome == kernels.OK
 
-    def _follow_true_point(self, shift: float) -> bool:
-        model, motion = self.machine.model, self._motion
-        threshold, probe = model.reversal_threshold, model.field.probe
-        return follow_point(*self._true_pose, probe, shift, threshold, motion.low, motion.sense, self._point)
+    def _follow_commanded_point(self) -> None:
+        """Take the field's directions from where the commands lead.
+
+        A reversal value belongs to the side from which a target is approached. Following errors and
+        backlash being taken up also move the tool along axes that are told to stand still; they have no
+        direction.
+        """
+        self._locate(self._commands, self._commanded_pose)
+        if self._outcome == kernels.OK:
+            model, motion = self.machine.model, self._motion
+            threshold, probe = model.field.reversal_threshold, model.field.probe
+            follow_point(*self._commanded_pose, probe, threshold, motion.low, motion.sense)
 
     def _read_encoders(self, dt: float) -> None:
         """Take a reading and deliver what has arrived by now."""

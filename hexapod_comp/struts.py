@@ -2,7 +2,7 @@
 
 One strut, command c (what its encoder counts, m) to actual length L (m):
 
-    L = (1 + g) · (c + o + p·(c − c₀) + A·cos(kc) + B·sin(kc) + map(c) − s·b/2 − l·θ/2π)
+    L = (1 + g) · (c + o + p·(c − c₀) + A·cos(kc) + B·sin(kc) + map(c) − s·b/2 + l·θ/2π)
 
 with offset o, pitch error p about the length c₀, screw waves A, B of period 2π/k, length map, backlash b by
 the sense of motion s, screw lead l times the rotation θ that the cardan joints force on the screw since
@@ -17,9 +17,10 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from .compiling import compiled
 from .errors import ModelError
 from .geometry import HexapodGeometry
-from .kernels import compiled, strut_vector
+from .kernels import strut_vector
 
 OFFSET, PITCH, REFERENCE, COSINE, SINE, WAVENUMBER, BACKLASH, LEAD, TWIST_HOME, GROWTH = range(10)
 """Columns of the table of strut parameters that the kernels read."""
@@ -141,7 +142,7 @@ def home_twists(geometry: HexapodGeometry) -> np.ndarray:
 
 @compiled
 def screw_twist(base, platform, base_axes, platform_axes, position, rotation, i):
-    """Return the angle about strut `i` from the platform's cardan axis to the base's, rad.
+    """Return the angle about strut `i` from the base's cardan axis to the platform's, rad.
 
     Both axes are seen along the strut, i.e. projected perpendicular to it. Where the angle stays within
     ±90°, its sine is the one in LinuxCNC's genhexkins.
@@ -161,13 +162,17 @@ def screw_twist(base, platform, base_axes, platform_axes, position, rotation, i)
 
 @compiled
 def screw_shift(base, platform, base_axes, platform_axes, position, rotation, table, i):
-    """Return l·θ/2π: how much longer the command of strut `i` must be for its screw's rotation, m."""
+    """Return −l·θ/2π: how much longer the command of strut `i` must be for its screw's rotation, m.
+
+    A platform that turns by θ about the strut turns the screw in its nut. A right-hand screw then advances
+    by l·θ/2π by itself, wherever its nut sits, and the command must be shorter by as much.
+    """
     lead = table[i, LEAD]
     if lead == 0.0:
         return 0.0
     twist = screw_twist(base, platform, base_axes, platform_axes, position, rotation, i)
-    twist -= table[i, TWIST_HOME]
-    return lead * (twist / (2.0 * math.pi) - math.floor(twist / (2.0 * math.pi) + 0.5))
+    turns = (twist - table[i, TWIST_HOME]) / (2.0 * math.pi)
+    return -lead * (turns - math.floor(turns + 0.5))
 
 
 @compiled

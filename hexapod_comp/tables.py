@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from .errors import InputFileError, PoseError
-from .files import UNITS, read_text
-from .pose import Pose, angles_from_rotation
+from .files import UNITS
+from .pose import QUATERNION_NORM_TOLERANCE, Pose, angles_from_rotation, rotation_from_angles
 
 LABEL_COLUMNS = ("sequence", "name")
 POSITION_COLUMNS = ("x", "y", "z")
 ANGLE_COLUMNS = ("alpha", "beta", "gamma")
 QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
 LENGTH_COLUMNS = tuple(f"L{i}" for i in range(1, 7))
+NOMINAL_COLUMNS = tuple(f"nominal_L{i}" for i in range(1, 7))
+CORRECTION_COLUMNS = tuple(f"correction_L{i}" for i in range(1, 7))
+
+MAX_ROWS = 2_000_000
+"""Longer files are refused: an hour's path at 500 Hz fits, a device that never ends does not."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +47,7 @@ class _Table:
 
     def __init__(self, path: str | Path) -> None:
         self.path = path
-        lines = csv.reader(io.StringIO(read_text(path)), skipinitialspace=True)
-        try:
-            numbered = [(lines.line_num, row) for row in lines if row and not row[0].startswith("#")]
-        except csv.Error as error:
-            raise InputFileError(path, f"line {lines.line_num}", f"is not CSV: {error}") from error
+        numbered = _read_rows(path)
         self.header = [name.strip() for name in numbered[0][1]] if numbered else []
         twice = [name for name in self.header if self.header.count(name) > 1]
         if twice:
@@ -74,14 +75,18 @@ class _Table:
             return None
         for name, entry in zip(names, found, strict=True):
             if entry is None:
-                raise InputFileError(self.path, "header", f"column {_column_names(name, dimension)} is missing")
+                raise InputFileError(
+                    self.path, "header", f"column {_column_names(name, dimension)} is missing"
+                )
         return [entry for entry in found if entry is not None]
 
     def required(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]]:
         """Return all columns of a group that must be there."""
         found = self.columns(names, dimension)
         if found is None:
-            raise InputFileError(self.path, "header", f"column {_column_names(names[0], dimension)} is missing")
+            raise InputFileError(
+                self.path, "header", f"column {_column_names(names[0], dimension)} is missing"
+            )
         return found
 
     def refuse_unknown(self) -> None:
@@ -106,7 +111,7 @@ class _Table:
             value = float(text)
         except ValueError:
             value = math.nan
-        if not math.isfinite(value):
+        if not math.isfinite(value) or "_" in text:  # Python reads 1_0 as ten, nobody else does
             where = f"line {line}, column {self.header[index]}"
             raise InputFileError(self.path, where, "must be a finite number", text)
         return value
@@ -118,6 +123,26 @@ class _Table:
             Row(line, row[columns[0]].strip() if columns else str(n + 1))
             for n, (line, row) in enumerate(self.rows)
         ]
+
+
+def _read_rows(path: str | Path) -> list[tuple[int, list[str]]]:
+    """Return the rows of a CSV file that are neither empty nor comments, with their lines."""
+    numbered: list[tuple[int, list[str]]] = []
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as stream:
+            lines = csv.reader(stream, skipinitialspace=True)
+            for row in lines:
+                if row and not row[0].startswith("#"):
+                    numbered.append((lines.line_num, row))
+                if len(numbered) > MAX_ROWS:
+                    raise InputFileError(path, "", f"has more than the allowed {MAX_ROWS} rows")
+    except csv.Error as error:
+        raise InputFileError(path, f"line {lines.line_num}", f"is not CSV: {error}") from error
+    except OSError as error:
+        raise InputFileError(path, "", f"cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InputFileError(path, f"line {len(numbered) + 1} or later", "is not UTF-8 text") from error
+    return numbered
 
 
 def _column_names(name: str, dimension: str | None) -> str:
@@ -145,6 +170,25 @@ def read_poses(path: str | Path) -> tuple[list[Row], list[Pose]]:
     InputFileError
         Naming file, line and column.
     """
+    rows, positions, rotations = read_pose_arrays(path)
+    return rows, [Pose(p, r) for p, r in zip(positions, rotations, strict=True)]
+
+
+def read_pose_arrays(path: str | Path) -> tuple[list[Row], np.ndarray, np.ndarray]:
+    """Read poses as :func:`read_poses` does, for files of many thousand rows.
+
+    Returns
+    -------
+    rows : list of Row
+        Where each pose stands.
+    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
+        m and rotation matrices.
+
+    Raises
+    ------
+    InputFileError
+        Naming file, line and column.
+    """
     table = _Table(path)
     positions = table.numbers(table.required(POSITION_COLUMNS, "length"))
     angle_columns = table.columns(ANGLE_COLUMNS, "angle")
@@ -154,24 +198,27 @@ def read_poses(path: str | Path) -> tuple[list[Row], list[Pose]]:
         raise InputFileError(path, "header", "give either angles or a quaternion, not both")
     rows = table.labels()
     if quaternion_columns:
-        quaternions = table.numbers(quaternion_columns)
-        return rows, [
-            _pose_from_quaternion(path, row, p, q)
-            for row, p, q in zip(rows, positions, quaternions, strict=True)
-        ]
+        return rows, positions, _rotations_from_quaternions(path, rows, table.numbers(quaternion_columns))
     angles = table.numbers(angle_columns) if angle_columns else np.zeros((len(rows), 3))
-    return rows, [Pose.from_angles(p, a) for p, a in zip(positions, angles, strict=True)]
+    return rows, positions, rotation_from_angles(angles)
 
 
-def _pose_from_quaternion(path: str | Path, row: Row, position: np.ndarray, quaternion: np.ndarray) -> Pose:
-    try:
-        return Pose.from_quaternion(position, quaternion)
-    except PoseError as error:
-        raise InputFileError(path, f"line {row.line}, columns qx…qw", str(error)) from error
+def _rotations_from_quaternions(path: str | Path, rows: list[Row], quaternions: np.ndarray) -> np.ndarray:
+    """Return rotation matrices, (N, 3, 3); refuse the first row that is no unit quaternion."""
+    wrong = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > QUATERNION_NORM_TOLERANCE
+    if wrong.any():
+        row = int(wrong.argmax())
+        try:
+            Pose.from_quaternion(np.zeros(3), quaternions[row])
+        except PoseError as error:
+            raise InputFileError(path, f"line {rows[row].line}, columns qx…qw", str(error)) from error
+    return Rotation.from_quat(quaternions).as_matrix()
 
 
 def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
     """Read strut lengths from a CSV file with the columns ``L1_mm`` … ``L6_mm`` (or ``_m``, ``_um``, ``_in``).
+
+    The columns ``nominal_L…`` and ``correction_L…`` that ``ik --model`` adds are known and passed over.
 
     Returns
     -------
@@ -187,6 +234,8 @@ def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
     """
     table = _Table(path)
     lengths = table.numbers(table.required(LENGTH_COLUMNS, "length"))
+    for group in (NOMINAL_COLUMNS, CORRECTION_COLUMNS):
+        table.columns(group, "length")
     table.refuse_unknown()
     return table.labels(), lengths
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from .geometry import HexapodGeometry
 from .kinematics import Structure, strut_lengths_batch
@@ -16,6 +17,9 @@ SHARE_OF_LIMIT = 0.8
 
 PEAK_OF_QUINTIC = 1.875
 """Largest slope of the quintic 10t³ − 15t⁴ + 6t⁵."""
+
+COARSE = 20
+"""Sections of a move over which the struts' slopes are taken."""
 
 
 @dataclass(frozen=True)
@@ -61,20 +65,56 @@ def move(geometry: HexapodGeometry, start: Pose, end: Pose, rate: float, feed: f
     feed : float, optional
         Largest tool speed, m/s.
     """
-    coarse = _interpolate(start, end, np.linspace(0.0, 1.0, 21))
-    lengths = _strut_lengths(geometry, *coarse)
-    steepest = float(np.abs(np.diff(lengths, axis=0)).max() * 20)
+    positions = np.array([start.position, end.position])
+    return moves(geometry, positions, np.array([start.rotation, end.rotation]), rate, feed)[0]
+
+
+def moves(
+    geometry: HexapodGeometry,
+    positions: np.ndarray,
+    rotations: np.ndarray,
+    rate: float,
+    feed: float | None = None,
+) -> tuple[Path, np.ndarray]:
+    """Return the moves (see :func:`move`) that join N tool poses, with a rest at each.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        Its limits of step and speed set each move's duration.
+    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
+        Tool poses in the work frame, m; the first is not part of the path.
+    rate : float
+        Poses per second, Hz.
+    feed : float, optional
+        Largest tool speed, m/s.
+
+    Returns
+    -------
+    path : Path
+        All moves, one after the other.
+    counts : ndarray of int, shape (N − 1,)
+        Poses of each move.
+    """
+    legs = np.arange(len(positions) - 1)
+    share = np.tile(np.linspace(0.0, 1.0, COARSE + 1), len(legs))
+    coarse = _interpolate(positions, rotations, np.repeat(legs, COARSE + 1), share)
+    lengths = strut_lengths_batch(Structure.of(geometry), *platform_poses(geometry, *coarse), threads=1)
+    changes = np.abs(np.diff(lengths.reshape(len(legs), COARSE + 1, 6), axis=1))
     allowed = SHARE_OF_LIMIT * min(geometry.limits.speed, geometry.limits.step * rate)
-    duration = PEAK_OF_QUINTIC * steepest / allowed
+    duration = PEAK_OF_QUINTIC * COARSE * changes.max(axis=(1, 2)) / allowed
     if feed is not None:
-        duration = max(duration, PEAK_OF_QUINTIC * float(np.linalg.norm(end.position - start.position)) / feed)
-    count = max(1, int(np.ceil(duration * rate)))
-    t = np.arange(1, count + 1) / count
-    return Path(*_interpolate(start, end, t**3 * (10.0 - 15.0 * t + 6.0 * t * t)), rate)
+        travel = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        duration = np.maximum(duration, PEAK_OF_QUINTIC * travel / feed)
+    counts = np.maximum(1, np.ceil(duration * rate).astype(int))
+    leg = np.repeat(legs, counts)
+    t = (np.arange(len(leg)) - (np.cumsum(counts) - counts)[leg] + 1) / counts[leg]
+    share = t**3 * (10.0 - 15.0 * t + 6.0 * t * t)
+    return Path(*_interpolate(positions, rotations, leg, share), rate), counts
 
 
 def circle(centre: Pose, radius: float, feed: float, rate: float) -> Path:
-    """Return one full circle in the centre pose's xy plane, starting at its +x side, at constant feed.
+    """Return one full circle in the centre pose's xy plane, from rest to rest at its +x side.
 
     Parameters
     ----------
@@ -83,15 +123,20 @@ def circle(centre: Pose, radius: float, feed: float, rate: float) -> Path:
     radius : float
         m.
     feed : float
-        Tool speed, m/s.
+        Largest tool speed, m/s.
     rate : float
         Poses per second, Hz.
     """
-    count = max(8, int(np.ceil(2.0 * np.pi * radius / feed * rate)))
-    angle = 2.0 * np.pi * np.arange(count + 1) / count
+    count = max(8, int(np.ceil(PEAK_OF_QUINTIC * 2.0 * np.pi * radius / feed * rate)))
+    angle = 2.0 * np.pi * quintic(np.arange(count + 1) / count)
     offsets = radius * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
     positions = centre.position + offsets @ centre.rotation.T
     return Path(positions, np.tile(centre.rotation, (count + 1, 1, 1)), rate)
+
+
+def quintic(t: np.ndarray) -> np.ndarray:
+    """Return 10t³ − 15t⁴ + 6t⁵: from 0 to 1 with speed and acceleration zero at both ends."""
+    return t**3 * (10.0 - 15.0 * t + 6.0 * t * t)
 
 
 def pocket(
@@ -114,12 +159,12 @@ def pocket(
     rate : float
         Poses per second, Hz.
     """
-    rows = int(round(size[1] / pitch)) + 1
+    rows = round(size[1] / pitch) + 1
     corners = []
     for row in range(rows):
         ends = (0.0, size[0]) if row % 2 == 0 else (size[0], 0.0)
         corners += [corner @ Pose(np.array([x, row * pitch, 0.0]), np.eye(3)) for x in ends]
-    return join([move(geometry, a, b, rate, feed) for a, b in zip(corners, corners[1:], strict=False)])
+    return join([move(geometry, a, b, rate, feed) for a, b in pairwise(corners)])
 
 
 def join(paths: list[Path]) -> Path:
@@ -131,14 +176,29 @@ def join(paths: list[Path]) -> Path:
     )
 
 
-def _interpolate(start: Pose, end: Pose, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    positions = start.position + share[:, None] * (end.position - start.position)
-    arc = Slerp([0.0, 1.0], Rotation.from_matrix(np.array([start.rotation, end.rotation])))
-    return positions, arc(np.clip(share, 0.0, 1.0)).as_matrix()
+def platform_poses(
+    geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the platform poses in ``base`` that belong to N tool poses in the work frame.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        Its tool and work frame.
+    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
+        ``pose_tool_in_work``, m.
+    """
+    work, tool_inverse = geometry.work, geometry.tool.inverse()
+    turned = work.rotation @ rotations
+    in_base = work.position + positions @ work.rotation.T
+    return in_base + turned @ tool_inverse.position, turned @ tool_inverse.rotation
 
 
-def _strut_lengths(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Return nominal strut lengths of tool poses in the work frame, shape (N, 6), m."""
-    poses = [geometry.work @ Pose(p, r) @ geometry.tool.inverse() for p, r in zip(positions, rotations, strict=True)]
-    stacked = np.array([pose.position for pose in poses]), np.array([pose.rotation for pose in poses])
-    return strut_lengths_batch(Structure.of(geometry), *stacked, threads=1)
+def _interpolate(
+    positions: np.ndarray, rotations: np.ndarray, leg: np.ndarray, share: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the poses at the given shares, (K,), of the given legs, (K,): straight, along the shortest arc."""
+    travel = np.diff(positions, axis=0)
+    turn = Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1)).as_rotvec()
+    turned = Rotation.from_rotvec(share[:, None] * turn[leg]).as_matrix() @ rotations[leg]
+    return positions[leg] + share[:, None] * travel[leg], turned

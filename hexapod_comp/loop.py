@@ -1,0 +1,154 @@
+"""What ``run`` and ``demo`` do with the loop: start it, send poses, judge the result."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, contextmanager
+
+import numpy as np
+from tqdm import tqdm
+
+from .errors import GeometryError, HexapodError
+from .geometry import HexapodGeometry
+from .pose import Pose
+from .session_records import PoseRecord, SessionResult
+from .tables import Row, length_values, pose_values
+from .trajectory import Path, circle, join, move, pocket
+
+RATES = (1.0, 1000.0)
+"""Commands per second that make sense over DDS from Python, Hz."""
+
+
+def checked_rate(rate: float) -> float:
+    """Return a command rate, Hz, or refuse it."""
+    if not RATES[0] <= rate <= RATES[1]:
+        raise GeometryError("--rate-hz", f"must lie in {RATES[0]:g}…{RATES[1]:g} Hz", rate)
+    return rate
+
+
+def demo_path(geometry: HexapodGeometry, rate: float) -> Path:
+    """Return the demo's milling path about home: a circle of 40 mm, then a zigzag pocket of 40 × 12 mm."""
+    home = geometry.work.inverse() @ geometry.home @ geometry.tool
+    ring = circle(home, radius=0.02, feed=0.03, rate=rate)
+    corner = home @ Pose(np.array([-0.02, -0.006, 0.0]), np.eye(3))
+    rows = pocket(geometry, corner, (0.04, 0.012), pitch=0.004, feed=0.03, rate=rate)
+    return join([ring, move(geometry, ring.pose(len(ring) - 1), corner, rate, feed=0.03), rows])
+
+
+def simulated(
+    geometry: HexapodGeometry, machine: str, model: str, truth: str
+) -> AbstractContextManager[Sequence[object]]:
+    """Start compensator and strut drive as two processes in a ROS domain of their own."""
+    session = _session_module()
+    from .paths import config_file
+
+    def found(name: str) -> str:
+        return name if name in ("ideal", "random") else str(config_file(name).resolve())
+
+    geometry_file = found(machine)
+    model_file, truth_file = found(model), found(truth)
+    print("preparing; the first run on a machine compiles its kernels, which takes up to a minute", file=sys.stderr)
+    session.prepare(geometry)
+    return session.simulated_machine(
+        {"geometry_file": geometry_file, "model_file": model_file},
+        {"geometry_file": geometry_file, "truth_file": truth_file},
+    )
+
+
+def witnessed(
+    geometry: HexapodGeometry,
+    nodes: Sequence[object],
+    poses: list[Pose],
+    path: Path | None,
+    rate: float,
+    compare: bool,
+) -> SessionResult:
+    """Run poses and path through the loop with a progress bar; see :func:`nodes.session.run_session`."""
+    session = _session_module()
+    client = session.LoopClient()
+    try:
+        session.connect(client, nodes)
+        with _progress() as bar:
+            return session.run_session(client, geometry, poses, path, rate, compare, bar.update)
+    finally:
+        client.close()
+
+
+@contextmanager
+def _progress():
+    """A bar on a terminal, nothing elsewhere."""
+    with tqdm(unit=" commands", disable=None, leave=False, mininterval=0.5) as bar:
+        yield bar
+
+
+def _session_module():
+    """Import the part that needs ROS, with a clear word where there is none."""
+    try:
+        from .nodes import session
+    except ImportError as error:
+        raise HexapodError(
+            f"ROS 2 is needed for this ({error}); install hexapod_comp[ros], or source a ROS 2 installation"
+        ) from error
+    return session
+
+
+def complaints(result: SessionResult, bar: float | None) -> list[str]:
+    """Return what was not as it should be, empty when all was well.
+
+    Parameters
+    ----------
+    result : SessionResult
+        A compared run.
+    bar : float or None
+        Largest error allowed, m; None asks only that compensation reduces the RMS error.
+    """
+    found = []
+    if result.lost:
+        found.append(f"{result.lost} commands were lost")
+    if result.refused:
+        found.append(f"{result.refused} commands were refused: {result.refusals}")
+    pairs = [record.errors() for record in result.poses]
+    errors = {"poses": ([p[0][0] for p in pairs if p[0]], [p[1][0] for p in pairs if p[1]])}
+    if result.path is not None:
+        errors["path"] = (list(result.path.deviation_without), list(result.path.deviation_with))
+    for name, (before, after) in errors.items():
+        if not before or not after:
+            found.append(f"{name}: the true tool pose was not seen")
+        elif bar is not None and max(after) > bar:
+            found.append(f"{name}: the largest error is {max(after) * 1e6:.3f} µm, allowed {bar * 1e6:g} µm")
+        elif np.mean(np.square(after)) >= np.mean(np.square(before)):
+            found.append(f"{name}: compensation does not reduce the error")
+    return found
+
+
+def as_json(rows: list[Row], result: SessionResult) -> dict[str, object]:
+    """Return a session as plain data: mm, degrees; errors in µm and µrad."""
+    return {
+        "model": result.model,
+        "sent": result.sent,
+        "lost": result.lost,
+        "refused": result.refused,
+        "latency_median_ms": float(np.median(result.latencies) * 1e3) if len(result.latencies) else None,
+        "poses": [_pose_json(row, record) for row, record in zip(rows, result.poses, strict=True)],
+    }
+
+
+def _pose_json(row: Row, record: PoseRecord) -> dict[str, object]:
+    def shown(pose: Pose | None) -> dict[str, float] | None:
+        return None if pose is None else pose_values(pose)
+
+    def error(pair: tuple[float, float] | None) -> dict[str, float] | None:
+        return None if pair is None else {"position_um": pair[0] * 1e6, "rotation_urad": pair[1] * 1e6}
+
+    without, compensated = record.errors()
+    return {
+        "pose": row.label,
+        "commanded": shown(record.target),
+        "struts": length_values(record.command),
+        "correction_um": [float(value) * 1e6 for value in record.correction],
+        "estimated": shown(record.estimate),
+        "true": shown(record.true_with),
+        "error_without": error(without),
+        "error_with": error(compensated),
+    }

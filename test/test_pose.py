@@ -1,0 +1,180 @@
+"""Poses: the paper's angles, quaternions, composition, and what is no pose."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from strategies import fixed
+
+from hexapod_comp.errors import PoseError
+from hexapod_comp.pose import Pose, angles_from_rotation, rotation_angle, rotation_from_angles
+
+turns = st.floats(-np.pi, np.pi)
+tilts = st.floats(-1.5, 1.5)
+metres = st.floats(-10.0, 10.0)
+EXACT = 4e-16
+"""A rotation matrix's elements are sums of two products of numbers up to 1."""
+
+
+def printed_matrix(alpha, beta, gamma):
+    """Return the rotation part of T_BASE^TOP as 000 prints it."""
+    ca, sa = np.cos(alpha), np.sin(alpha)
+    cb, sb = np.cos(beta), np.sin(beta)
+    cg, sg = np.cos(gamma), np.sin(gamma)
+    return np.array(
+        [
+            [cb * cg + sa * sb * sg, -cb * sg + sa * sb * cg, ca * sb],
+            [ca * sg, ca * cg, -sa],
+            [-sb * cg + sa * cb * sg, sb * sg + sa * cb * cg, ca * cb],
+        ]
+    )
+
+
+def as_matrix(pose):
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = pose.rotation, pose.position
+    return matrix
+
+
+@fixed
+@given(turns, turns, turns)
+def test_angles_give_the_papers_matrix(alpha, beta, gamma):
+    """Truth: T_BASE^TOP as printed in 000."""
+    rotation = rotation_from_angles(np.array([alpha, beta, gamma]))
+    np.testing.assert_allclose(rotation, printed_matrix(alpha, beta, gamma), atol=2 * EXACT)
+
+
+@fixed
+@given(turns, turns, turns)
+def test_angles_are_three_turns_in_order(alpha, beta, gamma):
+    """Truth: the product of SciPy's elementary rotations, Ry(β)·Rx(α)·Rz(γ)."""
+    about_x, about_y, about_z = (Rotation.from_rotvec(v) for v in np.diag([alpha, beta, gamma]))
+    product = about_y * about_x * about_z
+    pose = Pose.from_angles(np.zeros(3), np.array([alpha, beta, gamma]))
+    np.testing.assert_allclose(pose.rotation, product.as_matrix(), atol=2 * EXACT)
+
+
+@fixed
+@given(tilts, turns, turns)
+def test_angles_come_back(alpha, beta, gamma):
+    """Truth: the inverse, unique for |α| < 90°. Near ±86° a rounding of 1e-16 weighs 1/cos α = 14 times."""
+    found = Pose.from_angles(np.zeros(3), np.array([alpha, beta, gamma])).angles()
+    difference = np.angle(np.exp(1j * (found - [alpha, beta, gamma])))  # −π and π are one angle
+    np.testing.assert_allclose(difference, 0.0, atol=2e-14)
+
+
+@pytest.mark.parametrize("short_of", [0.0, 1e-15, 1e-12, 1e-9, 1e-6])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_angles_at_gimbal_lock_give_the_same_rotation(sign, short_of):
+    """Truth: the matrix. At α = ±90° only β ∓ γ is determined, but what is returned must mean the same.
+
+    (γ from the second row alone, whose elements vanish there, gave rotations that were out by 0.1.)
+    """
+    alpha = sign * (np.pi / 2 - short_of)
+    pose = Pose.from_angles(np.zeros(3), np.array([alpha, 0.3, 0.2]))
+    np.testing.assert_allclose(rotation_from_angles(pose.angles()), pose.rotation, atol=1e-15)
+
+
+def test_batches_of_angles():
+    angles = np.random.default_rng(2).uniform(-1.0, 1.0, (4, 5, 3))
+    rotations = rotation_from_angles(angles)
+    assert rotations.shape == (4, 5, 3, 3)
+    np.testing.assert_allclose(rotations[2, 3], printed_matrix(*angles[2, 3]), atol=2 * EXACT)
+    np.testing.assert_allclose(angles_from_rotation(rotations), angles, atol=2e-15)
+
+
+@pytest.mark.parametrize(
+    ("quaternion", "image_of_x"),
+    [
+        ([0, 0, np.sqrt(0.5), np.sqrt(0.5)], [0, 1, 0]),  # 90° about z, counter-clockwise from above
+        ([0, np.sqrt(0.5), 0, np.sqrt(0.5)], [0, 0, -1]),  # 90° about y
+        ([1, 0, 0, 0], [1, 0, 0]),  # 180° about x
+        ([0.5, 0.5, 0.5, 0.5], [0, 1, 0]),  # 120° about (1, 1, 1): x → y → z → x
+        ([0, 0, 0, -1], [1, 0, 0]),  # nothing, with the other sign
+    ],
+)
+def test_quaternions_by_hand(quaternion, image_of_x):
+    """Truth: well-known rotations; scalar last, as in ROS."""
+    pose = Pose.from_quaternion(np.zeros(3), quaternion)
+    np.testing.assert_allclose(pose.rotation @ [1, 0, 0], image_of_x, atol=EXACT)
+
+
+@fixed
+@given(st.integers(0, 2**32 - 1))
+def test_quaternion_is_half_the_angle_about_the_axis(seed):
+    """Truth: (n·sin φ/2, cos φ/2) with φ in [0, π], so that w ≥ 0; and back."""
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    angle = rng.uniform(0.0, 3.1)
+    pose = Pose(np.zeros(3), Rotation.from_rotvec(angle * axis).as_matrix())
+    truth = np.append(axis * np.sin(angle / 2), np.cos(angle / 2))
+    np.testing.assert_allclose(pose.quaternion(), truth, atol=2e-15)
+    np.testing.assert_allclose(Pose.from_quaternion(np.zeros(3), -truth).rotation, pose.rotation, atol=2e-15)
+    assert rotation_angle(pose.rotation) == pytest.approx(angle, abs=4e-15)
+
+
+def test_nearly_unit_quaternions_are_normalised():
+    """A quaternion rounded to four digits is a rotation all the same; its matrix must be one to rounding."""
+    pose = Pose.from_quaternion(np.zeros(3), [0.1826, 0.3651, 0.5477, 0.7303])
+    np.testing.assert_allclose(pose.rotation.T @ pose.rotation, np.eye(3), atol=1e-15)
+
+
+@fixed
+@given(st.tuples(*[metres] * 6), st.tuples(*[turns] * 6))
+def test_composition_and_inverse_are_those_of_matrices(positions, angles):
+    """Truth: products and inverses of 4 × 4 matrices by NumPy. Tolerance: 10 m, rounded a few times."""
+    one = Pose.from_angles(np.array(positions[:3]), np.array(angles[:3]))
+    two = Pose.from_angles(np.array(positions[3:]), np.array(angles[3:]))
+    np.testing.assert_allclose(as_matrix(one @ two), as_matrix(one) @ as_matrix(two), atol=1e-14)
+    np.testing.assert_allclose(as_matrix(one.inverse()), np.linalg.inv(as_matrix(one)), atol=1e-13)
+    np.testing.assert_allclose(as_matrix(one @ Pose.identity()), as_matrix(one), atol=0)
+
+
+def test_a_pose_keeps_its_own_arrays():
+    position, rotation = np.zeros(3), np.eye(3)
+    pose = Pose(position, rotation)
+    position[0], rotation[0, 0] = 1.0, 9.0
+    assert pose.position[0] == 0.0
+    assert pose.rotation[0, 0] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("position", "rotation", "message"),
+    [
+        ([0, 0], np.eye(3), r"position must have shape \(3,\), not \(2,\)"),
+        ([0, np.nan, 0], np.eye(3), "position must be finite.*nan"),
+        ([0, 0, np.inf], np.eye(3), "position must be finite.*inf"),
+        ([0, 0, 0], np.eye(2), r"rotation matrix must have shape \(3, 3\)"),
+        ([0, 0, 0], np.full((3, 3), np.nan), "rotation matrix must be finite"),
+        ([0, 0, 0], np.diag([1.0, 1.0, -1.0]), "orthonormal and right-handed"),
+        ([0, 0, 0], np.diag([1.0, 1.0, 1.0 + 1e-8]), "orthonormal and right-handed"),
+        ([0, 0, 0], np.zeros((3, 3)), "orthonormal and right-handed"),
+    ],
+)
+def test_what_is_no_pose(position, rotation, message):
+    with pytest.raises(PoseError, match=message):
+        Pose(position, rotation)
+
+
+@pytest.mark.parametrize(
+    ("quaternion", "message"),
+    [
+        ([0, 0, 0, 0], "norm 1, not 0"),
+        ([0, 0, 0, 2], "norm 1, not 2"),
+        ([0, 0, 0, 1.002], "norm 1, not 1.002"),
+        ([0, 0, np.nan, 1], "quaternion must be finite"),
+        ([0, 0, 1], r"quaternion must have shape \(4,\)"),
+    ],
+)
+def test_what_is_no_quaternion(quaternion, message):
+    with pytest.raises(PoseError, match=message):
+        Pose.from_quaternion(np.zeros(3), quaternion)
+
+
+def test_angles_that_are_none():
+    with pytest.raises(PoseError, match="angles must be finite"):
+        Pose.from_angles(np.zeros(3), [0.0, np.nan, 0.0])
