@@ -8,8 +8,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.experimental import EventsExecutor
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
@@ -18,7 +20,12 @@ from ..conversions import StrutReader, message_pose, pose_message
 from ..errors import HexapodError
 from ..pose import Pose
 from ..trajectory import Path
-from .runtime import COMMAND_QOS, STATE_QOS
+from .runtime import COMMAND_QOS, EVENT_QOS, STATE_QOS
+
+LISTENER_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
+"""Answers are all kept until they are read: a witness must not lose any."""
+
+TRACK_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 ANSWER_TIMEOUT = 0.25
 """A command without an answer after this long is lost or refused, s."""
@@ -64,19 +71,20 @@ class LoopClient:
         self._executor = EventsExecutor(context=self.context)
         self._executor.add_node(self.node)
         self._message = pose_message(Pose.identity(), frame_id)
-        self._commands, self._corrections, self._states = StrutReader(), StrutReader(), StrutReader()
+        self._commands, self._corrections = StrutReader(), StrutReader()
         self.sent: dict[int, Sent] = {}
-        self.state_speeds = np.full(6, np.nan)
+        self.track: list[np.ndarray] | None = None
+        self.diagnostics: dict[str, str] = {}
         self._true: PoseStamped | None = None
         self._estimate: PoseStamped | None = None
         self.true_count = 0
         node = self.node
         self._publisher = node.create_publisher(PoseStamped, "tool_pose_command", COMMAND_QOS)
-        node.create_subscription(JointState, "strut_commands", self._on_command, COMMAND_QOS)
-        node.create_subscription(JointState, "strut_corrections", self._on_correction, COMMAND_QOS)
-        node.create_subscription(JointState, "strut_states", self._on_state, STATE_QOS)
-        node.create_subscription(PoseStamped, "tool_pose_true", self._on_true, STATE_QOS)
+        node.create_subscription(JointState, "strut_commands", self._on_command, LISTENER_QOS)
+        node.create_subscription(JointState, "strut_corrections", self._on_correction, LISTENER_QOS)
+        node.create_subscription(PoseStamped, "tool_pose_true", self._on_true, TRACK_QOS)
         node.create_subscription(PoseStamped, "tool_pose_estimate", self._on_estimate, STATE_QOS)
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
         self._enable = node.create_client(SetBool, "compensator/enable_compensation")
 
     def close(self) -> None:
@@ -98,16 +106,26 @@ class LoopClient:
             self._corrections.read(message)
             entry.correction = self._corrections.lengths.copy()
 
-    def _on_state(self, message: JointState) -> None:
-        self._states.read(message)
-        self.state_speeds = np.array(message.velocity)
-
     def _on_true(self, message: PoseStamped) -> None:
         self._true = message
         self.true_count += 1
+        if self.track is not None:
+            p = message.pose.position
+            self.track.append(np.array([p.x, p.y, p.z]))
 
     def _on_estimate(self, message: PoseStamped) -> None:
         self._estimate = message
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name.startswith("compensator"):
+                self.diagnostics = {entry.key: entry.value for entry in status.values}
+                self.diagnostics["state"] = status.message
+
+    @property
+    def has_true_pose(self) -> bool:
+        """Whether somebody tells where the tool really is."""
+        return self._true is not None
 
     @property
     def true_pose(self) -> Pose:
@@ -139,15 +157,28 @@ class LoopClient:
             self._executor.spin_once(timeout_sec=min(left, 0.02))
 
     def connected(self) -> bool:
-        """Return whether commands reach a compensator and a drive's true pose and estimates come back."""
-        node = self.node
+        """Return whether commands reach a compensator and its answers and pose estimates come back."""
         return (
             self._publisher.get_subscription_count() > 0
-            and node.count_publishers("strut_commands") > 0
-            and self._true is not None
+            and self.node.count_publishers("strut_commands") > 0
             and self._estimate is not None
             and self._enable.service_is_ready()
+            and bool(self.diagnostics)
         )
+
+    def counted(self) -> tuple[int, int]:
+        """Return how many commands the compensator has accepted and refused, when it has counted all sent.
+
+        Commands that it does not count within two diagnostics periods are lost.
+        """
+
+        def counts() -> tuple[int, int]:
+            return int(self.diagnostics["commands"]), int(self.diagnostics["refused"])
+
+        end = time.monotonic() + 2.5
+        while sum(counts()) < len(self.sent) and time.monotonic() < end:
+            self._executor.spin_once(timeout_sec=0.05)
+        return counts()
 
     def enable(self, enabled: bool) -> None:
         """Switch compensation on or off."""
@@ -178,6 +209,9 @@ class LoopClient:
     def stream(self, path: Path, each: Callable[[int], None] | None = None) -> list[Sent]:
         """Send a path at its rate and return the records.
 
+        A command waits for the answer to the one before, so that a stall of any process delays the path
+        instead of making it jump.
+
         Parameters
         ----------
         path : Path
@@ -185,20 +219,25 @@ class LoopClient:
         each : callable, optional
             Called with the index after every pose sent.
         """
-        entries = []
+        entries: list[Sent] = []
         messages = [pose_message(path.pose(n), self._message.header.frame_id) for n in range(len(path))]
         due = time.monotonic()
         for index, message in enumerate(messages):
             while (left := due - time.monotonic()) > 0.0:
                 self._executor.spin_once(timeout_sec=left)
+            if entries:
+                self._await(entries[-1])
             entries.append(self._send(message))
             if each is not None:
                 each(index)
             due = max(due + 1.0 / path.rate, time.monotonic() - 1.0 / path.rate)
-        end = time.monotonic() + ANSWER_TIMEOUT
-        while not all(_answered(entry) for entry in entries[-3:]) and time.monotonic() < end:
-            self._executor.spin_once(timeout_sec=0.01)
+        self._await(entries[-1])
         return entries
+
+    def _await(self, entry: Sent) -> None:
+        """Handle messages until a command is answered, or has had its time."""
+        while not _answered(entry) and time.monotonic() < entry.sent_at + ANSWER_TIMEOUT:
+            self._executor.spin_once(timeout_sec=0.01)
 
     def hold(self, pose: Pose, rate: float, until: Callable[[], bool], timeout: float, what: str) -> Sent:
         """Send one pose again and again, as a controller at standstill does, until a condition holds."""

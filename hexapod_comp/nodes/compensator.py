@@ -10,11 +10,13 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from sensor_msgs.msg import JointState, Temperature
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
@@ -24,7 +26,7 @@ from .. import kernels
 from ..compensation import Compensator
 from ..conversions import PoseReader, StrutMessage, StrutReader, write_pose
 from ..errors import CommandError, HexapodError
-from ..geometry import load_geometry
+from ..geometry import HexapodGeometry, load_geometry
 from ..kinematics import forward_error
 from ..machine import MachineModel
 from ..model_file import load_model
@@ -36,11 +38,11 @@ from .runtime import (
     COMMAND_QOS,
     EVENT_QOS,
     STATE_QOS,
+    MachineNode,
     Parameter,
     Throttle,
     declare,
     keep_discovery_local,
-    qos_overridable,
     run,
 )
 
@@ -67,13 +69,13 @@ FORGET_ORDER_AFTER = 1.0
 """After a pause this long, s, stamps may start again earlier: the sender or its clock was restarted."""
 
 
-class CompensatorNode(LifecycleNode):
+class CompensatorNode(MachineNode):
     """Lifecycle node around one :class:`Compensator`; arguments are those of ``rclpy`` nodes."""
 
-    def __init__(self, **options) -> None:
+    def __init__(self, **options: Any) -> None:
         super().__init__("compensator", **options)
         self._options = declare(self, PARAMETERS)
-        self.wants_autostart: bool = self._options["autostart"]
+        self.wants_autostart = self._options["autostart"]
         self._active = False
         self._throttle = Throttle()
         self._refusals, self._feedback_refusals = Refusals(), Refusals()
@@ -81,7 +83,14 @@ class CompensatorNode(LifecycleNode):
         self._reader, self._struts = PoseReader(), StrutReader()
         self._last_stamp = 0
         self._fresh_start = True
-        self.compensator: Compensator | None = None
+        self._compensator: Compensator | None = None
+
+    @property
+    def compensator(self) -> Compensator:
+        """The compensator of a configured node."""
+        if self._compensator is None:
+            raise CommandError("not_configured", "the node is not configured")
+        return self._compensator
 
     # ---- lifecycle ----
 
@@ -91,7 +100,7 @@ class CompensatorNode(LifecycleNode):
         self.get_logger().info("loading; the first start on a machine compiles its kernels, some 30 s")
         try:
             geometry = load_geometry(config_file(self._options["geometry_file"]))
-            self.compensator = Compensator(geometry, self._load_model(geometry), self._options["ramp_rate"])
+            self._compensator = Compensator(geometry, self._load_model(geometry), self._options["ramp_rate"])
         except HexapodError as error:
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
@@ -122,7 +131,7 @@ class CompensatorNode(LifecycleNode):
         """Close topics and forget the machine."""
         self._active = False
         self._close_topics()
-        self.compensator = None
+        self._compensator = None
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -132,14 +141,14 @@ class CompensatorNode(LifecycleNode):
 
     def say_goodbye(self) -> None:
         """Publish a last status and wait until it has arrived."""
-        if self.compensator is None:
+        if self._compensator is None:
             return
         self._active = False
         self._check_state()
         self._diagnostics_pub.wait_for_all_acked()
         self._command_pub.wait_for_all_acked()
 
-    def _load_model(self, geometry) -> MachineModel:
+    def _load_model(self, geometry: HexapodGeometry) -> MachineModel:
         name = self._options["model_file"]
         return MachineModel(geometry.name) if name == "ideal" else load_model(config_file(name), geometry)
 
@@ -159,24 +168,23 @@ class CompensatorNode(LifecycleNode):
         compensator.reset()
 
     def _open_topics(self) -> None:
-        qos = dict(qos_overriding_options=qos_overridable())
-        self._command_pub = self.create_publisher(JointState, "strut_commands", COMMAND_QOS, **qos)
-        self._correction_pub = self.create_publisher(JointState, "strut_corrections", COMMAND_QOS, **qos)
-        self._estimate_pub = self.create_publisher(PoseStamped, "tool_pose_estimate", STATE_QOS, **qos)
+        self._command_pub = self.publish_on(JointState, "strut_commands", COMMAND_QOS)
+        self._correction_pub = self.publish_on(JointState, "strut_corrections", COMMAND_QOS)
+        self._estimate_pub = self.publish_on(PoseStamped, "tool_pose_estimate", STATE_QOS)
         self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", EVENT_QOS)
         self._marker_pub = self.create_publisher(MarkerArray, "~/markers", EVENT_QOS)
         self._array_pub = None
         if self._options["publish_array"]:
-            self._array_pub = self.create_publisher(Float64MultiArray, "strut_commands_array", COMMAND_QOS, **qos)
+            self._array_pub = self.publish_on(Float64MultiArray, "strut_commands_array", COMMAND_QOS)
             self._array_out = Float64MultiArray(data=[0.0] * 6)
             self._array_view = np.frombuffer(self._array_out.data, dtype=float)
         self._command_out, self._correction_out = StrutMessage(), StrutMessage()
         self._estimate_out = PoseStamped()
         self._estimate_out.header.frame_id = self._options["base_frame"]
         self._entities = [
-            self.create_subscription(PoseStamped, "tool_pose_command", self._on_command, COMMAND_QOS, **qos),
-            self.create_subscription(JointState, "strut_states", self._on_states, STATE_QOS, **qos),
-            self.create_subscription(Temperature, "temperatures", self._on_temperature, EVENT_QOS, **qos),
+            self.listen_to(PoseStamped, "tool_pose_command", self._on_command, COMMAND_QOS),
+            self.listen_to(JointState, "strut_states", self._on_states, STATE_QOS),
+            self.listen_to(Temperature, "temperatures", self._on_temperature, EVENT_QOS),
         ]
         self._own_services = [
             self.create_service(SetBool, "~/enable_compensation", self._on_enable),
@@ -227,7 +235,7 @@ class CompensatorNode(LifecycleNode):
         if self._feedback.age(now) > self._options["feedback_timeout"]:
             self._publish_estimate(self.compensator.command, stamp)
 
-    def _checked_stamp(self, stamp, now: float):
+    def _checked_stamp(self, stamp: Time, now: float) -> Time:
         """Return the stamp to copy, or refuse one too old, too new or out of order; zero means now."""
         nanoseconds = stamp.sec * 1_000_000_000 + stamp.nanosec
         clock = self.get_clock().now()
@@ -304,7 +312,7 @@ class CompensatorNode(LifecycleNode):
 
     # ---- messages out ----
 
-    def _publish_command(self, stamp, since_last: float) -> None:
+    def _publish_command(self, stamp: Time, since_last: float) -> None:
         out, correction, compensator = self._command_out, self._correction_out, self.compensator
         np.subtract(compensator.command, out.position, out=out.velocity)
         out.velocity *= 1.0 / since_last if since_last < FORGET_ORDER_AFTER else 0.0
@@ -318,7 +326,7 @@ class CompensatorNode(LifecycleNode):
             self._array_view[:] = compensator.command
             self._array_pub.publish(self._array_out)
 
-    def _publish_estimate(self, struts: np.ndarray, stamp) -> None:
+    def _publish_estimate(self, struts: np.ndarray, stamp: Time) -> None:
         compensator = self.compensator
         outcome, _, condition, _ = compensator.machine.forward(
             struts, compensator.motion.sense, *self._guess, *self._actual
@@ -372,6 +380,8 @@ class CompensatorNode(LifecycleNode):
             return OK, "waiting for the first command"
         if 0.0 < timeout < self._commands.age(now):
             return WARN, "no new command"
+        if self.compensator.ramping:
+            return OK, "running, a change is ramping in"
         if self._feedback.age(now) > self._options["feedback_timeout"]:
             return OK, "running, pose estimated from own commands"
         return OK, "running"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -91,7 +92,7 @@ class HealthReport:
         self._shown, self._last = (level, message), now
         return True
 
-    def message(self, level: bytes, text: str, values: dict[str, str], stamp) -> DiagnosticArray:
+    def message(self, level: bytes, text: str, values: dict[str, str], stamp: Time) -> DiagnosticArray:
         """Return the diagnostics message."""
         status = DiagnosticStatus(level=level, name=self._name, message=text, hardware_id=self._hardware_id)
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]

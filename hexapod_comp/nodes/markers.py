@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from builtin_interfaces.msg import Duration
+from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
@@ -25,7 +25,7 @@ def machine_markers(
     rotation: np.ndarray,
     correction: np.ndarray,
     frame_id: str,
-    stamp,
+    stamp: Time,
 ) -> MarkerArray:
     """Return the machine at a platform pose.
 
@@ -64,7 +64,7 @@ def correction_colour(correction: float, full: float = 100e-6) -> ColorRGBA:
     return ColorRGBA(r=1.0 if share > 0 else rest, g=rest, b=1.0 if share < 0 else rest, a=1.0)
 
 
-def _marker(frame_id: str, stamp, number: int, kind: int, size: float, colour: ColorRGBA | None = None) -> Marker:
+def _marker(frame_id: str, stamp: Time, number: int, kind: int, size: float, colour: ColorRGBA | None = None) -> Marker:
     marker = Marker(ns="hexapod", id=number, type=kind, action=Marker.ADD, lifetime=LIFETIME)
     marker.header.frame_id = frame_id
     marker.header.stamp = stamp

@@ -117,19 +117,20 @@ class NodeProcess:
 
     def output(self) -> str:
         """Return what it has printed so far."""
-        return self.log.read_text(encoding="utf-8", errors="replace")
+        return self.log.read_text(encoding="utf-8", errors="replace") if self.log.exists() else ""
 
-    def stop(self) -> int:
-        """End the process with SIGINT and return its exit code; kill it when it does not listen."""
+    def stop(self) -> tuple[int, str]:
+        """End the process with SIGINT; return its exit code and all it printed. Kill it when it does not listen."""
         if self._process.poll() is None:
             self.send(signal.SIGINT)
         try:
-            return self._process.wait(STOP_TIMEOUT)
+            code = self._process.wait(STOP_TIMEOUT)
         except subprocess.TimeoutExpired:
             self._process.kill()
-            return self._process.wait()
-        finally:
-            self.log.unlink(missing_ok=True)
+            code = self._process.wait()
+        said = self.output()
+        self.log.unlink(missing_ok=True)
+        return code, said
 
 
 def ros_arguments(parameters: dict[str, object]) -> Sequence[str]:

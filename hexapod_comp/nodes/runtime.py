@@ -16,9 +16,11 @@ import rclpy
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 
 from ..errors import HexapodError
 
@@ -112,7 +114,7 @@ def checked(parameter: Parameter, value: Any) -> Any:
         value = float(value)
     if type(value) is not wanted:
         raise ParameterError(f"parameter {parameter.name}: must be {wanted.__name__}, not {value!r}")
-    if wanted in (int, float):
+    if isinstance(value, int | float) and wanted is not bool:
         low = -float("inf") if parameter.low is None else parameter.low
         high = float("inf") if parameter.high is None else parameter.high
         if not low <= value <= high:
@@ -122,7 +124,7 @@ def checked(parameter: Parameter, value: Any) -> Any:
 
 def _warn_of_strangers(node: LifecycleNode) -> None:
     """Warn of overrides that no declared parameter takes: most likely misspelt."""
-    declared = {name for name in node.get_parameters_by_prefix("")}
+    declared = set(node.get_parameters_by_prefix(""))
     for name in getattr(node, "_parameter_overrides", {}):
         if name not in declared and not name.startswith("qos_overrides."):
             near = difflib.get_close_matches(name, declared, 1)
@@ -130,9 +132,25 @@ def _warn_of_strangers(node: LifecycleNode) -> None:
             node.get_logger().warning(f"there is no parameter {name}, it is ignored{hint}")
 
 
-def qos_overridable() -> QoSOverridingOptions:
-    """Return the options that let a user override a topic's QoS by parameters."""
-    return QoSOverridingOptions.with_default_policies()
+class MachineNode(LifecycleNode):
+    """What the package's lifecycle nodes have in common: topics whose QoS a user may override by parameters."""
+
+    wants_autostart = True
+
+    def publish_on(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
+        """Return a publisher."""
+        options = QoSOverridingOptions.with_default_policies()
+        return self.create_publisher(message_type, topic, qos, qos_overriding_options=options)
+
+    def listen_to(
+        self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
+    ) -> Subscription:
+        """Return a subscription."""
+        options = QoSOverridingOptions.with_default_policies()
+        return self.create_subscription(message_type, topic, callback, qos, qos_overriding_options=options)
+
+    def say_goodbye(self) -> None:
+        """Publish what must still be said before the node ends."""
 
 
 class Throttle:
@@ -165,7 +183,7 @@ def keep_discovery_local() -> None:
         os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
-def run(make_node: Callable[[], LifecycleNode], argv: Sequence[str] | None = None) -> int:
+def run(make_node: Callable[[], MachineNode], argv: Sequence[str] | None = None) -> int:
     """Run a node until SIGINT or SIGTERM.
 
     Signals only set a flag, since rclpy's own handling loses the last message and exits non-zero on a
@@ -203,3 +221,6 @@ def run(make_node: Callable[[], LifecycleNode], argv: Sequence[str] | None = Non
         executor.shutdown()
         node.destroy_node()
         rclpy.try_shutdown()
+        # Python puts its own handlers back while it shuts down; a second Ctrl-C would then end us with -2.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)

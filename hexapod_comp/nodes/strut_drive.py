@@ -11,17 +11,18 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter as RosParameter
 from sensor_msgs.msg import JointState
 
 from ..conversions import StrutMessage, StrutReader, write_pose
-from ..errors import HexapodError, KinematicsError
-from ..geometry import STRUT_NAMES, load_geometry
+from ..errors import CommandError, HexapodError, KinematicsError
+from ..geometry import STRUT_NAMES, HexapodGeometry, load_geometry
 from ..imperfections import ImperfectionBounds, draw_model
 from ..machine import MachineModel, RealMachine
 from ..model_file import load_model
@@ -32,12 +33,12 @@ from .runtime import (
     COMMAND_QOS,
     EVENT_QOS,
     STATE_QOS,
+    MachineNode,
     Parameter,
     Throttle,
     checked,
     declare,
     keep_discovery_local,
-    qos_overridable,
     run,
 )
 
@@ -54,7 +55,7 @@ PARAMETERS = (
     Parameter("base_frame", "base", "frame_id of the true tool pose"),
     Parameter("rate", 500.0, "readings published per second, Hz", 1.0, 2000.0),
     Parameter("step", 0.1e-6, "length of one motor step, m; 0 = none", 0.0, 1e-3),
-    Parameter("lag", 0.01, "time by which the drives follow a moving command, s", 1e-3, 1.0),
+    Parameter("lag", 0.005, "time by which the drives follow a moving command, s", 1e-3, 1.0),
     Parameter("max_speed", 0.0, "largest motor speed, m/s; 0 = the geometry's limit", 0.0, 10.0),
     Parameter("max_acceleration", 10.0, "largest motor acceleration, m/s²", 1e-3, 1e4),
     Parameter("encoder_resolution", 0.1e-6, "length of one encoder count, m; 0 = none", 0.0, 1e-3),
@@ -77,20 +78,27 @@ LONGEST_PAUSE = 0.25
 CHECK_PERIOD = 0.05
 
 
-class StrutDriveNode(LifecycleNode):
+class StrutDriveNode(MachineNode):
     """Lifecycle node around one :class:`StrutDrive`; arguments are those of ``rclpy`` nodes."""
 
-    def __init__(self, **options) -> None:
+    def __init__(self, **options: Any) -> None:
         super().__init__("strut_drive", **options)
         self._options = declare(self, PARAMETERS + FAULT_PARAMETERS)
-        self.wants_autostart: bool = self._options["autostart"]
+        self.wants_autostart = self._options["autostart"]
         self._active = False
         self._throttle, self._refusals, self._commands = Throttle(), Refusals(), Flow()
         self._reader = StrutReader()
         self._states_out, self._true_out = StrutMessage(), PoseStamped()
         self._true_out.header.frame_id = self._options["base_frame"]
-        self.drive: StrutDrive | None = None
+        self._drive: StrutDrive | None = None
         self.add_on_set_parameters_callback(self._on_parameters)
+
+    @property
+    def drive(self) -> StrutDrive:
+        """The simulated machine of a configured node."""
+        if self._drive is None:
+            raise CommandError("not_configured", "the node is not configured")
+        return self._drive
 
     # ---- lifecycle ----
 
@@ -101,7 +109,7 @@ class StrutDriveNode(LifecycleNode):
         try:
             geometry = load_geometry(config_file(options["geometry_file"]))
             machine = RealMachine(geometry, self._truth(geometry))
-            self.drive = StrutDrive(machine, self._drive_parameters(), options["noise_seed"])
+            self._drive = StrutDrive(machine, self._drive_parameters(), options["noise_seed"])
             self.drive.faults = self._faults(options)
             self.drive.advance(1.0 / options["rate"])
             self._tool_in_base()
@@ -133,7 +141,7 @@ class StrutDriveNode(LifecycleNode):
         self.destroy_subscription(self._subscription)
         for publisher in (self._states_pub, self._true_pub, self._diagnostics_pub):
             self.destroy_publisher(publisher)
-        self.drive = None
+        self._drive = None
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -143,13 +151,13 @@ class StrutDriveNode(LifecycleNode):
 
     def say_goodbye(self) -> None:
         """Publish a last status and wait until it has arrived."""
-        if self.drive is None:
+        if self._drive is None:
             return
         self._active = False
         self._check_state()
         self._diagnostics_pub.wait_for_all_acked()
 
-    def _truth(self, geometry) -> MachineModel:
+    def _truth(self, geometry: HexapodGeometry) -> MachineModel:
         name = self._options["truth_file"]
         if name == "ideal":
             return MachineModel(geometry.name)
@@ -163,12 +171,11 @@ class StrutDriveNode(LifecycleNode):
         return DriveParameters(max_speed=self._options["max_speed"] or None, **values)
 
     def _open_topics(self) -> None:
-        qos = dict(qos_overriding_options=qos_overridable())
-        self._states_pub = self.create_publisher(JointState, "strut_states", STATE_QOS, **qos)
-        self._true_pub = self.create_publisher(PoseStamped, "tool_pose_true", STATE_QOS, **qos)
+        self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
+        self._true_pub = self.publish_on(PoseStamped, "tool_pose_true", STATE_QOS)
         self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", EVENT_QOS)
-        self._subscription = self.create_subscription(
-            JointState, "strut_commands", self._on_commands, COMMAND_QOS, **qos
+        self._subscription = self.listen_to(
+            JointState, "strut_commands", self._on_commands, COMMAND_QOS
         )
         self._own_timers = [
             self.create_timer(1.0 / self._options["rate"], self._run),
@@ -190,12 +197,12 @@ class StrutDriveNode(LifecycleNode):
         if not any(parameter.name == "fault_jump" for parameter in parameters):
             faults = replace(faults, jump=None)
         self._options = wanted
-        if self.drive is not None:
+        if self._drive is not None:
             self.drive.faults = faults
         return SetParametersResult(successful=True)
 
     @staticmethod
-    def _faults(options) -> Faults:
+    def _faults(options: dict[str, Any]) -> Faults:
         def index(number: int) -> int | None:
             return number - 1 if number else None
 
