@@ -1,0 +1,77 @@
+# make demo · make test: all that they need goes into .venv, once; later runs start at once and stay offline.
+
+PYTHON ?= python3
+BIN := .venv/bin
+
+# The environment brings its own ROS 2. What a sourced ROS 2 installation, or another environment,
+# leaves in these variables would be mixed into it, binary libraries included.
+unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH COLCON_PREFIX_PATH CMAKE_PREFIX_PATH
+unexport RMW_IMPLEMENTATION _ROS_WHEELS_BOOTSTRAP_COMPLETE PIP_USER PIP_TARGET PIP_PREFIX
+ifdef AMENT_PREFIX_PATH
+unexport LD_LIBRARY_PATH
+endif
+
+# A moved or copied tree carries a .venv that still runs the code at the old place, and an upgrade of the
+# system may have taken its Python away: make it anew.
+ifneq ($(shell test -x .venv/bin/python && cat .venv/made-in 2>/dev/null),$(CURDIR))
+.PHONY: .venv/made-in
+endif
+
+.PHONY: help demo test bench clean
+.DELETE_ON_ERROR:
+.NOTPARALLEL:
+
+help:
+	@echo 'make demo    run the compensator against a simulated machine; figures, out/demo.png'
+	@echo 'make test    ruff, mypy and the tests'
+	@echo 'make bench   speed beside NumPy, SciPy, MuJoCo and Pinocchio, and a relay node'
+	@echo 'make clean   remove .venv, build folders and caches (out/ stays)'
+	@echo 'PYTHON=...   the Python (3.10 to 3.13) from which .venv is made; make clean before a change'
+
+demo: .venv/with-ros
+	@$(BIN)/hexapod_comp demo
+
+test: .venv/with-ros,test
+	$(BIN)/ruff check
+	$(BIN)/mypy
+	$(BIN)/pytest
+
+bench: .venv/with-ros,bench
+	@$(BIN)/python -m benchmarks
+
+clean:
+	rm -rf .venv build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+.venv/made-in:
+	@'$(PYTHON)' -c "$$CHECK_PYTHON" || { [ $$? -ne 127 ] || echo "$$NO_PYTHON"; exit 1; } >&2
+	@echo "Making .venv ..."
+	@'$(PYTHON)' -m venv --clear .venv
+	@pwd -P > $@
+
+.venv/with-%: setup.py .venv/made-in
+	@echo "Installing hexapod_comp[$*] and what it needs into .venv, once; this takes a minute or two ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-input --use-pep517 --editable '.[$*]'
+	@touch .venv/with-ros $@
+
+define NO_PYTHON
+make: '$(PYTHON)' is not a command here. Python 3.10 to 3.13 is needed: install it, or name another one,
+  for example: make demo PYTHON=python3.12
+endef
+export NO_PYTHON
+
+define CHECK_PYTHON
+import platform, sys
+if not (3, 10) <= sys.version_info[:2] <= (3, 13):
+    sys.exit("make: '$(PYTHON)' is Python %d.%d; 3.10 to 3.13 is needed. Name another one, for example:\n"
+             "  make demo PYTHON=python3.12" % sys.version_info[:2])
+if not sys.platform.startswith("linux") or platform.machine() != "x86_64":
+    sys.exit("make: this is %s on %s, but PyPI has ROS 2 only for Linux on x86_64.\n"
+             "  On a ROS 2 machine use colcon build instead (see README)." % (sys.platform, platform.machine()))
+try:
+    import ensurepip, venv
+except ImportError:
+    sys.exit("make: '$(PYTHON)' cannot make virtual environments. On Debian and Ubuntu:\n"
+             "  apt-get install python%d.%d-venv" % sys.version_info[:2])
+endef
+export CHECK_PYTHON

@@ -1,0 +1,74 @@
+"""Package metadata, read by pip (virtual environment) and by colcon (ROS 2 workspace) alike."""
+
+from __future__ import annotations
+
+import os
+
+from setuptools import find_packages, setup
+
+NAME = "hexapod_comp"
+
+
+def shared_files(folder: str) -> list[tuple[str, list[str]]]:
+    """List a folder's files, subfolders included, with where each goes under share/."""
+    found = []
+    for directory, subfolders, files in os.walk(folder):
+        subfolders[:] = sorted(name for name in subfolders if name != "__pycache__")
+        kept = sorted(os.path.join(directory, name) for name in files if not name.startswith("."))
+        if kept:
+            found.append((f"share/{NAME}/{directory}", kept))
+    return found
+
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Error compensation for hexapod machine tools: tool poses in, compensated strut lengths out",
+    license="Apache-2.0",
+    maintainer="hexapod_comp maintainers",
+    maintainer_email="maintainers@hexapod-comp.example",
+    python_requires=">=3.10,<3.14",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        *shared_files("config"),
+        *shared_files("launch"),
+    ],
+    zip_safe=False,
+    # The lower bounds are what Ubuntu 24.04 ships, the system of ROS 2 Jazzy.
+    install_requires=[
+        "numpy>=1.26",
+        "scipy>=1.11",
+        "numba>=0.58",
+        "PyYAML>=6.0",
+        "matplotlib>=3.6",
+        "tqdm>=4.66",
+    ],
+    extras_require={
+        # ROS 2 Jazzy as wheels (Linux x86-64), for machines without a ROS installation.
+        "ros": [
+            "ros-jazzy-rclpy[fastrtps]>=7.1.6,<8",
+            "ros-jazzy-common-interfaces>=5.3.6,<6",
+        ],
+        # Linters stay at one minor version, so that a new rule never breaks yesterday's checkout.
+        "test": [
+            "pytest>=8",
+            "pytest-timeout>=2.2",
+            "hypothesis>=6.98",
+            "ruff==0.17.*",
+            "mypy==2.4.*",
+            "colcon-core>=0.18",
+            "colcon-ros>=0.5",
+            "colcon-library-path>=0.2.1",
+        ],
+        "bench": ["mujoco>=3.1", "pin>=2.7"],
+    },
+    entry_points={
+        "console_scripts": [
+            f"hexapod_comp = {NAME}.cli:main",
+            f"compensator = {NAME}.nodes.compensator:main",
+            f"strut_drive = {NAME}.nodes.strut_drive:main",
+        ],
+    },
+)

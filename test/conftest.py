@@ -1,0 +1,64 @@
+"""What tests with ROS need: nothing of them is seen outside, nothing outside disturbs them.
+
+rclpy is imported inside the fixtures only, so that the core's tests run where there is no ROS.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+import pytest
+
+from hexapod_comp.nodes.processes import reserve_domain
+
+if TYPE_CHECKING:
+    from rclpy.context import Context
+    from rclpy.executors import Executor
+
+
+@pytest.fixture(scope="session", autouse=True)
+def isolated_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+    """Keep this session's nodes on this machine, in a domain of their own, their logs in a temporary folder.
+
+    Yields the domain id. Processes that tests start inherit all of it through the environment.
+    """
+    domain, reservation = reserve_domain()
+    with reservation, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(domain))
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        patch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("ros_log")))
+        patch.delenv("ROS_LOCALHOST_ONLY", raising=False)
+        patch.delenv("ROS_STATIC_PEERS", raising=False)
+        patch.delenv("ROS_DISCOVERY_SERVER", raising=False)
+        yield domain
+
+
+@pytest.fixture
+def ros_context(isolated_ros: int) -> Iterator[Context]:
+    """Give a private rclpy context; nodes and executors made with it leave no trace in other tests."""
+    import rclpy
+
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context, domain_id=isolated_ros)
+    yield context
+    rclpy.try_shutdown(context=context)
+
+
+@pytest.fixture
+def spin_until() -> Callable[..., None]:
+    """Give :func:`spin_executor_until`: ``spin_until(executor, condition, timeout=5.0, what="…")``."""
+    return spin_executor_until
+
+
+def spin_executor_until(
+    executor: Executor, condition: Callable[[], object], timeout: float = 5.0, what: str = ""
+) -> None:
+    """Spin until `condition()` holds; raise TimeoutError naming `what` if it does not within `timeout` s."""
+    end = time.monotonic() + timeout
+    while not condition():
+        if time.monotonic() > end:
+            awaited = what or getattr(condition, "__name__", "condition")
+            raise TimeoutError(f"waited {timeout} s in vain for: {awaited}")
+        executor.spin_once(timeout_sec=0.02)

@@ -1,0 +1,187 @@
+"""The package as colcon and ros2 see it, and its dependencies as the source really has them."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import runpy
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from unittest import mock
+from xml.etree import ElementTree
+
+import pytest
+
+from hexapod_comp.errors import InputFileError
+from hexapod_comp.paths import config_file, shipped_names
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "hexapod_comp"
+FOLDERS = ("hexapod_comp", "config", "launch", "resource")
+FILES = ("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "LICENSE")
+
+# Import name → key in rosdep's python.yaml and name on PyPI, where the three differ. ROS packages are
+# imported under their own name, which is also their key.
+PYTHON3 = ("hypothesis", "matplotlib", "numba", "numpy", "pytest", "scipy", "tqdm", "yaml")
+ROSDEP_KEYS = {name: f"python3-{name}" for name in PYTHON3}
+PYPI_NAMES = {"yaml": "pyyaml"}
+# setuptools runs setup.py wherever that is read; the others are optional extras and benchmark tools.
+EXEMPT = {"setuptools", "plotly", "dask", "mujoco", "pinocchio"}
+WITHOUT_ROS = """
+import importlib, sys
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in BLOCKED:
+            raise ImportError(f"{name} is blocked: the core must not need ROS")
+
+BLOCKED = set(sys.argv[1].split(","))
+sys.meta_path.insert(0, Blocker())
+for module in sys.argv[2:]:
+    importlib.import_module(module)
+assert not BLOCKED & set(sys.modules)
+"""
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build a copy of the source with colcon; return the prefix of the installation."""
+    workspace = tmp_path_factory.mktemp("colcon workspace")
+    source = workspace / "src" / "hexapod_comp"
+    source.mkdir(parents=True)
+    for name in FOLDERS:
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in FILES:
+        shutil.copy2(ROOT / name, source / name)
+    (source / "config" / "own").mkdir(exist_ok=True)
+    (source / "config" / "own" / "deep.yaml").write_text("deep: 1\n")
+    command = [sys.executable, "-m", "colcon", "--log-base", "log", "build", "--paths", "src/hexapod_comp"]
+    run = subprocess.run(command, cwd=workspace, capture_output=True, text=True, timeout=100, check=False)
+    assert run.returncode == 0, run.stdout + run.stderr
+    return workspace / "install" / "hexapod_comp"
+
+
+@pytest.mark.parametrize("name", ["compensator", "strut_drive", "hexapod_comp"])
+def test_ros2_run_finds_the_executables(installed: Path, name: str):
+    executable = installed / "lib" / "hexapod_comp" / name
+    assert os.access(executable, os.X_OK), sorted(installed.rglob(name))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "ament_index/resource_index/packages/hexapod_comp",
+        "hexapod_comp/package.xml",
+        "hexapod_comp/launch/machine.launch.py",
+        "hexapod_comp/config/paper.yaml",
+        "hexapod_comp/config/own/deep.yaml",  # a subfolder, put there by the fixture
+    ],
+)
+def test_share_has_what_ros_looks_for(installed: Path, name: str):
+    assert (installed / "share" / name).is_file()
+
+
+def test_every_module_is_installed(installed: Path):
+    package = next(installed.glob("**/hexapod_comp/__init__.py")).parent
+    modules = {path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py")}
+    assert {path.relative_to(package) for path in package.rglob("*.py")} == modules
+
+
+def test_installed_command_runs_and_finds_its_own_config(installed: Path, tmp_path: Path):
+    site_packages = next(installed.glob("**/hexapod_comp/__init__.py")).parents[1]
+    environment = os.environ | {"PYTHONPATH": str(site_packages)}
+    code = "from hexapod_comp.paths import config_file; print(config_file('paper'), config_file('own/deep'))"
+    found = subprocess.check_output([sys.executable, "-c", code], env=environment, cwd=tmp_path, text=True)
+    share = installed / "share" / "hexapod_comp" / "config"
+    assert found.strip() == f"{share / 'paper.yaml'} {share / 'own' / 'deep.yaml'}"
+    # Through the interpreter: a first line with a space in its path, as here perhaps, is beyond the kernel.
+    command = [sys.executable, installed / "lib" / "hexapod_comp" / "hexapod_comp", "--help"]
+    assert subprocess.check_output(command, env=environment, cwd=tmp_path, timeout=60)
+
+
+def test_a_file_of_the_user_wins_over_a_shipped_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    assert config_file("paper.yaml") == ROOT / "config" / "paper.yaml"
+    (tmp_path / "paper.yaml").write_text("mine: 1\n")
+    assert config_file("paper.yaml").resolve() == tmp_path / "paper.yaml"
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert config_file("~/paper.yaml") == tmp_path / "paper.yaml"
+
+
+@pytest.mark.parametrize("name", ["papr.yaml", "", "../setup.py", "config", "x" * 5000])
+def test_a_missing_config_file_is_refused_with_the_shipped_names(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputFileError, match=r"paper\.yaml"):
+        config_file(name)
+    assert "paper.yaml" in shipped_names()
+
+
+def test_the_core_imports_without_ros():
+    modules = ["hexapod_comp"]
+    for path in sorted(PACKAGE.rglob("*.py")):
+        dotted = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        if path.name not in ("__init__.py", "conversions.py") and path.parent.name != "nodes":
+            modules.append(dotted)
+    blocked = ",".join(sorted({"rclpy", "launch", "launch_ros", *_ros_dependencies()}))
+    run = subprocess.run(
+        [sys.executable, "-c", WITHOUT_ROS, blocked, *modules], capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stderr
+
+
+def test_package_xml_lists_what_the_source_imports():
+    listed = _package_xml("exec_depend")
+    needed = {_rosdep_key(name) for folder in (PACKAGE, ROOT / "launch") for name in _imports(folder)}
+    assert needed <= listed
+    assert {key for key in listed if key.startswith("python3-")} <= needed
+
+
+def test_package_xml_lists_what_the_tests_import():
+    listed = _package_xml("exec_depend") | _package_xml("test_depend")
+    assert {_rosdep_key(name) for name in _imports(ROOT / "test")} <= listed
+
+
+def test_setup_py_agrees_with_the_imports_and_package_xml(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(ROOT)
+    with mock.patch("setuptools.setup") as setup:
+        runpy.run_path("setup.py")
+    metadata = setup.call_args.kwargs
+    required = {re.split(r"[^\w.-]", line)[0].lower() for line in metadata["install_requires"]}
+    assert required == {PYPI_NAMES.get(name, name) for name in _imports(PACKAGE) - _ros_dependencies()}
+    package_xml = ElementTree.parse(ROOT / "package.xml")
+    for field in ("name", "version", "license", "maintainer"):
+        assert package_xml.findtext(field) == metadata[field]
+
+
+def _ros_dependencies() -> set[str]:
+    """Return the dependencies of package.xml that are ROS packages."""
+    return {key for key in _package_xml("exec_depend") if not key.startswith("python3-")}
+
+
+def _package_xml(tag: str) -> set[str]:
+    return {element.text or "" for element in ElementTree.parse(ROOT / "package.xml").iter(tag)}
+
+
+def _rosdep_key(name: str) -> str:
+    return ROSDEP_KEYS.get(name, name)
+
+
+def _imports(folder: Path) -> set[str]:
+    """Return the third-party top-level names that the Python files of a folder import, anywhere in them."""
+    own = {"hexapod_comp", "conftest", *(path.stem for path in folder.glob("*.py"))}
+    names = {name for path in folder.rglob("*.py") for name in _imported_names(ast.parse(path.read_bytes()))}
+    return names - own - EXEMPT - set(sys.stdlib_module_names)
+
+
+def _imported_names(tree: ast.AST) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.partition(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            yield node.module.partition(".")[0]
