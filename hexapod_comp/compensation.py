@@ -13,11 +13,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from . import kernels
-from .compiling import compiled
+from .compensation_kernels import (
+    BUMP,
+    COMMAND,
+    CORRECTION,
+    LOW,
+    NOMINAL,
+    OUTSIDE,
+    SENSE,
+    STATE_SIZE,
+    UNSOLVED,
+    compensate_one,
+    estimate_one,
+    pack_machine,
+    pack_nominal,
+    pose_views,
+)
 from .errors import HexapodError, NotConvergedError, NotFiniteError, OutsideFieldError
 from .geometry import HexapodGeometry
-from .limits import CORRECTION, STEP, WITHIN, LimitTable, check_change, check_stage
-from .machine import MachineModel, RealMachine, Temperatures, command_one
+from .kinematics import forward_error, strut_lengths
+from .limits import WITHIN, LimitTable
+from .machine import MachineModel, RealMachine, Temperatures
 from .motion import MotionState
 from .pose import Pose
 
@@ -26,8 +42,6 @@ DEFAULT_RAMP_RATE = 1e-3
 
 LONGEST_RAMP_STEP = 0.02
 """A pause between commands counts as no more than this in a ramp, s: a late command must not step."""
-
-SOLVED, UNSOLVED, OUTSIDE = range(3)
 
 
 @dataclass(frozen=True)
@@ -83,6 +97,29 @@ class Correction:
     outside_box: bool
 
 
+class _Command:
+    """One command's numbers: a state vector and two poses, and the views that give them names."""
+
+    __slots__ = ("bump", "command", "correction", "model", "motion", "nominal", "platform", "poses", "state")
+
+    def __init__(self) -> None:
+        self.state, self.poses = np.empty(STATE_SIZE), np.empty(24)
+        self.motion = MotionState(self.state[LOW:SENSE], self.state[SENSE:NOMINAL])
+        self.nominal = self.state[NOMINAL:CORRECTION]
+        self.correction = self.state[CORRECTION:COMMAND]
+        self.command = self.state[COMMAND:BUMP]
+        self.bump = self.state[BUMP:]
+        position, rotation, model_position, model_rotation = pose_views.py_func(self.poses)
+        self.platform, self.model = (position, rotation), (model_position, model_rotation)
+        self.clear()
+
+    def clear(self) -> None:
+        """Make it the state before any command."""
+        self.state[:] = math.nan
+        self.motion.sense[:] = 0.0
+        self.bump[:] = 0.0
+
+
 class Compensator:
     """Turns commanded tool poses into compensated strut commands for one machine.
 
@@ -115,18 +152,35 @@ class Compensator:
         self.temperatures = Temperatures()
         self.machine = RealMachine(geometry, model)
         self.enabled = True
-        self.command = np.empty(6)
-        self.nominal = np.empty(6)
-        self.correction = np.empty(6)
         self.condition = math.nan
         self.outside_field = False
-        self.motion, self._next_motion = MotionState(), MotionState()
         self._tool_inverse = geometry.tool.inverse()
-        self._platform = np.empty(3), np.empty((3, 3))
-        self._model = np.empty(3), np.empty((3, 3))
-        self._findings = np.empty(4)
-        self._next = np.empty((3, 6))  # nominal, correction, command of a command under way
+        self._nominal_numbers = pack_nominal(geometry, self._tool_inverse, self.limits)
+        self._last, self._next = _Command(), _Command()
+        self._take_machine(RealMachine(geometry, model))
+        self._model_pose, self._tool_pose = np.empty(12), np.empty(12)
         self._forget()
+        self._changed = False
+
+    @property
+    def command(self) -> np.ndarray:
+        """Strut commands last accepted, m; NaN before the first, the measured struts after a reset."""
+        return self._last.command
+
+    @property
+    def nominal(self) -> np.ndarray:
+        """Nominal strut lengths of the last command, m; NaN before the first."""
+        return self._last.nominal
+
+    @property
+    def correction(self) -> np.ndarray:
+        """Corrections of the last command, m; NaN before the first."""
+        return self._last.correction
+
+    @property
+    def motion(self) -> MotionState:
+        """Directions of motion after the last command."""
+        return self._last.motion
 
     @property
     def model(self) -> MachineModel:
@@ -136,12 +190,39 @@ class Compensator:
     @property
     def ramping(self) -> bool:
         """Whether a change has not been fully taken up yet."""
-        return bool(self._bump.any()) or self._changed
+        return bool(self._last.bump.any()) or self._changed
 
     def set_model(self, model: MachineModel) -> None:
         """Replace the model; the corrections ramp from the old one's to the new one's."""
-        self.machine = RealMachine(self.geometry, model, self.temperatures)
+        machine = RealMachine(self.geometry, model, self.temperatures)
+        before, after = self._followed(self.machine), self._followed(machine)
+        if before is not None and after is not None:
+            # The model's lengths jump, the struts do not: without this the jump would count as a motion,
+            # turn directions round, and a backlash would step when they turn back.
+            self.motion.low[:] += after - before
+        self._take_machine(machine)
         self._changed = True
+
+    def _followed(self, machine: RealMachine) -> np.ndarray | None:
+        """Return the nine values whose directions are followed, at the last command, under a machine's model.
+
+        None before the first command, and where the model's field cannot be undone: it is refused there.
+        """
+        if not np.isfinite(self._last.nominal).all():
+            return None
+        platform, motion = Pose(*self._last.platform), MotionState()
+        motion.copy_from(self.motion)
+        try:
+            _, model_pose, _ = machine.commands_for(platform, motion)
+        except NotConvergedError:
+            return None
+        point = platform.position + platform.rotation @ machine.model.field.probe
+        return np.concatenate([point, strut_lengths(machine.structure, model_pose)])
+
+    def _take_machine(self, machine: RealMachine) -> None:
+        self.machine = machine
+        self._machine_numbers = pack_machine(machine)
+        self._varied = (*machine.strut_arrays[1:], *machine.field_arrays[1:])
 
     def set_temperature(self, name: str, value: float) -> None:
         """Take a temperature reading, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
@@ -168,21 +249,20 @@ class Compensator:
         measured : array_like, shape (6,), optional
             Where the struts are, m: the next command may be at most one allowed step away from it.
         """
+        if measured is None:
+            self._forget()
+            return
+        measured = np.array(measured, dtype=float)
+        if measured.shape != (6,) or not np.isfinite(measured).all():
+            raise NotFiniteError("measured strut lengths must be six finite numbers, m", measured.tolist())
         self._forget()
-        if measured is not None:
-            measured = np.array(measured, dtype=float)
-            if measured.shape != (6,) or not np.isfinite(measured).all():
-                raise NotFiniteError("measured strut lengths must be six finite numbers, m", measured.tolist())
-            self._previous[1] = measured
+        self._last.command[:] = measured
 
     def _forget(self) -> None:
-        self.motion = MotionState()
-        self._previous = np.full((2, 6), math.nan)  # last nominal and compensated lengths
-        self._bump = np.zeros(6)
-        self._next_bump = np.zeros(6)
-        self._changed = False
+        home = self.geometry.home
+        self._last.clear()
+        self._model_pose[:3], self._model_pose[3:] = home.position, home.rotation.ravel()
         self._last_time = math.nan
-        self.command[:] = math.nan
 
     def step(
         self, position: np.ndarray, rotation: np.ndarray, time: float, frame: Pose | None = None
@@ -208,70 +288,78 @@ class Compensator:
         LimitError, KinematicsError, OutsideFieldError
             The command is refused and nothing has changed.
         """
-        geometry, tool, machine, limits = self.geometry, self._tool_inverse, self.machine, self.limits
-        frame = geometry.work if frame is None else frame
+        frame = self.geometry.work if frame is None else frame
         ramp = 0.0 if math.isnan(self._last_time) else min(time - self._last_time, LONGEST_RAMP_STEP)
-        status, finding, strut, stage = compensate_one(
+        upcoming = self._next
+        status, finding, strut, stage, value, condition = compensate_one(
             position,
             rotation,
             frame.position,
             frame.rotation,
-            tool.position,
-            tool.rotation,
-            geometry.kernel_joints[0],
-            geometry.kernel_joints[1],
-            machine.structure.base_joints,
-            machine.structure.platform_joints,
-            machine.axes[0],
-            machine.axes[1],
-            *machine.strut_arrays,
-            *machine.field_arrays,
-            machine.thresholds,
+            self._machine_numbers,
+            self._nominal_numbers,
+            *self._varied,
             1.0 if self.enabled else 0.0,
             self._changed,
             max(ramp, 0.0) * self.ramp_rate,
-            self.motion.low,
-            self.motion.sense,
-            self._next_motion.low,
-            self._next_motion.sense,
-            self.correction,
-            self._bump,
-            self._next_bump,
-            self._previous,
-            limits.stroke,
-            limits.cone_axes,
-            limits.cone_cosines,
-            limits.scalars,
-            self._platform[0],
-            self._platform[1],
-            self._model[0],
-            self._model[1],
-            self._next,
-            self._findings,
+            self._last.state,
+            upcoming.state,
+            upcoming.poses,
         )
         if status == UNSOLVED:
             raise NotConvergedError("the error field is too steep to be undone at this pose")
-        if status == OUTSIDE and machine.model.field.outside == "refuse":
-            raise self._outside_error()
+        if status == OUTSIDE and self.model.field.outside == "refuse":
+            raise self._outside_error(upcoming)
         if finding != WITHIN:
-            raise limits.error(finding, strut, stage, self._findings[0])
-        self._accept(time, status == OUTSIDE)
-        return self.command
+            raise self.limits.error(finding, strut, stage, value)
+        self._last, self._next = upcoming, self._last
+        self.condition, self.outside_field = condition, status == OUTSIDE
+        self._changed, self._last_time = False, time
+        return upcoming.command
 
-    def _accept(self, time: float, outside: bool) -> None:
-        """Make the command under way the last one."""
-        self.motion, self._next_motion = self._next_motion, self.motion
-        self._bump, self._next_bump = self._next_bump, self._bump
-        self.nominal[:], self.correction[:], self.command[:] = self._next
-        self._previous[0], self._previous[1] = self.nominal, self.command
-        self.condition = float(self._findings[1])
-        self.outside_field = outside
-        self._changed = False
-        self._last_time = time
+    def estimate(self, struts: np.ndarray) -> np.ndarray:
+        """Return where the tool is when the struts read `struts`, through the model.
 
-    def _outside_error(self) -> HexapodError:
+        Parameters
+        ----------
+        struts : ndarray, shape (6,)
+            Encoder readings, or commands, m.
+
+        Returns
+        -------
+        ndarray, shape (12,)
+            ``pose_tool_in_base``: position, m, then the rotation matrix by rows; this compensator's own
+            array, valid until the next call.
+
+        Raises
+        ------
+        KinematicsError
+            There is no such pose; the next estimate starts from the last good one.
+        """
+        tool = self.geometry.tool
+        outcome, condition = estimate_one(
+            struts,
+            self._last.state,
+            self._machine_numbers,
+            *self._varied,
+            tool.position,
+            tool.rotation,
+            self._model_pose,
+            self._tool_pose,
+        )
+        if outcome != kernels.OK:
+            raise forward_error(outcome, condition, self.geometry.limits.condition)
+        return self._tool_pose
+
+    @property
+    def platform_estimate(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position (3,) and rotation (3, 3) of the platform in ``base`` by the last estimate, field left out."""
+        return self._model_pose[:3], self._model_pose[3:].reshape((3, 3))
+
+    def _outside_error(self, command: _Command) -> HexapodError:
         box = self.model.field.box * 1e3
-        point = (self._platform[0] + self._platform[1] @ self.model.field.probe) * 1e3
+        position, rotation = command.platform
+        point = (position + rotation @ self.model.field.probe) * 1e3
         low, high = (", ".join(f"{v:g}" for v in corner) for corner in box)
         problem = f"the measured point ({point[0]:.3f}, {point[1]:.3f}, {point[2]:.3f}) mm is outside the field's box"
         return OutsideFieldError(f"{problem} ({low})…({high}) mm", point, box)
@@ -296,7 +384,7 @@ class Compensator:
 
     def record(self, tool_pose: Pose) -> Correction:
         """Return the record of the command just accepted for `tool_pose`."""
-        platform = Pose(*self._platform)
+        platform = Pose(*self._last.platform)
         box = self.model.valid_box
         outside_box = box is not None and bool(
             (platform.position < box[0]).any() or (platform.position > box[1]).any()
@@ -304,7 +392,7 @@ class Compensator:
         return Correction(
             tool_pose=tool_pose,
             platform_pose=platform,
-            model_pose=Pose(*self._model),
+            model_pose=Pose(*self._last.model),
             sense=self.motion.sense.copy(),
             temperatures=dict(self.temperatures.values),
             nominal=self.nominal.copy(),
@@ -321,9 +409,9 @@ class Compensator:
     def predicted_error(self) -> np.ndarray:
         """Return the tool error that nominal lengths would leave at the last command (see `Correction`)."""
         matrix, twist = np.empty((6, 6)), self._model_correction() * -1.0
-        kernels.jacobian_one(*self.geometry.kernel_joints, *self._platform, matrix)
+        kernels.jacobian_one(*self.geometry.kernel_joints, *self._last.platform, matrix)
         kernels.solve_six(matrix, twist)
-        lever = self._platform[1] @ self.geometry.tool.position
+        lever = self._last.platform[1] @ self.geometry.tool.position
         twist[:3] += np.cross(twist[3:], lever)
         return twist
 
@@ -331,7 +419,7 @@ class Compensator:
         """Return what the model would correct at the last command, ramp and switch left aside."""
         motion = MotionState()
         motion.copy_from(self.motion)
-        commands, _, _ = self.machine.commands_for(Pose(*self._platform), motion)
+        commands, _, _ = self.machine.commands_for(Pose(*self._last.platform), motion)
         return commands - self.nominal
 
     def platform_pose(self, tool_pose: Pose) -> Pose:
@@ -341,177 +429,3 @@ class Compensator:
     def tool_pose(self, platform_pose: Pose) -> Pose:
         """Return ``pose_tool_in_work`` for a ``pose_platform_in_base``."""
         return self.geometry.work.inverse() @ platform_pose @ self.geometry.tool
-
-
-@compiled
-def compose(p1, r1, p2, r2, position, rotation):
-    """Write the pose product (p1, r1) ∘ (p2, r2)."""
-    for i in range(3):
-        position[i] = p1[i] + r1[i, 0] * p2[0] + r1[i, 1] * p2[1] + r1[i, 2] * p2[2]
-        for j in range(3):
-            rotation[i, j] = r1[i, 0] * r2[0, j] + r1[i, 1] * r2[1, j] + r1[i, 2] * r2[2, j]
-
-
-@compiled
-def compensate_one(
-    position,
-    rotation,
-    frame_position,
-    frame_rotation,
-    tool_inverse_position,
-    tool_inverse_rotation,
-    nominal_base,
-    nominal_platform,
-    base,
-    platform,
-    base_axes,
-    platform_axes,
-    table,
-    knots,
-    pieces,
-    probe,
-    gx,
-    gy,
-    gz,
-    lx,
-    ly,
-    lz,
-    thresholds,
-    share,
-    changed,
-    ramp,
-    low,
-    sense,
-    next_low,
-    next_sense,
-    last_correction,
-    bump,
-    next_bump,
-    previous,
-    stroke,
-    cone_axes,
-    cone_cosines,
-    scalars,
-    platform_position,
-    platform_rotation,
-    model_position,
-    model_rotation,
-    result,
-    findings,
-):
-    """Run the whole chain for one command; return (status, finding, strut, stage).
-
-    Inputs stay as they are; `next_*`, the two poses, `result` (nominal, correction, command) and
-    `findings` (offending value, condition number) are written, and count only when nothing was found.
-    """
-    half_position, half_rotation = np.empty(3), np.empty((3, 3))
-    compose(frame_position, frame_rotation, position, rotation, half_position, half_rotation)
-    compose(
-        half_position,
-        half_rotation,
-        tool_inverse_position,
-        tool_inverse_rotation,
-        platform_position,
-        platform_rotation,
-    )
-    nominal, correction, command = result[0], result[1], result[2]
-    kernels.strut_lengths_one(nominal_base, nominal_platform, platform_position, platform_rotation, nominal)
-    finding, strut, value, condition = check_stage(
-        nominal_base,
-        nominal_platform,
-        platform_position,
-        platform_rotation,
-        nominal,
-        stroke,
-        cone_axes,
-        cone_cosines,
-        scalars,
-    )
-    findings[0], findings[1] = value, condition
-    if finding != WITHIN:
-        return SOLVED, finding, strut, 0
-    next_low[:] = low
-    next_sense[:] = sense
-    solved, outside = command_one(
-        platform_position,
-        platform_rotation,
-        thresholds,
-        next_low,
-        next_sense,
-        base,
-        platform,
-        base_axes,
-        platform_axes,
-        table,
-        knots,
-        pieces,
-        probe,
-        gx,
-        gy,
-        gz,
-        lx,
-        ly,
-        lz,
-        model_position,
-        model_rotation,
-        command,
-    )
-    if not solved:
-        return UNSOLVED, WITHIN, -1, 1
-    status = OUTSIDE if outside else SOLVED
-    for i in range(6):
-        correction[i] = share * (command[i] - nominal[i])
-    ramp_bump(correction, last_correction, previous, bump, next_bump, changed, ramp)
-    for i in range(6):
-        correction[i] += next_bump[i]
-        command[i] = nominal[i] + correction[i]
-    finding, strut, value, stage = check_command(
-        nominal, correction, command, previous, scalars
-    )
-    if finding == WITHIN:
-        stage = 1
-        finding, strut, value, _ = check_stage(
-            base,
-            platform,
-            model_position,
-            model_rotation,
-            command,
-            stroke,
-            cone_axes,
-            cone_cosines,
-            scalars,
-        )
-    findings[0] = value
-    return status, finding, strut, stage
-
-
-@compiled
-def check_command(nominal, correction, command, previous, scalars):
-    """Check correction and steps; return (finding, strut, value, stage)."""
-    for i in range(6):
-        if not abs(correction[i]) <= scalars[1]:
-            return CORRECTION, i, correction[i], 1
-    finding, strut, value = check_change(nominal, previous[0], scalars[2], STEP)
-    if finding != WITHIN:
-        return finding, strut, value, 0
-    finding, strut, value = check_change(command, previous[1], scalars[2], STEP)
-    return finding, strut, value, 1
-
-
-@compiled
-def ramp_bump(correction, last_correction, previous, bump, next_bump, changed, ramp):
-    """Write the part of the last correction that has not been given up yet.
-
-    When model, temperatures or enabling have changed since the last command, the bump takes up the whole
-    difference, so that the command does not move; it then shrinks in proportion, its largest element by at
-    most `ramp` metres a command.
-    """
-    largest = 0.0
-    for i in range(6):
-        next_bump[i] = bump[i]
-        if changed and not math.isnan(previous[0, i]):
-            next_bump[i] = last_correction[i] - correction[i]
-        largest = max(largest, abs(next_bump[i]))
-    keep = 0.0 if largest <= ramp else 1.0 - ramp / largest
-    for i in range(6):
-        next_bump[i] *= keep

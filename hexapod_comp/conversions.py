@@ -147,6 +147,18 @@ class StrutMessage:
         self.position = np.frombuffer(self.message.position, dtype=float)
         self.velocity = np.frombuffer(self.message.velocity, dtype=float)
 
+    def write(self, lengths: np.ndarray, period: float = 0.0) -> None:
+        """Write lengths, m, and as velocities their change since the last ones over `period` s; 0: at rest."""
+        write_lengths(lengths, period, self.position, self.velocity)
+
+
+@compiled
+def write_lengths(lengths, period, position, velocity):
+    """Write six lengths and their speeds in place."""
+    for i in range(6):
+        velocity[i] = (lengths[i] - position[i]) / period if period > 0.0 else 0.0
+        position[i] = lengths[i]
+
 
 class StrutReader:
     """Reads JointState messages of six struts, matched by name.

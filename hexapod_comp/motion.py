@@ -19,6 +19,8 @@ FOLLOWED = 9
 class MotionState:
     """Windows and directions of motion of the nine followed values.
 
+    Given arrays are used in place; without them the state is that before the first value.
+
     Attributes
     ----------
     low : ndarray, shape (9,)
@@ -29,9 +31,9 @@ class MotionState:
 
     __slots__ = ("low", "sense")
 
-    def __init__(self) -> None:
-        self.low = np.full(FOLLOWED, math.nan)
-        self.sense = np.zeros(FOLLOWED)
+    def __init__(self, low: np.ndarray | None = None, sense: np.ndarray | None = None) -> None:
+        self.low = np.full(FOLLOWED, math.nan) if low is None else low
+        self.sense = np.zeros(FOLLOWED) if sense is None else sense
 
     def copy_from(self, other: MotionState) -> None:
         """Take over the state of another."""

@@ -22,12 +22,10 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
-from .. import kernels
 from ..compensation import Compensator
 from ..conversions import PoseReader, StrutMessage, StrutReader, write_pose
 from ..errors import CommandError, HexapodError
 from ..geometry import HexapodGeometry, load_geometry
-from ..kinematics import forward_error
 from ..machine import MachineModel
 from ..model_file import load_model
 from ..paths import config_file
@@ -65,6 +63,9 @@ PARAMETERS = (
 CHECK_PERIOD = 0.05
 """How often the node looks whether its state has changed, s."""
 
+ESTIMATE_PERIOD = 0.02
+"""How often the pose is estimated from the node's own commands while there is no feedback, s."""
+
 FORGET_ORDER_AFTER = 1.0
 """After a pause this long, s, stamps may start again earlier: the sender or its clock was restarted."""
 
@@ -83,6 +84,8 @@ class CompensatorNode(MachineNode):
         self._reader, self._struts = PoseReader(), StrutReader()
         self._last_stamp = 0
         self._fresh_start = True
+        self._unestimated: Time | None = None
+        self._simulated_time = bool(self.get_parameter("use_sim_time").value)
         self._compensator: Compensator | None = None
 
     @property
@@ -101,10 +104,11 @@ class CompensatorNode(MachineNode):
         try:
             geometry = load_geometry(config_file(self._options["geometry_file"]))
             self._compensator = Compensator(geometry, self._load_model(geometry), self._options["ramp_rate"])
+            self._warm_up()
         except HexapodError as error:
+            self._compensator = None
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
-        self._warm_up()
         self._frames = {self._options["base_frame"]: Pose.identity(), self._options["work_frame"]: geometry.work}
         self._open_topics()
         name = f"{self.get_fully_qualified_name()[1:]}: {geometry.name}"
@@ -161,9 +165,9 @@ class CompensatorNode(MachineNode):
         write_pose(message, home.position, home.rotation)
         reader.read(message)
         compensator.step(reader.position, reader.rotation, 0.0)
-        self._guess = compensator.geometry.home.position.copy(), compensator.geometry.home.rotation.copy()
-        self._actual = np.empty(3), np.empty((3, 3))
-        compensator.machine.forward(compensator.command, compensator.motion.sense, *self._guess, *self._actual)
+        compensator.estimate(compensator.command)
+        StrutMessage().write(compensator.command)
+        write_pose(message, home.position, home.rotation)
         compensator.enable(self._options["enable_compensation"])
         compensator.reset()
 
@@ -191,7 +195,10 @@ class CompensatorNode(MachineNode):
             self.create_service(Trigger, "~/reload_model", self._on_reload),
             self.create_service(Trigger, "~/reset", self._on_reset),
         ]
-        self._timers_open = [self.create_timer(CHECK_PERIOD, self._check_state)]
+        self._timers_open = [
+            self.create_timer(CHECK_PERIOD, self._check_state),
+            self.create_timer(ESTIMATE_PERIOD, self._estimate_from_commands),
+        ]
         if self._options["marker_rate"] > 0.0:
             self._timers_open.append(self.create_timer(1.0 / self._options["marker_rate"], self._publish_markers))
 
@@ -230,25 +237,25 @@ class CompensatorNode(MachineNode):
             self._refuse(error, now)
             return
         self._fresh_start = False
+        self._last_stamp = _nanoseconds(message.header.stamp) or self._last_stamp
         self._publish_command(stamp, now - self._commands.last)
         self._commands.tick(now)
-        if self._feedback.age(now) > self._options["feedback_timeout"]:
-            self._publish_estimate(self.compensator.command, stamp)
+        self._unestimated = stamp
 
     def _checked_stamp(self, stamp: Time, now: float) -> Time:
         """Return the stamp to copy, or refuse one too old, too new or out of order; zero means now."""
-        nanoseconds = stamp.sec * 1_000_000_000 + stamp.nanosec
-        clock = self.get_clock().now()
+        nanoseconds = _nanoseconds(stamp)
         if nanoseconds == 0:
-            return clock.to_msg()
-        age = (clock.nanoseconds - nanoseconds) * 1e-9
+            return self.get_clock().now().to_msg()
+        # The node's clock is this one, and costs a dozen microseconds more, unless time is simulated.
+        clock = self.get_clock().now().nanoseconds if self._simulated_time else time.time_ns()
+        age = (clock - nanoseconds) * 1e-9
         allowed = self._options["max_command_age"]
         if 0.0 < allowed < abs(age):
             reason, word = ("stamp_past", "old") if age > 0.0 else ("stamp_future", "in the future")
             raise CommandError(reason, f"stamp is {abs(age):.3f} s {word}, allowed {allowed:g} s")
         if nanoseconds < self._last_stamp and self._commands.age(now) < FORGET_ORDER_AFTER:
             raise CommandError("stamp_order", "stamp is earlier than the last command's")
-        self._last_stamp = nanoseconds
         return stamp
 
     def _frame(self, frame_id: str) -> Pose:
@@ -266,17 +273,18 @@ class CompensatorNode(MachineNode):
             self.compensator.reset(self._struts.lengths if fresh else None)
 
     def _on_states(self, message: JointState) -> None:
-        if not self._active:
-            return
+        # Also while inactive: the first command after activation must start from where the struts are.
         now = time.monotonic()
         try:
             self._struts.read(message)
         except CommandError as error:
-            self._feedback_refusals.add(error.reason, str(error), now)
-            self._log("feedback " + error.reason, f"strut_states ignored: {error}")
+            if self._active:
+                self._feedback_refusals.add(error.reason, str(error), now)
+                self._log("feedback " + error.reason, f"strut_states ignored: {error}")
             return
         self._feedback.tick(now)
-        self._publish_estimate(self._struts.lengths, message.header.stamp)
+        if self._active:
+            self._publish_estimate(self._struts.lengths, message.header.stamp)
 
     def _on_temperature(self, message: Temperature) -> None:
         if not self._active:
@@ -314,12 +322,10 @@ class CompensatorNode(MachineNode):
 
     def _publish_command(self, stamp: Time, since_last: float) -> None:
         out, correction, compensator = self._command_out, self._correction_out, self.compensator
-        np.subtract(compensator.command, out.position, out=out.velocity)
-        out.velocity *= 1.0 / since_last if since_last < FORGET_ORDER_AFTER else 0.0
-        out.position[:] = compensator.command
+        out.write(compensator.command, since_last if since_last < FORGET_ORDER_AFTER else 0.0)
         out.message.header.stamp = stamp
         self._command_pub.publish(out.message)
-        correction.position[:] = compensator.correction
+        correction.write(compensator.correction)
         correction.message.header.stamp = stamp
         self._correction_pub.publish(correction.message)
         if self._array_pub is not None:
@@ -327,34 +333,38 @@ class CompensatorNode(MachineNode):
             self._array_pub.publish(self._array_out)
 
     def _publish_estimate(self, struts: np.ndarray, stamp: Time) -> None:
-        compensator = self.compensator
-        outcome, _, condition, _ = compensator.machine.forward(
-            struts, compensator.motion.sense, *self._guess, *self._actual
-        )
-        if outcome != kernels.OK:
-            error = forward_error(outcome, condition, compensator.geometry.limits.condition)
+        try:
+            pose = self.compensator.estimate(struts)
+        except HexapodError as error:
             self._feedback_refusals.add(error.reason, str(error), time.monotonic())
             self._log("estimate " + error.reason, f"no pose estimate: {error}")
             return
-        tool = compensator.geometry.tool
-        position = self._actual[0] + self._actual[1] @ tool.position
-        write_pose(self._estimate_out, position, self._actual[1] @ tool.rotation)
+        write_pose(self._estimate_out, pose[:3], pose[3:].reshape((3, 3)))
         self._estimate_out.header.stamp = stamp
         self._estimate_pub.publish(self._estimate_out)
+
+    def _estimate_from_commands(self) -> None:
+        """Without feedback, estimate the pose from the newest command, at a rate that leaves the loop alone."""
+        stamp, self._unestimated = self._unestimated, None
+        if stamp is None or not self._active:
+            return
+        if self._feedback.age(time.monotonic()) > self._options["feedback_timeout"]:
+            self._publish_estimate(self.compensator.command, stamp)
 
     def _publish_markers(self) -> None:
         if not self._active or not self._marker_pub.get_subscription_count():
             return
         now = self.get_clock().now().to_msg()
         correction = np.zeros(6) if self._fresh_start else self.compensator.correction
-        frame = self._options["base_frame"]
-        markers = machine_markers(self.compensator.geometry, *self._guess, correction, frame, now)
+        frame, pose = self._options["base_frame"], self.compensator.platform_estimate
+        markers = machine_markers(self.compensator.geometry, *pose, correction, frame, now)
         self._marker_pub.publish(markers)
 
     # ---- state ----
 
     def _forget(self) -> None:
         self.compensator.reset()
+        self._unestimated = None
         self._fresh_start = True
         self._last_stamp = 0
 
@@ -417,6 +427,10 @@ class CompensatorNode(MachineNode):
         values.update({f"temperature.{k}_degC": f"{v:.2f}" for k, v in compensator.temperatures.values.items()})
         values.update(self._refusals.values())
         return values
+
+
+def _nanoseconds(stamp: Time) -> int:
+    return stamp.sec * 1_000_000_000 + stamp.nanosec
 
 
 def main(argv: Sequence[str] | None = None) -> int:

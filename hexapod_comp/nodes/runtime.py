@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
+import gc
 import os
 import signal
 import sys
@@ -133,21 +135,24 @@ def _warn_of_strangers(node: LifecycleNode) -> None:
 
 
 class MachineNode(LifecycleNode):
-    """What the package's lifecycle nodes have in common: topics whose QoS a user may override by parameters."""
+    """What the package's lifecycle nodes have in common: topics whose QoS a user may override by parameters.
+
+    rclpy writes the overrides into the profile that it is given, so every topic gets a copy of its own.
+    """
 
     wants_autostart = True
 
     def publish_on(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
         """Return a publisher."""
         options = QoSOverridingOptions.with_default_policies()
-        return self.create_publisher(message_type, topic, qos, qos_overriding_options=options)
+        return self.create_publisher(message_type, topic, copy.copy(qos), qos_overriding_options=options)
 
     def listen_to(
         self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
     ) -> Subscription:
         """Return a subscription."""
         options = QoSOverridingOptions.with_default_policies()
-        return self.create_subscription(message_type, topic, callback, qos, qos_overriding_options=options)
+        return self.create_subscription(message_type, topic, callback, copy.copy(qos), qos_overriding_options=options)
 
     def say_goodbye(self) -> None:
         """Publish what must still be said before the node ends."""
@@ -213,6 +218,9 @@ def run(make_node: Callable[[], MachineNode], argv: Sequence[str] | None = None)
     try:
         if node.wants_autostart and not autostart(node):
             return 1
+        # What is loaded by now stays; the collector need not look at it again while the machine moves.
+        gc.collect()
+        gc.freeze()
         while not stop.is_set() and rclpy.ok():
             executor.spin_once(timeout_sec=SPIN_PERIOD)
         node.say_goodbye()

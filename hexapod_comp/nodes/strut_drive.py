@@ -114,6 +114,7 @@ class StrutDriveNode(MachineNode):
             self.drive.advance(1.0 / options["rate"])
             self._tool_in_base()
         except HexapodError as error:
+            self._drive = None
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
         self._open_topics()

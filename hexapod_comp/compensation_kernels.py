@@ -1,0 +1,291 @@
+"""Compiled steps of the compensator's loop.
+
+Handing an array to a compiled function costs more than most of what is computed with it, so everything
+that stays the same between two commands travels in two vectors, and everything that changes in a third.
+Each vector is packed and taken apart by two functions that stand side by side here.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from . import kernels
+from .compiling import compiled
+from .geometry import HexapodGeometry
+from .limits import CORRECTION as CORRECTION_FOUND
+from .limits import STEP, WITHIN, LimitTable, check_change, check_stage
+from .machine import RealMachine, actual_pose_one, command_one
+from .pose import Pose
+from .struts import PARAMETERS
+
+SOLVED, UNSOLVED, OUTSIDE = range(3)
+"""How undoing the field went: solved, not solved, solved with the boundary's value held."""
+
+LOW, SENSE, NOMINAL, CORRECTION, COMMAND, BUMP, STATE_SIZE = 0, 9, 18, 24, 30, 36, 42
+"""Where the parts of a state begin: motion windows and directions (9 each), then six struts each."""
+
+TABLE_END = 72 + 6 * PARAMETERS
+
+
+def pack_machine(machine: RealMachine) -> np.ndarray:
+    """Return what :func:`machine_views` takes apart."""
+    structure = machine.structure
+    solver = [structure.characteristic_length, structure.home_sign, structure.max_condition]
+    parts = (
+        structure.base_joints,
+        structure.platform_joints,
+        *machine.axes,
+        machine.strut_arrays[0],
+        machine.model.field.probe,
+        machine.thresholds,
+        np.array(solver),
+    )
+    return np.concatenate([np.ravel(part) for part in parts])
+
+
+@compiled
+def machine_views(numbers):
+    """Return base, platform, both cardan axes, strut table, probe, thresholds, solver's scalars."""
+    end = TABLE_END
+    return (
+        numbers[:18].reshape((6, 3)),
+        numbers[18:36].reshape((6, 3)),
+        numbers[36:54].reshape((6, 3)),
+        numbers[54:72].reshape((6, 3)),
+        numbers[72:end].reshape((6, PARAMETERS)),
+        numbers[end : end + 3],
+        numbers[end + 3 : end + 5],
+        numbers[end + 5 : end + 8],
+    )
+
+
+def pack_nominal(geometry: HexapodGeometry, tool_inverse: Pose, limits: LimitTable) -> np.ndarray:
+    """Return what :func:`nominal_views` takes apart."""
+    parts = (
+        *geometry.kernel_joints,
+        tool_inverse.position,
+        tool_inverse.rotation,
+        limits.stroke,
+        limits.cone_axes,
+        limits.cone_cosines,
+        limits.scalars,
+    )
+    return np.concatenate([np.ravel(part) for part in parts])
+
+
+@compiled
+def nominal_views(numbers):
+    """Return base, platform, tool inverse (position over rotation), stroke, cone axes and cosines, scalars."""
+    return (
+        numbers[:18].reshape((6, 3)),
+        numbers[18:36].reshape((6, 3)),
+        numbers[36:48].reshape((4, 3)),
+        numbers[48:60].reshape((6, 2)),
+        numbers[60:96].reshape((2, 6, 3)),
+        numbers[96:108].reshape((2, 6)),
+        numbers[108:113],
+    )
+
+
+@compiled
+def pose_views(poses):
+    """Return positions and rotations of the two poses, (24,), that a command leaves behind."""
+    return poses[:3], poses[3:12].reshape((3, 3)), poses[12:15], poses[15:].reshape((3, 3))
+
+
+@compiled
+def compose(p1, r1, p2, r2, position, rotation):
+    """Write the pose product (p1, r1) ∘ (p2, r2)."""
+    for i in range(3):
+        position[i] = p1[i] + r1[i, 0] * p2[0] + r1[i, 1] * p2[1] + r1[i, 2] * p2[2]
+        for j in range(3):
+            rotation[i, j] = r1[i, 0] * r2[0, j] + r1[i, 1] * r2[1, j] + r1[i, 2] * r2[2, j]
+
+
+@compiled
+def compensate_one(
+    position,
+    rotation,
+    frame_position,
+    frame_rotation,
+    machine_numbers,
+    nominal_numbers,
+    knots,
+    pieces,
+    gx,
+    gy,
+    gz,
+    lx,
+    ly,
+    lz,
+    share,
+    changed,
+    ramp,
+    state,
+    next_state,
+    poses,
+):
+    """Run the whole chain for one command; return (status, finding, strut, stage, value, condition number).
+
+    `state` stays as it is; `next_state` and `poses` (platform pose, model pose) are written, and count only
+    when nothing was found.
+    """
+    base, platform, base_axes, platform_axes, table, probe, thresholds, _ = machine_views(machine_numbers)
+    nominal_base, nominal_platform, tool, stroke, cone_axes, cone_cosines, scalars = nominal_views(nominal_numbers)
+    platform_position, platform_rotation, model_position, model_rotation = pose_views(poses)
+    half_position, half_rotation = np.empty(3), np.empty((3, 3))
+    compose(frame_position, frame_rotation, position, rotation, half_position, half_rotation)
+    compose(half_position, half_rotation, tool[0], tool[1:], platform_position, platform_rotation)
+    nominal, correction = next_state[NOMINAL:CORRECTION], next_state[CORRECTION:COMMAND]
+    command = next_state[COMMAND:BUMP]
+    kernels.strut_lengths_one(nominal_base, nominal_platform, platform_position, platform_rotation, nominal)
+    finding, strut, value, condition = check_stage(
+        nominal_base,
+        nominal_platform,
+        platform_position,
+        platform_rotation,
+        nominal,
+        stroke,
+        cone_axes,
+        cone_cosines,
+        scalars,
+    )
+    if finding != WITHIN:
+        return SOLVED, finding, strut, 0, value, condition
+    next_state[:NOMINAL] = state[:NOMINAL]
+    solved, outside = command_one(
+        platform_position,
+        platform_rotation,
+        thresholds,
+        next_state[LOW:SENSE],
+        next_state[SENSE:NOMINAL],
+        base,
+        platform,
+        base_axes,
+        platform_axes,
+        table,
+        knots,
+        pieces,
+        probe,
+        gx,
+        gy,
+        gz,
+        lx,
+        ly,
+        lz,
+        model_position,
+        model_rotation,
+        command,
+    )
+    if not solved:
+        return UNSOLVED, WITHIN, -1, 1, math.nan, condition
+    for i in range(6):
+        correction[i] = share * (command[i] - nominal[i])
+    ramp_bump(correction, state, next_state[BUMP:], changed, ramp)
+    for i in range(6):
+        correction[i] += next_state[BUMP + i]
+        command[i] = nominal[i] + correction[i]
+    finding, strut, value, stage = check_command(nominal, correction, command, state, scalars)
+    if finding == WITHIN:
+        stage = 1
+        finding, strut, value, _ = check_stage(
+            base,
+            platform,
+            model_position,
+            model_rotation,
+            command,
+            stroke,
+            cone_axes,
+            cone_cosines,
+            scalars,
+        )
+    return OUTSIDE if outside else SOLVED, finding, strut, stage, value, condition
+
+
+@compiled
+def check_command(nominal, correction, command, state, scalars):
+    """Check correction and steps; return (finding, strut, value, stage)."""
+    for i in range(6):
+        if not abs(correction[i]) <= scalars[1]:
+            return CORRECTION_FOUND, i, correction[i], 1
+    finding, strut, value = check_change(nominal, state[NOMINAL:CORRECTION], scalars[2], STEP)
+    if finding != WITHIN:
+        return finding, strut, value, 0
+    finding, strut, value = check_change(command, state[COMMAND:BUMP], scalars[2], STEP)
+    return finding, strut, value, 1
+
+
+@compiled
+def ramp_bump(correction, state, next_bump, changed, ramp):
+    """Write the part of the last correction that has not been given up yet.
+
+    When model, temperatures or enabling have changed since the last command, the bump takes up the whole
+    difference, so that the command does not move; it then shrinks in proportion, its largest element by at
+    most `ramp` metres a command.
+    """
+    largest = 0.0
+    for i in range(6):
+        next_bump[i] = state[BUMP + i]
+        if changed and not math.isnan(state[NOMINAL + i]):
+            next_bump[i] = state[CORRECTION + i] - correction[i]
+        largest = max(largest, abs(next_bump[i]))
+    keep = 0.0 if largest <= ramp else 1.0 - ramp / largest
+    for i in range(6):
+        next_bump[i] *= keep
+
+
+@compiled
+def estimate_one(
+    struts,
+    state,
+    machine_numbers,
+    knots,
+    pieces,
+    gx,
+    gy,
+    gz,
+    lx,
+    ly,
+    lz,
+    tool_position,
+    tool_rotation,
+    model_pose,
+    tool_pose,
+):
+    """Run the model forwards and write the tool pose in ``base``; return (outcome, condition number).
+
+    `model_pose` (12,) is the guess and, when the outcome is OK, becomes the solution; `tool_pose` (12,)
+    is then written: position, rotation matrix by rows.
+    """
+    base, platform, base_axes, platform_axes, table, probe, _, solver = machine_views(machine_numbers)
+    position, rotation = np.empty(3), np.empty((3, 3))
+    outcome, _, condition, _ = actual_pose_one(
+        struts,
+        state[SENSE:NOMINAL],
+        base,
+        platform,
+        base_axes,
+        platform_axes,
+        table,
+        knots,
+        pieces,
+        probe,
+        gx,
+        gy,
+        gz,
+        lx,
+        ly,
+        lz,
+        solver[0],
+        solver[1],
+        solver[2],
+        model_pose[:3],
+        model_pose[3:].reshape((3, 3)),
+        position,
+        rotation,
+    )
+    if outcome == kernels.OK:
+        compose(position, rotation, tool_position, tool_rotation, tool_pose[:3], tool_pose[3:].reshape((3, 3)))
+    return outcome, condition
