@@ -19,6 +19,9 @@ from .trajectory import Path, circle, join, move, pocket
 RATES = (1.0, 1000.0)
 """Commands per second that make sense over DDS from Python, Hz."""
 
+DEMO_FEED = 0.02
+"""Tool speed of the demo's path, m/s: the simulated drives follow it without reaching their acceleration."""
+
 
 def checked_rate(rate: float) -> float:
     """Return a command rate, Hz, or refuse it."""
@@ -28,12 +31,13 @@ def checked_rate(rate: float) -> float:
 
 
 def demo_path(geometry: HexapodGeometry, rate: float) -> Path:
-    """Return the demo's milling path about home: a circle of 40 mm, then a zigzag pocket of 40 × 12 mm."""
+    """Return the demo's milling path about home: a circle of 24 mm, then a zigzag pocket of 24 × 8 mm."""
     home = geometry.work.inverse() @ geometry.home @ geometry.tool
-    ring = circle(home, radius=0.02, feed=0.03, rate=rate)
-    corner = home @ Pose(np.array([-0.02, -0.006, 0.0]), np.eye(3))
-    rows = pocket(geometry, corner, (0.04, 0.012), pitch=0.004, feed=0.03, rate=rate)
-    return join([ring, move(geometry, ring.pose(len(ring) - 1), corner, rate, feed=0.03), rows])
+    ring = circle(home, radius=0.012, feed=DEMO_FEED, rate=rate)
+    corner = home @ Pose(np.array([-0.012, -0.004, 0.0]), np.eye(3))
+    rows = pocket(geometry, corner, (0.024, 0.008), pitch=0.004, feed=DEMO_FEED, rate=rate)
+    to_corner = move(geometry, ring.pose(len(ring) - 1), corner, rate, DEMO_FEED)
+    return join([ring, to_corner, rows])
 
 
 def simulated(
@@ -111,7 +115,9 @@ def complaints(result: SessionResult, bar: float | None) -> list[str]:
     pairs = [record.errors() for record in result.poses]
     errors = {"poses": ([p[0][0] for p in pairs if p[0]], [p[1][0] for p in pairs if p[1]])}
     if result.path is not None:
-        errors["path"] = (list(result.path.deviation_without), list(result.path.deviation_with))
+        tracks = (result.path.without, result.path.compensated)
+        before, after = ([] if track is None else track.deviation.tolist() for track in tracks)
+        errors["path"] = (before, after)
     for name, (before, after) in errors.items():
         if not before or not after:
             found.append(f"{name}: the true tool pose was not seen")

@@ -9,8 +9,8 @@ import numpy as np
 from .pose import Pose, rotation_angle
 from .trajectory import Path
 
-TRACK_WINDOW = 40
-"""How many commands ahead and behind its last place the tool is looked for on the path."""
+TRACK_WINDOW = 25
+"""How many commands the tool may lag behind the newest one; at 250 Hz a tenth of a second."""
 
 
 @dataclass
@@ -42,6 +42,27 @@ class PoseRecord:
 
 
 @dataclass
+class Track:
+    """Where the tool really went along a path.
+
+    Attributes
+    ----------
+    positions : ndarray, shape (n, 3)
+        True tool positions on the way, m.
+    feet : ndarray, shape (n, 3)
+        The nearest point of the commanded path to each, m: a late tool is no contour error.
+    """
+
+    positions: np.ndarray
+    feet: np.ndarray
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """Distances to the path, shape (n,), m."""
+        return np.linalg.norm(self.positions - self.feet, axis=1)
+
+
+@dataclass
 class PathRecord:
     """What happened along a path.
 
@@ -49,19 +70,15 @@ class PathRecord:
     ----------
     path : Path
         Commanded poses in ``base``.
-    track_without, track_with : ndarray, shape (n, 3)
-        True tool positions on the way, m.
-    deviation_without, deviation_with : ndarray, shape (n,)
-        Their distances to the commanded path, m: a late tool is no contour error.
+    without, compensated : Track or None
+        The two passes; None where there was none, or nobody to tell where the tool was.
     corrections : ndarray, shape (N, 6)
         Corrections sent, m.
     """
 
     path: Path
-    track_without: np.ndarray
-    track_with: np.ndarray
-    deviation_without: np.ndarray
-    deviation_with: np.ndarray
+    without: Track | None
+    compensated: Track | None
     corrections: np.ndarray
 
 
@@ -103,21 +120,27 @@ def pose_error(target: Pose, actual: Pose | None) -> tuple[float, float] | None:
     return distance, rotation_angle(target.rotation.T @ actual.rotation)
 
 
-def path_deviation(path: Path, track: np.ndarray) -> np.ndarray:
-    """Return the distance of each true position to the commanded polyline, shape (n,), m.
+def track_along(path: Path, positions: np.ndarray, sent: np.ndarray) -> Track | None:
+    """Return true positions with their feet on the commanded polyline.
 
-    The track is followed along the path, so that a place where the path crosses itself is not taken for
-    the wrong pass.
+    Parameters
+    ----------
+    path : Path
+        Commanded poses.
+    positions : ndarray, shape (n, 3)
+        True tool positions, m.
+    sent : ndarray of int, shape (n,)
+        How many poses of the path had been sent when each was seen. Only what was commanded within the
+        last :data:`TRACK_WINDOW` poses counts, so that a path that crosses itself is not mistaken.
     """
+    if not len(positions):
+        return None
     start, along = path.positions[:-1], np.diff(path.positions, axis=0)
     square = np.maximum((along**2).sum(axis=1), 1e-30)
-    deviation = np.empty(len(track))
-    at = 0
-    for n, point in enumerate(track):
-        near = slice(max(0, at - TRACK_WINDOW), at + TRACK_WINDOW)
+    feet = np.empty_like(positions)
+    for n, (point, count) in enumerate(zip(positions, sent, strict=True)):
+        near = slice(max(0, min(count, len(start)) - TRACK_WINDOW), max(1, min(count, len(start))))
         share = np.clip(((point - start[near]) * along[near]).sum(axis=1) / square[near], 0.0, 1.0)
-        distance = np.linalg.norm(point - (start[near] + share[:, None] * along[near]), axis=1)
-        nearest = int(distance.argmin())
-        deviation[n] = distance[nearest]
-        at = near.start + nearest
-    return deviation
+        candidates = start[near] + share[:, None] * along[near]
+        feet[n] = candidates[np.linalg.norm(point - candidates, axis=1).argmin()]
+    return Track(positions, feet)

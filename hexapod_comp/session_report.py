@@ -48,8 +48,10 @@ def _error_lines(result: SessionResult) -> Iterator[str]:
             np.array([before[0] for before, _ in pairs if before is not None]),
             np.array([after[0] for _, after in pairs if after is not None]),
         )
-    if result.path is not None and len(result.path.deviation_with):
-        yield _comparison(path_title(result.path), result.path.deviation_without, result.path.deviation_with)
+    path = result.path
+    if path is not None and path.compensated is not None:
+        before = np.zeros(0) if path.without is None else path.without.deviation
+        yield _comparison(path_title(path), before, path.compensated.deviation)
 
 
 def path_title(path: PathRecord) -> str:

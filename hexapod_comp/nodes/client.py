@@ -73,7 +73,8 @@ class LoopClient:
         self._message = pose_message(Pose.identity(), frame_id)
         self._commands, self._corrections = StrutReader(), StrutReader()
         self.sent: dict[int, Sent] = {}
-        self.track: list[np.ndarray] | None = None
+        self.track: list[tuple[np.ndarray, int]] = []
+        self._streamed: int | None = None
         self.diagnostics: dict[str, str] = {}
         self._true: PoseStamped | None = None
         self._estimate: PoseStamped | None = None
@@ -109,9 +110,9 @@ class LoopClient:
     def _on_true(self, message: PoseStamped) -> None:
         self._true = message
         self.true_count += 1
-        if self.track is not None:
+        if self._streamed is not None:
             p = message.pose.position
-            self.track.append(np.array([p.x, p.y, p.z]))
+            self.track.append((np.array([p.x, p.y, p.z]), self._streamed))
 
     def _on_estimate(self, message: PoseStamped) -> None:
         self._estimate = message
@@ -207,7 +208,7 @@ class LoopClient:
         self.spin_until(lambda: _answered(entry), timeout, "the answer to a command: lost or refused")
 
     def stream(self, path: Path, each: Callable[[int], None] | None = None) -> list[Sent]:
-        """Send a path at its rate and return the records.
+        """Send a path at its rate and return the records; :attr:`track` then holds where the tool went.
 
         A command waits for the answer to the one before, so that a stall of any process delays the path
         instead of making it jump.
@@ -220,6 +221,7 @@ class LoopClient:
             Called with the index after every pose sent.
         """
         entries: list[Sent] = []
+        self.track = []
         messages = [pose_message(path.pose(n), self._message.header.frame_id) for n in range(len(path))]
         due = time.monotonic()
         for index, message in enumerate(messages):
@@ -228,10 +230,12 @@ class LoopClient:
             if entries:
                 self._await(entries[-1])
             entries.append(self._send(message))
+            self._streamed = len(entries)
             if each is not None:
                 each(index)
             due = max(due + 1.0 / path.rate, time.monotonic() - 1.0 / path.rate)
         self._await(entries[-1])
+        self._streamed = None
         return entries
 
     def _await(self, entry: Sent) -> None:

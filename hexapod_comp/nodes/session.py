@@ -13,7 +13,7 @@ from ..errors import HexapodError
 from ..geometry import HexapodGeometry
 from ..machine import MachineModel, RealMachine
 from ..pose import Pose
-from ..session_records import PathRecord, PoseRecord, SessionResult, path_deviation
+from ..session_records import PathRecord, PoseRecord, SessionResult, Track, track_along
 from ..simulation import StrutDrive
 from ..trajectory import Path, move
 from .client import LoopClient, NoAnswerError, Sent
@@ -124,15 +124,15 @@ class Session:
             else:
                 record.true_without = true
 
-    def mill(self, path: Path) -> tuple[np.ndarray, np.ndarray]:
-        """Run a path; return the true track, shape (n, 3), and the corrections sent, shape (N, 6)."""
+    def mill(self, path: Path) -> tuple[Track | None, np.ndarray]:
+        """Run a path; return the true track and the corrections sent, shape (N, 6)."""
         self.go(path.pose(0))
         self.rest()
-        self._client.track = []
         answers = self._stream(path)
         self._at = path.pose(len(path) - 1)
-        self.rest()
-        track, self._client.track = np.array(self._client.track), None
+        positions = np.array([position for position, _ in self._client.track])
+        sent = np.array([count for _, count in self._client.track])
+        track = track_along(path, positions, sent)
         return track, np.array([answer.correction for answer in answers])
 
     def _stream(self, path: Path) -> list[Sent]:
@@ -196,7 +196,7 @@ def run_session(
     """
     session = Session(client, geometry, rate, progress)
     records = [PoseRecord(target) for target in targets]
-    track_without = np.zeros((0, 3))
+    track_without = None
     if compare:
         session.enable(False)
         session.visit(records, compensated=False)
@@ -208,14 +208,7 @@ def run_session(
     result = SessionResult(records)
     if path is not None:
         track_with, corrections = session.mill(path)
-        result.path = PathRecord(
-            path,
-            track_without,
-            track_with,
-            path_deviation(path, track_without),
-            path_deviation(path, track_with),
-            corrections,
-        )
+        result.path = PathRecord(path, track_without, track_with, corrections)
     result.latencies = session.latencies()
     _count(client, result)
     return result
