@@ -120,7 +120,14 @@ def assess(
     return Assessment(seeds, ideal, real, positions, rotations, errors, trips)
 
 
-def _run_machine(geometry, model: MachineModel, poses, platform, ideal, names) -> tuple[np.ndarray, ...]:
+def _run_machine(
+    geometry: HexapodGeometry,
+    model: MachineModel,
+    poses: Sequence[Pose],
+    platform: Sequence[Pose],
+    ideal: np.ndarray,
+    names: Sequence[str],
+) -> tuple[np.ndarray, ...]:
     """Return real lengths, taken positions and rotations, pose errors and round trips of one machine."""
     machine = RealMachine(geometry, model)
     rows = []

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from . import limits as codes
+from .compiling import compiled
 from .errors import (
     GeometryError,
     HexapodError,
@@ -21,7 +22,7 @@ from .errors import (
     OutsideFieldError,
 )
 from .geometry import STRUT_NAMES, HexapodGeometry
-from .kernels import compiled, condition_one, strut_lengths_one
+from .kernels import condition_one, strut_lengths_one
 from .limits import STAGES, LimitTable, joint_cosines
 from .machine import MachineModel, RealMachine, command_one
 from .motion import MotionState
@@ -218,7 +219,7 @@ class _Worst:
             self.share[into, stage] = share[first]
         self._take_broken(margin, value, owner, share)
 
-    def _take_broken(self, margin, value, owner, share) -> None:
+    def _take_broken(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
         pose, stage, strut = np.nonzero(margin < 0.0)
         # The worst of each row and strut first; of equals the nominal stage.
         order = np.lexsort((stage, margin[pose, stage, strut], strut, owner[pose]))
@@ -250,14 +251,16 @@ class _Run:
         self.motion = MotionState()
         self.previous = np.full((1, 2, 6), np.nan)
 
-    def check_rows(self, positions, rotations, stream: bool, progress: Callable[[int], object]) -> None:
+    def check_rows(
+        self, positions: np.ndarray, rotations: np.ndarray, stream: bool, progress: Callable[[int], object]
+    ) -> None:
         """Check the rows themselves, as consecutive commands or each for itself."""
         for start in range(0, self.count, CHUNK):
             owner = np.arange(start, min(start + CHUNK, self.count))
             self.take(positions[owner], rotations[owner], owner, np.ones(len(owner)), stream)
             progress(len(owner))
 
-    def check_moves(self, positions, rotations, progress: Callable[[int], object]) -> None:
+    def check_moves(self, positions: np.ndarray, rotations: np.ndarray, progress: Callable[[int], object]) -> None:
         """Check the rows, then the moves between those that are within their limits."""
         self.check_rows(positions, rotations, False, lambda rows: None)
         bad = np.zeros(self.count, dtype=bool)
@@ -272,7 +275,7 @@ class _Run:
                     self._take_moves(positions, rotations, rows[legs[0] : legs[-1] + 2])
             progress(len(rows) - 1)
 
-    def _take_moves(self, positions, rotations, rows: np.ndarray) -> None:
+    def _take_moves(self, positions: np.ndarray, rotations: np.ndarray, rows: np.ndarray) -> None:
         """Check the moves that join consecutive rows."""
         if rows[0] == 0 or self.unchecked[rows[0]]:
             self._start()
@@ -285,8 +288,15 @@ class _Run:
             part = slice(start, start + CHUNK)
             self.take(path.positions[part], path.rotations[part], owner[part], share[part], True)
 
-    def take(self, positions, rotations, owner: np.ndarray, share: np.ndarray, in_sequence: bool) -> None:
-        """Examine tool poses, (n, …), that belong to the rows `owner`; `in_sequence` after the ones before."""
+    def take(
+        self,
+        positions: np.ndarray,
+        rotations: np.ndarray,
+        owner: np.ndarray,
+        share: np.ndarray,
+        in_sequence: bool,
+    ) -> None:
+        """Examine tool poses, (n, …), of the rows `owner`; `in_sequence`: after the ones before."""
         values, flags = self._examine(*platform_poses(self.geometry, positions, rotations), in_sequence)
         lengths = values[:, :, :6]
         at_rows = share == 1.0
@@ -302,7 +312,9 @@ class _Run:
         for name, (margin, value) in measured.items():
             self.worst[name].take(margin, value, owner, share)
 
-    def _examine(self, positions, rotations, in_sequence: bool) -> tuple[np.ndarray, np.ndarray]:
+    def _examine(
+        self, positions: np.ndarray, rotations: np.ndarray, in_sequence: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
         machine, geometry = self.machine, self.geometry
         values = np.empty((len(positions), 2, QUANTITIES))
         flags = np.empty(len(positions), np.int64)
@@ -398,9 +410,7 @@ class _Run:
         if name == "not_converged":
             return NotConvergedError("the error field is too steep to be undone at this pose")
         if name == "outside_field":
-            return OutsideFieldError(
-                "the measured point is outside the field's box, and the model refuses that"
-            )
+            return OutsideFieldError("the measured point is outside the field's box, and the model refuses that")
         if not np.isfinite(value) and name != "condition":
             return NotFiniteError(f"{STRUT_NAMES[strut]}: {name} cannot be computed, the pose is degenerate")
         if name == "speed":
@@ -424,7 +434,7 @@ def examine_many(
     nominal_platform,
     cone_axes,
     characteristic_length,
-    threshold,
+    thresholds,
     low,
     sense,
     base,
@@ -460,7 +470,7 @@ def examine_many(
         solved, outside = command_one(
             position,
             rotation,
-            threshold,
+            thresholds,
             low,
             sense,
             base,

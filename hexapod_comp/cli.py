@@ -79,9 +79,7 @@ class _Version(argparse.Action):
         from .files import read_text
         from .paths import config_folder
 
-        found = re.search(
-            r"<version>\s*(.*?)\s*</version>", read_text(config_folder().parent / "package.xml")
-        )
+        found = re.search(r"<version>\s*(.*?)\s*</version>", read_text(config_folder().parent / "package.xml"))
         print(f"{PROGRAM} {found.group(1) if found else 'of unknown version'}")
         parser.exit()
 

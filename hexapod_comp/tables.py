@@ -75,18 +75,14 @@ class _Table:
             return None
         for name, entry in zip(names, found, strict=True):
             if entry is None:
-                raise InputFileError(
-                    self.path, "header", f"column {_column_names(name, dimension)} is missing"
-                )
+                raise InputFileError(self.path, "header", f"column {_column_names(name, dimension)} is missing")
         return [entry for entry in found if entry is not None]
 
     def required(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]]:
         """Return all columns of a group that must be there."""
         found = self.columns(names, dimension)
         if found is None:
-            raise InputFileError(
-                self.path, "header", f"column {_column_names(names[0], dimension)} is missing"
-            )
+            raise InputFileError(self.path, "header", f"column {_column_names(names[0], dimension)} is missing")
         return found
 
     def refuse_unknown(self) -> None:
@@ -120,8 +116,7 @@ class _Table:
         """Return line and label of every row."""
         columns = [self.header.index(name) for name in LABEL_COLUMNS if name in self.header]
         return [
-            Row(line, row[columns[0]].strip() if columns else str(n + 1))
-            for n, (line, row) in enumerate(self.rows)
+            Row(line, row[columns[0]].strip() if columns else str(n + 1)) for n, (line, row) in enumerate(self.rows)
         ]
 
 
@@ -216,7 +211,7 @@ def _rotations_from_quaternions(path: str | Path, rows: list[Row], quaternions: 
 
 
 def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
-    """Read strut lengths from a CSV file with the columns ``L1_mm`` … ``L6_mm`` (or ``_m``, ``_um``, ``_in``).
+    """Read strut lengths from a CSV file with the columns ``L1_mm`` … ``L6_mm`` (or ``_m``, …).
 
     The columns ``nominal_L…`` and ``correction_L…`` that ``ik --model`` adds are known and passed over.
 

@@ -109,8 +109,7 @@ def moves(
     counts = np.maximum(1, np.ceil(duration * rate).astype(int))
     leg = np.repeat(legs, counts)
     t = (np.arange(len(leg)) - (np.cumsum(counts) - counts)[leg] + 1) / counts[leg]
-    share = t**3 * (10.0 - 15.0 * t + 6.0 * t * t)
-    return Path(*_interpolate(positions, rotations, leg, share), rate), counts
+    return Path(*_interpolate(positions, rotations, leg, quintic(t)), rate), counts
 
 
 def circle(centre: Pose, radius: float, feed: float, rate: float) -> Path:
@@ -197,7 +196,7 @@ def platform_poses(
 def _interpolate(
     positions: np.ndarray, rotations: np.ndarray, leg: np.ndarray, share: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the poses at the given shares, (K,), of the given legs, (K,): straight, along the shortest arc."""
+    """Return the poses at the given shares, (K,), of the given legs, (K,): straight, shortest arc."""
     travel = np.diff(positions, axis=0)
     turn = Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1)).as_rotvec()
     turned = Rotation.from_rotvec(share[:, None] * turn[leg]).as_matrix() @ rotations[leg]
