@@ -18,24 +18,27 @@ from .compensation_kernels import (
     COMMAND,
     CORRECTION,
     LOW,
+    NO_POSE,
     NOMINAL,
     OUTSIDE,
     SENSE,
     STATE_SIZE,
     UNSOLVED,
     compensate_one,
+    compensate_quaternion,
     estimate_one,
     pack_machine,
     pack_nominal,
+    pack_pose,
     pose_views,
 )
-from .errors import HexapodError, NotConvergedError, NotFiniteError, OutsideFieldError
+from .errors import HexapodError, NotConvergedError, NotFiniteError, OutsideFieldError, PoseError
 from .geometry import HexapodGeometry
 from .kinematics import forward_error, strut_lengths
 from .limits import WITHIN, LimitTable
 from .machine import MachineModel, RealMachine, Temperatures
 from .motion import MotionState
-from .pose import Pose
+from .pose import POSE_NOT_FINITE, QUATERNION_NORM_TOLERANCE, Pose
 
 DEFAULT_RAMP_RATE = 1e-3
 """How fast a change of model, temperature or enabling moves a strut, m/s."""
@@ -156,6 +159,7 @@ class Compensator:
         self.outside_field = False
         self._tool_inverse = geometry.tool.inverse()
         self._nominal_numbers = pack_nominal(geometry, self._tool_inverse, self.limits)
+        self._work = pack_pose(geometry.work)
         self._last, self._next = _Command(), _Command()
         self._take_machine(RealMachine(geometry, model))
         self._model_pose, self._tool_pose = np.empty(12), np.empty(12)
@@ -264,19 +268,18 @@ class Compensator:
         self._model_pose[:3], self._model_pose[3:] = home.position, home.rotation.ravel()
         self._last_time = math.nan
 
-    def step(
-        self, position: np.ndarray, rotation: np.ndarray, time: float, frame: Pose | None = None
-    ) -> np.ndarray:
-        """Compensate one commanded tool pose.
+    def step(self, numbers: tuple[float, ...], time: float, frame: np.ndarray | None = None) -> np.ndarray:
+        """Compensate one commanded tool pose: the loop's entry.
 
         Parameters
         ----------
-        position, rotation : ndarray, shape (3,), (3, 3)
-            Tool pose in `frame`; trusted to be a pose (see :class:`~hexapod_comp.pose.Pose`).
+        numbers : tuple of seven float
+            Position x, y, z, m, and quaternion x, y, z, w of the tool in `frame`.
         time : float
             Monotonic clock, s; only its differences matter, for ramps.
-        frame : Pose, optional
-            Frame of the commanded pose, seen from ``base``; the geometry's work frame by default.
+        frame : ndarray, shape (12,), optional
+            Frame of the commanded pose seen from ``base``, packed by
+            :func:`~hexapod_comp.compensation_kernels.pack_pose`; the geometry's work frame by default.
 
         Returns
         -------
@@ -285,17 +288,16 @@ class Compensator:
 
         Raises
         ------
-        LimitError, KinematicsError, OutsideFieldError
+        PoseError, LimitError, KinematicsError, OutsideFieldError
             The command is refused and nothing has changed.
         """
-        frame = self.geometry.work if frame is None else frame
+        return self._finish(compensate_quaternion(*numbers, *self._arguments(time, frame)), time, numbers)
+
+    def _arguments(self, time: float, frame: np.ndarray | None) -> tuple:
+        """Return what the kernels take besides the pose."""
         ramp = 0.0 if math.isnan(self._last_time) else min(time - self._last_time, LONGEST_RAMP_STEP)
-        upcoming = self._next
-        status, finding, strut, stage, value, condition = compensate_one(
-            position,
-            rotation,
-            frame.position,
-            frame.rotation,
+        return (
+            self._work if frame is None else frame,
             self._machine_numbers,
             self._nominal_numbers,
             *self._varied,
@@ -303,19 +305,25 @@ class Compensator:
             self._changed,
             max(ramp, 0.0) * self.ramp_rate,
             self._last.state,
-            upcoming.state,
-            upcoming.poses,
+            self._next.state,
+            self._next.poses,
         )
+
+    def _finish(self, found: tuple, time: float, numbers: tuple[float, ...] = ()) -> np.ndarray:
+        """Accept the command under way, or raise what was found."""
+        status, finding, strut, stage, value, condition = found
+        if status == NO_POSE:
+            raise _pose_error(finding, numbers)
         if status == UNSOLVED:
             raise NotConvergedError("the error field is too steep to be undone at this pose")
         if status == OUTSIDE and self.model.field.outside == "refuse":
-            raise self._outside_error(upcoming)
+            raise self._outside_error(self._next)
         if finding != WITHIN:
             raise self.limits.error(finding, strut, stage, value)
-        self._last, self._next = upcoming, self._last
+        self._last, self._next = self._next, self._last
         self.condition, self.outside_field = condition, status == OUTSIDE
         self._changed, self._last_time = False, time
-        return upcoming.command
+        return self._last.command
 
     def estimate(self, struts: np.ndarray) -> np.ndarray:
         """Return where the tool is when the struts read `struts`, through the model.
@@ -379,7 +387,8 @@ class Compensator:
         LimitError, KinematicsError, OutsideFieldError
             The command is refused and nothing has changed.
         """
-        self.step(tool_pose.position, tool_pose.rotation, time)
+        position, rotation = tool_pose.position, tool_pose.rotation
+        self._finish(compensate_one(position, rotation, *self._arguments(time, None)), time)
         return self.record(tool_pose)
 
     def record(self, tool_pose: Pose) -> Correction:
@@ -429,3 +438,11 @@ class Compensator:
     def tool_pose(self, platform_pose: Pose) -> Pose:
         """Return ``pose_tool_in_work`` for a ``pose_platform_in_base``."""
         return self.geometry.work.inverse() @ platform_pose @ self.geometry.tool
+
+
+def _pose_error(outcome: int, numbers: tuple[float, ...]) -> PoseError:
+    if outcome == POSE_NOT_FINITE:
+        return PoseError("pose must be finite", list(numbers), "not_finite")
+    norm = math.hypot(*numbers[3:])
+    problem = f"quaternion must have norm 1 within {QUATERNION_NORM_TOLERANCE:g}, not {norm:.6g}"
+    return PoseError(problem, list(numbers[3:]), "quaternion")

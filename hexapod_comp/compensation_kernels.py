@@ -17,11 +17,11 @@ from .geometry import HexapodGeometry
 from .limits import CORRECTION as CORRECTION_FOUND
 from .limits import STEP, WITHIN, LimitTable, check_change, check_stage
 from .machine import RealMachine, actual_pose_one, command_one
-from .pose import Pose
+from .pose import POSE_OK, Pose, read_pose
 from .struts import PARAMETERS
 
-SOLVED, UNSOLVED, OUTSIDE = range(3)
-"""How undoing the field went: solved, not solved, solved with the boundary's value held."""
+SOLVED, UNSOLVED, OUTSIDE, NO_POSE = range(4)
+"""How it went: solved, field not undone, solved with the field held at its boundary, input is no pose."""
 
 LOW, SENSE, NOMINAL, CORRECTION, COMMAND, BUMP, STATE_SIZE = 0, 9, 18, 24, 30, 36, 42
 """Where the parts of a state begin: motion windows and directions (9 each), then six struts each."""
@@ -89,6 +89,11 @@ def nominal_views(numbers):
     )
 
 
+def pack_pose(pose: Pose) -> np.ndarray:
+    """Return position, then rotation matrix by rows, shape (12,)."""
+    return np.concatenate([pose.position, pose.rotation.ravel()])
+
+
 @compiled
 def pose_views(poses):
     """Return positions and rotations of the two poses, (24,), that a command leaves behind."""
@@ -108,8 +113,7 @@ def compose(p1, r1, p2, r2, position, rotation):
 def compensate_one(
     position,
     rotation,
-    frame_position,
-    frame_rotation,
+    frame,
     machine_numbers,
     nominal_numbers,
     knots,
@@ -136,7 +140,7 @@ def compensate_one(
     nominal_base, nominal_platform, tool, stroke, cone_axes, cone_cosines, scalars = nominal_views(nominal_numbers)
     platform_position, platform_rotation, model_position, model_rotation = pose_views(poses)
     half_position, half_rotation = np.empty(3), np.empty((3, 3))
-    compose(frame_position, frame_rotation, position, rotation, half_position, half_rotation)
+    compose(frame[:3], frame[3:].reshape((3, 3)), position, rotation, half_position, half_rotation)
     compose(half_position, half_rotation, tool[0], tool[1:], platform_position, platform_rotation)
     nominal, correction = next_state[NOMINAL:CORRECTION], next_state[CORRECTION:COMMAND]
     command = next_state[COMMAND:BUMP]
@@ -202,6 +206,64 @@ def compensate_one(
             scalars,
         )
     return OUTSIDE if outside else SOLVED, finding, strut, stage, value, condition
+
+
+@compiled
+def compensate_quaternion(
+    x,
+    y,
+    z,
+    qx,
+    qy,
+    qz,
+    qw,
+    frame,
+    machine_numbers,
+    nominal_numbers,
+    knots,
+    pieces,
+    gx,
+    gy,
+    gz,
+    lx,
+    ly,
+    lz,
+    share,
+    changed,
+    ramp,
+    state,
+    next_state,
+    poses,
+):
+    """Run :func:`compensate_one` on a position and a quaternion, as messages carry them.
+
+    When the status is NO_POSE, the finding is the outcome of :func:`hexapod_comp.pose.read_pose`.
+    """
+    position, rotation = np.empty(3), np.empty((3, 3))
+    outcome = read_pose(x, y, z, qx, qy, qz, qw, position, rotation)
+    if outcome != POSE_OK:
+        return NO_POSE, outcome, -1, 0, math.nan, math.nan
+    return compensate_one(
+        position,
+        rotation,
+        frame,
+        machine_numbers,
+        nominal_numbers,
+        knots,
+        pieces,
+        gx,
+        gy,
+        gz,
+        lx,
+        ly,
+        lz,
+        share,
+        changed,
+        ramp,
+        state,
+        next_state,
+        poses,
+    )
 
 
 @compiled

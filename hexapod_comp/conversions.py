@@ -12,67 +12,13 @@ from sensor_msgs.msg import JointState
 from .compiling import compiled
 from .errors import CommandError
 from .geometry import STRUT_NAMES
-from .pose import QUATERNION_NORM_TOLERANCE, Pose
-
-POSE_OK, POSE_NOT_FINITE, POSE_NOT_UNIT = range(3)
+from .pose import Pose
 
 
-class PoseReader:
-    """Reads PoseStamped messages into one preallocated pose, without garbage.
-
-    Attributes
-    ----------
-    position, rotation : ndarray, shape (3,), (3, 3)
-        The pose last read, m and rotation matrix.
-    """
-
-    def __init__(self) -> None:
-        self.position, self.rotation = np.zeros(3), np.eye(3)
-
-    def read(self, message: PoseStamped) -> None:
-        """Read a message.
-
-        Raises
-        ------
-        CommandError
-            ``not_finite`` or ``quaternion``: its norm is not 1.
-        """
-        p, q = message.pose.position, message.pose.orientation
-        outcome = read_pose(p.x, p.y, p.z, q.x, q.y, q.z, q.w, self.position, self.rotation)
-        if outcome == POSE_NOT_FINITE:
-            values = [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
-            raise CommandError("not_finite", f"pose must be finite, not {values}")
-        if outcome == POSE_NOT_UNIT:
-            norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
-            raise CommandError(
-                "quaternion", f"quaternion must have norm 1 within {QUATERNION_NORM_TOLERANCE:g}, not {norm:.6g}"
-            )
-
-    def pose(self) -> Pose:
-        """Return the pose last read as a value of its own."""
-        return Pose(self.position, self.rotation)
-
-
-@compiled
-def read_pose(x, y, z, qx, qy, qz, qw, position, rotation):
-    """Write position and rotation of a message's numbers; return the outcome."""
-    square = qx * qx + qy * qy + qz * qz + qw * qw
-    if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z) and math.isfinite(square)):
-        return POSE_NOT_FINITE
-    if abs(math.sqrt(square) - 1.0) > QUATERNION_NORM_TOLERANCE:
-        return POSE_NOT_UNIT
-    s = 2.0 / square
-    position[0], position[1], position[2] = x, y, z
-    rotation[0, 0] = 1.0 - s * (qy * qy + qz * qz)
-    rotation[0, 1] = s * (qx * qy - qz * qw)
-    rotation[0, 2] = s * (qx * qz + qy * qw)
-    rotation[1, 0] = s * (qx * qy + qz * qw)
-    rotation[1, 1] = 1.0 - s * (qx * qx + qz * qz)
-    rotation[1, 2] = s * (qy * qz - qx * qw)
-    rotation[2, 0] = s * (qx * qz - qy * qw)
-    rotation[2, 1] = s * (qy * qz + qx * qw)
-    rotation[2, 2] = 1.0 - s * (qx * qx + qy * qy)
-    return POSE_OK
+def pose_numbers(message: PoseStamped) -> tuple[float, float, float, float, float, float, float]:
+    """Return x, y, z (m) and the quaternion x, y, z, w of a message."""
+    p, q = message.pose.position, message.pose.orientation
+    return p.x, p.y, p.z, q.x, q.y, q.z, q.w
 
 
 @compiled
@@ -120,12 +66,11 @@ def message_pose(message: PoseStamped) -> Pose:
 
     Raises
     ------
-    CommandError
-        As :meth:`PoseReader.read`.
+    PoseError
+        Not finite, or the quaternion's norm is not 1.
     """
-    reader = PoseReader()
-    reader.read(message)
-    return reader.pose()
+    numbers = pose_numbers(message)
+    return Pose.from_quaternion(np.array(numbers[:3]), np.array(numbers[3:]))
 
 
 class StrutMessage:
@@ -188,7 +133,7 @@ class StrutReader:
         if len(message.position) != 6:
             raise CommandError("strut_count", f"six positions are needed, not {len(message.position)}")
         lengths = np.frombuffer(message.position, dtype=float)[self._order]
-        if not math.isfinite(lengths.sum()):
+        if not math.isfinite(lengths.dot(lengths)):
             raise CommandError("not_finite", f"strut lengths must be finite, not {lengths.tolist()}")
         self.lengths[:] = lengths
 

@@ -60,12 +60,20 @@ class ModelError(GeometryError):
 
 
 class PoseError(HexapodError):
-    """A pose that is not one: not finite, or its rotation is not a rotation."""
+    """A pose that is not one: not finite, or its rotation is not a rotation.
 
-    reason = "bad_pose"
+    Parameters
+    ----------
+    problem : str
+        What is wrong and what is allowed.
+    value : object, optional
+        The numbers found.
+    reason : str
+        Name under which diagnostics count it.
+    """
 
-    def __init__(self, problem: str, value: Any = None):
-        self.value = value
+    def __init__(self, problem: str, value: Any = None, reason: str = "bad_pose"):
+        self.value, self.reason = value, reason
         found = "" if value is None else f" (found {shorten(value)})"
         super().__init__(f"{problem}{found}")
 

@@ -63,9 +63,10 @@ def _pose_errors(axes: Axes, poses: list[PoseRecord]) -> None:
         if not np.isnan(values).all():
             axes.bar(number + shift, np.maximum(values, NOTHING), 0.4, color=colour, label=label)
     axes.set(title="Position error of the tool at rest", xlabel="pose", ylabel="error, µm", yscale="log")
+    axes.set_ylim(top=10.0 * axes.get_ylim()[1])  # room for the legend
     if len(poses) <= 20:
         axes.set_xticks(number)
-    axes.legend()
+    axes.legend(loc="upper right", ncols=2)
 
 
 def _path(axes: Axes, record: PathRecord) -> None:

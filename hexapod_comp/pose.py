@@ -18,6 +18,9 @@ from .errors import PoseError
 QUATERNION_NORM_TOLERANCE = 1e-3
 """A quaternion whose norm is further from 1 than this is refused: it was never a rotation."""
 
+POSE_OK, POSE_NOT_FINITE, POSE_NOT_UNIT = range(3)
+"""Outcomes of :func:`read_pose`."""
+
 ROTATION_TOLERANCE = 1e-9
 """Largest deviation of RᵀR from the identity that passes as rounding."""
 
@@ -152,6 +155,28 @@ def rotation_flaw(r):
     if x * r[0, 2] + y * r[1, 2] + z * r[2, 2] < 0.0:
         return math.inf
     return flaw
+
+
+@compiled
+def read_pose(x, y, z, qx, qy, qz, qw, position, rotation):
+    """Write position and rotation matrix of a position and a quaternion; return the outcome."""
+    square = qx * qx + qy * qy + qz * qz + qw * qw
+    if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z) and math.isfinite(square)):
+        return POSE_NOT_FINITE
+    if abs(math.sqrt(square) - 1.0) > QUATERNION_NORM_TOLERANCE:
+        return POSE_NOT_UNIT
+    s = 2.0 / square
+    position[0], position[1], position[2] = x, y, z
+    rotation[0, 0] = 1.0 - s * (qy * qy + qz * qz)
+    rotation[0, 1] = s * (qx * qy - qz * qw)
+    rotation[0, 2] = s * (qx * qz + qy * qw)
+    rotation[1, 0] = s * (qx * qy + qz * qw)
+    rotation[1, 1] = 1.0 - s * (qx * qx + qz * qz)
+    rotation[1, 2] = s * (qy * qz - qx * qw)
+    rotation[2, 0] = s * (qx * qz - qy * qw)
+    rotation[2, 1] = s * (qy * qz + qx * qw)
+    rotation[2, 2] = 1.0 - s * (qx * qx + qy * qy)
+    return POSE_OK
 
 
 def _finite(values: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:

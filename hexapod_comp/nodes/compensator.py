@@ -23,7 +23,8 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
 from ..compensation import Compensator
-from ..conversions import PoseReader, StrutMessage, StrutReader, write_pose
+from ..compensation_kernels import pack_pose
+from ..conversions import StrutMessage, StrutReader, pose_numbers, write_pose
 from ..errors import CommandError, HexapodError
 from ..geometry import HexapodGeometry, load_geometry
 from ..machine import MachineModel
@@ -81,7 +82,7 @@ class CompensatorNode(MachineNode):
         self._throttle = Throttle()
         self._refusals, self._feedback_refusals = Refusals(), Refusals()
         self._commands, self._feedback = Flow(), Flow()
-        self._reader, self._struts = PoseReader(), StrutReader()
+        self._struts = StrutReader()
         self._last_stamp = 0
         self._fresh_start = True
         self._unestimated: Time | None = None
@@ -109,7 +110,10 @@ class CompensatorNode(MachineNode):
             self._compensator = None
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
-        self._frames = {self._options["base_frame"]: Pose.identity(), self._options["work_frame"]: geometry.work}
+        self._frames = {
+            self._options["base_frame"]: pack_pose(Pose.identity()),
+            self._options["work_frame"]: pack_pose(geometry.work),
+        }
         self._open_topics()
         name = f"{self.get_fully_qualified_name()[1:]}: {geometry.name}"
         self._report = HealthReport(name, geometry.name)
@@ -160,14 +164,11 @@ class CompensatorNode(MachineNode):
         """Run every kernel of the loop once, so that none compiles while the machine moves."""
         compensator = self.compensator
         home = compensator.tool_pose(compensator.geometry.home)
-        reader = PoseReader()
         message = PoseStamped()
         write_pose(message, home.position, home.rotation)
-        reader.read(message)
-        compensator.step(reader.position, reader.rotation, 0.0)
+        compensator.step(pose_numbers(message), 0.0)
         compensator.estimate(compensator.command)
         StrutMessage().write(compensator.command)
-        write_pose(message, home.position, home.rotation)
         compensator.enable(self._options["enable_compensation"])
         compensator.reset()
 
@@ -229,10 +230,9 @@ class CompensatorNode(MachineNode):
         try:
             stamp = self._checked_stamp(message.header.stamp, now)
             frame = self._frame(message.header.frame_id)
-            self._reader.read(message)
             if self._fresh_start or self._options["require_feedback"]:
                 self._consult_feedback(now)
-            self.compensator.step(self._reader.position, self._reader.rotation, now, frame)
+            self.compensator.step(pose_numbers(message), now, frame)
         except HexapodError as error:
             self._refuse(error, now)
             return
@@ -258,7 +258,7 @@ class CompensatorNode(MachineNode):
             raise CommandError("stamp_order", "stamp is earlier than the last command's")
         return stamp
 
-    def _frame(self, frame_id: str) -> Pose:
+    def _frame(self, frame_id: str) -> np.ndarray:
         frame = self._frames.get(frame_id)
         if frame is None:
             raise CommandError("frame_id", f"frame_id must be one of {', '.join(self._frames)}, not {frame_id!r}")
