@@ -24,7 +24,8 @@ from .errors import (
 from .geometry import STRUT_NAMES, HexapodGeometry
 from .kernels import condition_one, strut_lengths_one
 from .limits import STAGES, LimitTable, joint_cosines
-from .machine import MachineModel, RealMachine, command_one
+from .machine import MachineModel, RealMachine
+from .machine_kernels import command_one
 from .motion import MotionState
 from .trajectory import moves, platform_poses
 
@@ -122,6 +123,8 @@ class CheckResult:
         The move to this pose was left out, because one of its ends breaks a limit by itself.
     outside_box : ndarray of bool, shape (N,)
         The pose lies outside the box for which the model was measured.
+    outside_field : ndarray of bool, shape (N,)
+        There, or on the move to it, the error field's value is held at the boundary of its box.
     """
 
     mode: str
@@ -132,10 +135,11 @@ class CheckResult:
     lengths: np.ndarray
     unchecked_moves: np.ndarray
     outside_box: np.ndarray
+    outside_field: np.ndarray
 
     @property
     def ok(self) -> bool:
-        """Whether every limit is kept and every move was checked."""
+        """Whether every limit is kept; then every move was checked."""
         return not self.breaches
 
 
@@ -243,6 +247,7 @@ class _Run:
         self.worst = {name: _Worst.empty(count) for name in (*LIMITS, *OTHER_FINDINGS)}
         self.lengths = np.full((count, 2, 6), np.nan)
         self.unchecked = np.zeros(count, dtype=bool)
+        self.outside_field = np.zeros(count, dtype=bool)
         self.examined = 0
         self._start()
 
@@ -302,6 +307,7 @@ class _Run:
         at_rows = share == 1.0
         self.lengths[owner[at_rows]] = lengths[at_rows]
         self.examined += len(owner)
+        self.outside_field[owner[flags == OUTSIDE]] = True
         solved = flags != UNSOLVED
         with np.errstate(invalid="ignore", over="ignore"):
             measured = {**self._static(values, solved), **self._other(values, flags)}
@@ -403,6 +409,7 @@ class _Run:
             lengths=self.lengths,
             unchecked_moves=self.unchecked,
             outside_box=outside,
+            outside_field=self.outside_field,
         )
 
     def _error(self, name: str, strut: int, stage: int, value: float) -> HexapodError:

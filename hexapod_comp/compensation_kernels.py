@@ -16,7 +16,8 @@ from .compiling import compiled
 from .geometry import HexapodGeometry
 from .limits import CORRECTION as CORRECTION_FOUND
 from .limits import STEP, WITHIN, LimitTable, check_change, check_stage
-from .machine import RealMachine, actual_pose_one, command_one
+from .machine import RealMachine
+from .machine_kernels import actual_pose_one, command_one
 from .pose import POSE_OK, Pose, read_pose
 from .struts import PARAMETERS
 

@@ -21,7 +21,8 @@ import numpy as np
 from .compiling import compiled
 from .errors import ModelError
 from .geometry import STRUT_NAMES
-from .machine import RealMachine, lever
+from .machine import RealMachine
+from .machine_kernels import lever
 from .motion import MotionState, follow
 
 LEAST_LAG = 1e-3

@@ -14,7 +14,7 @@ from .geometry import HexapodGeometry
 from .pose import Pose
 from .session_records import PoseRecord, SessionResult
 from .tables import Row, length_values, pose_values
-from .trajectory import Path, circle, join, move, pocket
+from .trajectory import Path, circle, commanded_in_base, join, move, pocket
 
 RATES = (1.0, 1000.0)
 """Commands per second that make sense over DDS from Python, Hz."""
@@ -31,8 +31,9 @@ def checked_rate(rate: float) -> float:
 
 
 def demo_path(geometry: HexapodGeometry, rate: float) -> Path:
-    """Return the demo's milling path about home: a circle of 24 mm, then a zigzag pocket of 24 × 8 mm."""
-    home = geometry.work.inverse() @ geometry.home @ geometry.tool
+    """Return the demo's milling path about home: a circle of 24 mm, then a zigzag pocket of 24 × 8 mm, in ``base``."""
+    geometry = commanded_in_base(geometry)
+    home = geometry.home @ geometry.tool
     ring = circle(home, radius=0.012, feed=DEMO_FEED, rate=rate)
     corner = home @ Pose(np.array([-0.012, -0.004, 0.0]), np.eye(3))
     rows = pocket(geometry, corner, (0.024, 0.008), pitch=0.004, feed=DEMO_FEED, rate=rate)
@@ -68,13 +69,14 @@ def witnessed(
     rate: float,
     compare: bool,
 ) -> SessionResult:
-    """Run poses and path through the loop with a progress bar; see :func:`nodes.session.run_session`."""
+    """Run poses of the work frame and a path in ``base`` through the loop, with a progress bar."""
     session = _session_module()
     client = session.LoopClient()
     try:
         session.connect(client, nodes)
         with _progress() as bar:
-            return session.run_session(client, geometry, poses, path, rate, compare, bar.update)
+            targets = [geometry.work @ pose for pose in poses]
+            return session.run_session(client, geometry, targets, path, rate, compare, bar.update)
     finally:
         client.close()
 

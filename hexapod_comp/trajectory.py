@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -164,6 +164,11 @@ def pocket(
         ends = (0.0, size[0]) if row % 2 == 0 else (size[0], 0.0)
         corners += [corner @ Pose(np.array([x, row * pitch, 0.0]), np.eye(3)) for x in ends]
     return join([move(geometry, a, b, rate, feed) for a, b in pairwise(corners)])
+
+
+def commanded_in_base(geometry: HexapodGeometry) -> HexapodGeometry:
+    """Return the machine with its work frame in the base, for poses that are given in ``base``."""
+    return replace(geometry, work=Pose.identity())
 
 
 def join(paths: list[Path]) -> Path:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from ..machine import MachineModel, RealMachine
 from ..pose import Pose
 from ..session_records import PathRecord, PoseRecord, SessionResult, Track, track_along
 from ..simulation import StrutDrive
-from ..trajectory import Path, move
+from ..trajectory import Path, commanded_in_base, move
 from .client import LoopClient, NoAnswerError, Sent
 from .processes import NodeProcess, PrivateDomain
 
@@ -84,7 +83,7 @@ class Session:
     ) -> None:
         self._client, self._geometry, self._rate = client, geometry, rate
         self._progress = progress
-        self._base = _in_base_frame(geometry)
+        self._base = commanded_in_base(geometry)
         self._at = client.estimate
         self._answers: list[Sent] = []
 
@@ -222,8 +221,3 @@ def _count(client: LoopClient, result: SessionResult) -> None:
     for key, value in client.diagnostics.items():
         if key.startswith("refused."):
             result.refusals[key.removeprefix("refused.")] = int(value)
-
-
-def _in_base_frame(geometry: HexapodGeometry) -> HexapodGeometry:
-    """Return the geometry with the work frame in the base: sessions command in ``base``."""
-    return replace(geometry, work=Pose.identity())

@@ -234,12 +234,13 @@ def _notes(rows: list[Row], result: CheckResult, ideal: bool) -> list[str]:
         notes.append(
             f"not checked: {skipped} moves of which an end breaks a limit by itself, the first to {common.where(first)}"
         )
-    if result.outside_box.any() and not ideal:
-        first = rows[int(result.outside_box.argmax())]
-        notes.append(
-            f"note: {int(result.outside_box.sum())} poses are outside the box in which the model was "
-            f"measured, the first at {common.where(first)}"
-        )
+    for outside, problem in (
+        (result.outside_box, "outside the box in which the model was measured"),
+        (result.outside_field, "outside the error field, whose value at the boundary is held there"),
+    ):
+        if outside.any() and not ideal:
+            first = rows[int(outside.argmax())]
+            notes.append(f"note: {problem}: {int(outside.sum())} of {len(rows)}, first {common.where(first)}")
     return notes
 
 

@@ -123,7 +123,9 @@ def _solve(
     guess = _guess(args, geometry)
     batch = None if args.cold else solve_poses(structure, lengths, guess)
     poses = []
+    bar = common.progress_bar(len(rows), " rows")
     for n, row in enumerate(rows):
+        bar.update()
         try:
             if batch is None:
                 pose = working_mode(geometry, structure, lengths[n])
@@ -137,6 +139,7 @@ def _solve(
             problem = f"{common.where(row)}: {error}" if row.line else str(error)
             raise KinematicsError(problem, error.value, error.limit) from error
         poses.append(pose)
+    bar.close()
     return poses
 
 

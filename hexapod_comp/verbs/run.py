@@ -13,8 +13,7 @@ EXAMPLE = """example:
   hexapod_comp run poses.csv --attach --rate-hz 100     (nodes already running in this ROS domain)
 
 The tool moves from pose to pose within the machine's limits, rests at each, and its error is taken from
-tool_pose_true. Columns of the file: x_mm, y_mm, z_mm, alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw);
-poses are in the frame `base`."""
+tool_pose_true. Columns of the file: x_mm, y_mm, z_mm, alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw)."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
