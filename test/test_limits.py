@@ -1,0 +1,227 @@
+"""Every limit at its edge: a hair inside passes, a hair outside is refused and says what, where and how much.
+
+The limited quantities come from NumPy alone (distances between joints, angles by arctan2, condition number
+by the inverse matrix); limits are set a relative 1e-9 above and below them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from strategies import paper_geometry
+
+from hexapod_comp.compensation import Compensator
+from hexapod_comp.errors import LimitError
+from hexapod_comp.geometry import HexapodGeometry, Limits
+from hexapod_comp.machine import MachineModel
+from hexapod_comp.pose import Pose
+from hexapod_comp.struts import StrutErrors
+
+PAPER = paper_geometry()
+HOME = PAPER.home
+HAIR = 1e-9
+WIDE = Limits(np.tile([0.1, 2.0], (6, 1)), np.full(6, np.pi), np.full(6, np.pi), 100.0, 0.01, 1.0, 1.0)
+TILTED = Pose.from_angles([0.02, -0.03, 0.52], np.deg2rad([12.0, -9.0, 15.0]))
+
+
+def struts(pose: Pose) -> np.ndarray:
+    """Return the strut vectors in ``base``, shape (6, 3), m."""
+    return pose.position + PAPER.platform_joints @ pose.rotation.T - PAPER.base_joints
+
+
+def angles_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the angles of rows, by arctan2, which is exact where arccos is not."""
+    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1))
+
+
+def condition_by_inverse(pose: Pose) -> float:
+    """Return ‖J‖·‖J⁻¹‖/6 (Frobenius), rotations in units of the RMS radius of the platform joints."""
+    s = struts(pose)
+    unit = s / np.linalg.norm(s, axis=1)[:, None]
+    arms = PAPER.platform_joints @ pose.rotation.T
+    spread = PAPER.platform_joints - PAPER.platform_joints.mean(axis=0)
+    radius = np.sqrt((spread**2).sum(axis=1).mean())
+    matrix = np.hstack([unit, np.cross(arms, unit) / radius])
+    return float(np.linalg.norm(matrix) * np.linalg.norm(np.linalg.inv(matrix)) / 6.0)
+
+
+def with_limits(**changes: object) -> HexapodGeometry:
+    return replace(PAPER, limits=replace(WIDE, **changes))
+
+
+def one_strut(value: float, strut: int, wide: float) -> np.ndarray:
+    values = np.full(6, wide)
+    values[strut] = value
+    return values
+
+
+def refusal(geometry: HexapodGeometry, pose: Pose, model: MachineModel | None = None) -> LimitError:
+    """Return the error with which a fresh compensator refuses the pose."""
+    compensator = Compensator(geometry, model or MachineModel(PAPER.name))
+    with pytest.raises(LimitError) as caught:
+        compensator.correct(pose)
+    assert np.isnan(compensator.command).all()
+    return caught.value
+
+
+def accepted(geometry: HexapodGeometry, pose: Pose, model: MachineModel | None = None) -> None:
+    Compensator(geometry, model or MachineModel(PAPER.name)).correct(pose)
+
+
+@pytest.mark.parametrize("strut", range(6))
+def test_longest_stroke(strut: int) -> None:
+    length = np.linalg.norm(struts(TILTED), axis=1)[strut]
+    bounds = WIDE.stroke.copy()
+    bounds[strut, 1] = length * (1.0 + HAIR)
+    accepted(with_limits(stroke=bounds), TILTED)
+    bounds[strut, 1] = length * (1.0 - HAIR)
+    error = refusal(with_limits(stroke=bounds), TILTED)
+    assert (error.reason, error.strut, error.stage) == ("stroke", strut, "nominal")
+    assert error.value == pytest.approx(length, rel=1e-14)
+    assert error.limit == bounds[strut, 1]
+    assert f"strut_{strut + 1}" in str(error)
+    assert f"{length * 1e3:.4f} mm" in str(error)
+
+
+@pytest.mark.parametrize("strut", range(6))
+def test_shortest_stroke(strut: int) -> None:
+    low = Pose(HOME.position - np.array([0.0, 0.0, 0.05]), HOME.rotation)
+    length = np.linalg.norm(struts(low), axis=1)[strut]
+    bounds = WIDE.stroke.copy()
+    bounds[strut, 0] = length * (1.0 - HAIR)
+    accepted(with_limits(stroke=bounds), low)
+    bounds[strut, 0] = length * (1.0 + HAIR)
+    error = refusal(with_limits(stroke=bounds), low)
+    assert (error.reason, error.strut, error.limit) == ("stroke", strut, bounds[strut, 0])
+
+
+@pytest.mark.parametrize("strut", range(6))
+@pytest.mark.parametrize("body", ["base", "platform"])
+def test_joint_cones(body: str, strut: int) -> None:
+    """Neutral directions are the struts' at home, each seen from the body that carries the joint."""
+    now, home = struts(TILTED), struts(HOME)
+    if body == "platform":
+        now, home = now @ TILTED.rotation, home @ HOME.rotation
+    angle = angles_between(now, home)[strut]
+    accepted(with_limits(**{f"{body}_cone": one_strut(angle * (1.0 + HAIR), strut, np.pi)}), TILTED)
+    error = refusal(with_limits(**{f"{body}_cone": one_strut(angle * (1.0 - HAIR), strut, np.pi)}), TILTED)
+    assert (error.reason, error.strut, error.stage) == (f"{body}_cone", strut, "nominal")
+    assert error.value == pytest.approx(angle, rel=1e-12)
+    assert f"{np.degrees(angle):.3f}°" in str(error)
+
+
+def test_condition_number() -> None:
+    condition = condition_by_inverse(TILTED)
+    accepted(with_limits(condition=condition * (1.0 + HAIR)), TILTED)
+    error = refusal(with_limits(condition=condition * (1.0 - HAIR)), TILTED)
+    assert (error.reason, error.strut, error.stage) == ("condition", None, "nominal")
+    assert error.value == pytest.approx(condition, rel=1e-12)
+
+
+def test_other_assembly_mode() -> None:
+    """The machine mirrored in the base plane: same lengths, det J of the other sign (six rows, z negated)."""
+    flip = np.diag([1.0, 1.0, -1.0])
+    mirrored = Pose(flip @ HOME.position, flip @ HOME.rotation @ flip)
+    error = refusal(with_limits(), mirrored)
+    assert error.reason == "assembly"
+
+
+@pytest.mark.parametrize("strut", range(6))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_largest_correction(strut: int, sign: float) -> None:
+    """A strut that is 40 µm long is told 40 µm less: the correction is minus the offset, by definition."""
+    offset = np.zeros(6)
+    offset[strut] = sign * 40e-6
+    model = MachineModel(PAPER.name, struts=StrutErrors(offset=offset))
+    accepted(with_limits(correction=40e-6 * (1.0 + HAIR)), TILTED, model)
+    error = refusal(with_limits(correction=40e-6 * (1.0 - HAIR)), TILTED, model)
+    assert (error.reason, error.strut, error.stage) == ("correction", strut, "compensated")
+    assert error.value == pytest.approx(-offset[strut], rel=1e-9)
+    assert "40.000 µm" in str(error)
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_largest_step(way: float) -> None:
+    """At home all six struts lengthen alike along z; the first is named."""
+    z = HOME.position[2]
+    flat = np.linalg.norm(struts(HOME)[0, :2])
+    length = np.hypot(flat, z)
+    for step, allowed in ((2e-3 * (1.0 - HAIR), True), (2e-3 * (1.0 + HAIR), False)):
+        compensator = Compensator(with_limits(step=2e-3), MachineModel(PAPER.name))
+        compensator.correct(HOME)
+        next_z = np.sqrt((length + way * step) ** 2 - flat**2)
+        there = Pose([0.0, 0.0, next_z], HOME.rotation)
+        if allowed:
+            compensator.correct(there)
+            continue
+        with pytest.raises(LimitError, match=r"would change by -?2\.0000 mm") as caught:
+            compensator.correct(there)
+        assert (caught.value.reason, caught.value.stage) == ("step", "nominal")
+        assert caught.value.value == pytest.approx(way * step, rel=1e-9)
+
+
+def test_compensated_lengths_are_checked_too() -> None:
+    """Nominally 30 µm inside; the correction of +50 µm leads 20 µm outside."""
+    length = np.linalg.norm(struts(TILTED), axis=1)[2]
+    bounds = WIDE.stroke.copy()
+    bounds[2, 1] = length + 30e-6
+    model = MachineModel(PAPER.name, struts=StrutErrors(offset=np.array([0, 0, -50e-6, 0, 0, 0])))
+    accepted(with_limits(stroke=bounds), TILTED)
+    error = refusal(with_limits(stroke=bounds), TILTED, model)
+    assert (error.reason, error.strut, error.stage) == ("stroke", 2, "compensated")
+    assert error.value == pytest.approx(length + 50e-6, rel=1e-12)
+
+
+def test_compensated_cones_are_checked_too() -> None:
+    """The real base joint 4 stands 1 mm aside, which turns its strut past a cone that nominally fits."""
+    home = struts(HOME)
+    sideways = np.cross(home[3], [0.0, 0.0, 1.0])
+    deviation = np.zeros((6, 3))
+    deviation[3] = -1e-3 * sideways / np.linalg.norm(sideways)
+    there = Pose(HOME.position + 0.02 * sideways / np.linalg.norm(sideways), HOME.rotation)
+    angle = angles_between(struts(there), home)[3]
+    real = angles_between(struts(there) - deviation, home)[3]
+    geometry = with_limits(base_cone=one_strut(0.5 * (angle + real), 3, np.pi))
+    accepted(geometry, there)
+    error = refusal(geometry, there, MachineModel(PAPER.name, base_deviation=deviation))
+    assert (error.reason, error.strut, error.stage) == ("base_cone", 3, "compensated")
+    assert error.value == pytest.approx(real, rel=1e-9)
+
+
+def test_compensated_steps_are_checked_too() -> None:
+    """A pitch error of 2 % makes the compensated step 2 % longer than the nominal one."""
+    model = MachineModel(
+        PAPER.name,
+        struts=StrutErrors(pitch=np.full(6, -0.02), reference_length=np.full(6, np.linalg.norm(struts(HOME)[0]))),
+    )
+    there = Pose(HOME.position + np.array([0.0, 0.0, 2.5e-3]), HOME.rotation)
+    step = np.linalg.norm(struts(there)[0]) - np.linalg.norm(struts(HOME)[0])
+    compensator = Compensator(with_limits(step=1.01 * step), model)
+    compensator.correct(HOME)
+    with pytest.raises(LimitError) as caught:
+        compensator.correct(there)
+    assert (caught.value.reason, caught.value.stage) == ("step", "compensated")
+    assert caught.value.value == pytest.approx(step / 0.98, rel=1e-9)
+
+
+def test_nothing_is_refused_just_inside_all_limits_at_random_poses() -> None:
+    """200 poses: limits that just hold what NumPy says of the pose let it through."""
+    rng = np.random.default_rng(4)
+    for _ in range(200):
+        turn = Rotation.from_rotvec(rng.uniform(-0.25, 0.25, 3)).as_matrix()
+        pose = Pose(HOME.position + rng.uniform(-0.05, 0.05, 3), turn)
+        now, home = struts(pose), struts(HOME)
+        lengths = np.linalg.norm(now, axis=1)
+        at_home = np.linalg.norm(home, axis=1)
+        stroke = np.stack([np.minimum(lengths, at_home), np.maximum(lengths, at_home)], axis=1)
+        limits = replace(
+            WIDE,
+            stroke=stroke * [1.0 - HAIR, 1.0 + HAIR],
+            base_cone=angles_between(now, home) * (1.0 + HAIR),
+            platform_cone=angles_between(now @ turn, home) * (1.0 + HAIR),
+            condition=max(condition_by_inverse(pose), condition_by_inverse(HOME)) * (1.0 + HAIR),
+        )
+        accepted(replace(PAPER, limits=limits), pose)
