@@ -176,7 +176,8 @@ def main() -> int:
                 f"   {row['p99_ratio']:10.3f}"
             )
     kept = all(row["rate_ratio"] >= BAR_RATE and row["median_ratio"] <= BAR_LATENCY for row in rows)
-    print(f"bars (rate ≥ {BAR_RATE} ×, median latency ≤ {BAR_LATENCY} ×): {'kept' if kept else 'MISSED'}", file=sys.stderr)
+    verdict = "kept" if kept else "MISSED"
+    print(f"bars (rate ≥ {BAR_RATE} ×, median latency ≤ {BAR_LATENCY} ×): {verdict}", file=sys.stderr)
     return 0 if kept else 1
 
 

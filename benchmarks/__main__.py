@@ -1,0 +1,13 @@
+"""Run all benchmarks, one after the other: ``make bench`` or ``python -m benchmarks``."""
+
+import subprocess
+import sys
+
+BENCHMARKS = ("kernels", "assembly", "loop")
+
+if __name__ == "__main__":
+    worst = 0
+    for name in BENCHMARKS:
+        print(f"== benchmarks.{name}", flush=True)
+        worst = max(worst, subprocess.run([sys.executable, "-m", f"benchmarks.{name}"], check=False).returncode)
+    sys.exit(worst)
