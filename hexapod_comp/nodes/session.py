@@ -173,6 +173,7 @@ def run_session(
     rate: float,
     compare: bool,
     progress: Callable[[int], None] | None = None,
+    announce: Callable[[str], None] = lambda _: None,
 ) -> SessionResult:
     """Visit poses, then mill a path; first without compensation when `compare`, then with it.
 
@@ -192,17 +193,21 @@ def run_session(
         Make the uncompensated pass.
     progress : callable, optional
         Called with a number of commands just sent.
+    announce : callable, optional
+        Called with a line about what happens now.
     """
     session = Session(client, geometry, rate, progress)
     records = [PoseRecord(target) for target in targets]
     track_without = None
     if compare:
+        announce("pass without compensation …")
         session.enable(False)
         session.visit(records, compensated=False)
         if path is not None:
             track_without, _ = session.mill(path)
         session.enable(True)
         session.latencies()
+    announce("pass with compensation …")
     session.visit(records, compensated=True)
     result = SessionResult(records)
     if path is not None:
