@@ -335,12 +335,9 @@ class _Run:
             machine.thresholds,
             self.motion.low,
             self.motion.sense,
-            machine.structure.base_joints,
-            machine.structure.platform_joints,
-            machine.axes[0],
-            machine.axes[1],
-            *machine.strut_arrays,
-            *machine.field_arrays,
+            machine.body,
+            machine.strut_arrays,
+            machine.field_arrays,
             values,
             flags,
         )
@@ -444,20 +441,9 @@ def examine_many(
     thresholds,
     low,
     sense,
-    base,
-    platform,
-    base_axes,
-    platform_axes,
-    table,
-    knots,
-    pieces,
-    probe,
-    gx,
-    gy,
-    gz,
-    lx,
-    ly,
-    lz,
+    body,
+    struts,
+    field,
     values,
     flags,
 ):
@@ -480,20 +466,9 @@ def examine_many(
             thresholds,
             low,
             sense,
-            base,
-            platform,
-            base_axes,
-            platform_axes,
-            table,
-            knots,
-            pieces,
-            probe,
-            gx,
-            gy,
-            gz,
-            lx,
-            ly,
-            lz,
+            body,
+            struts,
+            field,
             q_position,
             q_rotation,
             commands,
@@ -505,7 +480,7 @@ def examine_many(
             continue
         row = values[n, 1]
         row[:6] = commands
-        fill(base, platform, q_position, q_rotation, cone_axes, characteristic_length, row)
+        fill(body[0], body[1], q_position, q_rotation, cone_axes, characteristic_length, row)
 
 
 @compiled

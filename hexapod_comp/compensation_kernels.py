@@ -32,29 +32,22 @@ TABLE_END = 72 + 6 * PARAMETERS
 
 def pack_machine(machine: RealMachine) -> np.ndarray:
     """Return what :func:`machine_views` takes apart."""
-    structure = machine.structure
-    solver = [structure.characteristic_length, structure.home_sign, structure.max_condition]
-    parts = (
-        structure.base_joints,
-        structure.platform_joints,
-        *machine.axes,
-        machine.strut_arrays[0],
-        machine.model.field.probe,
-        machine.thresholds,
-        np.array(solver),
-    )
+    parts = (*machine.body, machine.strut_arrays[0], machine.field_arrays[0], machine.thresholds, machine.solver)
     return np.concatenate([np.ravel(part) for part in parts])
 
 
 @compiled
 def machine_views(numbers):
-    """Return base, platform, both cardan axes, strut table, probe, thresholds, solver's scalars."""
+    """Return the body (four arrays), strut table, probe, thresholds, solver's scalars."""
     end = TABLE_END
-    return (
+    body = (
         numbers[:18].reshape((6, 3)),
         numbers[18:36].reshape((6, 3)),
         numbers[36:54].reshape((6, 3)),
         numbers[54:72].reshape((6, 3)),
+    )
+    return (
+        body,
         numbers[72:end].reshape((6, PARAMETERS)),
         numbers[end : end + 3],
         numbers[end + 3 : end + 5],
@@ -78,15 +71,14 @@ def pack_nominal(geometry: HexapodGeometry, tool_inverse: Pose, limits: LimitTab
 
 @compiled
 def nominal_views(numbers):
-    """Return base, platform, tool inverse (position over rotation), stroke, cone axes and cosines, scalars."""
+    """Return base, platform, tool inverse (position over rotation) and the limits (four arrays)."""
+    cone_axes, cone_cosines = numbers[60:96].reshape((2, 6, 3)), numbers[96:108].reshape((2, 6))
+    limits = (numbers[48:60].reshape((6, 2)), cone_axes, cone_cosines, numbers[108:113])
     return (
         numbers[:18].reshape((6, 3)),
         numbers[18:36].reshape((6, 3)),
         numbers[36:48].reshape((4, 3)),
-        numbers[48:60].reshape((6, 2)),
-        numbers[60:96].reshape((2, 6, 3)),
-        numbers[96:108].reshape((2, 6)),
-        numbers[108:113],
+        limits,
     )
 
 
@@ -117,14 +109,7 @@ def compensate_one(
     frame,
     machine_numbers,
     nominal_numbers,
-    knots,
-    pieces,
-    gx,
-    gy,
-    gz,
-    lx,
-    ly,
-    lz,
+    varied,
     share,
     changed,
     ramp,
@@ -137,8 +122,9 @@ def compensate_one(
     `state` stays as it is; `next_state` and `poses` (platform pose, model pose) are written, and count only
     when nothing was found.
     """
-    base, platform, base_axes, platform_axes, table, probe, thresholds, _ = machine_views(machine_numbers)
-    nominal_base, nominal_platform, tool, stroke, cone_axes, cone_cosines, scalars = nominal_views(nominal_numbers)
+    body, table, probe, thresholds, _ = machine_views(machine_numbers)
+    nominal_base, nominal_platform, tool, limits = nominal_views(nominal_numbers)
+    struts, field = (table, *varied[:2]), (probe, *varied[2:])
     platform_position, platform_rotation, model_position, model_rotation = pose_views(poses)
     half_position, half_rotation = np.empty(3), np.empty((3, 3))
     compose(frame[:3], frame[3:].reshape((3, 3)), position, rotation, half_position, half_rotation)
@@ -147,15 +133,7 @@ def compensate_one(
     command = next_state[COMMAND:BUMP]
     kernels.strut_lengths_one(nominal_base, nominal_platform, platform_position, platform_rotation, nominal)
     finding, strut, value, condition = check_stage(
-        nominal_base,
-        nominal_platform,
-        platform_position,
-        platform_rotation,
-        nominal,
-        stroke,
-        cone_axes,
-        cone_cosines,
-        scalars,
+        nominal_base, nominal_platform, platform_position, platform_rotation, nominal, limits
     )
     if finding != WITHIN:
         return SOLVED, finding, strut, 0, value, condition
@@ -166,20 +144,9 @@ def compensate_one(
         thresholds,
         next_state[LOW:SENSE],
         next_state[SENSE:NOMINAL],
-        base,
-        platform,
-        base_axes,
-        platform_axes,
-        table,
-        knots,
-        pieces,
-        probe,
-        gx,
-        gy,
-        gz,
-        lx,
-        ly,
-        lz,
+        body,
+        struts,
+        field,
         model_position,
         model_rotation,
         command,
@@ -192,20 +159,10 @@ def compensate_one(
     for i in range(6):
         correction[i] += next_state[BUMP + i]
         command[i] = nominal[i] + correction[i]
-    finding, strut, value, stage = check_command(nominal, correction, command, state, scalars)
+    finding, strut, value, stage = check_command(nominal, correction, command, state, limits[3])
     if finding == WITHIN:
         stage = 1
-        finding, strut, value, _ = check_stage(
-            base,
-            platform,
-            model_position,
-            model_rotation,
-            command,
-            stroke,
-            cone_axes,
-            cone_cosines,
-            scalars,
-        )
+        finding, strut, value, _ = check_stage(body[0], body[1], model_position, model_rotation, command, limits)
     return OUTSIDE if outside else SOLVED, finding, strut, stage, value, condition
 
 
@@ -221,14 +178,7 @@ def compensate_quaternion(
     frame,
     machine_numbers,
     nominal_numbers,
-    knots,
-    pieces,
-    gx,
-    gy,
-    gz,
-    lx,
-    ly,
-    lz,
+    varied,
     share,
     changed,
     ramp,
@@ -250,14 +200,7 @@ def compensate_quaternion(
         frame,
         machine_numbers,
         nominal_numbers,
-        knots,
-        pieces,
-        gx,
-        gy,
-        gz,
-        lx,
-        ly,
-        lz,
+        varied,
         share,
         changed,
         ramp,
@@ -301,49 +244,30 @@ def ramp_bump(correction, state, next_bump, changed, ramp):
 
 @compiled
 def estimate_one(
-    struts,
+    readings,
     state,
     machine_numbers,
-    knots,
-    pieces,
-    gx,
-    gy,
-    gz,
-    lx,
-    ly,
-    lz,
+    varied,
     tool_position,
     tool_rotation,
     model_pose,
     tool_pose,
 ):
-    """Run the model forwards and write the tool pose in ``base``; return (outcome, condition number).
+    """Run the model forwards from six strut readings; return (outcome, condition number).
 
-    `model_pose` (12,) is the guess and, when the outcome is OK, becomes the solution; `tool_pose` (12,)
+    `model_pose` (12,) is the guess and, when the outcome is OK, becomes the solution; `tool_pose` (12,) in ``base``
     is then written: position, rotation matrix by rows.
     """
-    base, platform, base_axes, platform_axes, table, probe, _, solver = machine_views(machine_numbers)
+    body, table, probe, _, solver = machine_views(machine_numbers)
+    struts, field = (table, *varied[:2]), (probe, *varied[2:])
     position, rotation = np.empty(3), np.empty((3, 3))
     outcome, _, condition, _ = actual_pose_one(
-        struts,
+        readings,
         state[SENSE:NOMINAL],
-        base,
-        platform,
-        base_axes,
-        platform_axes,
-        table,
-        knots,
-        pieces,
-        probe,
-        gx,
-        gy,
-        gz,
-        lx,
-        ly,
-        lz,
-        solver[0],
-        solver[1],
-        solver[2],
+        body,
+        struts,
+        field,
+        solver,
         model_pose[:3],
         model_pose[3:].reshape((3, 3)),
         position,

@@ -110,8 +110,12 @@ def joint_cosines(base, platform, position, rotation, cone_axes, i):
 
 
 @compiled
-def check_stage(base, platform, position, rotation, lengths, stroke, cone_axes, cone_cosines, scalars):
-    """Check lengths and pose of one stage; return (finding, strut, value, condition number)."""
+def check_stage(base, platform, position, rotation, lengths, limits):
+    """Check lengths and pose of one stage; return (finding, strut, value, condition number).
+
+    `limits` holds stroke, cone axes, cone cosines and scalars, as in :class:`LimitTable`.
+    """
+    stroke, cone_axes, cone_cosines, scalars = limits
     for i in range(6):
         if not math.isfinite(lengths[i]):
             return NOT_FINITE, i, lengths[i], math.nan

@@ -196,7 +196,9 @@ class RealMachine:
             self._displacement("platform", platform, model.platform_deviation, model.platform_expansion),
         )
         growth = np.array([self._growth(n, a) for n, a in zip(STRUT_NAMES, model.struts.expansion, strict=True)])
-        self.axes = geometry.kernel_axes
+        structure = self.structure
+        self.body = (structure.base_joints, structure.platform_joints, *geometry.kernel_axes)
+        self.solver = (structure.characteristic_length, structure.home_sign, structure.max_condition)
         self.strut_arrays = (
             model.struts.parameter_table(geometry, growth),
             model.struts.map_knots.copy(),
@@ -246,11 +248,9 @@ class RealMachine:
             self.thresholds,
             motion.low,
             motion.sense,
-            self.structure.base_joints,
-            self.structure.platform_joints,
-            *self.axes,
-            *self.strut_arrays,
-            *self.field_arrays,
+            self.body,
+            self.strut_arrays,
+            self.field_arrays,
             position,
             rotation,
             commands,
@@ -297,18 +297,13 @@ class RealMachine:
 
     def forward(self, commands, sense, position, rotation, actual_position, actual_rotation):
         """Run :func:`actual_pose_one` on preallocated arrays: the loop's entry, without checks."""
-        structure = self.structure
         return actual_pose_one(
             commands,
             sense,
-            structure.base_joints,
-            structure.platform_joints,
-            *self.axes,
-            *self.strut_arrays,
-            *self.field_arrays,
-            structure.characteristic_length,
-            structure.home_sign,
-            structure.max_condition,
+            self.body,
+            self.strut_arrays,
+            self.field_arrays,
+            self.solver,
             position,
             rotation,
             actual_position,

@@ -1,4 +1,9 @@
-"""Compiled runs of the machine model: backwards (what to command) and forwards (where the tool really goes)."""
+"""Compiled runs of the machine model: backwards (what to command) and forwards (where the tool really goes).
+
+What stays the same between two commands travels in tuples of arrays: the `body` (base joints, platform
+joints, cardan axes on the base, on the platform), the `struts` (table, map knots, map pieces) and the
+`field` (probe, three grids, three families of lines); see :class:`hexapod_comp.machine.RealMachine`.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +19,14 @@ from .struts import LEAD, actual_length, command_for_length, screw_shift
 
 
 @compiled
-def undo_field(position, rotation, sense, probe, gx, gy, gz, lx, ly, lz, q_position, q_rotation):
+def undo_field(position, rotation, sense, field, q_position, q_rotation):
     """Solve q ∘ E(q) = target for q; return (solved, outside).
 
     With f the measured point, E moves it by d(f) and turns the platform by exp(ω(f)), both along the axes
     of ``base``. So q's measured point is a fixed point of f ← f_target − d(f): a contraction whose factor
     is the field's slope, some 1e-4 on a machine tool.
     """
+    probe, gx, gy, gz, lx, ly, lz = field
     error = np.empty(6)
     offset = lever(rotation, probe)
     tx, ty, tz = position[0] + offset[0], position[1] + offset[1], position[2] + offset[2]
@@ -46,8 +52,9 @@ def undo_field(position, rotation, sense, probe, gx, gy, gz, lx, ly, lz, q_posit
 
 
 @compiled
-def apply_field(q_position, q_rotation, sense, probe, gx, gy, gz, lx, ly, lz, position, rotation):
+def apply_field(q_position, q_rotation, sense, field, position, rotation):
     """Write q ∘ E(q): the measured point moves by d, the platform turns by exp(ω) about it; return outside."""
+    probe, gx, gy, gz, lx, ly, lz = field
     error = np.empty(6)
     point = np.empty(3)
     offset = lever(q_rotation, probe)
@@ -76,41 +83,18 @@ def lever(rotation, offset):
 
 
 @compiled
-def command_one(
-    position,
-    rotation,
-    thresholds,
-    low,
-    sense,
-    base,
-    platform,
-    base_axes,
-    platform_axes,
-    table,
-    knots,
-    pieces,
-    probe,
-    gx,
-    gy,
-    gz,
-    lx,
-    ly,
-    lz,
-    q_position,
-    q_rotation,
-    commands,
-):
+def command_one(position, rotation, thresholds, low, sense, body, struts, field, q_position, q_rotation, commands):
     """Run the model backwards for one platform pose; return (solved, outside).
 
     `thresholds` are those of the axes and of the struts, m; `low` and `sense` (9,) are the motion state,
     updated in place; q and `commands` are written.
     """
-    point = lever(rotation, probe)
+    base, platform, base_axes, platform_axes = body
+    table, knots, pieces = struts
+    point = lever(rotation, field[0])
     for axis in range(3):
         follow(position[axis] + point[axis], thresholds[0], low, sense, axis)
-    solved, outside = undo_field(
-        position, rotation, sense, probe, gx, gy, gz, lx, ly, lz, q_position, q_rotation
-    )
+    solved, outside = undo_field(position, rotation, sense, field, q_position, q_rotation)
     for i in range(6):
         sx, sy, sz = kernels.strut_vector(base, platform, q_position, q_rotation, i)
         length = math.sqrt(sx * sx + sy * sy + sz * sz)
@@ -121,37 +105,16 @@ def command_one(
 
 
 @compiled
-def actual_pose_one(
-    commands,
-    sense,
-    base,
-    platform,
-    base_axes,
-    platform_axes,
-    table,
-    knots,
-    pieces,
-    probe,
-    gx,
-    gy,
-    gz,
-    lx,
-    ly,
-    lz,
-    characteristic_length,
-    home_sign,
-    max_condition,
-    q_position,
-    q_rotation,
-    position,
-    rotation,
-):
+def actual_pose_one(commands, sense, body, struts, field, solver, q_position, q_rotation, position, rotation):
     """Run the model forwards for six commands; return (outcome, iterations, condition, outside).
 
-    q (guess in, solution out) and the actual pose are written only when the outcome is OK. The screw
-    rotation depends on the pose sought, so lengths and pose are settled in turn; that contracts by the
-    lead over the strut length, and takes one pass when there is no lead.
+    `solver` holds characteristic length, home sign and largest condition number. q (guess in, solution out)
+    and the actual pose are written only when the outcome is OK. The screw rotation depends on the pose
+    sought, so lengths and pose are settled in turn; that contracts by the lead over the strut length, and
+    takes one pass when there is no lead.
     """
+    base, platform, base_axes, platform_axes = body
+    table, knots, pieces = struts
     lengths = np.empty(6)
     shifts = np.zeros(6)
     p, r = q_position.copy(), q_rotation.copy()
@@ -169,7 +132,7 @@ def actual_pose_one(
         if turning and outcome == kernels.OK and change < 1e-15:
             break
         outcome, steps, condition = kernels.solve_pose_one(
-            base, platform, lengths, p, r, characteristic_length, home_sign, max_condition
+            base, platform, lengths, p, r, solver[0], solver[1], solver[2]
         )
         iterations += steps
         if outcome != kernels.OK:
@@ -180,5 +143,5 @@ def actual_pose_one(
         q_position[i] = p[i]
         for j in range(3):
             q_rotation[i, j] = r[i, j]
-    outside = apply_field(p, r, sense, probe, gx, gy, gz, lx, ly, lz, position, rotation)
+    outside = apply_field(p, r, sense, field, position, rotation)
     return outcome, iterations, condition, outside
