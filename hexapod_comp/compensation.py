@@ -114,13 +114,13 @@ class _Command:
         self.bump = self.state[BUMP:]
         position, rotation, model_position, model_rotation = pose_views.py_func(self.poses)
         self.platform, self.model = (position, rotation), (model_position, model_rotation)
+        self.correction[:], self.bump[:] = math.nan, 0.0
         self.clear()
 
     def clear(self) -> None:
-        """Make it the state before any command."""
-        self.state[:] = math.nan
-        self.motion.sense[:] = 0.0
-        self.bump[:] = 0.0
+        """Forget lengths and motion; the correction stays, as what the struts stand at."""
+        self.motion.low[:], self.motion.sense[:] = math.nan, 0.0
+        self.nominal[:], self.command[:] = math.nan, math.nan
 
 
 class Compensator:
@@ -164,7 +164,6 @@ class Compensator:
         self._take_machine(RealMachine(geometry, model))
         self._model_pose, self._tool_pose = np.empty(12), np.empty(12)
         self._forget()
-        self._changed = False
 
     @property
     def command(self) -> np.ndarray:
@@ -248,6 +247,9 @@ class Compensator:
     def reset(self, measured: np.ndarray | None = None) -> None:
         """Forget the last command and all directions of motion.
 
+        What was corrected last is not forgotten, since the struts still stand there: the next command
+        starts from it and ramps.
+
         Parameters
         ----------
         measured : array_like, shape (6,), optional
@@ -267,6 +269,7 @@ class Compensator:
         self._last.clear()
         self._model_pose[:3], self._model_pose[3:] = home.position, home.rotation.ravel()
         self._last_time = math.nan
+        self._changed = not math.isnan(self._last.correction[0])
 
     def step(self, numbers: tuple[float, ...], time: float, frame: np.ndarray | None = None) -> np.ndarray:
         """Compensate one commanded tool pose: the loop's entry.

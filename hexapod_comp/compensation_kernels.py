@@ -234,7 +234,7 @@ def ramp_bump(correction, state, next_bump, changed, ramp):
     largest = 0.0
     for i in range(6):
         next_bump[i] = state[BUMP + i]
-        if changed and not math.isnan(state[NOMINAL + i]):
+        if changed and not math.isnan(state[CORRECTION + i]):
             next_bump[i] = state[CORRECTION + i] - correction[i]
         largest = max(largest, abs(next_bump[i]))
     keep = 0.0 if largest <= ramp else 1.0 - ramp / largest

@@ -387,9 +387,8 @@ def test_check_agrees_with_the_compensator_on_a_random_stream() -> None:
     rotations = Rotation.from_rotvec(rng.uniform(-0.3, 0.3, (400, 3))).as_matrix()
     result = check(geometry, model, positions, rotations, mode="poses")
     reasons = [{b.limit for b in result.breaches if b.row == n} for n in range(400)]
-    compensator = Compensator(geometry, model)
     for n in range(400):
-        compensator.reset()
+        compensator = Compensator(geometry, model)
         if reasons[n]:
             with pytest.raises(HexapodError) as caught:
                 compensator.correct(Pose(positions[n], rotations[n]))

@@ -397,12 +397,17 @@ def test_measured_lengths_that_are_none_are_refused(measured: np.ndarray) -> Non
     np.testing.assert_array_equal(compensator.command, before)
 
 
-def test_a_reset_forgets_directions_and_ramps() -> None:
+def test_after_a_reset_the_correction_ramps_to_that_of_a_fresh_start() -> None:
+    """Truth: a compensator that never knew anything else, once the ramp is through; before it, no step."""
     compensator = standing()
     assert compensator.ramping
     compensator.reset()
     compensator.enable(True)
-    record = compensator.correct(PAPER.home, 99.0)
+    stands_at = compensator.correction.copy()
+    first = compensator.correct(PAPER.home, 99.0)
+    np.testing.assert_allclose(first.correction, stands_at, atol=1e-15)
+    for n in range(200):
+        record = compensator.correct(PAPER.home, 99.0 + 0.02 * (n + 1))
     fresh = Compensator(PAPER, compensator.model, RAMP).correct(PAPER.home, 99.0)
     assert_same_records(record, fresh)
 

@@ -34,6 +34,7 @@ from ..pose import Pose
 from .health import ERROR, OK, WARN, Flow, HealthReport, Refusals, seconds
 from .markers import machine_markers
 from .runtime import (
+    ACKNOWLEDGED_WITHIN,
     COMMAND_QOS,
     EVENT_QOS,
     STATE_QOS,
@@ -153,8 +154,8 @@ class CompensatorNode(MachineNode):
             return
         self._active = False
         self._check_state()
-        self._diagnostics_pub.wait_for_all_acked()
-        self._command_pub.wait_for_all_acked()
+        self._diagnostics_pub.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+        self._command_pub.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
     def _load_model(self, geometry: HexapodGeometry) -> MachineModel:
         name = self._options["model_file"]
@@ -162,15 +163,14 @@ class CompensatorNode(MachineNode):
 
     def _warm_up(self) -> None:
         """Run every kernel of the loop once, so that none compiles while the machine moves."""
-        compensator = self.compensator
-        home = compensator.tool_pose(compensator.geometry.home)
+        trial = Compensator(self.compensator.geometry, self.compensator.model)
+        home = trial.tool_pose(trial.geometry.home)
         message = PoseStamped()
         write_pose(message, home.position, home.rotation)
-        compensator.step(pose_numbers(message), 0.0)
-        compensator.estimate(compensator.command)
-        StrutMessage().write(compensator.command)
-        compensator.enable(self._options["enable_compensation"])
-        compensator.reset()
+        trial.step(pose_numbers(message), 0.0)
+        trial.estimate(trial.command)
+        StrutMessage().write(trial.command)
+        self.compensator.enabled = self._options["enable_compensation"]
 
     def _open_topics(self) -> None:
         self._command_pub = self.publish_on(JointState, "strut_commands", COMMAND_QOS)

@@ -16,6 +16,7 @@ from typing import Any
 
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.publisher import Publisher
@@ -37,6 +38,9 @@ STATE_QOS = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=Rel
 
 EVENT_QOS = QoSProfile(depth=10, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 """Rare messages, each of which counts: temperatures, diagnostics, markers."""
+
+ACKNOWLEDGED_WITHIN = Duration(seconds=0.4)
+"""How long the last message waits to be acknowledged: that may take DDS 3 s, and the dead never do it."""
 
 
 class ParameterError(HexapodError):

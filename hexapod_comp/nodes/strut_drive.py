@@ -30,6 +30,7 @@ from ..paths import config_file
 from ..simulation import DriveParameters, Faults, StrutDrive
 from .health import ERROR, OK, WARN, Flow, HealthReport, Refusals, seconds
 from .runtime import (
+    ACKNOWLEDGED_WITHIN,
     COMMAND_QOS,
     EVENT_QOS,
     STATE_QOS,
@@ -156,7 +157,7 @@ class StrutDriveNode(MachineNode):
             return
         self._active = False
         self._check_state()
-        self._diagnostics_pub.wait_for_all_acked()
+        self._diagnostics_pub.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
     def _truth(self, geometry: HexapodGeometry) -> MachineModel:
         name = self._options["truth_file"]

@@ -1,0 +1,154 @@
+"""The two nodes as operating-system processes: start, the loop between them, every way to end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from node_helpers import HOME, closed_form_lengths, near
+
+from hexapod_comp.nodes.client import LoopClient
+from hexapod_comp.nodes.processes import NodeProcess
+from hexapod_comp.nodes.session import connect
+
+STOP_WITHIN = 2.0
+"""From the signal to the end of the process, s."""
+
+
+@pytest.fixture
+def client(isolated_ros) -> Iterator[LoopClient]:
+    made = LoopClient()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def pair(client) -> Iterator[tuple[NodeProcess, NodeProcess]]:
+    """Compensator and strut drive, connected with each other and with the client."""
+    nodes = NodeProcess("compensator", {}), NodeProcess("strut_drive", {})
+    try:
+        connect(client, nodes)
+        yield nodes
+    finally:
+        for node in nodes:
+            node.stop()
+
+
+def assert_ends_well(node: NodeProcess, *signals: signal.Signals) -> None:
+    """Send signals one after the other; the process ends in time, with 0 and without a traceback."""
+    began = time.monotonic()
+    for number in signals:
+        node.send(number)
+    while node.exit_code() is None and time.monotonic() - began < 30.0:
+        time.sleep(0.01)
+    assert node.exit_code() == 0, node.output()
+    assert time.monotonic() - began < STOP_WITHIN
+    assert "Traceback" not in node.output()
+
+
+def run_both(*arguments: str) -> list[tuple[int, str]]:
+    """Run both nodes at once, as a user would, and return exit code and stderr of each when they have ended."""
+    modules = [f"hexapod_comp.nodes.{name}" for name in ("compensator", "strut_drive")]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    started = [subprocess.Popen([sys.executable, "-m", module, *arguments], **pipes) for module in modules]
+    try:
+        return [(process.returncode, said) for process in started for _, said in [process.communicate(timeout=60.0)]]
+    finally:
+        for process in started:
+            process.kill()
+
+
+def test_loop_between_processes(client, pair):
+    """A command comes back as struts near the closed form, the tool goes there, the estimate says so.
+
+    In three commands, so that every strut has a direction of motion: the first alone has none to go by.
+    """
+    pose = near(HOME, (0.0005, -0.0003, 0.0008))
+    for share in (0.2, 0.6, 1.0):
+        entry = client.send(near(HOME, (0.0005 * share, -0.0003 * share, 0.0008 * share)))
+        client.wait_for_answer(entry, 5.0)
+    np.testing.assert_allclose(entry.command - entry.correction, closed_form_lengths(pose), rtol=0.0, atol=1e-12)
+    client.spin_until(client.settled(), 5.0, "the tool to rest")
+    # 0.1 µm steps, 0.05 µm noise of the encoders, J⁻¹ below 3: a fraction of a micrometre; uncorrected 100 µm.
+    assert np.abs(client.true_pose.position - pose.position).max() < 0.5e-6
+    assert np.abs(client.estimate.position - pose.position).max() < 2e-6
+    assert client.counted() == (3, 0)
+    for node in pair:
+        assert "ready" in node.output()
+        assert_ends_well(node, signal.SIGINT)
+
+
+@pytest.mark.parametrize(
+    ("to_compensator", "to_drive"),
+    [
+        ((signal.SIGINT, signal.SIGINT), (signal.SIGTERM,)),
+        ((signal.SIGTERM, signal.SIGINT), (signal.SIGINT, signal.SIGINT)),
+    ],
+    ids=["double SIGINT, SIGTERM", "SIGTERM and SIGINT, double SIGINT"],
+)
+def test_signals_end_both_with_0(client, pair, to_compensator, to_drive):
+    """A double SIGINT is what ``ros2 launch`` sends. The last thing said arrives."""
+    client.wait_for_answer(client.send(HOME), 5.0)
+    for node, signals in zip(pair, (to_compensator, to_drive), strict=True):
+        assert_ends_well(node, *signals)
+    client.spin_until(lambda: client.diagnostics["state"] == "not active", 2.0, "the compensator's last status")
+
+
+def test_compensator_survives_the_end_of_the_drive(client, pair):
+    """kill -9 leaves no good-bye: the compensator goes on, says so, takes a new drive, and ends when told."""
+    compensator, drive = pair
+
+    def estimated_from(source: str) -> bool:
+        client.wait_for_answer(client.send(HOME), 5.0)
+        return client.diagnostics["pose_estimated_from"] == source
+
+    client.spin_until(lambda: estimated_from("strut_states"), 5.0, "feedback")
+    drive.send(signal.SIGKILL)
+    client.spin_until(lambda: estimated_from("own commands"), 5.0, "the compensator to notice")
+    assert client.diagnostics["state"] == "running, pose estimated from own commands"
+    again = NodeProcess("strut_drive", {})
+    try:
+        client.spin_until(lambda: estimated_from("strut_states"), 20.0, "the new drive to be heard")
+        again.send(signal.SIGKILL)
+        assert_ends_well(compensator, signal.SIGINT)  # without waiting for the dead to acknowledge
+    finally:
+        again.stop()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "texts"),
+    [
+        (["-p", "geometry_file:=nowhere.yaml"], ["cannot configure", "nowhere.yaml", "paper.yaml"]),
+        (["-p", "autostart:=maybe"], ["cannot start", "parameter autostart", "must be bool", "'maybe'"]),
+        (["-p", "no_assignment"], ["no_assignment"]),
+        (["-p", "compensator:ramp_rate:=-1.0", "-p", "strut_drive:lag:=-1.0"], ["cannot start: parameter", "-1.0"]),
+        (["-p", "compensator:ramp_rate:=50", "-p", "strut_drive:lag:=50"], ["cannot start: parameter", "…1, not 50"]),
+    ],
+    ids=["no such file", "wrong type", "not an argument", "below its range", "an int above its range"],
+)
+def test_bad_start_ends_with_1_and_a_clear_word(isolated_ros, arguments, texts):
+    for code, said in run_both("--ros-args", *arguments):
+        assert code == 1, said
+        assert "Traceback" not in said
+        for text in texts:
+            assert text in said
+
+
+def test_ready_within_three_seconds(client):
+    """With a warm cache of compiled kernels, which the tests before have left."""
+    if len(os.sched_getaffinity(0)) < 2 or os.getloadavg()[0] > 4.0:
+        pytest.skip("a start cannot be timed on a machine that is busy otherwise")
+    began = time.monotonic()
+    node = NodeProcess("compensator", {})
+    try:
+        client.spin_until(lambda: "ready" in node.output(), 30.0, "the compensator to be ready")
+        assert time.monotonic() - began < 3.0
+        assert "loading; the first start" in node.output(), "a compiling start says what it is doing"
+    finally:
+        node.stop()
