@@ -10,8 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from tqdm import tqdm
 
-from .errors import GeometryError, HexapodError
+from .checking import check
+from .errors import GeometryError, HexapodError, InputFileError
 from .geometry import HexapodGeometry
+from .machine import MachineModel
+from .model_file import load_model
+from .paths import config_file
 from .pose import Pose
 from .session_records import PoseRecord, SessionResult
 from .session_report import rms
@@ -43,18 +47,39 @@ def demo_path(geometry: HexapodGeometry, rate: float) -> Path:
     return join([ring, to_corner, rows])
 
 
+def refuse_broken_limits(path: str, geometry: HexapodGeometry, model: str, rows: list[Row], poses: list[Pose]) -> None:
+    """Check poses and the way between them before anything moves.
+
+    Raises
+    ------
+    InputFileError
+        A limit is broken; names the first pose and says how to see them all.
+    """
+    known = MachineModel(geometry.name) if model == "ideal" else load_model(config_file(model), geometry)
+    positions = np.array([pose.position for pose in poses])
+    rotations = np.array([pose.rotation for pose in poses])
+    found = check(geometry, known, positions, rotations).breaches
+    if found:
+        row = rows[found[0].row]
+        problem = f"pose {row.label}: {found[0].error}; `hexapod_comp check` lists all {len(found)} breaches"
+        raise InputFileError(path, f"line {row.line}", problem)
+
+
 def simulated(
     geometry: HexapodGeometry, machine: str, model: str, truth: str
 ) -> AbstractContextManager[Sequence[object]]:
     """Start compensator and strut drive as two processes in a ROS domain of their own."""
     session = _session_module()
-    from .paths import config_file
 
-    def found(name: str) -> str:
-        return name if name in ("ideal", "random") else str(config_file(name).resolve())
+    def checked(name: str, *words: str) -> str:
+        """Return a model as the nodes take it, refused here rather than in a process of its own."""
+        if name in words:
+            return name
+        load_model(config_file(name), geometry)
+        return str(config_file(name).resolve())
 
-    geometry_file = found(machine)
-    model_file, truth_file = found(model), found(truth)
+    geometry_file = str(config_file(machine).resolve())
+    model_file, truth_file = checked(model, "ideal"), checked(truth, "ideal", "random")
     print("preparing; the first run on a machine compiles its kernels, which takes up to a minute", file=sys.stderr)
     session.prepare(geometry)
     return session.simulated_machine(
@@ -70,10 +95,11 @@ def witnessed(
     path: Path | None,
     rate: float,
     compare: bool,
+    namespace: str = "",
 ) -> SessionResult:
     """Run poses of the work frame and a path in ``base`` through the loop, with a progress bar."""
     session = _session_module()
-    client = session.LoopClient()
+    client = session.LoopClient(namespace=namespace)
     try:
         session.connect(client, nodes)
         with _progress() as bar:

@@ -76,8 +76,8 @@ def rms(values: np.ndarray) -> float:
 
 
 def _pose_text(pose: Pose) -> str:
-    x, y, z = pose.position * 1e3
-    alpha, beta, gamma = np.degrees(pose.angles())
+    x, y, z = np.round(pose.position * 1e3, 4) + 0.0  # no minus before a zero
+    alpha, beta, gamma = np.round(np.degrees(pose.angles()), 5) + 0.0
     return f"x {x:10.4f}  y {y:10.4f}  z {z:10.4f} mm   α {alpha:9.5f}  β {beta:9.5f}  γ {gamma:9.5f} °"
 
 

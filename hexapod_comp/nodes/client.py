@@ -27,8 +27,8 @@ LISTENER_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
 
 TRACK_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 
-ANSWER_TIMEOUT = 0.25
-"""A command without an answer after this long is lost or refused, s."""
+ANSWER_TIMEOUT = 1.0
+"""A command without an answer after this long is lost or refused, s: longer than a diagnostics period."""
 
 
 class NoAnswerError(HexapodError):
@@ -62,12 +62,14 @@ class LoopClient:
     ----------
     frame_id : str
         Frame of the commanded poses.
+    namespace : str
+        Where the machine's nodes are.
     """
 
-    def __init__(self, frame_id: str = "base") -> None:
+    def __init__(self, frame_id: str = "base", namespace: str = "") -> None:
         self.context = rclpy.Context()
         rclpy.init(args=[], context=self.context, signal_handler_options=SignalHandlerOptions.NO)
-        self.node = rclpy.create_node("hexapod_comp_client", context=self.context)
+        self.node = rclpy.create_node("hexapod_comp_client", namespace=namespace, context=self.context)
         self._executor = EventsExecutor(context=self.context)
         self._executor.add_node(self.node)
         self._message = pose_message(Pose.identity(), frame_id)
@@ -76,6 +78,8 @@ class LoopClient:
         self.track: list[tuple[np.ndarray, int]] = []
         self._streamed: int | None = None
         self.diagnostics: dict[str, str] = {}
+        self._status_name = f"{self.node.get_namespace()}/compensator:".lstrip("/")
+        self._counted_before: tuple[int, int] | None = None
         self._true: PoseStamped | None = None
         self._estimate: PoseStamped | None = None
         self.true_count = 0
@@ -119,9 +123,9 @@ class LoopClient:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            if status.name.startswith("compensator"):
+            if status.name.startswith(self._status_name):
                 self.diagnostics = {entry.key: entry.value for entry in status.values}
-                self.diagnostics["state"] = status.message
+                self._counted_before = self._counted_before or self._counts()
 
     @property
     def has_true_pose(self) -> bool:
@@ -167,19 +171,23 @@ class LoopClient:
             and bool(self.diagnostics)
         )
 
+    def _counts(self) -> tuple[int, int]:
+        return int(self.diagnostics["commands"]), int(self.diagnostics["refused"])
+
     def counted(self) -> tuple[int, int]:
-        """Return how many commands the compensator has accepted and refused, when it has counted all sent.
+        """Return how many of this client's commands the compensator has accepted and refused.
 
-        Commands that it does not count within two diagnostics periods are lost.
+        Commands that it does not count within two diagnostics periods are lost. Other clients' commands
+        count as ours: nobody else should be sending any.
         """
-
-        def counts() -> tuple[int, int]:
-            return int(self.diagnostics["commands"]), int(self.diagnostics["refused"])
-
+        accepted_before, refused_before = self._counted_before or (0, 0)
         end = time.monotonic() + 2.5
-        while sum(counts()) < len(self.sent) and time.monotonic() < end:
+        while True:
+            accepted, refused = self._counts()
+            accepted, refused = accepted - accepted_before, refused - refused_before
+            if accepted + refused >= len(self.sent) or time.monotonic() > end:
+                return accepted, refused
             self._executor.spin_once(timeout_sec=0.05)
-        return counts()
 
     def enable(self, enabled: bool) -> None:
         """Switch compensation on or off."""
@@ -197,15 +205,20 @@ class LoopClient:
         self._publisher.publish(message)
         return entry
 
-    def wait_for_answer(self, entry: Sent, timeout: float = ANSWER_TIMEOUT) -> None:
+    def wait_for_answer(self, entry: Sent) -> None:
         """Wait until command and correction have come back.
 
         Raises
         ------
         NoAnswerError
-            The command was lost or refused.
+            The command was lost or refused; carries the compensator's last refusal.
         """
-        self.spin_until(lambda: _answered(entry), timeout, "the answer to a command: lost or refused")
+        end = entry.sent_at + ANSWER_TIMEOUT
+        while not _answered(entry):
+            if time.monotonic() > end:
+                refusal = self.diagnostics.get("last_refusal") or "none"
+                raise NoAnswerError(f"no answer to a command within {ANSWER_TIMEOUT:g} s; last refusal: {refusal}")
+            self._executor.spin_once(timeout_sec=0.01)
 
     def stream(self, path: Path, each: Callable[[int], None] | None = None) -> list[Sent]:
         """Send a path at its rate and return the records; :attr:`track` then holds where the tool went.
@@ -219,6 +232,11 @@ class LoopClient:
             Poses and rate.
         each : callable, optional
             Called with the index after every pose sent.
+
+        Raises
+        ------
+        NoAnswerError
+            A command was lost or refused; the path ends there.
         """
         entries: list[Sent] = []
         self.track = []
@@ -228,20 +246,15 @@ class LoopClient:
             while (left := due - time.monotonic()) > 0.0:
                 self._executor.spin_once(timeout_sec=left)
             if entries:
-                self._await(entries[-1])
+                self.wait_for_answer(entries[-1])
             entries.append(self._send(message))
             self._streamed = len(entries)
             if each is not None:
                 each(index)
             due = max(due + 1.0 / path.rate, time.monotonic() - 1.0 / path.rate)
-        self._await(entries[-1])
+        self.wait_for_answer(entries[-1])
         self._streamed = None
         return entries
-
-    def _await(self, entry: Sent) -> None:
-        """Handle messages until a command is answered, or has had its time."""
-        while not _answered(entry) and time.monotonic() < entry.sent_at + ANSWER_TIMEOUT:
-            self._executor.spin_once(timeout_sec=0.01)
 
     def hold(self, pose: Pose, rate: float, until: Callable[[], bool], timeout: float, what: str) -> Sent:
         """Send one pose again and again, as a controller at standstill does, until a condition holds."""

@@ -23,8 +23,9 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("poses", help="CSV file of poses")
     add_loop_options(parser)
-    parser.add_argument("--attach", action="store_true", help="use nodes that are already running")
-    parser.add_argument("--no-compare", action="store_true", help="leave out the pass without compensation")
+    parser.add_argument("--attach", action="store_true", help="use nodes that already run; one pass, as they are")
+    parser.add_argument("--namespace", default="", help="namespace of those nodes")
+    parser.add_argument("--no-compare", action="store_true", help="leave out the simulated pass without compensation")
     parser.add_argument("--plot", metavar="PNG", help="write a picture")
     parser.add_argument("--json", action="store_true", help="print results as JSON")
     parser.set_defaults(run=run)
@@ -60,9 +61,11 @@ def run(args: argparse.Namespace) -> int:
     rate = loop.checked_rate(args.rate_hz)
     geometry = load_geometry(config_file(args.machine))
     rows, poses = read_poses(config_file(args.poses))
+    loop.refuse_broken_limits(args.poses, geometry, "ideal" if args.attach else args.model, rows, poses)
     started = nullcontext(()) if args.attach else loop.simulated(geometry, args.machine, args.model, args.truth)
+    compare = not (args.attach or args.no_compare)  # nobody switches a real machine's compensation off in passing
     with started as nodes:
-        result = loop.witnessed(geometry, nodes, poses, None, rate, not args.no_compare)
+        result = loop.witnessed(geometry, nodes, poses, None, rate, compare, args.namespace)
     if args.json:
         json.dump(loop.as_json(rows, result), sys.stdout, indent=1)
         print()
