@@ -11,11 +11,13 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from node_helpers import HOME, closed_form_lengths, near
 
-from hexapod_comp.nodes.client import LoopClient
+from hexapod_comp.nodes.client import LoopClient, Sent
 from hexapod_comp.nodes.processes import NodeProcess
 from hexapod_comp.nodes.session import connect
+from hexapod_comp.pose import Pose
 
 STOP_WITHIN = 2.0
 """From the signal to the end of the process, s."""
@@ -38,6 +40,28 @@ def pair(client) -> Iterator[tuple[NodeProcess, NodeProcess]]:
     finally:
         for node in nodes:
             node.stop()
+
+
+def ask(client: LoopClient, pose: Pose) -> Sent:
+    """Send one command and wait for its answer."""
+    entry = client.send(pose)
+    client.spin_until(lambda: answered(entry), 5.0, "the answer to a command")
+    return entry
+
+
+def answered(entry: Sent) -> bool:
+    return bool(np.isfinite(entry.command[0]) and np.isfinite(entry.correction[0]))
+
+
+def said(client: LoopClient) -> list[str]:
+    """Return the list to which the messages of the compensator's statuses are appended from now on."""
+    messages: list[str] = []
+
+    def listen(array: DiagnosticArray) -> None:
+        messages.extend(status.message for status in array.status if status.name.startswith("compensator:"))
+
+    client.node.create_subscription(DiagnosticArray, "/diagnostics", listen, 10)
+    return messages
 
 
 def assert_ends_well(node: NodeProcess, *signals: signal.Signals) -> None:
@@ -71,8 +95,7 @@ def test_loop_between_processes(client, pair):
     """
     pose = near(HOME, (0.0005, -0.0003, 0.0008))
     for share in (0.2, 0.6, 1.0):
-        entry = client.send(near(HOME, (0.0005 * share, -0.0003 * share, 0.0008 * share)))
-        client.wait_for_answer(entry, 5.0)
+        entry = ask(client, near(HOME, (0.0005 * share, -0.0003 * share, 0.0008 * share)))
     np.testing.assert_allclose(entry.command - entry.correction, closed_form_lengths(pose), rtol=0.0, atol=1e-12)
     client.spin_until(client.settled(), 5.0, "the tool to rest")
     # 0.1 µm steps, 0.05 µm noise of the encoders, J⁻¹ below 3: a fraction of a micrometre; uncorrected 100 µm.
@@ -94,27 +117,34 @@ def test_loop_between_processes(client, pair):
 )
 def test_signals_end_both_with_0(client, pair, to_compensator, to_drive):
     """A double SIGINT is what ``ros2 launch`` sends. The last thing said arrives."""
-    client.wait_for_answer(client.send(HOME), 5.0)
+    ask(client, HOME)
+    states = said(client)
+    client.spin_until(lambda: bool(states), 5.0, "a status")
     for node, signals in zip(pair, (to_compensator, to_drive), strict=True):
         assert_ends_well(node, *signals)
-    client.spin_until(lambda: client.diagnostics["state"] == "not active", 2.0, "the compensator's last status")
+    client.spin_until(lambda: states[-1] == "not active", 2.0, "the compensator's last status")
 
 
 def test_compensator_survives_the_end_of_the_drive(client, pair):
-    """kill -9 leaves no good-bye: the compensator goes on, says so, takes a new drive, and ends when told."""
+    """kill -9 leaves no good-bye: the compensator goes on, says so, takes a new drive, and ends when told.
+
+    When a process dies inside Fast DDS's shared memory, the others' messages may hang for up to 3 s: those
+    commands are refused as too old, and the client goes on sending.
+    """
     compensator, drive = pair
+    states = said(client)
 
-    def estimated_from(source: str) -> bool:
-        client.wait_for_answer(client.send(HOME), 5.0)
-        return client.diagnostics["pose_estimated_from"] == source
+    def goes_on(state: str) -> bool:
+        entry = client.send(HOME)
+        client.spin_until(lambda: answered(entry) or time.monotonic() > entry.sent_at + 0.2, 5.0, "an answer")
+        return answered(entry) and states[-1:] == [state]
 
-    client.spin_until(lambda: estimated_from("strut_states"), 5.0, "feedback")
+    client.spin_until(lambda: goes_on("running"), 10.0, "feedback")
     drive.send(signal.SIGKILL)
-    client.spin_until(lambda: estimated_from("own commands"), 5.0, "the compensator to notice")
-    assert client.diagnostics["state"] == "running, pose estimated from own commands"
+    client.spin_until(lambda: goes_on("running, pose estimated from own commands"), 10.0, "the loss to be said")
     again = NodeProcess("strut_drive", {})
     try:
-        client.spin_until(lambda: estimated_from("strut_states"), 20.0, "the new drive to be heard")
+        client.spin_until(lambda: goes_on("running"), 20.0, "the new drive to be heard")
         again.send(signal.SIGKILL)
         assert_ends_well(compensator, signal.SIGINT)  # without waiting for the dead to acknowledge
     finally:
@@ -140,15 +170,19 @@ def test_bad_start_ends_with_1_and_a_clear_word(isolated_ros, arguments, texts):
             assert text in said
 
 
-def test_ready_within_three_seconds(client):
-    """With a warm cache of compiled kernels, which the tests before have left."""
-    if len(os.sched_getaffinity(0)) < 2 or os.getloadavg()[0] > 4.0:
-        pytest.skip("a start cannot be timed on a machine that is busy otherwise")
-    began = time.monotonic()
-    node = NodeProcess("compensator", {})
-    try:
-        client.spin_until(lambda: "ready" in node.output(), 30.0, "the compensator to be ready")
-        assert time.monotonic() - began < 3.0
-        assert "loading; the first start" in node.output(), "a compiling start says what it is doing"
-    finally:
-        node.stop()
+def test_nodes_end_when_their_parent_is_killed(isolated_ros):
+    """kill -9 of a demo must not leave a machine running that nobody sees."""
+    script = (
+        "from hexapod_comp.nodes.processes import NodeProcess\n"
+        "import time\n"
+        "print(NodeProcess('strut_drive', {}).pid, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    pid = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    end = time.monotonic() + 20.0
+    while os.path.exists(f"/proc/{pid}") and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not os.path.exists(f"/proc/{pid}")

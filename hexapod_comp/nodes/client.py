@@ -205,7 +205,7 @@ class LoopClient:
         self._publisher.publish(message)
         return entry
 
-    def wait_for_answer(self, entry: Sent) -> None:
+    def wait_for_answer(self, entry: Sent, timeout: float = ANSWER_TIMEOUT) -> None:
         """Wait until command and correction have come back.
 
         Raises
@@ -213,11 +213,11 @@ class LoopClient:
         NoAnswerError
             The command was lost or refused; carries the compensator's last refusal.
         """
-        end = entry.sent_at + ANSWER_TIMEOUT
+        end = entry.sent_at + timeout
         while not _answered(entry):
             if time.monotonic() > end:
                 refusal = self.diagnostics.get("last_refusal") or "none"
-                raise NoAnswerError(f"no answer to a command within {ANSWER_TIMEOUT:g} s; last refusal: {refusal}")
+                raise NoAnswerError(f"no answer to a command within {timeout:g} s; last refusal: {refusal}")
             self._executor.spin_once(timeout_sec=0.01)
 
     def stream(self, path: Path, each: Callable[[int], None] | None = None) -> list[Sent]:

@@ -102,7 +102,7 @@ class CompensatorNode(MachineNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load geometry and model, compile, open topics."""
         began = time.perf_counter()
-        self.get_logger().info("loading; the first start on a machine compiles its kernels, some 30 s")
+        self.get_logger().info("loading; the first start on a machine compiles its kernels, which takes up to a minute")
         try:
             geometry = load_geometry(config_file(self._options["geometry_file"]))
             self._compensator = Compensator(geometry, self._load_model(geometry), self._options["ramp_rate"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import socket
@@ -17,6 +18,11 @@ from types import TracebackType
 DOMAINS = range(1, 102)
 RESERVED_OFFSET = 5
 FIRST_PARTICIPANT_OFFSET = 10
+
+LIBC = ctypes.CDLL(None)
+
+PR_SET_PDEATHSIG = 1
+"""From Linux's <sys/prctl.h>."""
 
 STOP_TIMEOUT = 5.0
 """A process that has not ended this long after SIGINT is killed, s."""
@@ -81,8 +87,16 @@ class PrivateDomain:
         self._reservation.close()
 
 
+def _end_with_parent() -> None:
+    """Ask the system to interrupt this process when its parent dies, however it dies.
+
+    A session of its own keeps a terminal's Ctrl-C away from the nodes; nobody but the parent ends them.
+    """
+    LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGINT)
+
+
 class NodeProcess:
-    """One node as an operating-system process; its output goes to a log file.
+    """One node as an operating-system process; its output goes to a log file, and it ends with its parent.
 
     Parameters
     ----------
@@ -99,7 +113,12 @@ class NodeProcess:
         command = [sys.executable, "-m", f"hexapod_comp.nodes.{module}", *ros_arguments(parameters)]
         with os.fdopen(handle, "wb") as log:
             self._process = subprocess.Popen(
-                command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, start_new_session=True
+                command,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+                preexec_fn=_end_with_parent,
             )
 
     @property

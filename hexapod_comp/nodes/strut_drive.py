@@ -106,7 +106,7 @@ class StrutDriveNode(MachineNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Build the machine and open topics."""
         options = self._options
-        self.get_logger().info("loading; the first start on a machine compiles its kernels, which takes a while")
+        self.get_logger().info("loading; the first start on a machine compiles its kernels, which takes up to a minute")
         try:
             geometry = load_geometry(config_file(options["geometry_file"]))
             machine = RealMachine(geometry, self._truth(geometry))
