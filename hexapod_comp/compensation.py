@@ -15,14 +15,17 @@ import numpy as np
 from . import kernels
 from .compensation_kernels import (
     BUMP,
+    CHANGED,
     COMMAND,
     CORRECTION,
+    ENABLED,
     LOW,
     NO_POSE,
     NOMINAL,
     OUTSIDE,
     SENSE,
     STATE_SIZE,
+    TIME,
     UNSOLVED,
     compensate_one,
     compensate_quaternion,
@@ -42,9 +45,6 @@ from .pose import POSE_NOT_FINITE, QUATERNION_NORM_TOLERANCE, Pose
 
 DEFAULT_RAMP_RATE = 1e-3
 """How fast a change of model, temperature or enabling moves a strut, m/s."""
-
-LONGEST_RAMP_STEP = 0.02
-"""A pause between commands counts as no more than this in a ramp, s: a late command must not step."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class _Command:
         self.nominal = self.state[NOMINAL:CORRECTION]
         self.correction = self.state[CORRECTION:COMMAND]
         self.command = self.state[COMMAND:BUMP]
-        self.bump = self.state[BUMP:]
+        self.bump = self.state[BUMP:TIME]
         position, rotation, model_position, model_rotation = pose_views.py_func(self.poses)
         self.platform, self.model = (position, rotation), (model_position, model_rotation)
         self.correction[:], self.bump[:] = math.nan, 0.0
@@ -120,7 +120,7 @@ class _Command:
     def clear(self) -> None:
         """Forget lengths and motion; the correction stays, as what the struts stand at."""
         self.motion.low[:], self.motion.sense[:] = math.nan, 0.0
-        self.nominal[:], self.command[:] = math.nan, math.nan
+        self.nominal[:], self.command[:], self.state[TIME] = math.nan, math.nan, math.nan
 
 
 class Compensator:
@@ -150,11 +150,10 @@ class Compensator:
         self, geometry: HexapodGeometry, model: MachineModel, ramp_rate: float = DEFAULT_RAMP_RATE
     ) -> None:
         self.geometry = geometry
-        self.ramp_rate = ramp_rate
         self.limits = LimitTable(geometry)
         self.temperatures = Temperatures()
         self.machine = RealMachine(geometry, model)
-        self.enabled = True
+        self._switches = np.array([1.0, 0.0, ramp_rate])
         self.condition = math.nan
         self.outside_field = False
         self._tool_inverse = geometry.tool.inverse()
@@ -193,7 +192,12 @@ class Compensator:
     @property
     def ramping(self) -> bool:
         """Whether a change has not been fully taken up yet."""
-        return bool(self._last.bump.any()) or self._changed
+        return bool(self._last.bump.any() or self._switches[CHANGED])
+
+    @property
+    def enabled(self) -> bool:
+        """Whether it compensates."""
+        return bool(self._switches[ENABLED])
 
     def set_model(self, model: MachineModel) -> None:
         """Replace the model; the corrections ramp from the old one's to the new one's."""
@@ -204,7 +208,7 @@ class Compensator:
             # turn directions round, and a backlash would step when they turn back.
             self.motion.low[:] += after - before
         self._take_machine(machine)
-        self._changed = True
+        self._switches[CHANGED] = 1.0
 
     def _followed(self, machine: RealMachine) -> np.ndarray | None:
         """Return the nine values whose directions are followed, at the last command, under a machine's model.
@@ -224,8 +228,8 @@ class Compensator:
 
     def _take_machine(self, machine: RealMachine) -> None:
         self.machine = machine
-        self._machine_numbers = pack_machine(machine)
-        self._varied = (*machine.strut_arrays[1:], *machine.field_arrays[1:])
+        varied = (*machine.strut_arrays[1:], *machine.field_arrays[1:])
+        self._fixed = (pack_machine(machine), self._nominal_numbers, varied)
 
     def set_temperature(self, name: str, value: float) -> None:
         """Take a temperature reading, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
@@ -241,8 +245,8 @@ class Compensator:
     def enable(self, enabled: bool) -> None:
         """Switch compensation on or off; the corrections ramp."""
         if enabled != self.enabled:
-            self.enabled = enabled
-            self._changed = True
+            self._switches[ENABLED] = float(enabled)
+            self._switches[CHANGED] = float(not math.isnan(self._last.correction[0]))
 
     def reset(self, measured: np.ndarray | None = None) -> None:
         """Forget the last command and all directions of motion.
@@ -268,8 +272,7 @@ class Compensator:
         home = self.geometry.home
         self._last.clear()
         self._model_pose[:3], self._model_pose[3:] = home.position, home.rotation.ravel()
-        self._last_time = math.nan
-        self._changed = not math.isnan(self._last.correction[0])
+        self._switches[CHANGED] = float(not math.isnan(self._last.correction[0]))
 
     def step(self, numbers: tuple[float, ...], time: float, frame: np.ndarray | None = None) -> np.ndarray:
         """Compensate one commanded tool pose: the loop's entry.
@@ -294,25 +297,20 @@ class Compensator:
         PoseError, LimitError, KinematicsError, OutsideFieldError
             The command is refused and nothing has changed.
         """
-        return self._finish(compensate_quaternion(*numbers, *self._arguments(time, frame)), time, numbers)
-
-    def _arguments(self, time: float, frame: np.ndarray | None) -> tuple:
-        """Return what the kernels take besides the pose."""
-        ramp = 0.0 if math.isnan(self._last_time) else min(time - self._last_time, LONGEST_RAMP_STEP)
-        return (
+        last, upcoming = self._last, self._next
+        found = compensate_quaternion(
+            *numbers,
+            time,
             self._work if frame is None else frame,
-            self._machine_numbers,
-            self._nominal_numbers,
-            self._varied,
-            1.0 if self.enabled else 0.0,
-            self._changed,
-            max(ramp, 0.0) * self.ramp_rate,
-            self._last.state,
-            self._next.state,
-            self._next.poses,
+            self._fixed,
+            self._switches,
+            last.state,
+            upcoming.state,
+            upcoming.poses,
         )
+        return self._finish(found, numbers)
 
-    def _finish(self, found: tuple, time: float, numbers: tuple[float, ...] = ()) -> np.ndarray:
+    def _finish(self, found: tuple, numbers: tuple[float, ...] = ()) -> np.ndarray:
         """Accept the command under way, or raise what was found."""
         status, finding, strut, stage, value, condition = found
         if status == NO_POSE:
@@ -325,7 +323,7 @@ class Compensator:
             raise self.limits.error(finding, strut, stage, value)
         self._last, self._next = self._next, self._last
         self.condition, self.outside_field = condition, status == OUTSIDE
-        self._changed, self._last_time = False, time
+        self._switches[CHANGED] = 0.0
         return self._last.command
 
     def estimate(self, struts: np.ndarray) -> np.ndarray:
@@ -351,8 +349,7 @@ class Compensator:
         outcome, condition = estimate_one(
             struts,
             self._last.state,
-            self._machine_numbers,
-            self._varied,
+            self._fixed,
             tool.position,
             tool.rotation,
             self._model_pose,
@@ -390,8 +387,19 @@ class Compensator:
         LimitError, KinematicsError, OutsideFieldError
             The command is refused and nothing has changed.
         """
-        position, rotation = tool_pose.position, tool_pose.rotation
-        self._finish(compensate_one(position, rotation, *self._arguments(time, None)), time)
+        last, upcoming = self._last, self._next
+        found = compensate_one(
+            tool_pose.position,
+            tool_pose.rotation,
+            time,
+            self._work,
+            self._fixed,
+            self._switches,
+            last.state,
+            upcoming.state,
+            upcoming.poses,
+        )
+        self._finish(found)
         return self.record(tool_pose)
 
     def record(self, tool_pose: Pose) -> Correction:

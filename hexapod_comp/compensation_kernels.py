@@ -24,8 +24,14 @@ from .struts import PARAMETERS
 SOLVED, UNSOLVED, OUTSIDE, NO_POSE = range(4)
 """How it went: solved, field not undone, solved with the field held at its boundary, input is no pose."""
 
-LOW, SENSE, NOMINAL, CORRECTION, COMMAND, BUMP, STATE_SIZE = 0, 9, 18, 24, 30, 36, 42
-"""Where the parts of a state begin: motion windows and directions (9 each), then six struts each."""
+LOW, SENSE, NOMINAL, CORRECTION, COMMAND, BUMP, TIME, STATE_SIZE = 0, 9, 18, 24, 30, 36, 42, 43
+"""Where the parts of a state begin: motion windows and directions (9 each), six struts each, time of the command."""
+
+ENABLED, CHANGED, RAMP_RATE = range(3)
+"""What the compensator is told from outside: share of the correction, whether anything changed, m/s."""
+
+LONGEST_RAMP_STEP = 0.02
+"""A pause between commands counts as no more than this in a ramp, s: a late command must not step."""
 
 TABLE_END = 72 + 6 * PARAMETERS
 
@@ -106,22 +112,21 @@ def compose(p1, r1, p2, r2, position, rotation):
 def compensate_one(
     position,
     rotation,
+    time,
     frame,
-    machine_numbers,
-    nominal_numbers,
-    varied,
-    share,
-    changed,
-    ramp,
+    fixed,
+    switches,
     state,
     next_state,
     poses,
 ):
     """Run the whole chain for one command; return (status, finding, strut, stage, value, condition number).
 
-    `state` stays as it is; `next_state` and `poses` (platform pose, model pose) are written, and count only
-    when nothing was found.
+    `fixed` holds the machine's numbers, the nominal ones, and the arrays whose size varies. `state` stays as
+    it is; `next_state` and `poses` (platform pose, model pose) are written, and count only when nothing was
+    found.
     """
+    machine_numbers, nominal_numbers, varied = fixed
     body, table, probe, thresholds, _ = machine_views(machine_numbers)
     nominal_base, nominal_platform, tool, limits = nominal_views(nominal_numbers)
     struts, field = (table, *varied[:2]), (probe, *varied[2:])
@@ -154,8 +159,9 @@ def compensate_one(
     if not solved:
         return UNSOLVED, WITHIN, -1, 1, math.nan, condition
     for i in range(6):
-        correction[i] = share * (command[i] - nominal[i])
-    ramp_bump(correction, state, next_state[BUMP:], changed, ramp)
+        correction[i] = switches[ENABLED] * (command[i] - nominal[i])
+    next_state[TIME] = time
+    ramp_bump(correction, state, next_state[BUMP:TIME], switches, time)
     for i in range(6):
         correction[i] += next_state[BUMP + i]
         command[i] = nominal[i] + correction[i]
@@ -175,13 +181,10 @@ def compensate_quaternion(
     qy,
     qz,
     qw,
+    time,
     frame,
-    machine_numbers,
-    nominal_numbers,
-    varied,
-    share,
-    changed,
-    ramp,
+    fixed,
+    switches,
     state,
     next_state,
     poses,
@@ -197,13 +200,10 @@ def compensate_quaternion(
     return compensate_one(
         position,
         rotation,
+        time,
         frame,
-        machine_numbers,
-        nominal_numbers,
-        varied,
-        share,
-        changed,
-        ramp,
+        fixed,
+        switches,
         state,
         next_state,
         poses,
@@ -224,17 +224,19 @@ def check_command(nominal, correction, command, state, scalars):
 
 
 @compiled
-def ramp_bump(correction, state, next_bump, changed, ramp):
+def ramp_bump(correction, state, next_bump, switches, time):
     """Write the part of the last correction that has not been given up yet.
 
     When model, temperatures or enabling have changed since the last command, the bump takes up the whole
-    difference, so that the command does not move; it then shrinks in proportion, its largest element by at
-    most `ramp` metres a command.
+    difference, so that the command does not move; it then shrinks in proportion, its largest element at no
+    more than the ramp rate.
     """
+    pause = time - state[TIME]
+    ramp = 0.0 if math.isnan(pause) else switches[RAMP_RATE] * min(max(pause, 0.0), LONGEST_RAMP_STEP)
     largest = 0.0
     for i in range(6):
         next_bump[i] = state[BUMP + i]
-        if changed and not math.isnan(state[CORRECTION + i]):
+        if switches[CHANGED] != 0.0 and not math.isnan(state[CORRECTION + i]):
             next_bump[i] = state[CORRECTION + i] - correction[i]
         largest = max(largest, abs(next_bump[i]))
     keep = 0.0 if largest <= ramp else 1.0 - ramp / largest
@@ -246,8 +248,7 @@ def ramp_bump(correction, state, next_bump, changed, ramp):
 def estimate_one(
     readings,
     state,
-    machine_numbers,
-    varied,
+    fixed,
     tool_position,
     tool_rotation,
     model_pose,
@@ -258,6 +259,7 @@ def estimate_one(
     `model_pose` (12,) is the guess and, when the outcome is OK, becomes the solution; `tool_pose` (12,) in ``base``
     is then written: position, rotation matrix by rows.
     """
+    machine_numbers, _, varied = fixed
     body, table, probe, _, solver = machine_views(machine_numbers)
     struts, field = (table, *varied[:2]), (probe, *varied[2:])
     position, rotation = np.empty(3), np.empty((3, 3))

@@ -85,7 +85,7 @@ class CompensatorNode(MachineNode):
         self._commands, self._feedback = Flow(), Flow()
         self._struts = StrutReader()
         self._last_stamp = 0
-        self._fresh_start = True
+        self._fresh_start = self._looks_at_feedback = True
         self._unestimated: Time | None = None
         self._simulated_time = bool(self.get_parameter("use_sim_time").value)
         self._compensator: Compensator | None = None
@@ -170,7 +170,7 @@ class CompensatorNode(MachineNode):
         trial.step(pose_numbers(message), 0.0)
         trial.estimate(trial.command)
         StrutMessage().write(trial.command)
-        self.compensator.enabled = self._options["enable_compensation"]
+        self.compensator.enable(self._options["enable_compensation"])
 
     def _open_topics(self) -> None:
         self._command_pub = self.publish_on(JointState, "strut_commands", COMMAND_QOS)
@@ -227,20 +227,27 @@ class CompensatorNode(MachineNode):
         if not self._active:
             return
         now = time.monotonic()
+        header = message.header
         try:
-            stamp = self._checked_stamp(message.header.stamp, now)
-            frame = self._frame(message.header.frame_id)
-            if self._fresh_start or self._options["require_feedback"]:
-                self._consult_feedback(now)
+            stamp = self._checked_stamp(header.stamp, now)
+            frame = self._frames.get(header.frame_id)
+            if frame is None or self._looks_at_feedback:
+                self._examine(header.frame_id, now)
             self.compensator.step(pose_numbers(message), now, frame)
         except HexapodError as error:
             self._refuse(error, now)
             return
-        self._fresh_start = False
-        self._last_stamp = _nanoseconds(message.header.stamp) or self._last_stamp
         self._publish_command(stamp, now - self._commands.last)
+        self._fresh_start, self._looks_at_feedback = False, self._options["require_feedback"]
+        self._last_stamp = _nanoseconds(header.stamp) or self._last_stamp
         self._commands.tick(now)
         self._unestimated = stamp
+
+    def _examine(self, frame_id: str, now: float) -> None:
+        """Refuse an unknown frame, or missing feedback; start from the feedback there is."""
+        if frame_id not in self._frames:
+            raise CommandError("frame_id", f"frame_id must be one of {', '.join(self._frames)}, not {frame_id!r}")
+        self._consult_feedback(now)
 
     def _checked_stamp(self, stamp: Time, now: float) -> Time:
         """Return the stamp to copy, or refuse one too old, too new or out of order; zero means now."""
@@ -257,12 +264,6 @@ class CompensatorNode(MachineNode):
         if nanoseconds < self._last_stamp and self._commands.age(now) < FORGET_ORDER_AFTER:
             raise CommandError("stamp_order", "stamp is earlier than the last command's")
         return stamp
-
-    def _frame(self, frame_id: str) -> np.ndarray:
-        frame = self._frames.get(frame_id)
-        if frame is None:
-            raise CommandError("frame_id", f"frame_id must be one of {', '.join(self._frames)}, not {frame_id!r}")
-        return frame
 
     def _consult_feedback(self, now: float) -> None:
         """Take the measured struts as the state to start from, or refuse when they are required and absent."""
@@ -365,7 +366,7 @@ class CompensatorNode(MachineNode):
     def _forget(self) -> None:
         self.compensator.reset()
         self._unestimated = None
-        self._fresh_start = True
+        self._fresh_start = self._looks_at_feedback = True
         self._last_stamp = 0
 
     def _refuse(self, error: HexapodError, now: float) -> None:
