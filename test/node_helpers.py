@@ -201,13 +201,27 @@ class Bench:
 
     def call(self, kind: type, name: str, request: Any = None) -> Any:
         """Call a service and return its response."""
-        if name not in self._clients:
-            self._clients[name] = self.witness.create_client(kind, name)
-        client = self._clients[name]
-        self.until(client.service_is_ready, f"service {name}")
+        client = self._client(kind, name)
         future = client.call_async(kind.Request() if request is None else request)
         self.until(future.done, f"answer of {name}")
         return future.result()
+
+    def _client(self, kind: type, name: str) -> Any:
+        """Return a client whose service is there.
+
+        Within one process Fast DDS now and then never matches a client with its service; a new one does.
+        """
+        for attempt in range(3):
+            if name not in self._clients:
+                self._clients[name] = self.witness.create_client(kind, name)
+            try:
+                self.until(self._clients[name].service_is_ready, f"service {name}", 10.0 if attempt == 2 else 2.0)
+                break
+            except TimeoutError:
+                if attempt == 2:
+                    raise
+                self.witness.destroy_client(self._clients.pop(name))
+        return self._clients[name]
 
     def change(self, transition: str, node: str = "compensator") -> bool:
         """Ask a node for a lifecycle transition; return whether it went well."""

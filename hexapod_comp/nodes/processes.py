@@ -25,7 +25,7 @@ PR_SET_PDEATHSIG = 1
 """From Linux's <sys/prctl.h>."""
 
 STOP_TIMEOUT = 5.0
-"""A process that has not ended this long after SIGINT is killed, s."""
+"""A process that has not ended this long after SIGTERM is killed, s."""
 
 
 def reserve_domain() -> tuple[int, socket.socket]:
@@ -88,11 +88,11 @@ class PrivateDomain:
 
 
 def _end_with_parent() -> None:
-    """Ask the system to interrupt this process when its parent dies, however it dies.
+    """Ask the system to end this process when its parent dies, however it dies.
 
     A session of its own keeps a terminal's Ctrl-C away from the nodes; nobody but the parent ends them.
     """
-    LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGINT)
+    LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 class NodeProcess:
@@ -139,9 +139,12 @@ class NodeProcess:
         return self.log.read_text(encoding="utf-8", errors="replace") if self.log.exists() else ""
 
     def stop(self) -> tuple[int, str]:
-        """End the process with SIGINT; return its exit code and all it printed. Kill it when it does not listen."""
+        """End the process with SIGTERM; return its exit code and all it printed. Kill it when it does not listen.
+
+        Not SIGINT: a shell's background jobs ignore that until the node has set its own handler.
+        """
         if self._process.poll() is None:
-            self.send(signal.SIGINT)
+            self.send(signal.SIGTERM)
         try:
             code = self._process.wait(STOP_TIMEOUT)
         except subprocess.TimeoutExpired:
