@@ -22,6 +22,7 @@ from hexapod_comp.conversions import message_pose
 from hexapod_comp.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine import RealMachine
 from hexapod_comp.model_file import load_model
+from hexapod_comp.nodes import health
 from hexapod_comp.nodes.health import ERROR, OK
 from hexapod_comp.pose import Pose
 from hexapod_comp.simulation import DriveParameters, StrutDrive
@@ -160,8 +161,9 @@ def test_with_the_papers_lines_the_loop_shows_what_the_core_predicts(bench, geom
     assert bench.values()["model"] == "paper's 1-D lines"
 
 
-def test_lost_encoder_is_said_and_the_loop_goes_on(bench):
+def test_lost_encoder_is_said_and_the_loop_goes_on(bench, monkeypatch):
     """A NaN among the readings: none is used, the estimate comes from the commands, the tool goes on."""
+    monkeypatch.setattr(health, "REFUSAL_SHOWN_FOR", 0.2)
     loop(bench, model_file=TRUE_MODEL, command_timeout=0.0)
     bench.ask(HOME)
     drive = next(node for node in bench.nodes if node.get_name() == "strut_drive")
