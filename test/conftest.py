@@ -5,6 +5,7 @@ rclpy is imported inside the fixtures only, so that the core's tests run where t
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
@@ -16,6 +17,20 @@ from hexapod_comp.nodes.processes import reserve_domain
 if TYPE_CHECKING:
     from rclpy.context import Context
     from rclpy.executors import Executor
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[object]:
+    """Destroy what a test with ROS leaves behind before the next one starts.
+
+    rclpy's nodes are in reference cycles, and die when the collector runs. If that is while the next test's
+    nodes are being discovered, Fast DDS waits for a callback that waits for the GIL, for ever.
+    """
+    result = yield
+    if {"ros_context", "client"} & set(getattr(item, "fixturenames", ())):
+        gc.collect()
+        gc.freeze()  # what is left lives on, and need not be looked at again after every test
+    return result
 
 
 @pytest.fixture(scope="session", autouse=True)
