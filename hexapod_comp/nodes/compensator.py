@@ -40,7 +40,6 @@ from .runtime import (
     STATE_QOS,
     MachineNode,
     Parameter,
-    Throttle,
     declare,
     keep_discovery_local,
     run,
@@ -79,8 +78,6 @@ class CompensatorNode(MachineNode):
         super().__init__("compensator", **options)
         self._options = declare(self, PARAMETERS)
         self.wants_autostart = self._options["autostart"]
-        self._active = False
-        self._throttle = Throttle()
         self._refusals, self._feedback_refusals = Refusals(), Refusals()
         self._commands, self._feedback = Flow(), Flow()
         self._struts = StrutReader()
@@ -131,22 +128,12 @@ class CompensatorNode(MachineNode):
         self.get_logger().info("ready")
         return super().on_activate(state)
 
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop taking commands; the struts keep their last one."""
-        self._active = False
-        return super().on_deactivate(state)
-
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close topics and forget the machine."""
         self._active = False
         self._close_topics()
         self._compensator = None
         return super().on_cleanup(state)
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop taking commands for good."""
-        self._active = False
-        return super().on_shutdown(state)
 
     def say_goodbye(self) -> None:
         """Publish a last status and wait until it has arrived."""
@@ -281,7 +268,7 @@ class CompensatorNode(MachineNode):
         except CommandError as error:
             if self._active:
                 self._feedback_refusals.add(error.reason, str(error), now)
-                self._log("feedback " + error.reason, f"strut_states ignored: {error}")
+                self.warn_of("feedback " + error.reason, f"strut_states ignored: {error}")
             return
         self._feedback.tick(now)
         if self._active:
@@ -294,7 +281,7 @@ class CompensatorNode(MachineNode):
             self.compensator.set_temperature(message.header.frame_id, message.temperature)
         except HexapodError as error:
             self._feedback_refusals.add("temperature", str(error), time.monotonic())
-            self._log("temperature", f"temperature ignored: {error}")
+            self.warn_of("temperature", f"temperature ignored: {error}")
 
     # ---- services ----
 
@@ -338,7 +325,7 @@ class CompensatorNode(MachineNode):
             pose = self.compensator.estimate(struts)
         except HexapodError as error:
             self._feedback_refusals.add(error.reason, str(error), time.monotonic())
-            self._log("estimate " + error.reason, f"no pose estimate: {error}")
+            self.warn_of("estimate " + error.reason, f"no pose estimate: {error}")
             return
         write_pose(self._estimate_out, pose[:3], pose[3:].reshape((3, 3)))
         self._estimate_out.header.stamp = stamp
@@ -371,12 +358,7 @@ class CompensatorNode(MachineNode):
 
     def _refuse(self, error: HexapodError, now: float) -> None:
         self._refusals.add(error.reason, str(error), now)
-        self._log(error.reason, f"command refused ({error.reason}): {error}")
-
-    def _log(self, cause: str, text: str) -> None:
-        held = self._throttle.passes(cause)
-        if held is not None:
-            self.get_logger().warning(text + (f" ({held} more like it)" if held else ""))
+        self.warn_of(error.reason, f"command refused ({error.reason}): {error}")
 
     def _state(self, now: float) -> tuple[bytes, str]:
         """Return level and message of the diagnostics."""

@@ -18,7 +18,7 @@ import rclpy
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
-from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -139,12 +139,34 @@ def _warn_of_strangers(node: LifecycleNode) -> None:
 
 
 class MachineNode(LifecycleNode):
-    """What the package's lifecycle nodes have in common: topics whose QoS a user may override by parameters.
+    """What the package's lifecycle nodes have in common: when they act, throttled warnings, topics.
 
-    rclpy writes the overrides into the profile that it is given, so every topic gets a copy of its own.
+    Topics have a QoS that a user may override by parameters. rclpy writes the overrides into the profile
+    that it is given, so every topic gets a copy of its own.
     """
 
     wants_autostart = True
+
+    def __init__(self, name: str, **options: Any) -> None:
+        super().__init__(name, **options)
+        self._active = False
+        self._throttle = Throttle()
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop acting; the struts keep their last command."""
+        self._active = False
+        return super().on_deactivate(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop acting for good."""
+        self._active = False
+        return super().on_shutdown(state)
+
+    def warn_of(self, cause: str, text: str) -> None:
+        """Log a warning, once per cause and second."""
+        held = self._throttle.passes(cause)
+        if held is not None:
+            self.get_logger().warning(text + (f" ({held} more like it)" if held else ""))
 
     def publish_on(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
         """Return a publisher."""

@@ -36,7 +36,6 @@ from .runtime import (
     STATE_QOS,
     MachineNode,
     Parameter,
-    Throttle,
     checked,
     declare,
     keep_discovery_local,
@@ -86,8 +85,7 @@ class StrutDriveNode(MachineNode):
         super().__init__("strut_drive", **options)
         self._options = declare(self, PARAMETERS + FAULT_PARAMETERS)
         self.wants_autostart = self._options["autostart"]
-        self._active = False
-        self._throttle, self._refusals, self._commands = Throttle(), Refusals(), Flow()
+        self._refusals, self._commands = Refusals(), Flow()
         self._reader = StrutReader()
         self._states_out, self._true_out = StrutMessage(), PoseStamped()
         self._true_out.header.frame_id = self._options["base_frame"]
@@ -130,11 +128,6 @@ class StrutDriveNode(MachineNode):
         self.get_logger().info("ready")
         return super().on_activate(state)
 
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stand still and be silent."""
-        self._active = False
-        return super().on_deactivate(state)
-
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close topics and forget the machine."""
         self._active = False
@@ -145,11 +138,6 @@ class StrutDriveNode(MachineNode):
             self.destroy_publisher(publisher)
         self._drive = None
         return super().on_cleanup(state)
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stand still for good."""
-        self._active = False
-        return super().on_shutdown(state)
 
     def say_goodbye(self) -> None:
         """Publish a last status and wait until it has arrived."""
@@ -228,7 +216,7 @@ class StrutDriveNode(MachineNode):
             self.drive.set_command(self._reader.lengths)
         except HexapodError as error:
             self._refusals.add(error.reason, str(error), now)
-            self._log(error.reason, f"command refused ({error.reason}): {error}")
+            self.warn_of(error.reason, f"command refused ({error.reason}): {error}")
             return
         self._commands.tick(now)
 
@@ -248,7 +236,7 @@ class StrutDriveNode(MachineNode):
         try:
             self._tool_in_base()
         except KinematicsError as error:
-            self._log("true pose", f"the machine cannot stand where its struts are: {error}")
+            self.warn_of("true pose", f"the machine cannot stand where its struts are: {error}")
             return
         self._true_out.header.stamp = stamp
         self._true_pub.publish(self._true_out)
@@ -259,11 +247,6 @@ class StrutDriveNode(MachineNode):
         write_pose(self._true_out, pose.position, pose.rotation)
 
     # ---- state ----
-
-    def _log(self, cause: str, text: str) -> None:
-        held = self._throttle.passes(cause)
-        if held is not None:
-            self.get_logger().warning(text + (f" ({held} more like it)" if held else ""))
 
     def _state(self, now: float) -> tuple[bytes, str]:
         stopped = [name for name, at_stop in zip(STRUT_NAMES, self.drive.stopped, strict=True) if at_stop]
