@@ -216,6 +216,13 @@ class Section:
             raise self.error(key, f"must be one of {', '.join(allowed)}", value)
         return value
 
+    def integer(self, key: str, default: int) -> int:
+        """Take an optional whole number."""
+        value = self._left.pop(key, default)
+        if type(value) is not int:
+            raise self.error(key, "must be a whole number", value)
+        return value
+
     def section(self, key: str) -> Section:
         """Take a required sub-mapping."""
         return Section(self.path, self.where(key), self.take(key))

@@ -1,0 +1,473 @@
+"""Measured data of a machine, whatever instrument they come from, in one form.
+
+Every reading is one number that the error of the measured point gives: its displacement along a direction,
+or its rotation about one. With e = (dx, dy, dz, rx, ry, rz) = actual minus commanded, along and about the
+axes of ``base``,
+
+    value = w · e + what the instrument does not know (each run's own zero, the slope of its beam)
+
+so a laser line, a straightness, an angle, a body diagonal and a tracker's pose differ only in w and in what
+is unknown. Readings of one *run* share these unknowns; readings taken at the same command, from the same
+direction, under the same temperatures share a *station*.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .errors import InputFileError
+from .geometry import HexapodGeometry
+from .kinematics import Structure, jacobian, strut_lengths
+from .limits import WITHIN, LimitTable, check_stage
+from .machine import REFERENCE_TEMPERATURE, Temperatures
+from .pose import Pose
+
+AXES = ("x", "y", "z")
+CHANNELS = (
+    "linear",
+    *(f"straightness_{a}" for a in AXES),
+    *(f"rotation_{a}" for a in AXES),
+    *(f"position_{a}" for a in AXES),
+    *(f"attitude_{a}" for a in AXES),
+)
+"""What a reading is of. ``linear`` is along the run's line; the others are along or about an axis of the work
+frame. Straightness and rotation belong to lines and have unknown zeros; position and attitude are absolute."""
+
+KINDS = ("linear", "straightness", "rotation", "position", "attitude")
+"""Kinds of channel: those of one kind share an instrument and its noise."""
+
+KIND_OF = np.array([KINDS.index(channel.partition("_")[0]) for channel in CHANNELS])
+"""Kind of each channel, as an index."""
+
+DEFAULT_UNCERTAINTY = dict(zip(KINDS, (1e-6, 1e-6, 1e-6, 10e-6, 10e-6), strict=True))
+"""Standard deviation of a reading where neither the file nor repeated readings tell, m or rad."""
+
+ANGULAR_KINDS = ("rotation", "attitude")
+
+FORWARD, BACKWARD, UNKNOWN, FROM_PREVIOUS = 1, -1, 0, 2
+"""How a station was approached; FROM_PREVIOUS: from the command in the row before."""
+
+LEAST_TRAVEL = 1e-6
+"""Components of a line shorter than this, m, are no travel along that axis."""
+
+SAME = 1e-9
+"""Commands nearer to each other than this, m, are the same command."""
+
+
+class Source(NamedTuple):
+    """Where a reading stands.
+
+    Attributes
+    ----------
+    file : str
+        Name of the file, or of what made the reading.
+    line : int
+        Line in it; 0 when it has none.
+    """
+
+    file: str
+    line: int
+
+    def __str__(self) -> str:
+        return f"{self.file}: line {self.line}" if self.line else self.file
+
+
+class Reading(NamedTuple):
+    """One reading as an instrument or a file gives it, in SI; the unit in which files become sets.
+
+    Attributes
+    ----------
+    run : str
+        Readings of one run share the unknown zeros.
+    cycle : int
+        Which of several passes of the run, from 1.
+    direction : int
+        ``FORWARD``, ``BACKWARD``, ``UNKNOWN`` or ``FROM_PREVIOUS``.
+    pose : Pose
+        Commanded ``pose_tool_in_work``.
+    channel : str
+        One of :data:`CHANNELS`.
+    value : float
+        Error read, actual minus commanded, m or rad.
+    uncertainty : float
+        Its standard deviation; NaN when not known.
+    temperatures : tuple of float
+        struts 1–6, base, platform, °C.
+    commands : tuple of float or None
+        Strut readings, m, when the file has them; otherwise the machine was told nominal lengths.
+    source : Source
+        For messages.
+    """
+
+    run: str
+    cycle: int
+    direction: int
+    pose: Pose
+    channel: str
+    value: float
+    uncertainty: float = np.nan
+    temperatures: tuple[float, ...] = (REFERENCE_TEMPERATURE,) * 8
+    commands: tuple[float, ...] | None = None
+    source: Source = Source("", 0)
+
+
+@dataclass(frozen=True)
+class Run:
+    """What the readings of one run share.
+
+    Attributes
+    ----------
+    name : str
+        As in the file.
+    axis : ndarray, shape (3,)
+        Unit vector of the run's line in ``base``, zero for scattered poses. It points along the first of x,
+        y, z along which the line travels: that is forward.
+    origin : ndarray, shape (3,)
+        First commanded point of the line, m in ``base``.
+    """
+
+    name: str
+    axis: np.ndarray
+    origin: np.ndarray
+
+    @property
+    def is_line(self) -> bool:
+        """Whether its points lie on a line."""
+        return bool(self.axis.any())
+
+    @property
+    def base_axis(self) -> int | None:
+        """0, 1 or 2 for a line parallel to x, y or z of ``base``, None for any other."""
+        parallel = np.flatnonzero(np.abs(self.axis) > 1.0 - 1e-9)
+        return int(parallel[0]) if len(parallel) else None
+
+
+@dataclass(frozen=True)
+class Stations:
+    """Where the machine stood: commands and what it felt.
+
+    Attributes
+    ----------
+    positions, rotations : ndarray, shape (M, 3), (M, 3, 3)
+        Commanded ``pose_platform_in_base``, m.
+    commands : ndarray, shape (M, 6)
+        Strut commands, or encoder readings, m.
+    sense : ndarray, shape (M, 9)
+        Directions of motion as in :class:`hexapod_comp.motion.MotionState`.
+    temperatures : ndarray, shape (M, 8)
+        Struts 1–6, base, platform, °C.
+    """
+
+    positions: np.ndarray
+    rotations: np.ndarray
+    commands: np.ndarray
+    sense: np.ndarray
+    temperatures: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def pose(self, index: int) -> Pose:
+        """Return a commanded ``pose_platform_in_base``."""
+        return Pose(self.positions[index], self.rotations[index])
+
+    def temperature(self, index: int) -> Temperatures:
+        """Return the temperatures of a station."""
+        return Temperatures(dict(zip(Temperatures.NAMES, self.temperatures[index].tolist(), strict=True)))
+
+
+@dataclass(frozen=True)
+class MeasurementSet:
+    """Readings of one machine; arrays have one entry a reading.
+
+    Attributes
+    ----------
+    geometry : HexapodGeometry
+        The machine as designed.
+    probe : ndarray, shape (3,)
+        The measured point (reflector, target) in ``platform``, m.
+    runs : tuple of Run
+        Runs in order of appearance.
+    stations : Stations
+        Distinct places.
+    station, run, cycle, direction, channel : ndarray of int, shape (N,)
+        Indices of station, run and channel; number of the pass; direction.
+    value, uncertainty : ndarray, shape (N,)
+        m or rad; NaN where the uncertainty is not known.
+    sources : tuple of Source
+        Where each reading stands.
+    files : tuple of (str, str)
+        Name and SHA-256 of each file read.
+    notes : tuple of str
+        What the reader found odd, for the report.
+    """
+
+    geometry: HexapodGeometry
+    probe: np.ndarray
+    runs: tuple[Run, ...]
+    stations: Stations
+    station: np.ndarray
+    run: np.ndarray
+    cycle: np.ndarray
+    direction: np.ndarray
+    channel: np.ndarray
+    value: np.ndarray
+    uncertainty: np.ndarray
+    sources: tuple[Source, ...]
+    files: tuple[tuple[str, str], ...] = ()
+    notes: tuple[str, ...] = field(default=())
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+    @property
+    def kind(self) -> np.ndarray:
+        """Index into :data:`KINDS` of each reading."""
+        return KIND_OF[self.channel]
+
+    def directions(self) -> np.ndarray:
+        """Return w of each reading, shape (N, 6): value = w · (dx, dy, dz, rx, ry, rz) in ``base``."""
+        axes = self.geometry.work.rotation.T  # row a: the work frame's axis a, in base
+        fixed = np.zeros((len(CHANNELS), 6))
+        for index, channel in enumerate(CHANNELS[1:], start=1):
+            kind, _, axis = channel.partition("_")
+            part = slice(3, 6) if kind in ANGULAR_KINDS else slice(0, 3)
+            fixed[index, part] = axes[AXES.index(axis)]
+        weights = fixed[self.channel]
+        linear = self.channel == 0
+        weights[linear, :3] = np.array([run.axis for run in self.runs]).reshape(-1, 3)[self.run[linear]]
+        return weights
+
+    def points(self) -> np.ndarray:
+        """Return the commanded place of the measured point at each station, shape (M, 3), m in ``base``."""
+        return self.stations.positions + self.stations.rotations @ self.probe
+
+    def along(self) -> np.ndarray:
+        """Return each reading's commanded coordinate along its line, from the run's first point, m, (N,)."""
+        origins = np.array([run.origin for run in self.runs]).reshape(-1, 3)
+        axes = np.array([run.axis for run in self.runs]).reshape(-1, 3)
+        return ((self.points()[self.station] - origins[self.run]) * axes[self.run]).sum(axis=1)
+
+    def select(self, mask: np.ndarray) -> MeasurementSet:
+        """Return the set of the readings in a boolean mask (N,); runs and stations keep their numbers."""
+        arrays = ("station", "run", "cycle", "direction", "channel", "value", "uncertainty")
+        chosen = {name: getattr(self, name)[mask] for name in arrays}
+        return replace(self, sources=tuple(s for s, m in zip(self.sources, mask, strict=True) if m), **chosen)
+
+    def with_values(self, value: np.ndarray) -> MeasurementSet:
+        """Return the same stations with other readings, shape (N,), m or rad."""
+        return replace(self, value=value)
+
+
+def assemble(
+    geometry: HexapodGeometry,
+    readings: Sequence[Reading],
+    probe: np.ndarray | None = None,
+    files: Iterable[tuple[str, str]] = (),
+    notes: Iterable[str] = (),
+) -> MeasurementSet:
+    """Return the set of some readings: runs recognised as lines, stations made unique, reach checked.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        The machine as designed.
+    readings : sequence of Reading
+        In the order in which they were taken, as far as ``FROM_PREVIOUS`` needs it.
+    probe : array_like, shape (3,), optional
+        Measured point in ``platform``, m; the tool's tip by default.
+    files : iterable of (str, str)
+        Name and SHA-256 of each file.
+    notes : iterable of str
+        Remarks so far.
+
+    Raises
+    ------
+    InputFileError
+        No readings, an unknown channel, values that are not finite, poses out of the machine's reach, line
+        channels in a run that is no line. Names file and line.
+    """
+    if not readings:
+        raise InputFileError("measurements", "", "hold no reading")
+    probe = np.array(geometry.tool.position if probe is None else probe, dtype=float)
+    _check_readings(readings)
+    poses = _platform_poses(geometry, readings)
+    points = np.array([pose.position + pose.rotation @ probe for pose in poses])
+    members: dict[str, list[int]] = {}
+    for index, reading in enumerate(readings):
+        members.setdefault(reading.run, []).append(index)
+    runs = tuple(_recognise([readings[i] for i in rows], points[rows]) for rows in members.values())
+    number = {run.name: index for index, run in enumerate(runs)}
+    run_of = np.array([number[r.run] for r in readings])
+    stations, station = _collect_stations(geometry, readings, poses, [runs[i] for i in run_of])
+    swapped = [_swapped_note(run, [readings[i] for i in rows], points[rows])
+               for run, rows in zip(runs, members.values(), strict=True)]  # fmt: skip
+    return MeasurementSet(
+        geometry=geometry,
+        probe=probe,
+        runs=runs,
+        stations=stations,
+        station=station,
+        run=run_of,
+        cycle=np.array([r.cycle for r in readings]),
+        direction=np.array([r.direction for r in readings]),
+        channel=np.array([CHANNELS.index(r.channel) for r in readings]),
+        value=np.array([r.value for r in readings], dtype=float),
+        uncertainty=np.array([r.uncertainty for r in readings], dtype=float),
+        sources=tuple(r.source for r in readings),
+        files=tuple(files),
+        notes=(*notes, *filter(None, swapped)),
+    )
+
+
+def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> list[Pose]:
+    """Return the commanded ``pose_platform_in_base`` of each reading; equal poses are one object."""
+    known: dict[bytes, Pose] = {}
+    poses = []
+    from_tool = geometry.tool.inverse()
+    for reading in readings:
+        key = reading.pose.position.tobytes() + reading.pose.rotation.tobytes()
+        if key not in known:
+            known[key] = geometry.work @ reading.pose @ from_tool
+        poses.append(known[key])
+    return poses
+
+
+def _check_readings(readings: Sequence[Reading]) -> None:
+    """Refuse what no instrument reads."""
+    for r in readings:
+        if r.channel not in CHANNELS:
+            raise InputFileError(r.source.file, _line(r), f"channel must be one of {', '.join(CHANNELS)}", r.channel)
+        if not np.isfinite(r.value):
+            raise InputFileError(r.source.file, _line(r), "value must be finite", r.value)
+        if r.uncertainty <= 0.0:
+            raise InputFileError(r.source.file, _line(r), "uncertainty must be above zero", r.uncertainty)
+
+
+def _line(reading: Reading) -> str:
+    return f"line {reading.source.line}" if reading.source.line else f"run {reading.run}"
+
+
+def _recognise(readings: list[Reading], points: np.ndarray) -> Run:
+    """Return a run from its readings and their commanded points (n, 3), with its line if it has line channels.
+
+    Raises
+    ------
+    InputFileError
+        Line channels whose commanded points do not lie on a line, or at one place only; line and absolute
+        channels mixed.
+    """
+    first, name = readings[0], readings[0].run
+    of_lines = {KIND_OF[CHANNELS.index(r.channel)] < KINDS.index("position") for r in readings}
+    if len(of_lines) == 2:
+        raise InputFileError(first.source.file, f"run {name}", "mixes channels of a line with absolute ones")
+    if of_lines == {False}:
+        return Run(name, np.zeros(3), points[0])
+    spread = points - points[0]
+    far = spread[np.linalg.norm(spread, axis=1).argmax()]
+    if np.linalg.norm(far) < LEAST_TRAVEL:
+        raise InputFileError(first.source.file, f"run {name}", "has one commanded point only; a line needs two")
+    axis = far / np.linalg.norm(far)
+    off = np.linalg.norm(spread - np.outer(spread @ axis, axis), axis=1)
+    if off.max() > LEAST_TRAVEL:
+        where = readings[int(off.argmax())]
+        problem = f"run {name}: the commanded point is {off.max() * 1e3:.4f} mm off the run's line"
+        raise InputFileError(where.source.file, _line(where), problem)
+    leading = int(np.flatnonzero(np.abs(far) > LEAST_TRAVEL)[0])
+    return Run(name, axis * np.sign(axis[leading]), points[0])
+
+
+def senses(geometry: HexapodGeometry, pose: Pose, direction: np.ndarray) -> np.ndarray:
+    """Return the directions of motion, shape (9,), of a platform that passes a pose in a direction (3,).
+
+    Axes along which it does not move have none (0: the mean of both); the struts' come from the Jacobian.
+    """
+    speeds = jacobian(Structure.of(geometry), pose)[:, :3] @ direction
+    moving = np.concatenate([direction, speeds])
+    return np.sign(moving) * (np.abs(moving) > 1e-9)
+
+
+def _collect_stations(
+    geometry: HexapodGeometry, readings: Sequence[Reading], poses: list[Pose], runs: list[Run]
+) -> tuple[Stations, np.ndarray]:
+    """Return the distinct stations and each reading's index among them; poses and runs per reading."""
+    known: dict[tuple, int] = {}
+    rows: list[tuple] = []
+    index = np.empty(len(readings), dtype=int)
+    limits, nominal = LimitTable(geometry), Structure.of(geometry)
+    here: tuple | None = None
+    before: int | None = None
+    for n, (r, pose, run) in enumerate(zip(readings, poses, runs, strict=True)):
+        place = (r.run, id(pose), r.commands)
+        if here is not None and place != here:
+            before = int(index[n - 1]) if readings[n - 1].run == r.run else None
+        here = place
+        # A station belongs to a run: lines that cross at a point pass it in different ways.
+        came_from = rows[before] if before is not None and r.direction == FROM_PREVIOUS else None
+        key = (place, r.direction, None if came_from is None else before, r.temperatures)
+        if key not in known:
+            lengths = strut_lengths(nominal, pose)
+            _check_reach(limits, pose, lengths, r)
+            commands = np.array(lengths if r.commands is None else r.commands, dtype=float)
+            sense = _sense(geometry, r.direction, run, pose, commands, came_from)
+            known[key] = len(rows)
+            rows.append((pose.position, pose.rotation, commands, sense, r.temperatures))
+        index[n] = known[key]
+    columns = [np.array(column, dtype=float) for column in zip(*rows, strict=True)]
+    return Stations(*columns), index
+
+
+def _check_reach(limits: LimitTable, pose: Pose, lengths: np.ndarray, reading: Reading) -> None:
+    """Refuse a commanded pose that the machine cannot have taken."""
+    arrays = (limits.stroke, limits.cone_axes, limits.cone_cosines, limits.scalars)
+    finding, strut, value, _ = check_stage(*limits.geometry.kernel_joints, pose.position, pose.rotation,
+                                           lengths, arrays)  # fmt: skip
+    if finding != WITHIN:
+        problem = f"the commanded pose is out of the machine's reach: {limits.error(finding, strut, 0, value)}"
+        raise InputFileError(reading.source.file, _line(reading), problem)
+
+
+def _sense(
+    geometry: HexapodGeometry, direction: int, run: Run, pose: Pose, commands: np.ndarray, came_from: tuple | None
+) -> np.ndarray:
+    """Return the directions of motion at a station, shape (9,); `came_from` is the station before."""
+    if direction in (FORWARD, BACKWARD):
+        return senses(geometry, pose, direction * run.axis)
+    if came_from is not None:
+        change = np.concatenate([pose.position - came_from[0], commands - came_from[2]])
+        return np.sign(change) * (np.abs(change) > SAME)
+    return np.zeros(9)
+
+
+def _swapped_note(run: Run, readings: list[Reading], points: np.ndarray) -> str:
+    """Return a remark on a line whose rows run against both their directions, else nothing."""
+    if not run.is_line:
+        return ""
+    along = points @ run.axis
+    way = {direction: _way(readings, along, direction) for direction in (FORWARD, BACKWARD)}
+    if not way[FORWARD] < 0.0 < way[BACKWARD]:
+        return ""
+    return f"{readings[0].source}: run {run.name}: rows called forward run backward and vice versa; swapped?"
+
+
+def _way(readings: list[Reading], along: np.ndarray, direction: int) -> float:
+    """Return the way from the first to the last row of the first pass in a direction, m."""
+    chosen = [(r.cycle, r.channel, a) for r, a in zip(readings, along, strict=True) if r.direction == direction]
+    first_pass = [a for cycle, channel, a in chosen if (cycle, channel) == chosen[0][:2]]
+    return float(first_pass[-1] - first_pass[0]) if first_pass else 0.0
+
+
+def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:
+    """Return the rotation vector(s) that turn commanded into actual rotations, rad in their common frame.
+
+    Parameters
+    ----------
+    actual, commanded : ndarray, shape (..., 3, 3)
+        Rotation matrices.
+    """
+    return Rotation.from_matrix(actual @ np.swapaxes(commanded, -1, -2)).as_rotvec()
