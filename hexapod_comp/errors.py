@@ -59,6 +59,24 @@ class ModelError(GeometryError):
     reason = "bad_model"
 
 
+class CalibrationError(HexapodError):
+    """Measurements from which no model can be made.
+
+    Parameters
+    ----------
+    what : str
+        Which part of them.
+    problem : str
+        What is wrong and what is needed.
+    """
+
+    reason = "bad_measurements"
+
+    def __init__(self, what: str, problem: str):
+        self.what, self.problem = what, problem
+        super().__init__(f"{what}: {problem}")
+
+
 class PoseError(HexapodError):
     """A pose that is not one: not finite, or its rotation is not a rotation.
 
