@@ -1,0 +1,322 @@
+"""What measurements determine and what they do not: rank, indices, weak directions, the tool error to expect."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..kinematics import Structure, strut_lengths
+from ..limits import WITHIN, LimitTable, check_stage
+from ..machine import REFERENCE_TEMPERATURE, Temperatures
+from ..measurement import Stations, senses
+from ..pose import Pose, rotation_from_angles
+from .joint import LinearProblem, Posterior, physical_covariance
+from .sensitivity import derivatives, predict
+from .space import ParameterSpace
+
+SEEN = 1.0
+"""A direction is observable when its tolerance changes the readings by more than so many standard deviations."""
+
+WEAK = 5.0
+"""Observable directions below so many standard deviations are called weak."""
+
+UNSEEN_SHARE = 0.5
+"""A parameter is called unobservable when more than this share of it lies in directions nobody sees."""
+
+POINTS, DRAWS, SEED = 300, 300, 7
+"""Random points and draws of the parameters behind an expected tool error."""
+
+MACHINE_ERRORS: dict[str, tuple[tuple[str, str], ...]] = {
+    "squareness xy": (("dx", "y1"), ("dy", "x1")),
+    "squareness xz": (("dx", "z1"), ("dz", "x1")),
+    "squareness yz": (("dy", "z1"), ("dz", "y1")),
+    "twist dx ~ y z": (("dx", "y1z1"),),
+    "twist dy ~ x z": (("dy", "x1z1"),),
+    "twist dz ~ x y": (("dz", "x1y1"),),
+    "roll of x": (("rx", "x1"),),
+    "roll of y": (("ry", "y1"),),
+    "roll of z": (("rz", "z1"),),
+}
+"""Machine errors in the field's terms (component, term), by the names under which machinists know them."""
+
+
+@dataclass(frozen=True)
+class BlockSight:
+    """How well the data see one block.
+
+    Attributes
+    ----------
+    name, unit : str
+        Block and SI unit.
+    parameters : int
+        How many.
+    determined : float
+        How many of them the data determine; the prior the rest.
+    tolerance : float
+        Standard deviation of the block's prior.
+    error : float
+        Median standard error of its parameters.
+    """
+
+    name: str
+    unit: str
+    parameters: int
+    determined: float
+    tolerance: float
+    error: float
+
+
+@dataclass(frozen=True)
+class Observability:
+    """What the data determine.
+
+    Attributes
+    ----------
+    blocks : tuple of BlockSight
+        Block by block.
+    structure_rank, structure_size : int
+        Directions of the structure that the data see, and how many there are.
+    rank, size : int
+        The same of all parameters.
+    condition : float
+        Largest over smallest singular value of what is seen, each parameter in its tolerance.
+    indices : dict of str to float
+        Observability indices of the seen directions: O1 (Borm and Menq: geometric mean over √readings), O2 (Driels
+        and Pathre: 1/condition), O3 (Nahvi: smallest), O4 (Nahvi and Hollerbach: smallest²/largest).
+    weak : tuple of (float, str)
+        Strength, in standard deviations, and main parameters of directions that are only just seen.
+    unseen : tuple of str
+        Structure parameters that the data do not see.
+    """
+
+    blocks: tuple[BlockSight, ...]
+    structure_rank: int
+    structure_size: int
+    rank: int
+    size: int
+    condition: float
+    indices: dict[str, float]
+    weak: tuple[tuple[float, str], ...]
+    unseen: tuple[str, ...]
+
+
+def observe(space: ParameterSpace, problem: LinearProblem, posterior: Posterior) -> Observability:
+    """Return what a linear problem's data determine.
+
+    Parameters
+    ----------
+    space : ParameterSpace
+        Names and priors.
+    problem : LinearProblem
+        The data's derivatives.
+    posterior : Posterior
+        Tolerances, noise and covariance, all blocks in use.
+    """
+    spread = space.spread(posterior.tolerances)
+    information = spread[:, None] * np.tensordot(posterior.noise**-2, problem.normal, 1) * spread
+    singular, vectors = _singular(information)
+    seen = singular[singular > SEEN]
+    structure = space.blocks[0]
+    alone, directions = _singular(information[structure.part, structure.part])
+    hidden = (directions[:, alone <= SEEN] ** 2).sum(axis=1) > UNSEEN_SHARE
+    return Observability(
+        blocks=tuple(_sight(space, posterior, n) for n in range(len(space.blocks))),
+        structure_rank=int((alone > SEEN).sum()),
+        structure_size=len(structure.labels),
+        rank=len(seen),
+        size=space.size,
+        condition=float(seen[0] / seen[-1]) if len(seen) else np.inf,
+        indices=_indices(seen, len(problem.target)),
+        weak=tuple(_weak(space, singular, vectors)),
+        unseen=tuple(label for label, is_hidden in zip(structure.labels, hidden, strict=True) if is_hidden),
+    )
+
+
+def _singular(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the singular values of the whitened derivatives, largest first, and their directions."""
+    values, vectors = np.linalg.eigh(information)
+    return np.sqrt(np.maximum(values[::-1], 0.0)), vectors[:, ::-1]
+
+
+def _sight(space: ParameterSpace, posterior: Posterior, n: int) -> BlockSight:
+    block = space.blocks[n]
+    errors = np.sqrt(np.diag(physical_covariance(space, posterior))[block.part])
+    return BlockSight(
+        name=block.name,
+        unit=block.unit,
+        parameters=len(block.labels),
+        determined=float(posterior.determined[block.part].sum()),
+        tolerance=float(posterior.tolerances[n]),
+        error=float(np.median(errors)),
+    )
+
+
+def _indices(seen: np.ndarray, readings: int) -> dict[str, float]:
+    """Return the four observability indices of some singular values."""
+    if not len(seen):
+        return {}
+    return {
+        "O1": float(np.exp(np.log(seen).mean()) / np.sqrt(readings)),
+        "O2": float(seen[-1] / seen[0]),
+        "O3": float(seen[-1]),
+        "O4": float(seen[-1] ** 2 / seen[0]),
+    }
+
+
+def _weak(space: ParameterSpace, singular: np.ndarray, vectors: np.ndarray) -> list[tuple[float, str]]:
+    """Return strength and main parameters of the weakest seen directions, at most five."""
+    labels = [label for block in space.blocks for label in block.labels]
+    chosen = np.flatnonzero((singular > SEEN) & (singular < WEAK))[::-1][:5]
+    found = []
+    for n in chosen:
+        main = np.argsort(-np.abs(vectors[:, n]))[:3]
+        found.append((float(singular[n]), ", ".join(f"{vectors[i, n]:+.2f} {labels[i]}" for i in main)))
+    return found
+
+
+def unseen_errors(space: ParameterSpace, problem: LinearProblem) -> tuple[str, ...]:
+    """Return the machine errors that leave no trace in the readings; none when the space has no field.
+
+    Parameters
+    ----------
+    space : ParameterSpace
+        With the field's blocks.
+    problem : LinearProblem
+        The data's derivatives.
+    """
+    index = {label: n for n, label in enumerate(label for block in space.blocks for label in block.labels)}
+    scale = space.spread(space.start_tolerances())
+    found = []
+    for name, parts in MACHINE_ERRORS.items():
+        wanted = [index[label] for label in (f"{c} {term}" for c, term in parts) if label in index]
+        trace = np.sqrt(np.einsum("i,kij,j->", scale[wanted], problem.normal[:, wanted][:, :, wanted], scale[wanted]))
+        if len(wanted) == len(parts) and trace <= SEEN:
+            found.append(name)
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class ToolError:
+    """The tool error of a machine before and after compensation, the datum aligned, in a box.
+
+    Attributes
+    ----------
+    before : float
+        RMS 3-D error of the machine as fitted, told nominal lengths, m.
+    after : float
+        RMS 3-D error to expect with the model, m.
+    low, high : float
+        Between these it lies with a probability of 95 %, m.
+    rotation_before, rotation_after : float
+        The same of the rotation, rad.
+    """
+
+    before: float
+    after: float
+    low: float
+    high: float
+    rotation_before: float
+    rotation_after: float
+
+
+def expected_error(
+    space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, tilt: float = 0.0
+) -> ToolError | None:
+    """Return the tool error that the parameters' covariance leaves, at random points, both directions.
+
+    The parameters are drawn from their distribution and the machine is moved accordingly, to first order;
+    what one shift and one rotation of the datum take away is taken away.
+
+    Parameters
+    ----------
+    space : ParameterSpace
+        The parameters.
+    x : ndarray, shape (size,)
+        Their values.
+    covariance : ndarray, shape (size, size)
+        Their covariance.
+    tilt : float
+        Tilt of the tool, rad, in random directions.
+
+    Returns
+    -------
+    ToolError or None
+        None where the machine cannot take such poses.
+    """
+    stations = box_stations(space, tilt)
+    if stations is None:
+        return None
+    prediction = predict(space, x, stations)
+    rows = derivatives(space, prediction, stations)
+    points = stations.positions + stations.rotations @ space.probe
+    free = np.linalg.qr(_datum(points - points.mean(axis=0)))[0]
+    values, vectors = np.linalg.eigh(covariance)
+    z = np.random.default_rng(SEED).standard_normal((space.size, DRAWS))
+    drawn = vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * z)
+    moved = np.einsum("mip,pd->mid", rows, drawn)
+    count = len(stations)
+
+    def shown(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return RMS displacement and rotation of errors (M, 6, D) after aligning the datum."""
+        flat = errors[:, :3].reshape(3 * count, -1)
+        flat = flat - free @ (free.T @ flat)
+        turned = errors[:, 3:] - errors[:, 3:].mean(axis=0)
+        return np.sqrt((flat**2).sum(axis=0) / count), np.sqrt((turned**2).sum(axis=(0, 1)) / count)
+
+    before, rotation_before = shown(prediction.errors[:, :, None])
+    after, rotation_after = shown(moved)
+    low, high = np.percentile(after, [2.5, 97.5])
+    return ToolError(
+        before=float(before[0]),
+        after=_rms(after),
+        low=float(low),
+        high=float(high),
+        rotation_before=float(rotation_before[0]),
+        rotation_after=_rms(rotation_after),
+    )
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt((values**2).mean()))
+
+
+def _datum(points: np.ndarray) -> np.ndarray:
+    """Return how a shift and a rotation of the datum move points (n, 3), shape (3n, 6)."""
+    columns = [np.tile(axis, (len(points), 1)) for axis in np.eye(3)]
+    columns += [np.cross(axis, points) for axis in np.eye(3)]
+    return np.stack([column.ravel() for column in columns], axis=1)
+
+
+def box_stations(space: ParameterSpace, tilt: float = 0.0) -> Stations | None:
+    """Return random reachable stations in the measured box, each approached forward and backward.
+
+    The measured point passes along the space diagonal, forward on all axes and then backward; first all
+    forward. The tool is tilted by `tilt`, rad, each time about another horizontal axis.
+    """
+    rng = np.random.default_rng(SEED)
+    points = rng.uniform(space.box[0], space.box[1], (POINTS, 3))
+    headings = rng.uniform(0.0, 2.0 * np.pi, POINTS)
+    angles = tilt * np.stack([np.cos(headings), np.sin(headings), np.zeros(POINTS)], axis=1)
+    rotations = rotation_from_angles(angles)
+    every = [Pose(p - r @ space.probe, r) for p, r in zip(points, rotations, strict=True)]
+    nominal, limits = Structure.of(space.geometry), LimitTable(space.geometry)
+    poses = [pose for pose in every if _reachable(limits, nominal, pose)]
+    if not poses:
+        return None
+    lengths = np.array([strut_lengths(nominal, pose) for pose in poses])
+    sense = [senses(space.geometry, pose, np.full(3, sign)) for sign in (1.0, -1.0) for pose in poses]
+    return Stations(
+        positions=np.tile([pose.position for pose in poses], (2, 1)),
+        rotations=np.tile([pose.rotation for pose in poses], (2, 1, 1)),
+        commands=np.tile(lengths, (2, 1)),
+        sense=np.array(sense),
+        temperatures=np.full((2 * len(poses), len(Temperatures.NAMES)), REFERENCE_TEMPERATURE),
+    )
+
+
+def _reachable(limits: LimitTable, nominal: Structure, pose: Pose) -> bool:
+    arrays = (limits.stroke, limits.cone_axes, limits.cone_cosines, limits.scalars)
+    joints = limits.geometry.kernel_joints
+    finding = check_stage(*joints, pose.position, pose.rotation, strut_lengths(nominal, pose), arrays)[0]
+    return bool(finding == WITHIN)

@@ -1,0 +1,142 @@
+"""What a parametrised machine does at measured stations, and how every parameter moves it.
+
+The error of the measured point is e = (dx, dy, dz, rx, ry, rz), actual minus commanded, along and about the
+axes of ``base``. Values come from the model that the compensator runs; derivatives from the loop closures,
+differentiated by hand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..machine import RealMachine
+from ..measurement import Stations, attitude_error
+from .space import ParameterSpace
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The machine at some stations.
+
+    Attributes
+    ----------
+    errors : ndarray, shape (M, 6)
+        e of each station, m and rad.
+    positions, rotations : ndarray, shape (M, 3), (M, 3, 3)
+        Actual ``pose_platform_in_base`` without the field, m.
+    base_joints, platform_joints : ndarray, shape (M, 6, 3)
+        Real joints at each station's temperatures, m.
+    """
+
+    errors: np.ndarray
+    positions: np.ndarray
+    rotations: np.ndarray
+    base_joints: np.ndarray
+    platform_joints: np.ndarray
+
+
+def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Prediction:
+    """Return where the machine of a parameter vector goes at each station.
+
+    Raises
+    ------
+    KinematicsError
+        The machine cannot take one of the poses.
+    """
+    model = space.model(x, with_field=False)
+    count = len(stations)
+    positions, rotations = np.empty((count, 3)), np.empty((count, 3, 3))
+    base, platform = np.empty((count, 6, 3)), np.empty((count, 6, 3))
+    machines: dict[bytes, RealMachine] = {}
+    for n in range(count):
+        key = stations.temperatures[n].tobytes()
+        if key not in machines:
+            machines[key] = RealMachine(space.geometry, model, stations.temperature(n))
+        machine = machines[key]
+        actual, _ = machine.pose_for(stations.commands[n], stations.sense[n], stations.pose(n))
+        positions[n], rotations[n] = actual.position, actual.rotation
+        base[n], platform[n] = machine.structure.base_joints, machine.structure.platform_joints
+    errors = _errors(space, stations, positions, rotations)
+    points = positions + rotations @ space.probe
+    errors += space.field.evaluate(space.field_coefficients(x), points)
+    return Prediction(errors, positions, rotations, base, platform)
+
+
+def _errors(
+    space: ParameterSpace, stations: Stations, positions: np.ndarray, rotations: np.ndarray
+) -> np.ndarray:
+    """Return e between commanded and actual platform poses, shape (M, 6)."""
+    actual = positions + rotations @ space.probe
+    commanded = stations.positions + stations.rotations @ space.probe
+    return np.hstack([actual - commanded, attitude_error(rotations, stations.rotations)])
+
+
+def derivatives(space: ParameterSpace, prediction: Prediction, stations: Stations) -> np.ndarray:
+    """Return ∂e/∂x at each station, shape (M, 6, size).
+
+    From u_i·(δP + δω × R·t_i + R·δt_i − δb_i) = δl_i: the platform's twist is X·(δl + u·δb − u·R·δt) with
+    X the inverse of the Jacobian's rows (u_i, R·t_i × u_i).
+    """
+    rotations = prediction.rotations
+    arms = np.einsum("nij,nkj->nki", rotations, prediction.platform_joints)
+    struts = prediction.positions[:, None] + arms - prediction.base_joints
+    u = struts / np.linalg.norm(struts, axis=2, keepdims=True)
+    inverse = np.linalg.inv(np.concatenate([u, np.cross(arms, u)], axis=2))
+    lever = np.einsum("nij,j->ni", rotations, space.probe)
+    per_length = inverse.copy()  # (M, 6, struts): of the measured point, no longer of the platform's origin
+    per_length[:, :3] += np.cross(inverse[:, 3:].transpose(0, 2, 1), lever[:, None]).transpose(0, 2, 1)
+    result = np.zeros((len(stations), 6, space.size))
+    for block in space.blocks:
+        result[:, :, block.part] = _block(space, block.name, per_length, u, rotations, stations)
+    points = prediction.positions + lever
+    _field(space, space.field.basis(points), result)
+    return result
+
+
+def _block(
+    space: ParameterSpace,
+    name: str,
+    per_length: np.ndarray,
+    u: np.ndarray,
+    rotations: np.ndarray,
+    stations: Stations,
+) -> np.ndarray:
+    """Return ∂e/∂x of one block; zeros for the field, which has no part in the struts."""
+    commands = stations.commands
+    if name == "structure":
+        base = (per_length[:, :, :, None] * u[:, None]).reshape(len(commands), 6, 18)
+        in_platform = np.einsum("nij,nki->nkj", rotations, u)
+        platform = -per_length[:, :, :, None] * in_platform[:, None]
+        joined = np.zeros((len(commands), 6, space.platform_groups.max() + 1, 3))
+        for strut, group in enumerate(space.platform_groups):
+            joined[:, :, group] += platform[:, :, strut]
+        return np.concatenate([base, joined.reshape(len(commands), 6, -1), per_length], axis=2)
+    if name == "wave":
+        phase = 2.0 * np.pi * commands / space.periods
+        parts = np.stack([np.cos(phase), np.sin(phase)], axis=-1)
+        return (per_length[..., None] * parts[:, None]).reshape(len(commands), 6, 12)
+    if name == "map":
+        weights = space.spline_weights(commands)
+        return (per_length[..., None] * weights[:, None]).reshape(len(commands), 6, -1)
+    factors = {
+        "pitch": commands - space.home_lengths,
+        "backlash": -0.5 * stations.sense[:, 3:],
+    }
+    if name in factors:
+        return per_length * factors[name][:, None]
+    block = space.block(name)
+    return np.zeros((len(commands), 6, block.part.stop - block.part.start if block else 0))
+
+
+def _field(space: ParameterSpace, basis: np.ndarray, result: np.ndarray) -> None:
+    """Write the field blocks' derivatives: each component has the basis to itself."""
+    count = basis.shape[1]
+    for name, first in (("field displacement", 0), ("field rotation", 3)):
+        block = space.block(name)
+        if block is None:
+            continue
+        for c in range(3):
+            start = block.part.start + c * count
+            result[:, first + c, start : start + count] = basis
