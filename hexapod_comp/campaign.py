@@ -16,6 +16,7 @@ import numpy as np
 from .errors import InputFileError
 from .field import CROSS_AXES
 from .files import Section, read_yaml
+from .gathering import assemble
 from .geometry import HexapodGeometry
 from .measurement import (
     ANGULAR_KINDS,
@@ -27,7 +28,6 @@ from .measurement import (
     MeasurementSet,
     Reading,
     Source,
-    assemble,
 )
 from .pose import Pose, rotation_from_angles
 
@@ -94,7 +94,7 @@ class Campaign:
         if box.shape != (2, 3) or not (np.isfinite(box).all() and (box[0] < box[1]).all()):
             raise InputFileError("campaign", "box", "must be its lowest and its highest corner", box.tolist())
         for name in ("cell", "step"):
-            if not 0.0 < getattr(self, name) <= np.ptp(box, axis=0).min():
+            if not 0.0 < getattr(self, name) <= np.ptp(box, axis=0).min() + 1e-9:
                 problem = "must be above zero and no longer than the box's shortest side, m"
                 raise InputFileError("campaign", name, problem, getattr(self, name))
         if self.instrument is not None and self.instrument not in INSTRUMENTS:

@@ -26,13 +26,14 @@ MAX_FILE_BYTES = 8_000_000
 
 UNITS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "in": 0.0254},
-    "angle": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": np.pi / 180.0},
+    "angle": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": np.pi / 180.0, "arcsec": np.pi / 648000.0},
     "ratio": {"ppm": 1e-6, "percent": 1e-2},
     "expansion": {"ppm_per_K": 1e-6},
     "temperature": {"degC": 1.0},
     "speed": {"m_s": 1.0, "mm_s": 1e-3, "m_min": 1.0 / 60.0},
     "acceleration": {"m_s2": 1.0, "mm_s2": 1e-3},
     "time": {"s": 1.0, "ms": 1e-3},
+    "pressure": {"Pa": 1.0, "hPa": 1e2, "kPa": 1e3},
 }
 """Unit suffixes per kind of quantity, and their size in SI (temperatures stay in degrees Celsius)."""
 

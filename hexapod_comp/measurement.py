@@ -13,17 +13,14 @@ direction, under the same temperatures share a *station*.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .errors import InputFileError
 from .geometry import HexapodGeometry
-from .kinematics import Structure, jacobian, strut_lengths
-from .limits import WITHIN, LimitTable, check_stage
+from .kinematics import Structure, jacobian
 from .machine import REFERENCE_TEMPERATURE, Temperatures
 from .pose import Pose
 
@@ -54,9 +51,6 @@ FORWARD, BACKWARD, UNKNOWN, FROM_PREVIOUS = 1, -1, 0, 2
 
 LEAST_TRAVEL = 1e-6
 """Components of a line shorter than this, m, are no travel along that axis."""
-
-SAME = 1e-9
-"""Commands nearer to each other than this, m, are the same command."""
 
 
 class Source(NamedTuple):
@@ -264,122 +258,15 @@ class MeasurementSet:
         return replace(self, value=value)
 
 
-def assemble(
-    geometry: HexapodGeometry,
-    readings: Sequence[Reading],
-    probe: np.ndarray | None = None,
-    files: Iterable[tuple[str, str]] = (),
-    notes: Iterable[str] = (),
-) -> MeasurementSet:
-    """Return the set of some readings: runs recognised as lines, stations made unique, reach checked.
+def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:
+    """Return the rotation vector(s) that turn commanded into actual rotations, rad in their common frame.
 
     Parameters
     ----------
-    geometry : HexapodGeometry
-        The machine as designed.
-    readings : sequence of Reading
-        In the order in which they were taken, as far as ``FROM_PREVIOUS`` needs it.
-    probe : array_like, shape (3,), optional
-        Measured point in ``platform``, m; the tool's tip by default.
-    files : iterable of (str, str)
-        Name and SHA-256 of each file.
-    notes : iterable of str
-        Remarks so far.
-
-    Raises
-    ------
-    InputFileError
-        No readings, an unknown channel, values that are not finite, poses out of the machine's reach, line
-        channels in a run that is no line. Names file and line.
+    actual, commanded : ndarray, shape (..., 3, 3)
+        Rotation matrices.
     """
-    if not readings:
-        raise InputFileError("measurements", "", "hold no reading")
-    probe = np.array(geometry.tool.position if probe is None else probe, dtype=float)
-    _check_readings(readings)
-    poses = _platform_poses(geometry, readings)
-    points = np.array([pose.position + pose.rotation @ probe for pose in poses])
-    members: dict[str, list[int]] = {}
-    for index, reading in enumerate(readings):
-        members.setdefault(reading.run, []).append(index)
-    runs = tuple(_recognise([readings[i] for i in rows], points[rows]) for rows in members.values())
-    number = {run.name: index for index, run in enumerate(runs)}
-    run_of = np.array([number[r.run] for r in readings])
-    stations, station = _collect_stations(geometry, readings, poses, [runs[i] for i in run_of])
-    swapped = [_swapped_note(run, [readings[i] for i in rows], points[rows])
-               for run, rows in zip(runs, members.values(), strict=True)]  # fmt: skip
-    return MeasurementSet(
-        geometry=geometry,
-        probe=probe,
-        runs=runs,
-        stations=stations,
-        station=station,
-        run=run_of,
-        cycle=np.array([r.cycle for r in readings]),
-        direction=np.array([r.direction for r in readings]),
-        channel=np.array([CHANNELS.index(r.channel) for r in readings]),
-        value=np.array([r.value for r in readings], dtype=float),
-        uncertainty=np.array([r.uncertainty for r in readings], dtype=float),
-        sources=tuple(r.source for r in readings),
-        files=tuple(files),
-        notes=(*notes, *filter(None, swapped)),
-    )
-
-
-def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> list[Pose]:
-    """Return the commanded ``pose_platform_in_base`` of each reading; equal poses are one object."""
-    known: dict[bytes, Pose] = {}
-    poses = []
-    from_tool = geometry.tool.inverse()
-    for reading in readings:
-        key = reading.pose.position.tobytes() + reading.pose.rotation.tobytes()
-        if key not in known:
-            known[key] = geometry.work @ reading.pose @ from_tool
-        poses.append(known[key])
-    return poses
-
-
-def _check_readings(readings: Sequence[Reading]) -> None:
-    """Refuse what no instrument reads."""
-    for r in readings:
-        if r.channel not in CHANNELS:
-            raise InputFileError(r.source.file, _line(r), f"channel must be one of {', '.join(CHANNELS)}", r.channel)
-        if not np.isfinite(r.value):
-            raise InputFileError(r.source.file, _line(r), "value must be finite", r.value)
-        if r.uncertainty <= 0.0:
-            raise InputFileError(r.source.file, _line(r), "uncertainty must be above zero", r.uncertainty)
-
-
-def _line(reading: Reading) -> str:
-    return f"line {reading.source.line}" if reading.source.line else f"run {reading.run}"
-
-
-def _recognise(readings: list[Reading], points: np.ndarray) -> Run:
-    """Return a run from its readings and their commanded points (n, 3), with its line if it has line channels.
-
-    Raises
-    ------
-    InputFileError
-        Line channels whose commanded points do not lie on a line, or at one place only; line and absolute
-        channels mixed.
-    """
-    first, name = readings[0], readings[0].run
-    of_lines = {KIND_OF[CHANNELS.index(r.channel)] < KINDS.index("position") for r in readings}
-    if len(of_lines) == 2:
-        raise InputFileError(first.source.file, f"run {name}", "mixes channels of a line with absolute ones")
-    if of_lines == {False}:
-        return Run(name, np.zeros(3), points[0])
-    spread = points - points[0]
-    far = spread[np.linalg.norm(spread, axis=1).argmax()]
-    if np.linalg.norm(far) < LEAST_TRAVEL:
-        raise InputFileError(first.source.file, f"run {name}", "has one commanded point only; a line needs two")
-    axis = far / np.linalg.norm(far)
-    off = np.linalg.norm(spread - np.outer(spread @ axis, axis), axis=1)
-    if off.max() > LEAST_TRAVEL:
-        where = readings[int(off.argmax())]
-        problem = f"run {name}: the commanded point is {off.max() * 1e3:.4f} mm off the run's line"
-        raise InputFileError(where.source.file, _line(where), problem)
-    leading = int(np.flatnonzero(np.abs(far) > LEAST_TRAVEL)[0])
-    return Run(name, axis * np.sign(axis[leading]), points[0])
+    return Rotation.from_matrix(actual @ np.swapaxes(commanded, -1, -2)).as_rotvec()
 
 
 def senses(geometry: HexapodGeometry, pose: Pose, direction: np.ndarray) -> np.ndarray:
@@ -390,84 +277,3 @@ def senses(geometry: HexapodGeometry, pose: Pose, direction: np.ndarray) -> np.n
     speeds = jacobian(Structure.of(geometry), pose)[:, :3] @ direction
     moving = np.concatenate([direction, speeds])
     return np.sign(moving) * (np.abs(moving) > 1e-9)
-
-
-def _collect_stations(
-    geometry: HexapodGeometry, readings: Sequence[Reading], poses: list[Pose], runs: list[Run]
-) -> tuple[Stations, np.ndarray]:
-    """Return the distinct stations and each reading's index among them; poses and runs per reading."""
-    known: dict[tuple, int] = {}
-    rows: list[tuple] = []
-    index = np.empty(len(readings), dtype=int)
-    limits, nominal = LimitTable(geometry), Structure.of(geometry)
-    here: tuple | None = None
-    before: int | None = None
-    for n, (r, pose, run) in enumerate(zip(readings, poses, runs, strict=True)):
-        place = (r.run, id(pose), r.commands)
-        if here is not None and place != here:
-            before = int(index[n - 1]) if readings[n - 1].run == r.run else None
-        here = place
-        # A station belongs to a run: lines that cross at a point pass it in different ways.
-        came_from = rows[before] if before is not None and r.direction == FROM_PREVIOUS else None
-        key = (place, r.direction, None if came_from is None else before, r.temperatures)
-        if key not in known:
-            lengths = strut_lengths(nominal, pose)
-            _check_reach(limits, pose, lengths, r)
-            commands = np.array(lengths if r.commands is None else r.commands, dtype=float)
-            sense = _sense(geometry, r.direction, run, pose, commands, came_from)
-            known[key] = len(rows)
-            rows.append((pose.position, pose.rotation, commands, sense, r.temperatures))
-        index[n] = known[key]
-    columns = [np.array(column, dtype=float) for column in zip(*rows, strict=True)]
-    return Stations(*columns), index
-
-
-def _check_reach(limits: LimitTable, pose: Pose, lengths: np.ndarray, reading: Reading) -> None:
-    """Refuse a commanded pose that the machine cannot have taken."""
-    arrays = (limits.stroke, limits.cone_axes, limits.cone_cosines, limits.scalars)
-    finding, strut, value, _ = check_stage(*limits.geometry.kernel_joints, pose.position, pose.rotation,
-                                           lengths, arrays)  # fmt: skip
-    if finding != WITHIN:
-        problem = f"the commanded pose is out of the machine's reach: {limits.error(finding, strut, 0, value)}"
-        raise InputFileError(reading.source.file, _line(reading), problem)
-
-
-def _sense(
-    geometry: HexapodGeometry, direction: int, run: Run, pose: Pose, commands: np.ndarray, came_from: tuple | None
-) -> np.ndarray:
-    """Return the directions of motion at a station, shape (9,); `came_from` is the station before."""
-    if direction in (FORWARD, BACKWARD):
-        return senses(geometry, pose, direction * run.axis)
-    if came_from is not None:
-        change = np.concatenate([pose.position - came_from[0], commands - came_from[2]])
-        return np.sign(change) * (np.abs(change) > SAME)
-    return np.zeros(9)
-
-
-def _swapped_note(run: Run, readings: list[Reading], points: np.ndarray) -> str:
-    """Return a remark on a line whose rows run against both their directions, else nothing."""
-    if not run.is_line:
-        return ""
-    along = points @ run.axis
-    way = {direction: _way(readings, along, direction) for direction in (FORWARD, BACKWARD)}
-    if not way[FORWARD] < 0.0 < way[BACKWARD]:
-        return ""
-    return f"{readings[0].source}: run {run.name}: rows called forward run backward and vice versa; swapped?"
-
-
-def _way(readings: list[Reading], along: np.ndarray, direction: int) -> float:
-    """Return the way from the first to the last row of the first pass in a direction, m."""
-    chosen = [(r.cycle, r.channel, a) for r, a in zip(readings, along, strict=True) if r.direction == direction]
-    first_pass = [a for cycle, channel, a in chosen if (cycle, channel) == chosen[0][:2]]
-    return float(first_pass[-1] - first_pass[0]) if first_pass else 0.0
-
-
-def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:
-    """Return the rotation vector(s) that turn commanded into actual rotations, rad in their common frame.
-
-    Parameters
-    ----------
-    actual, commanded : ndarray, shape (..., 3, 3)
-        Rotation matrices.
-    """
-    return Rotation.from_matrix(actual @ np.swapaxes(commanded, -1, -2)).as_rotvec()

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import csv
+import hashlib
+import io
 import math
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -42,12 +46,24 @@ class Row:
     label: str
 
 
-class _Table:
-    """A CSV file with its header understood."""
+class Table:
+    """A CSV file with its header understood.
+
+    Attributes
+    ----------
+    path : str or Path
+        The file.
+    sha256 : str
+        Of the bytes that were read, hexadecimal.
+    header : list of str
+        Column names.
+    rows : list of (int, list of str)
+        Line and cells of each row; all as many as the header's.
+    """
 
     def __init__(self, path: str | Path) -> None:
         self.path = path
-        numbered = _read_rows(path)
+        numbered, self.sha256 = _read_rows(path)
         self.header = [name.strip() for name in numbered[0][1]] if numbered else []
         twice = [name for name in self.header if self.header.count(name) > 1]
         if twice:
@@ -55,6 +71,10 @@ class _Table:
         self.rows = numbered[1:]
         if not self.rows:
             raise InputFileError(path, "", "has a header but no rows" if self.header else "has no header")
+        for line, row in self.rows:
+            if len(row) != len(self.header):
+                problem = f"has {len(row)} columns, the header has {len(self.header)}"
+                raise InputFileError(path, f"line {line}", problem)
         self._known: set[str] = {name for name in LABEL_COLUMNS if name in self.header}
 
     def column(self, name: str, dimension: str | None) -> tuple[int, float] | None:
@@ -95,14 +115,31 @@ class _Table:
         """Return the finite numbers of some columns in SI, shape (rows, columns)."""
         values = np.empty((len(self.rows), len(columns)))
         for n, (line, row) in enumerate(self.rows):
-            if len(row) != len(self.header):
-                problem = f"has {len(row)} columns, the header has {len(self.header)}"
-                raise InputFileError(self.path, f"line {line}", problem)
             for k, (index, unit) in enumerate(columns):
-                values[n, k] = unit * self._number(line, index, row[index])
+                values[n, k] = si_from_text(row[index], self.number(line, index, row[index]), unit)
         return values
 
-    def _number(self, line: int, index: int, text: str) -> float:
+    def texts(self, name: str) -> list[str]:
+        """Return the cells of a column that must be there, without spaces around them."""
+        index = self.required((name,), None)[0][0]
+        return [row[index].strip() for _, row in self.rows]
+
+    def poses(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the poses of the columns that :func:`read_poses` describes, shapes (N, 3), (N, 3, 3)."""
+        columns = self.required(POSITION_COLUMNS, "length")
+        angle_columns = self.columns(ANGLE_COLUMNS, "angle")
+        quaternion_columns = self.columns(QUATERNION_COLUMNS, None)
+        if angle_columns and quaternion_columns:
+            raise InputFileError(self.path, "header", "give either angles or a quaternion, not both")
+        positions = self.numbers(columns)
+        if quaternion_columns:
+            quaternions = self.numbers(quaternion_columns)
+            return positions, _rotations_from_quaternions(self.path, self.labels(), quaternions)
+        angles = self.numbers(angle_columns) if angle_columns else np.zeros((len(self.rows), 3))
+        return positions, rotation_from_angles(angles)
+
+    def number(self, line: int, index: int, text: str) -> float:
+        """Return the finite number in a cell."""
         try:
             value = float(text)
         except ValueError:
@@ -120,11 +157,32 @@ class _Table:
         ]
 
 
-def _read_rows(path: str | Path) -> list[tuple[int, list[str]]]:
-    """Return the rows of a CSV file that are neither empty nor comments, with their lines."""
+
+
+
+class _Hashed(io.RawIOBase):
+    """The bytes of a file, hashed as they pass: what was read is what is named, also from a pipe."""
+
+    def __init__(self, file: io.FileIO) -> None:
+        self._file = file
+        self.sha256 = hashlib.sha256()
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        count = self._file.readinto(buffer) or 0
+        self.sha256.update(memoryview(buffer)[:count])
+        return count
+
+
+def _read_rows(path: str | Path) -> tuple[list[tuple[int, list[str]]], str]:
+    """Return the rows of a CSV file that are neither empty nor comments, with their lines, and its SHA-256."""
     numbered: list[tuple[int, list[str]]] = []
     try:
-        with open(path, newline="", encoding="utf-8-sig") as stream:
+        with open(path, "rb", buffering=0) as file:
+            source = _Hashed(file)
+            stream = io.TextIOWrapper(io.BufferedReader(source), newline="", encoding="utf-8-sig")
             lines = csv.reader(stream, skipinitialspace=True)
             for row in lines:
                 if row and not row[0].startswith("#"):
@@ -137,7 +195,38 @@ def _read_rows(path: str | Path) -> list[tuple[int, list[str]]]:
         raise InputFileError(path, "", f"cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise InputFileError(path, f"line {len(numbered) + 1} or later", "is not UTF-8 text") from error
-    return numbered
+    return numbered, source.sha256.hexdigest()
+
+
+SHIFTS = {10.0**digits: digits for digits in range(-9, 10)}
+"""Digits by which a unit of such a size moves the decimal point."""
+
+
+def si_from_text(text: str, number: float, unit: float) -> float:
+    """Return a number in SI: where the unit moves the decimal point only, the float that is nearest to the text.
+
+    So 203.2 mm is the very 0.2032 of source code, and what was written with all its digits comes back.
+
+    Parameters
+    ----------
+    text : str
+        As it stands in the file.
+    number : float
+        What it is, finite.
+    unit : float
+        Size of its unit in SI.
+    """
+    digits = SHIFTS.get(unit)
+    if digits is None:
+        return unit * number
+    if digits == 0:
+        return number
+    return float(exact(text, number).scaleb(digits)) if "e" in text.lower() else float(f"{text.strip()}e{digits}")
+
+
+def exact(text: str, number: float) -> Decimal:
+    """Return a number that stands in a file as a decimal, without rounding it first."""
+    return Decimal(repr(number)) if "e" in text.lower() else Decimal(text)
 
 
 def _column_names(name: str, dimension: str | None) -> str:
@@ -184,18 +273,10 @@ def read_pose_arrays(path: str | Path) -> tuple[list[Row], np.ndarray, np.ndarra
     InputFileError
         Naming file, line and column.
     """
-    table = _Table(path)
-    positions = table.numbers(table.required(POSITION_COLUMNS, "length"))
-    angle_columns = table.columns(ANGLE_COLUMNS, "angle")
-    quaternion_columns = table.columns(QUATERNION_COLUMNS, None)
+    table = Table(path)
+    positions, rotations = table.poses()
     table.refuse_unknown()
-    if angle_columns and quaternion_columns:
-        raise InputFileError(path, "header", "give either angles or a quaternion, not both")
-    rows = table.labels()
-    if quaternion_columns:
-        return rows, positions, _rotations_from_quaternions(path, rows, table.numbers(quaternion_columns))
-    angles = table.numbers(angle_columns) if angle_columns else np.zeros((len(rows), 3))
-    return rows, positions, rotation_from_angles(angles)
+    return table.labels(), positions, rotations
 
 
 def _rotations_from_quaternions(path: str | Path, rows: list[Row], quaternions: np.ndarray) -> np.ndarray:
@@ -227,7 +308,7 @@ def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
     InputFileError
         Naming file, line and column.
     """
-    table = _Table(path)
+    table = Table(path)
     lengths = table.numbers(table.required(LENGTH_COLUMNS, "length"))
     for group in (NOMINAL_COLUMNS, CORRECTION_COLUMNS):
         table.columns(group, "length")

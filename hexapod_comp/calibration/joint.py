@@ -31,6 +31,9 @@ SCALE_ROUNDS = 12
 HYPER = 0.1
 """How many parameters the first guess of a tolerance is worth."""
 
+LARGEST_TOLERANCE = {"structure": 5e-3}
+"""No machine is built worse than this, m; a misfit that grows the tolerance further has another cause."""
+
 LEAST_FREEDOM = 10.0
 """Noise is estimated from at least so many readings beyond those that the parameters use up."""
 
@@ -303,7 +306,7 @@ def _tolerances(space: ParameterSpace, posterior: Posterior, z: np.ndarray) -> n
         if mine.any():
             first = HYPER * (start[n] / result[n]) ** 2
             factor = np.sqrt((z[mine] @ z[mine] + first) / (posterior.determined[mine].sum() + HYPER))
-            result[n] *= np.clip(factor, 0.1, 10.0)
+            result[n] = min(result[n] * np.clip(factor, 0.1, 10.0), LARGEST_TOLERANCE.get(block.name, np.inf))
     return result
 
 

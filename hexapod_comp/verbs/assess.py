@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from .. import texts
 from . import common
 
 if TYPE_CHECKING:
@@ -155,9 +156,9 @@ def _taken(result: Assessment) -> list[Pose]:
 
 def _table(header: Sequence[str], rows: list[Row], values: Iterable[Sequence[float]], digits: int) -> str:
     body = [
-        [row.label, *(common.number(float(v), digits) for v in line)] for row, line in zip(rows, values, strict=True)
+        [row.label, *(texts.number(float(v), digits) for v in line)] for row, line in zip(rows, values, strict=True)
     ]
-    return common.aligned(["sequence", *header], body)
+    return texts.aligned(["sequence", *header], body)
 
 
 def _lengths(rows: list[Row], lengths: np.ndarray) -> str:
@@ -177,12 +178,12 @@ def _statistics(rows: list[Row], result: Assessment) -> list[str]:
         columns.append((found[name] * factor, 3 if unit == "um" else 6))
     body = []
     for n, row in enumerate(rows):
-        cells = [common.number(float(v), digits) for values, digits in columns for v in values[n]]
+        cells = [texts.number(float(v), digits) for values, digits in columns for v in values[n]]
         body.append([row.label, *cells])
     title = (
         f"over {len(result.seeds)} machines: largest strut change, tool displacement and rotation under ideal lengths:"
     )
-    return [title, common.aligned(["sequence", *header], body)]
+    return [title, texts.aligned(["sequence", *header], body)]
 
 
 def _conclusion(args: argparse.Namespace, result: Assessment) -> list[str]:

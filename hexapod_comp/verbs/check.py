@@ -6,6 +6,7 @@ import argparse
 import math
 from typing import TYPE_CHECKING, Any
 
+from .. import texts
 from . import common
 
 if TYPE_CHECKING:
@@ -130,7 +131,7 @@ def _margin_table(rows: list[Row], result: CheckResult, ideal: bool) -> str:
     body = [[rows[n].label, str(rows[n].line), *_row_cells(result, n, ideal)] for n in shown]
     kind = "" if ideal else " (nominal/compensated)"
     way = ", the worst of the move to each pose" if result.mode == "moves" else ""
-    return f"margins of stroke and cones, values of the rest{kind}{way}:\n{common.aligned(header, body)}{note}"
+    return f"margins of stroke and cones, values of the rest{kind}{way}:\n{texts.aligned(header, body)}{note}"
 
 
 def _row_cells(result: CheckResult, n: int, ideal: bool) -> list[str]:
@@ -144,7 +145,7 @@ def _row_cells(result: CheckResult, n: int, ideal: bool) -> list[str]:
 def _cell(result: CheckResult, name: str, n: int, stage: int) -> str:
     digits = LIMITS_SHOWN[name][3]
     value = _shown(result, name, n, stage)
-    return common.number(value, digits) if math.isfinite(value) else "–"
+    return texts.number(value, digits) if math.isfinite(value) else "–"
 
 
 def _shown(result: CheckResult, name: str, n: int, stage: int) -> float:
@@ -222,7 +223,7 @@ def _smallest_table(limits: Limits, rows: list[Row], result: CheckResult) -> str
         strut = str(entry["strut"] or "–")
         place = [entry["stage"], entry["label"], str(entry["line"]), way]
         body.append([entry["limit"], *numbers, entry["unit"].replace("_", "/") or "–", strut, *place])
-    return common.aligned(header, body)
+    return texts.aligned(header, body)
 
 
 def _notes(rows: list[Row], result: CheckResult, ideal: bool) -> list[str]:

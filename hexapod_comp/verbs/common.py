@@ -9,8 +9,10 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias
+
+from ..texts import number
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -187,21 +189,6 @@ def _cell(value: Any, digits: int) -> Any:
     if not isinstance(value, float):
         return value
     return number(value, digits) if math.isfinite(value) else ""
-
-
-def number(value: float, digits: int) -> str:
-    """Return a number with so many digits after its point, never −0."""
-    return f"{round(value, digits) + 0.0:.{digits}f}"
-
-
-def aligned(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table with its columns aligned to the right, a last one without header to the left."""
-    lines = [list(header), *(list(row) for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    if not header[-1]:
-        widths[-1] = 0
-    shown = [[cell.rjust(width) for cell, width in zip(line, widths, strict=True)] for line in lines]
-    return "\n".join("  ".join(cells).rstrip() for cells in shown)
 
 
 def json_text(content: Any) -> str:

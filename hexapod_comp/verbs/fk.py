@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
+from .. import texts
 from . import common
 
 if TYPE_CHECKING:
@@ -99,7 +100,7 @@ def _poses(
         return common.csv_text(table)
     header = list(table[0])[1:]
     title = f"machine {geometry.name}" + (f", model {model.name}" if args.model != "ideal" else "")
-    return f"{title}\n{common.aligned(header, [[common.number(table[0][name], 6) for name in header]])}\n"
+    return f"{title}\n{texts.aligned(header, [[texts.number(table[0][name], 6) for name in header]])}\n"
 
 
 def _solve(
@@ -174,8 +175,8 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
         found.append({"mode": index, **values, "working": is_working, "objections": objections})
     if args.json:
         return common.json_text({"machine": geometry.name, "modes": found, "no_working_mode": reason})
-    body = [[str(m["mode"]), *(common.number(m[name], 6) for name in MODE_COLUMNS[1:7]), _verdict(m)] for m in found]
-    lines = [f"machine {geometry.name}: {len(modes)} assembly modes", common.aligned(MODE_COLUMNS, body)]
+    body = [[str(m["mode"]), *(texts.number(m[name], 6) for name in MODE_COLUMNS[1:7]), _verdict(m)] for m in found]
+    lines = [f"machine {geometry.name}: {len(modes)} assembly modes", texts.aligned(MODE_COLUMNS, body)]
     return "\n".join(lines + [f"no working mode: {reason}"] * bool(reason)) + "\n"
 
 

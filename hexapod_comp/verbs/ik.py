@@ -6,6 +6,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
+from .. import texts
 from . import common
 
 if TYPE_CHECKING:
@@ -147,8 +148,8 @@ def _one_pose(geometry: HexapodGeometry, model: MachineModel, lengths: np.ndarra
         columns += [command * 1e3, (command - nominal) * 1e6]
     digits = [6, 6, 3]
     body = [
-        [name, *(common.number(float(c[i]), d) for c, d in zip(columns, digits, strict=False))]
+        [name, *(texts.number(float(c[i]), d) for c, d in zip(columns, digits, strict=False))]
         for i, name in enumerate(STRUT_NAMES)
     ]
     title = f"machine {geometry.name}" + (f", model {model.name}" if with_model else "")
-    return f"{title}\n{common.aligned(header, body)}\n"
+    return f"{title}\n{texts.aligned(header, body)}\n"

@@ -1,0 +1,115 @@
+"""What a fit of scheme ``lines`` prints: how good the polynomials are, and what the model is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+
+import numpy as np
+
+from ..field import COMPONENTS
+from ..measurement import AXES
+from ..texts import aligned, number
+from .evaluation import Worth
+from .lines import LineFit, LinesFit
+
+WAYS = {1: "forward", -1: "backward", 0: "both"}
+
+
+def report(fit: LinesFit, worth: Worth | None = None, every_line: bool = False) -> str:
+    """Return the report of a fit.
+
+    Parameters
+    ----------
+    fit : LinesFit
+        What to report.
+    worth : Worth, optional
+        What the model is worth on the virtual machine that was measured, where there is one.
+    every_line : bool
+        List every polynomial too, not only each family's summary.
+    """
+    field = fit.model.field
+    nodes = " × ".join(str(len(along)) for along in field.grid)
+    blocks = [f"{fit.model.name}: {len(fit.lines)} polynomials on a grid of {nodes} nodes", summary_table(fit.lines)]
+    if every_line:
+        blocks.append(line_table(fit.lines))
+    blocks += [f"note: {note}" for note in fit.notes]
+    if worth is not None:
+        blocks.append(worth_text(worth))
+    return "\n\n".join(blocks) + "\n"
+
+
+def summary_table(lines: Sequence[LineFit]) -> str:
+    """Return one row for each family and component: orders, R², residuals."""
+    header = ("lines along", "of", "polynomials", "order", "R² least", "adjusted R² median", "σ median", "largest", "")
+    by_family = groupby(sorted(lines, key=_family), key=_family)
+    return aligned(header, (_summary_row(list(members)) for _, members in by_family))
+
+
+def _family(line: LineFit) -> tuple[int, int]:
+    return line.axis, line.component
+
+
+def _summary_row(lines: Sequence[LineFit]) -> Sequence[str]:
+    orders = [line.order for line in lines]
+    order = f"{min(orders)}…{max(orders)}" if min(orders) < max(orders) else str(orders[0])
+    spread = np.array([line.residual_std for line in lines]) * 1e6
+    component = lines[0].component
+    return (
+        AXES[lines[0].axis],
+        COMPONENTS[component],
+        str(len(lines)),
+        order,
+        number(min(line.r2 for line in lines), 3),
+        number(float(np.median([line.adjusted_r2 for line in lines])), 3),
+        f"{np.median(spread):.2f}",
+        f"{spread.max():.2f}",
+        _unit(component),
+    )
+
+
+def _unit(component: int) -> str:
+    return "µm" if component < 3 else "µrad"
+
+
+def line_table(lines: Sequence[LineFit]) -> str:
+    """Return one row for each polynomial; σ of its residuals, and of repeated readings where there are any."""
+    header = ("of", "direction", "points", "order", "R²", "adjusted R²", "σ", "σ repeated", "unit", "")
+    return aligned(header, (_line_row(line) for line in lines))
+
+
+def _line_row(line: LineFit) -> Sequence[str]:
+    return (
+        COMPONENTS[line.component],
+        WAYS[line.direction],
+        str(len(line.values)),
+        str(line.order),
+        number(line.r2, 4),
+        number(line.adjusted_r2, 4),
+        f"{line.residual_std * 1e6:.2f}",
+        "–" if np.isnan(line.repeat_std) else f"{line.repeat_std * 1e6:.2f}",
+        _unit(line.component),
+        line.name,
+    )
+
+
+def worth_text(worth: Worth) -> str:
+    """Return what a model is worth on a virtual machine: the paper's measure next to the honest one."""
+    return "\n".join(_worth_lines(worth))
+
+
+def _worth_lines(worth: Worth) -> Iterator[str]:
+    before, after, paper = worth.before, worth.after, worth.paper
+    along = _fall(paper.before, paper.after, "µm")
+    yield f"On the virtual machine, without → with the model (held out: {after.points} points, both ways):"
+    yield f"  001's metric, mean |displacement error| along {paper.lines} lines: {along}"
+    yield f"  error vector in space, RMS, datum aligned: {_fall(before.aligned_rms, after.aligned_rms, 'µm')}"
+    yield f"  its largest: {_fall(before.aligned_max, after.aligned_max, 'µm')}"
+    yield f"  error vector in space, RMS, as it is: {_fall(before.raw_rms, after.raw_rms, 'µm')}"
+    yield f"  rotation, RMS, datum aligned: {_fall(before.rotation_rms, after.rotation_rms, 'µrad')}"
+
+
+def _fall(before: float, after: float, unit: str) -> str:
+    """Return a comparison in millionths as text."""
+    removed = f" ({100.0 * (1.0 - after / before):.1f} % less)" if before > 0.0 else ""
+    return f"{before * 1e6:.2f} → {after * 1e6:.2f} {unit}{removed}"

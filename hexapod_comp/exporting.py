@@ -1,0 +1,327 @@
+"""What an export is worth: the tool error that a machine keeps when it is driven by the exported data.
+
+The model is taken for the truth. Its machine is driven twice along the same random travel, with nominal
+strut lengths and with what the export makes of the same commands, and the tool's error is compared. Travel
+passes each point along a space diagonal, forward on all axes and then backward, so that everything that
+depends on a direction has one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .errors import HexapodError, ModelError
+from .geometry import HexapodGeometry
+from .kernels import OK
+from .kinematics import Structure, forward_error, strut_lengths_batch
+from .limits import WITHIN, LimitTable, check_stage
+from .machine import MachineModel, RealMachine, Temperatures
+from .pose import Pose
+
+DIAGONAL = np.ones(3)
+"""Direction of travel, forward; backward is its opposite."""
+
+
+@dataclass(frozen=True)
+class Travel:
+    """Commanded tool poses, each passed in a direction.
+
+    Parameters
+    ----------
+    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
+        ``pose_tool_in_work``, m.
+    directions : ndarray, shape (N, 3)
+        Direction of motion along the axes of ``work``; the tool does not turn.
+    """
+
+    positions: np.ndarray
+    rotations: np.ndarray
+    directions: np.ndarray
+
+    def platform(self, geometry: HexapodGeometry) -> tuple[np.ndarray, np.ndarray]:
+        """Return the commanded ``pose_platform_in_base`` of each row: positions (N, 3), m, rotations (N, 3, 3)."""
+        work, back = geometry.work, geometry.tool.inverse()
+        rotations = work.rotation @ self.rotations
+        positions = work.position + self.positions @ work.rotation.T + rotations @ back.position
+        return positions, rotations @ back.rotation
+
+
+CommandsOf = Callable[[Travel], np.ndarray]
+"""Returns the strut commands, shape (N, 6), m, that are sent for a travel of N rows."""
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What a machine did along a travel, seen at the tool along the axes of ``work``.
+
+    Attributes
+    ----------
+    displacement, rotation : ndarray, shape (N, 3)
+        Actual minus commanded tool position, m, and rotation vector from commanded to actual, rad.
+    field_share : ndarray, shape (N, 3)
+        The part of the displacement that the model's field adds, m.
+    """
+
+    displacement: np.ndarray
+    rotation: np.ndarray
+    field_share: np.ndarray
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large a set of vectors is.
+
+    Attributes
+    ----------
+    rms, largest : float
+        Root mean square and largest length of the vectors.
+    """
+
+    rms: float
+    largest: float
+
+    @staticmethod
+    def of(vectors: np.ndarray) -> Size:
+        """Return the size of (N, 3) vectors."""
+        lengths = np.linalg.norm(vectors, axis=1)
+        return Size(float(np.sqrt((lengths**2).mean())), float(lengths.max()))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Errors of the tool without and with an export.
+
+    Attributes
+    ----------
+    passes : int
+        Poses times directions that were driven.
+    before, after : Size
+        3-D displacement error, m.
+    before_rotation, after_rotation : Size
+        Rotation error, rad.
+    """
+
+    passes: int
+    before: Size
+    after: Size
+    before_rotation: Size
+    after_rotation: Size
+
+
+@dataclass(frozen=True)
+class ExportCheck:
+    """What one export leaves, and how large the effects are that it cannot carry.
+
+    Attributes
+    ----------
+    level : Comparison
+        Level tool, inside the box.
+    tilted : Comparison or None
+        The same places with the tool tilted; None where no such pose is within the machine's limits.
+    field : Size
+        Displacement of the tool by the model's error field, m.
+    per_kelvin : Size or None
+        Displacement of the tool when struts, base and platform are 1 K warmer, m; None for a model without
+        thermal expansion.
+    """
+
+    level: Comparison
+    tilted: Comparison | None
+    field: Size
+    per_kelvin: Size | None
+
+
+def commanded_box(geometry: HexapodGeometry, model: MachineModel) -> np.ndarray:
+    """Return the box of level tool positions in ``work`` for which a model was measured, shape (2, 3), m.
+
+    It is the model's valid box, else the box of its field, both boxes of platform positions; with a work
+    frame that is turned, the box around it.
+
+    Raises
+    ------
+    ModelError
+        The model has neither.
+    """
+    box = model.valid_box
+    if box is None and any(family.shape[4] for family in model.field.lines):
+        box = model.field.box
+    if box is None:
+        raise ModelError("valid_box", "the model has neither a valid box nor a field; give a box of tool positions")
+    corners = np.array(np.meshgrid(*box.T)).reshape(3, 8).T
+    level = geometry.work.rotation @ geometry.tool.rotation.T  # of the platform, when the tool is level
+    tools = [(geometry.work.inverse() @ Pose(corner, level) @ geometry.tool).position for corner in corners]
+    return np.array([np.min(tools, axis=0), np.max(tools, axis=0)])
+
+
+def draw_travel(box: np.ndarray, count: int, seed: int, tilt: float = 0.0) -> Travel:
+    """Draw positions in a box; each is passed forward and backward.
+
+    Parameters
+    ----------
+    box : ndarray, shape (2, 3)
+        Lowest and highest tool position in ``work``, m.
+    count : int
+        Positions; the travel has twice as many rows.
+    seed : int
+        Of the random numbers.
+    tilt : float, optional
+        Angle by which the tool leans, rad, about a random horizontal axis.
+    """
+    rng = np.random.default_rng(seed)
+    positions = rng.uniform(box[0], box[1], (count, 3))
+    azimuth = rng.uniform(0.0, 2.0 * np.pi, count)
+    axes = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(count)], axis=1)
+    rotations = Rotation.from_rotvec(tilt * axes).as_matrix()
+    directions = np.repeat([DIAGONAL, -DIAGONAL], count, axis=0)
+    return Travel(np.tile(positions, (2, 1)), np.tile(rotations, (2, 1, 1)), directions)
+
+
+def nominal_commands(geometry: HexapodGeometry, travel: Travel) -> np.ndarray:
+    """Return the strut lengths of the nominal machine, shape (N, 6), m: the commands without compensation."""
+    return strut_lengths_batch(Structure.of(geometry), *travel.platform(geometry))
+
+
+def senses(structure: Structure, geometry: HexapodGeometry, travel: Travel) -> np.ndarray:
+    """Return the directions of motion, shape (N, 9), of a platform along a travel: axes of ``base``, six struts.
+
+    A strut whose platform joint moves along d gets longer when d points along it.
+    """
+    positions, rotations = travel.platform(geometry)
+    along = travel.directions @ geometry.work.rotation.T
+    struts = positions[:, None] + structure.platform_joints @ rotations.transpose(0, 2, 1) - structure.base_joints
+    return np.sign(np.hstack([along, np.einsum("nij,nj->ni", struts, along)]))
+
+
+def drive(machine: RealMachine, travel: Travel, commands: np.ndarray) -> Driven:
+    """Run the machine forwards along a travel.
+
+    Parameters
+    ----------
+    machine : RealMachine
+        The truth.
+    travel : Travel
+        What was commanded.
+    commands : ndarray, shape (N, 6)
+        What the struts are told, m.
+
+    Raises
+    ------
+    KinematicsError
+        The machine has no pose for a row's commands; names the row's position.
+    """
+    geometry, count = machine.geometry, len(commands)
+    wanted, commands = travel.platform(geometry), np.ascontiguousarray(commands)
+    modelled = wanted[0].copy(), wanted[1].copy()
+    actual = np.empty((count, 3)), np.empty((count, 3, 3))
+    sense = senses(machine.structure, geometry, travel)
+    for row in range(count):
+        arrays = (modelled[0][row], modelled[1][row], actual[0][row], actual[1][row])
+        outcome, _, condition, _ = machine.forward(commands[row], sense[row], *arrays)
+        if outcome != OK:
+            error = forward_error(outcome, condition, machine.structure.max_condition)
+            raise type(error)(f"{at(wanted[0][row])}: {error}", error.value, error.limit)
+    turn, tool = geometry.work.rotation, geometry.tool.position
+    at_tool, without, target = (p + r @ tool for p, r in (actual, modelled, wanted))
+    rotation = Rotation.from_matrix(actual[1] @ wanted[1].transpose(0, 2, 1)).as_rotvec()
+    return Driven((at_tool - target) @ turn, rotation @ turn, (at_tool - without) @ turn)
+
+
+def at(position: np.ndarray) -> str:
+    """Say where the platform is, for messages; position (3,), m."""
+    return "platform at ({:.3f}, {:.3f}, {:.3f}) mm".format(*(position * 1e3))
+
+
+def within_limits(geometry: HexapodGeometry, travel: Travel) -> tuple[np.ndarray, HexapodError | None]:
+    """Return which rows the nominal machine may take, shape (N,), and the error of the first that it may not."""
+    table, joints = LimitTable(geometry), geometry.kernel_joints
+    limits = (table.stroke, table.cone_axes, table.cone_cosines, table.scalars)
+    inside, first = np.ones(len(travel.positions), dtype=bool), None
+    lengths = nominal_commands(geometry, travel)
+    for row, pose in enumerate(zip(*travel.platform(geometry), strict=True)):
+        finding, strut, value, _ = check_stage(*joints, *pose, lengths[row], limits)
+        inside[row] = finding == WITHIN
+        if finding != WITHIN and first is None:
+            first = table.error(finding, strut, 0, value)
+            first.args = (f"{at(pose[0])}: {first}",)
+    return inside, first
+
+
+class ExportTrial:
+    """A machine and the travel on which exports for it are tried; the model is taken for the truth.
+
+    Parameters
+    ----------
+    geometry, model : HexapodGeometry, MachineModel
+        The machine that the exports were made for, at 20 °C.
+    box : ndarray, shape (2, 3)
+        Lowest and highest tool position in ``work``, m.
+    count, seed : int
+        Positions to draw, each passed forward and backward, and the seed.
+    tilt : float
+        How far the tool leans in the second comparison, rad.
+
+    Raises
+    ------
+    LimitError, KinematicsError
+        The machine cannot reach a part of the box with a level tool.
+    """
+
+    def __init__(
+        self,
+        geometry: HexapodGeometry,
+        model: MachineModel,
+        box: np.ndarray,
+        count: int = 1000,
+        seed: int = 0,
+        tilt: float = np.deg2rad(5.0),
+    ) -> None:
+        self.machine, self.level = RealMachine(geometry, model), draw_travel(box, count, seed)
+        _, refused = within_limits(geometry, self.level)
+        if refused is not None:
+            raise refused
+        leaning = draw_travel(box, count, seed, tilt)
+        inside, _ = within_limits(geometry, leaning)
+        self.tilted = Travel(leaning.positions[inside], leaning.rotations[inside], leaning.directions[inside])
+        travels = (self.level, self.tilted) if inside.any() else (self.level,)
+        self._before = [drive(self.machine, travel, nominal_commands(geometry, travel)) for travel in travels]
+
+    def check(self, commands_of: CommandsOf) -> ExportCheck:
+        """Compare the tool error without and with an export.
+
+        Parameters
+        ----------
+        commands_of : callable
+            What the export makes of a travel.
+
+        Raises
+        ------
+        KinematicsError
+            The machine has no pose for what the export commands.
+        """
+        commands = commands_of(self.level)
+        driven = drive(self.machine, self.level, commands)
+        tilted = None
+        if len(self._before) > 1:
+            leaning = drive(self.machine, self.tilted, commands_of(self.tilted))
+            tilted = _comparison(self._before[1], leaning)
+        warmer = _warmer(self.machine, self.level, commands, driven)
+        return ExportCheck(_comparison(self._before[0], driven), tilted, Size.of(driven.field_share), warmer)
+
+
+def _comparison(before: Driven, after: Driven) -> Comparison:
+    sizes = [Size.of(v) for v in (before.displacement, after.displacement, before.rotation, after.rotation)]
+    return Comparison(len(after.displacement), *sizes)
+
+
+def _warmer(machine: RealMachine, travel: Travel, commands: np.ndarray, driven: Driven) -> Size | None:
+    """Return how far 1 K on struts, base and platform moves the tool, None without any expansion."""
+    model = machine.model
+    if not (model.struts.expansion.any() or model.base_expansion or model.platform_expansion):
+        return None
+    readings = Temperatures(dict.fromkeys(Temperatures.NAMES, 21.0))
+    warm = drive(RealMachine(machine.geometry, model, readings), travel, commands)
+    return Size.of(warm.displacement - driven.displacement)

@@ -1,0 +1,20 @@
+"""Numbers and tables as text, for reports."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+
+def number(value: float, digits: int) -> str:
+    """Return a number with so many digits after its point, never −0."""
+    return f"{round(value, digits) + 0.0:.{digits}f}"
+
+
+def aligned(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table with its columns aligned to the right, a last one without header to the left."""
+    lines = [list(header), *(list(row) for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    if not header[-1]:
+        widths[-1] = 0
+    shown = [[cell.rjust(width) for cell, width in zip(line, widths, strict=True)] for line in lines]
+    return "\n".join("  ".join(cells).rstrip() for cells in shown)
