@@ -9,14 +9,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from .calibration.evaluation import Passes, run
+from .calibration.joint_fit import JointFit
 from .calibration.lines import LineFit, LinesFit
 from .errors import CalibrationError
 from .field import COMPONENTS, CROSS_AXES
 from .geometry import STRUT_NAMES, HexapodGeometry
 from .kinematics import Structure, strut_lengths_batch
 from .machine import MachineModel, RealMachine
-from .measurement import AXES
+from .measurement import AXES, KINDS
 from .plotting import WITH, WITHOUT
+from .struts import smooth_error
 
 SAMPLES = 161
 """Points of a curve."""
@@ -157,3 +159,67 @@ def _label_edges(panels: np.ndarray, axis: int, component: int) -> None:
     for axes in panels[:, 0]:
         axes.set_ylabel("µm" if component < 3 else "µrad")
     panels[0, 0].legend(fontsize=6)
+
+
+def joint_figure(fit: JointFit) -> Figure:
+    """Show a joint fit: its residuals, the struts' errors, what the data determine, and what error to expect."""
+    figure = Figure(figsize=(11, 7.6), layout="constrained")
+    panels = figure.subplots(2, 2)
+    _residual_panel(panels[0, 0], fit)
+    _strut_panel(panels[0, 1], fit)
+    _sight_panel(panels[1, 0], fit)
+    _tool_error_panel(panels[1, 1], fit)
+    figure.suptitle(f"{fit.measurements.geometry.name}: scheme joint, {len(fit.measurements)} readings")
+    return figure
+
+
+def _residual_panel(axes: Axes, fit: JointFit) -> None:
+    """Show the residuals of each kind of channel against what noise alone would look like."""
+    kinds = fit.measurements.kind
+    edges = np.linspace(-5.0, 5.0, 51)
+    for channel in fit.channels:
+        residuals = fit.solution.residuals[kinds == KINDS.index(channel.kind)] / channel.found
+        label = f"{channel.kind}, {channel.readings}"
+        axes.hist(np.clip(residuals, -5.0, 5.0), edges.tolist(), density=True, histtype="step", label=label)
+    axes.plot(edges, np.exp(-0.5 * edges**2) / np.sqrt(2.0 * np.pi), "k:", lw=1.0, label="normal")
+    axes.set(title="residuals", xlabel="residual over the noise found", ylabel="density")
+    axes.legend(fontsize=7)
+
+
+def _strut_panel(axes: Axes, fit: JointFit) -> None:
+    """Show what each strut does with its commands, offset and backlash aside."""
+    struts = RealMachine(fit.measurements.geometry, fit.model).strut_arrays
+    commands = fit.measurements.stations.commands
+    for strut, name in enumerate(STRUT_NAMES):
+        at = np.linspace(commands[:, strut].min(), commands[:, strut].max(), 4 * SAMPLES)
+        errors = [smooth_error(c, *struts, strut)[0] - fit.model.struts.offset[strut] for c in at]
+        axes.plot(at * 1e3, np.array(errors) * 1e6, lw=0.8, label=name)
+    axes.set(title="strut errors: pitch, screw wave, length map", xlabel="command, mm", ylabel="error, µm")
+    axes.legend(ncols=2, fontsize=7)
+
+
+def _sight_panel(axes: Axes, fit: JointFit) -> None:
+    """Show how many parameters of each block the data determine."""
+    blocks = fit.observability.blocks
+    names = [block.name for block in blocks]
+    axes.barh(names, [block.parameters for block in blocks], color="#d0d0d0", label="parameters")
+    axes.barh(names, [block.determined for block in blocks], height=0.5, color=WITH, label="determined by data")
+    axes.invert_yaxis()
+    axes.set(title="what the readings determine", xlabel="parameters")
+    axes.legend(fontsize=7)
+
+
+def _tool_error_panel(axes: Axes, fit: JointFit) -> None:
+    """Show the tool error to expect, before and after, for a level and for a tilted tool."""
+    cases = {"level": fit.level, "tilted 10°": fit.tilted}
+    known = {name: error for name, error in cases.items() if error is not None}
+    places = np.arange(len(known))
+    before = [error.before * 1e6 for error in known.values()]
+    after = np.array([error.after * 1e6 for error in known.values()])
+    low, high = (np.array([getattr(error, end) * 1e6 for error in known.values()]) for end in ("low", "high"))
+    axes.bar(places - 0.2, before, 0.35, color=WITHOUT, label="as the machine is")
+    spread = [np.maximum(after - low, 0.0), np.maximum(high - after, 0.0)]
+    axes.bar(places + 0.2, after, 0.35, color=WITH, yerr=spread, capsize=4, label="with the model (95 %)")
+    axes.set_xticks(places, list(known))
+    axes.set(title="tool error to expect, datum aligned", ylabel="RMS in space, µm", yscale="log")
+    axes.legend(fontsize=7)

@@ -7,12 +7,13 @@ symbols of the standard stand beside each figure; the formulas are those of its 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from .errors import ModelError
+from .texts import aligned
 
 DIRECTIONS = ("up", "down")
 """Approach in the positive direction, and in the negative."""
@@ -349,3 +350,15 @@ def _figure_lines(test: PositioningTest) -> list[str]:
 def _micrometres(value: float) -> str:
     """Return a length in µm, ten characters wide, never −0."""
     return f"{round(value * 1e6, 3) + 0.0:10.3f}"
+
+
+def table(tests: Mapping[str, PositioningTest]) -> str:
+    """Return the figures of several bidirectional tests, one row each, µm."""
+    keys = ("A", "E", "R", "M", "B", "B_mean")
+    header = ("run", "targets", "cycles", *keys[:-1], "B̄", "")
+    rows = []
+    for name, test in tests.items():
+        figures = test.figures()
+        cells = [_micrometres(figures[key]).strip() if key in figures else "–" for key in keys]
+        rows.append((name, str(len(test.targets)), str(test.cycles), *cells, "um"))
+    return "ISO 230-2:2014, both directions\n" + aligned(header, rows)

@@ -14,6 +14,7 @@ from ..measurement import ANGULAR_KINDS, KINDS, MeasurementSet, Source
 from .joint import HUBER, OUTLIER, JointProblem, Solution, held_out, iterate, physical_covariance
 from .observability import Observability, ToolError, expected_error, observe, unseen_errors
 from .selection import Decision, select
+from .smooth_field import DIGITS
 from .space import ParameterSpace, Settings
 
 SURE = 4.0
@@ -113,6 +114,16 @@ class JointFit:
     tilted: ToolError | None
     outliers: tuple[Outlier, ...]
     notes: tuple[str, ...]
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance of the parameters, shape (size, size), SI."""
+        return physical_covariance(self.space, self.solution.posterior)
+
+    @property
+    def standard_errors(self) -> np.ndarray:
+        """Standard errors of the parameters, shape (size,), SI."""
+        return np.sqrt(np.diag(self.covariance))
 
 
 def fit_joint(
@@ -273,4 +284,4 @@ def _named(
     note = f"scheme joint, {len(measurements)} readings, blocks {kept} (of {tried + 1} tried)"
     residual = float(np.sqrt(np.mean(np.square(lengths)))) if lengths else None
     origin = ModelOrigin(date.today().isoformat(), measurements.files, residual, note)
-    return replace(space.model(solution.x), origin=origin)
+    return replace(space.model(solution.x.round(DIGITS)), origin=origin)

@@ -221,7 +221,11 @@ class ToolError:
 
 
 def expected_error(
-    space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, tilt: float = 0.0
+    space: ParameterSpace,
+    x: np.ndarray,
+    covariance: np.ndarray,
+    tilt: float = 0.0,
+    prior: np.ndarray | None = None,
 ) -> ToolError | None:
     """Return the tool error that the parameters' covariance leaves, at random points, both directions.
 
@@ -238,6 +242,8 @@ def expected_error(
         Their covariance.
     tilt : float
         Tilt of the tool, rad, in random directions.
+    prior : ndarray, shape (size, size), optional
+        Take the error before from machines of this covariance instead of the one that x describes.
 
     Returns
     -------
@@ -251,10 +257,6 @@ def expected_error(
     rows = derivatives(space, prediction, stations)
     points = stations.positions + stations.rotations @ space.probe
     free = np.linalg.qr(_datum(points - points.mean(axis=0)))[0]
-    values, vectors = np.linalg.eigh(covariance)
-    z = np.random.default_rng(SEED).standard_normal((space.size, DRAWS))
-    drawn = vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * z)
-    moved = np.einsum("mip,pd->mid", rows, drawn)
     count = len(stations)
 
     def shown(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -264,17 +266,25 @@ def expected_error(
         turned = errors[:, 3:] - errors[:, 3:].mean(axis=0)
         return np.sqrt((flat**2).sum(axis=0) / count), np.sqrt((turned**2).sum(axis=(0, 1)) / count)
 
-    before, rotation_before = shown(prediction.errors[:, :, None])
-    after, rotation_after = shown(moved)
+    errors = prediction.errors[:, :, None] if prior is None else rows @ _drawn(prior)
+    before, rotation_before = shown(errors)
+    after, rotation_after = shown(rows @ _drawn(covariance))
     low, high = np.percentile(after, [2.5, 97.5])
     return ToolError(
-        before=float(before[0]),
+        before=_rms(before),
         after=_rms(after),
         low=float(low),
         high=float(high),
-        rotation_before=float(rotation_before[0]),
+        rotation_before=_rms(rotation_before),
         rotation_after=_rms(rotation_after),
     )
+
+
+def _drawn(covariance: np.ndarray) -> np.ndarray:
+    """Return draws of parameters with a covariance, shape (size, DRAWS)."""
+    values, vectors = np.linalg.eigh(covariance)
+    z = np.random.default_rng(SEED).standard_normal((len(covariance), DRAWS))
+    return vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * z)
 
 
 def _rms(values: np.ndarray) -> float:

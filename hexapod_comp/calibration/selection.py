@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .joint import LinearProblem, held_out, solve
+from .joint import LinearProblem, Posterior, held_out, solve
 from .space import ParameterSpace
 
-ROUNDS = 6
-"""Rounds of estimating tolerances and noise for each candidate."""
+FIRST_ROUNDS, ROUNDS = 10, 4
+"""Rounds of estimating tolerances and noise: for all blocks, and for each set with fewer, which starts there."""
 
 CLEAR = 2.0
 """A block is taken when its gain is so many times its standard error over the folds."""
@@ -86,6 +86,7 @@ class _Trials:
     ) -> None:
         self._space, self._problem, self._noise, self._progress = space, problem, noise, progress
         self._known: dict[frozenset[str], np.ndarray] = {}
+        self._tolerances = self._solve(space.start_tolerances(), FIRST_ROUNDS).tolerances
 
     def gain(self, names: tuple[str, ...], block: str) -> tuple[float, float]:
         """Return by which share a block among `names` lowers the squared error, and its standard error."""
@@ -94,14 +95,16 @@ class _Trials:
         less = (without - with_it) / without.sum()
         return float(less.sum()), float(np.sqrt(len(less) * less.var()))
 
+    def _solve(self, tolerances: np.ndarray, rounds: int) -> Posterior:
+        return solve(self._space, self._problem, tolerances, self._noise, rounds)
+
     def _errors(self, names: tuple[str, ...]) -> np.ndarray:
         """Return the summed squared errors of each fold, in fixed units, under a set of blocks."""
         key = frozenset(names)
         if key not in self._known:
             self._progress(f"trying {', '.join(names)}")
-            start = self._space.start_tolerances()
-            tolerances = np.where([b.name in key for b in self._space.blocks], start, 0.0)
-            posterior = solve(self._space, self._problem, tolerances, self._noise, ROUNDS)
+            tolerances = np.where([b.name in key for b in self._space.blocks], self._tolerances, 0.0)
+            posterior = self._solve(tolerances, ROUNDS)
             errors = held_out(self._problem, posterior) * (posterior.noise / self._noise)[self._problem.kind]
             self._known[key] = np.bincount(self._problem.fold, errors**2)
         return self._known[key]

@@ -60,7 +60,7 @@ def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Predict
         base[n], platform[n] = machine.structure.base_joints, machine.structure.platform_joints
     errors = _errors(space, stations, positions, rotations)
     points = positions + rotations @ space.probe
-    errors += space.field.evaluate(space.field_coefficients(x), points)
+    errors += space.field_errors(x, points, stations.sense[:, :3])
     return Prediction(errors, positions, rotations, base, platform)
 
 
@@ -91,7 +91,7 @@ def derivatives(space: ParameterSpace, prediction: Prediction, stations: Station
     for block in space.blocks:
         result[:, :, block.part] = _block(space, block.name, per_length, u, rotations, stations)
     points = prediction.positions + lever
-    _field(space, space.field.basis(points), result)
+    _add_field(space, points, stations.sense[:, :3], result)
     return result
 
 
@@ -130,13 +130,18 @@ def _block(
     return np.zeros((len(commands), 6, block.part.stop - block.part.start if block else 0))
 
 
-def _field(space: ParameterSpace, basis: np.ndarray, result: np.ndarray) -> None:
+def _add_field(space: ParameterSpace, points: np.ndarray, sense: np.ndarray, result: np.ndarray) -> None:
     """Write the field blocks' derivatives: each component has the basis to itself."""
-    count = basis.shape[1]
+    basis, turning = space.field.basis(points), space.field.reversal_basis(points)
     for name, first in (("field displacement", 0), ("field rotation", 3)):
         block = space.block(name)
-        if block is None:
-            continue
-        for c in range(3):
-            start = block.part.start + c * count
-            result[:, first + c, start : start + count] = basis
+        for c in range(3 if block else 0):
+            start = block.part.start + c * basis.shape[1]  # type: ignore[union-attr]
+            result[:, first + c, start : start + basis.shape[1]] = basis
+    block = space.block("field reversal")
+    if block is not None:
+        count = turning.shape[1]
+        for n in range(18):
+            axis, c = divmod(n, 6)
+            start = block.part.start + n * count
+            result[:, c, start : start + count] = 0.5 * sense[:, axis, None] * turning

@@ -7,17 +7,27 @@ import itertools
 import numpy as np
 from numpy.polynomial import legendre
 
-from ..field import GridField
+from ..field import CROSS_AXES, GridField
 
 COMPONENT_UNITS = (("dx", "m"), ("dy", "m"), ("dz", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 
 DECAY = 0.6
 """How much smaller the prior is with every degree: a smooth field has little in its high terms."""
 
-GRID_TOLERANCE = (10e-9, 10e-9)
+REVERSAL_DEGREE = 2
+"""Degree of what depends on the direction of motion."""
+
+GRID_TOLERANCE = 30e-9
 """What interpolation between a grid's lines may add to the polynomial, m and rad: far below any reading."""
 
-MOST_NODES = 33
+DIGITS = 11
+"""Digits after the point of what goes into a model file, m, rad or m/m: a hundredth of a nanometre."""
+
+CHECKED = 400
+"""Random points at which that is checked."""
+
+MOST_NODES = 17
+"""Nodes along the longest axis at most: more make the model file too long to read."""
 
 
 class SmoothField:
@@ -37,68 +47,121 @@ class SmoothField:
         Degrees along x, y, z of each term.
     prior : ndarray, shape (terms,)
         Relative size of the terms' priors.
+    reversal_powers, reversal_prior : ndarray
+        The same of what depends on the direction of motion: fewer terms.
     """
 
     def __init__(self, box: np.ndarray, degree: int) -> None:
         flat = np.ptp(box, axis=0) <= 0.0
         self.box = np.array([box[0], np.where(flat, box[0] + 1.0, box[1])])
-        sides = np.ptp(self.box, axis=0)
-        cost = np.sqrt(np.where(flat, 1.0, sides).max() / sides)
-        every = np.array(list(itertools.product(range(degree + 1), repeat=3)))
-        total = every @ cost
-        kept = (total <= degree + 1e-9) & ~(every[:, flat] > 0).any(axis=1)
-        order = np.argsort(total[kept], kind="stable")
-        self.powers = every[kept][order]
-        self.prior = DECAY ** total[kept][order]
+        self._sides = np.where(flat, 0.0, np.ptp(self.box, axis=0))
+        cost = np.sqrt(max(self._sides.max(), 1e-3) / np.where(flat, 1.0, self._sides))
         self.degree = degree
+        self.powers, self.prior = _terms(degree, cost, flat)
+        self.reversal_powers, self.reversal_prior = _terms(min(degree, REVERSAL_DEGREE), cost, flat)
 
     @property
     def terms(self) -> tuple[str, ...]:
         """Names of the terms: ``x2y1`` is P₂(x)·P₁(y)."""
-        return tuple("".join(f"{a}{n}" for a, n in zip("xyz", p, strict=True) if n) or "1" for p in self.powers)
+        return _names(self.powers)
+
+    @property
+    def reversal_terms(self) -> tuple[str, ...]:
+        """Names of the terms of what depends on the direction."""
+        return _names(self.reversal_powers)
 
     def basis(self, points: np.ndarray) -> np.ndarray:
         """Return the terms' values at points (n, 3), m; held at the box; shape (n, terms)."""
+        return self._products(points, self.powers)
+
+    def reversal_basis(self, points: np.ndarray) -> np.ndarray:
+        """Return the same of the terms of what depends on the direction."""
+        return self._products(points, self.reversal_powers)
+
+    def _products(self, points: np.ndarray, powers: np.ndarray) -> np.ndarray:
         u = np.clip(2.0 * (points - self.box[0]) / (self.box[1] - self.box[0]) - 1.0, -1.0, 1.0)
         along = [legendre.legvander(u[:, a], self.degree) for a in range(3)]
-        return np.prod([along[a][:, self.powers[:, a]] for a in range(3)], axis=0)
+        return np.prod([along[a][:, powers[:, a]] for a in range(3)], axis=0)
 
-    def evaluate(self, coefficients: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return the field of coefficients (6, terms) at points (n, 3), shape (n, 6), m and rad."""
-        return self.basis(points) @ coefficients.T
-
-    def as_grid(self, coefficients: np.ndarray) -> GridField:
-        """Return the field as lines along x, so many that interpolating between them adds nothing visible.
+    def evaluate(
+        self, coefficients: np.ndarray, reversal: np.ndarray, points: np.ndarray, sense: np.ndarray
+    ) -> np.ndarray:
+        """Return the field at points, shape (n, 6), m and rad.
 
         Parameters
         ----------
         coefficients : ndarray, shape (6, terms)
-            m and rad.
+            Mean of both directions, m and rad.
+        reversal : ndarray, shape (3, 6, reversal terms)
+            Forward minus backward along x, y, z, m and rad.
+        points, sense : ndarray, shape (n, 3)
+            Places, m, and directions of motion along the axes, −1…1.
         """
-        rng = np.random.default_rng(0)
-        points = rng.uniform(self.box[0], self.box[1], (500, 3))
-        wanted = self.evaluate(coefficients, points)
+        turning = np.einsum("nt,act,na->nc", self.reversal_basis(points), reversal, 0.5 * sense)
+        return self.basis(points) @ coefficients.T + turning
+
+    def as_grid(self, coefficients: np.ndarray, reversal: np.ndarray) -> GridField:
+        """Return the field as grid lines, so many that interpolating between them adds nothing visible.
+
+        What does not depend on the direction of motion stands on the lines along x; what changes sign with the
+        motion along an axis stands on the lines along that axis.
+
+        Parameters
+        ----------
+        coefficients : ndarray, shape (6, terms)
+            Mean of both directions, m and rad.
+        reversal : ndarray, shape (3, 6, reversal terms)
+            Forward minus backward along x, y, z, m and rad.
+        """
+        points = np.random.default_rng(0).uniform(self.box[0], self.box[1], (CHECKED, 3))
+        sense = np.where(np.arange(CHECKED)[:, None] % 2, 1.0, -1.0) * np.ones(3)
+        wanted = self.evaluate(coefficients, reversal, points, sense)
         nodes = 2
         while True:
-            field = self._lines_along_x(coefficients, nodes)
-            found = np.array([field.evaluate(p, np.zeros(3))[0] for p in points])
-            error = np.abs(found - wanted).max(axis=0)
-            if nodes >= MOST_NODES or (error <= np.repeat(GRID_TOLERANCE, 3)).all():
+            field = self._on_lines(coefficients, reversal, nodes)
+            found = np.array([field.evaluate(p, s)[0] for p, s in zip(points, sense, strict=True)])
+            if nodes >= MOST_NODES or (np.abs(found - wanted).max(axis=0) <= GRID_TOLERANCE).all():
                 return field
-            nodes = min(MOST_NODES, 2 * nodes - 1)
+            nodes = 2 * nodes - 1
 
-    def _lines_along_x(self, coefficients: np.ndarray, nodes: int) -> GridField:
-        """Return the field on nodes × nodes lines along x, the same in both directions."""
-        low, high = self.box
-        y, z = (np.linspace(low[a], high[a], nodes) for a in (1, 2))
-        across = np.array([[(low[0], b, c) for c in z] for b in y]).reshape(-1, 3)
-        u = 2.0 * (across - low) / (high - low) - 1.0
-        weights = [legendre.legvander(u[:, a], self.degree)[:, self.powers[:, a]] for a in (1, 2)]
-        powers = np.array([_monomials(n, self.degree) for n in self.powers[:, 0]])
-        lines = np.einsum("nt,ct,tp->ncp", weights[0] * weights[1], coefficients, powers)
-        family = np.tile(lines.reshape(1, nodes, nodes, 6, -1), (2, 1, 1, 1, 1))
-        empty_y, empty_z = np.zeros((2, 2, nodes, 6, 0)), np.zeros((2, 2, nodes, 6, 0))
-        return GridField((np.array([low[0], high[0]]), y, z), (family, empty_y, empty_z))
+    def _on_lines(self, coefficients: np.ndarray, reversal: np.ndarray, nodes: int) -> GridField:
+        """Return the field on a grid of so many nodes along the longest axis, as far apart along the others."""
+        share = self._sides / max(self._sides.max(), 1e-3)
+        counts = np.maximum(2, np.ceil(share * (nodes - 1)).astype(int) + 1)
+        grid = tuple(np.linspace(self.box[0, a], self.box[1, a], n) for a, n in enumerate(counts))
+        families = []
+        for axis in range(3):
+            half = 0.5 * self._family(grid, axis, reversal[axis], self.reversal_powers)
+            mean = self._family(grid, axis, coefficients, self.powers) if axis == 0 else np.zeros_like(half)
+            wide = np.zeros((*mean.shape[:-1], max(mean.shape[-1], half.shape[-1])))
+            family = np.stack([wide, wide])
+            family[..., : mean.shape[-1]] += mean
+            family[0, ..., : half.shape[-1]] += half
+            family[1, ..., : half.shape[-1]] -= half
+            families.append(family.round(DIGITS) if family.any() else family[..., :0])
+        return GridField((grid[0], grid[1], grid[2]), (families[0], families[1], families[2]))
+
+    def _family(self, grid: tuple, axis: int, coefficients: np.ndarray, powers: np.ndarray) -> np.ndarray:
+        """Return the polynomials in u of the lines along an axis, shape (n, m, 6, powers)."""
+        first, second = CROSS_AXES[axis]
+        degree = int(powers.max(initial=0))
+        across = [legendre.legvander(np.linspace(-1.0, 1.0, len(grid[a])), degree) for a in (first, second)]
+        weights = np.einsum("nt,mt->nmt", across[0][:, powers[:, first]], across[1][:, powers[:, second]])
+        along = np.array([_monomials(n, degree) for n in powers[:, axis]])
+        return np.einsum("nmt,ct,tp->nmcp", weights, coefficients, along)
+
+
+def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the powers (n, 3) of all terms up to a degree, and the relative size of their priors (n,)."""
+    every = np.array(list(itertools.product(range(degree + 1), repeat=3)))
+    total = every @ cost
+    kept = (total <= degree + 1e-9) & ~(every[:, flat] > 0).any(axis=1)
+    order = np.argsort(total[kept], kind="stable")
+    return every[kept][order], DECAY ** total[kept][order]
+
+
+def _names(powers: np.ndarray) -> tuple[str, ...]:
+    return tuple("".join(f"{a}{n}" for a, n in zip("xyz", p, strict=True) if n) or "1" for p in powers)
 
 
 def _monomials(n: int, degree: int) -> np.ndarray:

@@ -35,6 +35,7 @@ TOLERANCES = {
     "map": 5e-6,
     "field displacement": 5e-6,
     "field rotation": 20e-6,
+    "field reversal": 1e-6,
 }
 """First guess of the blocks' standard deviations, m, m/m or rad; the fit goes on from there."""
 
@@ -181,6 +182,10 @@ class ParameterSpace:
             root = np.kron(np.eye(6), _correlation_root(self.knots))
             labels = [f"{s} map at {1e3 * k:.0f} mm" for s in STRUT_NAMES for k in self.knots]
             return root, tuple(labels), "m"
+        if name == "field reversal":
+            terms = self.field.reversal_terms
+            labels = [f"{c} {t} reversal {a}" for a in AXES for c, _ in COMPONENT_UNITS for t in terms]
+            return np.diag(np.tile(self.field.reversal_prior, 18)), tuple(labels), "m"
         if name.startswith("field"):
             which = 0 if name.endswith("displacement") else 3
             terms = self.field.terms
@@ -209,6 +214,10 @@ class ParameterSpace:
     def physical(self, y: np.ndarray) -> np.ndarray:
         """Return x = root·y for y of shape (size, …)."""
         return np.concatenate([b.root @ y[b.part] for b in self.blocks])
+
+    def prior_covariance(self, tolerances: np.ndarray) -> np.ndarray:
+        """Return the prior's covariance of x, shape (size, size), SI."""
+        return self.physical(self.physical(np.diag(self.spread(tolerances) ** 2)).T)
 
     def spline_weights(self, commands: np.ndarray) -> np.ndarray:
         """Return what each knot's value adds at some commands (n,), shape (n, knots)."""
@@ -265,11 +274,20 @@ class ParameterSpace:
         parts = [self._values(x, f"field {kind}", count) for kind in ("displacement", "rotation")]
         return np.concatenate(parts).reshape(6, -1)
 
+    def field_reversal(self, x: np.ndarray) -> np.ndarray:
+        """Return the field's forward minus backward, shape (3, 6, reversal terms), m and rad."""
+        count = len(self.field.reversal_terms)
+        return self._values(x, "field reversal", 18 * count).reshape(3, 6, count)
+
+    def field_errors(self, x: np.ndarray, points: np.ndarray, sense: np.ndarray) -> np.ndarray:
+        """Return the field at points (n, 3), m, passed in directions (n, 3), shape (n, 6), m and rad."""
+        return self.field.evaluate(self.field_coefficients(x), self.field_reversal(x), points, sense)
+
     def _grid_field(self, x: np.ndarray) -> GridField:
-        coefficients = self.field_coefficients(x)
-        if not coefficients.any():
+        coefficients, reversal = self.field_coefficients(x), self.field_reversal(x)
+        if not (coefficients.any() or reversal.any()):
             return no_field()
-        return replace(self.field.as_grid(coefficients), probe=self.probe)
+        return replace(self.field.as_grid(coefficients, reversal), probe=self.probe)
 
     def _values(self, x: np.ndarray, name: str, missing: int = 0) -> np.ndarray:
         """Return the parameters of a block, zeros where there is none."""

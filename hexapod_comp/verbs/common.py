@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import csv
 import io
 import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ..texts import number
@@ -239,3 +241,22 @@ def progress_bar(total: int, unit: str) -> Any:
     from tqdm import tqdm
 
     return tqdm(total=total, unit=unit, delay=1.0, disable=None, leave=False)
+
+
+@contextlib.contextmanager
+def stage_line() -> Iterator[Callable[[str], None]]:
+    """Give a function that shows on stderr, on terminals only, what a long calculation is at and since when."""
+    if not sys.stderr.isatty():
+        yield lambda text: None
+        return
+    began = time.monotonic()
+
+    def say(text: str) -> None:
+        width = os.get_terminal_size(sys.stderr.fileno()).columns - 1
+        line = f"{time.monotonic() - began:5.1f} s  {text}"[:width]
+        print(f"\r\033[K{line}", end="", file=sys.stderr, flush=True)
+
+    try:
+        yield say
+    finally:
+        print("\r\033[K", end="", file=sys.stderr, flush=True)

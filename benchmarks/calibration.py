@@ -1,0 +1,231 @@
+"""What calibration is worth: virtual machines measured, fitted, and judged at points that nothing was fitted to.
+
+Each machine is drawn from its own seed, measured by the virtual instruments of a campaign, and fitted as
+``hexapod_comp fit`` does it, with every block of parameters allowed. 1,000 random points, passed there and
+back in random directions, then tell what is left after one rotation and shift of the datum.
+
+Usage: python -m benchmarks.calibration [--machines 20] [--workers 2] [--case NAME ...] [--json]
+
+Exits 1 when a bar is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from hexapod_comp.calibration.evaluation import Worth, worth
+from hexapod_comp.calibration.joint_fit import fit_joint
+from hexapod_comp.calibration.lines import fit_lines
+from hexapod_comp.calibration.space import Settings
+from hexapod_comp.campaign import Campaign, load_campaign, template
+from hexapod_comp.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.imperfections import ImperfectionBounds, draw_model
+from hexapod_comp.machine import MachineModel, RealMachine
+from hexapod_comp.smooth_imperfections import with_length_map, with_wavy_field
+from hexapod_comp.virtual_instruments import measure
+
+CONFIG = Path(__file__).resolve().parents[1] / "config"
+LEAD = 0.01
+
+SMALL = ImperfectionBounds(
+    joint=10e-6, strut_offset=10e-6, pitch=50e-6, wave=(4e-6, 4e-6), wave_period=LEAD, backlash=(3e-6, 5e-6)
+)
+LARGE = replace(SMALL, joint=100e-6, strut_offset=100e-6, pitch=100e-6)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row: which campaign on which kind of machine, fitted how, and what must come out.
+
+    A machine of kind A has ±10 µm on joints and struts, B ±100 µm; D is B with a length map of 5 µm RMS,
+    G is B with a smooth pose field of 5 µm and 30 µrad RMS.
+    """
+
+    name: str
+    machine: str
+    campaign: Callable[[], Campaign]
+    scheme: str
+    bar: float
+    figure: str = "position"
+    largest_rms: float = np.inf
+    largest: float = np.inf
+
+
+def five(**changes: object) -> Campaign:
+    """Return the 5-D campaign, changed."""
+    return replace(load_campaign(CONFIG / "campaign_5d.yaml"), **changes)
+
+
+def one(**changes: object) -> Campaign:
+    """Return the 1-D campaign, changed."""
+    return replace(load_campaign(CONFIG / "campaign_1d.yaml"), **changes)
+
+
+CASES = (
+    *(Case("1-D, lines", kind, lambda: one(diagonals=0), "lines", 0.70, "paper") for kind in "BD"),
+    *(Case("1-D + 4, joint", kind, one, "joint", 0.95 if kind == "A" else 0.97) for kind in "ABD"),
+    Case("5-D + 16, joint", "A", five, "joint", 0.97, largest_rms=0.3e-6, largest=0.6e-6),
+    Case("5-D + 16, joint", "B", five, "joint", 0.97, largest_rms=0.3e-6),
+    *(Case("5-D + 16, joint", kind, five, "joint", 0.97) for kind in "DG"),
+    *(Case("6-D + 16, joint", kind, lambda: five(instrument="6-D"), "joint", 0.97, "rotation") for kind in "ABDG"),
+    Case("5-D + 16, ±1 µm stops", "B", lambda: five(repeatability=1e-6), "joint", 0.93),
+)
+
+
+def truth_of(geometry: HexapodGeometry, kind: str, seed: int, box: np.ndarray) -> MachineModel:
+    """Draw a machine of a kind."""
+    model = draw_model(geometry, SMALL if kind == "A" else LARGE, seed)
+    if kind == "D":
+        return with_length_map(model, geometry, seed)
+    return with_wavy_field(model, box, seed) if kind == "G" else model
+
+
+@dataclass(frozen=True)
+class Machine:
+    """One machine measured, fitted and judged; `expected`: RMS after, and its 95 % interval, as the fit says."""
+
+    worth: Worth
+    seconds: float
+    expected: tuple[float, float, float] | None
+
+
+def one_machine(number: int, seed: int) -> Machine:
+    """Measure, fit and judge one machine of a case."""
+    case, geometry = CASES[number], load_geometry(CONFIG / "paper.yaml")
+    campaign = case.campaign()
+    truth = RealMachine(geometry, truth_of(geometry, case.machine, seed, campaign.box))
+    measured = measure(template(campaign, geometry), campaign, truth, seed)
+    began, expected = time.perf_counter(), None
+    if case.scheme == "lines":
+        model = fit_lines(measured).model
+    else:
+        fit = fit_joint(measured, Settings(lead=LEAD))
+        model = fit.model
+        if fit.level is not None:
+            expected = (fit.level.after, fit.level.low, fit.level.high)
+    seconds = time.perf_counter() - began
+    judged = worth(truth, model, campaign.box, seed=seed, repeatability=campaign.repeatability)
+    return Machine(judged, seconds, expected)
+
+
+@dataclass(frozen=True)
+class Row:
+    """What came out of a case; lengths in µm, rotations in µrad."""
+
+    case: str
+    machine: str
+    machines: int
+    figure: str
+    before: float
+    after: float
+    largest: float
+    removed: float
+    mean_removed: float
+    least_removed: float
+    bar: float
+    met: bool
+    expected: float | None
+    inside: int | None
+    seconds: float
+
+
+def summed_up(case: Case, machines: list[Machine]) -> Row:
+    """Return the row of a case: root mean square over all machines, for the paper's metric the mean."""
+    before, after = (np.array([_figure(case, m, which) for m in machines]) for which in ("before", "after"))
+    together = np.mean if case.figure == "paper" else lambda v: np.sqrt(np.mean(v**2))
+    removed = 1.0 - together(after) / together(before)
+    largest = max(m.worth.after.aligned_max for m in machines)
+    expected = [m.expected for m in machines if m.expected is not None]
+    return Row(
+        case=case.name,
+        machine=case.machine,
+        machines=len(machines),
+        figure=case.figure,
+        before=1e6 * float(together(before)),
+        after=1e6 * float(together(after)),
+        largest=1e6 * largest,
+        removed=float(removed),
+        mean_removed=float((1.0 - after / before).mean()),
+        least_removed=float((1.0 - after / before).min()),
+        bar=case.bar,
+        met=bool(removed >= case.bar and together(after) <= case.largest_rms and largest <= case.largest),
+        expected=1e6 * float(np.sqrt(np.mean([e[0] ** 2 for e in expected]))) if expected else None,
+        inside=sum(e[1] <= m.worth.after.aligned_rms <= e[2] for e, m in zip(expected, machines, strict=False))
+        if expected
+        else None,
+        seconds=float(np.median([m.seconds for m in machines])),
+    )
+
+
+def _figure(case: Case, machine: Machine, which: str) -> float:
+    if case.figure == "paper":
+        return float(getattr(machine.worth.paper, which))
+    judged = getattr(machine.worth, which)
+    return float(judged.rotation_rms if case.figure == "rotation" else judged.aligned_rms)
+
+
+COLUMNS = "campaign, scheme|machine|figure|before|after|largest|removed|mean|least|bar|expected|s"
+HEADER = "| " + COLUMNS.replace("|", " | ") + " |"
+
+
+def shown(row: Row) -> str:
+    """Return a row of the table."""
+    unit = "µrad" if row.figure == "rotation" else "µm"
+    shares = " | ".join(f"{100.0 * share:.1f} %" for share in (row.removed, row.mean_removed, row.least_removed))
+    expected = "" if row.expected is None else f"{row.expected:.3f} ({row.inside}/{row.machines})"
+    verdict = f"{100.0 * row.bar:.0f} % {'met' if row.met else 'MISSED'}"
+    return (
+        f"| {row.case} | {row.machine} | {row.figure} | {row.before:.2f} {unit} | {row.after:.3f} {unit} "
+        f"| {row.largest:.2f} | {shares} | {verdict} | {expected} | {row.seconds:.0f} |"
+    )
+
+
+def main() -> int:
+    """Run the cases and print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--machines", type=int, default=20, help="machines of each case (default 20)")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: all cores)")
+    parser.add_argument("--case", action="append", help="only cases whose name starts so; may be repeated")
+    parser.add_argument("--kind", help="only these kinds of machine, such as AB")
+    parser.add_argument("--json", action="store_true", help="JSON instead of a table")
+    args = parser.parse_args()
+    chosen = [
+        n
+        for n, case in enumerate(CASES)
+        if (not args.case or case.name.startswith(tuple(args.case))) and case.machine in (args.kind or case.machine)
+    ]
+    # One process per core: a library's own threads would only be in each other's way.
+    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    pool = ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn"))
+    rows = []
+    if not args.json:
+        print(HEADER + "\n" + "|---" * 3 + "|---:" * 9 + "|", flush=True)
+    with pool, tqdm(total=len(chosen) * args.machines, disable=None) as bar:
+        for n in chosen:
+            done = []
+            for machine in pool.map(one_machine, [n] * args.machines, range(1, args.machines + 1)):
+                done.append(machine)
+                bar.update()
+            rows.append(summed_up(CASES[n], done))
+            if not args.json:
+                tqdm.write(shown(rows[-1]))
+                sys.stdout.flush()
+    if args.json:
+        print(json.dumps([asdict(row) for row in rows], indent=1))
+    return 0 if all(row.met for row in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,80 @@
+"""What a campaign will determine, and what it will not, before anyone measures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..campaign import Campaign
+from ..measurement import DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
+from .joint import JointProblem, physical_covariance, solve
+from .joint_fit import TILT
+from .observability import Observability, ToolError, expected_error, observe, unseen_errors
+from .space import ParameterSpace, Settings
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What may be expected of a campaign.
+
+    Attributes
+    ----------
+    measurements : MeasurementSet
+        Its readings, without values.
+    space : ParameterSpace
+        The parameters to be fitted.
+    observability : Observability
+        What the readings will determine.
+    unseen_errors : tuple of str
+        Machine errors that they cannot show.
+    level, tilted : ToolError or None
+        The tool error to expect after a fit; `before` is that of machines within the tolerances.
+    """
+
+    measurements: MeasurementSet
+    space: ParameterSpace
+    observability: Observability
+    unseen_errors: tuple[str, ...]
+    level: ToolError | None
+    tilted: ToolError | None
+
+
+def plan(measurements: MeasurementSet, campaign: Campaign, settings: Settings) -> Plan:
+    """Return what a campaign's readings would determine on a machine within the settings' tolerances.
+
+    Parameters
+    ----------
+    measurements : MeasurementSet
+        The campaign's template.
+    campaign : Campaign
+        Tells the instruments' noise and the machine's repeatability.
+    settings : Settings
+        Blocks and tolerances.
+    """
+    space = ParameterSpace(measurements, settings)
+    joint = JointProblem(measurements, space)
+    problem, _ = joint.linearise(np.zeros(space.size), np.ones(len(measurements)))
+    noise = np.array([_noise_factor(campaign, kind) for kind in KINDS])
+    posterior = solve(space, problem, space.start_tolerances(), noise, rounds=0)
+    covariance, x = physical_covariance(space, posterior), np.zeros(space.size)
+    prior = space.prior_covariance(space.start_tolerances())
+    level, tilted = (expected_error(space, x, covariance, tilt, prior) for tilt in (0.0, TILT))
+    everything = JointProblem(measurements, ParameterSpace(measurements, Settings(lead=settings.lead)))
+    all_rows, _ = everything.linearise(np.zeros(everything.space.size), np.ones(len(measurements)))
+    return Plan(
+        measurements=measurements,
+        space=space,
+        observability=observe(space, problem, posterior),
+        unseen_errors=unseen_errors(everything.space, all_rows),
+        level=level,
+        tilted=tilted,
+    )
+
+
+def _noise_factor(campaign: Campaign, kind: str) -> float:
+    """Return the noise of a kind of channel over the default, the machine's repeatability included."""
+    noise = campaign.noise[KINDS.index(kind)]
+    if kind not in ("rotation", "attitude"):
+        noise = float(np.hypot(noise, campaign.repeatability))
+    return max(noise, 1e-3 * DEFAULT_UNCERTAINTY[kind]) / DEFAULT_UNCERTAINTY[kind]

@@ -1,0 +1,243 @@
+"""``hexapod_comp fit``: from measurements to a model of the machine."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from . import common
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike
+
+    from ..calibration.space import Settings
+    from ..machine import MachineModel
+    from ..measurement import MeasurementSet
+
+SUMMARY = "fit a model of the machine's errors to measurements"
+
+TEXT = """Reads tidy CSV (one reading a row, what measure writes), .rtl and .rtx files of the laser software (each with
+its line file NAME.rtl.yaml beside it), or with --columns the wide CSV files of other labs.
+
+--scheme joint fits structure, struts and field to all readings at once, and keeps only what helps on readings that
+the fit did not see. --scheme lines is the paper's: a polynomial per grid line, direction and channel.
+--truth names the errors of the virtual machine that measure moved: the report then says what the model is worth.
+
+example:
+  $ hexapod_comp measure --campaign campaign_5d --seed 1 --out measured.csv
+  $ hexapod_comp fit measured.csv --lead-mm 10 --out model.yaml --pictures out
+  $ hexapod_comp demo --model model.yaml"""
+
+
+def add_parser(subparsers: common.Subparsers) -> None:
+    """Add the verb."""
+    parser = common.add_verb(subparsers, "fit", run, SUMMARY, TEXT)
+    add_reading_options(parser)
+    parser.add_argument("--scheme", choices=("joint", "lines"), default="joint", help="how to fit (default joint)")
+    parser.add_argument("--out", metavar="MODEL", required=True, help="model file to write")
+    parser.add_argument("--name", metavar="TEXT", help="name of the model")
+    parser.add_argument("--report", metavar="FILE", help="write the report to a file too")
+    parser.add_argument("--json", metavar="FILE", help="write values, errors and all tables as JSON (joint)")
+    parser.add_argument("--covariance", metavar="FILE.npz", help="write the parameters' covariance (joint)")
+    parser.add_argument("--pictures", metavar="DIR", help="folder for pictures; made if it is missing")
+    parser.add_argument("--truth", metavar="FILE", help="model of the virtual machine that was measured")
+    add_joint_options(parser)
+    parser.add_argument("--not-robust", action="store_true", help="trust readings that disagree with the rest (joint)")
+    parser.add_argument(
+        "--order",
+        choices=("adjusted-r2", "aicc"),
+        default="adjusted-r2",
+        help="what picks the polynomials' order (lines; default adjusted-r2)",
+    )
+
+
+def add_reading_options(parser: argparse.ArgumentParser) -> None:
+    """Add the files, the machine, and how the files are read."""
+    parser.add_argument("files", nargs="+", metavar="FILE", help="measured files")
+    common.add_machine_options(parser, with_model=False)
+    parser.add_argument("--columns", metavar="FILE", help="columns file that explains wide CSV files")
+    parser.add_argument(
+        "--probe-mm", type=point_argument, metavar="X,Y,Z", help="measured point in platform (default: the tool's tip)"
+    )
+
+
+def add_joint_options(parser: argparse.ArgumentParser) -> None:
+    """Add what a joint fit, or a plan for one, is told."""
+    add = parser.add_argument_group("scheme joint").add_argument
+    add("--lead-mm", type=common.bound, metavar="MM", help="period of the screws' errors (default: the geometry's)")
+    add("--blocks", metavar="A,B,…", help="what may be fitted: pitch, wave, backlash, map, field (default all)")
+    add("--separate-joints", action="store_true", help="platform joints at the same place are two joints, not one")
+    text = "how well joints are built, to start from, µm (default 100)"
+    add("--tolerance-um", type=common.bound, default=100.0, metavar="UM", help=text)
+    add("--field-degree", type=common.count, default=6, metavar="N", help="degree of the field (default 6)")
+    text = "thermal expansion of struts, or of struts, base and platform, ppm/K (default 0)"
+    add("--expansion-ppm", type=expansion_argument, default=(0.0, 0.0, 0.0), metavar="S[,B,P]", help=text)
+
+
+def point_argument(text: str) -> tuple[float, ...]:
+    """Read ``x,y,z`` in mm; return m."""
+    position, angles = common.pose_argument(text)
+    if any(angles):
+        raise argparse.ArgumentTypeError(f"needs three numbers, mm, not {text}")
+    return position
+
+
+def expansion_argument(text: str) -> tuple[float, float, float]:
+    """Read one or three expansions in ppm/K; return them in 1/K, for struts, base and platform."""
+    numbers = [common.finite(part) * 1e-6 for part in text.split(",")]
+    if len(numbers) not in (1, 3):
+        raise argparse.ArgumentTypeError(f"needs one or three numbers, not {text}")
+    return (numbers[0], *(numbers[1:] or (0.0, 0.0)))
+
+
+def joint_settings(args: argparse.Namespace) -> Settings:
+    """Return what the options say about a joint fit.
+
+    Raises
+    ------
+    ModelError
+        An unknown block.
+    """
+    from ..calibration.space import BLOCKS, TOLERANCES, Settings
+
+    blocks = BLOCKS
+    if args.blocks is not None:
+        named = [name.strip() for name in args.blocks.split(",") if name.strip()]
+        blocks = tuple(b for name in named for b in _blocks_called(name))
+    struts, base, platform = args.expansion_ppm
+    return Settings(
+        blocks=blocks,
+        shared_platform_joints=not args.separate_joints,
+        lead=None if args.lead_mm is None else args.lead_mm * 1e-3,
+        field_degree=args.field_degree,
+        strut_expansion=struts,
+        base_expansion=base,
+        platform_expansion=platform,
+        tolerances=tuple({**TOLERANCES, "structure": args.tolerance_um * 1e-6}.items()),
+        robust=not getattr(args, "not_robust", False),
+    )
+
+
+def _blocks_called(name: str) -> tuple[str, ...]:
+    return ("field displacement", "field rotation", "field reversal") if name == "field" else (name,)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the verb."""
+    from ..files import write_text_atomically
+    from ..geometry import load_geometry
+    from ..machine import RealMachine
+    from ..measured_files import read_files
+    from ..model_file import load_model, save_model
+    from ..paths import config_file
+
+    geometry = load_geometry(config_file(args.machine))
+    truth = None if args.truth is None else RealMachine(geometry, load_model(config_file(args.truth), geometry))
+    columns = None if args.columns is None else config_file(args.columns)
+    settings = joint_settings(args)
+    measured = read_files(args.files, geometry, columns, args.probe_mm)
+    common.mention_compiling("machine_kernels.actual_pose_one")
+    model, text, pictures = _joint(args, measured, settings) if args.scheme == "joint" else _lines(args, measured)
+    text = "\n".join(part for part in (text, _iso_text(measured), _worth_text(truth, model)) if part)
+    save_model(model, args.out)
+    if args.report is not None:
+        write_text_atomically(args.report, text)
+    print(text)
+    print(f"model: {args.out}")
+    _save_pictures(pictures, args.pictures)
+    return 0
+
+
+def _joint(
+    args: argparse.Namespace, measured: MeasurementSet, settings: Settings
+) -> tuple[MachineModel, str, dict[str, Figure]]:
+    """Fit with scheme joint; return model, report and pictures by file name."""
+    from dataclasses import replace
+
+    from ..calibration.joint_fit import fit_joint
+    from ..calibration.joint_report import as_json, report
+    from ..files import write_text_atomically
+
+    with common.stage_line() as say:
+        fit = fit_joint(measured, settings, say)
+    if args.json is not None:
+        write_text_atomically(args.json, common.json_text(as_json(fit)))
+    if args.covariance is not None:
+        labels = [label for block in fit.space.blocks for label in block.labels]
+        _save_arrays(args.covariance, labels=labels, values=fit.solution.x, covariance=fit.covariance)
+    pictures = {}
+    if args.pictures is not None:
+        from ..calibration_pictures import joint_figure, strut_error_figure
+
+        pictures["fit.png"] = joint_figure(fit)
+        if fit.model.valid_box is not None:
+            title = "scheme joint"
+            pictures["strut_errors.png"] = strut_error_figure(measured.geometry, {title: fit.model})
+    model = fit.model if args.name is None else replace(fit.model, name=args.name)
+    return model, report(fit), pictures
+
+
+def _lines(args: argparse.Namespace, measured: MeasurementSet) -> tuple[MachineModel, str, dict[str, Figure]]:
+    """Fit with scheme lines; return model, report and pictures by file name."""
+    from ..calibration.lines import fit_lines
+    from ..calibration.lines_report import report
+    from ..errors import CalibrationError
+
+    if args.json is not None or args.covariance is not None:
+        raise CalibrationError("--json, --covariance", "belong to scheme joint")
+    fit = fit_lines(measured, args.order, name=args.name or "")
+    pictures = {}
+    if args.pictures is not None:
+        from ..calibration_pictures import fitted_lines_figure, strut_error_figure
+
+        pictures["lines.png"] = fitted_lines_figure(fit)
+        pictures["strut_errors.png"] = strut_error_figure(measured.geometry, {fit.model.name: fit.model})
+    return fit.model, report(fit), pictures
+
+
+def _iso_text(measured: MeasurementSet) -> str:
+    """Return the figures of ISO 230-2 of the runs that have them."""
+    from ..iso230 import evaluate, table
+    from ..measurement_csv import iso230_runs
+
+    tests = {run.name: evaluate(run.targets, run.deviations) for run in iso230_runs(measured)}
+    return table(tests) + "\n" if tests else ""
+
+
+def _worth_text(truth: object, model: MachineModel) -> str:
+    """Return what the model is worth on the virtual machine that was measured."""
+    from ..calibration.evaluation import worth
+    from ..calibration.lines_report import worth_text
+    from ..errors import CalibrationError
+    from ..machine import RealMachine
+
+    if not isinstance(truth, RealMachine):
+        return ""
+    if model.valid_box is None:
+        raise CalibrationError("--truth", "the readings span no box in which the model could be judged")
+    return worth_text(worth(truth, model, model.valid_box)) + "\n"
+
+
+def _save_arrays(path: str, **arrays: ArrayLike) -> None:
+    """Write arrays, without pickles."""
+    import numpy as np
+
+    from ..errors import InputFileError
+
+    try:
+        with open(path, "wb") as stream:
+            np.savez_compressed(stream, allow_pickle=False, **arrays)
+    except OSError as error:
+        raise InputFileError(path, "", f"cannot be written: {error.strerror}") from error
+
+
+def _save_pictures(pictures: dict[str, Figure], folder: str | None) -> None:
+    """Write pictures into a folder and say where they are."""
+    from ..plotting import save
+
+    for name, figure in pictures.items():
+        path = Path(folder or ".") / name
+        save(figure, path)
+        print(f"picture: {path}")
