@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-BENCHMARKS = ("kernels", "assembly", "start", "loop")
+BENCHMARKS = ("kernels", "assembly", "thermal", "start", "loop")
 
 if __name__ == "__main__":
     worst = 0

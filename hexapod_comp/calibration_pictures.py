@@ -222,4 +222,5 @@ def _tool_error_panel(axes: Axes, fit: JointFit) -> None:
     axes.bar(places + 0.2, after, 0.35, color=WITH, yerr=spread, capsize=4, label="with the model (95 %)")
     axes.set_xticks(places, list(known))
     axes.set(title="tool error to expect, datum aligned", ylabel="RMS in space, µm", yscale="log")
+    axes.set_ylim(top=4.0 * max(before))  # room for the legend
     axes.legend(fontsize=7)

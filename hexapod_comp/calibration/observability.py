@@ -299,23 +299,26 @@ def _datum(points: np.ndarray) -> np.ndarray:
 
 
 def box_stations(space: ParameterSpace, tilt: float = 0.0) -> Stations | None:
-    """Return random reachable stations in the measured box, each approached forward and backward.
+    """Return random reachable stations in the measured box, each passed there and back in a random direction.
 
-    The measured point passes along the space diagonal, forward on all axes and then backward; first all
-    forward. The tool is tilted by `tilt`, rad, each time about another horizontal axis.
+    First all there, then all back. The tool is tilted by `tilt`, rad, each time about another horizontal axis.
     """
     rng = np.random.default_rng(SEED)
     points = rng.uniform(space.box[0], space.box[1], (POINTS, 3))
+    directions = rng.standard_normal((POINTS, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     headings = rng.uniform(0.0, 2.0 * np.pi, POINTS)
     angles = tilt * np.stack([np.cos(headings), np.sin(headings), np.zeros(POINTS)], axis=1)
     rotations = rotation_from_angles(angles)
     every = [Pose(p - r @ space.probe, r) for p, r in zip(points, rotations, strict=True)]
     nominal, limits = Structure.of(space.geometry), LimitTable(space.geometry)
-    poses = [pose for pose in every if _reachable(limits, nominal, pose)]
+    reachable = [_reachable(limits, nominal, pose) for pose in every]
+    poses = [pose for pose, is_reachable in zip(every, reachable, strict=True) if is_reachable]
     if not poses:
         return None
+    passed = list(zip(poses, directions[reachable], strict=True))
     lengths = np.array([strut_lengths(nominal, pose) for pose in poses])
-    sense = [senses(space.geometry, pose, np.full(3, sign)) for sign in (1.0, -1.0) for pose in poses]
+    sense = [senses(space.geometry, pose, way * direction) for way in (1.0, -1.0) for pose, direction in passed]
     return Stations(
         positions=np.tile([pose.position for pose in poses], (2, 1)),
         rotations=np.tile([pose.rotation for pose in poses], (2, 1, 1)),
