@@ -232,7 +232,10 @@ class Compensator:
         self._fixed = (pack_machine(machine), self._nominal_numbers, varied)
 
     def set_temperature(self, name: str, value: float) -> None:
-        """Take a temperature reading, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
+        """Take a temperature, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
+
+        A sensor's noise would move the struts: pass its readings through a
+        :class:`~hexapod_comp.thermal.TemperatureFilter`.
 
         Raises
         ------

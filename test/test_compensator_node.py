@@ -745,6 +745,39 @@ def test_temperatures_ramp(bench, tmp_path):
     assert len(answers) > 3
 
 
+@pytest.mark.parametrize(("time_constant", "taken"), [(3600.0, 26.0), (0.0, 27.0)], ids=["filtered", "off"])
+def test_readings_are_filtered(bench, tmp_path, time_constant, taken):
+    """Two readings within a few seconds count alike in an hour's mean; 1 nm is 0.6 s out of that."""
+    path = model_file(tmp_path, struts={"expansion_ppm_per_K": 12.0})
+    bench.compensator(model_file=path, ramp_rate=1.0, temperature_time_constant_s=time_constant)
+    bench.warm("strut_3", 25.0)
+    bench.warm("strut_3", 27.0)
+    values_of(bench, "temperature.strut_3_degC", f"{taken:.2f}")
+    nominal = closed_form_lengths(HOME)[2]
+    expected = nominal / (1.0 + 12e-6 * (taken - 20.0)) - nominal
+    assert bench.ask(HOME).corrections[2] == pytest.approx(expected, rel=0.0, abs=10e-9)
+
+
+def test_temperatures_of_an_inactive_node_act_on_activation(bench, tmp_path):
+    """The first command after it finds the strut as warm as it is; one that has moved before ramps to it."""
+    path = model_file(tmp_path, struts={"expansion_ppm_per_K": 12.0})
+    settings = {"ramp_rate": 0.005, "max_command_age": 0.0, "temperature_time_constant_s": 0.0}
+    bench.compensator(start=False, model_file=path, **settings)
+    assert bench.change("configure")
+    bench.until(bench.matched, "discovery")
+    bench.warm("strut_3", 25.0)
+    assert bench.change("activate")
+    nominal = closed_form_lengths(HOME)[2]
+    warm, hot = (nominal / (1.0 + 12e-6 * kelvin) - nominal for kelvin in (5.0, 60.0))
+    first = bench.ask(HOME)
+    assert first.corrections[2] == pytest.approx(warm, rel=0.0, abs=ROUNDING)
+    assert bench.change("deactivate")
+    bench.warm("strut_3", 80.0)
+    assert bench.change("activate")
+    answers = stream(bench, HOME, first, lambda answer: abs(answer.corrections[2] - hot) < ROUNDING)
+    assert_ramp(answers, 0.005)
+
+
 @pytest.mark.parametrize(
     ("part", "temperature", "text"),
     [
@@ -898,6 +931,7 @@ def test_known_parameters_are_not_warned_of(bench):
         ({"ramp_rate": 2.0}, "ramp_rate"),
         ({"ramp_rate": math.nan}, "ramp_rate"),
         ({"ramp_rate": 2}, "ramp_rate: must lie in 1e-06…1, not 2"),
+        ({"temperature_time_constant_s": -1.0}, "temperature_time_constant_s"),
         ({"require_feedback": "yes"}, "require_feedback: must be bool, not 'yes'"),
         ({"marker_rate": True}, "marker_rate: must be float, not True"),
         ({"model_file": 3}, "model_file: must be str, not 3"),

@@ -31,6 +31,7 @@ from ..machine import MachineModel
 from ..model_file import load_model
 from ..paths import config_file
 from ..pose import Pose
+from ..thermal import DEFAULT_TIME_CONSTANT, TemperatureFilter
 from .health import ERROR, OK, WARN, Flow, HealthReport, Refusals, seconds
 from .markers import machine_markers
 from .runtime import (
@@ -57,6 +58,9 @@ PARAMETERS = (
     Parameter("require_feedback", False, "refuse commands while there is no feedback"),
     Parameter("ramp_rate", 1e-3, "strut speed at which a change of model or enabling is taken up, m/s", 1e-6, 1.0),
     Parameter("enable_compensation", True, "compensate from the start"),
+    Parameter(
+        "temperature_time_constant_s", DEFAULT_TIME_CONSTANT, "low pass of temperatures, s; 0 = off", 0.0, 3600.0
+    ),
     Parameter("marker_rate", 10.0, "markers per second, Hz; 0 = none", 0.0, 10.0),
     Parameter("publish_array", False, "also publish strut_commands_array for ros2_controllers"),
 )
@@ -108,6 +112,7 @@ class CompensatorNode(MachineNode):
             self._compensator = None
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
+        self._temperatures = TemperatureFilter(self._options["temperature_time_constant_s"])
         self._frames = {
             self._options["base_frame"]: pack_pose(Pose.identity()),
             self._options["work_frame"]: pack_pose(geometry.work),
@@ -122,7 +127,7 @@ class CompensatorNode(MachineNode):
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Start to take commands; nothing that came before is replayed."""
+        """Start to take commands; of those that came before none is replayed."""
         self._forget()
         self._active = True
         self.get_logger().info("ready")
@@ -275,12 +280,15 @@ class CompensatorNode(MachineNode):
             self._publish_estimate(self._struts.lengths, message.header.stamp)
 
     def _on_temperature(self, message: Temperature) -> None:
-        if not self._active:
-            return
+        # Also while inactive: the first command after activation must know how warm the machine is. Dated by
+        # arrival: sensors need not stamp, clocks may be set, and what a transport delays a drift does not notice.
+        name, now = message.header.frame_id, time.monotonic()
         try:
-            self.compensator.set_temperature(message.header.frame_id, message.temperature)
+            self.compensator.set_temperature(name, self._temperatures.take(name, message.temperature, now))
         except HexapodError as error:
-            self._feedback_refusals.add("temperature", str(error), time.monotonic())
+            if not self._active:
+                return
+            self._feedback_refusals.add("temperature", str(error), now)
             self.warn_of("temperature", f"temperature ignored: {error}")
 
     # ---- services ----
