@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .errors import ModelError
+from .measurement import BACKWARD, FORWARD, MeasurementSet
 from .texts import aligned
 
 DIRECTIONS = ("up", "down")
@@ -362,3 +363,55 @@ def table(tests: Mapping[str, PositioningTest]) -> str:
         cells = [_micrometres(figures[key]).strip() if key in figures else "–" for key in keys]
         rows.append((name, str(len(test.targets)), str(test.cycles), *cells, "um"))
     return "ISO 230-2:2014, both directions\n" + aligned(header, rows)
+
+
+@dataclass(frozen=True)
+class Iso230Run:
+    """A linear run as ISO 230-2 wants it.
+
+    Attributes
+    ----------
+    name : str
+        Of the run.
+    targets : ndarray, shape (m,)
+        Commanded coordinates along the line, rising, m.
+    deviations : ndarray, shape (2, cycles, m)
+        Readings, forward and backward, m.
+    """
+
+    name: str
+    targets: np.ndarray
+    deviations: np.ndarray
+
+
+def iso230_runs(measurements: MeasurementSet) -> list[Iso230Run]:
+    """Return the linear runs that ISO 230-2 can judge: two cycles or more, every target from both sides in each.
+
+    Runs with fewer cycles, gaps or without both directions are left out.
+    """
+    points = measurements.points()[measurements.station]
+    found = []
+    for number, run in enumerate(measurements.runs):
+        chosen = np.flatnonzero((measurements.run == number) & (measurements.channel == 0))
+        table: dict[tuple[int, int], dict[float, float]] = {}
+        for n in chosen:
+            pass_of = (int(measurements.direction[n]), int(measurements.cycle[n]))
+            target = round(float(points[n] @ run.axis), 9) + 0.0
+            table.setdefault(pass_of, {})[target] = float(measurements.value[n])
+        complete = _complete_run(run.name, table)
+        if complete is not None:
+            found.append(complete)
+    return found
+
+
+def _complete_run(name: str, table: dict[tuple[int, int], dict[float, float]]) -> Iso230Run | None:
+    """Return a run from {(direction, cycle): {target: reading}} if nothing is missing in it."""
+    cycles = sorted({cycle for _, cycle in table})
+    passes = {(direction, cycle) for direction in (FORWARD, BACKWARD) for cycle in cycles}
+    if len(cycles) < 2 or set(table) != passes:
+        return None
+    targets = sorted(table[FORWARD, cycles[0]])
+    if any(sorted(readings) != targets for readings in table.values()):
+        return None
+    deviations = [[[table[d, c][t] for t in targets] for c in cycles] for d in (FORWARD, BACKWARD)]
+    return Iso230Run(name, np.array(targets), np.array(deviations))

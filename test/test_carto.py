@@ -17,8 +17,8 @@ from test_measurement_csv import edits, mutated
 
 from hexapod_comp.carto import load_line, read_carto, read_rtl, read_rtx, read_sections
 from hexapod_comp.errors import HexapodError, InputFileError
+from hexapod_comp.iso230 import iso230_runs
 from hexapod_comp.measurement import BACKWARD, CHANNELS, FORWARD
-from hexapod_comp.measurement_csv import iso230_runs
 
 RATE, SPEED = 100.0, 5.0  # 1/s, mm/s
 

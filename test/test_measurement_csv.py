@@ -20,9 +20,11 @@ from hexapod_comp.campaign import Campaign, template
 from hexapod_comp.columns import read_wide
 from hexapod_comp.errors import HexapodError, InputFileError
 from hexapod_comp.geometry import load_geometry
+from hexapod_comp.iso230 import iso230_runs
 from hexapod_comp.kinematics import Structure, strut_lengths
 from hexapod_comp.measurement import CHANNELS, MeasurementSet
-from hexapod_comp.measurement_csv import iso230_runs, read_measurements, write_measurements
+from hexapod_comp.measurement_csv import read_measurements
+from hexapod_comp.measurement_writing import write_measurements
 from hexapod_comp.paths import config_file
 from hexapod_comp.pose import Pose
 

@@ -36,16 +36,26 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import date as calendar
 from itertools import product
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.polynomial import Legendre, Polynomial, legendre
 
 from ..errors import CalibrationError
-from ..field import COMPONENTS, CROSS_AXES, GridField
-from ..kinematics import Structure, strut_lengths_batch
-from ..machine import REFERENCE_TEMPERATURE, MachineModel, ModelOrigin
-from ..measurement import AXES, CHANNELS, KINDS, LEAST_TRAVEL, MeasurementSet
+from ..field import CROSS_AXES, GridField
+from ..machine import MachineModel, ModelOrigin
+from ..measurement import AXES, MeasurementSet
+from .grid_readings import (
+    Readings,
+    check_complete,
+    datum_of,
+    distinct,
+    grid_of,
+    grid_readings,
+    line_name,
+    nearest_nodes,
+    valid_box_of,
+)
 
 OrderRule = Literal["adjusted-r2", "aicc"] | int
 """How the order of a polynomial is chosen, or the order itself."""
@@ -55,12 +65,6 @@ POINTS_PER_COEFFICIENT = 3
 
 FEWEST_POINTS = 2 * POINTS_PER_COEFFICIENT
 """Below this not even a straight line is left."""
-
-WARM = 0.5
-"""Temperatures further than this from the reference, K, are mentioned: the scheme has no temperature."""
-
-COMPENSATED, FOLLOWED = 10e-6, 0.1e-6
-"""Commands further off the nominal lengths than this, m, are a compensation's; than that, worth a remark."""
 
 DIRECTIONS = (1, -1)
 """Forward, backward: the order of a field's polynomials."""
@@ -135,38 +139,6 @@ class LinesFit:
     notes: tuple[str, ...]
 
 
-class Readings(NamedTuple):
-    """Readings on grid lines; every array has one entry a reading.
-
-    Attributes
-    ----------
-    axis, component, direction, run, cycle : ndarray of int, shape (N,)
-        Of the line, the reading, the pass.
-    point : ndarray, shape (N, 3)
-        Commanded place of the measured point in ``base``, m.
-    node : ndarray of int, shape (N, 3)
-        Nearest node along each axis; along the line itself without meaning.
-    value : ndarray, shape (N,)
-        m or rad.
-    sloping : ndarray of bool, shape (N,)
-        Whether the beam's slope is unknown.
-    """
-
-    axis: np.ndarray
-    component: np.ndarray
-    direction: np.ndarray
-    run: np.ndarray
-    cycle: np.ndarray
-    point: np.ndarray
-    node: np.ndarray
-    value: np.ndarray
-    sloping: np.ndarray
-
-    def select(self, mask: np.ndarray) -> Readings:
-        """Return those in a mask or at indices."""
-        return Readings(*(array[mask] for array in self))
-
-
 def fit_lines(
     measurements: MeasurementSet, order: OrderRule = "adjusted-r2", date: str = "", name: str = ""
 ) -> LinesFit:
@@ -194,11 +166,11 @@ def fit_lines(
     """
     if not (order in ("adjusted-r2", "aicc") or (isinstance(order, int) and order >= 1)):
         raise CalibrationError("order", f"must be adjusted-r2, aicc or a whole number from 1, not {order!r}")
-    readings, notes = _grid_readings(measurements)
-    grid = _grid(readings)
-    readings = readings._replace(node=_nearest_nodes(readings.point, grid))
-    _check_complete(readings, grid)
-    datum, remark = _datum(measurements, grid)
+    readings, notes = grid_readings(measurements)
+    grid = grid_of(readings)
+    readings = readings._replace(node=nearest_nodes(readings.point, grid))
+    check_complete(readings, grid)
+    datum, remark = datum_of(measurements, grid)
     notes += remark
     empty = GridField(grid, _no_lines(grid), probe=measurements.probe)
     field, fits = _fit_families(readings, empty, order, datum)
@@ -207,7 +179,7 @@ def fit_lines(
         machine=measurements.geometry.name,
         name=name or f"lines, {'5-D' if (readings.component >= 3).any() else '1-D'}",
         field=field,
-        valid_box=_valid_box(measurements, grid),
+        valid_box=valid_box_of(measurements, grid),
         origin=ModelOrigin(date or calendar.today().isoformat(), measurements.files, None, _origin_note(order)),
     )
     return LinesFit(model, tuple(fits), tuple(dict.fromkeys((*measurements.notes, *notes))))
@@ -219,165 +191,6 @@ def _origin_note(order: OrderRule) -> str:
         f"Scheme lines (001): polynomials {chosen} along grid lines. Datum: displacements and rotations are zero "
         "(mean of both directions) at home's coordinate along each line; straightness without its straight line."
     )
-
-
-# From measurements to readings on grid lines
-
-
-def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
-    """Return the readings on lines parallel to an axis, and remarks on all that was left out.
-
-    Raises
-    ------
-    CalibrationError
-        None is left, or they cannot be taken as components along the axes of ``base``.
-    """
-    m = measurements
-    axis_of_run = np.array([-1 if run.base_axis is None else run.base_axis for run in m.runs])
-    axis = axis_of_run[m.run]
-    notes = []
-    others = [m.runs[r].name for r in np.unique(m.run[axis < 0])]
-    if others:
-        what = "not parallel to an axis of base; scheme lines has no use for them"
-        notes.append(f"{len(others)} runs are {what} (first: {others[0]})")
-    if (axis < 0).all():
-        raise CalibrationError("grid lines", "there are none: no run is parallel to an axis of base")
-    component = _components(m, axis >= 0)
-    along_itself = (component == axis) & (m.channel != CHANNELS.index("linear"))
-    if along_itself.any():
-        notes.append("straightness along the line itself was left out")
-    kept = np.flatnonzero((axis >= 0) & ~along_itself)
-    axis, station = axis[kept], m.station[kept]
-    _check_level(m.stations.rotations[station])
-    notes += _warm_note(m.stations.temperatures[station]) + _command_note(m, np.unique(station))
-    direction = m.stations.sense[station, axis].astype(int)
-    node = np.zeros((len(kept), 3), dtype=int)
-    value = m.value[kept] * np.sign(m.directions()[kept, component[kept]])
-    sloping = m.kind[kept] == KINDS.index("straightness")
-    point = m.points()[station]
-    return Readings(axis, component[kept], direction, m.run[kept], m.cycle[kept], point, node, value, sloping), notes
-
-
-def _components(measurements: MeasurementSet, wanted: np.ndarray) -> np.ndarray:
-    """Return which of the six components each reading is of, shape (N,), −1 where a mask does not want it."""
-    weights = np.abs(measurements.directions())
-    turned = wanted & (weights.max(axis=1) < 1.0 - 1e-9)
-    if turned.any():
-        run = measurements.runs[measurements.run[turned.argmax()]]
-        raise CalibrationError(f"run {run.name}", "is read across axes that are turned against those of base")
-    return np.where(wanted, weights.argmax(axis=1), -1)
-
-
-def _check_level(rotations: np.ndarray) -> None:
-    """Refuse lines that were read at different attitudes: the field does not depend on attitude."""
-    if np.abs(rotations - rotations[0]).max() > 1e-9:
-        raise CalibrationError("grid lines", "must all be read at one attitude of the platform: the field has none")
-
-
-def _warm_note(temperatures: np.ndarray) -> list[str]:
-    low, high = temperatures.min(), temperatures.max()
-    if max(REFERENCE_TEMPERATURE - low, high - REFERENCE_TEMPERATURE) <= WARM:
-        return []
-    return [f"read at {low:.1f} to {high:.1f} °C; scheme lines takes the growth for an error at 20 °C"]
-
-
-def _command_note(measurements: MeasurementSet, stations: np.ndarray) -> list[str]:
-    """Return a remark on commands that were not quite nominal; refuse a machine that was compensated."""
-    there, nominal = measurements.stations, Structure.of(measurements.geometry)
-    lengths = strut_lengths_batch(nominal, there.positions[stations], there.rotations[stations])
-    most = float(np.abs(there.commands[stations] - lengths).max())
-    if most > COMPENSATED:
-        problem = f"were read under strut commands up to {most * 1e6:.1f} µm off the nominal lengths: compensated?"
-        raise CalibrationError("grid lines", f"{problem} Scheme lines needs the machine as it is")
-    if most <= FOLLOWED:
-        return []
-    return [f"strut commands are up to {most * 1e6:.2f} µm off the nominal lengths, and are taken for nominal"]
-
-
-# The grid
-
-
-def _distinct(values: np.ndarray) -> np.ndarray:
-    """Return values, in order, of which no two are the same place."""
-    ordered = np.unique(values)
-    return ordered[np.append(True, np.diff(ordered) > LEAST_TRAVEL)]
-
-
-def _grid(readings: Readings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the nodes along x, y, z, m: where the lines stand, or how far they go where none crosses.
-
-    Raises
-    ------
-    CalibrationError
-        Lines at one place only, or that end within the grid.
-    """
-    grid = []
-    for axis, name in enumerate(AXES):
-        along = readings.point[readings.axis == axis, axis]
-        across = readings.point[readings.axis != axis, axis]
-        nodes = _distinct(across) if len(across) else np.array([along.min(), along.max()])
-        if len(nodes) < 2:
-            raise CalibrationError("grid", f"lines stand at one {name} only ({nodes[0] * 1e3:g} mm); two are needed")
-        grid.append(nodes)
-    return grid[0], grid[1], grid[2]
-
-
-def _nearest_nodes(points: np.ndarray, grid: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the index of the node nearest to each point along each axis, shape (N, 3)."""
-    columns = [np.abs(points[:, axis, None] - nodes).argmin(axis=1) for axis, nodes in enumerate(grid)]
-    return np.stack(columns, axis=1)
-
-
-def _line_name(grid: Sequence[np.ndarray], axis: int, node: Sequence[int]) -> str:
-    places = zip(CROSS_AXES[axis], node, strict=True)
-    return f"{AXES[axis]} line at " + ", ".join(f"{AXES[a]} {grid[a][n] * 1e3:.1f}" for a, n in places) + " mm"
-
-
-def _check_complete(readings: Readings, grid: Sequence[np.ndarray]) -> None:
-    """Refuse a family of which a line, a channel of a line, or a line's end is missing."""
-    for axis in np.unique(readings.axis):
-        family = readings.select(readings.axis == axis)
-        every = set(product(*(range(len(grid[a])) for a in CROSS_AXES[axis])))
-        for component in np.unique(family.component):
-            rows = family.component == component
-            there = {(int(i), int(j)) for i, j in family.node[rows][:, CROSS_AXES[axis]]}
-            if every - there:
-                first = _line_name(grid, axis, min(every - there))
-                what = f"{COMPONENTS[component]} on the {first}"
-                missing = f"of {len(every)} lines of the rectangular grid {len(every - there)} were not measured"
-                raise CalibrationError(what, f"is missing; {missing}")
-        _check_ends(family, int(axis), grid)
-
-
-def _check_ends(family: Readings, axis: int, grid: Sequence[np.ndarray]) -> None:
-    """Refuse a line that ends within the grid: a polynomial says nothing beyond its readings."""
-    low, high = grid[axis][0], grid[axis][-1]
-    for node in sorted({(int(i), int(j)) for i, j in family.node[:, CROSS_AXES[axis]]}):
-        on_line = (family.node[:, CROSS_AXES[axis]] == node).all(axis=1)
-        reach = family.point[on_line, axis]
-        if reach.min() > low + LEAST_TRAVEL or reach.max() < high - LEAST_TRAVEL:
-            problem = f"is read from {reach.min() * 1e3:.1f} to {reach.max() * 1e3:.1f} mm"
-            wanted = f"the grid reaches from {low * 1e3:.1f} to {high * 1e3:.1f} mm"
-            raise CalibrationError(_line_name(grid, axis, node), f"{problem}, but {wanted}")
-
-
-def _datum(measurements: MeasurementSet, grid: Sequence[np.ndarray]) -> tuple[np.ndarray, list[str]]:
-    """Return where each line is zero, shape (3,), m in ``base``: home's place of the measured point."""
-    home = measurements.geometry.home
-    point = home.position + home.rotation @ measurements.probe
-    datum = np.array([min(max(p, nodes[0]), nodes[-1]) for p, nodes in zip(point, grid, strict=True)])
-    beyond = [name for name, p, d in zip(AXES, point, datum, strict=True) if abs(p - d) > LEAST_TRAVEL]
-    if not beyond:
-        return datum, []
-    return datum, [f"home lies outside the box along {', '.join(beyond)}: lines are zero at the end next to it"]
-
-
-def _valid_box(measurements: MeasurementSet, grid: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the platform positions that the grid covers, shape (2, 3), m in ``base``."""
-    on_lines = [run.base_axis is not None for run in measurements.runs]
-    first = measurements.station[np.array(on_lines)[measurements.run]][0]
-    lever = measurements.stations.rotations[first] @ measurements.probe
-    return np.array([[nodes[0] for nodes in grid], [nodes[-1] for nodes in grid]]) - lever
 
 
 # From readings to polynomials
@@ -430,7 +243,7 @@ def _fit_family(
     family = family._replace(value=family.value - _said(field, family, component))
     fits = []
     for nodes, group in _groups(family, axis, field.grid, shared):
-        name = _line_name(field.grid, axis, nodes[0])
+        name = line_name(field.grid, axis, nodes[0])
         if len(nodes) > 1:
             name += f" and {len(nodes) - 1} beside it along {AXES[first]}"
         fits += _fit_line(group, name, nodes, field.grid[axis], order, datum[axis])
@@ -513,7 +326,7 @@ def _parameter(coordinate: np.ndarray, along: np.ndarray) -> np.ndarray:
 
 def _places(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distinct places on a line, and each reading's index among them."""
-    places = _distinct(coordinates)
+    places = distinct(coordinates)
     return places, np.abs(coordinates[:, None] - places).argmin(axis=1)
 
 
@@ -526,7 +339,7 @@ def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> n
     runs, run = np.unique(group.run, return_inverse=True)
     if len(runs) == 1:
         return group.value
-    powers = max(1, len(_distinct(u)) // POINTS_PER_COEFFICIENT)
+    powers = max(1, len(distinct(u)) // POINTS_PER_COEFFICIENT)
     shape = legendre.legvander(u, powers - 1)
     smooth = np.concatenate([shape * (group.direction == way)[:, None] for way in ways], axis=1)
     unknown = (run[:, None] == np.arange(len(runs))).astype(float)

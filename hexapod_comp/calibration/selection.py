@@ -61,17 +61,16 @@ def select(
     """
     trials = _Trials(space, problem, noise, progress)
     names = tuple(b.name for b in space.blocks)
-    optional, gone = list(names[1:]), {}
-    while optional:
-        kept = ("structure", *optional)
-        gains = {name: trials.gain(kept, name) for name in optional}
-        worst = min(optional, key=lambda name: gains[name][0] / max(gains[name][1], 1e-12))
-        if _clear(gains[worst]):
-            break
-        optional.remove(worst)
-        gone[worst] = gains[worst]
-    known = {**gone, **{name: gains[name] for name in optional}}
-    return [Decision(name, name in optional, *known[name]) for name in names[1:]]
+    optional = list(names[1:])
+    gains: dict[str, tuple[float, float]] = {}
+    while True:
+        # A block that helps clearly beside all others helps no less when some of them have gone.
+        doubtful = [name for name in optional if name not in gains or not _clear(gains[name])]
+        gains |= {name: trials.gain(("structure", *optional), name) for name in doubtful}
+        doubtful = [name for name in doubtful if not _clear(gains[name])]
+        if not doubtful:
+            return [Decision(name, name in optional, *gains[name]) for name in names[1:]]
+        optional.remove(min(doubtful, key=lambda name: gains[name][0] / max(gains[name][1], 1e-12)))
 
 
 def _clear(gain: tuple[float, float]) -> bool:

@@ -199,8 +199,7 @@ def _lines(args: argparse.Namespace, measured: MeasurementSet) -> tuple[MachineM
 
 def _iso_text(measured: MeasurementSet) -> str:
     """Return the figures of ISO 230-2 of the runs that have them."""
-    from ..iso230 import evaluate, table
-    from ..measurement_csv import iso230_runs
+    from ..iso230 import evaluate, iso230_runs, table
 
     tests = {run.name: evaluate(run.targets, run.deviations) for run in iso230_runs(measured)}
     return table(tests) + "\n" if tests else ""

@@ -28,9 +28,8 @@ def run(args: argparse.Namespace) -> int:
     """Run the verb."""
     from ..errors import CalibrationError
     from ..geometry import load_geometry
-    from ..iso230 import evaluate, report, table
+    from ..iso230 import evaluate, iso230_runs, report, table
     from ..measured_files import read_files
-    from ..measurement_csv import iso230_runs
     from ..paths import config_file
 
     geometry = load_geometry(config_file(args.machine))

@@ -28,6 +28,10 @@ example:
   1670 readings of 59 runs at 1670 stations: measured.csv"""
 
 
+RESOLUTION = 10
+"""Digits after the point of the instruments, m and rad: a tenth of a nanometre."""
+
+
 def add_parser(subparsers: common.Subparsers) -> None:
     """Add the verb."""
     parser = common.add_verb(subparsers, "measure", run, SUMMARY, TEXT)
@@ -52,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the verb."""
     from ..campaign import load_campaign, template
     from ..machine import RealMachine
-    from ..measurement_csv import write_measurements
+    from ..measurement_writing import write_measurements
     from ..model_file import load_model
     from ..paths import config_file
     from ..virtual_instruments import compensated, measure
@@ -65,7 +69,8 @@ def run(args: argparse.Namespace) -> int:
     if args.model != "ideal":
         plan = compensated(plan, model)
     with common.progress_bar(len(plan.stations), " stations") as bar:
-        measured = measure(plan, campaign, RealMachine(geometry, truth), args.seed, bar.update)
+        read = measure(plan, campaign, RealMachine(geometry, truth), args.seed, bar.update)
+    measured = read.with_values(read.value.round(RESOLUTION))
     write_measurements(measured, args.out)
     print(_report(measured, args))
     return 0
