@@ -14,14 +14,14 @@ MOST_LISTED = 10
 """Outliers and notes beyond these are counted, not listed."""
 
 TRUST = 3.0
-"""A tilted tool whose expected error is so many times a level one's is warned of."""
+"""A tilted tool whose expected error is so many times a level one's is warned of, when parameters are not seen."""
 
 
 def report(fit: JointFit) -> str:
     """Return the report of a joint fit."""
     parts = [
         _headline(fit),
-        *_expected(fit.level, fit.tilted),
+        *_expected(fit.level, fit.tilted, fit.observability),
         _channel_table(fit),
         _decision_table(fit),
         observability_text(fit.observability, fit.unseen_errors),
@@ -40,7 +40,7 @@ def _headline(fit: JointFit) -> str:
     )
 
 
-def _expected(level: ToolError | None, tilted: ToolError | None) -> Iterator[str]:
+def _expected(level: ToolError | None, tilted: ToolError | None, seen: Observability) -> Iterator[str]:
     """Yield what tool error the model leaves, and whether it can be trusted with a tilted tool."""
     if level is None:
         return
@@ -48,7 +48,7 @@ def _expected(level: ToolError | None, tilted: ToolError | None) -> Iterator[str
     lines.append(f"  level tool:  {tool_error_text(level)}")
     if tilted is not None:
         lines.append(f"  tilted 10°:  {tool_error_text(tilted)}")
-        if tilted.after > TRUST * level.after:
+        if seen.structure_rank < seen.structure_size and tilted.after > TRUST * level.after:
             lines.append("  The readings do not show what tilting does: do not trust this model with a tilted tool.")
     yield "\n".join(lines)
 
@@ -152,7 +152,7 @@ def plan_report(plan: Plan) -> str:
         f"{plan.space.size} parameters"
     )
     seen = observability_text(plan.observability, plan.unseen_errors)
-    return "\n\n".join([head, *_expected(plan.level, plan.tilted), seen]) + "\n"
+    return "\n\n".join([head, *_expected(plan.level, plan.tilted, plan.observability), seen]) + "\n"
 
 
 def plan_json(plan: Plan) -> dict:
