@@ -23,12 +23,13 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.calibration import CONFIG, LARGE
-from hexapod_comp.calibration.evaluation import Passes, random_passes, run
+from hexapod_comp.calibration.evaluation import run
 from hexapod_comp.campaign import load_campaign
 from hexapod_comp.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.imperfections import draw_model
 from hexapod_comp.machine import REFERENCE_TEMPERATURE, MachineModel, RealMachine, Temperatures
 from hexapod_comp.thermal import DEFAULT_TIME_CONSTANT, TemperatureFilter
+from hexapod_comp.travel import Passes, random_passes
 
 STEEL = 11.5e-6
 """Expansion of struts, base and platform, 1/K."""
@@ -88,7 +89,7 @@ def one_machine(drift: Drift, seed: int, settings: Settings) -> np.ndarray:
     for phase in range(len(PHASES)):
         moved = np.empty((len(COMPENSATIONS), *cold.shape))
         for group, second in _groups(settings.points, phase):
-            at = Passes(passes.positions[group], passes.rotations[group], passes.directions[group])
+            at = passes.select(group)
             truth = RealMachine(geometry, model, _temperatures(drift, true[second]))
             for n, seen in enumerate((None, *readings)):
                 sensed = None if seen is None else _temperatures(drift, seen[second])

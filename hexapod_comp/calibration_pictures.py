@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from .calibration.evaluation import Passes, run
+from .calibration.evaluation import run
 from .calibration.joint_fit import JointFit
 from .calibration.lines import LineFit, LinesFit
 from .errors import CalibrationError
@@ -19,6 +19,7 @@ from .machine import MachineModel, RealMachine
 from .measurement import AXES, KINDS
 from .plotting import WITH, WITHOUT
 from .struts import smooth_error
+from .travel import Passes
 
 SAMPLES = 161
 """Points of a curve."""

@@ -14,13 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .errors import HexapodError, ModelError
+from .errors import ModelError
 from .geometry import HexapodGeometry
-from .kernels import OK
-from .kinematics import Structure, forward_error, strut_lengths_batch
-from .limits import WITHIN, LimitTable, check_stage
 from .machine import MachineModel, RealMachine, Temperatures
 from .pose import Pose
+from .travel import Passes, at, drive, nominal_commands
 
 DIAGONAL = np.ones(3)
 """Direction of travel, forward; backward is its opposite."""
@@ -42,12 +40,13 @@ class Travel:
     rotations: np.ndarray
     directions: np.ndarray
 
-    def platform(self, geometry: HexapodGeometry) -> tuple[np.ndarray, np.ndarray]:
-        """Return the commanded ``pose_platform_in_base`` of each row: positions (N, 3), m, rotations (N, 3, 3)."""
-        work, back = geometry.work, geometry.tool.inverse()
-        rotations = work.rotation @ self.rotations
-        positions = work.position + self.positions @ work.rotation.T + rotations @ back.position
-        return positions, rotations @ back.rotation
+    def passes(self, geometry: HexapodGeometry) -> Passes:
+        """Return the same of the platform in ``base``."""
+        return Passes.of_tool(geometry, self.positions, self.rotations, self.directions)
+
+    def select(self, mask: np.ndarray) -> Travel:
+        """Return the rows in a mask."""
+        return Travel(self.positions[mask], self.rotations[mask], self.directions[mask])
 
 
 CommandsOf = Callable[[Travel], np.ndarray]
@@ -55,7 +54,7 @@ CommandsOf = Callable[[Travel], np.ndarray]
 
 
 @dataclass(frozen=True)
-class Driven:
+class ToolErrors:
     """What a machine did along a travel, seen at the tool along the axes of ``work``.
 
     Attributes
@@ -180,74 +179,37 @@ def draw_travel(box: np.ndarray, count: int, seed: int, tilt: float = 0.0) -> Tr
     return Travel(np.tile(positions, (2, 1)), np.tile(rotations, (2, 1, 1)), directions)
 
 
-def nominal_commands(geometry: HexapodGeometry, travel: Travel) -> np.ndarray:
-    """Return the strut lengths of the nominal machine, shape (N, 6), m: the commands without compensation."""
-    return strut_lengths_batch(Structure.of(geometry), *travel.platform(geometry))
-
-
-def senses(structure: Structure, geometry: HexapodGeometry, travel: Travel) -> np.ndarray:
-    """Return the directions of motion, shape (N, 9), of a platform along a travel: axes of ``base``, six struts.
-
-    A strut whose platform joint moves along d gets longer when d points along it.
-    """
-    positions, rotations = travel.platform(geometry)
-    along = travel.directions @ geometry.work.rotation.T
-    struts = positions[:, None] + structure.platform_joints @ rotations.transpose(0, 2, 1) - structure.base_joints
-    return np.sign(np.hstack([along, np.einsum("nij,nj->ni", struts, along)]))
-
-
-def drive(machine: RealMachine, travel: Travel, commands: np.ndarray) -> Driven:
-    """Run the machine forwards along a travel.
-
-    Parameters
-    ----------
-    machine : RealMachine
-        The truth.
-    travel : Travel
-        What was commanded.
-    commands : ndarray, shape (N, 6)
-        What the struts are told, m.
+def tool_errors(machine: RealMachine, travel: Travel, commands: np.ndarray) -> ToolErrors:
+    """Return what the tool does along a travel under strut commands, shape (N, 6), m.
 
     Raises
     ------
     KinematicsError
         The machine has no pose for a row's commands; names the row's position.
     """
-    geometry, count = machine.geometry, len(commands)
-    wanted, commands = travel.platform(geometry), np.ascontiguousarray(commands)
-    modelled = wanted[0].copy(), wanted[1].copy()
-    actual = np.empty((count, 3)), np.empty((count, 3, 3))
-    sense = senses(machine.structure, geometry, travel)
-    for row in range(count):
-        arrays = (modelled[0][row], modelled[1][row], actual[0][row], actual[1][row])
-        outcome, _, condition, _ = machine.forward(commands[row], sense[row], *arrays)
-        if outcome != OK:
-            error = forward_error(outcome, condition, machine.structure.max_condition)
-            raise type(error)(f"{at(wanted[0][row])}: {error}", error.value, error.limit)
+    geometry = machine.geometry
+    passes = travel.passes(geometry)
+    driven = drive(machine, passes, commands)
     turn, tool = geometry.work.rotation, geometry.tool.position
-    at_tool, without, target = (p + r @ tool for p, r in (actual, modelled, wanted))
-    rotation = Rotation.from_matrix(actual[1] @ wanted[1].transpose(0, 2, 1)).as_rotvec()
-    return Driven((at_tool - target) @ turn, rotation @ turn, (at_tool - without) @ turn)
+    at_tool = driven.positions + driven.rotations @ tool
+    without = driven.positions_without_field + driven.rotations_without_field @ tool
+    rotation = Rotation.from_matrix(driven.rotations @ passes.rotations.transpose(0, 2, 1)).as_rotvec()
+    return ToolErrors((at_tool - passes.points(tool)) @ turn, rotation @ turn, (at_tool - without) @ turn)
 
 
-def at(position: np.ndarray) -> str:
-    """Say where the platform is, for messages; position (3,), m."""
-    return "platform at ({:.3f}, {:.3f}, {:.3f}) mm".format(*(position * 1e3))
+def refuse_unreachable(geometry: HexapodGeometry, travel: Travel) -> None:
+    """Raise the error of the first row that the nominal machine may not take.
 
-
-def within_limits(geometry: HexapodGeometry, travel: Travel) -> tuple[np.ndarray, HexapodError | None]:
-    """Return which rows the nominal machine may take, shape (N,), and the error of the first that it may not."""
-    table, joints = LimitTable(geometry), geometry.kernel_joints
-    limits = (table.stroke, table.cone_axes, table.cone_cosines, table.scalars)
-    inside, first = np.ones(len(travel.positions), dtype=bool), None
-    lengths = nominal_commands(geometry, travel)
-    for row, pose in enumerate(zip(*travel.platform(geometry), strict=True)):
-        finding, strut, value, _ = check_stage(*joints, *pose, lengths[row], limits)
-        inside[row] = finding == WITHIN
-        if finding != WITHIN and first is None:
-            first = table.error(finding, strut, 0, value)
-            first.args = (f"{at(pose[0])}: {first}",)
-    return inside, first
+    Raises
+    ------
+    LimitError, KinematicsError
+        Naming the position.
+    """
+    passes = travel.passes(geometry)
+    for position, refusal in zip(passes.positions, passes.refusals(geometry), strict=True):
+        if refusal is not None:
+            refusal.args = (f"{at(position)}: {refusal}",)
+            raise refusal
 
 
 class ExportTrial:
@@ -280,14 +242,13 @@ class ExportTrial:
         tilt: float = np.deg2rad(5.0),
     ) -> None:
         self.machine, self.level = RealMachine(geometry, model), draw_travel(box, count, seed)
-        _, refused = within_limits(geometry, self.level)
-        if refused is not None:
-            raise refused
+        refuse_unreachable(geometry, self.level)
         leaning = draw_travel(box, count, seed, tilt)
-        inside, _ = within_limits(geometry, leaning)
-        self.tilted = Travel(leaning.positions[inside], leaning.rotations[inside], leaning.directions[inside])
+        inside = np.array([refusal is None for refusal in leaning.passes(geometry).refusals(geometry)])
+        self.tilted = leaning.select(inside)
         travels = (self.level, self.tilted) if inside.any() else (self.level,)
-        self._before = [drive(self.machine, travel, nominal_commands(geometry, travel)) for travel in travels]
+        nominal = [nominal_commands(geometry, travel.passes(geometry)) for travel in travels]
+        self._before = [tool_errors(self.machine, *told) for told in zip(travels, nominal, strict=True)]
 
     def check(self, commands_of: CommandsOf) -> ExportCheck:
         """Compare the tool error without and with an export.
@@ -303,25 +264,25 @@ class ExportTrial:
             The machine has no pose for what the export commands.
         """
         commands = commands_of(self.level)
-        driven = drive(self.machine, self.level, commands)
+        driven = tool_errors(self.machine, self.level, commands)
         tilted = None
         if len(self._before) > 1:
-            leaning = drive(self.machine, self.tilted, commands_of(self.tilted))
+            leaning = tool_errors(self.machine, self.tilted, commands_of(self.tilted))
             tilted = _comparison(self._before[1], leaning)
         warmer = _warmer(self.machine, self.level, commands, driven)
         return ExportCheck(_comparison(self._before[0], driven), tilted, Size.of(driven.field_share), warmer)
 
 
-def _comparison(before: Driven, after: Driven) -> Comparison:
+def _comparison(before: ToolErrors, after: ToolErrors) -> Comparison:
     sizes = [Size.of(v) for v in (before.displacement, after.displacement, before.rotation, after.rotation)]
     return Comparison(len(after.displacement), *sizes)
 
 
-def _warmer(machine: RealMachine, travel: Travel, commands: np.ndarray, driven: Driven) -> Size | None:
+def _warmer(machine: RealMachine, travel: Travel, commands: np.ndarray, driven: ToolErrors) -> Size | None:
     """Return how far 1 K on struts, base and platform moves the tool, None without any expansion."""
     model = machine.model
     if not (model.struts.expansion.any() or model.base_expansion or model.platform_expansion):
         return None
     readings = Temperatures(dict.fromkeys(Temperatures.NAMES, 21.0))
-    warm = drive(RealMachine(machine.geometry, model, readings), travel, commands)
+    warm = tool_errors(RealMachine(machine.geometry, model, readings), travel, commands)
     return Size.of(warm.displacement - driven.displacement)

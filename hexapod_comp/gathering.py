@@ -12,7 +12,7 @@ import numpy as np
 from .errors import InputFileError
 from .geometry import HexapodGeometry
 from .kinematics import Structure, strut_lengths
-from .limits import WITHIN, LimitTable, check_stage
+from .limits import LimitTable
 from .measurement import (
     BACKWARD,
     CHANNELS,
@@ -25,9 +25,9 @@ from .measurement import (
     Reading,
     Run,
     Stations,
-    senses,
 )
 from .pose import Pose
+from .travel import Passes
 
 SAME = 1e-9
 """Commands nearer to each other than this, m, are the same command."""
@@ -187,11 +187,9 @@ def _collect_stations(
 
 def _check_reach(limits: LimitTable, pose: Pose, lengths: np.ndarray, reading: Reading) -> None:
     """Refuse a commanded pose that the machine cannot have taken."""
-    arrays = (limits.stroke, limits.cone_axes, limits.cone_cosines, limits.scalars)
-    finding, strut, value, _ = check_stage(*limits.geometry.kernel_joints, pose.position, pose.rotation,
-                                           lengths, arrays)  # fmt: skip
-    if finding != WITHIN:
-        problem = f"the commanded pose is out of the machine's reach: {limits.error(finding, strut, 0, value)}"
+    refusal = limits.refusal(pose.position, pose.rotation, lengths)
+    if refusal is not None:
+        problem = f"the commanded pose is out of the machine's reach: {refusal}"
         raise InputFileError(reading.source.file, _line(reading), problem)
 
 
@@ -200,7 +198,7 @@ def _sense(
 ) -> np.ndarray:
     """Return the directions of motion at a station, shape (9,); `came_from` is the station before."""
     if direction in (FORWARD, BACKWARD):
-        return senses(geometry, pose, direction * run.axis)
+        return Passes(pose.position[None], pose.rotation[None], direction * run.axis[None]).senses(geometry)[0]
     if came_from is not None:
         change = np.concatenate([pose.position - came_from[0], commands - came_from[2]])
         return np.sign(change) * (np.abs(change) > SAME)

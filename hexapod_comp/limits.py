@@ -55,6 +55,15 @@ class LimitTable:
             ]
         )
 
+    def refusal(
+        self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray
+    ) -> LimitError | KinematicsError | None:
+        """Return why the nominal machine may not stand in a pose with its strut lengths, or None if it may."""
+        arrays = (self.stroke, self.cone_axes, self.cone_cosines, self.scalars)
+        joints = self.geometry.kernel_joints
+        finding, strut, value, _ = check_stage(*joints, position, rotation, lengths, arrays)
+        return None if finding == WITHIN else self.error(finding, strut, 0, value)
+
     def error(self, code: int, strut: int, stage: int, value: float) -> LimitError | KinematicsError:
         """Return the error for a finding: which limit, which strut, found and allowed value with units."""
         limits, which = self.geometry.limits, STAGES[stage]

@@ -26,6 +26,7 @@ from .exporting import Travel
 from .geometry import STRUT_NAMES
 from .machine import RealMachine
 from .struts import LEAD, TWIST_HOME, command_for_length, screw_twist
+from .travel import Passes
 
 MOST_POINTS = 256
 """EMCMOT_COMP_SIZE."""
@@ -159,9 +160,9 @@ def _side(machine: RealMachine, box: np.ndarray) -> np.ndarray:
     if not geometry.screw_lead.any():
         return np.ones(6)
     nodes = _box_nodes(box, 5)
-    level = Travel(nodes, np.tile(np.eye(3), (len(nodes), 1, 1)), np.zeros_like(nodes))
+    level = Passes.of_tool(geometry, nodes, np.tile(np.eye(3), (len(nodes), 1, 1)), np.zeros_like(nodes))
     cosines = np.empty((len(nodes), 6))
-    for row, pose in enumerate(zip(*level.platform(geometry), strict=True)):
+    for row, pose in enumerate(zip(level.positions, level.rotations, strict=True)):
         cosines[row] = np.cos([screw_twist(*machine.body, *pose, i) for i in range(6)])
     side = np.where(np.cos(machine.strut_arrays[0][:, TWIST_HOME]) > 0.0, 1.0, -1.0)
     nearest = (side * cosines).min(axis=0)

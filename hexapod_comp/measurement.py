@@ -20,7 +20,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .geometry import HexapodGeometry
-from .kinematics import Structure, jacobian
 from .machine import REFERENCE_TEMPERATURE, Temperatures
 from .pose import Pose
 
@@ -267,13 +266,3 @@ def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:
         Rotation matrices.
     """
     return Rotation.from_matrix(actual @ np.swapaxes(commanded, -1, -2)).as_rotvec()
-
-
-def senses(geometry: HexapodGeometry, pose: Pose, direction: np.ndarray) -> np.ndarray:
-    """Return the directions of motion, shape (9,), of a platform that passes a pose in a direction (3,).
-
-    Axes along which it does not move have none (0: the mean of both); the struts' come from the Jacobian.
-    """
-    speeds = jacobian(Structure.of(geometry), pose)[:, :3] @ direction
-    moving = np.concatenate([direction, speeds])
-    return np.sign(moving) * (np.abs(moving) > 1e-9)

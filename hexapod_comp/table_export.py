@@ -22,7 +22,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from .errors import InputFileError, ModelError, OutsideFieldError
-from .exporting import DIAGONAL, Travel, at, nominal_commands, senses, within_limits
+from .exporting import DIAGONAL, Travel, refuse_unreachable
 from .files import write_text_atomically
 from .geometry import HexapodGeometry
 from .kinematics import Structure, solve_pose
@@ -31,6 +31,7 @@ from .model_file import DIRECTIONS
 from .motion import MotionState
 from .pose import Pose
 from .tables import Table
+from .travel import Passes, at, nominal_commands
 
 POSITION = ("x", "y", "z")
 CORRECTION = tuple(f"correction_L{i}" for i in range(1, 7))
@@ -160,9 +161,7 @@ def make_table(
     places = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)
     level = np.tile(np.eye(3), (2 * len(places), 1, 1))
     travel = Travel(np.tile(places, (2, 1)), level, np.repeat([DIAGONAL, -DIAGONAL], len(places), axis=0))
-    _, refused = within_limits(geometry, travel)
-    if refused is not None:
-        raise refused
+    refuse_unreachable(geometry, travel)
     carried, left_out = _without_fine_waves(model, step)
     machine = RealMachine(geometry, carried)
     held = _outside_field(machine, travel)
@@ -202,22 +201,24 @@ def _outside_field(machine: RealMachine, travel: Travel) -> int:
     """
     field = machine.model.field
     low, high = field.box + np.array([[-EDGE], [EDGE]])
-    positions, rotations = travel.platform(machine.geometry)
-    points = positions + rotations @ field.probe
+    passes = travel.passes(machine.geometry)
+    points = passes.points(field.probe)
     outside = ((points < low) | (points > high)).any(axis=1)
     if outside.any() and field.outside == "refuse":
         row, corners = int(outside.argmax()), (field.box * 1e3).tolist()
-        problem = f"{at(positions[row])}: the measured point is outside the field's box {corners} mm"
+        problem = f"{at(passes.positions[row])}: the measured point is outside the field's box {corners} mm"
         raise OutsideFieldError(problem, points[row], field.box)
     return int(outside.sum())
 
 
 def _strut_corrections(machine: RealMachine, travel: Travel) -> tuple[np.ndarray, np.ndarray]:
     """Return corrections without backlash, shape (N, 6), and backlash, shape (N, 6), m."""
-    nominal = nominal_commands(machine.geometry, travel)
+    passes = travel.passes(machine.geometry)
+    nominal = nominal_commands(machine.geometry, passes)
     found = np.empty((3, *nominal.shape))
-    for row, pose in enumerate(zip(*travel.platform(machine.geometry), strict=True)):
-        target, along = Pose(*pose), np.sign(machine.geometry.work.rotation @ travel.directions[row])
+    for row in range(len(passes)):
+        target = Pose(passes.positions[row], passes.rotations[row])
+        along = np.sign(passes.directions[row])
         for k, sense in enumerate((0.0, 1.0, -1.0)):
             motion = MotionState()
             motion.sense[:] = np.concatenate([along, np.full(6, sense)])
@@ -228,10 +229,12 @@ def _strut_corrections(machine: RealMachine, travel: Travel) -> tuple[np.ndarray
 def _pose_corrections(geometry: HexapodGeometry, travel: Travel, corrections: np.ndarray) -> np.ndarray:
     """Return the changes of the commanded tool pose, shape (N, 6), that amount to strut corrections (N, 6)."""
     structure = Structure.of(geometry)
-    lengths = nominal_commands(geometry, travel) + corrections
+    passes = travel.passes(geometry)
+    lengths = nominal_commands(geometry, passes) + corrections
     changes = np.empty((len(lengths), 6))
-    for row, pose in enumerate(zip(*travel.platform(geometry), strict=True)):
-        told = geometry.work.inverse() @ solve_pose(structure, lengths[row], Pose(*pose)) @ geometry.tool
+    for row in range(len(passes)):
+        commanded = Pose(passes.positions[row], passes.rotations[row])
+        told = geometry.work.inverse() @ solve_pose(structure, lengths[row], commanded) @ geometry.tool
         changes[row, :3] = told.position - travel.positions[row]
         changes[row, 3:] = Rotation.from_matrix(told.rotation @ travel.rotations[row].T).as_rotvec()
     return changes
@@ -242,16 +245,18 @@ def _pose_corrections(geometry: HexapodGeometry, travel: Travel, corrections: np
 
 def commands_by_struts(table: GridTable, geometry: HexapodGeometry, travel: Travel) -> np.ndarray:
     """Return strut commands, shape (N, 6), m: nominal lengths plus strut corrections, backlash by each strut."""
-    own = senses(Structure.of(geometry), geometry, travel)[:, 3:]
+    passes = travel.passes(geometry)
+    own = passes.senses(geometry)[:, 3:]
     corrections = table.strut_corrections(travel.positions, travel.directions[:, 0] < 0.0, own)
-    return nominal_commands(geometry, travel) + corrections
+    return nominal_commands(geometry, passes) + corrections
 
 
 def commands_by_poses(table: GridTable, geometry: HexapodGeometry, travel: Travel) -> np.ndarray:
     """Return strut commands, shape (N, 6), m: nominal lengths of the corrected tool poses."""
     changes = table.pose_corrections(travel.positions, travel.directions[:, 0] < 0.0)
     rotations = Rotation.from_rotvec(changes[:, 3:]).as_matrix() @ travel.rotations
-    return nominal_commands(geometry, Travel(travel.positions + changes[:, :3], rotations, travel.directions))
+    told = Passes.of_tool(geometry, travel.positions + changes[:, :3], rotations, travel.directions)
+    return nominal_commands(geometry, told)
 
 
 # Files

@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.calibration.evaluation import INCH, Passes, held_out, paper_metric, random_passes, run, worth
+from hexapod_comp.calibration.evaluation import INCH, held_out, paper_metric, run, worth
 from hexapod_comp.errors import ModelError
 from hexapod_comp.field import GridField
 from hexapod_comp.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.imperfections import ImperfectionBounds, draw_model
+from hexapod_comp.kinematics import Structure, jacobian
 from hexapod_comp.machine import MachineModel, RealMachine, Temperatures
-from hexapod_comp.measurement import senses
 from hexapod_comp.motion import MotionState
 from hexapod_comp.paths import config_file
 from hexapod_comp.pose import Pose
 from hexapod_comp.struts import StrutErrors
+from hexapod_comp.travel import Passes, random_passes
 
 BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])
 BOUNDS = ImperfectionBounds(joint=1e-4, strut_offset=1e-4, pitch=1e-4, wave=(4e-6, 4e-6), backlash=(3e-6, 5e-6))
@@ -102,7 +103,7 @@ def test_temperatures_seen_and_not_seen(geometry):
 
 
 def test_all_passes_at_once_are_the_machine_one_by_one(framed):
-    """The objects' way, pose by pose, with directions from measurement.senses."""
+    """The objects' way, pose by pose; a strut's direction is the sign of its speed, from the Jacobian."""
     truth = RealMachine(framed, draw_model(framed, BOUNDS, 5))
     model = draw_model(framed, BOUNDS, 6)
     passes = random_passes(framed, BOX * 0.5 + np.array([0.0, 0.0, 0.1]), 20, 0.1, np.random.default_rng(0))
@@ -111,7 +112,8 @@ def test_all_passes_at_once_are_the_machine_one_by_one(framed):
     for n in range(len(passes)):
         pose = Pose(passes.positions[n], passes.rotations[n])
         motion = MotionState()
-        motion.sense[:] = senses(framed, pose, passes.directions[n])
+        speeds = jacobian(Structure.of(framed), pose)[:, :3] @ passes.directions[n]
+        motion.sense[:] = np.sign(np.concatenate([passes.directions[n], speeds]))
         assert (found[n] == motion.sense).all()
         commands = believed.commands_for(pose, motion)[0]
         actual = truth.pose_for(commands, motion.sense, pose)[0]

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from strategies import PAPER_FILE, paper_geometry, random_model, skewed_geometry
 
 from hexapod_comp.errors import GeometryError, HexapodError, InputFileError, LimitError, ModelError, OutsideFieldError
-from hexapod_comp.exporting import ExportTrial, Travel, commanded_box, draw_travel, nominal_commands
+from hexapod_comp.exporting import ExportTrial, Travel, commanded_box, draw_travel
 from hexapod_comp.field import GridField, no_field
 from hexapod_comp.geometry import HexapodGeometry
 from hexapod_comp.linuxcnc_export import Genhexkins, make_genhexkins, table_misfit
@@ -35,6 +35,7 @@ from hexapod_comp.table_export import (
     read_table,
     write_table,
 )
+from hexapod_comp.travel import nominal_commands
 from hexapod_comp.verbs import export
 
 MACHINE_FILE = PAPER_FILE.with_name("paper_machine.yaml")
@@ -202,7 +203,7 @@ def test_paper_machine_keeps_its_field_only(tmp_path: Path) -> None:
 def test_tilt_out_of_reach_is_not_driven() -> None:
     geometry = paper_geometry()
     trial = ExportTrial(geometry, paper_machine(), PAPER_BOX, 20, tilt=1.5)
-    check = trial.check(lambda travel: nominal_commands(geometry, travel))
+    check = trial.check(lambda travel: nominal_commands(geometry, travel.passes(geometry)))
     assert check.tilted is None
     assert check.level.after == check.level.before
 

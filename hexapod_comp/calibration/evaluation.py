@@ -12,79 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .. import kernels
-from ..errors import ModelError, NotConvergedError
+from ..errors import ModelError
 from ..field import CROSS_AXES
 from ..geometry import HexapodGeometry
-from ..kinematics import Structure, forward_error, strut_lengths_batch
 from ..machine import MachineModel, RealMachine, Temperatures
-from ..machine_kernels import command_one
-from ..motion import FOLLOWED
-from ..pose import rotation_from_angles
+from ..travel import BOTH_WAYS, Passes, drive, model_commands, nominal_commands, random_passes
 
 INCH = 0.0254
-
-LEAST_SPEED = 1e-9
-"""Below this share of the travel an axis or a strut stands still (as in :mod:`..measurement`)."""
-
-BOTH_WAYS = (1.0, -1.0)
-"""Forward, backward."""
-
-
-@dataclass(frozen=True)
-class Passes:
-    """Platform poses that a machine is sent through, each in a direction; what a run of it starts from.
-
-    Attributes
-    ----------
-    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
-        Commanded ``pose_platform_in_base``, m.
-    directions : ndarray, shape (N, 3)
-        Directions of travel in ``base``; length does not matter.
-    """
-
-    positions: np.ndarray
-    rotations: np.ndarray
-    directions: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.positions)
-
-    @staticmethod
-    def of_tool(
-        geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, directions: np.ndarray
-    ) -> Passes:
-        """Return the passes that bring the tool to poses in the work frame.
-
-        Parameters
-        ----------
-        geometry : HexapodGeometry
-            With its tool and work frames.
-        positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
-            ``pose_tool_in_work``, m.
-        directions : ndarray, shape (N, 3)
-            Directions of travel in the work frame.
-        """
-        work, tool = geometry.work, geometry.tool
-        platform = work.rotation @ rotations @ tool.rotation.T
-        tips = work.position + positions @ work.rotation.T
-        return Passes(tips - platform @ tool.position, platform, directions @ work.rotation.T)
-
-    def points(self, probe: np.ndarray) -> np.ndarray:
-        """Return where a point of ``platform``, shape (3,), is told to be, shape (N, 3), m in ``base``."""
-        return self.positions + self.rotations @ probe
-
-    def senses(self, geometry: HexapodGeometry) -> np.ndarray:
-        """Return the directions of motion of axes and struts, shape (N, 9), each −1, 0 or 1.
-
-        All passes at once what :func:`hexapod_comp.measurement.senses` says of one.
-        """
-        struts = self.positions[:, None] + geometry.platform_joints @ np.swapaxes(self.rotations, 1, 2)
-        struts -= geometry.base_joints
-        struts /= np.linalg.norm(struts, axis=2, keepdims=True)
-        speeds = np.einsum("nij,nj->ni", struts, self.directions)
-        moving = np.concatenate([self.directions, speeds], axis=1)
-        return np.sign(moving) * (np.abs(moving) > LEAST_SPEED)
 
 
 def run(
@@ -112,36 +46,12 @@ def run(
     KinematicsError
         As :func:`hexapod_comp.kinematics.solve_pose`.
     """
-    senses = passes.senses(truth.geometry)
     if model is None:
-        commands = strut_lengths_batch(Structure.of(truth.geometry), passes.positions, passes.rotations)
+        commands = nominal_commands(truth.geometry, passes)
     else:
-        commands = _commands(RealMachine(truth.geometry, model, sensed), passes, senses)
-    positions, rotations = np.empty((len(passes), 3)), np.empty((len(passes), 3, 3))
-    for n in range(len(passes)):
-        guess = passes.positions[n].copy(), passes.rotations[n].copy()
-        outcome, _, condition, _ = truth.forward(commands[n], senses[n], *guess, positions[n], rotations[n])
-        if outcome != kernels.OK:
-            raise forward_error(outcome, condition, truth.structure.max_condition)
-    return positions, rotations
-
-
-def _commands(believed: RealMachine, passes: Passes, senses: np.ndarray) -> np.ndarray:
-    """Return the strut commands of a model for some passes, shape (N, 6), m.
-
-    :meth:`RealMachine.commands_for` without its objects: a study asks for millions.
-    """
-    commands = np.empty((len(passes), 6))
-    low, sense = np.empty(FOLLOWED), np.empty(FOLLOWED)
-    position, rotation = np.empty(3), np.empty((3, 3))
-    arrays = believed.body, believed.strut_arrays, believed.field_arrays
-    for n in range(len(passes)):
-        low[:], sense[:] = np.nan, senses[n]  # no window yet: the direction is the one given
-        at = np.ascontiguousarray(passes.positions[n]), np.ascontiguousarray(passes.rotations[n])
-        solved, _ = command_one(*at, believed.thresholds, low, sense, *arrays, position, rotation, commands[n])
-        if not solved:
-            raise NotConvergedError("the error field is too steep to be undone at this pose")
-    return commands
+        commands = model_commands(RealMachine(truth.geometry, model, sensed), passes)
+    driven = drive(truth, passes, commands)
+    return driven.positions, driven.rotations
 
 
 @dataclass(frozen=True)
@@ -215,19 +125,6 @@ def held_out(
     turned = Rotation.from_matrix(rotations @ np.swapaxes(passes.rotations, 1, 2))
     rotation = _length((turned.mean().inv() * turned).as_rotvec())
     return HeldOut(points, _rms(_length(actual - wanted)), _rms(left), float(left.max()), _rms(rotation))
-
-
-def random_passes(
-    geometry: HexapodGeometry, box: np.ndarray, points: int, tilt: float, rng: np.random.Generator
-) -> Passes:
-    """Return passes through random points of a box of the work frame: all one way, then all back."""
-    positions = rng.uniform(box[0], box[1], (points, 3))
-    directions = rng.standard_normal((points, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    tilts = np.append(rng.uniform(-tilt, tilt, (points, 2)), np.zeros((points, 1)), axis=1)
-    there_and_back = np.concatenate([way * directions for way in BOTH_WAYS])
-    rotations = rotation_from_angles(tilts)
-    return Passes.of_tool(geometry, np.tile(positions, (2, 1)), np.tile(rotations, (2, 1, 1)), there_and_back)
 
 
 def align(actual: np.ndarray, wanted: np.ndarray) -> np.ndarray:

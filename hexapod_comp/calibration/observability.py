@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..kinematics import Structure, strut_lengths
-from ..limits import WITHIN, LimitTable, check_stage
 from ..machine import REFERENCE_TEMPERATURE, Temperatures
-from ..measurement import Stations, senses
-from ..pose import Pose, rotation_from_angles
+from ..measurement import Stations
+from ..pose import rotation_from_angles
+from ..travel import BOTH_WAYS, Passes, nominal_commands
 from .joint import LinearProblem, Posterior, physical_covariance
 from .sensitivity import derivatives, predict
 from .space import ParameterSpace
@@ -310,26 +309,20 @@ def box_stations(space: ParameterSpace, tilt: float = 0.0) -> Stations | None:
     headings = rng.uniform(0.0, 2.0 * np.pi, POINTS)
     angles = tilt * np.stack([np.cos(headings), np.sin(headings), np.zeros(POINTS)], axis=1)
     rotations = rotation_from_angles(angles)
-    every = [Pose(p - r @ space.probe, r) for p, r in zip(points, rotations, strict=True)]
-    nominal, limits = Structure.of(space.geometry), LimitTable(space.geometry)
-    reachable = [_reachable(limits, nominal, pose) for pose in every]
-    poses = [pose for pose, is_reachable in zip(every, reachable, strict=True) if is_reachable]
-    if not poses:
+    every = Passes(points - rotations @ space.probe, rotations, directions)
+    reachable = np.array([refusal is None for refusal in every.refusals(space.geometry)])
+    if not reachable.any():
         return None
-    passed = list(zip(poses, directions[reachable], strict=True))
-    lengths = np.array([strut_lengths(nominal, pose) for pose in poses])
-    sense = [senses(space.geometry, pose, way * direction) for way in (1.0, -1.0) for pose, direction in passed]
-    return Stations(
-        positions=np.tile([pose.position for pose in poses], (2, 1)),
-        rotations=np.tile([pose.rotation for pose in poses], (2, 1, 1)),
-        commands=np.tile(lengths, (2, 1)),
-        sense=np.array(sense),
-        temperatures=np.full((2 * len(poses), len(Temperatures.NAMES)), REFERENCE_TEMPERATURE),
+    there = every.select(reachable)
+    passes = Passes(
+        np.tile(there.positions, (2, 1)),
+        np.tile(there.rotations, (2, 1, 1)),
+        np.concatenate([way * there.directions for way in BOTH_WAYS]),
     )
-
-
-def _reachable(limits: LimitTable, nominal: Structure, pose: Pose) -> bool:
-    arrays = (limits.stroke, limits.cone_axes, limits.cone_cosines, limits.scalars)
-    joints = limits.geometry.kernel_joints
-    finding = check_stage(*joints, pose.position, pose.rotation, strut_lengths(nominal, pose), arrays)[0]
-    return bool(finding == WITHIN)
+    return Stations(
+        positions=passes.positions,
+        rotations=passes.rotations,
+        commands=nominal_commands(space.geometry, passes),
+        sense=passes.senses(space.geometry),
+        temperatures=np.full((len(passes), len(Temperatures.NAMES)), REFERENCE_TEMPERATURE),
+    )
