@@ -115,8 +115,8 @@ def _check_readings(readings: Sequence[Reading]) -> None:
             raise InputFileError(r.source.file, _line(r), f"channel must be one of {', '.join(CHANNELS)}", r.channel)
         if not np.isfinite(r.value):
             raise InputFileError(r.source.file, _line(r), "value must be finite", r.value)
-        if r.uncertainty <= 0.0:
-            raise InputFileError(r.source.file, _line(r), "uncertainty must be above zero", r.uncertainty)
+        if r.uncertainty <= 0.0 or np.isinf(r.uncertainty):
+            raise InputFileError(r.source.file, _line(r), "uncertainty must be finite and above zero", r.uncertainty)
 
 
 def _line(reading: Reading) -> str:

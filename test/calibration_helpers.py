@@ -6,7 +6,8 @@ The box is the paper's, but its lines stand 8 inches apart and are read every 2 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,10 +18,11 @@ from hexapod_comp.gathering import assemble
 from hexapod_comp.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.imperfections import ImperfectionBounds, draw_model
 from hexapod_comp.machine import MachineModel, RealMachine
-from hexapod_comp.measurement import AXES, FROM_PREVIOUS, MeasurementSet, Reading, Source, senses
+from hexapod_comp.measurement import AXES, FROM_PREVIOUS, MeasurementSet, Reading, Source
 from hexapod_comp.motion import MotionState
 from hexapod_comp.paths import config_file
 from hexapod_comp.pose import Pose
+from hexapod_comp.travel import Passes
 from hexapod_comp.virtual_instruments import measure
 
 INCH = 0.0254
@@ -31,12 +33,16 @@ BOUNDS = ImperfectionBounds(joint=1e-4, strut_offset=1e-4, pitch=1e-4, wave=(4e-
 """Machine B of the calibration bars."""
 
 SETTINGS = Settings(lead=LEAD, field_degree=3)
+"""Everything that there is, the field kept small."""
 
-TOLERABLE = (8, 20.0)
-"""Number of temperatures of a station, and the one that changes nothing, °C."""
+FEW = replace(SETTINGS, blocks=("pitch", "wave", "backlash"))
+"""The blocks that machine B has."""
+
+NEUTRAL = (20.0,) * 8
+"""Temperatures that change nothing, °C."""
 
 
-@lru_cache
+@cache
 def paper() -> HexapodGeometry:
     """Return the paper's machine."""
     return load_geometry(config_file("paper.yaml"))
@@ -70,11 +76,13 @@ def true_parameters(space: ParameterSpace, truth: MachineModel) -> np.ndarray:
     return np.concatenate([part for block in space.blocks for part in known[block.name]])
 
 
-def tool_error(truth: RealMachine, model: MachineModel | None, seed: int = 5, count: int = 300) -> tuple[float, float]:
+def tool_error(
+    truth: RealMachine, model: MachineModel | None, box: np.ndarray = BOX, seed: int = 5, count: int = 300
+) -> tuple[float, float]:
     """Return the RMS tool error that a model's compensation leaves on the machine itself.
 
     Displacement of the platform's origin (m) and rotation (rad) at random level poses in the box, passed
-    forward and backward along the space diagonal; shift and rotation of the datum aligned with Kabsch's method.
+    there and back in a random direction; shift and rotation of the datum aligned with Kabsch's method.
 
     Parameters
     ----------
@@ -82,11 +90,15 @@ def tool_error(truth: RealMachine, model: MachineModel | None, seed: int = 5, co
         The machine.
     model : MachineModel or None
         What the compensator believes; None commands nominal lengths.
+    box : ndarray, shape (2, 3)
+        Corners of the box, m in ``base``.
     """
-    wanted = np.tile(np.random.default_rng(seed).uniform(*BOX, (count, 3)), (2, 1))
-    sense = np.repeat([1.0, -1.0], count)
+    rng = np.random.default_rng(seed)
+    wanted = np.tile(rng.uniform(*box, (count, 3)), (2, 1))
+    ways = rng.standard_normal((count, 3))
     believed = RealMachine(truth.geometry, model or MachineModel(truth.geometry.name))
-    actual = [_reached(truth, believed, Pose(p, np.eye(3)), s) for p, s in zip(wanted, sense, strict=True)]
+    passed = zip(wanted, np.vstack([ways, -ways]), strict=True)
+    actual = [_reached(truth, believed, Pose(p, np.eye(3)), way) for p, way in passed]
     points = np.array([pose.position for pose in actual])
     centred, around = wanted - wanted.mean(axis=0), points - points.mean(axis=0)
     turn, _ = Rotation.align_vectors(centred, around)
@@ -96,8 +108,8 @@ def tool_error(truth: RealMachine, model: MachineModel | None, seed: int = 5, co
     return float(np.sqrt((left**2).sum(axis=1).mean())), float(np.sqrt((turns**2).sum(axis=1).mean()))
 
 
-def _reached(truth: RealMachine, believed: RealMachine, target: Pose, way: float) -> Pose:
-    sense = senses(truth.geometry, target, np.full(3, way))
+def _reached(truth: RealMachine, believed: RealMachine, target: Pose, way: np.ndarray) -> Pose:
+    sense = Passes(target.position[None], target.rotation[None], way[None]).senses(truth.geometry)[0]
     commands, _, _ = believed.commands_for(target, MotionState(sense=sense.copy()))
     return truth.pose_for(commands, sense, target)[0]
 
@@ -109,8 +121,7 @@ def scattered(
     probe: np.ndarray | None = None,
 ) -> MeasurementSet:
     """Return absolute readings, all zero, at poses that the machine took one after the other."""
-    count, neutral = TOLERABLE
-    temperatures = temperatures or [(neutral,) * count] * len(poses)
+    temperatures = temperatures or [NEUTRAL] * len(poses)
     readings = [
         Reading("poses", 1, FROM_PREVIOUS, pose, f"{kind}_{axis}", 0.0, temperatures=warmth, source=Source("test", n))
         for n, (pose, warmth) in enumerate(zip(poses, temperatures, strict=True))

@@ -35,17 +35,33 @@ def unit_box(points: np.ndarray, box: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(points[:, a], box[:, a], (-1.0, 1.0)) for a in range(3)])
 
 
+def series(powers: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return coefficients as NumPy's three-dimensional Legendre series takes them, shape (5, 5, 5)."""
+    result = np.zeros((5, 5, 5))
+    result[tuple(powers.T)] = values
+    return result
+
+
+def random_field(field: SmoothField, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return a field of 5 µm and 20 µrad as its prior expects it, forward and backward 1 µm and 1 µrad apart."""
+    size = np.repeat([5e-6, 20e-6], 3)[:, None] * field.prior
+    reversal = 1e-6 * field.reversal_prior * rng.standard_normal((3, 6, len(field.reversal_powers)))
+    return size * rng.standard_normal((6, len(field.powers))), reversal
+
+
 def test_smooth_field_is_the_legendre_series():
     """NumPy's legval3d sums the same series; both round some fifty products of values below 1e-5."""
     rng = np.random.default_rng(1)
     field = SmoothField(BOX, 4)
-    coefficients = rng.uniform(-1e-5, 1e-5, (6, len(field.powers)))
+    mean, reversal = random_field(field, rng)
     points = rng.uniform(*BOX, (40, 3))
-    found = field.evaluate(coefficients, points)
+    sense = rng.choice([-1.0, 0.0, 1.0], (40, 3))
+    found = field.evaluate(mean, reversal, points, sense)
     for component in range(6):
-        series = np.zeros((5, 5, 5))
-        series[tuple(field.powers.T)] = coefficients[component]
-        wanted = legendre.legval3d(*unit_box(points, BOX), series)
+        wanted = legendre.legval3d(*unit_box(points, BOX), series(field.powers, mean[component]))
+        for axis in range(3):
+            turning = series(field.reversal_powers, reversal[axis, component])
+            wanted += 0.5 * sense[:, axis] * legendre.legval3d(*unit_box(points, BOX), turning)
         np.testing.assert_allclose(found[:, component], wanted, atol=1e-18)
 
 
@@ -72,25 +88,34 @@ def test_terms_are_named_by_their_powers():
 
 def test_outside_its_box_the_field_holds():
     field = SmoothField(BOX, 3)
-    coefficients = np.random.default_rng(2).uniform(-1e-5, 1e-5, (6, len(field.powers)))
+    coefficients = random_field(field, np.random.default_rng(2))
     beyond = np.array([[0.5, 0.1, 0.4], [0.0, -1.0, 0.9]])
     held = np.clip(beyond, BOX[0], BOX[1])
-    assert (field.evaluate(coefficients, beyond) == field.evaluate(coefficients, held)).all()
+    assert (field.evaluate(*coefficients, beyond, np.ones((2, 3)))
+            == field.evaluate(*coefficients, held, np.ones((2, 3)))).all()  # fmt: skip
 
 
-@pytest.mark.parametrize("degree", [1, 3, 6])
-def test_grid_field_is_the_same_field(degree: int):
-    """Stated: 10 nm and 10 nrad at 500 points of its own; a few times that at other points."""
+def grid_difference(field: SmoothField, coefficients: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Return the largest difference between a field and its grid at random points and directions, shape (6,)."""
     rng = np.random.default_rng(3)
+    points = rng.uniform(*field.box, (400, 3))
+    sense = rng.choice([-1.0, 0.0, 1.0], (400, 3))
+    grid = field.as_grid(*coefficients)
+    found = np.array([grid.evaluate(p, s)[0] for p, s in zip(points, sense, strict=True)])
+    return np.abs(found - field.evaluate(*coefficients, points, sense)).max(axis=0)
+
+
+@pytest.mark.parametrize(("degree", "allowed"), [(1, GRID_TOLERANCE), (3, GRID_TOLERANCE), (6, 100e-9)])
+def test_grid_field_is_the_same_field(degree: int, allowed: float):
+    """Stated: 30 nm and 30 nrad at points of its own; twice that elsewhere.
+
+    A field of degree 6 would need more lines than a model file should carry. A tenth of what lasers resolve is
+    allowed there: 0.1 µm, and twice as many µrad.
+    """
     field = SmoothField(BOX, degree)
-    size = np.repeat([5e-6, 20e-6], 3)[:, None] * field.prior
-    coefficients = size * rng.standard_normal((6, len(field.powers)))
-    grid = field.as_grid(coefficients)
-    points = rng.uniform(*BOX, (300, 3))
-    found = np.array([grid.evaluate(p, sense)[0] for p in points for sense in ([1, -1, 0], [-1, 1, 1])])
-    difference = np.abs(found - np.repeat(field.evaluate(coefficients, points), 2, axis=0)).max(axis=0)
-    assert (difference <= 3.0 * np.repeat(GRID_TOLERANCE, 3)).all()
-    np.testing.assert_allclose(grid.box, BOX, atol=1e-15)
+    coefficients = random_field(field, np.random.default_rng(4))
+    assert (grid_difference(field, coefficients) <= np.repeat([allowed, 2.0 * allowed], 3)).all()
+    np.testing.assert_allclose(field.as_grid(*coefficients).box, BOX, atol=1e-15)
 
 
 @pytest.mark.parametrize("flat", [[2], [0, 1], [0, 1, 2]])
@@ -101,10 +126,12 @@ def test_flat_boxes_carry_no_power_across(flat: list[int]):
     field = SmoothField(box, 3)
     assert not field.powers[:, flat].any()
     assert len(field.powers) == {1: 10, 2: 4, 3: 1}[len(flat)]
-    coefficients = np.random.default_rng(4).uniform(-1e-6, 1e-6, (6, len(field.powers)))
-    points = np.random.default_rng(5).uniform(box[0], box[1], (20, 3))
-    found = np.array([field.as_grid(coefficients).evaluate(p, np.zeros(3))[0] for p in points])
-    np.testing.assert_allclose(found, field.evaluate(coefficients, points), atol=1e-8)
+    coefficients = random_field(field, np.random.default_rng(5))
+    points = np.random.default_rng(6).uniform(box[0], box[1], (20, 3))
+    grid = field.as_grid(*coefficients)
+    found = np.array([grid.evaluate(p, np.ones(3))[0] for p in points])
+    wanted = field.evaluate(*coefficients, points, np.ones((20, 3)))
+    np.testing.assert_allclose(found, wanted, atol=2.0 * GRID_TOLERANCE)
 
 
 def test_boxes_flat_but_for_rounding_are_flat():
@@ -112,15 +139,16 @@ def test_boxes_flat_but_for_rounding_are_flat():
     box = BOX.copy()
     box[1, 2] = box[0, 2] + 2e-16
     field = SmoothField(box, 3)
-    grid = field.as_grid(np.full((6, len(field.powers)), 1e-6))
+    assert not field.powers[:, 2].any()
+    grid = field.as_grid(*random_field(field, np.random.default_rng(7)))
     assert np.isfinite(grid.evaluate(box[0], np.zeros(3))[0]).all()
 
 
 def test_vector_names_and_sizes(space: ParameterSpace):
     """Twelve joints (three shared ones on the platform) and six offsets are 33; every parameter has a name."""
     sizes = {block.name: len(block.labels) for block in space.blocks}
-    knots, terms = len(space.knots), len(space.field.terms)
-    expected = (33, 6, 12, 6, 6 * knots, 3 * terms, 3 * terms)
+    knots, terms, turning = len(space.knots), len(space.field.terms), len(space.field.reversal_terms)
+    expected = (33, 6, 12, 6, 6 * knots, 3 * terms, 3 * terms, 18 * turning)
     assert sizes == dict(zip(BLOCKS, expected, strict=True))
     labels = [label for block in space.blocks for label in block.labels]
     assert len(set(labels)) == space.size == sum(sizes.values())
@@ -170,7 +198,9 @@ def test_priors_drawn_have_their_size(space: ParameterSpace):
     spread = space.spread(space.start_tolerances())
     drawn = space.physical(spread[:, None] * rng.standard_normal((space.size, 4000))).std(axis=1)
     for block, tolerance in zip(space.blocks, space.start_tolerances(), strict=True):
-        relative = np.tile(space.field.prior, 3) if block.name.startswith("field") else 1.0
+        priors = {"field displacement": space.field.prior, "field rotation": space.field.prior,
+                  "field reversal": space.field.reversal_prior}  # fmt: skip
+        relative = np.resize(priors.get(block.name, [1.0]), len(block.labels))
         np.testing.assert_allclose(drawn[block.part], tolerance * relative, rtol=0.055, atol=0)
 
 

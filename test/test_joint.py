@@ -1,7 +1,7 @@
 """Scheme `joint`: cells, nuisances, the linear solver against textbook least squares, whole fits against the truth."""
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache
 
 import calibration_helpers as small
 import numpy as np
@@ -12,33 +12,35 @@ from hexapod_comp.calibration.joint import (
     HYPER,
     JointProblem,
     LinearProblem,
-    Posterior,
     held_out,
     physical_covariance,
     solve,
 )
 from hexapod_comp.calibration.joint_fit import JointFit, fit_joint
-from hexapod_comp.calibration.space import ParameterSpace, Settings
+from hexapod_comp.calibration.space import BLOCKS, ParameterSpace, Settings
 from hexapod_comp.campaign import template
 from hexapod_comp.errors import CalibrationError
+from hexapod_comp.imperfections import ImperfectionBounds
 from hexapod_comp.machine import RealMachine
-from hexapod_comp.measurement import CHANNELS, KINDS, UNKNOWN, MeasurementSet, Reading, Source
+from hexapod_comp.measurement import CHANNELS, KINDS, MeasurementSet, Source
 from hexapod_comp.pose import Pose
+from hexapod_comp.virtual_instruments import station_errors
 
-FEW = replace(small.SETTINGS, blocks=("pitch", "wave", "backlash"))
+FEW = small.FEW
+SOME = replace(FEW, blocks=(*FEW.blocks, "field displacement", "field rotation"), field_degree=2)
 LINEAR, STRAIGHTNESS, ROTATION, POSITION, ATTITUDE = range(len(KINDS))
 ONES = np.ones(len(KINDS))
 
 
-@lru_cache
+@cache
 def readings(seed: int = 1, instrument: str = "5-D", diagonals: int = 4, cycles: int = 1) -> MeasurementSet:
     plan = small.campaign(instrument, diagonals, cycles=cycles)
     return small.measured(small.virtual_machine(seed), plan, seed)
 
 
-@lru_cache
-def fitted(seed: int, instrument: str = "5-D") -> JointFit:
-    return fit_joint(readings(seed, instrument), small.SETTINGS)
+@cache
+def fitted(seed: int, instrument: str) -> JointFit:
+    return fit_joint(readings(seed, instrument), SOME)
 
 
 def linearised(measurements: MeasurementSet, settings: Settings = FEW) -> tuple[ParameterSpace, LinearProblem]:
@@ -116,7 +118,7 @@ def test_cells_are_left_out_by_line_and_by_pose():
 # ---------------------------------------------------------------- the linear solver
 
 
-@lru_cache
+@cache
 def random_problem(seed: int = 3, count: int = 240) -> tuple[ParameterSpace, LinearProblem, np.ndarray]:
     """Return a problem with random rows and three kinds of readings, and the noise factors that it was made with."""
     space, rng = ParameterSpace(readings(), FEW), np.random.default_rng(seed)
@@ -142,6 +144,7 @@ def problem_of(
         moment=np.array([rows[p].T @ target[p] for p in parts]),
         square=np.array([target[p] @ target[p] for p in parts]),
         freedom=np.array([float(len(p)) for p in parts]),
+        least_noise=np.zeros(len(KINDS)),
     )
 
 
@@ -205,9 +208,7 @@ def test_held_out_lines_are_those_of_fits_without_the_line():
         np.testing.assert_allclose(errors[out], problem.target[out] - problem.rows[out] @ answer.y, atol=1e-6)
 
 
-def log_evidence(
-    space: ParameterSpace, problem: LinearProblem, tolerances: np.ndarray, noise: np.ndarray
-) -> float:
+def log_evidence(space: ParameterSpace, problem: LinearProblem, tolerances: np.ndarray, noise: np.ndarray) -> float:
     """Return the logarithm of the readings' probability with all parameters integrated out."""
     spread = space.spread(tolerances)
     covariance = (problem.rows * spread**2) @ problem.rows.T + np.diag(noise[problem.kind] ** 2)
@@ -278,7 +279,7 @@ def test_parameters_are_as_wrong_as_the_fit_says(instrument: str):
 @pytest.mark.parametrize("seed", [1, 3])
 def test_strut_errors_come_back(seed: int):
     """Backlash and waves within four standard errors each, and these below half a micrometre."""
-    fit, truth = fitted(seed), small.virtual_machine(seed)
+    fit, truth = fitted(seed, "5-D"), small.virtual_machine(seed)
     wrong = fit.solution.x - small.true_parameters(fit.space, truth.model)
     errors = np.sqrt(np.diag(physical_covariance(fit.space, fit.solution.posterior)))
     for name in ("wave", "backlash"):
@@ -301,31 +302,33 @@ def test_tool_error_falls_as_predicted(seed: int, instrument: str):
 
 
 def test_blocks_that_the_machine_has_are_kept_and_no_others():
-    kept = {d.block for d in fitted(1).decisions if d.kept}
-    assert kept == {"pitch", "wave", "backlash"}
-    assert [block.name for block in fitted(1).space.blocks] == ["structure", "pitch", "wave", "backlash"]
+    """All blocks on offer; then a machine of joints alone."""
+    fit = fit_joint(readings(), replace(small.SETTINGS, field_degree=1))
+    assert [d.block for d in fit.decisions] == list(BLOCKS[1:])
+    assert {d.block for d in fit.decisions if d.kept} == {"pitch", "wave", "backlash"}
+    assert [block.name for block in fit.space.blocks] == ["structure", "pitch", "wave", "backlash"]
     bare = replace(small.BOUNDS, pitch=0.0, wave=(0.0, 0.0), backlash=(0.0, 0.0))
-    fit = fit_joint(small.measured(small.virtual_machine(1, bare), small.campaign(), 1), small.SETTINGS)
+    fit = fit_joint(small.measured(small.virtual_machine(1, bare), small.campaign(), 1), SOME)
     assert not any(d.kept for d in fit.decisions)
 
 
-def test_a_smooth_field_and_a_length_map_are_found():
-    """A field of 30 µm and 60 µrad is kept and takes the error down; without it 10 times more is left."""
+def test_a_field_is_found():
+    """A field of 30 µm and 60 µrad, with terms up to degree six, is kept and takes a good part of it away."""
     bounds = replace(small.BOUNDS, field_displacement=30e-6, field_rotation=60e-6, field_box=small.BOX,
                      field_reversal=0.0)  # fmt: skip
     truth = small.virtual_machine(2, bounds)
     ours = small.measured(truth, small.campaign("6-D", 16), 2)
-    fit = fit_joint(ours, small.SETTINGS)
+    fit = fit_joint(ours, replace(SOME, field_degree=3))
     assert {"field displacement", "field rotation"} <= {d.block for d in fit.decisions if d.kept}
     without = fit_joint(ours, FEW)
-    assert small.tool_error(truth, fit.model)[0] < 0.3 * small.tool_error(truth, without.model)[0]
+    assert small.tool_error(truth, fit.model)[0] < 0.7 * small.tool_error(truth, without.model)[0]
 
 
 def test_noise_twice_and_three_times_as_stated_is_found():
     """2 µm and 3 µrad under a stated 1: known from some 360 to 600 free readings, 4 % each; four of these."""
     plan = small.campaign(noise=(2e-6, 1e-6, 3e-6, 1e-5, 1e-5))
     ours = small.measured(small.virtual_machine(1), plan, 1)
-    fit = fit_joint(replace(ours, uncertainty=np.full(len(ours), 1e-6)), small.SETTINGS)
+    fit = fit_joint(replace(ours, uncertainty=np.full(len(ours), 1e-6)), FEW)
     found = {channel.kind: channel.found / channel.stated for channel in fit.channels}
     assert found == {kind: pytest.approx(n, rel=0.16) for kind, n in zip(KINDS[:3], (2.0, 1.0, 3.0), strict=True)}
     assert all(c.chi_square == pytest.approx((c.found / c.stated) ** 2) for c in fit.channels)
@@ -336,9 +339,10 @@ SMALL_ERRORS = replace(small.BOUNDS, joint=1e-5, strut_offset=1e-5, pitch=5e-5)
 """Machine A: so good that Gauss–Newton settles in two steps, before any reading has been doubted."""
 
 
-@pytest.mark.parametrize("bounds", [small.BOUNDS, SMALL_ERRORS], ids=["machine B", "machine A"])
-@pytest.mark.parametrize("gross", [2e-5, 1e-3])
-def test_gross_errors_are_named_and_do_no_harm(bounds, gross: float):
+@pytest.mark.parametrize(
+    ("bounds", "gross"), [(small.BOUNDS, 1e-3), (SMALL_ERRORS, 2e-5), (SMALL_ERRORS, 1e-3)], ids=["B", "A", "A, worse"]
+)
+def test_gross_errors_are_named_and_do_no_harm(bounds: ImperfectionBounds, gross: float):
     """Three readings that are 20 standard deviations off, or a millimetre: listed, and the tool error stays.
 
     Dropping them outright would be best; downweighted readings pull with 2.5 standard deviations each, which
@@ -349,7 +353,7 @@ def test_gross_errors_are_named_and_do_no_harm(bounds, gross: float):
     ours = replace(ours, sources=tuple(Source("shop.csv", n + 2) for n in range(len(ours))))
     value = ours.value.copy()
     value[where] += [gross, -gross, gross]
-    clean, fit = fit_joint(ours, small.SETTINGS), fit_joint(ours.with_values(value), small.SETTINGS)
+    clean, fit = fit_joint(ours, FEW), fit_joint(ours.with_values(value), FEW)
     assert {o.source.line for o in fit.outliers} == {n + 2 for n in where}
     assert all(abs(o.residual) == pytest.approx(gross, abs=6e-6) for o in fit.outliers)
     assert [d.kept for d in fit.decisions] == [d.kept for d in clean.decisions]
@@ -382,14 +386,14 @@ def swapped(ours: MeasurementSet) -> MeasurementSet:
 
 def test_swapped_directions_are_named():
     with pytest.raises(CalibrationError, match="swapped"):
-        fit_joint(swapped(readings()), small.SETTINGS)
+        fit_joint(swapped(readings()), FEW)
 
 
 def test_too_few_readings_are_refused_with_their_numbers():
     ours = readings()
-    few = ours.select(ours.run < 3)
-    with pytest.raises(CalibrationError, match="33 parameters"):
-        fit_joint(few.select((few.channel == 0) & (few.direction == 1)), small.SETTINGS)
+    few = ours.select((ours.run < 3) & (ours.channel == 0) & (ours.direction == 1))
+    with pytest.raises(CalibrationError, match=r"27 readings .* 33 parameters"):
+        fit_joint(few, FEW)
 
 
 @pytest.mark.parametrize("factor", [1e3, 1e6], ids=["millimetres", "micrometres"])
@@ -397,13 +401,82 @@ def test_wrong_units_are_a_calibration_error(factor: float):
     """38 µm read as 38 mm or 38 m: no machine is like that."""
     ours = readings()
     with pytest.raises(CalibrationError, match="units"):
-        fit_joint(ours.with_values(factor * ours.value), small.SETTINGS)
+        fit_joint(ours.with_values(factor * ours.value), FEW)
 
 
 def test_commands_in_wrong_units_are_a_calibration_error():
-    """Strut readings in millimetres: no machine has them, before the first step is taken."""
+    """Strut readings in centimetres: refused before anything is computed from them."""
     poses = [Pose([x, y, 0.45], np.eye(3)) for x in np.linspace(-0.1, 0.1, 4) for y in np.linspace(-0.1, 0.1, 4)]
     ours = small.scattered(small.paper(), poses)
-    ours = replace(ours, stations=replace(ours.stations, commands=1e3 * ours.stations.commands))
+    ours = replace(ours, stations=replace(ours.stations, commands=1e2 * ours.stations.commands))
     with pytest.raises(CalibrationError, match="units"):
         fit_joint(ours, Settings(blocks=("pitch",)))
+
+
+# ---------------------------------------------------------------- the edge of what can be asked
+
+
+def tilted_poses(count: int, seed: int = 4) -> list[Pose]:
+    rng = np.random.default_rng(seed)
+    positions = rng.uniform([-0.15, -0.15, 0.4], [0.15, 0.15, 0.5], (count, 3))
+    return [Pose.from_angles(p, a) for p, a in zip(positions, rng.uniform(-0.1, 0.1, (count, 3)), strict=True)]
+
+
+def test_a_tracker_at_tilted_poses_is_enough():
+    """Eighty absolute poses of 10 µm and 10 µrad: no line, no zero; the error falls as predicted."""
+    truth, rng = small.virtual_machine(1), np.random.default_rng(5)
+    template_of_poses = small.scattered(small.paper(), tilted_poses(80))
+    errors = station_errors(template_of_poses, truth)[template_of_poses.station]
+    value = (template_of_poses.directions() * errors).sum(axis=1) + 1e-5 * rng.standard_normal(len(errors))
+    fit = fit_joint(template_of_poses.with_values(value), FEW)
+    assert "pitch" in {d.block for d in fit.decisions if d.kept}
+    after, _ = small.tool_error(truth, fit.model, fit.space.box)
+    assert after < 0.3 * small.tool_error(truth, None, fit.space.box)[0]
+    assert fit.level.low < after < fit.level.high
+
+
+def test_readings_that_are_all_zero_make_the_nominal_machine():
+    """Nothing to explain, nothing explained, and no division by the error that is not there."""
+    ours = template(small.campaign(), small.paper())
+    fit = fit_joint(ours, FEW)
+    np.testing.assert_allclose(fit.solution.x, 0.0, atol=1e-12)
+    assert not any(d.kept for d in fit.decisions)
+
+
+def test_readings_without_noise_are_welcome():
+    """What a virtual campaign with perfect lasers gives: nanometres are left, of which rounding makes none."""
+    plan = small.campaign("6-D", noise=(0.0,) * len(KINDS))
+    truth = small.virtual_machine(1)
+    fit = fit_joint(small.measured(truth, plan, 1), FEW)
+    assert small.tool_error(truth, fit.model)[0] < 10e-9
+
+
+def test_columns_that_never_change_are_no_accident():
+    """A constant is a zero, so nothing is left but rounding: no division by it, and no machine made of it."""
+    ours = readings()
+    fit = fit_joint(ours.with_values(1e-6 * ours.channel), FEW)
+    np.testing.assert_allclose(fit.solution.x, 0.0, atol=1e-12)
+
+
+def test_uncertainties_below_any_instrument_are_refused():
+    """1e-15 m against a prior of 100 µm: 22 decimal places, six more than numbers have."""
+    ours = readings()
+    with pytest.raises(CalibrationError, match="uncertainty"):
+        fit_joint(replace(ours, uncertainty=np.full(len(ours), 1e-15)), FEW)
+
+
+@pytest.mark.parametrize("kinds", [(ROTATION,), (LINEAR,)], ids=["rotations only", "lengths only"])
+def test_one_kind_of_reading_is_enough_to_go_on(kinds: tuple[int, ...]):
+    ours = readings().select(np.isin(readings().kind, kinds))
+    fit = fit_joint(ours, FEW)
+    assert [c.kind for c in fit.channels] == [KINDS[k] for k in kinds]
+    assert np.isfinite(fit.solution.x).all()
+    assert fit.observability.structure_rank < 33
+
+
+def test_one_line_can_not_choose_blocks():
+    """A single run leaves nothing to hold out: the structure alone answers, and says how little it knows."""
+    ours = readings().select(readings().run == 0)
+    fit = fit_joint(ours, FEW)
+    assert not any(d.kept for d in fit.decisions)
+    assert fit.observability.structure_rank < 12

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from ..errors import CalibrationError, KinematicsError, ModelError
 from ..measurement import DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
@@ -34,11 +34,17 @@ HYPER = 0.1
 LARGEST_TOLERANCE = {"structure": 5e-3}
 """No machine is built worse than this, m; a misfit that grows the tolerance further has another cause."""
 
+LEAST_NOISE = 1e-9
+"""No instrument reads better, m or rad; also keeps readings without noise from having infinite weight."""
+
 LEAST_FREEDOM = 10.0
 """Noise is estimated from at least so many readings beyond those that the parameters use up."""
 
 HUBER = 2.5
 """Residuals beyond so many standard deviations lose weight in proportion."""
+
+MEDIAN_TO_SIGMA = 1.4826
+"""Standard deviation of a normal distribution over the median of its absolute values."""
 
 OUTLIER = 5.0
 """Residuals beyond so many standard deviations are listed."""
@@ -79,7 +85,9 @@ class Cells:
         _, first, of_reading = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         groups = np.unique(np.stack([m.run, m.channel], axis=1), axis=0, return_inverse=True)[1].ravel()
         is_line = np.array([run.is_line for run in m.runs])[m.run[first]]
-        fold_key = np.where(is_line, -1 - m.run[first], m.station[first])
+        poses = np.hstack([m.stations.positions, m.stations.rotations.reshape(-1, 9)]).round(9)
+        pose = np.unique(poses, axis=0, return_inverse=True)[1].ravel()[m.station[first]]
+        fold_key = np.where(is_line, -1 - m.run[first], pose)
         return Cells(
             of_reading=of_reading.ravel(),
             station=m.station[first],
@@ -112,6 +120,8 @@ class LinearProblem:
         Sum of squared targets, the scatter of readings about their cell's mean included.
     freedom : ndarray, shape (kinds,)
         Readings minus unknowns projected out.
+    least_noise : ndarray, shape (kinds,)
+        Smallest noise factors that an instrument can have.
     """
 
     target: np.ndarray
@@ -122,6 +132,7 @@ class LinearProblem:
     moment: np.ndarray
     square: np.ndarray
     freedom: np.ndarray
+    least_noise: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -202,11 +213,14 @@ class JointProblem:
             Parameters, SI.
         reading_weights : ndarray, shape (N,)
             Trust in each reading, 0…1.
+
+        Raises
+        ------
+        CalibrationError
+            No machine is like that, or it cannot take one of the poses.
         """
         c, m = self.cells, self.measurements
-        prediction = predict(self.space, x, m.stations)
-        expected = np.einsum("ci,ci->c", c.directions, prediction.errors[c.station])
-        rows = np.einsum("ci,cip->cp", c.directions, derivatives(self.space, prediction, m.stations)[c.station])
+        expected, rows = self._expected(x)
         weights = reading_weights / self.uncertainty**2
         total = np.bincount(c.of_reading, weights)
         misfit = m.value - expected[c.of_reading]
@@ -220,8 +234,29 @@ class JointProblem:
             target[members] -= explained
             unknown[members] = explained / scale[members]
             rows[members] -= q @ (q.T @ rows[members])
+        residuals = misfit - unknown[c.of_reading]
         scatter = np.bincount(m.kind, weights * (misfit - mean[c.of_reading]) ** 2, len(KINDS))
-        return self._problem(target + rows @ x, self.space.whitened(rows), scatter), misfit - unknown[c.of_reading]
+        # Huber's proposal 2: noise comes from the residuals cut off, weight² · residual², or outliers blow it up.
+        beyond = np.bincount(m.kind, weights * (1.0 - reading_weights) * residuals**2, len(KINDS))
+        return self._problem(target + rows @ x, self.space.whitened(rows), scatter - beyond), residuals
+
+    def _expected(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what each cell should read, shape (C,), and its derivatives, (C, size), m and rad.
+
+        Raises
+        ------
+        CalibrationError
+            No machine is like that, or it cannot take one of the poses.
+        """
+        c, stations = self.cells, self.measurements.stations
+        try:
+            prediction = predict(self.space, x, stations)
+        except (ModelError, KinematicsError) as error:
+            problem = f"left the machines that can be ({error}); do units, directions and commanded poses fit?"
+            raise CalibrationError("joint fit", problem) from error
+        slopes = derivatives(self.space, prediction, stations)[c.station]
+        expected = np.einsum("ci,ci->c", c.directions, prediction.errors[c.station])
+        return expected, np.einsum("ci,cip->cp", c.directions, slopes)
 
     def _problem(self, target: np.ndarray, rows: np.ndarray, scatter: np.ndarray) -> LinearProblem:
         """Gather the sums that everything later needs."""
@@ -235,12 +270,27 @@ class JointProblem:
             normal[k] = part.T @ part
             moment[k] = part.T @ target[kind == k]
             square[k] += target[kind == k] @ target[kind == k]
-        return LinearProblem(target, rows, kind, self.cells.fold, normal, moment, square, freedom)
+        least_noise = LEAST_NOISE / np.array([self.stated(k) for k in range(kinds)])
+        return LinearProblem(target, rows, kind, self.cells.fold, normal, moment, square, freedom, least_noise)
 
-    def robust_weights(self, residuals: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return Huber's weights of residuals (N,), 1 for all that are no surprise."""
-        size = np.abs(residuals) / (self.uncertainty * noise[self.measurements.kind])
-        return np.minimum(1.0, HUBER / np.maximum(size, HUBER))
+    def stated(self, kind: int) -> float:
+        """Return the standard deviation of a kind's readings as stated, root mean square, m or rad."""
+        mine = self.uncertainty[self.measurements.kind == kind]
+        return float(np.sqrt((mine**2).mean())) if len(mine) else 1.0
+
+    def robust_weights(self, residuals: np.ndarray) -> np.ndarray:
+        """Return Huber's weights of residuals (N,), 1 for all that are no surprise.
+
+        What is a surprise is measured by the median of each kind's residuals, which gross errors do not move.
+        """
+        size = np.abs(residuals) / self.uncertainty
+        weights = np.ones(len(size))
+        for k in np.unique(self.measurements.kind):
+            mine = self.measurements.kind == k
+            cut = HUBER * MEDIAN_TO_SIGMA * np.median(size[mine])
+            if cut > 0.0:
+                weights[mine] = np.minimum(1.0, cut / np.maximum(size[mine], cut))
+        return weights
 
 
 def solve(
@@ -273,7 +323,7 @@ def solve(
         precision = np.tensordot(noise**-2, normal, 1)
         whitened = spread[:, None] * precision * spread
         whitened[np.diag_indices_from(whitened)] += 1.0
-        inverse = cho_solve(cho_factor(whitened, lower=True), np.eye(len(used)))
+        inverse = _inverse(whitened)
         z = inverse @ (spread * (noise**-2 @ moment))
         posterior = Posterior(
             used, spread * z, spread[:, None] * inverse * spread, tolerances, noise, 1.0 - np.diag(inverse)
@@ -284,6 +334,21 @@ def solve(
     return posterior
 
 
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    """Return the inverse of a positive definite matrix.
+
+    Raises
+    ------
+    CalibrationError
+        It is not, to rounding: readings outweigh the priors more than 1e16 times.
+    """
+    try:
+        return cho_solve(cho_factor(matrix, lower=True), np.eye(len(matrix)))
+    except LinAlgError as error:
+        problem = "are too few to tell noise from the machine's errors, or their uncertainty is below any instrument's"
+        raise CalibrationError("measurements", problem) from error
+
+
 def _noise(problem: LinearProblem, normal: np.ndarray, moment: np.ndarray, posterior: Posterior) -> np.ndarray:
     """Return new noise factors: squared residuals over what freedom the parameters leave."""
     result, y = posterior.noise.copy(), posterior.y
@@ -292,7 +357,7 @@ def _noise(problem: LinearProblem, normal: np.ndarray, moment: np.ndarray, poste
         freedom = problem.freedom[k] - (posterior.covariance * normal[k]).sum() / result[k] ** 2
         if freedom > LEAST_FREEDOM and rest > 0.0:
             result[k] = np.sqrt(rest / freedom)
-    return result
+    return np.maximum(result, problem.least_noise)
 
 
 def _tolerances(space: ParameterSpace, posterior: Posterior, z: np.ndarray) -> np.ndarray:
@@ -368,22 +433,18 @@ def iterate(
     CalibrationError
         They do not.
     """
-    weights = np.ones(len(joint.measurements))
+    weights, robust = np.ones(len(joint.measurements)), joint.space.settings.robust
     for step in range(1, STEPS + 1):
-        try:
-            problem, residuals = joint.linearise(x, weights)
-        except (ModelError, KinematicsError) as error:
-            problem_text = f"left the machines that can be ({error}); do units, directions and commanded poses fit?"
-            raise CalibrationError("joint fit", problem_text) from error
+        problem, residuals = joint.linearise(x, weights)
         posterior = solve(joint.space, problem, tolerances, noise)
         tolerances, noise = posterior.tolerances, posterior.noise
         change = _change(joint.space.physical(posterior.y) - x, joint.space, posterior)
         progress(f"step {step}: largest change {change:.2g} standard deviations")
         x = joint.space.physical(posterior.y)
-        if change < SETTLED or step == STEPS:
+        if (change < SETTLED and (step > 2 or not robust)) or step == STEPS:
             break
-        if joint.space.settings.robust and step > 1:
-            weights = joint.robust_weights(residuals, noise)
+        if robust and step > 1:
+            weights = joint.robust_weights(residuals)
     if change > 1.0:
         raise CalibrationError("joint fit", f"did not settle within {STEPS} steps")
     return Solution(problem, posterior, x, residuals, weights, step)

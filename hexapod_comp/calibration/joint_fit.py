@@ -20,6 +20,12 @@ from .space import ParameterSpace, Settings
 SURE = 4.0
 """Backlash so many standard deviations below zero is no noise."""
 
+LARGEST_NOISE = 0.02
+"""A machine that leaves more than this of its readings, m or rad, is not the one that was measured."""
+
+SCATTERED = 1.5
+"""Readings whose noise is found so many times as large as stated are remarked on."""
+
 TILT = np.radians(10.0)
 """Tilt at which the report says what the model is worth for a tilted tool."""
 
@@ -156,11 +162,13 @@ def fit_joint(
         if [d.kept for d in again] != [d.kept for d in decisions]:
             space, joint, solution = _solve(measurements, again, settings, (space, solution), progress)
         decisions = again
-    notes = [*measurements.notes, *_check_backlash(space, solution)]
     channels = tuple(_channels(joint, solution))
+    notes = [*measurements.notes, *_check_backlash(space, solution), *_check_noise(channels)]
     progress("what is it worth?")
     covariance = physical_covariance(space, solution.posterior)
     level, tilted = (expected_error(space, solution.x, covariance, tilt) for tilt in (0.0, TILT))
+    if level is not None and level.after > level.before:
+        notes.append("the model is not expected to help: the readings determine too little of this machine")
     return JointFit(
         model=_named(space, solution, measurements, channels, len(decisions)),
         measurements=measurements,
@@ -238,6 +246,26 @@ def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
     return [f"strut_{i + 1}: backlash of {values[i] * 1e6:.2f} µm found, taken as none" for i in negative]
 
 
+def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:
+    """Return remarks on readings that scatter more than they should; refuse those that no machine explains.
+
+    Raises
+    ------
+    CalibrationError
+        What is left of a kind of reading is larger than any machine's error.
+    """
+    for c in channels:
+        if c.found > LARGEST_NOISE:
+            unit = "rad" if c.kind in ANGULAR_KINDS else "m"
+            problem = f"{c.kind} readings are off by {c.found:.3g} {unit} (allowed {LARGEST_NOISE:g}); do units fit?"
+            raise CalibrationError("measurements", problem)
+    noisy = [f"{c.kind} {c.found / c.stated:.1f} times" for c in channels if c.found > SCATTERED * c.stated]
+    if not noisy:
+        return []
+    problem = "readings scatter more than stated: something of the machine, or of an instrument, is not in the model"
+    return [f"{problem}, and the expected tool error may be too low ({', '.join(noisy)})"]
+
+
 def _channels(joint: JointProblem, solution: Solution) -> list[ChannelFit]:
     """Return how each kind of channel was met."""
     problem, posterior, kinds = solution.problem, solution.posterior, joint.measurements.kind
@@ -246,7 +274,7 @@ def _channels(joint: JointProblem, solution: Solution) -> list[ChannelFit]:
     result = []
     for k in np.unique(kinds):
         mine = problem.kind == k
-        stated = float(np.sqrt((joint.uncertainty[kinds == k] ** 2).mean()))
+        stated = joint.stated(k)
         mean_square = float((errors[mine] ** 2 / readings_of_cell[mine]).mean())
         factor = float(posterior.noise[k])
         result.append(

@@ -91,7 +91,7 @@ class _Trials:
         """Return by which share a block among `names` lowers the squared error, and its standard error."""
         with_it = self._errors(names)
         without = self._errors(tuple(name for name in names if name != block))
-        less = (without - with_it) / without.sum()
+        less = (without - with_it) / max(without.sum(), np.finfo(float).tiny)
         return float(less.sum()), float(np.sqrt(len(less) * less.var()))
 
     def _solve(self, tolerances: np.ndarray, rounds: int) -> Posterior:

@@ -45,7 +45,8 @@ def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Predict
     KinematicsError
         The machine cannot take one of the poses.
     """
-    model = space.model(x, with_field=False)
+    positive, sense = _without_negative_backlash(space, x, stations.sense)
+    model = space.model(positive, with_field=False)
     count = len(stations)
     positions, rotations = np.empty((count, 3)), np.empty((count, 3, 3))
     base, platform = np.empty((count, 6, 3)), np.empty((count, 6, 3))
@@ -55,13 +56,30 @@ def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Predict
         if key not in machines:
             machines[key] = RealMachine(space.geometry, model, stations.temperature(n))
         machine = machines[key]
-        actual, _ = machine.pose_for(stations.commands[n], stations.sense[n], stations.pose(n))
+        actual, _ = machine.pose_for(stations.commands[n], sense[n], stations.pose(n))
         positions[n], rotations[n] = actual.position, actual.rotation
         base[n], platform[n] = machine.structure.base_joints, machine.structure.platform_joints
     errors = _errors(space, stations, positions, rotations)
     points = positions + rotations @ space.probe
     errors += space.field_errors(x, points, stations.sense[:, :3])
     return Prediction(errors, positions, rotations, base, platform)
+
+
+def _without_negative_backlash(
+    space: ParameterSpace, x: np.ndarray, sense: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return parameters and directions that mean the same machine without negative backlash.
+
+    A nut cannot lead its screw, but an estimate can say so: by noise, or for swapped directions. Backlash −b
+    in one direction is b in the other; cutting it off here would make the fit add it again in every step.
+    """
+    block = space.block("backlash")
+    if block is None:
+        return x, sense
+    x, sense = x.copy(), sense.copy()
+    sense[:, 3:] *= np.where(x[block.part] < 0.0, -1.0, 1.0)
+    x[block.part] = np.abs(x[block.part])
+    return x, sense
 
 
 def _errors(

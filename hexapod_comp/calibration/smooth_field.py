@@ -26,6 +26,9 @@ DIGITS = 11
 CHECKED = 400
 """Random points at which that is checked."""
 
+LEAST_SIDE = 1e-6
+"""A box thinner than this, m, is flat: its points differ by rounding."""
+
 MOST_NODES = 17
 """Nodes along the longest axis at most: more make the model file too long to read."""
 
@@ -52,7 +55,7 @@ class SmoothField:
     """
 
     def __init__(self, box: np.ndarray, degree: int) -> None:
-        flat = np.ptp(box, axis=0) <= 0.0
+        flat = np.ptp(box, axis=0) < LEAST_SIDE
         self.box = np.array([box[0], np.where(flat, box[0] + 1.0, box[1])])
         self._sides = np.where(flat, 0.0, np.ptp(self.box, axis=0))
         cost = np.sqrt(max(self._sides.max(), 1e-3) / np.where(flat, 1.0, self._sides))
@@ -103,8 +106,9 @@ class SmoothField:
     def as_grid(self, coefficients: np.ndarray, reversal: np.ndarray) -> GridField:
         """Return the field as grid lines, so many that interpolating between them adds nothing visible.
 
-        What does not depend on the direction of motion stands on the lines along x; what changes sign with the
-        motion along an axis stands on the lines along that axis.
+        Terms that do not depend on the direction of motion stand on the lines along the axis of their highest
+        power: across it their powers are small, and bilinear interpolation is exact up to 1. What changes sign
+        with the motion along an axis stands on the lines along that axis.
 
         Parameters
         ----------
@@ -132,7 +136,8 @@ class SmoothField:
         families = []
         for axis in range(3):
             half = 0.5 * self._family(grid, axis, reversal[axis], self.reversal_powers)
-            mean = self._family(grid, axis, coefficients, self.powers) if axis == 0 else np.zeros_like(half)
+            mine = self.powers.argmax(axis=1) == axis
+            mean = self._family(grid, axis, coefficients[:, mine], self.powers[mine])
             wide = np.zeros((*mean.shape[:-1], max(mean.shape[-1], half.shape[-1])))
             family = np.stack([wide, wide])
             family[..., : mean.shape[-1]] += mean
@@ -145,6 +150,8 @@ class SmoothField:
         """Return the polynomials in u of the lines along an axis, shape (n, m, 6, powers)."""
         first, second = CROSS_AXES[axis]
         degree = int(powers.max(initial=0))
+        if not len(powers):
+            return np.zeros((len(grid[first]), len(grid[second]), 6, 1))
         across = [legendre.legvander(np.linspace(-1.0, 1.0, len(grid[a])), degree) for a in (first, second)]
         weights = np.einsum("nt,mt->nmt", across[0][:, powers[:, first]], across[1][:, powers[:, second]])
         along = np.array([_monomials(n, degree) for n in powers[:, axis]])
@@ -155,7 +162,8 @@ def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray,
     """Return the powers (n, 3) of all terms up to a degree, and the relative size of their priors (n,)."""
     every = np.array(list(itertools.product(range(degree + 1), repeat=3)))
     total = every @ cost
-    kept = (total <= degree + 1e-9) & ~(every[:, flat] > 0).any(axis=1)
+    bilinear = (every.max(axis=1) <= 1) & (every.sum(axis=1) <= 2)  # squareness, twist and roll are always asked for
+    kept = ((total <= degree + 1e-9) | bilinear) & ~(every[:, flat] > 0).any(axis=1)
     order = np.argsort(total[kept], kind="stable")
     return every[kept][order], DECAY ** total[kept][order]
 

@@ -12,17 +12,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from ..errors import ModelError
+from ..errors import CalibrationError, ModelError
 from ..field import GridField, no_field
 from ..geometry import COINCIDENT, STRUT_NAMES, HexapodGeometry
 from ..kinematics import Structure, strut_lengths
 from ..machine import MachineModel
 from ..measurement import AXES, MeasurementSet
 from ..struts import StrutErrors
-from .smooth_field import COMPONENT_UNITS, SmoothField
+from .smooth_field import COMPONENT_UNITS, LEAST_SIDE, SmoothField
 
 KNOT_DISTANCE = 0.017
 """Largest distance of the length map's knots, m: a wave of 60 mm has then three and a half knots."""
+
+MOST_BEYOND = 0.05
+"""Encoders may read this far beyond the stroke, m: their zeros are not the geometry's."""
 
 MAP_CORRELATION_LENGTH = 0.04
 """How far the errors of a length map are alike, m (Matérn 5/2)."""
@@ -143,6 +146,7 @@ class ParameterSpace:
         self.platform_groups = _groups(geometry, settings.shared_platform_joints)
         self.periods = _periods(geometry, settings.lead)
         commands = measurements.stations.commands
+        _check_commands(geometry, commands)
         self.knots = _knots(commands.min(), commands.max())
         points = measurements.points()
         self.box = np.array([points.min(axis=0), points.max(axis=0)])
@@ -185,7 +189,7 @@ class ParameterSpace:
         if name == "field reversal":
             terms = self.field.reversal_terms
             labels = [f"{c} {t} reversal {a}" for a in AXES for c, _ in COMPONENT_UNITS for t in terms]
-            return np.diag(np.tile(self.field.reversal_prior, 18)), tuple(labels), "m"
+            return np.diag(np.tile(self.field.reversal_prior, 18)), tuple(labels), "m, rad"
         if name.startswith("field"):
             which = 0 if name.endswith("displacement") else 3
             terms = self.field.terms
@@ -265,7 +269,7 @@ class ParameterSpace:
             field=self._grid_field(x) if with_field else no_field(),
             base_expansion=s.base_expansion,
             platform_expansion=s.platform_expansion,
-            valid_box=self.box if (self.box[0] < self.box[1]).all() else None,
+            valid_box=self.box if (np.ptp(self.box, axis=0) >= LEAST_SIDE).all() else None,
         )
 
     def field_coefficients(self, x: np.ndarray) -> np.ndarray:
@@ -310,6 +314,15 @@ def _periods(geometry: HexapodGeometry, lead: float | None) -> np.ndarray:
     if lead is not None:
         return np.full(6, lead)
     return np.where(geometry.screw_lead != 0.0, np.abs(geometry.screw_lead), np.nan)
+
+
+def _check_commands(geometry: HexapodGeometry, commands: np.ndarray) -> None:
+    """Refuse strut readings that are no lengths of this machine's struts."""
+    low, high = geometry.limits.stroke.min() - MOST_BEYOND, geometry.limits.stroke.max() + MOST_BEYOND
+    if not (low <= commands.min() and commands.max() <= high):
+        found = f"{commands.min():.4g}…{commands.max():.4g} m"
+        problem = f"run over {found}, the struts over {low:.4g}…{high:.4g} m; do units fit?"
+        raise CalibrationError("strut readings", problem)
 
 
 def _knots(low: float, high: float) -> np.ndarray:
