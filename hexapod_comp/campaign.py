@@ -165,7 +165,9 @@ def _read_noise(section: Section) -> tuple[float, ...]:
     return noise
 
 
-def template(campaign: Campaign, geometry: HexapodGeometry, seed: int = 0) -> MeasurementSet:
+def template(
+    campaign: Campaign, geometry: HexapodGeometry, seed: int = 0, name: str = "campaign"
+) -> MeasurementSet:
     """Return the readings of a campaign with values of zero.
 
     Parameters
@@ -176,6 +178,8 @@ def template(campaign: Campaign, geometry: HexapodGeometry, seed: int = 0) -> Me
         The machine as designed.
     seed : int
         Picks the scattered poses.
+    name : str
+        Of the campaign's file, for messages.
 
     Raises
     ------
@@ -183,7 +187,7 @@ def template(campaign: Campaign, geometry: HexapodGeometry, seed: int = 0) -> Me
         A pose of the campaign is out of the machine's reach.
     """
     readings = [*_lines(campaign), *_diagonals(campaign), *_scattered(campaign, seed)]
-    return assemble(geometry, readings)
+    return assemble(geometry, [reading._replace(source=Source(name, 0)) for reading in readings])
 
 
 def _lines(campaign: Campaign) -> Iterator[Reading]:
@@ -231,12 +235,11 @@ def _line(campaign: Campaign, name: str, ends: np.ndarray, channels: tuple[str, 
         ends = ends[::-1]  # forward is along the first of x, y, z that moves
     count = max(2, round(length / campaign.step) + 1)
     poses = [Pose(p, np.eye(3)) for p in np.linspace(ends[0], ends[1], count).round(12)]
-    source = Source("campaign", 0)
     for cycle in range(1, campaign.cycles + 1):
         for direction in (FORWARD, BACKWARD):
             for pose in poses[::direction]:
                 for channel in channels:
-                    yield Reading(name, cycle, direction, pose, channel, 0.0, source=source)
+                    yield Reading(name, cycle, direction, pose, channel, 0.0)
 
 
 def _scattered(campaign: Campaign, seed: int) -> Iterator[Reading]:
@@ -248,4 +251,4 @@ def _scattered(campaign: Campaign, seed: int) -> Iterator[Reading]:
         angles = np.append(rng.uniform(-campaign.tilt, campaign.tilt, 2), 0.0).round(6)
         pose = Pose(position, rotation_from_angles(angles))
         for channel in channels:
-            yield Reading("poses", number + 1, UNKNOWN, pose, channel, 0.0, source=Source("campaign", 0))
+            yield Reading("poses", number + 1, UNKNOWN, pose, channel, 0.0)

@@ -148,8 +148,11 @@ def _refuse_references(text: str) -> None:
 
 
 def write_text_atomically(path: str | Path, text: str) -> None:
-    """Write a file so that a reader, or a crash, never sees half of it."""
-    target = Path(path)
+    """Write a file so that a reader, or a crash, never sees half of it; into a pipe or device, just write."""
+    target = Path(os.path.realpath(path))
+    if target.exists() and not target.is_file():
+        _write_into(path, text)
+        return
     try:
         handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
     except OSError as error:
@@ -161,6 +164,15 @@ def write_text_atomically(path: str | Path, text: str) -> None:
         os.replace(temporary, target)
     except OSError as error:
         os.unlink(temporary)
+        raise InputFileError(path, "", f"cannot be written: {error.strerror}") from error
+
+
+def _write_into(path: str | Path, text: str) -> None:
+    """Write into what is no regular file: it must not be replaced by one."""
+    try:
+        with open(path, "w", encoding="utf-8") as stream:
+            stream.write(text)
+    except OSError as error:
         raise InputFileError(path, "", f"cannot be written: {error.strerror}") from error
 
 

@@ -230,9 +230,14 @@ def joined(sets: Sequence[MeasurementSet]) -> MeasurementSet:
     Raises
     ------
     InputFileError
-        Sets of different measured points.
+        Sets of different measured points, or a file twice.
     """
     first = sets[0]
+    hashes = [sha for s in sets for _, sha in s.files]
+    for s in sets:
+        for name, sha in s.files:
+            if hashes.count(sha) > 1:
+                raise InputFileError(name, "", "is given twice: its readings would count twice")
     if len(sets) == 1:
         return first
     if any(np.abs(other.probe - first.probe).max() > SAME for other in sets[1:]):

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from .errors import InputFileError
 from .geometry import STRUT_NAMES, HexapodGeometry
 from .motion import follow
 from .pose import Pose
@@ -26,10 +27,19 @@ NOTHING = 1e-3
 
 
 def save(figure: Figure, path: str | Path) -> None:
-    """Write a figure as PNG, making the folder when it is missing."""
+    """Write a figure as PNG, making the folder when it is missing.
+
+    Raises
+    ------
+    InputFileError
+        It cannot be written.
+    """
     target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(target, dpi=140)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(target, dpi=140)
+    except OSError as error:
+        raise InputFileError(path, "", f"cannot be written: {error.strerror}") from error
 
 
 def session_figure(result: SessionResult, title: str) -> Figure:

@@ -94,7 +94,9 @@ def with_wavy_field(
     along = x[0] + 0.5 * (u + 1.0) * (x[-1] - x[0])
     points = np.stack(np.meshgrid(y, z, along, indexing="ij"), axis=-1)[..., [2, 0, 1]]
     values = waves_at(points)
-    size = np.sqrt((values**2).mean(axis=(0, 1, 2)))
+    centres = (0.5 * (nodes[1:] + nodes[:-1]) for nodes in (x, y, z))
+    even = np.stack(np.meshgrid(*centres, indexing="ij"), axis=-1)
+    size = np.sqrt((waves_at(even) ** 2).mean(axis=(0, 1, 2)))
     values *= np.repeat([displacement, rotation], 3) / size
     flat = np.moveaxis(values, 2, 0).reshape(len(u), -1)
     fitted = polynomial.polyfit(u, flat, FIELD_POWERS - 1)

@@ -15,7 +15,7 @@ from hexapod_comp.calibration.observability import (
     box_stations,
     expected_error,
     observe,
-    unseen_errors,
+    without_trace,
 )
 from hexapod_comp.calibration.sensitivity import predict
 from hexapod_comp.calibration.space import ParameterSpace, Settings
@@ -91,13 +91,13 @@ def test_tilted_poses_see_more():
 def test_machine_errors_that_leave_no_trace(instrument: str, diagonals: int, unseen: set[str]):
     """By hand: a shear or a bilinear twist is constant along its own line and linear across, which zeros and beam
     slopes swallow; on a body diagonal it is not. Roll needs a roll channel."""
-    assert set(unseen_errors(*linearised(instrument, diagonals, FIELD))) == unseen
+    assert set(without_trace(*linearised(instrument, diagonals, FIELD))) == unseen
 
 
 def test_errors_are_unseen_however_few_terms_the_field_has():
     """A field of degree 2 has no term for a twist that involves the short z axis: it is no less unseen."""
     small_field = replace(FIELD, field_degree=2)
-    assert set(unseen_errors(*linearised("5-D", 0, small_field))) == {*SQUARENESS, *TWISTS, *ROLLS}
+    assert set(without_trace(*linearised("5-D", 0, small_field))) == {*SQUARENESS, *TWISTS, *ROLLS}
 
 
 def readings_of(instrument: str, diagonals: int, model: MachineModel) -> JointProblem:
@@ -125,7 +125,7 @@ def test_an_unseen_error_really_changes_no_reading(name: str):
 
 
 def test_without_field_blocks_nothing_is_called_unseen():
-    assert unseen_errors(*linearised("5-D", 0, STRUCTURE)) == ()
+    assert without_trace(*linearised("5-D", 0, STRUCTURE)) == ()
 
 
 # ---------------------------------------------------------------- definitions

@@ -168,7 +168,6 @@ def test_field_is_of_the_size_asked_in_the_mean() -> None:
     np.testing.assert_allclose(found, [5e-6, 30e-6], rtol=0.1)
 
 
-@pytest.mark.xfail(raises=AssertionError, strict=True, reason="sized over points that crowd at the ends of the box")
 def test_every_component_is_of_the_size_asked() -> None:
     """As said: "root mean square of each component in the box". 512 even points: 3 %, bilinear 1 %: 5 %."""
     for seed in SEEDS:

@@ -19,8 +19,12 @@ from ..measurement import DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
 from .sensitivity import derivatives, predict
 from .space import ParameterSpace
 
-STEPS = 8
-"""Most Gauss–Newton steps; three are enough for deviations of a tenth of a millimetre."""
+STEPS = 20
+"""Most Gauss–Newton steps; a handful is enough for deviations of a tenth of a millimetre."""
+
+SLOW, LEAST_SHARE = 0.7, 0.3
+"""A step whose change is not below so much of the last one's is shortened by half, to this share at least:
+tolerances and parameters that wait for each other could otherwise swing for ever."""
 
 SETTLED = 1e-2
 """The fit stops when no parameter moves by more than this share of its standard deviation."""
@@ -434,13 +438,16 @@ def iterate(
         They do not.
     """
     weights, robust = np.ones(len(joint.measurements)), joint.space.settings.robust
+    share, last = 1.0, np.inf
     for step in range(1, STEPS + 1):
         problem, residuals = joint.linearise(x, weights)
         posterior = solve(joint.space, problem, tolerances, noise)
         tolerances, noise = posterior.tolerances, posterior.noise
         change = _change(joint.space.physical(posterior.y) - x, joint.space, posterior)
         progress(f"step {step}: largest change {change:.2g} standard deviations")
-        x = joint.space.physical(posterior.y)
+        if step > 2 and change > SLOW * last:
+            share = max(LEAST_SHARE, 0.5 * share)
+        x, last = x + share * (joint.space.physical(posterior.y) - x), change
         if (change < SETTLED and (step > 2 or not robust)) or step == STEPS:
             break
         if robust and step > 1:

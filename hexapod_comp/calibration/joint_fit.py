@@ -11,8 +11,8 @@ import numpy as np
 from ..errors import CalibrationError
 from ..machine import MachineModel, ModelOrigin
 from ..measurement import ANGULAR_KINDS, KINDS, MeasurementSet, Source
-from .joint import HUBER, OUTLIER, JointProblem, Solution, held_out, iterate, physical_covariance
-from .observability import Observability, ToolError, expected_error, observe, unseen_errors
+from .joint import HUBER, OUTLIER, JointProblem, Posterior, Solution, held_out, iterate, physical_covariance
+from .observability import Observability, ToolError, expected_error, observe, without_trace
 from .selection import Decision, select
 from .smooth_field import DIGITS
 from .space import ParameterSpace, Settings
@@ -155,10 +155,10 @@ def fit_joint(
     """
     settings = settings or Settings()
     everything = JointProblem(measurements, ParameterSpace(measurements, settings))
-    decisions, unseen = _decide(everything, None, progress)
+    decisions, possible = _decide(everything, None, progress)
     space, joint, solution = _solve(measurements, decisions, settings, None, progress)
     if solution.weights.min() < HUBER / OUTLIER:  # the choice was made with readings that turned out to be wrong
-        again, unseen = _decide(everything, (space, solution), progress)
+        again, possible = _decide(everything, (space, solution), progress)
         if [d.kept for d in again] != [d.kept for d in decisions]:
             space, joint, solution = _solve(measurements, again, settings, (space, solution), progress)
         decisions = again
@@ -166,7 +166,8 @@ def fit_joint(
     notes = [*measurements.notes, *_check_backlash(space, solution), *_check_noise(channels)]
     progress("what is it worth?")
     covariance = physical_covariance(space, solution.posterior)
-    level, tilted = (expected_error(space, solution.x, covariance, tilt) for tilt in (0.0, TILT))
+    allowed = _allowed(everything.space, possible, (space, solution))
+    level, tilted = (expected_error(space, solution.x, covariance, tilt, allowed=allowed) for tilt in (0.0, TILT))
     if level is not None and level.after > level.before:
         notes.append("the model is not expected to help: the readings determine too little of this machine")
     return JointFit(
@@ -177,7 +178,7 @@ def fit_joint(
         decisions=tuple(decisions),
         channels=channels,
         observability=observe(space, solution.problem, solution.posterior),
-        unseen_errors=unseen,
+        unseen_errors=unseen_errors(measurements, settings),
         level=level,
         tilted=tilted,
         outliers=tuple(_outliers(joint, solution)),
@@ -217,12 +218,36 @@ def _carried_over(
 
 def _decide(
     everything: JointProblem, before: tuple[ParameterSpace, Solution] | None, progress: Callable[[str], object]
-) -> tuple[list[Decision], tuple[str, ...]]:
-    """Return what becomes of every block, and the machine errors that the readings cannot show."""
+) -> tuple[list[Decision], Posterior]:
+    """Return what becomes of every block, and what the readings allow if none is ruled out."""
     x, _, noise = _carried_over(before, everything.space)
     weights = np.ones(len(everything.measurements)) if before is None else before[1].weights
     problem, _ = everything.linearise(x, weights)
-    return select(everything.space, problem, noise, progress), unseen_errors(everything.space, problem)
+    return select(everything.space, problem, noise, progress)
+
+
+def _allowed(
+    everything: ParameterSpace, possible: Posterior, answer: tuple[ParameterSpace, Solution]
+) -> tuple[ParameterSpace, np.ndarray, np.ndarray]:
+    """Return what the readings allow, as :func:`expected_error` wants it, seen from an answer."""
+    x, _, _ = _carried_over(answer, everything)
+    return everything, everything.physical(possible.y) - x, physical_covariance(everything, possible)
+
+
+def unseen_errors(measurements: MeasurementSet, settings: Settings) -> tuple[str, ...]:
+    """Return the machine errors that the readings cannot show, whatever blocks are allowed in a fit.
+
+    Parameters
+    ----------
+    measurements : MeasurementSet
+        The readings; their values do not matter.
+    settings : Settings
+        Of the fit.
+    """
+    space = ParameterSpace(measurements, replace(settings, blocks=("field displacement", "field rotation")))
+    joint = JointProblem(measurements, space)
+    problem, _ = joint.linearise(np.zeros(space.size), np.ones(len(measurements)))
+    return without_trace(space, problem)
 
 
 def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:

@@ -174,7 +174,7 @@ def _weak(space: ParameterSpace, singular: np.ndarray, vectors: np.ndarray) -> l
     return found
 
 
-def unseen_errors(space: ParameterSpace, problem: LinearProblem) -> tuple[str, ...]:
+def without_trace(space: ParameterSpace, problem: LinearProblem) -> tuple[str, ...]:
     """Return the machine errors that leave no trace in the readings; none when the space has no field.
 
     Parameters
@@ -206,7 +206,8 @@ class ToolError:
     after : float
         RMS 3-D error to expect with the model, m.
     low, high : float
-        Between these it lies with a probability of 95 %, m.
+        Between these it lies with a probability of 95 %, m; the upper end also allows for errors of which the
+        readings do not tell whether the machine has them.
     rotation_before, rotation_after : float
         The same of the rotation, rad.
     """
@@ -225,6 +226,7 @@ def expected_error(
     covariance: np.ndarray,
     tilt: float = 0.0,
     prior: np.ndarray | None = None,
+    allowed: tuple[ParameterSpace, np.ndarray, np.ndarray] | None = None,
 ) -> ToolError | None:
     """Return the tool error that the parameters' covariance leaves, at random points, both directions.
 
@@ -243,6 +245,9 @@ def expected_error(
         Tilt of the tool, rad, in random directions.
     prior : ndarray, shape (size, size), optional
         Take the error before from machines of this covariance instead of the one that x describes.
+    allowed : (ParameterSpace, ndarray, ndarray), optional
+        A larger space in which nothing is ruled out, how far its most probable parameters are from x, and their
+        covariance: what may hide there widens the interval upwards.
 
     Returns
     -------
@@ -268,7 +273,13 @@ def expected_error(
     errors = prediction.errors[:, :, None] if prior is None else rows @ _drawn(prior)
     before, rotation_before = shown(errors)
     after, rotation_after = shown(rows @ _drawn(covariance))
+    possible = after
+    if allowed is not None:
+        wide_space, shift, wide_covariance = allowed
+        wide = derivatives(wide_space, prediction, stations)
+        possible, _ = shown(wide @ (shift[:, None] + _drawn(wide_covariance)))
     low, high = np.percentile(after, [2.5, 97.5])
+    high = max(high, np.percentile(possible, 97.5))
     return ToolError(
         before=_rms(before),
         after=_rms(after),

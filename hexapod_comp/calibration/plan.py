@@ -9,8 +9,8 @@ import numpy as np
 from ..campaign import Campaign
 from ..measurement import DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
 from .joint import JointProblem, physical_covariance, solve
-from .joint_fit import TILT
-from .observability import Observability, ToolError, expected_error, observe, unseen_errors
+from .joint_fit import TILT, unseen_errors
+from .observability import Observability, ToolError, expected_error, observe
 from .space import ParameterSpace, Settings
 
 
@@ -60,13 +60,11 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: Settings) -
     covariance, x = physical_covariance(space, posterior), np.zeros(space.size)
     prior = space.prior_covariance(space.start_tolerances())
     level, tilted = (expected_error(space, x, covariance, tilt, prior) for tilt in (0.0, TILT))
-    everything = JointProblem(measurements, ParameterSpace(measurements, Settings(lead=settings.lead)))
-    all_rows, _ = everything.linearise(np.zeros(everything.space.size), np.ones(len(measurements)))
     return Plan(
         measurements=measurements,
         space=space,
         observability=observe(space, problem, posterior),
-        unseen_errors=unseen_errors(everything.space, all_rows),
+        unseen_errors=unseen_errors(measurements, settings),
         level=level,
         tilted=tilted,
     )

@@ -14,7 +14,10 @@ FIRST_ROUNDS, ROUNDS = 10, 4
 """Rounds of estimating tolerances and noise: for all blocks, and for each set with fewer, which starts there."""
 
 CLEAR = 2.0
-"""A block is taken when its gain is so many times its standard error over the folds."""
+"""A general block stays when its gain is so many times its standard error over the folds."""
+
+EXPECTED = ("pitch", "wave", "backlash")
+"""Errors that every screw has: they stay when they help at all. Of a length map or a field nobody knows beforehand."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +45,12 @@ class Decision:
 
 def select(
     space: ParameterSpace, problem: LinearProblem, noise: np.ndarray, progress: Callable[[str], object]
-) -> list[Decision]:
+) -> tuple[list[Decision], Posterior]:
     """Decide on each block by leaving out one line, or one scattered pose, after the other.
 
-    All blocks start in; the one that helps least goes, until every one that is left helps clearly. Taking
-    them in one by one instead can let a field explain what a length map does better.
+    All blocks start in. The general one that helps least goes, until every one that is left helps clearly;
+    then the expected ones that do not help at all. Taking them in one by one instead can let a field explain
+    what a length map does better.
 
     Parameters
     ----------
@@ -58,23 +62,36 @@ def select(
         Noise factors in which errors are weighed, the same for all candidates.
     progress : callable
         Told about every candidate.
+
+    Returns
+    -------
+    decisions : list of Decision
+        One for each block but the structure.
+    everything : Posterior
+        With all blocks in: what the data allow if nothing may be ruled out.
     """
     trials = _Trials(space, problem, noise, progress)
-    names = tuple(b.name for b in space.blocks)
-    optional = list(names[1:])
+    names = [b.name for b in space.blocks[1:]]
+    kept = list(names)
     gains: dict[str, tuple[float, float]] = {}
+    general = [name for name in names if name not in EXPECTED]
     while True:
         # A block that helps clearly beside all others helps no less when some of them have gone.
-        doubtful = [name for name in optional if name not in gains or not _clear(gains[name])]
-        gains |= {name: trials.gain(("structure", *optional), name) for name in doubtful}
+        doubtful = [name for name in general if name in kept and not _clear(gains.get(name))]
+        gains |= {name: trials.gain(("structure", *kept), name) for name in doubtful}
         doubtful = [name for name in doubtful if not _clear(gains[name])]
         if not doubtful:
-            return [Decision(name, name in optional, *gains[name]) for name in names[1:]]
-        optional.remove(min(doubtful, key=lambda name: gains[name][0] / max(gains[name][1], 1e-12)))
+            break
+        kept.remove(min(doubtful, key=lambda name: gains[name][0] / max(gains[name][1], 1e-12)))
+    for name in (name for name in names if name in EXPECTED):
+        gains[name] = trials.gain(("structure", *kept), name)
+    useless = [name for name in EXPECTED if name in kept and gains[name][0] <= 0.0]
+    kept = [name for name in kept if name not in useless]
+    return [Decision(name, name in kept, *gains[name]) for name in names], trials.everything
 
 
-def _clear(gain: tuple[float, float]) -> bool:
-    return gain[0] > CLEAR * gain[1]
+def _clear(gain: tuple[float, float] | None) -> bool:
+    return gain is not None and gain[0] > CLEAR * gain[1]
 
 
 class _Trials:
@@ -85,7 +102,7 @@ class _Trials:
     ) -> None:
         self._space, self._problem, self._noise, self._progress = space, problem, noise, progress
         self._known: dict[frozenset[str], np.ndarray] = {}
-        self._tolerances = self._solve(space.start_tolerances(), FIRST_ROUNDS).tolerances
+        self.everything = self._solve(space.start_tolerances(), FIRST_ROUNDS)
 
     def gain(self, names: tuple[str, ...], block: str) -> tuple[float, float]:
         """Return by which share a block among `names` lowers the squared error, and its standard error."""
@@ -102,7 +119,7 @@ class _Trials:
         key = frozenset(names)
         if key not in self._known:
             self._progress(f"trying {', '.join(names)}")
-            tolerances = np.where([b.name in key for b in self._space.blocks], self._tolerances, 0.0)
+            tolerances = np.where([b.name in key for b in self._space.blocks], self.everything.tolerances, 0.0)
             posterior = self._solve(tolerances, ROUNDS)
             errors = held_out(self._problem, posterior) * (posterior.noise / self._noise)[self._problem.kind]
             self._known[key] = np.bincount(self._problem.fold, errors**2)

@@ -27,6 +27,9 @@ KNOT_DISTANCE = 0.017
 MOST_BEYOND = 0.05
 """Encoders may read this far beyond the stroke, m: their zeros are not the geometry's."""
 
+LARGEST_EXPANSION = 100e-6
+"""No machine is built of anything that grows more, 1/K."""
+
 MAP_CORRELATION_LENGTH = 0.04
 """How far the errors of a length map are alike, m (Matérn 5/2)."""
 
@@ -84,6 +87,13 @@ class Settings:
             raise ModelError("blocks", f"must be of {', '.join(BLOCKS)}", sorted(unknown))
         if self.lead is not None and not 0.0 < self.lead < 1.0:
             raise ModelError("lead", "must be above zero and below 1 m", self.lead)
+        for name, value in self.tolerances:
+            if not 0.0 < value < np.inf:
+                raise ModelError(f"tolerance of {name}", "must be finite and above zero", value)
+        for body in ("strut", "base", "platform"):
+            value = getattr(self, f"{body}_expansion")
+            if not 0.0 <= value <= LARGEST_EXPANSION:
+                raise ModelError(f"{body} expansion", f"must be 0…{LARGEST_EXPANSION * 1e6:g} ppm/K", value * 1e6)
         if not 1 <= self.field_degree <= 8:
             raise ModelError("field_degree", "must be 1…8", self.field_degree)
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from . import common
 
@@ -45,12 +47,8 @@ def add_parser(subparsers: common.Subparsers) -> None:
     parser.add_argument("--truth", metavar="FILE", help="model of the virtual machine that was measured")
     add_joint_options(parser)
     parser.add_argument("--not-robust", action="store_true", help="trust readings that disagree with the rest (joint)")
-    parser.add_argument(
-        "--order",
-        choices=("adjusted-r2", "aicc"),
-        default="adjusted-r2",
-        help="what picks the polynomials' order (lines; default adjusted-r2)",
-    )
+    text = "what picks the polynomials' order (lines; default adjusted-r2)"
+    parser.add_argument("--order", choices=("adjusted-r2", "aicc"), help=text)
 
 
 def add_reading_options(parser: argparse.ArgumentParser) -> None:
@@ -70,10 +68,10 @@ def add_joint_options(parser: argparse.ArgumentParser) -> None:
     add("--blocks", metavar="A,B,…", help="what may be fitted: pitch, wave, backlash, map, field (default all)")
     add("--separate-joints", action="store_true", help="platform joints at the same place are two joints, not one")
     text = "how well joints are built, to start from, µm (default 100)"
-    add("--tolerance-um", type=common.bound, default=100.0, metavar="UM", help=text)
-    add("--field-degree", type=common.count, default=6, metavar="N", help="degree of the field (default 6)")
+    add("--tolerance-um", type=common.bound, metavar="UM", help=text)
+    add("--field-degree", type=common.count, metavar="N", help="degree of the field (default 6)")
     text = "thermal expansion of struts, or of struts, base and platform, ppm/K (default 0)"
-    add("--expansion-ppm", type=expansion_argument, default=(0.0, 0.0, 0.0), metavar="S[,B,P]", help=text)
+    add("--expansion-ppm", type=expansion_argument, metavar="S[,B,P]", help=text)
 
 
 def point_argument(text: str) -> tuple[float, ...]:
@@ -100,24 +98,22 @@ def joint_settings(args: argparse.Namespace) -> Settings:
     ModelError
         An unknown block.
     """
-    from ..calibration.space import BLOCKS, TOLERANCES, Settings
+    from ..calibration.space import TOLERANCES, Settings
 
-    blocks = BLOCKS
+    said: dict[str, Any] = {}
     if args.blocks is not None:
         named = [name.strip() for name in args.blocks.split(",") if name.strip()]
-        blocks = tuple(b for name in named for b in _blocks_called(name))
-    struts, base, platform = args.expansion_ppm
-    return Settings(
-        blocks=blocks,
-        shared_platform_joints=not args.separate_joints,
-        lead=None if args.lead_mm is None else args.lead_mm * 1e-3,
-        field_degree=args.field_degree,
-        strut_expansion=struts,
-        base_expansion=base,
-        platform_expansion=platform,
-        tolerances=tuple({**TOLERANCES, "structure": args.tolerance_um * 1e-6}.items()),
-        robust=not getattr(args, "not_robust", False),
-    )
+        said["blocks"] = tuple(b for name in named for b in _blocks_called(name))
+    if args.lead_mm is not None:
+        said["lead"] = args.lead_mm * 1e-3
+    if args.field_degree is not None:
+        said["field_degree"] = args.field_degree
+    if args.expansion_ppm is not None:
+        said |= dict(zip(("strut_expansion", "base_expansion", "platform_expansion"), args.expansion_ppm, strict=True))
+    if args.tolerance_um is not None:
+        said["tolerances"] = tuple({**TOLERANCES, "structure": args.tolerance_um * 1e-6}.items())
+    robust = not getattr(args, "not_robust", False)
+    return Settings(shared_platform_joints=not args.separate_joints, robust=robust, **said)
 
 
 def _blocks_called(name: str) -> tuple[str, ...]:
@@ -133,68 +129,98 @@ def run(args: argparse.Namespace) -> int:
     from ..model_file import load_model, save_model
     from ..paths import config_file
 
+    _refuse_options_of_the_other_scheme(args)
+    for path in (args.out, args.report, args.json, args.covariance):
+        _refuse_missing_folder(path)
     geometry = load_geometry(config_file(args.machine))
     truth = None if args.truth is None else RealMachine(geometry, load_model(config_file(args.truth), geometry))
     columns = None if args.columns is None else config_file(args.columns)
     settings = joint_settings(args)
     measured = read_files(args.files, geometry, columns, args.probe_mm)
     common.mention_compiling("machine_kernels.actual_pose_one")
-    model, text, pictures = _joint(args, measured, settings) if args.scheme == "joint" else _lines(args, measured)
-    text = "\n".join(part for part in (text, _iso_text(measured), _worth_text(truth, model)) if part)
-    save_model(model, args.out)
-    if args.report is not None:
-        write_text_atomically(args.report, text)
+    result = _joint(args, measured, settings) if args.scheme == "joint" else _lines(args, measured)
+    text = "\n".join(part for part in (result.text, _iso_text(measured), _worth_text(truth, result.model)) if part)
+    save_model(result.model, args.out)
     print(text)
     print(f"model: {args.out}")
-    _save_pictures(pictures, args.pictures)
+    if args.report is not None:
+        write_text_atomically(args.report, text)
+    result.save_more()
+    _save_pictures(result.pictures, args.pictures)
     return 0
 
 
-def _joint(
-    args: argparse.Namespace, measured: MeasurementSet, settings: Settings
-) -> tuple[MachineModel, str, dict[str, Figure]]:
-    """Fit with scheme joint; return model, report and pictures by file name."""
-    from dataclasses import replace
+def _refuse_options_of_the_other_scheme(args: argparse.Namespace) -> None:
+    """Raise on an option that the scheme would not listen to."""
+    from ..errors import CalibrationError
 
+    of_joint = ("lead_mm", "blocks", "tolerance_um", "field_degree", "expansion_ppm", "json", "covariance")
+    others = ("order",) if args.scheme == "joint" else (*of_joint, "separate_joints", "not_robust")
+    for name in others:
+        if getattr(args, name) not in (None, False):
+            raise CalibrationError(f"--{name.replace('_', '-')}", f"has no meaning for scheme {args.scheme}")
+
+
+def _refuse_missing_folder(path: str | None) -> None:
+    """Raise before a long fit when its result could not be written."""
+    from ..errors import InputFileError
+
+    if path is not None and not Path(path).parent.is_dir():
+        raise InputFileError(path, "", "cannot be written: its folder does not exist")
+
+
+@dataclass(frozen=True)
+class _Result:
+    """What a scheme gives: the model, its report, its pictures, and what else to save."""
+
+    model: MachineModel
+    text: str
+    pictures: Callable[[], dict[str, Figure]]
+    save_more: Callable[[], None] = lambda: None
+
+
+def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: Settings) -> _Result:
+    """Fit with scheme joint."""
     from ..calibration.joint_fit import fit_joint
     from ..calibration.joint_report import as_json, report
     from ..files import write_text_atomically
 
     with common.stage_line() as say:
         fit = fit_joint(measured, settings, say)
-    if args.json is not None:
-        write_text_atomically(args.json, common.json_text(as_json(fit)))
-    if args.covariance is not None:
-        labels = [label for block in fit.space.blocks for label in block.labels]
-        _save_arrays(args.covariance, labels=labels, values=fit.solution.x, covariance=fit.covariance)
-    pictures = {}
-    if args.pictures is not None:
+
+    def save_more() -> None:
+        if args.json is not None:
+            write_text_atomically(args.json, common.json_text(as_json(fit)))
+        if args.covariance is not None:
+            labels = [label for block in fit.space.blocks for label in block.labels]
+            _save_arrays(args.covariance, labels=labels, values=fit.solution.x, covariance=fit.covariance)
+
+    def pictures() -> dict[str, Figure]:
         from ..calibration_pictures import joint_figure, strut_error_figure
 
-        pictures["fit.png"] = joint_figure(fit)
+        made = {"fit.png": joint_figure(fit)}
         if fit.model.valid_box is not None:
-            title = "scheme joint"
-            pictures["strut_errors.png"] = strut_error_figure(measured.geometry, {title: fit.model})
+            made["strut_errors.png"] = strut_error_figure(measured.geometry, {"scheme joint": fit.model})
+        return made
+
     model = fit.model if args.name is None else replace(fit.model, name=args.name)
-    return model, report(fit), pictures
+    return _Result(model, report(fit), pictures, save_more)
 
 
-def _lines(args: argparse.Namespace, measured: MeasurementSet) -> tuple[MachineModel, str, dict[str, Figure]]:
-    """Fit with scheme lines; return model, report and pictures by file name."""
+def _lines(args: argparse.Namespace, measured: MeasurementSet) -> _Result:
+    """Fit with scheme lines."""
     from ..calibration.lines import fit_lines
     from ..calibration.lines_report import report
-    from ..errors import CalibrationError
 
-    if args.json is not None or args.covariance is not None:
-        raise CalibrationError("--json, --covariance", "belong to scheme joint")
-    fit = fit_lines(measured, args.order, name=args.name or "")
-    pictures = {}
-    if args.pictures is not None:
+    fit = fit_lines(measured, args.order or "adjusted-r2", name=args.name or "")
+
+    def pictures() -> dict[str, Figure]:
         from ..calibration_pictures import fitted_lines_figure, strut_error_figure
 
-        pictures["lines.png"] = fitted_lines_figure(fit)
-        pictures["strut_errors.png"] = strut_error_figure(measured.geometry, {fit.model.name: fit.model})
-    return fit.model, report(fit), pictures
+        of_struts = strut_error_figure(measured.geometry, {fit.model.name: fit.model})
+        return {"lines.png": fitted_lines_figure(fit), "strut_errors.png": of_struts}
+
+    return _Result(fit.model, report(fit), pictures)
 
 
 def _iso_text(measured: MeasurementSet) -> str:
@@ -232,11 +258,13 @@ def _save_arrays(path: str, **arrays: ArrayLike) -> None:
         raise InputFileError(path, "", f"cannot be written: {error.strerror}") from error
 
 
-def _save_pictures(pictures: dict[str, Figure], folder: str | None) -> None:
-    """Write pictures into a folder and say where they are."""
+def _save_pictures(pictures: Callable[[], dict[str, Figure]], folder: str | None) -> None:
+    """Draw pictures and write them into a folder, if one is given, and say where they are."""
     from ..plotting import save
 
-    for name, figure in pictures.items():
-        path = Path(folder or ".") / name
+    if folder is None:
+        return
+    for name, figure in pictures().items():
+        path = Path(folder) / name
         save(figure, path)
         print(f"picture: {path}")

@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     truth = load_model(config_file(args.truth), geometry)
     campaign = load_campaign(config_file(args.campaign))
     common.mention_compiling("machine_kernels.actual_pose_one")
-    plan = template(campaign, geometry, args.seed)
+    plan = template(campaign, geometry, args.seed, args.campaign)
     if args.model != "ideal":
         plan = compensated(plan, model)
     with common.progress_bar(len(plan.stations), " stations") as bar:

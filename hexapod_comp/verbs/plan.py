@@ -38,6 +38,6 @@ def run(args: argparse.Namespace) -> int:
     geometry = load_geometry(config_file(args.machine))
     campaign = load_campaign(config_file(args.campaign))
     common.mention_compiling("machine_kernels.actual_pose_one")
-    result = plan(template(campaign, geometry, args.seed), campaign, joint_settings(args))
+    result = plan(template(campaign, geometry, args.seed, args.campaign), campaign, joint_settings(args))
     common.emit(common.json_text(plan_json(result)) if args.json else plan_report(result), None)
     return 0
