@@ -292,7 +292,8 @@ def test_scheme_lines(hexapod: Program, done: Calibration, tmp_path: Path) -> No
 @pytest.mark.parametrize("option", ["--json", "--covariance"])
 def test_scheme_lines_has_no_covariance(hexapod: Program, done: Calibration, tmp_path: Path, option: str) -> None:
     written = ("--out", tmp_path / "m.yaml", option, tmp_path / "other")
-    assert_refused(hexapod("fit", done.measured, "--scheme", "lines", *written), f"{option}: has no meaning for scheme lines")
+    outcome = hexapod("fit", done.measured, "--scheme", "lines", *written)
+    assert_refused(outcome, f"{option}: has no meaning for scheme lines")
     assert not list(tmp_path.iterdir())
 
 
