@@ -34,7 +34,8 @@ demo: .venv/with-ros
 test: .venv/with-ros,test
 	$(BIN)/ruff check
 	$(BIN)/mypy
-	$(BIN)/pytest
+	@# The matrices of the tests are small: more threads of OpenBLAS would only wait for each other.
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest
 
 bench: .venv/with-ros,bench
 	@$(BIN)/python -m benchmarks
