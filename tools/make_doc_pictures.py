@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""Make the pictures of doc/theory.md, all of them from the code and the files that the page is about.
+"""Make the pictures of doc/, all of them from the code and the files that the pages are about.
 
-Run from the project's root: ``python -m tools.make_doc_pictures [--out FOLDER]``. Two runs with the same
-matplotlib give identical files.
+Run from the project's root: ``python -m tools.make_doc_pictures [--out FOLDER]``; the two of calibrations take a
+minute. Two runs with the same libraries on the same number of threads give identical files.
 """
 
 from __future__ import annotations
@@ -16,15 +16,30 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from hexapod_comp.calibration.joint_fit import JointFit, fit_joint
+from hexapod_comp.calibration.lines import fit_lines
+from hexapod_comp.calibration.space import Settings
+from hexapod_comp.calibration_pictures import joint_figure, strut_error_figure
+from hexapod_comp.campaign import load_campaign, template
 from hexapod_comp.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine import RealMachine
+from hexapod_comp.measurement import MeasurementSet
+from hexapod_comp.model_file import load_model
 from hexapod_comp.plotting import direction_figure, machine_figure, weights_figure
 from hexapod_comp.pose import Pose
+from hexapod_comp.virtual_instruments import measure
 
 ROOT = Path(__file__).resolve().parents[1]
 
 EXAMPLE_TOOL = Pose.from_angles([0.0, 0.0, 0.12], np.zeros(3))
 EXAMPLE_WORK = Pose.from_angles([0.15, -0.12, 0.0], np.deg2rad([0.0, 0.0, 20.0]))
 """Frames that the paper's machine does not have; drawn to show what the names mean."""
+
+SEED, LEAD = 1, 0.01
+"""Of the calibrations shown, as doc/calibration.md has them: the virtual instruments' seed; the screws' lead, m."""
+
+LINE_Y = 0.1016
+"""Where the line along x stands on which strut length errors are shown, m: one that was measured."""
 
 
 def machine_picture(geometry: HexapodGeometry) -> Figure:
@@ -41,18 +56,40 @@ def machine_picture(geometry: HexapodGeometry) -> Figure:
     return figure
 
 
+def measured(geometry: HexapodGeometry, name: str) -> MeasurementSet:
+    """Return what ``hexapod_comp measure --campaign NAME --seed 1`` reads."""
+    campaign = load_campaign(ROOT / "config" / f"{name}.yaml")
+    truth = RealMachine(geometry, load_model(ROOT / "config" / "paper_machine.yaml", geometry))
+    return measure(template(campaign, geometry, SEED), campaign, truth, SEED)
+
+
+def strut_error_picture(fit: JointFit, one_d: MeasurementSet) -> Figure:
+    """Return 001's Figures 3 and 4, from 1-D and from 5-D lines, and the same as the joint fit has it."""
+    models = {
+        "lines, 1-D": fit_lines(one_d).model,
+        "lines, 5-D": fit_lines(fit.measurements).model,
+        "joint, 5-D": fit.model,
+    }
+    # Off the middle, where displacements along x alone give mirrored struts the same curve.
+    return strut_error_figure(one_d.geometry, models, y=LINE_Y)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Make all pictures."""
-    parser = argparse.ArgumentParser(description="make the pictures of doc/theory.md")
+    parser = argparse.ArgumentParser(description="make the pictures of doc/")
     parser.add_argument("--out", type=Path, default=ROOT / "doc" / "pictures", help="folder")
     out = parser.parse_args(arguments).out
     out.mkdir(parents=True, exist_ok=True)
     # Without these two every run writes other identifiers and another date.
     matplotlib.rcParams["svg.hashsalt"] = "hexapod_comp"
+    geometry = load_geometry(ROOT / "config" / "paper.yaml")
+    fit = fit_joint(measured(geometry, "campaign_5d"), Settings(lead=LEAD))
     pictures = {
-        "machine.svg": machine_picture(load_geometry(ROOT / "config" / "paper.yaml")),
+        "machine.svg": machine_picture(geometry),
         "weights.svg": weights_figure(),
         "direction.svg": direction_figure(),
+        "joint_fit.svg": joint_figure(fit),
+        "strut_errors.svg": strut_error_picture(fit, measured(geometry, "campaign_1d")),
     }
     for name, figure in pictures.items():
         figure.savefig(out / name, metadata={"Date": None})
