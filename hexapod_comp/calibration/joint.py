@@ -256,7 +256,8 @@ class JointProblem:
         try:
             prediction = predict(self.space, x, stations)
         except (ModelError, KinematicsError) as error:
-            problem = f"left the machines that can be ({error}); do units, directions and commanded poses fit?"
+            hint = "do units, directions and commanded poses fit, and are all blocks allowed?"
+            problem = f"left the machines that can be ({error}); {hint}"
             raise CalibrationError("joint fit", problem) from error
         slopes = derivatives(self.space, prediction, stations)[c.station]
         expected = np.einsum("ci,ci->c", c.directions, prediction.errors[c.station])

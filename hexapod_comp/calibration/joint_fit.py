@@ -9,7 +9,7 @@ from datetime import date
 import numpy as np
 
 from ..errors import CalibrationError
-from ..machine import MachineModel, ModelOrigin
+from ..machine import REFERENCE_TEMPERATURE, MachineModel, ModelOrigin
 from ..measurement import ANGULAR_KINDS, KINDS, MeasurementSet, Source
 from .joint import HUBER, OUTLIER, JointProblem, Posterior, Solution, held_out, iterate, physical_covariance
 from .observability import Observability, ToolError, expected_error, observe, without_trace
@@ -25,6 +25,9 @@ LARGEST_NOISE = 0.02
 
 SCATTERED = 1.5
 """Readings whose noise is found so many times as large as stated are remarked on."""
+
+WARM = 0.2
+"""Readings taken further than this from the reference temperature, K, need an expansion: 1 µm on half a metre."""
 
 TILT = np.radians(10.0)
 """Tilt at which the report says what the model is worth for a tilted tool."""
@@ -163,7 +166,8 @@ def fit_joint(
             space, joint, solution = _solve(measurements, again, settings, (space, solution), progress)
         decisions = again
     channels = tuple(_channels(joint, solution))
-    notes = [*measurements.notes, *_check_backlash(space, solution), *_check_noise(channels)]
+    notes = [*measurements.notes, *_ignored(measurements, settings, space)]
+    notes += [*_check_backlash(space, solution), *_check_noise(channels)]
     progress("what is it worth?")
     covariance = physical_covariance(space, solution.posterior)
     allowed = _allowed(everything.space, possible, (space, solution))
@@ -269,6 +273,17 @@ def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
         problem = f"forward and backward look swapped: the struts would have a backlash of {found} µm"
         raise CalibrationError("direction", problem)
     return [f"strut_{i + 1}: backlash of {values[i] * 1e6:.2f} µm found, taken as none" for i in negative]
+
+
+def _ignored(measurements: MeasurementSet, settings: Settings, space: ParameterSpace) -> list[str]:
+    """Return remarks on what the fit was not told and therefore takes for something else."""
+    notes = []
+    if not np.isfinite(space.periods).all():
+        notes.append("the screws' lead is not known: a periodic error of the screws, if they have one, is not fitted")
+    warmth = np.abs(measurements.stations.temperatures - REFERENCE_TEMPERATURE).max()
+    if warmth > WARM and not (settings.strut_expansion or settings.base_expansion or settings.platform_expansion):
+        notes.append(f"read up to {warmth:.1f} K from 20 °C, but no expansion is given: growth is taken for an error")
+    return notes
 
 
 def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:

@@ -13,8 +13,8 @@ from .plan import Plan
 MOST_LISTED = 10
 """Outliers and notes beyond these are counted, not listed."""
 
-TRUST = 3.0
-"""A tilted tool whose expected error is so many times a level one's is warned of, when parameters are not seen."""
+TRUST = 0.1
+"""A tilted tool that keeps more than this share of its error is warned of, when parameters are not seen."""
 
 
 def report(fit: JointFit) -> str:
@@ -22,13 +22,18 @@ def report(fit: JointFit) -> str:
     parts = [
         _headline(fit),
         *_expected(fit.level, fit.tilted, fit.observability),
+        *_notes(fit),
         _channel_table(fit),
         _decision_table(fit),
         observability_text(fit.observability, fit.unseen_errors),
         *_outliers(fit),
-        *(f"note: {note}" for note in fit.notes),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _notes(fit: JointFit) -> Iterator[str]:
+    if fit.notes:
+        yield "\n".join(f"note: {note}" for note in fit.notes)
 
 
 def _headline(fit: JointFit) -> str:
@@ -48,7 +53,7 @@ def _expected(level: ToolError | None, tilted: ToolError | None, seen: Observabi
     lines.append(f"  level tool:  {tool_error_text(level)}")
     if tilted is not None:
         lines.append(f"  tilted 10°:  {tool_error_text(tilted)}")
-        if seen.structure_rank < seen.structure_size and tilted.after > TRUST * level.after:
+        if seen.structure_rank < seen.structure_size and tilted.after > TRUST * tilted.before:
             lines.append("  The readings do not show what tilting does: do not trust this model with a tilted tool.")
     yield "\n".join(lines)
 
@@ -110,7 +115,7 @@ def _outliers(fit: JointFit) -> Iterator[str]:
     """Yield the list of readings that disagree with all others."""
     if not fit.outliers:
         return
-    lines = [f"{len(fit.outliers)} readings disagree with all others, and got little weight:"]
+    lines = [f"readings that disagree with all others, and got little weight: {len(fit.outliers)}"]
     for o in fit.outliers[:MOST_LISTED]:
         unit = "urad" if CHANNELS[o.channel].partition("_")[0] in ANGULAR_KINDS else "um"
         lines.append(f"  {o.source}: {CHANNELS[o.channel]} is {o.residual * 1e6:.2f} {unit} off ({o.sigmas:.1f} σ)")

@@ -243,6 +243,12 @@ def progress_bar(total: int, unit: str) -> Any:
     return tqdm(total=total, unit=unit, delay=1.0, disable=None, leave=False)
 
 
+def say_notes(notes: Iterable[str]) -> None:
+    """Say on stderr what a reader of files found odd."""
+    for note in notes:
+        print(f"hexapod_comp: note: {note}", file=sys.stderr)
+
+
 @contextlib.contextmanager
 def stage_line() -> Iterator[Callable[[str], None]]:
     """Give a function that shows on stderr, on terminals only, what a long calculation is at and since when."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -49,6 +50,7 @@ def add_parser(subparsers: common.Subparsers) -> None:
     parser.add_argument("--not-robust", action="store_true", help="trust readings that disagree with the rest (joint)")
     text = "what picks the polynomials' order (lines; default adjusted-r2)"
     parser.add_argument("--order", choices=("adjusted-r2", "aicc"), help=text)
+    parser.add_argument("--every-line", action="store_true", help="report order, R² and residual of each line (lines)")
 
 
 def add_reading_options(parser: argparse.ArgumentParser) -> None:
@@ -122,6 +124,10 @@ def _blocks_called(name: str) -> tuple[str, ...]:
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
+    # One fit's matrices are too small for the threads of NumPy's BLAS, which on busy cores wait for each other. It
+    # reads this when it is loaded, and nothing has loaded it yet.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from ..errors import CalibrationError
     from ..files import write_text_atomically
     from ..geometry import load_geometry
     from ..machine import RealMachine
@@ -138,7 +144,11 @@ def run(args: argparse.Namespace) -> int:
     settings = joint_settings(args)
     measured = read_files(args.files, geometry, columns, args.probe_mm)
     common.mention_compiling("machine_kernels.actual_pose_one")
-    result = _joint(args, measured, settings) if args.scheme == "joint" else _lines(args, measured)
+    try:
+        result = _joint(args, measured, settings) if args.scheme == "joint" else _lines(args, measured)
+    except CalibrationError:
+        common.say_notes(measured.notes)  # they may say why
+        raise
     text = "\n".join(part for part in (result.text, _iso_text(measured), _worth_text(truth, result.model)) if part)
     save_model(result.model, args.out)
     print(text)
@@ -155,7 +165,7 @@ def _refuse_options_of_the_other_scheme(args: argparse.Namespace) -> None:
     from ..errors import CalibrationError
 
     of_joint = ("lead_mm", "blocks", "tolerance_um", "field_degree", "expansion_ppm", "json", "covariance")
-    others = ("order",) if args.scheme == "joint" else (*of_joint, "separate_joints", "not_robust")
+    others = ("order", "every_line") if args.scheme == "joint" else (*of_joint, "separate_joints", "not_robust")
     for name in others:
         if getattr(args, name) not in (None, False):
             raise CalibrationError(f"--{name.replace('_', '-')}", f"has no meaning for scheme {args.scheme}")
@@ -220,7 +230,7 @@ def _lines(args: argparse.Namespace, measured: MeasurementSet) -> _Result:
         of_struts = strut_error_figure(measured.geometry, {fit.model.name: fit.model})
         return {"lines.png": fitted_lines_figure(fit), "strut_errors.png": of_struts}
 
-    return _Result(fit.model, report(fit), pictures)
+    return _Result(fit.model, report(fit, every_line=args.every_line), pictures)
 
 
 def _iso_text(measured: MeasurementSet) -> str:

@@ -10,7 +10,7 @@ from .fit import add_reading_options
 SUMMARY = "the figures of ISO 230-2:2014 (A, E, R, M, B) of measured lines"
 
 TEXT = """Judges every linear run with two cycles or more, all targets read from both sides in each (the standard asks
-for five cycles). --targets prints each run target by target.
+for five cycles; a campaign says how many it makes). --targets prints each run target by target.
 
 example:
   $ hexapod_comp iso230 measured.csv"""
@@ -35,6 +35,7 @@ def run(args: argparse.Namespace) -> int:
     geometry = load_geometry(config_file(args.machine))
     columns = None if args.columns is None else config_file(args.columns)
     measured = read_files(args.files, geometry, columns, args.probe_mm)
+    common.say_notes(measured.notes)
     tests = {run.name: evaluate(run.targets, run.deviations) for run in iso230_runs(measured)}
     if not tests:
         problem = "no linear run has two cycles or more with every target read from both sides in each"

@@ -9,9 +9,8 @@ from .fit import add_joint_options, joint_settings
 
 SUMMARY = "what a measuring campaign will determine, and what it will not"
 
-TEXT = """Takes a campaign file, or the readings of a file that exists, and says without a single value which parameters
-they would determine, which they leave open, and what tool error a joint fit may be expected to leave on a machine
-within the tolerances.
+TEXT = """Takes a campaign file and says without a single reading which parameters the campaign would determine, which
+it leaves open, and what tool error a joint fit may be expected to leave on a machine within the tolerances.
 
 example:
   $ hexapod_comp plan campaign_1d --lead-mm 10 --blocks pitch,wave,backlash"""
