@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from .calibration.evaluation import run
 from .calibration.joint_fit import JointFit
 from .calibration.lines import LineFit, LinesFit
+from .calibration.observability import left_in_space
 from .errors import CalibrationError
 from .field import COMPONENTS, CROSS_AXES
 from .geometry import STRUT_NAMES, HexapodGeometry
@@ -23,6 +24,9 @@ from .travel import Passes
 
 SAMPLES = 161
 """Points of a curve."""
+
+MAP_NODES = 21
+"""Points along x and y of a map."""
 
 ARROWS = {1: "→", -1: "←"}
 
@@ -225,3 +229,30 @@ def _tool_error_panel(axes: Axes, fit: JointFit) -> None:
     axes.set(title="tool error to expect, datum aligned", ylabel="RMS in space, µm", yscale="log")
     axes.set_ylim(top=4.0 * max(before))  # room for the legend
     axes.legend(fontsize=7)
+
+
+def left_error_figure(fit: JointFit) -> Figure:
+    """Show where in the measured box what error is left after compensation: the RMS to expect, at three heights.
+
+    Raises
+    ------
+    CalibrationError
+        The readings span no box.
+    """
+    if fit.model.valid_box is None:
+        raise CalibrationError("picture of the error left", "needs readings that span a box")
+    low, high = fit.space.box
+    x, y = (np.linspace(low[a], high[a], MAP_NODES) for a in range(2))
+    heights = np.linspace(low[2], high[2], 3)
+    points = np.stack(np.meshgrid(heights, y, x, indexing="ij"), axis=-1)[..., ::-1].reshape(-1, 3)
+    left = left_in_space(fit.space, fit.solution.x, fit.covariance, points).reshape(3, MAP_NODES, MAP_NODES) * 1e6
+    figure = Figure(figsize=(11, 3.9), layout="constrained")
+    panels = figure.subplots(1, 3, sharex=True, sharey=True)
+    levels = np.linspace(np.nanmin(left), np.nanmax(left), 13)
+    for axes, height, values in zip(panels, heights, left, strict=True):
+        drawn = axes.contourf(x * 1e3, y * 1e3, np.ma.masked_invalid(values), levels, cmap="viridis")
+        axes.set(title=f"z = {height * 1e3:.0f} mm", xlabel="x, mm", aspect="equal")
+    panels[0].set_ylabel("y, mm")
+    figure.colorbar(drawn, ax=panels, label="RMS error in space to expect, µm")
+    figure.suptitle("what is left after compensation, level tool, datum aligned")
+    return figure

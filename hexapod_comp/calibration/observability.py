@@ -260,15 +260,12 @@ def expected_error(
     prediction = predict(space, x, stations)
     rows = derivatives(space, prediction, stations)
     points = stations.positions + stations.rotations @ space.probe
-    free = np.linalg.qr(_datum(points - points.mean(axis=0)))[0]
-    count = len(stations)
 
     def shown(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return RMS displacement and rotation of errors (M, 6, D) after aligning the datum."""
-        flat = errors[:, :3].reshape(3 * count, -1)
-        flat = flat - free @ (free.T @ flat)
         turned = errors[:, 3:] - errors[:, 3:].mean(axis=0)
-        return np.sqrt((flat**2).sum(axis=0) / count), np.sqrt((turned**2).sum(axis=(0, 1)) / count)
+        squares = (_aligned(points, errors[:, :3]) ** 2).sum(axis=1), (turned**2).sum(axis=1)
+        return np.sqrt(squares[0].mean(axis=0)), np.sqrt(squares[1].mean(axis=0))
 
     errors = prediction.errors[:, :, None] if prior is None else rows @ _drawn(prior)
     before, rotation_before = shown(errors)
@@ -288,6 +285,40 @@ def expected_error(
         rotation_before=_rms(rotation_before),
         rotation_after=_rms(rotation_after),
     )
+
+
+def left_in_space(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the RMS error in space that is left at each of some points, shape (n,), m.
+
+    As :func:`expected_error`, for a level tool, the datum aligned over these points; NaN where the machine does
+    not reach.
+
+    Parameters
+    ----------
+    space, x, covariance
+        As for :func:`expected_error`.
+    points : ndarray, shape (n, 3)
+        Places of the measured point, m in ``base``.
+    """
+    level = np.tile(np.eye(3), (len(points), 1, 1))
+    every = Passes(points - space.probe, level, np.tile(np.eye(3)[0], (len(points), 1)))
+    reachable = np.array([refusal is None for refusal in every.refusals(space.geometry)])
+    left = np.full(len(points), np.nan)
+    if not reachable.any():
+        return left
+    stations = _there_and_back(space, every.select(reachable))
+    rows = derivatives(space, predict(space, x, stations), stations)[:, :3]
+    places = np.tile(points[reachable], (2, 1))
+    squares = (_aligned(places, rows @ _drawn(covariance)) ** 2).sum(axis=1).mean(axis=1)
+    left[reachable] = np.sqrt(squares.reshape(2, -1).mean(axis=0))
+    return left
+
+
+def _aligned(points: np.ndarray, displacements: np.ndarray) -> np.ndarray:
+    """Return displacements (M, 3, D) of points (M, 3) less what one shift and rotation of the datum explain."""
+    free = np.linalg.qr(_datum(points - points.mean(axis=0)))[0]
+    flat = displacements.reshape(3 * len(points), -1)
+    return (flat - free @ (free.T @ flat)).reshape(displacements.shape)
 
 
 def _drawn(covariance: np.ndarray) -> np.ndarray:
@@ -324,7 +355,11 @@ def box_stations(space: ParameterSpace, tilt: float = 0.0) -> Stations | None:
     reachable = np.array([refusal is None for refusal in every.refusals(space.geometry)])
     if not reachable.any():
         return None
-    there = every.select(reachable)
+    return _there_and_back(space, every.select(reachable))
+
+
+def _there_and_back(space: ParameterSpace, there: Passes) -> Stations:
+    """Return the stations of passes there, and then of the same passes back."""
     passes = Passes(
         np.tile(there.positions, (2, 1)),
         np.tile(there.rotations, (2, 1, 1)),

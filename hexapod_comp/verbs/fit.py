@@ -206,10 +206,11 @@ def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: Setting
             _save_arrays(args.covariance, labels=labels, values=fit.solution.x, covariance=fit.covariance)
 
     def pictures() -> dict[str, Figure]:
-        from ..calibration_pictures import joint_figure, strut_error_figure
+        from ..calibration_pictures import joint_figure, left_error_figure, strut_error_figure
 
         made = {"fit.png": joint_figure(fit)}
         if fit.model.valid_box is not None:
+            made["left.png"] = left_error_figure(fit)
             made["strut_errors.png"] = strut_error_figure(measured.geometry, {"scheme joint": fit.model})
         return made
 
