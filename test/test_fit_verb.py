@@ -147,6 +147,7 @@ def test_fit_reports_all_its_sections(done: Calibration) -> None:
         "001's metric, mean |displacement error|",
         f"model: {done.file('model.yaml')}",
         f"picture: {done.file('pictures')}/fit.png",
+        f"picture: {done.file('pictures')}/left.png",
         f"picture: {done.file('pictures')}/strut_errors.png",
     ):
         assert part in done.fit_said, part
@@ -222,7 +223,7 @@ def test_covariance_is_one(done: Calibration) -> None:
 
 def test_pictures_are_pictures(done: Calibration) -> None:
     pictures = sorted(done.file("pictures").iterdir())
-    assert [path.name for path in pictures] == ["fit.png", "strut_errors.png"]
+    assert [path.name for path in pictures] == ["fit.png", "left.png", "strut_errors.png"]
     for path in pictures:
         content = path.read_bytes()
         assert content.startswith(PNG)
