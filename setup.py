@@ -63,6 +63,9 @@ setup(
             "colcon-library-path>=0.2.1",
         ],
         "bench": ["mujoco>=3.1", "pin>=2.7"],
+        # No rosdep keys: imported where used, with a clear message when missing.
+        "pages": ["plotly>=5.18"],
+        "cluster": ["distributed>=2023.12"],
     },
     entry_points={
         "console_scripts": [

@@ -60,14 +60,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser with all verbs; importing them must stay cheap: ``--help`` answers at once."""
-    from .verbs import assess, check, demo, export, fit, fk, ik, iso230, measure, plan, run
+    from .verbs import assess, check, classify, demo, export, fit, fk, ik, iso230, measure, plan, run
 
     parser = argparse.ArgumentParser(
         PROGRAM, description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and leave")
     subparsers = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
-    for verb in (ik, fk, check, assess, run, demo, plan, measure, fit, iso230, export):
+    for verb in (ik, fk, check, assess, run, demo, plan, measure, fit, iso230, export, classify):
         verb.add_parser(subparsers)
     return parser
 

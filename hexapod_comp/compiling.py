@@ -70,7 +70,7 @@ def _make(folder: Path) -> None:
 
 def _source_hash() -> str:
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
         source = path.read_bytes()
         if re.search(rb"^@(compiled|internal|inlined)|\bnjit\b", source, re.MULTILINE):
             digest.update(source)

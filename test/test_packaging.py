@@ -29,8 +29,9 @@ FILES = ("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "LICENSE")
 PYTHON3 = ("hypothesis", "matplotlib", "numba", "numpy", "pytest", "scipy", "tqdm", "yaml")
 ROSDEP_KEYS = {name: f"python3-{name}" for name in PYTHON3}
 PYPI_NAMES = {"yaml": "pyyaml"}
-# setuptools runs setup.py wherever that is read; the others are optional extras and benchmark tools.
-EXEMPT = {"setuptools", "plotly", "dask", "mujoco", "pinocchio"}
+# setuptools runs setup.py wherever that is read, mpl_toolkits comes with matplotlib; the others are optional
+# extras and benchmark tools.
+EXEMPT = {"setuptools", "mpl_toolkits", "plotly", "distributed", "mujoco", "pinocchio"}
 WITHOUT_ROS = """
 import importlib, sys
 

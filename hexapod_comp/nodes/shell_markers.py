@@ -1,0 +1,120 @@
+"""Shells of the workspace as RViz or Foxglove markers, on a latched topic: who comes late sees them too."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point
+from matplotlib import colormaps
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import ColorRGBA
+from visualization_msgs.msg import Marker, MarkerArray
+
+from ..errors import GeometryError
+from ..workspace.pictures import COLOURS, Layer, Quantity
+
+SHELL_QOS = QoSProfile(
+    depth=1,
+    history=HistoryPolicy.KEEP_LAST,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""Latched: the last message is kept for those who subscribe later."""
+
+TOPIC = "workspace/shells"
+NAMESPACE = "workspace_shells"
+TEXT_SHARE = 0.06
+"""Height of the text, of the width of the outermost shell."""
+
+OPACITY = (1.0, 0.35)
+"""Of the innermost and of the outermost shell."""
+
+
+def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, frame_id: str, stamp: Time) -> MarkerArray:
+    """Return shells as triangles coloured from the smallest to the largest value, and a text that names both.
+
+    Parameters
+    ----------
+    layers : sequence of Layer
+        From inside to outside, in the frame `frame_id`.
+    quantity : Quantity
+        Of the values.
+    title : str
+        First line of the text.
+    frame_id, stamp
+        Header of the markers: the name of the work frame.
+
+    Raises
+    ------
+    GeometryError
+        No layer, or values that are not finite.
+    """
+    values = np.concatenate([layer.values.ravel() for layer in layers]) if layers else np.array([np.nan])
+    if not np.isfinite(values).all():
+        raise GeometryError("layers", "must be at least one, with finite values")
+    low, high = float(values.min()), float(values.max())
+    clear = Marker(ns=NAMESPACE, action=Marker.DELETEALL)
+    clear.header.frame_id, clear.header.stamp = frame_id, stamp
+    markers = [clear]
+    for number, layer in enumerate(layers):
+        marker = _marker(frame_id, stamp, number, Marker.TRIANGLE_LIST)
+        share = number / max(1, len(layers) - 1)
+        _fill(marker, layer, (low, high), OPACITY[0] + share * (OPACITY[1] - OPACITY[0]))
+        markers.append(marker)
+    text = f"{title}\n{quantity.label}: {low * quantity.factor:.4g} (dark) … {high * quantity.factor:.4g} (yellow)"
+    markers.append(_text(_marker(frame_id, stamp, len(layers), Marker.TEXT_VIEW_FACING), layers[-1].points, text))
+    return MarkerArray(markers=markers)
+
+
+def publish_shells(node: Node, markers: MarkerArray, topic: str = TOPIC) -> Publisher:
+    """Publish markers once on a latched topic; keep what is returned as long as they shall be there."""
+    publisher = node.create_publisher(MarkerArray, topic, SHELL_QOS)
+    publisher.publish(markers)
+    return publisher
+
+
+def triangles(points: np.ndarray) -> np.ndarray:
+    """Return the triangles of a mesh of (H, A) points as indices into its H·A points, shape (T, 3).
+
+    Counter-clockwise from outside; those that a pole makes a line are left out.
+    """
+    number = np.arange(points.shape[0] * points.shape[1]).reshape(points.shape[:2])
+    a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
+    found = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    corners = points.reshape(-1, 3)[found]
+    return found[(corners != np.roll(corners, 1, axis=1)).any(axis=2).all(axis=1)]
+
+
+def _fill(marker: Marker, layer: Layer, limits: tuple[float, float], opacity: float) -> None:
+    """Write a layer's triangles and colours."""
+    width = limits[1] - limits[0]
+    shares = (layer.values.ravel() - limits[0]) / (width if width > 0.0 else 1.0)
+    colours = [ColorRGBA(r=r, g=g, b=b, a=opacity) for r, g, b, _ in colormaps[COLOURS](shares).tolist()]
+    points = [Point(x=x, y=y, z=z) for x, y, z in layer.points.reshape(-1, 3).tolist()]
+    corners = triangles(layer.points).ravel().tolist()
+    marker.points = [points[corner] for corner in corners]
+    marker.colors = [colours[corner] for corner in corners]
+
+
+def _marker(frame_id: str, stamp: Time, number: int, kind: int) -> Marker:
+    marker = Marker(ns=NAMESPACE, id=number, type=kind, action=Marker.ADD)
+    marker.header.frame_id, marker.header.stamp = frame_id, stamp
+    marker.pose.orientation.w = 1.0
+    marker.scale.x = marker.scale.y = marker.scale.z = 1.0
+    marker.color.a = 1.0
+    return marker
+
+
+def _text(marker: Marker, points: np.ndarray, text: str) -> Marker:
+    """Put a text above the outermost shell."""
+    low, high = points.reshape(-1, 3).min(axis=0), points.reshape(-1, 3).max(axis=0)
+    height = TEXT_SHARE * float(high[0] - low[0])
+    centre = 0.5 * (low + high)
+    marker.text, marker.scale.z = text, height
+    marker.pose.position = Point(x=float(centre[0]), y=float(centre[1]), z=float(high[2]) + 3.0 * height)
+    marker.color = ColorRGBA(r=0.9, g=0.9, b=0.9, a=1.0)
+    return marker

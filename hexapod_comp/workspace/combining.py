@@ -1,0 +1,360 @@
+"""All errors at once: worst case, root sum of squares, Monte Carlo; and what each error may be.
+
+Everything here starts from effects to first order, ``effect_vectors(…, method=LINEAR)``: one vector
+(displacement, rotation vector) per pose and error. A machine whose errors are u times their sizes, u within
+±1, is then off by Σ u_e·v_e. Results have two columns: displacement of the tool, m, and the largest of its
+three rotations, rad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import binom
+
+from ..errors import CalibrationError, ModelError
+from .sources import TOOL, SingleErrors
+
+DISPLACEMENT, ROTATION = 0, 1
+"""Columns of every result."""
+
+RSS, WORST_CASE = "rss", "worst_case"
+"""How an allocation adds the errors up."""
+
+UNIFORM, NORMAL = "uniform", "normal"
+"""Distributions of u: uniform within ±1, or normal with a standard deviation of 1."""
+
+CHUNK = 512
+"""Poses handled together: bounds the memory of all combinations of signs."""
+
+LARGEST_FACTOR = 1e9
+"""A source that may grow by more has no effect that counts."""
+
+
+def absolute_sum(vectors: np.ndarray) -> np.ndarray:
+    """Return the sums of the sizes of all effects, shape (N, 2): simple, and never below the worst case.
+
+    The sum of lengths bounds the length of any sum; only if all errors pushed in one direction would it be met.
+    """
+    return np.stack([np.linalg.norm(vectors[..., :3], axis=2).sum(axis=1), _turns(vectors)], axis=1)
+
+
+def worst_case(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
+    """Return the largest effect that errors within their bounds can have together, shape (N, 2).
+
+    max |Σ u_e·v_e| over all u in ±1: not bounded, but found. The maximum of a convex function over a box lies in
+    a corner, and all errors of one strut push the tool to and fro in one direction, so that the corners of six
+    struts and the tool's axes are all that there are: at most 256 sums.
+
+    Parameters
+    ----------
+    errors : SingleErrors
+        E errors.
+    vectors : ndarray, shape (N, E, 6)
+        Their effects to first order.
+    """
+    return _worst(_along_struts(errors, vectors).sum(axis=3))
+
+
+def root_sum_of_squares(vectors: np.ndarray) -> np.ndarray:
+    """Return the root sum of squares of all effects, shape (N, 2).
+
+    For independent errors whose standard deviations are the sizes in `vectors`, this is the RMS of the
+    displacement, and the standard deviation of the rotation about the worst of the axes. For bounds it is what
+    tolerance analysis calls the statistical sum; uniform errors have an RMS √3 times smaller.
+    """
+    squares = (vectors**2).sum(axis=1)
+    return np.sqrt(np.stack([squares[:, :3].sum(axis=1), squares[:, 3:].max(axis=1)], axis=1))
+
+
+def covariance_vectors(rows: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return what a calibrated model's uncertainty does to the tool, as independent effects of one sigma each.
+
+    They stand where effects of single errors stand elsewhere: their :func:`root_sum_of_squares` is the RMS
+    error that is left after compensation at each pose, and :func:`monte_carlo` with normal deviates gives
+    percentiles. In contrast to :func:`hexapod_comp.calibration.observability.expected_error`, pose by pose, and
+    with nothing taken away for the datum.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (N, 6, P)
+        ∂(displacement, rotation)/∂x of the parameters at each pose, as
+        :func:`hexapod_comp.calibration.sensitivity.derivatives` returns them.
+    covariance : ndarray, shape (P, P)
+        Of the parameters.
+
+    Returns
+    -------
+    ndarray, shape (N, P, 6)
+
+    Raises
+    ------
+    CalibrationError
+        The shapes do not fit, or the matrix is no covariance.
+    """
+    size = rows.shape[-1]
+    if covariance.shape != (size, size):
+        raise CalibrationError("covariance", f"must have shape ({size}, {size}), not {covariance.shape}")
+    scale = np.sqrt(np.abs(np.diag(covariance)))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    normalised = covariance / np.outer(scale, scale)  # parameters of µm and of rad/m in one matrix
+    if not (np.isfinite(covariance).all() and np.allclose(normalised, normalised.T, atol=1e-8)):
+        raise CalibrationError("covariance", "must be finite and symmetric")
+    values, directions = np.linalg.eigh(normalised)
+    if values[0] < -1e-8 * size:
+        raise CalibrationError("covariance", f"must not be negative in any direction, eigenvalue {values[0]:.3g}")
+    factor = scale[:, None] * directions * np.sqrt(np.maximum(values, 0.0))
+    return np.swapaxes(rows @ factor, 1, 2)
+
+
+@dataclass(frozen=True)
+class MonteCarlo:
+    """Percentiles of the combined error over many machines, with their confidence bounds.
+
+    Attributes
+    ----------
+    percentiles : tuple of float
+        Q percentages.
+    values, low, high : ndarray, shape (Q, N, 2)
+        At each pose: percentile, and bounds between which the true one lies with the confidence asked for.
+    worst_values, worst_low, worst_high : ndarray, shape (Q, 2)
+        The same of each machine's largest error over all poses: its worst place is not every machine's.
+    draws : int
+        How many machines.
+    confidence : float
+        Of the bounds, 0…1.
+    """
+
+    percentiles: tuple[float, ...]
+    values: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    worst_values: np.ndarray
+    worst_low: np.ndarray
+    worst_high: np.ndarray
+    draws: int
+    confidence: float
+
+
+def monte_carlo(
+    vectors: np.ndarray,
+    draws: int = 10_000,
+    percentiles: Sequence[float] = (50.0, 95.0, 99.0),
+    confidence: float = 0.95,
+    seed: int = 1,
+    distribution: str = UNIFORM,
+) -> MonteCarlo:
+    """Draw machines within their errors and return percentiles of the tool's error.
+
+    Each machine keeps its errors at all poses. The confidence bounds are order statistics: they hold for any
+    distribution.
+
+    Parameters
+    ----------
+    vectors : ndarray, shape (N, E, 6)
+        Effects to first order.
+    draws : int
+        Machines.
+    percentiles : sequence of float
+        Percentages within (0, 100).
+    confidence : float
+        Of the bounds, within (0, 1).
+    seed : int
+        The same seed gives the same numbers.
+    distribution : str
+        ``uniform`` within ± the sizes, or ``normal`` with the sizes as standard deviations.
+
+    Raises
+    ------
+    ModelError
+        A value out of its range, or too few draws for such a percentile with such a confidence.
+    """
+    ranks = np.array([_ranks(draws, percentile, confidence) for percentile in percentiles])
+    deviates = _deviates(vectors.shape[1], draws, distribution, seed)
+    worst = np.zeros((2, draws))
+    found = np.empty((len(vectors), 2, *ranks.shape))
+    for n, effects in enumerate(vectors):
+        errors = effects.T @ deviates
+        sizes = np.stack([np.sqrt((errors[:3] ** 2).sum(axis=0)), np.abs(errors[3:]).max(axis=0)])
+        np.maximum(worst, sizes, out=worst)
+        found[n] = np.partition(sizes, np.unique(ranks), axis=1)[:, ranks]
+    values, low, high = np.transpose(found, (3, 2, 0, 1))
+    of_worst = np.transpose(np.sort(worst, axis=1)[:, ranks], (2, 1, 0))
+    return MonteCarlo(tuple(percentiles), values, low, high, of_worst[0], of_worst[1], of_worst[2], draws, confidence)
+
+
+def _deviates(count: int, draws: int, distribution: str, seed: int) -> np.ndarray:
+    """Return each machine's errors in units of their sizes, shape (count, draws)."""
+    rng = np.random.default_rng(seed)
+    if distribution == UNIFORM:
+        return rng.uniform(-1.0, 1.0, (count, draws))
+    if distribution == NORMAL:
+        return rng.standard_normal((count, draws))
+    raise ModelError("distribution", f"must be {UNIFORM} or {NORMAL}", distribution)
+
+
+def _ranks(draws: int, percentile: float, confidence: float) -> tuple[int, int, int]:
+    """Return the indices, in ascending order of draws, of a percentile and of its confidence bounds.
+
+    The number of draws below the true percentile is binomial, whatever they are distributed like.
+    """
+    if not 0.0 < percentile < 100.0:
+        raise ModelError("percentiles", "must lie within (0, 100)", percentile)
+    if not 0.0 < confidence < 1.0:
+        raise ModelError("confidence", "must lie within (0, 1)", confidence)
+    if draws < 1:
+        raise ModelError("draws", "must be at least 1", draws)
+    share, rest = 0.01 * percentile, 0.5 * (1.0 - confidence)
+    low, high = (int(binom.ppf(q, draws, share)) for q in (rest, 1.0 - rest))
+    if low < 1 or high >= draws:
+        problem = f"are too few for bounds of the {percentile:g}th percentile with {confidence:.0%} confidence"
+        raise ModelError("draws", problem, draws)
+    return min(draws - 1, int(np.ceil(share * draws)) - 1), low - 1, high
+
+
+@dataclass(frozen=True)
+class Allocation:
+    """What the errors may be, given what the tool's error may be.
+
+    Attributes
+    ----------
+    method : str
+        ``rss`` or ``worst_case``.
+    allowed : float
+        Allowed error of the tool at the worst pose, m or rad.
+    combined : float
+        What the budget as it is adds up to there.
+    pose : int
+        The worst pose's number.
+    scale : float
+        Largest factor that all sizes may be multiplied by.
+    alone : ndarray, shape (K,)
+        Largest factor of each type when all others stay: ∞ where it has no effect, NaN where the others alone are
+        too much.
+    """
+
+    method: str
+    allowed: float
+    combined: float
+    pose: int
+    scale: float
+    alone: np.ndarray
+
+
+def allocate(
+    errors: SingleErrors,
+    vectors: np.ndarray,
+    allowed: float,
+    method: str = RSS,
+    quantity: int = DISPLACEMENT,
+) -> Allocation:
+    """Return what each source may be so that the tool's error stays within what is allowed at every pose.
+
+    Parameters
+    ----------
+    errors : SingleErrors
+        The budget's errors.
+    vectors : ndarray, shape (N, E, 6)
+        Their effects to first order; some hundreds of poses: each type's search adds all of them up some ten times.
+    allowed : float
+        m, or rad for the rotation.
+    method : str
+        How errors add up: :func:`root_sum_of_squares` or :func:`worst_case`.
+    quantity : int
+        DISPLACEMENT or ROTATION.
+
+    Raises
+    ------
+    ModelError
+        Nothing is allowed, or the method is unknown, or there are no poses.
+    """
+    _check_allocation(vectors, allowed, method)
+    types = len(errors.kinds)
+    parts = _squares(errors, vectors, quantity) if method == RSS else _along_struts(errors, vectors)
+
+    def combined(factors: np.ndarray) -> np.ndarray:
+        """Return the combined error at each pose with each type's size multiplied, shape (N,)."""
+        if method == RSS:
+            return np.sqrt((parts @ factors**2).max(axis=1))
+        return _worst(parts @ factors)[:, quantity]
+
+    now = combined(np.ones(types))
+    pose = int(np.argmax(now))
+    alone = np.array([_alone(combined, types, k, allowed) for k in range(types)])
+    scale = allowed / float(now[pose]) if now[pose] > 0.0 else np.inf
+    return Allocation(method, allowed, float(now[pose]), pose, scale, alone)
+
+
+def _check_allocation(vectors: np.ndarray, allowed: float, method: str) -> None:
+    """Refuse what cannot be allocated."""
+    if not 0.0 < allowed < np.inf:
+        raise ModelError("allowed", "must be above zero", allowed)
+    if method not in (RSS, WORST_CASE):
+        raise ModelError("method", f"must be {RSS} or {WORST_CASE}", method)
+    if not len(vectors):
+        raise ModelError("poses", "there are none: the workspace is empty", 0)
+
+
+def _alone(combined: Callable[[np.ndarray], np.ndarray], types: int, kind: int, allowed: float) -> float:
+    """Return how far one type may grow: the combined error only grows with it, so that a bracket is easily found."""
+
+    def excess(factor: float) -> float:
+        factors = np.ones(types)
+        factors[kind] = factor
+        return float(combined(factors).max()) - allowed
+
+    if excess(0.0) > 0.0:
+        return np.nan
+    high = 1.0
+    while excess(high) < 0.0:
+        high *= 4.0
+        if high > LARGEST_FACTOR:
+            return np.inf
+    return float(brentq(excess, 0.0, high, rtol=1e-10))
+
+
+def _squares(errors: SingleErrors, vectors: np.ndarray, quantity: int) -> np.ndarray:
+    """Return each type's part of the squared error, shape (N, 1 or 3 axes, K)."""
+    belongs = np.eye(len(errors.kinds))[errors.kind]
+    parts = np.einsum("nec,ek->nck", vectors**2, belongs)
+    return parts[:, :3].sum(axis=1, keepdims=True) if quantity == DISPLACEMENT else parts[:, 3:]
+
+
+def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
+    """Return what the errors of one direction do together, type by type, shape (N, G, 6, K).
+
+    The errors of a strut all have one direction at a pose; those of the tool have one each.
+    """
+    tools = np.flatnonzero(errors.part == TOOL)
+    members = [np.flatnonzero((errors.strut == strut) & (errors.part != TOOL)) for strut in range(6)]
+    members = [chosen for chosen in members if len(chosen)] + [tools[[n]] for n in range(len(tools))]
+    result = np.zeros((len(vectors), len(members), 6, len(errors.kinds)))
+    for group, chosen in enumerate(members):
+        one = vectors[:, chosen]
+        longest = np.argmax((one**2).sum(axis=2), axis=1)
+        direction = one[np.arange(len(one)), longest]
+        ways = np.where(np.einsum("nec,nc->ne", one, direction) < 0.0, -1.0, 1.0)
+        for n, error in enumerate(chosen):
+            result[:, group, :, errors.kind[error]] += ways[:, n, None] * one[:, n]
+    return result
+
+
+def _worst(groups: np.ndarray) -> np.ndarray:
+    """Return the largest |Σ ± w| over all signs, (N, G, 6) → (N, 2)."""
+    count = groups.shape[1]
+    signs = 1.0 - 2.0 * ((np.arange(2 ** max(count - 1, 0))[:, None] >> np.arange(count)) & 1)
+    result = np.empty((len(groups), 2))
+    result[:, ROTATION] = _turns(groups)
+    for start in range(0, len(groups), CHUNK):
+        rows = slice(start, start + CHUNK)
+        sums = signs @ groups[rows, :, :3]
+        result[rows, DISPLACEMENT] = np.sqrt((sums**2).sum(axis=2).max(axis=1))
+    return result
+
+
+def _turns(vectors: np.ndarray) -> np.ndarray:
+    """Return the largest possible rotation about an axis, shape (N,): each axis has signs of its own."""
+    return np.abs(vectors[..., 3:]).sum(axis=1).max(axis=1)

@@ -1,0 +1,299 @@
+"""Pictures of the workspace study: coloured shells, what limits them, the ranked table as bars.
+
+Functions take plain arrays (points, values) and return a matplotlib figure, as those of
+:mod:`hexapod_comp.plotting` do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.gridspec import SubplotSpec
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.patches import Patch
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
+
+from ..errors import GeometryError
+from ..geometry import HexapodGeometry
+from .reach import FINDINGS
+
+COLOURS = "viridis"
+"""Colour map of effects: even steps for the eye, also in grey and to the colour-blind."""
+
+CAUSE_COLOURS = ("#ffffff", "#20639b", "#c1432e", "#e3a72f", "#3c8d5a", "#7b4ea3", "#444444", "#d77fb3")
+"""Of the findings, in their order."""
+
+VIEW_AZIMUTH, VIEW_ELEVATION = -60.0, 20.0
+"""Where the eye stands, degrees."""
+
+WEDGE = 130.0
+"""How far the outermost of several shells is cut open towards the eye, degrees; inner ones less, the innermost not."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A coloured mesh.
+
+    Attributes
+    ----------
+    points : ndarray, shape (H, A, 3)
+        m in the work frame.
+    values : ndarray, shape (H, A)
+        SI.
+    """
+
+    points: np.ndarray
+    values: np.ndarray
+
+    def __post_init__(self) -> None:
+        if self.points.ndim != 3 or self.points.shape[2] != 3 or self.points.shape[:2] != self.values.shape:
+            problem = f"must be (H, A, 3) points and (H, A) values, not {self.points.shape} and {self.values.shape}"
+            raise GeometryError("layer", problem)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What values mean and how they are shown.
+
+    Attributes
+    ----------
+    name : str
+        Such as "translation of the tool".
+    unit : str
+        Shown unit.
+    factor : float
+        Shown value per SI value.
+    """
+
+    name: str
+    unit: str
+    factor: float
+
+    @property
+    def label(self) -> str:
+        """Name and unit."""
+        return f"{self.name}, {self.unit}"
+
+
+TRANSLATION = Quantity("translation of the tool", "µm", 1e6)
+ROTATION = Quantity("rotation of the tool, largest of three", "m°", 1e3 * 180.0 / np.pi)
+
+
+@dataclass(frozen=True)
+class RankedRow:
+    """One bar pair of the ranked table.
+
+    Attributes
+    ----------
+    name : str
+        Error type, with its size.
+    translation, rotation : tuple of float
+        Smallest and largest effect over the workspace, m and rad.
+    """
+
+    name: str
+    translation: tuple[float, float]
+    rotation: tuple[float, float]
+
+
+def outline(geometry: HexapodGeometry) -> list[np.ndarray]:
+    """Return the machine at home as polylines, each (K, 3), m in the work frame: base, platform, six struts, tool."""
+    home, to_work = geometry.home, geometry.work.inverse()
+    platform = home.position + geometry.platform_joints @ home.rotation.T
+    base, tip = geometry.base_joints, (home @ geometry.tool).position
+    lines = [np.vstack([base, base[:1]]), np.vstack([platform, platform[:1]])]
+    lines += [np.stack([start, end]) for start, end in zip(base, platform, strict=True)]
+    lines.append(np.stack([home.position, tip]))
+    return [to_work.position + line @ to_work.rotation.T for line in lines]
+
+
+def shells_figure(
+    geometry: HexapodGeometry,
+    layers: Sequence[Layer],
+    quantity: Quantity,
+    title: str,
+    limits: tuple[float, float] | None = None,
+) -> Figure:
+    """Show shells of the workspace coloured by an effect (004, Figure 2), with the machine at home.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        The machine.
+    layers : sequence of Layer
+        From inside to outside; all but the innermost are cut open towards the eye.
+    quantity : Quantity
+        Of the values.
+    title : str
+        Machine, error and orientation.
+    limits : tuple of float, optional
+        Ends of the colour bar, SI; default the smallest and largest value.
+
+    Raises
+    ------
+    GeometryError
+        No layer, or values that are not finite.
+    """
+    values = _finite_values(layers) * quantity.factor
+    scale = np.array(limits) * quantity.factor if limits else np.array([values.min(), values.max()])
+    norm = Normalize(*scale)
+    figure = Figure(figsize=(12.0, 6.0), layout="constrained")
+    figure.suptitle(title)
+    faces, colours = [], []
+    for number, layer in enumerate(layers):
+        kept, corners = _faces(layer.points, WEDGE * number / max(1, len(layers) - 1))
+        faces.append(kept)
+        colours.append(colormaps[COLOURS](norm(_of_faces(layer.values, corners) * quantity.factor)))
+    places = figure.add_gridspec(1, 2, width_ratios=[2, 3])
+    _draw(_space(figure, places[0], "the machine at home"), geometry, faces[-1], colours[-1], machine=True)
+    axes = _space(figure, places[1], "cut open; the line is the platform at home" if len(layers) > 1 else "")
+    _draw(axes, geometry, np.concatenate(faces), np.concatenate(colours))
+    _colour_bar(figure, axes, norm, quantity)
+    return figure
+
+
+def causes_figure(geometry: HexapodGeometry, points: np.ndarray, findings: np.ndarray, title: str) -> Figure:
+    """Show what limits the workspace on its boundary, from above and from below.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        The machine.
+    points : ndarray, shape (H, A, 3)
+        Boundary mesh, m in the work frame.
+    findings : ndarray of int, shape (H, A)
+        Index into :data:`~hexapod_comp.workspace.reach.FINDINGS`.
+    title : str
+        Machine and orientation.
+    """
+    faces, corners = _faces(points, 0.0)
+    of_face = findings[corners]
+    area = _areas(faces)
+    colours = np.array(CAUSE_COLOURS)[of_face]
+    figure = Figure(figsize=(13.0, 5.2), layout=ConstrainedLayoutEngine(rect=(0.0, 0.08, 1.0, 0.92)))
+    figure.suptitle(title)
+    places = figure.add_gridspec(1, 3, width_ratios=[2, 3, 3])
+    _draw(_space(figure, places[0], "the machine at home"), geometry, faces, colours, machine=True)
+    for place, elevation, name in ((places[1], 30.0, "from above"), (places[2], -30.0, "from below")):
+        _draw(_space(figure, place, name, elevation), geometry, faces, colours)
+    present = [code for code in range(len(FINDINGS)) if (of_face == code).any()]
+    shares = [area[of_face == code].sum() / area.sum() for code in present]
+    handles = [
+        Patch(color=CAUSE_COLOURS[code], label=f"{FINDINGS[code]}: {share:.1%} of the area")
+        for code, share in zip(present, shares, strict=True)
+    ]
+    figure.legend(handles=handles, loc="lower center", ncols=min(4, len(handles)))
+    return figure
+
+
+def ranking_figure(rows: Sequence[RankedRow], title: str) -> Figure:
+    """Show a ranked table as bars from the smallest to the largest effect over the workspace (004, Table 1).
+
+    Parameters
+    ----------
+    rows : sequence of RankedRow
+        From the worst down.
+    title : str
+        Machine and budget.
+
+    Raises
+    ------
+    GeometryError
+        No row.
+    """
+    if not rows:
+        raise GeometryError("rows", "of a ranking must be at least one")
+    figure = Figure(figsize=(10.0, 1.9 + 0.42 * len(rows)), layout="constrained")
+    figure.suptitle(title)
+    left, right = figure.subplots(1, 2, sharey=True)
+    _bars(left, [row.translation for row in rows], TRANSLATION, "#20639b")
+    _bars(right, [row.rotation for row in rows], ROTATION, "#3c8d5a")
+    left.set_yticks(np.arange(len(rows)), [row.name for row in rows])
+    left.set_ylim(len(rows) - 0.4, -0.6)
+    return figure
+
+
+def _bars(axes: Axes, ranges: Sequence[tuple[float, float]], quantity: Quantity, colour: str) -> None:
+    """Draw bars from minimum to maximum, with both numbers."""
+    low, high = np.array(ranges).T * quantity.factor
+    number = np.arange(len(low))
+    least = 0.004 * high.max()  # minimum and maximum may be the same
+    axes.barh(number, np.maximum(high - low, least), left=low, height=0.55, color=colour)
+    for row, (start, end) in enumerate(zip(low, high, strict=True)):
+        shown = f"{start:.3g}" if start > 1e-3 * high.max() else "≈ 0"
+        axes.annotate(f"{shown} – {end:.3g}", (end, row), (4, 0), textcoords="offset points", va="center")
+    axes.set_xlim(0.0, 1.28 * high.max())
+    axes.set(title=quantity.name, xlabel=f"minimum – maximum over the workspace, {quantity.unit}")
+    axes.grid(False, axis="y")
+
+
+def _finite_values(layers: Sequence[Layer]) -> np.ndarray:
+    if not layers:
+        raise GeometryError("layers", "of a picture must be at least one")
+    values = np.concatenate([layer.values.ravel() for layer in layers])
+    if not np.isfinite(values).all():
+        raise GeometryError("values", "of a mesh must be finite", int((~np.isfinite(values)).sum()))
+    return values
+
+
+def _space(figure: Figure, place: SubplotSpec, title: str, elevation: float = VIEW_ELEVATION) -> Any:
+    """Return 3-D axes, drawn in the order in which things are added to them."""
+    axes: Any = figure.add_subplot(place, projection="3d", computed_zorder=False)
+    axes.view_init(elev=elevation, azim=VIEW_AZIMUTH)
+    axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm", title=title)
+    axes.locator_params(nbins=5)
+    return axes
+
+
+def _draw(axes: Any, geometry: HexapodGeometry, faces: np.ndarray, colours: np.ndarray, machine: bool = False) -> None:
+    """Draw faces, (F, 4, 3) m, and behind them the machine, or of it only the platform."""
+    lines = [line * 1e3 for line in outline(geometry)]
+    drawn = lines if machine else lines[1:2]
+    for line in drawn:
+        body = len(line) > 2
+        axes.plot(*line.T, color="black" if body else "#777777", lw=1.8 if body else 1.3, zorder=1)
+    # All faces in one collection: Matplotlib sorts by distance within a collection only.
+    edges: dict[str, Any] = {"edgecolors": colours if machine else (0.0, 0.0, 0.0, 0.12), "lw": 0.3}
+    axes.add_collection3d(Poly3DCollection(faces * 1e3, facecolors=colours, zorder=2, **edges))
+    everything = np.concatenate([*drawn, faces.reshape(-1, 3) * 1e3])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axes.set_box_aspect(high - low, zoom=0.88)  # room for the labels
+
+
+def _colour_bar(figure: Figure, axes: Any, norm: Normalize, quantity: Quantity) -> None:
+    """Draw a colour bar with its ends' values above and below."""
+    bar = figure.colorbar(ScalarMappable(norm, COLOURS), ax=axes, shrink=0.75, pad=0.12)
+    bar.set_label(quantity.label)
+    bar.ax.set_title(f"{norm.vmax:.4g}", fontsize=8)
+    bar.ax.set_xlabel(f"{norm.vmin:.4g}", fontsize=8)
+
+
+def _faces(points: np.ndarray, wedge: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Return the quadrilaterals of a mesh, (F, 4, 3), less a wedge towards the eye, and their mesh indices."""
+    quads = np.stack([points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]], axis=2)
+    away = quads.mean(axis=2) - points.reshape(-1, 3).mean(axis=0)
+    turn = np.rad2deg(np.arctan2(away[..., 1], away[..., 0])) - VIEW_AZIMUTH
+    kept = np.abs((turn + 180.0) % 360.0 - 180.0) >= 0.5 * wedge
+    where = np.nonzero(kept)
+    return quads[where], (where[0], where[1])
+
+
+def _of_faces(values: np.ndarray, corners: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Return the mean of the four corners' values of faces given by their first corner."""
+    i, j = corners
+    return 0.25 * (values[i, j] + values[i, j + 1] + values[i + 1, j + 1] + values[i + 1, j])
+
+
+def _areas(faces: np.ndarray) -> np.ndarray:
+    """Return the areas of quadrilaterals, (F, 4, 3) → (F,)."""
+    diagonals = np.cross(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
+    return 0.5 * np.linalg.norm(diagonals, axis=1)

@@ -1,0 +1,267 @@
+"""The ranking of error types by their effect on the tool, beside the figures that paper 004 prints (Table 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import KinematicsError
+from ..geometry import HexapodGeometry
+from ..pose import angles_from_rotation
+from ..texts import aligned, number
+from .effects import Extremes
+from .sources import SOURCE_TYPES
+
+MICRO = 1e6
+MILLIDEGREE = np.pi / 180e3
+
+JOINED = {
+    "base-/platform joint (x/y)": ("base joint x/y", "platform joint x/y"),
+    "base-/platform joint (z)": ("base joint z", "platform joint z"),
+}
+"""Types that 004 puts into one row, by their titles."""
+
+QUANTITIES = ("translation_max", "translation_min", "rotation_max", "rotation_min")
+
+
+@dataclass(frozen=True)
+class Extreme:
+    """One figure of the ranking.
+
+    Attributes
+    ----------
+    value : float
+        m or rad.
+    error : str
+        Which single error, with its type where several share a row.
+    position, angles : ndarray, shape (3,)
+        ``pose_tool_in_work`` where it happens: m; α, β, γ, rad.
+    pose : int
+        That pose's number.
+    """
+
+    value: float
+    error: str
+    position: np.ndarray
+    angles: np.ndarray
+    pose: int
+
+
+@dataclass(frozen=True)
+class RankingRow:
+    """One error type, or several that share a row.
+
+    Attributes
+    ----------
+    title : str
+        As people read it.
+    translation_max, translation_min : Extreme
+        Largest and smallest displacement of the tool, m.
+    rotation_max, rotation_min : Extreme
+        Largest and smallest of its rotation, the largest about three axes, rad.
+    failed : int
+        Effects that could not be had.
+    """
+
+    title: str
+    translation_max: Extreme
+    translation_min: Extreme
+    rotation_max: Extreme
+    rotation_min: Extreme
+    failed: int
+
+    def figures(self) -> np.ndarray:
+        """Return the four values, m, m, rad, rad."""
+        return np.array([getattr(self, name).value for name in QUANTITIES])
+
+
+@dataclass(frozen=True)
+class PaperRow:
+    """A row of 004, Table 1, as printed; zeros where it prints "≈ 0"; m and rad.
+
+    Attributes
+    ----------
+    title : str
+        As printed.
+    size : float
+        The error's size in the text, m.
+    figures : ndarray, shape (4,)
+        Translation max, min, m; rotation max, min, rad.
+    """
+
+    title: str
+    size: float
+    figures: np.ndarray
+
+
+def _paper_row(title: str, size_um: float, um: tuple[float, float], mdeg: tuple[float, float]) -> PaperRow:
+    return PaperRow(title, size_um / MICRO, np.array([v / MICRO for v in um] + [v * MILLIDEGREE for v in mdeg]))
+
+
+PAPER_TABLE = (
+    _paper_row("screw pitch", 20.0, (34.4, 22.4), (15.41, 10.71)),
+    _paper_row("base-/platform joint (x/y)", 10.0, (13.68, 0.0), (6.16, 0.0)),
+    _paper_row("base-/platform joint (z)", 10.0, (11.2, 11.18), (5.36, 3.84)),
+    _paper_row("quantization", 7.0, (10.85, 7.84), (4.39, 3.81)),
+)
+"""004, Table 1. Its machine's geometry is not printed: another machine cannot give the same digits."""
+
+_SAME_AS_PAPER = {"quantisation": "quantization"}
+
+
+def ranked(
+    extremes: Extremes, geometry: HexapodGeometry, joined: dict[str, tuple[str, ...]] | None = None
+) -> list[RankingRow]:
+    """Return one row per error type, the largest displacement of the tool first (004, Table 1).
+
+    Parameters
+    ----------
+    extremes : Extremes
+        Over the workspace.
+    geometry : HexapodGeometry
+        For the tool's poses.
+    joined : dict of str to tuple of str, optional
+        Titles of types that share a row, by the row's title; those of 004 by default, {} for none. A group of
+        which the budget has only one type keeps that type's own title.
+
+    Raises
+    ------
+    KinematicsError
+        A type has no effect that could be had at any pose.
+    """
+    rows = [_row(extremes, geometry, title, kinds) for title, kinds in _groups(extremes, joined)]
+    return sorted(rows, key=lambda row: -row.translation_max.value)
+
+
+def _groups(extremes: Extremes, joined: dict[str, tuple[str, ...]] | None) -> list[tuple[str, list[int]]]:
+    """Return title and type numbers of each row."""
+    titles = extremes.errors.kinds
+    rest, groups = list(range(len(titles))), []
+    for title, members in (JOINED if joined is None else joined).items():
+        kinds = [k for k in rest if titles[k] in members]
+        if len(kinds) > 1:
+            groups.append((title, kinds))
+            rest = [k for k in rest if k not in kinds]
+    return groups + [(titles[k], [k]) for k in rest]
+
+
+def _row(extremes: Extremes, geometry: HexapodGeometry, title: str, kinds: list[int]) -> RankingRow:
+    a, b, c, d = (_extreme(extremes, geometry, title, kinds, column) for column in range(4))
+    return RankingRow(title, a, b, c, d, int(extremes.failed[kinds].sum()))
+
+
+def _extreme(
+    extremes: Extremes, geometry: HexapodGeometry, title: str, kinds: list[int], column: int
+) -> Extreme:
+    """Return one column's extreme over some types."""
+    values = extremes.values[kinds, column]
+    if np.isnan(values).all():
+        problem = f"{title}: no pose of {extremes.poses} has a certified solution; is the workspace reachable?"
+        raise KinematicsError(problem, extremes.poses)
+    kind = kinds[int(np.nanargmin(values) if column % 2 else np.nanargmax(values))]
+    errors, error = extremes.errors, int(extremes.at_error[kind, column])
+    label = errors.labels[error]
+    rotation = extremes.rotations[kind, column]
+    tip = extremes.positions[kind, column] + rotation @ geometry.tool.position
+    position = geometry.work.rotation.T @ (tip - geometry.work.position)
+    angles = angles_from_rotation(geometry.work.rotation.T @ rotation @ geometry.tool.rotation)
+    pose = int(extremes.at_pose[kind, column])
+    return Extreme(float(extremes.values[kind, column]), label, position, angles, pose)
+
+
+def paper_row(title: str) -> PaperRow | None:
+    """Return the row of 004, Table 1, that stands for an error type; None for a type that it does not have."""
+    wanted = _SAME_AS_PAPER.get(title, title)
+    return next((row for row in PAPER_TABLE if row.title == wanted), None)
+
+
+def ranking_text(rows: Sequence[RankingRow], with_paper: bool = True) -> str:
+    """Return the ranking as tables: Table 1's figures, with the paper's in brackets, and where each happens."""
+    head = ["error type", "transl. max µm", "transl. min µm", "rot. max m°", "rot. min m°"]
+    lines = []
+    for row in rows:
+        printed = paper_row(row.title) if with_paper else None
+        lines.append([row.title, *(_cell(row, printed, column) for column in range(4))])
+    parts = [aligned(head, lines)]
+    if with_paper:
+        parts.append("In brackets: 004, Table 1, of a machine whose geometry is not printed, so not to be met.")
+    parts.append(aligned(["error type", "figure", "by", "tool x, y, z mm", "α, β, γ °"], _places(rows)))
+    failed = sum(row.failed for row in rows)
+    if failed:
+        parts.append(f"{failed} effects have no certified solution and were left out.")
+    return "\n\n".join(parts)
+
+
+def _cell(row: RankingRow, printed: PaperRow | None, column: int) -> str:
+    """Return one figure with the paper's in brackets."""
+    own = _shown(row.figures()[column], column)
+    return own if printed is None else f"{own} ({_shown(printed.figures[column], column)})"
+
+
+def _shown(value: float, column: int) -> str:
+    return number(value * MICRO, 2) if column < 2 else number(value / MILLIDEGREE, 2)
+
+
+def _places(rows: Sequence[RankingRow]) -> list[list[str]]:
+    """Return which error and which pose each figure comes from."""
+    lines = []
+    for row in rows:
+        for name in QUANTITIES:
+            extreme = getattr(row, name)
+            place = ", ".join(number(1e3 * v, 1) for v in extreme.position)
+            tilt = ", ".join(number(float(np.rad2deg(v)), 1) for v in extreme.angles)
+            lines.append([row.title, name.replace("_", " "), extreme.error, place, tilt])
+    return lines
+
+
+def ranking_rows(rows: Sequence[RankingRow]) -> list[dict[str, Any]]:
+    """Return the ranking for CSV or JSON: a record per row, units in the keys; the paper's figures beside, or None."""
+    records = []
+    for rank, row in enumerate(rows, start=1):
+        printed = paper_row(row.title)
+        record: dict[str, Any] = {"rank": rank, "error_type": row.title}
+        for column, name in enumerate(QUANTITIES):
+            extreme = getattr(row, name)
+            factor, unit = (MICRO, "um") if column < 2 else (1.0 / MILLIDEGREE, "mdeg")
+            record[f"{name}_{unit}"] = extreme.value * factor
+            record[f"{name}_paper_{unit}"] = None if printed is None else float(printed.figures[column] * factor)
+            record[f"{name}_error"] = extreme.error
+            for axis, value in zip("xyz", extreme.position, strict=True):
+                record[f"{name}_{axis}_mm"] = float(value * 1e3)
+            for angle, value in zip(("alpha", "beta", "gamma"), extreme.angles, strict=True):
+                record[f"{name}_{angle}_deg"] = float(np.rad2deg(value))
+        record["failed"] = row.failed
+        records.append(record)
+    return records
+
+
+def ratios_to_paper(rows: Sequence[RankingRow], sizes: dict[str, float]) -> list[dict[str, Any]]:
+    """Return how the machine's largest effects per input error compare with the paper's, type by type.
+
+    Parameters
+    ----------
+    rows : sequence of RankingRow
+        The ranking.
+    sizes : dict of str to float
+        Size of each type by its name in the budget, SI.
+
+    Returns
+    -------
+    list of dict
+        ``error_type``, ``gain`` and ``gain_paper`` (largest displacement per input error), for the rows that the
+        paper has.
+    """
+    by_title = {source.title: sizes[source.name] for source in SOURCE_TYPES if source.name in sizes}
+    records = []
+    for row in rows:
+        printed = paper_row(row.title)
+        members = JOINED.get(row.title, (row.title,))
+        size = max((by_title[member] for member in members if member in by_title), default=None)
+        if printed is None or size is None:
+            continue
+        gain, gain_paper = row.translation_max.value / size, float(printed.figures[0] / printed.size)
+        records.append({"error_type": row.title, "gain": gain, "gain_paper": gain_paper})
+    return records

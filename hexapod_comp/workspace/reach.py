@@ -1,0 +1,435 @@
+"""Where a machine can go at a given orientation, how large that is, and what stops it at the boundary.
+
+Poses are ``pose_tool_in_work``, as in the verbs: positions are those of the tool tip in the work frame. At one
+orientation the reach is a body; a regular grid finds it, and bisection along the grid's lines finds where each
+line leaves it, and which limit stands there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import ndimage
+
+from ..errors import GeometryError
+from ..geometry import COINCIDENT, HexapodGeometry
+from ..kinematics import over_chunks
+from ..limits import LimitTable
+from ..pose import Pose, angles_from_rotation, rotation_from_angles
+from ..trajectory import platform_poses
+from . import reach_kernels as kernels
+
+FINDINGS = (
+    "within",
+    "stroke, shortest",
+    "stroke, longest",
+    "base joint cone",
+    "platform joint cone",
+    "strut clearance",
+    "condition number",
+    "assembly mode",
+)
+"""What limits a pose, in words; the index is the code in :mod:`.reach_kernels`."""
+
+SEARCH_CELLS = (24, 48, 96)
+"""Cells along the longest edge with which the reach is looked for, one after the other until it is found."""
+
+CELLS = (4, 200)
+"""Cells along the longest edge that may be asked for: eight million poses are some ten seconds, and half a gigabyte."""
+
+HALVINGS = 24
+"""Of a grid cell: a boundary is found to a fraction of a nanometre."""
+
+
+class Examiner:
+    """Says what limits poses of a machine.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        Machine and limits.
+    clearance : float
+        Smallest distance between the axes of two struts, m; 0: not limited. Of the study, not of the geometry's
+        limits: compensator and ``check`` do not watch it. Struts that share a joint are not checked.
+
+    Raises
+    ------
+    GeometryError
+        A clearance that is negative or not finite.
+    """
+
+    def __init__(self, geometry: HexapodGeometry, clearance: float = 0.0) -> None:
+        if not 0.0 <= clearance < math.inf:
+            raise GeometryError("clearance", "must be finite and not negative, m", clearance)
+        self.geometry, self.clearance = geometry, clearance
+        limits, table = geometry.limits, LimitTable(geometry)
+        scalars = np.array(
+            [limits.condition, geometry.characteristic_length, geometry.home_sign, clearance]
+        )
+        self._arrays = (table.stroke, table.cone_axes, table.cone_cosines, scalars)
+        joints = geometry.platform_joints
+        self._apart = np.linalg.norm(joints[:, None] - joints, axis=2) > COINCIDENT
+
+    def findings(
+        self, positions: np.ndarray, rotations: np.ndarray, threads: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return what limits each of N poses, the first of :data:`FINDINGS` that applies.
+
+        Parameters
+        ----------
+        positions : ndarray, shape (N, 3)
+            Tool tip in the work frame, m.
+        rotations : ndarray, shape (N, 3, 3) or (1, 3, 3)
+            Orientation of the tool in the work frame; one may serve all.
+        threads : int, optional
+            Default: one per core.
+
+        Returns
+        -------
+        findings : ndarray of int8, shape (N,)
+            Index into :data:`FINDINGS`, 0 for a pose within all limits.
+        struts : ndarray of int8, shape (N, 2)
+            Struts concerned, 0…5; −1 where there is none, or no second one.
+        """
+        findings, struts = np.empty(len(positions), np.int8), np.empty((len(positions), 2), np.int8)
+
+        def run(rows: slice) -> None:
+            turned = rotations if len(rotations) == 1 else rotations[rows]
+            platform = platform_poses(self.geometry, positions[rows], turned)
+            poses = [np.ascontiguousarray(part) for part in platform]
+            arrays = (self._arrays, self._apart, findings[rows], struts[rows])
+            kernels.examine_poses(*self.geometry.kernel_joints, *poses, *arrays)
+
+        over_chunks(run, len(positions), threads)
+        return findings, struts
+
+    def boundary(
+        self, inside: np.ndarray, outside: np.ndarray, rotation: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Bisect between M points within the limits and M beyond; return boundary, finding and struts there.
+
+        Parameters
+        ----------
+        inside, outside : ndarray, shape (M, 3)
+            Tool tips in the work frame, m.
+        rotation : ndarray, shape (3, 3)
+            Orientation of the tool in the work frame.
+        """
+        inside, outside, rotations = inside.copy(), outside.copy(), rotation[None]
+        findings, struts = self.findings(outside, rotations)
+        for _ in range(HALVINGS):
+            middle = 0.5 * (inside + outside)
+            found, who = self.findings(middle, rotations)
+            beyond = found != kernels.WITHIN
+            inside[~beyond], outside[beyond] = middle[~beyond], middle[beyond]
+            findings[beyond], struts[beyond] = found[beyond], who[beyond]
+        return inside, findings, struts
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """Where the lines of a grid leave the reach, or enter it.
+
+    Attributes
+    ----------
+    positions : ndarray, shape (M, 3)
+        Last point within the limits, m in the work frame.
+    findings : ndarray of int, shape (M,)
+        What limits there, index into :data:`FINDINGS`.
+    struts : ndarray of int, shape (M, 2)
+        Struts concerned, 0…5 or −1.
+    axis : ndarray of int, shape (M,)
+        Axis of the line, 0…2.
+    outward : ndarray, shape (M,)
+        +1 where the line leaves the reach in the sense of its axis, −1 where it enters.
+    """
+
+    positions: np.ndarray
+    findings: np.ndarray
+    struts: np.ndarray
+    axis: np.ndarray
+    outward: np.ndarray
+
+
+@dataclass(frozen=True)
+class Reach:
+    """What a machine reaches at one orientation.
+
+    Attributes
+    ----------
+    geometry : HexapodGeometry
+        The machine.
+    rotation : ndarray, shape (3, 3)
+        Orientation of the tool in the work frame.
+    axes : tuple of three ndarray
+        Coordinates of the grid, m; the spacing is the same along all three.
+    findings : ndarray of int8, shape (X, Y, Z)
+        What limits each grid point, index into :data:`FINDINGS`.
+    boundary : Boundary
+        Where the grid's lines cross the boundary.
+    clearance : float
+        Smallest distance between the axes of two struts, m.
+    """
+
+    geometry: HexapodGeometry
+    rotation: np.ndarray
+    axes: tuple[np.ndarray, np.ndarray, np.ndarray]
+    findings: np.ndarray
+    boundary: Boundary
+    clearance: float = 0.0
+
+    @property
+    def within(self) -> np.ndarray:
+        """Grid points within all limits, bool, shape (X, Y, Z)."""
+        return self.findings == kernels.WITHIN
+
+    @property
+    def spacing(self) -> float:
+        """Distance of neighbouring grid points, m."""
+        return float(self.axes[0][1] - self.axes[0][0])
+
+    @property
+    def volumes(self) -> np.ndarray:
+        """Volume found along x, along y and along z, m³, shape (3,): their spread tells what to make of it.
+
+        Each grid line stands for a column; what lies between its crossings of the boundary is within reach.
+        """
+        found = self.boundary
+        here = found.positions[np.arange(len(found.axis)), found.axis]
+        return np.bincount(found.axis, found.outward * here, 3) * self.spacing**2
+
+    @property
+    def volume(self) -> float:
+        """Volume of the reach, m³."""
+        return float(self.volumes.mean())
+
+    @property
+    def box(self) -> np.ndarray:
+        """Smallest box around the boundary found, m in the work frame, shape (2, 3)."""
+        return np.array([self.boundary.positions.min(axis=0), self.boundary.positions.max(axis=0)])
+
+    @cached_property
+    def parts(self) -> int:
+        """Number of pieces that the reach falls into; at this orientation none is reached from another."""
+        return int(ndimage.label(self.within, np.ones((3, 3, 3)))[1])
+
+    @cached_property
+    def centre(self) -> np.ndarray:
+        """A point well inside, m, shape (3,): the centroid, or the deepest grid point if that lies outside."""
+        points = self.points()
+        centroid = points.mean(axis=0)
+        finding, _ = Examiner(self.geometry, self.clearance).findings(centroid[None], self.rotation[None])
+        if finding[0] == kernels.WITHIN:
+            return centroid
+        depth = ndimage.distance_transform_edt(self.within)
+        deepest = np.unravel_index(depth.argmax(), depth.shape)
+        return np.array([axis[index] for axis, index in zip(self.axes, deepest, strict=True)])
+
+    def points(self) -> np.ndarray:
+        """Return the grid points within reach, m in the work frame, shape (N, 3)."""
+        return _grid_points(self.axes)[self.within.ravel()]
+
+    def platform_poses(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return ``pose_platform_in_base`` of the grid points within reach, shape (N, 3) m and (N, 3, 3)."""
+        return poses_at(self.geometry, self.points(), self.rotation)
+
+    def shares(self) -> dict[str, float]:
+        """Return how much of the boundary each limit makes, by name, largest first.
+
+        Of the area as seen along the three axes: a face askew counts up to √3 times as much as a straight one.
+        """
+        return _shares(self.boundary.findings)
+
+    def regions(self) -> dict[str, dict[str, float]]:
+        """Return the shares of each region of the boundary: top, bottom, and six sectors of its side.
+
+        Top and bottom are what is seen from the centre more than 45° above or below the horizontal.
+        """
+        away = self.boundary.positions - self.centre
+        steep = np.abs(away[:, 2]) > np.hypot(away[:, 0], away[:, 1])
+        sector = np.floor(np.rad2deg(np.arctan2(away[:, 1], away[:, 0])) % 360.0 / 60.0).astype(int) % 6
+        masks = {"top": steep & (away[:, 2] > 0.0), "bottom": steep & (away[:, 2] <= 0.0)}
+        masks.update({f"side {60 * k}…{60 * k + 60}°": ~steep & (sector == k) for k in range(6)})
+        return {name: _shares(self.boundary.findings[mask]) for name, mask in masks.items() if mask.any()}
+
+
+def home_orientation(geometry: HexapodGeometry) -> np.ndarray:
+    """Return the orientation of the tool in the work frame at home, shape (3, 3)."""
+    return geometry.work.rotation.T @ geometry.home.rotation @ geometry.tool.rotation
+
+
+def orientations(geometry: HexapodGeometry, angles: Sequence[Sequence[float]]) -> np.ndarray:
+    """Return all combinations of angles, on top of the orientation at home.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        The machine.
+    angles : sequence of three array_like
+        Values of α, β and γ, rad; R = R_home·Ry(β)·Rx(α)·Rz(γ).
+
+    Returns
+    -------
+    ndarray, shape (N, 3, 3)
+    """
+    grid = np.stack(np.meshgrid(*angles, indexing="ij"), axis=-1).reshape(-1, 3)
+    return home_orientation(geometry) @ rotation_from_angles(grid)
+
+
+def reach(
+    geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: int = 40, clearance: float = 0.0
+) -> Reach:
+    """Find what a machine reaches at one orientation.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        Machine and limits.
+    rotation : ndarray, shape (3, 3), optional
+        Orientation of the tool in the work frame; default as at home.
+    cells : int
+        Cells along the longest edge of the grid.
+    clearance : float
+        As for :class:`Examiner`.
+
+    Raises
+    ------
+    GeometryError
+        Nothing is within the limits, or a number of cells that makes no sense.
+    PoseError
+        The orientation is no rotation.
+    """
+    if not CELLS[0] <= cells <= CELLS[1]:
+        raise GeometryError("cells", f"must lie in {CELLS[0]}…{CELLS[1]}", cells)
+    rotation = home_orientation(geometry) if rotation is None else Pose(np.zeros(3), rotation).rotation
+    examiner = Examiner(geometry, clearance)
+    box = _search(examiner, rotation)
+    outermost = possible_box(geometry, rotation)
+    while True:
+        axes, findings = _grid(examiner, rotation, box, cells)
+        grown = _grown(box, findings == kernels.WITHIN, outermost)
+        if np.array_equal(grown, box):
+            boundary = _crossings(examiner, rotation, axes, findings)
+            return Reach(geometry, rotation, axes, findings, boundary, clearance)
+        box = grown
+
+
+def reaches(
+    geometry: HexapodGeometry, rotations: np.ndarray, cells: int = 40, clearance: float = 0.0
+) -> tuple[Reach, ...]:
+    """Find what a machine reaches at each of some orientations, shape (M, 3, 3); see :func:`reach`.
+
+    Raises
+    ------
+    GeometryError
+        At one of them nothing is within the limits; names it.
+    """
+    return tuple(reach(geometry, rotation, cells, clearance) for rotation in rotations)
+
+
+def possible_box(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
+    """Return a box outside which no pose of an orientation can lie, m in the work frame, shape (2, 3).
+
+    At constant orientation each strut holds the tool tip within a ball about a fixed point; the box holds what
+    all six balls have in common.
+
+    Raises
+    ------
+    GeometryError
+        The balls have nothing in common.
+    """
+    at_origin, turned = platform_poses(geometry, np.zeros((1, 3)), rotation[None])
+    struts = at_origin[0] + geometry.platform_joints @ turned[0].T - geometry.base_joints
+    centres, longest = -struts @ geometry.work.rotation, geometry.limits.stroke[:, 1:]
+    box = np.array([(centres - longest).max(axis=0), (centres + longest).min(axis=0)])
+    if not (box[0] < box[1]).all():
+        raise _empty(rotation, f"{FINDINGS[kernels.STROKE_LONG]}: no point is near enough to all base joints")
+    return box
+
+
+def _search(examiner: Examiner, rotation: np.ndarray) -> np.ndarray:
+    """Return a box that holds the reach as far as a coarse grid sees it, one coarse cell wider."""
+    possible = possible_box(examiner.geometry, rotation)
+    for cells in SEARCH_CELLS:
+        axes, findings = _grid(examiner, rotation, possible, cells)
+        where = np.argwhere(findings == kernels.WITHIN)
+        if len(where):
+            step = axes[0][1] - axes[0][0]
+            low = np.array([axis[i] for axis, i in zip(axes, where.min(axis=0), strict=True)])
+            high = np.array([axis[i] for axis, i in zip(axes, where.max(axis=0), strict=True)])
+            return np.array([low - step, high + step])
+    codes, counts = np.unique(findings, return_counts=True)
+    most = ", ".join(f"{FINDINGS[codes[i]]} at {counts[i] / counts.sum():.0%}" for i in np.argsort(-counts))
+    raise _empty(rotation, f"of {findings.size} poses tried none is within the limits: {most}")
+
+
+def _grid(
+    examiner: Examiner, rotation: np.ndarray, box: np.ndarray, cells: int
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+    """Return axes and findings of a grid with equal steps whose outermost points lie on a box or beyond."""
+    size = box[1] - box[0]
+    step = size.max() / cells
+    middle = box.mean(axis=0)
+    counts = [math.ceil(edge / step - 1e-9) for edge in size]
+    x, y, z = (m + step * (np.arange(n + 1) - n / 2) for m, n in zip(middle, counts, strict=True))
+    findings, _ = examiner.findings(_grid_points((x, y, z)), rotation[None])
+    return (x, y, z), findings.reshape(len(x), len(y), len(z))
+
+
+def _grown(box: np.ndarray, within: np.ndarray, outermost: np.ndarray) -> np.ndarray:
+    """Return the box with every side moved out on which the grid still has points within reach."""
+    grown = box.copy()
+    step = 0.1 * (box[1] - box[0]).max()
+    for axis in range(3):
+        for side, index, way in ((0, 0, -1.0), (1, -1, 1.0)):
+            beyond = way * (box[side, axis] - outermost[side, axis]) > 0.0
+            if within.take(index, axis).any() and not beyond:
+                grown[side, axis] += way * step
+    return grown
+
+
+def _crossings(
+    examiner: Examiner, rotation: np.ndarray, axes: tuple[np.ndarray, ...], findings: np.ndarray
+) -> Boundary:
+    """Bisect every edge of the grid that has one end within reach."""
+    within = findings == kernels.WITHIN
+    inside, outside, axis, outward = [], [], [], []
+    for k in range(3):
+        before = np.take(within, np.arange(len(axes[k]) - 1), k)
+        after = np.take(within, np.arange(1, len(axes[k])), k)
+        for way, mask in ((1.0, before & ~after), (-1.0, after & ~before)):
+            start = np.argwhere(mask)
+            end = start + np.eye(3, dtype=int)[k]
+            first, second = (np.stack([a[i] for a, i in zip(axes, at.T, strict=True)], 1) for at in (start, end))
+            inside.append(first if way > 0 else second)
+            outside.append(second if way > 0 else first)
+            axis.append(np.full(len(start), k))
+            outward.append(np.full(len(start), way))
+    found = examiner.boundary(np.concatenate(inside), np.concatenate(outside), rotation)
+    return Boundary(*found, np.concatenate(axis), np.concatenate(outward))
+
+
+def _grid_points(axes: tuple[np.ndarray, ...]) -> np.ndarray:
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def poses_at(
+    geometry: HexapodGeometry, points: np.ndarray, rotation: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the platform poses in ``base`` of tool tips (N, 3), m in the work frame, at one orientation."""
+    positions, rotations = platform_poses(geometry, points, rotation[None])
+    return positions, np.repeat(rotations, len(points), axis=0)
+
+
+def _shares(findings: np.ndarray) -> dict[str, float]:
+    codes, counts = np.unique(findings, return_counts=True)
+    return {FINDINGS[codes[i]]: float(counts[i] / counts.sum()) for i in np.argsort(-counts, kind="stable")}
+
+
+def _empty(rotation: np.ndarray, problem: str) -> GeometryError:
+    angles = ", ".join(f"{angle:g}" for angle in np.rad2deg(angles_from_rotation(rotation)).round(6) + 0.0)
+    return GeometryError("limits", f"the workspace is empty at the orientation ({angles})°: {problem}")

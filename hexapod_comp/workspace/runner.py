@@ -1,0 +1,148 @@
+"""Extremes of effects over any number of poses: part by part, in this process, in several, or on a cluster.
+
+Parts are independent and are merged in the order of their poses, so that the numbers are the same to the last
+bit wherever they come from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+
+from ..errors import HexapodError
+from ..geometry import HexapodGeometry
+from .effects import EXACT, Extremes, extremes, merged
+from .reach import Reach, poses_at
+from .sources import SingleErrors
+
+PART = 65_536
+"""Poses per part: some seconds of work, and a few megabytes to send."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Poses of one orientation that are looked at together.
+
+    Attributes
+    ----------
+    geometry : HexapodGeometry
+        The machine.
+    errors : SingleErrors
+        The errors.
+    points : ndarray, shape (N, 3)
+        Tool tips in the work frame, m.
+    rotation : ndarray, shape (3, 3)
+        Orientation of the tool in the work frame.
+    method : str
+        As for :func:`~hexapod_comp.workspace.effects.extremes`.
+    first : int
+        Number of the first pose.
+    threads : int or None
+        Threads to use.
+    """
+
+    geometry: HexapodGeometry
+    errors: SingleErrors
+    points: np.ndarray
+    rotation: np.ndarray
+    method: str
+    first: int
+    threads: int | None
+
+
+def look_at(part: Part) -> Extremes:
+    """Return the extremes over a part; the function that workers run."""
+    poses = poses_at(part.geometry, part.points, part.rotation)
+    return extremes(part.geometry, part.errors, *poses, part.method, part.first, part.threads)
+
+
+def survey(
+    reaches: Iterable[Reach],
+    errors: SingleErrors,
+    method: str = EXACT,
+    workers: int = 1,
+    scheduler: str | None = None,
+    progress: Callable[[int], object] = lambda count: None,
+) -> Extremes:
+    """Return the extremes of every error's effect over all grid points within some reaches.
+
+    Parameters
+    ----------
+    reaches : iterable of Reach
+        One for each orientation.
+    errors : SingleErrors
+        Errors.
+    method : str
+        ``exact`` or ``linear``.
+    workers : int
+        Local processes; 1 stays in this one, with all its threads.
+    scheduler : str, optional
+        Address of a Dask scheduler (``tcp://host:8786``) that takes the parts instead.
+    progress : callable
+        Called with the number of poses done since the last call.
+
+    Raises
+    ------
+    HexapodError
+        The scheduler's library is not installed, or it cannot be reached.
+    """
+    alone = workers <= 1 and scheduler is None
+    parts = _parts(reaches, errors, method, None if alone else 1)
+    if scheduler is not None:
+        found = _on_cluster(parts, scheduler)
+    elif alone:
+        found = map(look_at, parts)
+    else:
+        found = _in_processes(parts, workers)
+    return merged(_counted(found, progress))
+
+
+def _parts(reaches: Iterable[Reach], errors: SingleErrors, method: str, threads: int | None) -> Iterator[Part]:
+    first = 0
+    for reach in reaches:
+        points = reach.points()
+        for start in range(0, len(points), PART):
+            chosen = points[start : start + PART]
+            yield Part(reach.geometry, errors, chosen, reach.rotation, method, first, threads)
+            first += len(chosen)
+
+
+def _counted(found: Iterable[Extremes], progress: Callable[[int], object]) -> Iterator[Extremes]:
+    for part in found:
+        progress(part.poses)
+        yield part
+
+
+def _in_processes(parts: Iterable[Part], workers: int) -> Iterator[Extremes]:
+    """Yield the parts' extremes in order, from local processes; an interruption ends these."""
+    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+    try:
+        yield from pool.map(look_at, parts)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _on_cluster(parts: Iterable[Part], scheduler: str) -> Iterator[Extremes]:
+    """Yield the parts' extremes in order, from a Dask cluster.
+
+    Raises
+    ------
+    HexapodError
+        Dask is missing, or no scheduler answers.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise HexapodError("a cluster needs Dask: pip install hexapod_comp[cluster]") from error
+    try:
+        client: Any = Client(scheduler, timeout="10s", set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise HexapodError(f"no Dask scheduler answers at {scheduler!r}: {error}") from error
+    with client:
+        for future in client.map(look_at, list(parts), pure=False):
+            yield future.result()

@@ -1,0 +1,236 @@
+"""Shells of the workspace at constant orientation (004, Figure 2), as meshes to colour.
+
+A shell is found by rays from one point well inside: along each the boundary is bracketed and bisected. That
+gives the whole boundary only where every point of it can be seen from there (the reach is star-shaped). It is
+not taken for granted: rays that enter the reach again behind a gap are marked, and the volume inside the shell
+is compared with that of the reach, which the grid finds without such an assumption.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import GeometryError
+from ..geometry import HexapodGeometry
+from . import reach_kernels as kernels
+from .reach import Examiner, Reach, poses_at
+
+FRACTIONS = (0.4, 0.7, 1.0)
+"""Sizes of nested shells, inside to outside, relative to the boundary."""
+
+SAMPLES = 96
+"""Points along a ray at which gaps are looked for: one smaller than a hundredth of the reach can stay unseen."""
+
+LEAST_RINGS, LEAST_SECTORS = 5, 8
+"""A coarser mesh is no picture of a body."""
+
+
+@dataclass(frozen=True)
+class Shell:
+    """The boundary of a reach as a mesh of rings from bottom to top.
+
+    Both poles are rings of one point, and the last azimuth repeats the first, so that the mesh is closed.
+
+    Attributes
+    ----------
+    geometry : HexapodGeometry
+        The machine.
+    rotation : ndarray, shape (3, 3)
+        Orientation of the tool in the work frame.
+    centre : ndarray, shape (3,)
+        Where the rays start, m in the work frame.
+    points : ndarray, shape (H, A, 3)
+        Tool tip on the boundary, m in the work frame.
+    findings : ndarray of int8, shape (H, A)
+        What limits there, index into :data:`~hexapod_comp.workspace.reach.FINDINGS`.
+    struts : ndarray of int8, shape (H, A, 2)
+        Struts concerned, 0…5 or −1.
+    folded : ndarray of bool, shape (H, A)
+        The ray enters the reach again beyond a gap: there is more than the mesh shows.
+    coverage : float
+        Volume inside the mesh over the volume of the reach.
+    """
+
+    geometry: HexapodGeometry
+    rotation: np.ndarray
+    centre: np.ndarray
+    points: np.ndarray
+    findings: np.ndarray
+    struts: np.ndarray
+    folded: np.ndarray
+    coverage: float
+
+    @property
+    def volume(self) -> float:
+        """Volume inside the mesh, m³."""
+        return mesh_volume(self.points)
+
+    def scaled(self, fraction: float) -> np.ndarray:
+        """Return the mesh shrunk towards the centre, shape (H, A, 3), m in the work frame.
+
+        Every point of it is within reach, since it lies on a ray before the boundary.
+
+        Raises
+        ------
+        GeometryError
+            The fraction is not in (0, 1].
+        """
+        if not 0.0 < fraction <= 1.0:
+            raise GeometryError("fraction", "of the reach must lie in (0, 1]", fraction)
+        return self.centre + fraction * (self.points - self.centre)
+
+    def platform_poses(self, fraction: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+        """Return ``pose_platform_in_base`` of the points of a scaled mesh, shape (H·A, 3) m and (H·A, 3, 3)."""
+        return poses_at(self.geometry, self.scaled(fraction).reshape(-1, 3), self.rotation)
+
+
+@dataclass(frozen=True)
+class Section:
+    """A horizontal cut through a reach: rings about the axis through its centre.
+
+    Attributes
+    ----------
+    geometry, rotation
+        As in :class:`Shell`.
+    points : ndarray, shape (K, A, 3)
+        Tool tips, m in the work frame, from the axis (first ring) to the boundary (last ring).
+    findings : ndarray of int8, shape (A,)
+        What limits at the last ring.
+    folded : ndarray of bool, shape (A,)
+        As in :class:`Shell`.
+    """
+
+    geometry: HexapodGeometry
+    rotation: np.ndarray
+    points: np.ndarray
+    findings: np.ndarray
+    folded: np.ndarray
+
+    def platform_poses(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return ``pose_platform_in_base`` of the points, shape (K·A, 3) m and (K·A, 3, 3)."""
+        return poses_at(self.geometry, self.points.reshape(-1, 3), self.rotation)
+
+
+def shell(reach: Reach, rings: int = 37, sectors: int = 72) -> Shell:
+    """Find the boundary of a reach along rays from its centre.
+
+    Parameters
+    ----------
+    reach : Reach
+        What the machine reaches at one orientation.
+    rings, sectors : int
+        Rings from pole to pole and points around; the mesh has (rings, sectors + 1) points.
+
+    Raises
+    ------
+    GeometryError
+        Too coarse a mesh.
+    """
+    _check_mesh(rings, sectors)
+    ends, findings, struts, folded = _cast(reach, reach.centre, _directions(reach, rings, sectors))
+    points = _closed(ends.reshape(rings, -1, 3))
+    return Shell(
+        reach.geometry,
+        reach.rotation,
+        reach.centre,
+        points,
+        findings.reshape(rings, -1),
+        struts.reshape(rings, -1, 2),
+        folded.reshape(rings, -1),
+        mesh_volume(points) / reach.volume,
+    )
+
+
+def section(reach: Reach, height: float, rings: int = 13, sectors: int = 72) -> Section:
+    """Cut a reach horizontally, by rays from the axis through its centre.
+
+    Parameters
+    ----------
+    reach : Reach
+        What the machine reaches at one orientation.
+    height : float
+        z of the tool tip in the work frame, m.
+    rings, sectors : int
+        Points from the axis outwards, and around.
+
+    Raises
+    ------
+    GeometryError
+        At this height the axis is not within reach, or too coarse a mesh.
+    """
+    _check_mesh(rings, sectors)
+    origin = np.array([*reach.centre[:2], height])
+    finding, _ = Examiner(reach.geometry, reach.clearance).findings(origin[None], reach.rotation[None])
+    if finding[0] != kernels.WITHIN:
+        low, high = axis_range(reach) * 1e3
+        raise GeometryError("height", f"must lie in {low:.1f}…{high:.1f} mm, where the axis is within reach", height)
+    azimuth = np.linspace(0.0, 2.0 * np.pi, sectors + 1)
+    directions = np.stack([np.cos(azimuth), np.sin(azimuth), 0.0 * azimuth], axis=-1)
+    ends, findings, _, folded = _cast(reach, origin, directions)
+    ends[-1] = ends[0]
+    shares = np.linspace(0.0, 1.0, rings)[:, None, None]
+    points = origin + shares * (ends - origin)
+    return Section(reach.geometry, reach.rotation, points, findings, folded)
+
+
+def axis_range(reach: Reach) -> np.ndarray:
+    """Return lowest and highest z of the tool tip on the axis through the centre, m, shape (2,)."""
+    directions = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+    return _cast(reach, reach.centre, directions)[0][:, 2]
+
+
+def mesh_volume(points: np.ndarray) -> float:
+    """Return the volume inside a closed mesh of rings from bottom to top, (H, A, 3) m, in m³.
+
+    The sum of the tetrahedra from one point to the triangles; the last azimuth must repeat the first.
+    """
+    p = points - points.reshape(-1, 3).mean(axis=0)
+    a, b, c, d = p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]
+    return float((np.cross(a, b) * c + np.cross(a, c) * d).sum() / 6.0)
+
+
+def _directions(reach: Reach, rings: int, sectors: int) -> np.ndarray:
+    """Return unit vectors, (rings·(sectors + 1), 3), spread over a spheroid as flat as the reach."""
+    box = reach.box[1] - reach.box[0]
+    elevation = np.linspace(-0.5 * np.pi, 0.5 * np.pi, rings)[:, None]
+    azimuth = np.linspace(0.0, 2.0 * np.pi, sectors + 1)
+    across, up = box[:2].mean() * np.cos(elevation), box[2] * np.sin(elevation) + 0.0 * azimuth
+    directions = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), up], axis=-1).reshape(-1, 3)
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def _check_mesh(rings: int, sectors: int) -> None:
+    for name, count, least in (("rings", rings, LEAST_RINGS), ("sectors", sectors, LEAST_SECTORS)):
+        if count < least:
+            raise GeometryError(name, f"must be at least {least}", count)
+
+
+def _cast(
+    reach: Reach, origin: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Follow rays from a point within reach to where they first leave it.
+
+    Returns boundary points (N, 3), findings, struts, and whether the ray enters the reach again.
+    """
+    examiner = Examiner(reach.geometry, reach.clearance)
+    corners = np.array([[axis[0], axis[-1]] for axis in reach.axes])
+    farthest = np.linalg.norm(np.abs(corners - origin[:, None]).max(axis=1))  # all of the grid, hence of the reach
+    shares = np.linspace(0.0, farthest, SAMPLES)
+    samples = origin + shares[:, None] * directions[:, None]
+    found, _ = examiner.findings(samples.reshape(-1, 3), reach.rotation[None])
+    within = (found == kernels.WITHIN).reshape(len(directions), SAMPLES)
+    within[:, 0] = True
+    exits = within.argmin(axis=1)
+    ray = np.arange(len(directions))
+    ends, findings, struts = examiner.boundary(samples[ray, exits - 1], samples[ray, exits], reach.rotation)
+    folded = (np.arange(SAMPLES) > exits[:, None]) & within
+    return ends, findings, struts, folded.any(axis=1)
+
+
+def _closed(points: np.ndarray) -> np.ndarray:
+    """Make poles and seam exactly one, where cosines of 90° and 360° left rounding."""
+    points[:, -1] = points[:, 0]
+    points[0], points[-1] = points[0, 0], points[-1, 0]
+    return points

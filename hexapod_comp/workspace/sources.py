@@ -1,0 +1,220 @@
+"""Single errors of a machine, each with its size, and the budget file that lists them (paper 004).
+
+A single error is one number that is not what it should be: a strut's length, a joint's coordinate, the
+tool's offset. A budget says how large the errors of each type are; every strut and every coordinate of a
+type then makes a single error of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputFileError, ModelError
+from ..files import Section, read_yaml
+from ..geometry import HexapodGeometry
+from .effect_kernels import BASE_JOINT, LENGTH, PLATFORM_JOINT, TOOL
+
+BUDGET_FORMAT = "hexapod_comp/error_budget"
+BUDGET_VERSION = 1
+
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class SingleErrors:
+    """Errors that act alone, one after the other; arrays have one entry an error.
+
+    Attributes
+    ----------
+    kind : ndarray of int, shape (E,)
+        Index into `kinds`.
+    part : ndarray of int, shape (E,)
+        LENGTH, BASE_JOINT, PLATFORM_JOINT or TOOL.
+    strut : ndarray of int, shape (E,)
+        0…5; −1 for the tool.
+    vector : ndarray, shape (E, 3)
+        For joints and tool the displacement in their body's frame, m. For lengths the coefficients a, b, c of
+        δL = a + b·(L − L_home) + c·L.
+    kinds : tuple of str
+        Names of the error types, in the budget's order.
+    labels : tuple of str
+        Name of each error.
+    """
+
+    kind: np.ndarray
+    part: np.ndarray
+    strut: np.ndarray
+    vector: np.ndarray
+    kinds: tuple[str, ...]
+    labels: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    def select(self, mask: np.ndarray) -> SingleErrors:
+        """Return the errors in a boolean mask (E,)."""
+        chosen = np.flatnonzero(mask)
+        labels = tuple(self.labels[i] for i in chosen)
+        return SingleErrors(
+            self.kind[chosen], self.part[chosen], self.strut[chosen], self.vector[chosen], self.kinds, labels
+        )
+
+    def scaled(self, factors: np.ndarray) -> SingleErrors:
+        """Return the errors with each type's size multiplied by a factor, shape (kinds,)."""
+        vector = self.vector * np.asarray(factors)[self.kind][:, None]
+        return SingleErrors(self.kind, self.part, self.strut, vector, self.kinds, self.labels)
+
+
+@dataclass(frozen=True)
+class SourceType:
+    """A type of error as a budget may name it.
+
+    Attributes
+    ----------
+    name : str
+        Key in the budget file, without its unit.
+    dimension : str
+        Kind of unit of its size.
+    title : str
+        What people read.
+    make : callable
+        From a size in SI and the geometry to (part, strut, vector, label) of each single error.
+    """
+
+    name: str
+    dimension: str
+    title: str
+    make: Callable[[float, HexapodGeometry], Iterable[tuple[int, int, tuple[float, float, float], str]]]
+
+
+def _lengths(coefficient: int, factor: float = 1.0) -> Callable:
+    """Return a maker of one length error per strut."""
+
+    def make(size: float, geometry: HexapodGeometry) -> Iterable[tuple[int, int, tuple, str]]:
+        del geometry
+        vector = [0.0, 0.0, 0.0]
+        vector[coefficient] = factor * size
+        for strut in range(6):
+            yield LENGTH, strut, tuple(vector), f"strut_{strut + 1}"
+
+    return make
+
+
+def _joints(part: int, axes: tuple[int, ...]) -> Callable:
+    """Return a maker of one displacement per strut and axis."""
+    body = "base" if part == BASE_JOINT else "platform"
+
+    def make(size: float, geometry: HexapodGeometry) -> Iterable[tuple[int, int, tuple, str]]:
+        del geometry
+        for strut in range(6):
+            for axis in axes:
+                yield part, strut, tuple(size * np.eye(3)[axis]), f"{body} joint {strut + 1} {AXES[axis]}"
+
+    return make
+
+
+def _tool(size: float, geometry: HexapodGeometry) -> Iterable[tuple[int, int, tuple, str]]:
+    del geometry
+    for axis in range(3):
+        yield TOOL, -1, tuple(size * np.eye(3)[axis]), f"tool {AXES[axis]}"
+
+
+def _temperature(size: float, geometry: HexapodGeometry) -> Iterable[tuple[int, int, tuple, str]]:
+    return _lengths(2)(size, geometry)
+
+
+SOURCE_TYPES = (
+    SourceType("strut_length", "length", "strut length", _lengths(0)),
+    SourceType("screw_pitch", "length", "screw pitch", _lengths(0)),
+    SourceType("screw_pitch_slope", "ratio", "screw pitch slope", _lengths(1)),
+    SourceType("quantisation", "length", "quantisation", _lengths(0)),
+    SourceType("base_joint_xy", "length", "base joint x/y", _joints(BASE_JOINT, (0, 1))),
+    SourceType("base_joint_z", "length", "base joint z", _joints(BASE_JOINT, (2,))),
+    SourceType("platform_joint_xy", "length", "platform joint x/y", _joints(PLATFORM_JOINT, (0, 1))),
+    SourceType("platform_joint_z", "length", "platform joint z", _joints(PLATFORM_JOINT, (2,))),
+    SourceType("backlash", "length", "backlash", _lengths(0, 0.5)),
+    SourceType("thermal_growth", "ratio", "thermal growth", _temperature),
+    SourceType("tool_offset", "length", "tool offset", _tool),
+)
+"""Types that a budget may have. Screw pitch as 004 has it, a bound of the length error; as a slope it grows with the
+way from home. A strut is off by half its backlash. Thermal growth is relative: expansion times kelvins."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How large the errors of a machine may be.
+
+    Attributes
+    ----------
+    machine : str
+        Name of the geometry it is for.
+    sizes : dict of str to float
+        Size of each type, SI, in the file's order; symmetric bounds (±).
+    """
+
+    machine: str
+    sizes: dict[str, float]
+
+    def __post_init__(self) -> None:
+        known = {source.name for source in SOURCE_TYPES}
+        if not self.sizes:
+            raise ModelError("errors", "must name at least one error type")
+        for name, size in self.sizes.items():
+            if name not in known:
+                raise ModelError(f"errors.{name}", f"must be one of {', '.join(sorted(known))}")
+            if not 0.0 < size < 0.1:
+                raise ModelError(f"errors.{name}", "must be above zero and below 0.1 (m, or relative)", size)
+
+    def single_errors(self, geometry: HexapodGeometry) -> SingleErrors:
+        """Return every single error of the budget.
+
+        Raises
+        ------
+        ModelError
+            The budget is another machine's.
+        """
+        if self.machine != geometry.name:
+            raise ModelError("machine", f"the budget is for {self.machine!r}, the geometry is {geometry.name!r}")
+        types = {source.name: source for source in SOURCE_TYPES}
+        rows = [
+            (number, *row)
+            for number, (name, size) in enumerate(self.sizes.items())
+            for row in types[name].make(size, geometry)
+        ]
+        kind, part, strut, vector, labels = zip(*rows, strict=True)
+        titles = tuple(types[name].title for name in self.sizes)
+        return SingleErrors(
+            np.array(kind), np.array(part), np.array(strut), np.array(vector, dtype=float), titles, tuple(labels)
+        )
+
+
+def load_budget(path: str | Path) -> Budget:
+    """Read a budget file (YAML, see config/error_budget.yaml).
+
+    Raises
+    ------
+    InputFileError
+        With file, key and value: unknown type, no unit, negative size.
+    """
+    top = read_yaml(path, BUDGET_FORMAT, BUDGET_VERSION)
+    machine, section = top.text("machine"), top.section("errors")
+    top.finish()
+    sizes = _read_sizes(section)
+    section.finish()
+    try:
+        return Budget(machine, sizes)
+    except ModelError as error:
+        raise InputFileError(path, error.key, error.problem, error.value) from error
+
+
+def _read_sizes(section: Section) -> dict[str, float]:
+    """Return the sizes in SI, in the order of :data:`SOURCE_TYPES`."""
+    sizes = {}
+    for source in SOURCE_TYPES:
+        if section.quantity_key(source.name, source.dimension) is not None:
+            sizes[source.name] = float(section.quantity(source.name, source.dimension))
+    return sizes

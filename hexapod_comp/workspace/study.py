@@ -1,0 +1,252 @@
+"""The whole classification of a machine's errors (paper 004): reach, ranking, combined budgets, meshes to show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry import HexapodGeometry
+from ..pose import Pose
+from .combining import RSS, WORST_CASE, Allocation, MonteCarlo, allocate, monte_carlo, root_sum_of_squares, worst_case
+from .effects import EXACT, LINEAR, Extremes, effect_vectors, effects
+from .page import PageData
+from .pictures import ROTATION, TRANSLATION
+from .ranking import RankingRow, ranked
+from .reach import Reach
+from .runner import survey
+from .shells import Shell, shell
+from .sources import LENGTH, TOOL, Budget, SingleErrors
+from .tangential import tangential_effect
+
+COMBINED_POSES = 500
+"""Random poses of the workspace at which budgets are combined."""
+
+DRAWS = 4000
+"""Machines of the Monte Carlo."""
+
+LAYERS = (0.4, 0.7, 1.0)
+"""Nested shells, as shares of the way from the centre to the boundary."""
+
+RINGS, SECTORS = 19, 36
+"""Mesh of a shell."""
+
+
+@dataclass(frozen=True)
+class Combined:
+    """What the whole budget does at random poses of the workspace; columns are m and rad.
+
+    Attributes
+    ----------
+    worst_case, root_sum_of_squares : ndarray, shape (2,)
+        Largest over the poses.
+    monte_carlo : MonteCarlo
+        Uniform errors within the budget's bounds.
+    """
+
+    worst_case: np.ndarray
+    root_sum_of_squares: np.ndarray
+    monte_carlo: MonteCarlo
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How the three methods agree at random poses.
+
+    Attributes
+    ----------
+    effects : int
+        How many were compared.
+    linear, tangential : float
+        Largest difference to the exact displacement, over the largest exact one of the same error type.
+    drift : float
+        Largest length error of a passive leg over the travel of the active one, for legs of wrong length.
+    """
+
+    effects: int
+    linear: float
+    tangential: float
+    drift: float
+
+
+@dataclass(frozen=True)
+class Study:
+    """A machine's errors, classified.
+
+    Attributes
+    ----------
+    geometry : HexapodGeometry
+        The machine.
+    budget : Budget
+        How large its errors may be.
+    errors : SingleErrors
+        Every single one.
+    reaches : tuple of Reach
+        What it reaches, one for each orientation.
+    extremes : Extremes
+        Largest and smallest effects.
+    rows : tuple of RankingRow
+        The ranked table.
+    combined : Combined
+        The budget as a whole.
+    allocations : tuple of Allocation
+        What the errors may be, by both methods; empty when no tool error is given.
+    agreement : Agreement or None
+        How exact, linear and tangential effects compare; None when not asked for.
+    """
+
+    geometry: HexapodGeometry
+    budget: Budget
+    errors: SingleErrors
+    reaches: tuple[Reach, ...]
+    extremes: Extremes
+    rows: tuple[RankingRow, ...]
+    combined: Combined
+    allocations: tuple[Allocation, ...]
+    agreement: Agreement | None
+
+
+def classify(
+    geometry: HexapodGeometry,
+    budget: Budget,
+    reaches: tuple[Reach, ...],
+    method: str = EXACT,
+    allowed: float | None = None,
+    compare: int = 0,
+    workers: int = 1,
+    scheduler: str | None = None,
+    seed: int = 0,
+    progress: Callable[[int], object] = lambda count: None,
+) -> Study:
+    """Classify a machine's errors over its workspace.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        The machine.
+    budget : Budget
+        Sizes of its errors.
+    reaches : tuple of Reach
+        From :func:`~hexapod_comp.workspace.reach.reaches`.
+    method : str
+        ``exact`` or ``linear``, for the ranking.
+    allowed : float, optional
+        Allowed displacement of the tool, m, to allocate tolerances for.
+    compare : int
+        Poses at which exact, linear and tangential effects are compared; 0 for none.
+    workers, scheduler, progress
+        As for :func:`~hexapod_comp.workspace.runner.survey`.
+    seed : int
+        Picks the random poses and draws.
+
+    Raises
+    ------
+    ModelError
+        The budget is another machine's, or the allowed error is not above zero.
+    """
+    errors = budget.single_errors(geometry)
+    extremes = survey(reaches, errors, method, workers, scheduler, progress)
+    positions, rotations = _random_poses(reaches, COMBINED_POSES, seed)
+    vectors = effect_vectors(geometry, errors, positions, rotations, LINEAR)
+    vectors = vectors[np.isfinite(vectors).all(axis=(1, 2))]
+    ways = () if allowed is None else (RSS, WORST_CASE)
+    return Study(
+        geometry=geometry,
+        budget=budget,
+        errors=errors,
+        reaches=reaches,
+        extremes=extremes,
+        rows=tuple(ranked(extremes, geometry)),
+        combined=Combined(
+            worst_case=worst_case(errors, vectors).max(axis=0),
+            root_sum_of_squares=root_sum_of_squares(vectors).max(axis=0),
+            monte_carlo=monte_carlo(vectors, DRAWS, seed=seed),
+        ),
+        allocations=tuple(allocate(errors, vectors, float(allowed or 0.0), way) for way in ways),
+        agreement=compared(geometry, errors, reaches, compare, seed) if compare else None,
+    )
+
+
+def _random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return platform poses picked from all reaches alike, (n, 3) and (n, 3, 3); all of them where there are few."""
+    poses = [found.platform_poses() for found in reaches]
+    positions, rotations = (np.concatenate([pose[k] for pose in poses]) for k in range(2))
+    chosen = np.random.default_rng(seed).permutation(len(positions))[:count]
+    return positions[chosen], rotations[chosen]
+
+
+def compared(
+    geometry: HexapodGeometry, errors: SingleErrors, reaches: tuple[Reach, ...], count: int, seed: int
+) -> Agreement:
+    """Compare the three methods at random poses of the workspace, all errors but the tool's.
+
+    Parameters
+    ----------
+    geometry, errors, reaches
+        As in :class:`Study`.
+    count : int
+        Poses.
+    seed : int
+        Picks them.
+    """
+    moved = errors.select(errors.part != TOOL)
+    positions, rotations = _random_poses(reaches, count, seed)
+    exact = effects(geometry, moved, positions, rotations, EXACT)[..., 0]
+    linear = effects(geometry, moved, positions, rotations, LINEAR)[..., 0]
+    walked, drift = np.empty_like(exact), 0.0
+    for n, pose in enumerate(zip(positions, rotations, strict=True)):
+        for e in range(len(moved)):
+            result = tangential_effect(geometry, moved, e, Pose(*pose))
+            walked[n, e] = np.linalg.norm(result.vector[:3])
+            if moved.part[e] == LENGTH and result.travel > 0.0:
+                drift = max(drift, result.drift / result.travel)
+    largest = np.array([exact[:, moved.kind == kind].max(initial=0.0) for kind in range(len(moved.kinds))])
+    scale = np.where(largest > 0.0, largest, np.inf)[moved.kind]
+    return Agreement(
+        effects=exact.size,
+        linear=float((np.abs(linear - exact) / scale).max()),
+        tangential=float((np.abs(walked - exact) / scale).max()),
+        drift=drift,
+    )
+
+
+def shells_of(reaches: tuple[Reach, ...]) -> tuple[Shell, ...]:
+    """Return the boundary meshes of some reaches."""
+    return tuple(shell(found, RINGS, SECTORS) for found in reaches)
+
+
+def mesh_effects(study: Study, body: Shell) -> tuple[np.ndarray, np.ndarray]:
+    """Return nested meshes of a shell and every error's effect on them.
+
+    Returns
+    -------
+    points : ndarray, shape (S, H, A, 3)
+        m in the work frame.
+    values : ndarray, shape (E, 2, S, H, A)
+        m and rad.
+    """
+    points = np.stack([body.scaled(fraction) for fraction in LAYERS])
+    poses = [body.platform_poses(fraction) for fraction in LAYERS]
+    positions, rotations = (np.concatenate([pose[k] for pose in poses]) for k in range(2))
+    found = effects(study.geometry, study.errors, positions, rotations, EXACT)
+    return points, np.moveaxis(found.reshape(*points.shape[:3], len(study.errors), 2), (3, 4), (0, 1))
+
+
+def page_data(study: Study, bodies: tuple[Shell, ...], frames: tuple[str, ...], frame_title: str) -> PageData:
+    """Return what the interactive page shows: one frame for each orientation."""
+    meshes, errors = [mesh_effects(study, body) for body in bodies], study.errors
+    return PageData(
+        title=f"{study.geometry.name}: effect of single errors on the tool",
+        note=(
+            "Each shell is the boundary of the workspace at one orientation of the tool, or a smaller one inside it, "
+            "coloured by how far one error alone moves or turns the tool there (exact, not to first order)."
+        ),
+        errors=[(errors.kinds[kind], label) for kind, label in zip(errors.kind, errors.labels, strict=True)],
+        quantities=(TRANSLATION, ROTATION),
+        frame_title=frame_title,
+        frames=frames,
+        layers=tuple(f"{100 * fraction:.0f} %" for fraction in LAYERS),
+        points=np.stack([points for points, _ in meshes]),
+        values=np.stack([values for _, values in meshes]),
+    )
