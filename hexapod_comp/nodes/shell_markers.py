@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
 from matplotlib import colormaps
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ..errors import GeometryError
 from ..workspace.pictures import COLOURS, Layer, Quantity
+from .runtime import keep_discovery_local
 
 SHELL_QOS = QoSProfile(
     depth=1,
@@ -75,6 +78,27 @@ def publish_shells(node: Node, markers: MarkerArray, topic: str = TOPIC) -> Publ
     publisher = node.create_publisher(MarkerArray, topic, SHELL_QOS)
     publisher.publish(markers)
     return publisher
+
+
+def show_shells(layers: Sequence[Layer], quantity: Quantity, title: str, frame_id: str = "work") -> None:
+    """Publish shells from a node of its own until Ctrl-C.
+
+    Parameters
+    ----------
+    layers, quantity, title, frame_id
+        As for :func:`shell_markers`.
+    """
+    keep_discovery_local()
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = rclpy.create_node("workspace_shells")
+        stamp = node.get_clock().now().to_msg()
+        publisher = publish_shells(node, shell_markers(layers, quantity, title, frame_id, stamp))
+        while rclpy.ok():
+            rclpy.spin_once(node, timeout_sec=0.2)
+        node.destroy_publisher(publisher)
+    finally:
+        rclpy.try_shutdown()
 
 
 def triangles(points: np.ndarray) -> np.ndarray:

@@ -49,6 +49,7 @@ def add_parser(subparsers: common.Subparsers) -> None:
     add("--scheduler", metavar="tcp://…", help="Dask scheduler that does the work instead")
     add("--seed", type=common.seed, default=0, metavar="N", help="of random poses and draws (default 0)")
     add("--no-page", action="store_true", help="leave the interactive page out")
+    add("--publish", action="store_true", help="then keep the worst type's shells on workspace/shells until Ctrl-C")
 
 
 def tilts_argument(text: str) -> tuple[float, ...]:
@@ -95,6 +96,8 @@ def run(args: argparse.Namespace) -> int:
     _draw(study, bodies, names, folder)
     if not args.no_page:
         _page(study, bodies, names, folder)
+    if args.publish:
+        _publish(study, bodies, names)
     return 0
 
 
@@ -156,6 +159,21 @@ def _draw(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...], folde
     for name, figure in figures.items():
         save(figure, folder / name)
     print(f"pictures: {', '.join(figures)} in {folder}")
+
+
+def _publish(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...]) -> None:
+    """Keep shells on a latched topic, for RViz and Foxglove, until Ctrl-C."""
+    from ..nodes.shell_markers import TOPIC, show_shells
+    from ..workspace.pictures import TRANSLATION, Layer
+    from ..workspace.study import mesh_effects
+
+    middle = len(bodies) // 2
+    points, values = mesh_effects(study, bodies[middle])
+    error = int(study.extremes.at_error[study.extremes.values[:, 0].argmax(), 0])
+    kind = study.errors.kinds[study.errors.kind[error]]
+    layers = [Layer(p, v) for p, v in zip(points, values[error, 0], strict=True)]
+    print(f"publishing on {TOPIC}, frame work, until Ctrl-C", flush=True)
+    show_shells(layers, TRANSLATION, f"{kind}, {study.errors.labels[error]}, {names[middle]}")
 
 
 def _bar(row: Any, kind: Any) -> Any:
