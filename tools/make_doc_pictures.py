@@ -28,6 +28,12 @@ from hexapod_comp.model_file import load_model
 from hexapod_comp.plotting import direction_figure, machine_figure, weights_figure
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual_instruments import measure
+from hexapod_comp.workspace.effects import effects
+from hexapod_comp.workspace.pictures import TRANSLATION, Layer, shells_figure
+from hexapod_comp.workspace.reach import reach
+from hexapod_comp.workspace.shells import shell
+from hexapod_comp.workspace.sources import load_budget
+from hexapod_comp.workspace.study import LAYERS, RINGS, SECTORS
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -74,6 +80,20 @@ def strut_error_picture(fit: JointFit, one_d: MeasurementSet) -> Figure:
     return strut_error_figure(one_d.geometry, models, y=LINE_Y)
 
 
+def shells_picture() -> Figure:
+    """Return what the first strut's screw pitch error does to the tool of the positioning unit (004, Figure 2)."""
+    geometry = load_geometry(ROOT / "config" / "positioning_unit.yaml")
+    errors = load_budget(ROOT / "config" / "error_budget.yaml").single_errors(geometry)
+    first = errors.select((errors.kind == errors.kinds.index("screw pitch")) & (errors.strut == 0))
+    body = shell(reach(geometry), RINGS, SECTORS)
+    layers = []
+    for share in LAYERS:
+        moved = effects(geometry, first, *body.platform_poses(share))[:, 0, 0]
+        layers.append(Layer(body.scaled(share), moved.reshape(body.points.shape[:2])))
+    title = "positioning unit, screw pitch of strut 1 off by 20 µm, tool level"
+    return shells_figure(geometry, layers, TRANSLATION, title)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Make all pictures."""
     parser = argparse.ArgumentParser(description="make the pictures of doc/")
@@ -90,6 +110,7 @@ def main(arguments: list[str] | None = None) -> int:
         "direction.svg": direction_figure(),
         "joint_fit.svg": joint_figure(fit),
         "strut_errors.svg": strut_error_picture(fit, measured(geometry, "campaign_1d")),
+        "shells_screw_pitch.png": shells_picture(),  # thousands of faces: a large file as SVG
     }
     for name, figure in pictures.items():
         figure.savefig(out / name, metadata={"Date": None})
