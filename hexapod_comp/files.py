@@ -325,6 +325,10 @@ class Section:
             return self.quantity(name, dimension, (6, 2))
         return np.tile(self.quantity(name, dimension, (2,)), (6, 1))
 
+    def left(self) -> list[str]:
+        """Return the keys that nobody has asked for yet."""
+        return list(self._left)
+
     def finish(self) -> None:
         """Raise if keys are left that nobody asked for: a misspelt key must not be lost in silence."""
         if self._left:

@@ -180,7 +180,7 @@ def test_json_says_the_same(done: Done) -> None:
         assert 1e-4 < found["volume_m3"] < 1e-3
         assert sum(found["limits"].values()) == pytest.approx(1.0)
         assert {"top", "bottom"} < set(found["regions"])
-    by_method = {allocation["method"]: allocation for allocation in content["allocations"]}
+    by_method = {allocation["method"]: allocation for allocation in content["allocations_m"]}
     assert set(by_method) == {"rss", "worst_case"}
     combined = content["combined_m_rad"]
     for method, name in (("rss", "root_sum_of_squares"), ("worst_case", "worst_case")):
@@ -281,13 +281,13 @@ WRONG = {
     "too few cells": ("--cells 3", "cells: must lie in 4…"),
     "too many cells": ("--cells 4001", "cells: must lie in 4…"),
     "half a cell": ("--cells 8.5", "argument --cells"),
-    "no clearance": ("--clearance-mm -1", "argument --clearance-mm: must not be negative"),
+    "no clearance": ("--clearance-mm -1", "argument --clearance-mm: must be above zero"),
     # The platform's joints stand in pairs less than 100 mm apart, and so do the struts' ends.
     "more clearance than there is": ("--clearance-mm 200", "the workspace is empty at the orientation (0, 0, 0)°"),
     "no workers": ("--workers 0", "argument --workers"),
     "a method that is none": ("--method guess", "argument --method"),
     "nothing allowed": ("--allow-um 0", "must be above zero"),
-    "less than nothing allowed": ("--allow-um -5", "argument --allow-um: must not be negative"),
+    "less than nothing allowed": ("--allow-um -5", "argument --allow-um: must be above zero"),
     "no seed": ("--seed -1", "argument --seed"),
 }
 

@@ -44,7 +44,7 @@ def add_parser(subparsers: common.Subparsers) -> None:
     add("--tilt-deg", type=tilts_argument, default=tilts_argument("-4,0,4"), metavar="A,B,…", help=text)
     add("--method", choices=("exact", "linear"), default="exact", help="of the ranking (default exact)")
     add("--compare", type=common.count, metavar="N", help="compare exact, linear and the paper's iteration at N poses")
-    add("--allow-um", type=common.bound, metavar="UM", help="allowed error of the tool: says what the errors may be")
+    add("--allow-um", type=above_zero, metavar="UM", help="allowed error of the tool: says what the errors may be")
     add("--workers", type=common.count, default=1, metavar="N", help="processes (default 1, with all threads)")
     add("--scheduler", metavar="tcp://…", help="Dask scheduler that does the work instead")
     add("--seed", type=common.seed, default=0, metavar="N", help="of random poses and draws (default 0)")
@@ -59,8 +59,17 @@ def tilts_argument(text: str) -> tuple[float, ...]:
     return tuple(math.radians(v) for v in sorted({common.finite(part) for part in text.split(",")}))
 
 
+def above_zero(text: str) -> float:
+    """Read a finite number above zero."""
+    number = common.finite(text)
+    if number <= 0.0:
+        raise argparse.ArgumentTypeError(f"must be above zero, not {text}")
+    return number
+
+
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
+    from ..errors import InputFileError, ModelError
     from ..geometry import load_geometry
     from ..paths import config_file
     from ..workspace.reach import orientations, reaches
@@ -68,10 +77,14 @@ def run(args: argparse.Namespace) -> int:
     from ..workspace.sources import load_budget
     from ..workspace.study import classify, shells_of
 
-    folder = _folder(args.out)
     geometry = load_geometry(config_file(args.machine))
-    budget = load_budget(config_file(args.budget))
-    budget.single_errors(geometry)  # a budget for another machine is refused before the work starts
+    budget_file = config_file(args.budget)
+    budget = load_budget(budget_file)
+    try:
+        budget.single_errors(geometry)
+    except ModelError as error:  # refused before the work starts
+        raise InputFileError(budget_file, error.key, error.problem, error.value) from error
+    folder = _folder(args.out)
     common.mention_compiling("workspace.effect_kernels.extremes_many")
     turned = orientations(geometry, (args.tilt_deg, args.tilt_deg, (0.0,)))
     found = reaches(geometry, turned, args.cells, args.clearance_mm * 1e-3)

@@ -313,6 +313,8 @@ def reach(
         axes, findings = _grid(examiner, rotation, box, cells)
         grown = _grown(box, findings == kernels.WITHIN, outermost)
         if np.array_equal(grown, box):
+            if not (findings == kernels.WITHIN).any():
+                raise GeometryError("cells", "are too coarse: the grid misses the small workspace; take more", cells)
             boundary = _crossings(examiner, rotation, axes, findings)
             return Reach(geometry, rotation, axes, findings, boundary, clearance)
         box = grown

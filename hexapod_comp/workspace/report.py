@@ -89,7 +89,7 @@ def as_json(study: Study) -> dict[str, Any]:
     drawn = study.combined.monte_carlo
     return {
         "machine": study.geometry.name,
-        "budget": study.budget.sizes,
+        "budget_si": study.budget.sizes,
         "poses": study.extremes.poses,
         "ranking": ranking_rows(study.rows),
         "reach": [
@@ -101,7 +101,7 @@ def as_json(study: Study) -> dict[str, Any]:
             "root_sum_of_squares": study.combined.root_sum_of_squares,
             "percentiles": dict(zip(map(str, drawn.percentiles), drawn.worst_values.tolist(), strict=True)),
         },
-        "allocations": [
+        "allocations_m": [
             {**vars(found), "alone": dict(zip(study.errors.kinds, found.alone.tolist(), strict=True))}
             for found in study.allocations
         ],

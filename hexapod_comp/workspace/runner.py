@@ -6,8 +6,11 @@ bit wherever they come from.
 
 from __future__ import annotations
 
+import asyncio
+import re
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Any
@@ -19,6 +22,9 @@ from ..geometry import HexapodGeometry
 from .effects import EXACT, Extremes, extremes, merged
 from .reach import Reach, poses_at
 from .sources import SingleErrors
+
+WAIT = 10
+"""For a cluster to answer, s."""
 
 PART = 65_536
 """Poses per part: some seconds of work, and a few megabytes to send."""
@@ -123,6 +129,8 @@ def _in_processes(parts: Iterable[Part], workers: int) -> Iterator[Extremes]:
     pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
     try:
         yield from pool.map(look_at, parts)
+    except BrokenProcessPool as error:
+        raise HexapodError("a worker process died (out of memory?); take fewer --workers") from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
@@ -133,16 +141,22 @@ def _on_cluster(parts: Iterable[Part], scheduler: str) -> Iterator[Extremes]:
     Raises
     ------
     HexapodError
-        Dask is missing, or no scheduler answers.
+        Dask is missing, no scheduler answers, or it has no workers.
     """
+    if not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d{1,5}", scheduler):
+        raise HexapodError(f"a scheduler's address is like tcp://host:8786, not {scheduler!r}")
     try:
         from distributed import Client
     except ImportError as error:
         raise HexapodError("a cluster needs Dask: pip install hexapod_comp[cluster]") from error
     try:
-        client: Any = Client(scheduler, timeout="10s", set_as_default=False)
+        client: Any = Client(scheduler, timeout=WAIT, set_as_default=False)
     except (OSError, ValueError) as error:
         raise HexapodError(f"no Dask scheduler answers at {scheduler!r}: {error}") from error
     with client:
+        try:
+            client.wait_for_workers(1, timeout=WAIT)
+        except (TimeoutError, asyncio.TimeoutError) as error:
+            raise HexapodError(f"the Dask scheduler at {scheduler!r} has no workers") from error
         for future in client.map(look_at, list(parts), pure=False):
             yield future.result()

@@ -23,6 +23,9 @@ BUDGET_VERSION = 1
 
 AXES = ("x", "y", "z")
 
+LARGEST = 0.1
+"""An error as large is a wrong unit; m, or relative."""
+
 
 @dataclass(frozen=True)
 class SingleErrors:
@@ -166,8 +169,8 @@ class Budget:
         for name, size in self.sizes.items():
             if name not in known:
                 raise ModelError(f"errors.{name}", f"must be one of {', '.join(sorted(known))}")
-            if not 0.0 < size < 0.1:
-                raise ModelError(f"errors.{name}", "must be above zero and below 0.1 (m, or relative)", size)
+            if not 0.0 < size < LARGEST:
+                raise ModelError(f"errors.{name}", f"must be above zero and below {LARGEST:g} (m, or relative)", size)
 
     def single_errors(self, geometry: HexapodGeometry) -> SingleErrors:
         """Return every single error of the budget.
@@ -216,5 +219,14 @@ def _read_sizes(section: Section) -> dict[str, float]:
     sizes = {}
     for source in SOURCE_TYPES:
         if section.quantity_key(source.name, source.dimension) is not None:
-            sizes[source.name] = float(section.quantity(source.name, source.dimension))
+            key = section.quantity_key(source.name, source.dimension)
+            size = float(section.quantity(source.name, source.dimension))
+            if not 0.0 < size < LARGEST:
+                raise section.error(str(key), f"must be above zero and below {LARGEST:g} in SI units", size)
+            sizes[source.name] = size
+    unknown = section.left()
+    if unknown:
+        known = ", ".join(source.name for source in SOURCE_TYPES)
+        problem = f"is no error type with its unit; types are {known}"
+        raise section.error(unknown[0], problem, section.take(unknown[0]))
     return sizes
