@@ -281,7 +281,7 @@ WRONG = {
     "too few cells": ("--cells 3", "cells: must lie in 4…"),
     "too many cells": ("--cells 4001", "cells: must lie in 4…"),
     "half a cell": ("--cells 8.5", "argument --cells"),
-    "no clearance": ("--clearance-mm -1", "argument --clearance-mm: must be above zero"),
+    "no clearance": ("--clearance-mm -1", "argument --clearance-mm: must not be negative"),
     # The platform's joints stand in pairs less than 100 mm apart, and so do the struts' ends.
     "more clearance than there is": ("--clearance-mm 200", "the workspace is empty at the orientation (0, 0, 0)°"),
     "no workers": ("--workers 0", "argument --workers"),
