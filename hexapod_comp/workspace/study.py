@@ -14,7 +14,7 @@ from .effects import EXACT, LINEAR, Extremes, effect_vectors, effects
 from .page import PageData
 from .pictures import ROTATION, TRANSLATION
 from .ranking import RankingRow, ranked
-from .reach import Reach
+from .reach import Reach, poses_at
 from .runner import survey
 from .shells import Shell, shell
 from .sources import LENGTH, TOOL, Budget, SingleErrors
@@ -170,10 +170,15 @@ def classify(
 
 def _random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return platform poses picked from all reaches alike, (n, 3) and (n, 3, 3); all of them where there are few."""
-    poses = [found.platform_poses() for found in reaches]
+    sizes = np.array([int(found.within.sum()) for found in reaches])
+    first = np.cumsum([0, *sizes])
+    chosen = np.random.default_rng(seed).choice(first[-1], min(count, first[-1]), replace=False)
+    poses = []
+    for n, found in enumerate(reaches):  # one after the other: all poses of all reaches may be too many to hold
+        mine = chosen[(chosen >= first[n]) & (chosen < first[n + 1])] - first[n]
+        poses.append(poses_at(found.geometry, found.points()[mine], found.rotation))
     positions, rotations = (np.concatenate([pose[k] for pose in poses]) for k in range(2))
-    chosen = np.random.default_rng(seed).permutation(len(positions))[:count]
-    return positions[chosen], rotations[chosen]
+    return positions, rotations
 
 
 def compared(
