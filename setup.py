@@ -61,6 +61,8 @@ setup(
             "colcon-core>=0.18",
             "colcon-ros>=0.5",
             "colcon-library-path>=0.2.1",
+            "plotly>=5.18",
+            "distributed>=2023.12",
         ],
         "bench": ["mujoco>=3.1", "pin>=2.7"],
         # No rosdep keys: imported where used, with a clear message when missing.

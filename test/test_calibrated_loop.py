@@ -135,7 +135,8 @@ def start_loop(bench: Bench, folder: Path, promise: Promise) -> HexapodGeometry:
     """Start both nodes on a machine that is as accurate but faster than the paper's: 60 rests take seconds."""
     file = geometry_file(folder, {"speed_mm_s": 5000, "step_mm": 40})
     bench.drive(geometry_file=file, truth_file=promise.truth_file, step=STEP, max_acceleration=200.0)
-    node = bench.compensator(geometry_file=file, model_file=promise.model_file)
+    # Every command is waited for: one that a busy machine delivers late is late, not lost.
+    node = bench.compensator(geometry_file=file, model_file=promise.model_file, max_command_age=0.0)
     both: list[Any] = [*node.publishers, *node.subscriptions]
     ends = {end.topic_name: end for end in both}
     bench.until(lambda: ends["/strut_commands"].get_subscription_count() == 2, "the drive to hear the compensator")
