@@ -330,3 +330,25 @@ class RealMachine:
         if not (lengths > 0.0).all():
             raise UnreachableError("a strut would have no length at this pose")
         return self.pose_for(lengths, sense, target)[0]
+
+
+class MachinesByTemperature:
+    """Real machines at temperatures that come again and again, each made once.
+
+    Parameters
+    ----------
+    geometry, model : HexapodGeometry, MachineModel
+        As for :class:`RealMachine`.
+    """
+
+    def __init__(self, geometry: HexapodGeometry, model: MachineModel) -> None:
+        self._geometry, self._model = geometry, model
+        self._known: dict[tuple[float, ...], RealMachine] = {}
+
+    def at(self, values: np.ndarray) -> RealMachine:
+        """Return the machine at the temperatures of struts 1–6, base and platform, °C, shape (8,)."""
+        key = tuple(values.tolist())
+        if key not in self._known:
+            temperatures = Temperatures(dict(zip(Temperatures.NAMES, key, strict=True)))
+            self._known[key] = RealMachine(self._geometry, self._model, temperatures)
+        return self._known[key]

@@ -13,28 +13,12 @@ import numpy as np
 
 from .campaign import Campaign
 from .errors import HexapodError, KinematicsError
-from .machine import MachineModel, RealMachine, Temperatures
+from .machine import MachineModel, MachinesByTemperature, RealMachine
 from .measurement import AXES, CHANNELS, KINDS, MeasurementSet, attitude_error
 from .motion import MotionState
 
 VISITS, SLOPES, NOISE = range(3)
 """Streams of random numbers, one per cause: changing one leaves the others' draws alone."""
-
-
-class _AtTemperatures:
-    """Real machines at the temperatures of the stations, each made once."""
-
-    def __init__(self, machine: RealMachine) -> None:
-        self._machine = machine
-        self._known: dict[tuple[float, ...], RealMachine] = {}
-
-    def at(self, values: np.ndarray) -> RealMachine:
-        """Return the machine at the temperatures of struts 1–6, base and platform, °C."""
-        key = tuple(values.tolist())
-        if key not in self._known:
-            temperatures = Temperatures(dict(zip(Temperatures.NAMES, key, strict=True)))
-            self._known[key] = RealMachine(self._machine.geometry, self._machine.model, temperatures)
-        return self._known[key]
 
 
 def measure(
@@ -86,7 +70,8 @@ def station_errors(
     Displacement of the point and rotation of the platform, actual minus commanded, under the stations'
     commands, directions of motion and temperatures.
     """
-    machines, stations, probe = _AtTemperatures(truth), measurements.stations, measurements.probe
+    machines = MachinesByTemperature(truth.geometry, truth.model)
+    stations, probe = measurements.stations, measurements.probe
     errors = np.empty((len(stations), 6))
     for n in range(len(stations)):
         commanded = stations.pose(n)
@@ -117,7 +102,7 @@ def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet
     HexapodError
         A pose at which the model cannot be undone; names the reading.
     """
-    machines, stations = _AtTemperatures(RealMachine(template.geometry, model)), template.stations
+    machines, stations = MachinesByTemperature(template.geometry, model), template.stations
     commands = np.empty_like(stations.commands)
     for n in range(len(stations)):
         motion = MotionState(sense=stations.sense[n].copy())

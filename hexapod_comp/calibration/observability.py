@@ -116,11 +116,12 @@ def observe(space: ParameterSpace, problem: LinearProblem, posterior: Posterior)
     information = spread[:, None] * np.tensordot(posterior.noise**-2, problem.normal, 1) * spread
     singular, vectors = _singular(information)
     seen = singular[singular > SEEN]
+    errors = np.sqrt(np.diag(physical_covariance(space, posterior)))
     structure = space.blocks[0]
     alone, directions = _singular(information[structure.part, structure.part])
     hidden = (directions[:, alone <= SEEN] ** 2).sum(axis=1) > UNSEEN_SHARE
     return Observability(
-        blocks=tuple(_sight(space, posterior, n) for n in range(len(space.blocks))),
+        blocks=tuple(_sight(space, posterior, n, errors) for n in range(len(space.blocks))),
         structure_rank=int((alone > SEEN).sum()),
         structure_size=len(structure.labels),
         rank=len(seen),
@@ -138,16 +139,16 @@ def _singular(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.sqrt(np.maximum(values[::-1], 0.0)), vectors[:, ::-1]
 
 
-def _sight(space: ParameterSpace, posterior: Posterior, n: int) -> BlockSight:
+def _sight(space: ParameterSpace, posterior: Posterior, n: int, errors: np.ndarray) -> BlockSight:
+    """Return how well block n is seen; `errors` are the standard errors of all parameters, SI."""
     block = space.blocks[n]
-    errors = np.sqrt(np.diag(physical_covariance(space, posterior))[block.part])
     return BlockSight(
         name=block.name,
         unit=block.unit,
         parameters=len(block.labels),
         determined=float(posterior.determined[block.part].sum()),
         tolerance=float(posterior.tolerances[n]),
-        error=float(np.median(errors)),
+        error=float(np.median(errors[block.part])),
     )
 
 

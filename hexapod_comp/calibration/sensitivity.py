@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..machine import RealMachine
+from ..machine import MachinesByTemperature
 from ..measurement import Stations, attitude_error
 from .space import ParameterSpace
 
@@ -50,12 +50,9 @@ def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Predict
     count = len(stations)
     positions, rotations = np.empty((count, 3)), np.empty((count, 3, 3))
     base, platform = np.empty((count, 6, 3)), np.empty((count, 6, 3))
-    machines: dict[bytes, RealMachine] = {}
+    machines = MachinesByTemperature(space.geometry, model)
     for n in range(count):
-        key = stations.temperatures[n].tobytes()
-        if key not in machines:
-            machines[key] = RealMachine(space.geometry, model, stations.temperature(n))
-        machine = machines[key]
+        machine = machines.at(stations.temperatures[n])
         actual, _ = machine.pose_for(stations.commands[n], sense[n], stations.pose(n))
         positions[n], rotations[n] = actual.position, actual.rotation
         base[n], platform[n] = machine.structure.base_joints, machine.structure.platform_joints
