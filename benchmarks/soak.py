@@ -1,0 +1,319 @@
+"""A long run at 1 kHz: is anything lost, does memory grow, and what were the longest gaps?
+
+Compensator and simulated drive run as processes of their own, the drive's readings go back to the compensator,
+and the tool goes round a circle. Their stderr goes into a pipe that nobody reads, as when a terminal was stopped
+with Ctrl-S. Latency is from just before a command is published to its strut commands' arrival here. For the longest
+ones the system says how long each process had been waiting for a processor in the second before
+it (/proc/PID/task/*/schedstat), and the nodes say what Python's garbage collector and Numba did.
+
+Usage: python -m benchmarks.soak [--minutes 30] [--rate-hz 1000] [--json]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from rclpy.experimental import EventsExecutor
+from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
+
+from hexapod_comp.conversions import pose_message
+from hexapod_comp.nodes.processes import PrivateDomain
+from hexapod_comp.nodes.runtime import COMMAND_QOS, EVENT_QOS, SPIN_PERIOD
+from hexapod_comp.pose import Pose
+
+NODES = ("compensator", "strut_drive")
+
+RADIUS, TURN_TIME = 0.012, 4.0
+"""Circle about home, m, and time of one turn, s: 19 mm/s."""
+
+WARM_UP = 0.1
+"""Share of the run after which memory should be flat; at least :data:`LEAST_WARM_UP`, s."""
+
+LEAST_WARM_UP = 5.0
+
+WORST_KEPT = 8
+
+BINS = np.geomspace(1e-5, 10.0, 6001)
+"""Edges of the latency histogram, s: 0.23 % apart, so that the client's own memory stays flat."""
+
+BAR_GROWTH = 1.0
+"""MB an hour."""
+
+
+@dataclass
+class Gap:
+    """One late answer.
+
+    Attributes
+    ----------
+    at : float
+        When the command left, CLOCK_MONOTONIC, s.
+    latency : float
+        s.
+    waiting : dict of str to float
+        How long each process had been waiting for a processor since the last look, s.
+    """
+
+    at: float
+    latency: float
+    waiting: dict[str, float]
+
+
+@dataclass
+class Soak:
+    """What a run found.
+
+    Attributes
+    ----------
+    commands, lost : int
+        Sent, and never answered.
+    histogram : ndarray
+        Answers by latency, in :data:`BINS`.
+    worst : list of Gap
+        Longest latencies, longest first.
+    memory : list of tuple of float
+        Time since the start, s, and resident memory of each node, byte.
+    waited : dict of str to float
+        How long each process waited for a processor during the whole run, s.
+    """
+
+    commands: int = 0
+    lost: int = 0
+    longest: float = 0.0
+    histogram: np.ndarray = field(default_factory=lambda: np.zeros(len(BINS) + 1, dtype=np.int64))
+    worst: list[Gap] = field(default_factory=list)
+    memory: list[tuple[float, ...]] = field(default_factory=list)
+    waited: dict[str, float] = field(default_factory=dict)
+    diagnostics: dict[str, dict[str, str]] = field(default_factory=dict)
+    notes: dict[str, list[dict]] = field(default_factory=dict)
+
+    def quantile(self, share: float) -> float:
+        """Return the latency, s, below which a share of the answers lies, to the width of a bin."""
+        counts = np.cumsum(self.histogram)
+        if not counts[-1]:
+            return float("nan")
+        index = int(np.searchsorted(counts, share * counts[-1]))
+        return float(min(BINS[min(index, len(BINS) - 1)], self.longest))
+
+    def growth(self, node: int) -> tuple[float, float]:
+        """Return slope and its standard error of a node's resident memory after warming up, MB/h."""
+        rows = np.array(self.memory)
+        rows = rows[rows[:, 0] > max(LEAST_WARM_UP, WARM_UP * rows[-1, 0])]
+        if len(rows) < 4:
+            return float("nan"), float("nan")
+        hours, megabytes = rows[:, 0] / 3600.0, rows[:, 1 + node] * 1e-6
+        (slope, _), covariance = np.polyfit(hours, megabytes, 1, cov="unscaled")
+        residual = megabytes - np.polyval(np.polyfit(hours, megabytes, 1), hours)
+        return float(slope), float(np.sqrt(covariance[0, 0] * residual.var()))
+
+
+class Commander:
+    """Sends a circle at a fixed rate and keeps account of the answers."""
+
+    def __init__(self, rate: float, pids: dict[str, int]) -> None:
+        self.found, self._rate, self._pids = Soak(), rate, pids
+        self.context = rclpy.Context()
+        rclpy.init(args=[], context=self.context, signal_handler_options=SignalHandlerOptions.NO)
+        self.node = rclpy.create_node("soak", context=self.context)
+        self.executor = EventsExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self._publisher = self.node.create_publisher(PoseStamped, "tool_pose_command", COMMAND_QOS)
+        self.node.create_subscription(JointState, "strut_commands", self._on_answer, QoSProfile(depth=1000))
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
+        self._message = pose_message(Pose(np.array([0.0, 0.0, 0.4]), np.eye(3)), "base")
+        self._sent: dict[int, float] = {}
+        self._waiting = self._first_waiting = self._run_queue()
+
+    def close(self) -> None:
+        """Leave ROS."""
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+    def wait_until_ready(self, timeout: float = 180.0) -> None:
+        """Return when both nodes are connected."""
+        end = time.monotonic() + timeout
+        while not (self._publisher.get_subscription_count() and set(NODES) <= set(self.found.diagnostics)):
+            self.executor.spin_once(timeout_sec=SPIN_PERIOD)
+            if time.monotonic() > end:
+                raise SystemExit(f"the nodes did not come up within {timeout:g} s")
+
+    def run(self, seconds: float) -> Soak:
+        """Send for some seconds, wait for the last answers, and return the account."""
+        start = due = time.monotonic()
+        next_look = start
+        while (now := time.monotonic()) < start + seconds:
+            self._send(now - start)
+            if now >= next_look:
+                self._look(now - start)
+                next_look = now + 1.0
+            due = max(due + 1.0 / self._rate, now - SPIN_PERIOD)
+            while (left := due - time.monotonic()) > 0.0:
+                self.executor.spin_once(timeout_sec=left)
+        end = time.monotonic() + 2.0
+        while self._sent and time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=SPIN_PERIOD)
+        self.found.lost = len(self._sent)
+        self.found.waited = {k: v - self._first_waiting[k] for k, v in self._run_queue().items()}
+        return self.found
+
+    def _send(self, elapsed: float) -> None:
+        angle = 2.0 * np.pi * elapsed / TURN_TIME
+        position = self._message.pose.position
+        position.x, position.y = RADIUS * float(np.cos(angle)) - RADIUS, RADIUS * float(np.sin(angle))
+        stamp = self.node.get_clock().now()
+        self._message.header.stamp = stamp.to_msg()
+        self._sent[stamp.nanoseconds] = time.monotonic()
+        self.found.commands += 1
+        self._publisher.publish(self._message)
+
+    def _on_answer(self, message: JointState) -> None:
+        now = time.monotonic()
+        sent = self._sent.pop(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec, None)
+        if sent is None:
+            return
+        latency, found = now - sent, self.found
+        found.histogram[np.searchsorted(BINS, latency)] += 1
+        found.longest = max(found.longest, latency)
+        if len(found.worst) < WORST_KEPT or latency > found.worst[-1].latency:
+            found.worst.append(Gap(sent, latency, self._waited_since()))
+            found.worst.sort(key=lambda gap: -gap.latency)
+            del found.worst[WORST_KEPT:]
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self.found.diagnostics[status.name.partition(":")[0]] = {v.key: v.value for v in status.values}
+
+    def _look(self, elapsed: float) -> None:
+        """Once a second: memory, and forget how long anybody waited for a processor before."""
+        self.found.memory.append((elapsed, *(_resident(self._pids[name]) for name in NODES)))
+        self._waiting = self._run_queue()
+
+    def _waited_since(self) -> dict[str, float]:
+        before, self._waiting = self._waiting, self._run_queue()
+        return {name: now - before[name] for name, now in self._waiting.items()}
+
+    def _run_queue(self) -> dict[str, float]:
+        """Return how long the threads of each process have waited for a processor up to now, s."""
+        return {name: _waited(pid) for name, pid in {**self._pids, "client": os.getpid()}.items()}
+
+
+def _waited(pid: int) -> float:
+    waited = 0
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        try:
+            waited += int((task / "schedstat").read_text().split()[1])
+        except OSError:  # a thread that has just ended
+            continue
+    return waited * 1e-9
+
+
+def _resident(pid: int) -> int:
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+@contextmanager
+def nodes(folder: Path) -> Iterator[dict[str, int]]:
+    """Run both nodes in a private domain, their log into a pipe that nobody reads; give their process ids."""
+    unread, sink = os.pipe()
+    children = {}
+    with PrivateDomain():
+        try:
+            for name in NODES:
+                command = [sys.executable, "-m", "benchmarks.soak_node", str(folder / f"{name}.jsonl"), name]
+                children[name] = subprocess.Popen(command, stderr=sink, stdin=subprocess.DEVNULL)
+            yield {name: child.pid for name, child in children.items()}
+        finally:
+            for child in children.values():
+                child.terminate()
+            for child in children.values():
+                child.wait(20)
+            os.close(unread)
+            os.close(sink)
+
+
+def soak(seconds: float, rate: float) -> Soak:
+    """Run everything for some seconds."""
+    with tempfile.TemporaryDirectory() as name, nodes(Path(name)) as pids:
+        commander = Commander(rate, pids)
+        try:
+            commander.wait_until_ready()
+            began = time.monotonic()
+            found = commander.run(seconds)
+        finally:
+            commander.close()
+        for node in NODES:
+            lines = (Path(name) / f"{node}.jsonl").read_text(encoding="utf-8").splitlines()
+            found.notes[node] = [note for note in map(json.loads, lines) if note["at"] >= began]
+    return found
+
+
+def report(found: Soak) -> list[str]:
+    """Return the lines for people."""
+    shares = (0.5, 0.9, 0.99, 0.999, 0.9999)
+    quantiles = "  ".join(f"{100 * share:g} % {found.quantile(share) * 1e6:.0f}" for share in shares)
+    lines = [
+        f"{found.commands} commands, {found.lost} without an answer",
+        f"latency, µs: {quantiles}  largest {found.longest * 1e6:.0f}",
+    ]
+    for index, node in enumerate(NODES):
+        slope, error = found.growth(index)
+        collections = [note["seconds"] for note in found.notes[node] if note["kind"] == "gc"]
+        compiled = [note["name"] for note in found.notes[node] if note["kind"] == "compile"]
+        lines.append(
+            f"{node}: {found.memory[-1][1 + index] * 1e-6:.1f} MB, "
+            f"{slope:+.2f} ± {2 * error:.2f} MB/h after warming up; "
+            f"{len(collections)} garbage collections, longest {max(collections, default=0.0) * 1e6:.0f} µs; "
+            f"compiled {len(compiled)}; waited {found.waited[node]:.2f} s for a processor"
+        )
+    lines.append("longest latencies, ms, and how long each process had waited for a processor in the second before:")
+    for gap in found.worst:
+        waiting = ", ".join(f"{name} {seconds * 1e3:.2f}" for name, seconds in gap.waiting.items())
+        busy = [
+            f"{node}'s collector {note['seconds'] * 1e3:.2f}"
+            for node in NODES
+            for note in found.notes[node]
+            if note["kind"] == "gc" and gap.at - 1e-3 <= note["at"] <= gap.at + gap.latency
+        ]
+        lines.append(f"  {gap.latency * 1e3:7.2f}: {', '.join([waiting, *busy])}")
+    return lines
+
+
+def main() -> int:
+    """Print the account; exit 1 when something was lost or memory grew."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--rate-hz", type=float, default=1000.0)
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    found = soak(args.minutes * 60.0, args.rate_hz)
+    if args.json:
+        values = {"commands": found.commands, "lost": found.lost, "growth_mb_h": [found.growth(i)[0] for i in (0, 1)]}
+        print(json.dumps(values | {"diagnostics": found.diagnostics}, indent=1))
+    else:
+        print("\n".join(report(found)))
+    grows = [found.growth(i)[0] > BAR_GROWTH for i in (0, 1)]
+    verdict = "MISSED" if found.lost or any(grows) else "kept"
+    print(f"bars (nothing lost, memory grows by less than {BAR_GROWTH:g} MB/h): {verdict}", file=sys.stderr)
+    return int(verdict == "MISSED")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
