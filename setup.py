@@ -63,17 +63,22 @@ setup(
             "colcon-library-path>=0.2.1",
             "plotly>=5.18",
             "distributed>=2023.12",
+            "rosbags>=0.10",
         ],
         "bench": ["mujoco>=3.1", "pin>=2.7"],
         # No rosdep keys: imported where used, with a clear message when missing.
         "pages": ["plotly>=5.18"],
         "cluster": ["distributed>=2023.12"],
+        "bags": ["rosbags>=0.10"],
     },
     entry_points={
         "console_scripts": [
             f"hexapod_comp = {NAME}.cli:main",
             f"compensator = {NAME}.nodes.compensator:main",
             f"strut_drive = {NAME}.nodes.strut_drive:main",
+            f"linuxcnc_bridge = {NAME}.nodes.linuxcnc_bridge:main",
+            f"linuxcnc_machine = {NAME}.linuxcnc_machine:main",
+            f"hal_sweep = {NAME}.hal_sweep:main",
         ],
     },
 )

@@ -8,7 +8,9 @@ A refused command leaves the compensator exactly as it was.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -35,13 +37,16 @@ from .compensation_kernels import (
     pack_pose,
     pose_views,
 )
-from .errors import HexapodError, NotConvergedError, NotFiniteError, OutsideFieldError, PoseError
+from .errors import HexapodError, ModelError, NotConvergedError, NotFiniteError, OutsideFieldError, PoseError
 from .geometry import HexapodGeometry
 from .kinematics import forward_error, strut_lengths
 from .limits import WITHIN, LimitTable
 from .machine import MachineModel, RealMachine, Temperatures
 from .motion import MotionState
 from .pose import POSE_NOT_FINITE, QUATERNION_NORM_TOLERANCE, Pose
+
+RESUMES = 3
+"""Place of a fourth switch, beside those of the kernels: the next command starts from the measured struts."""
 
 DEFAULT_RAMP_RATE = 1e-3
 """How fast a change of model, temperature or enabling moves a strut, m/s."""
@@ -144,6 +149,12 @@ class Compensator:
     -----
     :meth:`step` is the loop's entry: it works on preallocated arrays and returns nothing but what must be
     sent. :meth:`correct` does the same and gives the full record.
+
+    Attributes
+    ----------
+    on_change : callable
+        Called after each change from outside, with its name and value: ``temperature`` (name, °C), ``model``,
+        ``enable`` (bool), ``reset`` (measured struts or None). Together with the commands these decide all answers.
     """
 
     def __init__(
@@ -153,7 +164,7 @@ class Compensator:
         self.limits = LimitTable(geometry)
         self.temperatures = Temperatures()
         self.machine = RealMachine(geometry, model)
-        self._switches = np.array([1.0, 0.0, ramp_rate])
+        self._switches = np.array([1.0, 0.0, ramp_rate, 0.0])
         self.condition = math.nan
         self.outside_field = False
         self._tool_inverse = geometry.tool.inverse()
@@ -162,6 +173,7 @@ class Compensator:
         self._last, self._next = _Command(), _Command()
         self._take_machine(RealMachine(geometry, model))
         self._model_pose, self._tool_pose = np.empty(12), np.empty(12)
+        self.on_change: Callable[[str, Any], None] = lambda what, value: None
         self._forget()
 
     @property
@@ -201,6 +213,11 @@ class Compensator:
 
     def set_model(self, model: MachineModel) -> None:
         """Replace the model; the corrections ramp from the old one's to the new one's."""
+        self._renew(model)
+        self.on_change("model", model)
+
+    def _renew(self, model: MachineModel) -> None:
+        """Take a model at the present temperatures."""
         machine = RealMachine(self.geometry, model, self.temperatures)
         before, after = self._followed(self.machine), self._followed(machine)
         if before is not None and after is not None:
@@ -243,13 +260,15 @@ class Compensator:
             Unknown name or a value outside the allowed range.
         """
         self.temperatures.set(name, value)
-        self.set_model(self.model)
+        self._renew(self.model)
+        self.on_change("temperature", (name, self.temperatures.values[name]))
 
     def enable(self, enabled: bool) -> None:
         """Switch compensation on or off; the corrections ramp."""
         if enabled != self.enabled:
             self._switches[ENABLED] = float(enabled)
             self._switches[CHANGED] = float(not math.isnan(self._last.correction[0]))
+            self.on_change("enable", enabled)
 
     def reset(self, measured: np.ndarray | None = None) -> None:
         """Forget the last command and all directions of motion.
@@ -260,19 +279,53 @@ class Compensator:
         Parameters
         ----------
         measured : array_like, shape (6,), optional
-            Where the struts are, m: the next command may be at most one allowed step away from it.
+            Where the struts are, m. When the next command's nominal lengths lie within the allowed correction
+            of it, that command starts from there and ramps: the struts do not step. Elsewhere it may be at
+            most one allowed step away.
         """
         if measured is None:
             self._forget()
+            self.on_change("reset", None)
             return
         measured = np.array(measured, dtype=float)
         if measured.shape != (6,) or not np.isfinite(measured).all():
             raise NotFiniteError("measured strut lengths must be six finite numbers, m", measured.tolist())
         self._forget()
         self._last.command[:] = measured
+        self._switches[RESUMES] = 1.0
+        self.on_change("reset", measured)
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return what, beside geometry and model, decides the next command: lists of numbers by name."""
+        return {
+            "state": self._last.state.tolist(),
+            "poses": self._last.poses.tolist(),
+            "switches": self._switches.tolist(),
+            "temperatures": dict(self.temperatures.values),
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Take over a :meth:`snapshot` of a compensator with this geometry and model.
+
+        Raises
+        ------
+        ModelError
+            It does not have the numbers that a snapshot has, or a temperature is not allowed.
+        """
+        targets = {"state": self._last.state, "poses": self._last.poses, "switches": self._switches}
+        values = {name: np.asarray(snapshot.get(name, ()), dtype=float) for name in targets}
+        for name, target in targets.items():
+            if values[name].shape != target.shape:
+                raise ModelError(f"snapshot.{name}", f"must be {target.size} numbers", values[name].size)
+        temperatures = Temperatures(snapshot.get("temperatures"))
+        self._take_machine(RealMachine(self.geometry, self.model, temperatures))
+        self.temperatures = temperatures
+        for name, target in targets.items():
+            target[:] = values[name]
 
     def _forget(self) -> None:
         home = self.geometry.home
+        self._switches[RESUMES] = 0.0
         self._last.clear()
         self._model_pose[:3], self._model_pose[3:] = home.position, home.rotation.ravel()
         self._switches[CHANGED] = float(not math.isnan(self._last.correction[0]))
@@ -285,7 +338,9 @@ class Compensator:
         numbers : tuple of seven float
             Position x, y, z, m, and quaternion x, y, z, w of the tool in `frame`.
         time : float
-            Monotonic clock, s; only its differences matter, for ramps.
+            When the command was made, s: the node gives its stamp in nanoseconds × 1e-9. Only differences
+            matter, for ramps, and of them no more than 20 ms forwards; so the same commands with the same
+            stamps give the same answers bit for bit, and no jump of a clock can step.
         frame : ndarray, shape (12,), optional
             Frame of the commanded pose seen from ``base``, packed by
             :func:`~hexapod_comp.compensation_kernels.pack_pose`; the geometry's work frame by default.
@@ -300,18 +355,43 @@ class Compensator:
         PoseError, LimitError, KinematicsError, OutsideFieldError
             The command is refused and nothing has changed.
         """
-        last, upcoming = self._last, self._next
-        found = compensate_quaternion(
+        if self._switches[RESUMES]:
+            return self._resume(lambda: self._run_numbers(numbers, time, frame), numbers)
+        return self._finish(self._run_numbers(numbers, time, frame), numbers)
+
+    def _run_numbers(self, numbers: tuple[float, ...], time: float, frame: np.ndarray | None) -> tuple:
+        """Work out the next command from a message's numbers; what it is worth, :meth:`_finish` says."""
+        upcoming = self._next
+        return compensate_quaternion(
             *numbers,
             time,
             self._work if frame is None else frame,
             self._fixed,
             self._switches,
-            last.state,
+            self._last.state,
             upcoming.state,
             upcoming.poses,
         )
-        return self._finish(found, numbers)
+
+    def _resume(self, run: Callable[[], tuple], numbers: tuple[float, ...] = ()) -> np.ndarray:
+        """Take the first command after a reset to measured struts, starting from where they stand.
+
+        What they differ from the command's nominal lengths counts as the correction that they stand at, if it
+        could be one; the first command is then the measured struts, and ramps. A trial run finds the nominal
+        lengths.
+        """
+        last, before = self._last, (self._last.correction.copy(), self._switches[CHANGED])
+        run()
+        standing = last.command - self._next.nominal
+        if (np.abs(standing) <= self.geometry.limits.correction).all():
+            last.correction[:], self._switches[CHANGED] = standing, 1.0
+        try:
+            command = self._finish(run(), numbers)
+        except HexapodError:
+            last.correction[:], self._switches[CHANGED] = before
+            raise
+        self._switches[RESUMES] = 0.0
+        return command
 
     def _finish(self, found: tuple, numbers: tuple[float, ...] = ()) -> np.ndarray:
         """Accept the command under way, or raise what was found."""
@@ -383,27 +463,33 @@ class Compensator:
         tool_pose : Pose
             ``pose_tool_in_work``.
         time : float, optional
-            Monotonic clock, s, for ramps.
+            When the command was made, s, for ramps, as in :meth:`step`.
 
         Raises
         ------
         LimitError, KinematicsError, OutsideFieldError
             The command is refused and nothing has changed.
         """
-        last, upcoming = self._last, self._next
-        found = compensate_one(
+        if self._switches[RESUMES]:
+            self._resume(lambda: self._run_pose(tool_pose, time))
+        else:
+            self._finish(self._run_pose(tool_pose, time))
+        return self.record(tool_pose)
+
+    def _run_pose(self, tool_pose: Pose, time: float) -> tuple:
+        """Work out the next command from a pose."""
+        upcoming = self._next
+        return compensate_one(
             tool_pose.position,
             tool_pose.rotation,
             time,
             self._work,
             self._fixed,
             self._switches,
-            last.state,
+            self._last.state,
             upcoming.state,
             upcoming.poses,
         )
-        self._finish(found)
-        return self.record(tool_pose)
 
     def record(self, tool_pose: Pose) -> Correction:
         """Return the record of the command just accepted for `tool_pose`."""

@@ -41,6 +41,48 @@ def config_file(name: str | os.PathLike[str]) -> Path:
     raise InputFileError(os.fspath(name) or "''", "", _not_found(os.fspath(name), shipped))
 
 
+def confined_file(name: str | os.PathLike[str], folder: Path | None) -> Path:
+    """Find a configuration file as :func:`config_file` does, but only in one folder or among the shipped ones.
+
+    Parameters
+    ----------
+    name : str or path
+        Path of a file, also relative to `folder`, or the name of a shipped one.
+    folder : Path or None
+        Folder, with all below it, from which files may be read; None: only shipped ones.
+
+    Returns
+    -------
+    Path
+        An existing regular file, without links: what is replaced later cannot lead elsewhere.
+
+    Raises
+    ------
+    InputFileError
+        There is no such file, it is not a regular one, or it lies elsewhere, be it by ``..`` or a link.
+    """
+    own = os.path.expanduser(os.fspath(name))
+    if own and folder is not None and os.path.exists(folder / own):
+        own = os.path.join(folder, own)
+    if os.path.exists(own) and not os.path.isfile(own):
+        raise InputFileError(own, "", "is not a regular file")
+    path = config_file(own).resolve()
+    folders = [place.resolve() for place in (folder, config_folder()) if place is not None]
+    if not any(path.is_relative_to(place) for place in folders):
+        places = " and ".join(str(place) for place in folders)
+        problem = f"leads to {path}, but files are only read from {places}; see model_folder"
+        raise InputFileError(os.fspath(name), "", problem)
+    return path
+
+
+def folder_of(name: str | os.PathLike[str]) -> Path | None:
+    """Return the folder of a file given by its path, without links; None for the name of a shipped one."""
+    own = os.path.expanduser(name)
+    if os.path.dirname(own) or os.path.isfile(own):
+        return Path(os.path.dirname(own) or ".").resolve()
+    return None
+
+
 def shipped_names() -> list[str]:
     """Return the names of all shipped configuration files, relative to their folder, sorted."""
     folder = config_folder()

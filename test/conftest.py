@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from hexapod_comp.nodes.processes import reserve_domain
+from hexapod_comp.paths import config_file
 
 if TYPE_CHECKING:
     from rclpy.context import Context
@@ -44,6 +45,7 @@ def isolated_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
         patch.setenv("ROS_DOMAIN_ID", str(domain))
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         patch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("ros_log")))
+        patch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(config_file("fastdds.xml")))
         patch.delenv("ROS_LOCALHOST_ONLY", raising=False)
         patch.delenv("ROS_STATIC_PEERS", raising=False)
         patch.delenv("ROS_DISCOVERY_SERVER", raising=False)

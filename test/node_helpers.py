@@ -19,6 +19,9 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode
@@ -135,7 +138,9 @@ class Bench:
         self.executor.add_node(self.witness)
         for topic, (kind, qos) in WATCHED.items():
             self.witness.create_subscription(kind, topic, self.seen[topic].append, qos)
-        self._publishers = {t: self.witness.create_publisher(kind, t, RELIABLE) for t, kind in SENT.items()}
+        self._publishers: dict[str, Any] = {}
+        for topic in SENT.keys() - {"strut_commands"}:  # where there is a compensator, only that may publish
+            self.speak(topic)
         self._clients: dict[str, Any] = {}
 
     def __enter__(self) -> Bench:
@@ -152,10 +157,13 @@ class Bench:
 
     def compensator(self, start: bool = True, **parameters: object) -> CompensatorNode:
         """Add a compensator; `start` configures and activates it and waits until it is connected."""
+        self.hush("strut_commands")
         return self.add(CompensatorNode, start, parameters)
 
     def drive(self, start: bool = True, **parameters: object) -> StrutDriveNode:
-        """Add a strut drive."""
+        """Add a strut drive, which the witness commands unless there is a compensator to do it."""
+        if not self.nodes:
+            self.speak("strut_commands")
         return self.add(StrutDriveNode, start, parameters)
 
     def add(self, kind: type, start: bool, parameters: dict[str, object], **options: Any) -> Any:
@@ -241,7 +249,27 @@ class Bench:
         """Call ``reload_model`` or ``reset``."""
         return self.call(Trigger, f"compensator/{name}")
 
+    def begin(self, name: str) -> Any:
+        """Call ``reload_model`` or ``reset`` and return the future of its response."""
+        return self._client(Trigger, f"compensator/{name}").call_async(Trigger.Request())
+
+    def call_parameter(self, node: str, name: str, value: float) -> bool:
+        """Set a float parameter of a node; return whether it took it."""
+        parameter = ParameterMessage(name=name)
+        parameter.value.type, parameter.value.double_value = ParameterType.PARAMETER_DOUBLE, value
+        request = SetParameters.Request(parameters=[parameter])
+        return self.call(SetParameters, f"{node}/set_parameters", request).results[0].successful
+
     # ---- messages ----
+
+    def speak(self, topic: str) -> None:
+        """Let the witness publish on a topic."""
+        self._publishers[topic] = self.witness.create_publisher(SENT[topic], topic, RELIABLE)
+
+    def hush(self, topic: str) -> None:
+        """Let the witness publish on a topic no longer."""
+        if topic in self._publishers:
+            self.witness.destroy_publisher(self._publishers.pop(topic))
 
     def publish(self, topic: str, message: Any) -> None:
         """Publish a message to the nodes under test."""
@@ -269,6 +297,13 @@ class Bench:
             f"answer to a command; {self.status() and self.status().message}",
         )
         return Answer(find("strut_commands")[0], find("strut_corrections")[0], began, time.monotonic())
+
+    def settle(self, pose: Pose) -> Answer:
+        """Hold a pose until the corrections have ramped in: until two answers in turn are alike."""
+        last, answer = self.ask(pose), self.ask(pose)
+        while not (answer.corrections == last.corrections).all():
+            last, answer = answer, self.ask(pose)
+        return answer
 
     def estimate(self, of: JointState) -> PoseStamped:
         """Wait for the pose estimate made from a message of commanded or measured struts."""

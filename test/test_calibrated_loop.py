@@ -136,7 +136,9 @@ def start_loop(bench: Bench, folder: Path, promise: Promise) -> HexapodGeometry:
     file = geometry_file(folder, {"speed_mm_s": 5000, "step_mm": 40})
     bench.drive(geometry_file=file, truth_file=promise.truth_file, step=STEP, max_acceleration=200.0)
     # Every command is waited for: one that a busy machine delivers late is late, not lost.
-    node = bench.compensator(geometry_file=file, model_file=promise.model_file, max_command_age=0.0)
+    # Its drives overshoot by some 15 mm.
+    settings = {"max_command_age": 0.0, "following_error_limit": 0.0}
+    node = bench.compensator(geometry_file=file, model_file=promise.model_file, **settings)
     both: list[Any] = [*node.publishers, *node.subscriptions]
     ends = {end.topic_name: end for end in both}
     bench.until(lambda: ends["/strut_commands"].get_subscription_count() == 2, "the drive to hear the compensator")
@@ -173,6 +175,7 @@ def rest(bench: Bench) -> Pose:
 def visit(bench: Bench, geometry: HexapodGeometry, points: np.ndarray, ways: np.ndarray) -> np.ndarray:
     """Approach each point along its way and against it; return where the tool stood, (2 n, 3): there, then back."""
     at = HOME.position
+    bench.settle(HOME)
     found: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for point, way in zip(points, ways, strict=True):
         for stood, side in zip(found, (1.0, -1.0), strict=True):

@@ -412,6 +412,39 @@ def test_after_a_reset_the_correction_ramps_to_that_of_a_fresh_start() -> None:
     assert_same_records(record, fresh)
 
 
+@pytest.mark.parametrize("backlash", [0.0, 20e-6], ids=["none", "backlash"])
+def test_a_restarted_compensator_starts_from_the_measured_struts(backlash: float) -> None:
+    """Its first command is what was measured, the way from there no faster than the ramp, its end a fresh start's.
+
+    At rest, after a motion that has left every strut at the forward side of its backlash.
+    """
+    model = MachineModel("paper", struts=StrutErrors(offset=np.full(6, 70e-6), backlash=np.full(6, backlash)))
+    before = Compensator(PAPER, model, RAMP)
+    for n in range(10):
+        measured = before.correct(shifted(PAPER.home, 0.0, 0.0, 1e-4 * n), n / RATE).command + 0.3e-6
+    pose = shifted(PAPER.home, 0.0, 0.0, 9e-4)
+    again = Compensator(PAPER, model, RAMP)
+    again.reset(measured)
+    sent = [again.correct(pose, 7.0 + n / RATE).command for n in range(500)]
+    np.testing.assert_allclose(sent[0], measured, rtol=0.0, atol=1e-15)
+    assert (np.abs(np.diff(sent, axis=0)) <= RAMP / RATE + 1e-15).all()
+    assert not again.ramping
+    np.testing.assert_allclose(sent[-1], Compensator(PAPER, model).correct(pose).command, rtol=0.0, atol=1e-15)
+
+
+def test_a_refused_first_command_leaves_the_start_from_the_measured_struts() -> None:
+    """Struts on their commands, an impossible command, then a good one: that starts from the struts all the same."""
+    compensator = standing()
+    measured = compensator.command + 5e-6
+    compensator.reset(measured)
+    state = compensator.snapshot()
+    for bad in (shifted(PAPER.home, 0.0, 0.0, 0.05), shifted(PAPER.home, 0.0, 0.0, 5.0)):
+        with pytest.raises(LimitError):
+            compensator.correct(bad, 1.0)
+    assert repr(compensator.snapshot()) == repr(state), "NaN differs from itself"
+    np.testing.assert_allclose(compensator.correct(PAPER.home, 1.0).command, measured, rtol=0.0, atol=1e-15)
+
+
 # Changes ramp.
 
 

@@ -96,6 +96,7 @@ def rest(bench: Bench) -> Pose:
 def visit(bench: Bench, geometry: HexapodGeometry) -> list[Pose]:
     """Go from home to each target, rest, and return where the tool really stood."""
     start, found = HOME, []
+    bench.settle(HOME)
     for target in TARGETS:
         travel(bench, move(geometry, start, target, RATE, FEED))
         found.append(rest(bench))

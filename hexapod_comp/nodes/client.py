@@ -20,6 +20,7 @@ from ..conversions import StrutReader, message_pose, pose_message
 from ..errors import HexapodError
 from ..pose import Pose
 from ..trajectory import Path
+from .middleware import avoid_shared_memory
 from .runtime import COMMAND_QOS, EVENT_QOS, STATE_QOS
 
 LISTENER_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
@@ -67,6 +68,7 @@ class LoopClient:
     """
 
     def __init__(self, frame_id: str = "base", namespace: str = "") -> None:
+        avoid_shared_memory()
         self.context = rclpy.Context()
         rclpy.init(args=[], context=self.context, signal_handler_options=SignalHandlerOptions.NO)
         self.node = rclpy.create_node("hexapod_comp_client", namespace=namespace, context=self.context)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState, Temperature
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
@@ -24,55 +26,44 @@ from visualization_msgs.msg import MarkerArray
 
 from ..compensation import Compensator
 from ..compensation_kernels import pack_pose
-from ..conversions import StrutMessage, StrutReader, pose_numbers, write_pose
+from ..conversions import StrutReader, write_pose
 from ..errors import CommandError, HexapodError
 from ..geometry import HexapodGeometry, load_geometry
+from ..journal import Source, load_with_source
 from ..machine import MachineModel
 from ..model_file import load_model
-from ..paths import config_file
+from ..paths import confined_file, folder_of
 from ..pose import Pose
-from ..thermal import DEFAULT_TIME_CONSTANT, TemperatureFilter
-from .health import ERROR, OK, WARN, Flow, HealthReport, Refusals, seconds
+from ..thermal import TemperatureFilter
+from .command_source import CommandSource, OwnTopic
+from .compensator_parameters import PARAMETERS
+from .compensator_status import CompensatorStatus
+from .following import Reach
+from .health import WARN, HealthReport, seconds
+from .journal import JournalTopics
 from .markers import machine_markers
+from .model_loading import Loading
+from .order import InOrder
+from .reloading import ReloadService
 from .runtime import (
     ACKNOWLEDGED_WITHIN,
     COMMAND_QOS,
     EVENT_QOS,
     STATE_QOS,
     MachineNode,
-    Parameter,
+    ParameterError,
     declare,
     keep_discovery_local,
     run,
 )
-
-PARAMETERS = (
-    Parameter("autostart", True, "configure and activate at start"),
-    Parameter("geometry_file", "paper.yaml", "geometry file: a path or the name of a shipped one"),
-    Parameter("model_file", "paper_machine.yaml", "model file: a path or the name of a shipped one; ideal = none"),
-    Parameter("base_frame", "base", "frame_id of poses in the machine base"),
-    Parameter("work_frame", "work", "frame_id of poses in the geometry file's work frame"),
-    Parameter("command_timeout", 0.1, "without a command for this long the state is stale, s; 0 = off", 0.0, 3600.0),
-    Parameter("max_command_age", 0.5, "older (or newer) stamps are refused, s; 0 = off", 0.0, 3600.0),
-    Parameter("feedback_timeout", 0.1, "without measured struts for this long there is no feedback, s", 1e-3, 3600.0),
-    Parameter("require_feedback", False, "refuse commands while there is no feedback"),
-    Parameter("ramp_rate", 1e-3, "strut speed at which a change of model or enabling is taken up, m/s", 1e-6, 1.0),
-    Parameter("enable_compensation", True, "compensate from the start"),
-    Parameter(
-        "temperature_time_constant_s", DEFAULT_TIME_CONSTANT, "low pass of temperatures, s; 0 = off", 0.0, 3600.0
-    ),
-    Parameter("marker_rate", 10.0, "markers per second, Hz; 0 = none", 0.0, 10.0),
-    Parameter("publish_array", False, "also publish strut_commands_array for ros2_controllers"),
-)
+from .stamps import StampCheck, nanoseconds_of, period
+from .wire import StrutBytes, read_pose_bytes, stamp_of
 
 CHECK_PERIOD = 0.05
 """How often the node looks whether its state has changed, s."""
 
 ESTIMATE_PERIOD = 0.02
 """How often the pose is estimated from the node's own commands while there is no feedback, s."""
-
-FORGET_ORDER_AFTER = 1.0
-"""After a pause this long, s, stamps may start again earlier: the sender or its clock was restarted."""
 
 
 class CompensatorNode(MachineNode):
@@ -82,14 +73,22 @@ class CompensatorNode(MachineNode):
         super().__init__("compensator", **options)
         self._options = declare(self, PARAMETERS)
         self.wants_autostart = self._options["autostart"]
-        self._refusals, self._feedback_refusals = Refusals(), Refusals()
-        self._commands, self._feedback = Flow(), Flow()
-        self._struts = StrutReader()
-        self._last_stamp = 0
-        self._fresh_start = self._looks_at_feedback = True
-        self._unestimated: Time | None = None
-        self._simulated_time = bool(self.get_parameter("use_sim_time").value)
+        self._folders = {name: self._folder(name) for name in ("geometry_file", "model_file")}
+        if self._options["base_frame"] == self._options["work_frame"]:
+            raise ParameterError(f"parameter work_frame: must differ from base_frame, {self._options['base_frame']!r}")
+        simulated = bool(self.get_parameter("use_sim_time").value)
+        clock = (lambda: self.get_clock().now().nanoseconds) if simulated else None
+        self._stamps = StampCheck(self._options["max_command_age"], clock)
+        self._status = status = CompensatorStatus(self._options, self._stamps)
+        self._commands, self._feedback, self._following = status.commands, status.feedback, status.following
+        self._struts, self._measured = StrutReader(), np.full(6, np.nan)
+        self._order = InOrder("strut_states")
+        self._answered = 0
+        self._fresh_start = self._looks_closer = True
+        self._told = ""
+        self._unestimated: int | None = None
         self._compensator: Compensator | None = None
+        self._sources: dict[str, Source] = {}
 
     @property
     def compensator(self) -> Compensator:
@@ -98,6 +97,16 @@ class CompensatorNode(MachineNode):
             raise CommandError("not_configured", "the node is not configured")
         return self._compensator
 
+    def _folder(self, parameter: str) -> Path | None:
+        """Return the folder from which a file may be read."""
+        configured = self._options["model_folder"]
+        if not configured:
+            return folder_of(self._options[parameter])
+        folder = Path(configured).expanduser()
+        if not folder.is_dir():
+            raise ParameterError(f"parameter model_folder: {configured!r} is not a folder")
+        return folder
+
     # ---- lifecycle ----
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -105,7 +114,8 @@ class CompensatorNode(MachineNode):
         began = time.perf_counter()
         self.get_logger().info("loading; the first start on a machine compiles its kernels, which takes up to a minute")
         try:
-            geometry = load_geometry(config_file(self._options["geometry_file"]))
+            path = confined_file(self._options["geometry_file"], self._folders["geometry_file"])
+            geometry, self._sources["geometry"] = load_with_source(path, load_geometry)
             self._compensator = Compensator(geometry, self._load_model(geometry), self._options["ramp_rate"])
             self._warm_up()
         except HexapodError as error:
@@ -117,7 +127,10 @@ class CompensatorNode(MachineNode):
             self._options["base_frame"]: pack_pose(Pose.identity()),
             self._options["work_frame"]: pack_pose(geometry.work),
         }
+        self._reach = Reach(geometry)
         self._open_topics()
+        frames = {name: self._options[f"{name}_frame"] for name in ("base", "work")}
+        self._journal = JournalTopics(self, self.compensator, self._place, self._sources, frames)
         name = f"{self.get_fully_qualified_name()[1:]}: {geometry.name}"
         self._report = HealthReport(name, geometry.name)
         self.get_logger().info(
@@ -136,6 +149,8 @@ class CompensatorNode(MachineNode):
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close topics and forget the machine."""
         self._active = False
+        self._reload.close()
+        self._journal.close(time.monotonic())
         self._close_topics()
         self._compensator = None
         return super().on_cleanup(state)
@@ -146,12 +161,18 @@ class CompensatorNode(MachineNode):
             return
         self._active = False
         self._check_state()
+        self._journal.close(time.monotonic())
         self._diagnostics_pub.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
         self._command_pub.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
     def _load_model(self, geometry: HexapodGeometry) -> MachineModel:
         name = self._options["model_file"]
-        return MachineModel(geometry.name) if name == "ideal" else load_model(config_file(name), geometry)
+        if name == "ideal":
+            self._sources["model"] = Source.of(name, "")
+            return MachineModel(geometry.name)
+        path = confined_file(name, self._folders["model_file"])
+        model, self._sources["model"] = load_with_source(path, lambda file: load_model(file, geometry))
+        return model
 
     def _warm_up(self) -> None:
         """Run every kernel of the loop once, so that none compiles while the machine moves."""
@@ -159,9 +180,10 @@ class CompensatorNode(MachineNode):
         home = trial.tool_pose(trial.geometry.home)
         message = PoseStamped()
         write_pose(message, home.position, home.rotation)
-        trial.step(pose_numbers(message), 0.0)
+        _, _, numbers = read_pose_bytes(serialize_message(message))
+        trial.step(numbers, 0.0)
         trial.estimate(trial.command)
-        StrutMessage().write(trial.command)
+        StrutBytes().write(trial.command)
         self.compensator.enable(self._options["enable_compensation"])
 
     def _open_topics(self) -> None:
@@ -175,25 +197,33 @@ class CompensatorNode(MachineNode):
             self._array_pub = self.publish_on(Float64MultiArray, "strut_commands_array", COMMAND_QOS)
             self._array_out = Float64MultiArray(data=[0.0] * 6)
             self._array_view = np.frombuffer(self._array_out.data, dtype=float)
-        self._command_out, self._correction_out = StrutMessage(), StrutMessage()
+        self._command_out, self._correction_out = StrutBytes(), StrutBytes()
         self._estimate_out = PoseStamped()
         self._estimate_out.header.frame_id = self._options["base_frame"]
+        commands = self.obey(PoseStamped, "tool_pose_command", self._on_command, self._look_at_publishers, raw=True)
         self._entities = [
-            self.listen_to(PoseStamped, "tool_pose_command", self._on_command, COMMAND_QOS),
+            commands,
             self.listen_to(JointState, "strut_states", self._on_states, STATE_QOS),
             self.listen_to(Temperature, "temperatures", self._on_temperature, EVENT_QOS),
         ]
+        allowed = self._options["allow_several_publishers"]
+        self._status.watch_topics(
+            CommandSource(self, commands.topic_name, commands.get_publisher_count, allowed),
+            OwnTopic(self, self._command_pub.topic_name, allowed),
+        )
+        self._hear = self._status.source.hear
+        self._reload = ReloadService(self, self._begin_reload, self._take_model, self._status.failed_reloads)
         self._own_services = [
             self.create_service(SetBool, "~/enable_compensation", self._on_enable),
-            self.create_service(Trigger, "~/reload_model", self._on_reload),
+            self._reload.service,
             self.create_service(Trigger, "~/reset", self._on_reset),
         ]
         self._timers_open = [
-            self.create_timer(CHECK_PERIOD, self._check_state),
-            self.create_timer(ESTIMATE_PERIOD, self._estimate_from_commands),
+            self.every(CHECK_PERIOD, self._check_state),
+            self.every(ESTIMATE_PERIOD, self._estimate_from_commands),
         ]
         if self._options["marker_rate"] > 0.0:
-            self._timers_open.append(self.create_timer(1.0 / self._options["marker_rate"], self._publish_markers))
+            self._timers_open.append(self.every(1.0 / self._options["marker_rate"], self._publish_markers))
 
     def _close_topics(self) -> None:
         for timer in self._timers_open:
@@ -209,75 +239,98 @@ class CompensatorNode(MachineNode):
             self._diagnostics_pub,
             self._marker_pub,
             self._array_pub,
+            *self._journal.publishers,
         ):
             if publisher is not None:
                 self.destroy_publisher(publisher)
 
     # ---- messages in ----
 
-    def _on_command(self, message: PoseStamped) -> None:
+    def _on_command(self, data: bytes, number: int | None) -> None:
         if not self._active:
             return
         now = time.monotonic()
-        header = message.header
+        if self._hear(number, now):
+            self._look_closer()
+        stamp = 0
         try:
-            stamp = self._checked_stamp(header.stamp, now)
-            frame = self._frames.get(header.frame_id)
-            if frame is None or self._looks_at_feedback:
-                self._examine(header.frame_id, now)
-            self.compensator.step(pose_numbers(message), now, frame)
+            stamp, frame_id, numbers = read_pose_bytes(data)
+            frame = self._frames.get(frame_id)
+            if frame is None or self._looks_closer:
+                self._examine(frame_id, now)
+            if stamp:
+                self._stamps.check(stamp, now)
+            when = stamp or self.get_clock().now().nanoseconds  # zero means now
+            self.compensator.step(numbers, when * 1e-9, frame)
         except HexapodError as error:
+            self._journal.refused(stamp, error.reason, str(error))
             self._refuse(error, now)
             return
-        self._publish_command(stamp, now - self._commands.last)
-        self._fresh_start, self._looks_at_feedback = False, self._options["require_feedback"]
-        self._last_stamp = _nanoseconds(header.stamp) or self._last_stamp
+        self._publish_command(when)
+        if self._fresh_start:
+            self._fresh_start = False
+            self._look_closer()
+        if stamp:
+            self._stamps.accept(stamp, now)
+        self._following.note(self.compensator.command, now)
         self._commands.tick(now)
-        self._unestimated = stamp
+        self._unestimated = when
 
     def _examine(self, frame_id: str, now: float) -> None:
-        """Refuse an unknown frame, or missing feedback; start from the feedback there is."""
+        """Refuse an unknown frame, while a guard has a problem, or missing feedback; start from what there is."""
         if frame_id not in self._frames:
             raise CommandError("frame_id", f"frame_id must be one of {', '.join(self._frames)}, not {frame_id!r}")
-        self._consult_feedback(now)
-
-    def _checked_stamp(self, stamp: Time, now: float) -> Time:
-        """Return the stamp to copy, or refuse one too old, too new or out of order; zero means now."""
-        nanoseconds = _nanoseconds(stamp)
-        if nanoseconds == 0:
-            return self.get_clock().now().to_msg()
-        # The node's clock is this one, and costs a dozen microseconds more, unless time is simulated.
-        clock = self.get_clock().now().nanoseconds if self._simulated_time else time.time_ns()
-        age = (clock - nanoseconds) * 1e-9
-        allowed = self._options["max_command_age"]
-        if 0.0 < allowed < abs(age):
-            reason, word = ("stamp_past", "old") if age > 0.0 else ("stamp_future", "in the future")
-            raise CommandError(reason, f"stamp is {abs(age):.3f} s {word}, allowed {allowed:g} s")
-        if nanoseconds < self._last_stamp and self._commands.age(now) < FORGET_ORDER_AFTER:
-            raise CommandError("stamp_order", "stamp is earlier than the last command's")
-        return stamp
-
-    def _consult_feedback(self, now: float) -> None:
-        """Take the measured struts as the state to start from, or refuse when they are required and absent."""
-        fresh = self._feedback.age(now) <= self._options["feedback_timeout"]
-        if self._options["require_feedback"] and not fresh:
-            raise CommandError("no_feedback", f"no strut_states for {seconds(self._feedback.age(now))} s")
+        guard = self._status.problem()
+        if guard is not None:
+            raise CommandError(guard.reason, guard.problem)
+        fed = self._status.fed(now)
+        if self._options["require_feedback"] and not fed:
+            since = f"for {seconds(self._feedback.age(now))} s" if self._feedback.count else "yet"
+            raise CommandError("no_feedback", f"no strut_states {since}")
         if self._fresh_start:
-            self.compensator.reset(self._struts.lengths if fresh else None)
+            self.compensator.reset(self._measured if fed else None)
+
+    def _look_closer(self) -> None:
+        """Find out whether the next commands must be examined."""
+        required = self._fresh_start or self._options["require_feedback"]
+        self._looks_closer = required or self._status.problem() is not None
+
+    def _look_at_publishers(self) -> None:
+        """Look who publishes what only one may: now and then, and when somebody comes or goes."""
+        now = time.monotonic()
+        self._status.source.look(now)
+        self._status.own_topic.look(now)
+        self._look_closer()
 
     def _on_states(self, message: JointState) -> None:
         # Also while inactive: the first command after activation must start from where the struts are.
         now = time.monotonic()
+        struts = self._struts.lengths
+        stamp = nanoseconds_of(message.header.stamp)
         try:
+            self._order.check(stamp, now)
             self._struts.read(message)
-        except CommandError as error:
+            self._reach.check(struts)
+            pose = self.compensator.estimate(struts)
+        except HexapodError as error:
             if self._active:
-                self._feedback_refusals.add(error.reason, str(error), now)
+                self._status.bad_feedback.add(error.reason, str(error), now)
                 self.warn_of("feedback " + error.reason, f"strut_states ignored: {error}")
             return
+        self._measured[:] = struts
+        self._order.passed(stamp, now)
         self._feedback.tick(now)
         if self._active:
-            self._publish_estimate(self._struts.lengths, message.header.stamp)
+            self._watch_following(now)
+            self._publish_estimate(pose, message.header.stamp)
+
+    def _watch_following(self, now: float) -> None:
+        """Hold the measured struts against their commands; even one reading that is off is said."""
+        known = self._following.problem
+        self._following.check(self._measured, now)
+        if self._following.problem and not known:
+            self._looks_closer = True
+            self._status.bad_feedback.add(self._following.reason, self._following.problem, now)
 
     def _on_temperature(self, message: Temperature) -> None:
         # Also while inactive: the first command after activation must know how warm the machine is. Dated by
@@ -288,7 +341,7 @@ class CompensatorNode(MachineNode):
         except HexapodError as error:
             if not self._active:
                 return
-            self._feedback_refusals.add("temperature", str(error), now)
+            self._status.bad_feedback.add("temperature", str(error), now)
             self.warn_of("temperature", f"temperature ignored: {error}")
 
     # ---- services ----
@@ -299,14 +352,14 @@ class CompensatorNode(MachineNode):
         response.message = f"compensation ramps {'in' if request.data else 'out'}"
         return response
 
-    def _on_reload(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        try:
-            self.compensator.set_model(self._load_model(self.compensator.geometry))
-        except HexapodError as error:
-            response.success, response.message = False, f"the old model stays: {error}"
-            return response
-        response.success, response.message = True, f"model {self.compensator.model.name!r} ramps in"
-        return response
+    def _begin_reload(self) -> Loading:
+        """Begin to load the model, as at the start, elsewhere."""
+        name, machine = self._options["model_file"], self.compensator.geometry.name
+        return Loading(None if name == "ideal" else confined_file(name, self._folders["model_file"]), machine)
+
+    def _take_model(self, model: MachineModel, source: Source) -> None:
+        self._sources["model"] = source
+        self.compensator.set_model(model)
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._forget()
@@ -316,25 +369,18 @@ class CompensatorNode(MachineNode):
 
     # ---- messages out ----
 
-    def _publish_command(self, stamp: Time, since_last: float) -> None:
+    def _publish_command(self, when: int) -> None:
         out, correction, compensator = self._command_out, self._correction_out, self.compensator
-        out.write(compensator.command, since_last if since_last < FORGET_ORDER_AFTER else 0.0)
-        out.message.header.stamp = stamp
-        self._command_pub.publish(out.message)
+        out.write(compensator.command, period(self._answered, when))
+        self._answered = when
+        self._command_pub.publish(out.stamped(when))
         correction.write(compensator.correction)
-        correction.message.header.stamp = stamp
-        self._correction_pub.publish(correction.message)
+        self._correction_pub.publish(correction.stamped(when))
         if self._array_pub is not None:
             self._array_view[:] = compensator.command
             self._array_pub.publish(self._array_out)
 
-    def _publish_estimate(self, struts: np.ndarray, stamp: Time) -> None:
-        try:
-            pose = self.compensator.estimate(struts)
-        except HexapodError as error:
-            self._feedback_refusals.add(error.reason, str(error), time.monotonic())
-            self.warn_of("estimate " + error.reason, f"no pose estimate: {error}")
-            return
+    def _publish_estimate(self, pose: np.ndarray, stamp: Time) -> None:
         write_pose(self._estimate_out, pose[:3], pose[3:].reshape((3, 3)))
         self._estimate_out.header.stamp = stamp
         self._estimate_pub.publish(self._estimate_out)
@@ -342,10 +388,14 @@ class CompensatorNode(MachineNode):
     def _estimate_from_commands(self) -> None:
         """Without feedback, estimate the pose from the newest command, at a rate that leaves the loop alone."""
         stamp, self._unestimated = self._unestimated, None
-        if stamp is None or not self._active:
+        if stamp is None or not self._active or self._status.fed(time.monotonic()):
             return
-        if self._feedback.age(time.monotonic()) > self._options["feedback_timeout"]:
-            self._publish_estimate(self.compensator.command, stamp)
+        try:
+            pose = self.compensator.estimate(self.compensator.command)
+            self._publish_estimate(pose, stamp_of(stamp))
+        except HexapodError as error:
+            self._status.bad_feedback.add(error.reason, str(error), time.monotonic())
+            self.warn_of("estimate " + error.reason, f"no pose estimate: {error}")
 
     def _publish_markers(self) -> None:
         if not self._active or not self._marker_pub.get_subscription_count():
@@ -361,67 +411,40 @@ class CompensatorNode(MachineNode):
     def _forget(self) -> None:
         self.compensator.reset()
         self._unestimated = None
-        self._fresh_start = self._looks_at_feedback = True
-        self._last_stamp = 0
+        self._fresh_start = self._looks_closer = True
+        self._answered = 0
+        self._stamps.forget()
+        self._following.forget()
+
+    def _place(self) -> tuple[int, int]:
+        """Return how many commands have been answered, and the stamp of the last answer, ns."""
+        return self._commands.count, self._command_out.stamp
 
     def _refuse(self, error: HexapodError, now: float) -> None:
-        self._refusals.add(error.reason, str(error), now)
+        self._status.refusals.add(error.reason, str(error), now)
         self.warn_of(error.reason, f"command refused ({error.reason}): {error}")
 
-    def _state(self, now: float) -> tuple[bytes, str]:
-        """Return level and message of the diagnostics."""
-        if not self._active:
-            return WARN, "not active"
-        if self._refusals.recent(now):
-            return ERROR, f"refusing commands: {self._refusals.last_reason}"
-        if self._feedback_refusals.recent(now):
-            return ERROR, f"bad feedback: {self._feedback_refusals.last_reason}"
-        timeout = self._options["command_timeout"]
-        if not self._commands.count:
-            return OK, "waiting for the first command"
-        if 0.0 < timeout < self._commands.age(now):
-            return WARN, "no new command"
-        if self.compensator.ramping:
-            return OK, "running, a change is ramping in"
-        if self._feedback.age(now) > self._options["feedback_timeout"]:
-            return OK, "running, pose estimated from own commands"
-        return OK, "running"
-
     def _check_state(self) -> None:
+        self._look_at_publishers()
         now = time.monotonic()
-        level, text = self._state(now)
-        if not self._report.due(level, text, now):
-            return
-        stamp = self.get_clock().now().to_msg()
-        self._diagnostics_pub.publish(self._report.message(level, text, self._values(now), stamp))
+        self._status.log_space.look()
+        self._look_closer()
+        self._tell_problem()
+        self._reload.look()
+        self._journal.tick(now)
+        level, text = self._status.judged(self.compensator, now) if self._active else (WARN, "not active")
+        if self._report.due(level, text, now):
+            values = self._status.values(self.compensator, self._fresh_start, now)
+            stamp = self.get_clock().now().to_msg()
+            self._diagnostics_pub.publish(self._report.message(level, text, values, stamp))
 
-    def _values(self, now: float) -> dict[str, str]:
-        compensator = self.compensator
-        feedback = self._feedback.age(now) <= self._options["feedback_timeout"]
-        correction = 0.0 if self._fresh_start else float(np.abs(compensator.correction).max())
-        values = {
-            "model": compensator.model.name,
-            "compensation": "on" if compensator.enabled else "off",
-            "ramping": str(compensator.ramping).lower(),
-            "pose_estimated_from": "strut_states" if feedback else "own commands",
-            "commands": str(self._commands.count),
-            "command_rate_hz": f"{self._commands.rate(now):.1f}",
-            "command_age_s": seconds(self._commands.age(now)),
-            "feedback_rate_hz": f"{self._feedback.rate(now):.1f}",
-            "feedback_age_s": seconds(self._feedback.age(now)),
-            "largest_correction_m": f"{correction:.9f}",
-            "outside_field": str(compensator.outside_field).lower(),
-            "last_refusal": self._refusals.last_text,
-            "last_bad_feedback": self._feedback_refusals.last_text,
-            "bad_feedback": str(sum(self._feedback_refusals.counts.values())),
-        }
-        values.update({f"temperature.{k}_degC": f"{v:.2f}" for k, v in compensator.temperatures.values.items()})
-        values.update(self._refusals.values())
-        return values
-
-
-def _nanoseconds(stamp: Time) -> int:
-    return stamp.sec * 1_000_000_000 + stamp.nanosec
+    def _tell_problem(self) -> None:
+        """Log what stops the machine, once."""
+        guard = self._status.problem()
+        problem = guard.problem if guard is not None and self._active else ""
+        if problem and problem != self._told:
+            self.get_logger().error(f"refusing commands: {problem}")
+        self._told = problem
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Iterable
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -47,6 +48,7 @@ class Refusals:
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
+        self._times: dict[str, float] = {}
         self.last_reason = ""
         self.last_text = ""
         self.last_time = -float("inf")
@@ -54,11 +56,17 @@ class Refusals:
     def add(self, reason: str, text: str, now: float) -> None:
         """Count one refusal."""
         self.counts[reason] += 1
+        self._times[reason] = now
         self.last_reason, self.last_text, self.last_time = reason, text, now
 
     def recent(self, now: float) -> bool:
         """Return whether one is recent enough to be shown as an error."""
         return now - self.last_time < REFUSAL_SHOWN_FOR
+
+    def reasons(self, now: float, but: str = "") -> str:
+        """Return all reasons `but` one recent enough to be shown, the newest first: none must hide another."""
+        recent = [reason for reason, at in self._times.items() if now - at < REFUSAL_SHOWN_FOR and reason != but]
+        return ", ".join(sorted(recent, key=lambda reason: -self._times[reason]))
 
     def values(self) -> dict[str, str]:
         """Return the counters as key and value."""
@@ -99,6 +107,13 @@ class HealthReport:
         array = DiagnosticArray(status=[status])
         array.header.stamp = stamp
         return array
+
+
+def joined(findings: Iterable[tuple[bytes, str]]) -> tuple[bytes, str]:
+    """Return level and text of all findings that are not well, worst first; of the first when all are well."""
+    found = list(findings)
+    bad = [finding for finding in found if finding[0] != OK] or found[:1]
+    return bad[0][0], "; ".join(text for _, text in bad)
 
 
 def seconds(value: float) -> str:

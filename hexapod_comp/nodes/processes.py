@@ -9,9 +9,11 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
+
+from .middleware import avoid_shared_memory
 
 # DDS derives its UDP ports from the domain: 7400 + 250 · domain + offset. Offsets 0 and 1 are multicast,
 # participants take 10, 11, 12, …; nobody uses 2 to 9, and domains above 101 reach into the ephemeral ports.
@@ -77,6 +79,7 @@ class PrivateDomain:
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         for name in ("ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER", "ROS_LOCALHOST_ONLY"):
             os.environ.pop(name, None)
+        avoid_shared_memory()
         return domain
 
     def __exit__(
@@ -104,13 +107,24 @@ class NodeProcess:
         ``compensator`` or ``strut_drive``.
     parameters : dict of str to object
         ROS parameters.
+    remaps : mapping of str to str, optional
+        Topics under other names.
+    wrapper : sequence of str, optional
+        Command that runs the node and becomes it, such as ``nsenter``.
     """
 
-    def __init__(self, module: str, parameters: dict[str, object]) -> None:
+    def __init__(
+        self,
+        module: str,
+        parameters: dict[str, object],
+        remaps: Mapping[str, str] | None = None,
+        wrapper: Sequence[str] = (),
+    ) -> None:
         self.name = module
         handle, path = tempfile.mkstemp(prefix=f"hexapod_comp_{module}_", suffix=".log")
         self.log = Path(path)
-        command = [sys.executable, "-m", f"hexapod_comp.nodes.{module}", *ros_arguments(parameters)]
+        arguments = ros_arguments(parameters, remaps)
+        command = [*wrapper, sys.executable, "-m", f"hexapod_comp.nodes.{module}", *arguments]
         with os.fdopen(handle, "wb") as log:
             self._process = subprocess.Popen(
                 command,
@@ -155,12 +169,12 @@ class NodeProcess:
         return code, said
 
 
-def ros_arguments(parameters: dict[str, object]) -> Sequence[str]:
-    """Return the command-line arguments that set ROS parameters."""
-    if not parameters:
-        return []
-    arguments = ["--ros-args"]
+def ros_arguments(parameters: Mapping[str, object], remaps: Mapping[str, str] | None = None) -> Sequence[str]:
+    """Return the command-line arguments that set ROS parameters and rename topics."""
+    arguments = []
     for name, value in parameters.items():
         text = str(value).lower() if isinstance(value, bool) else str(value)
         arguments += ["-p", f"{name}:={text}"]
-    return arguments
+    for name, other in (remaps or {}).items():
+        arguments += ["-r", f"{name}:={other}"]
+    return ["--ros-args", *arguments] if arguments else []

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import difflib
+import functools
 import gc
+import inspect
 import os
 import signal
 import sys
@@ -12,11 +14,13 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
@@ -24,8 +28,12 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 
 from ..errors import HexapodError
+from .log_relay import LogRelay
+from .middleware import avoid_shared_memory
+from .refusing import unfailing
 
 SPIN_PERIOD = 0.1
 """Longest wait of one spin, s: how soon a signal is noticed (EventsExecutor.spin itself never returns)."""
@@ -151,6 +159,9 @@ class MachineNode(LifecycleNode):
         super().__init__(name, **options)
         self._active = False
         self._throttle = Throttle()
+        for service in self.services:  # those that rclpy has made
+            service.callback = unfailing(service, self.get_logger().warning)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop acting; the struts keep their last command."""
@@ -173,6 +184,10 @@ class MachineNode(LifecycleNode):
         options = QoSOverridingOptions.with_default_policies()
         return self.create_publisher(message_type, topic, copy.copy(qos), qos_overriding_options=options)
 
+    def every(self, period: float, callback: Callable[[], None]) -> Timer:
+        """Return a timer on a clock that nobody can set: the node's own stops for as long as it is set back."""
+        return self.create_timer(period, callback, clock=self._steady)
+
     def listen_to(
         self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
     ) -> Subscription:
@@ -180,8 +195,91 @@ class MachineNode(LifecycleNode):
         options = QoSOverridingOptions.with_default_policies()
         return self.create_subscription(message_type, topic, callback, copy.copy(qos), qos_overriding_options=options)
 
+    def obey(
+        self,
+        message_type: type,
+        topic: str,
+        callback: Callable[[Any, int | None], None],
+        matched: Callable[[], None],
+        raw: bool = False,
+    ) -> Subscription:
+        """Return a subscription of commands.
+
+        Its callback gets the message, or with `raw` its bytes, and the message's sequence number; `matched` is called
+        when a publisher comes or goes, where the middleware tells (who wants to be sure also looks now and then).
+        """
+        make = functools.partial(
+            self.create_subscription,
+            message_type,
+            topic,
+            numbered(callback),
+            copy.copy(COMMAND_QOS),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            raw=raw,
+        )
+
+        def on_matched(_: Any) -> None:
+            if subscription in self.subscriptions:  # told of a subscription that has been closed meanwhile
+                matched()
+
+        try:
+            subscription = make(event_callbacks=SubscriptionEventCallbacks(matched=on_matched))
+        except UnsupportedEventTypeError:
+            subscription = make()
+        return subscription
+
     def say_goodbye(self) -> None:
         """Publish what must still be said before the node ends."""
+
+
+def numbered(callback: Callable[[Any, int | None], None]) -> Callable[..., None]:
+    """Return a callback for rclpy that hands on a message and its publisher's sequence number.
+
+    rclpy asks a callback's signature whether it wants to be told about the message, and then calls it with two
+    arguments; the EventsExecutor of Jazzy (rclpy 7.1) calls it with a tuple of the two instead.
+    """
+
+    def called(*arguments: Any) -> None:
+        message, info = arguments[0] if len(arguments) == 1 else arguments
+        callback(message, info["publication_sequence_number"])
+
+    called.__signature__ = inspect.signature(lambda message, info: None)  # type: ignore[attr-defined]
+    return called
+
+
+class LateService:
+    """A service whose answer may come after its callback has returned: the node goes on in between.
+
+    Parameters
+    ----------
+    node : LifecycleNode
+        Where it is.
+    kind : type
+        Service type.
+    name : str
+        Its name.
+    callback : callable
+        Takes the request; returns the response, or None: then :meth:`answer` gives it later. Only one request
+        at a time may be left without an answer.
+    """
+
+    def __init__(self, node: LifecycleNode, kind: type, name: str, callback: Callable[[Any], Any]) -> None:
+        self.service = node.create_service(kind, name, lambda request, _: callback(request))
+        self._send, self._header = self.service.send_response, cast(Any, None)
+        # Executors call it with what the callback returns.
+        self.service.send_response = self._send_or_keep  # type: ignore[method-assign]
+
+    def _send_or_keep(self, response: Any, header: Any) -> None:
+        if response is None:
+            self._header = header
+        else:
+            self._send(response, header)
+
+    def answer(self, response: Any) -> None:
+        """Answer the request that waits."""
+        header, self._header = self._header, None
+        if header is not None:
+            self._send(response, header)
 
 
 class Throttle:
@@ -209,7 +307,8 @@ def autostart(node: LifecycleNode) -> bool:
 
 
 def keep_discovery_local() -> None:
-    """Keep discovery to this machine unless the user's environment says otherwise."""
+    """Keep discovery to this machine, and out of shared memory, unless the user's environment says otherwise."""
+    avoid_shared_memory()
     if "ROS_STATIC_PEERS" not in os.environ:
         os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
@@ -228,6 +327,11 @@ def run(make_node: Callable[[], MachineNode], argv: Sequence[str] | None = None)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    with LogRelay():
+        return _run_until(stop, make_node, argv)
+
+
+def _run_until(stop: threading.Event, make_node: Callable[[], MachineNode], argv: Sequence[str] | None) -> int:
     try:
         rclpy.init(args=list(argv) if argv is not None else None, signal_handler_options=SignalHandlerOptions.NO)
     except (rclpy.exceptions.ROSInterruptException, RuntimeError, ValueError) as error:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -28,10 +28,12 @@ from ..machine import MachineModel, RealMachine
 from ..model_file import load_model
 from ..paths import config_file
 from ..simulation import DriveParameters, Faults, StrutDrive
-from .health import ERROR, OK, WARN, Flow, HealthReport, Refusals, seconds
+from .command_source import CommandSource
+from .health import ERROR, OK, WARN, Flow, HealthReport, Refusals, joined, seconds
+from .log_space import LogSpace
+from .order import InOrder, NoStep
 from .runtime import (
     ACKNOWLEDGED_WITHIN,
-    COMMAND_QOS,
     EVENT_QOS,
     STATE_QOS,
     MachineNode,
@@ -41,6 +43,7 @@ from .runtime import (
     keep_discovery_local,
     run,
 )
+from .stamps import nanoseconds_of
 
 PARAMETERS = (
     Parameter("autostart", True, "configure and activate at start"),
@@ -53,6 +56,8 @@ PARAMETERS = (
     Parameter("truth_seed", 1, "seed of a random truth", 0, 2**31),
     Parameter("noise_seed", 0, "seed of the noise", 0, 2**31),
     Parameter("base_frame", "base", "frame_id of the true tool pose"),
+    Parameter("command_timeout", 0.1, "without a command for this long diagnostics warn, s; 0 = off", 0.0, 3600.0),
+    Parameter("allow_several_publishers", False, "obey though several nodes publish strut commands"),
     Parameter("rate", 500.0, "readings published per second, Hz", 1.0, 2000.0),
     Parameter("step", 0.1e-6, "length of one motor step, m; 0 = none", 0.0, 1e-3),
     Parameter("lag", 0.005, "time by which the drives follow a moving command, s", 1e-3, 1.0),
@@ -117,6 +122,7 @@ class StrutDriveNode(MachineNode):
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
         self._open_topics()
+        self._order, self._no_step, self._log_space = InOrder("strut_commands"), NoStep(geometry), LogSpace()
         self._report = HealthReport(f"{self.get_fully_qualified_name()[1:]}: {geometry.name}", geometry.name)
         self.get_logger().info(f"configured machine {geometry.name!r} with hidden truth {machine.model.name!r}")
         return super().on_configure(state)
@@ -164,12 +170,12 @@ class StrutDriveNode(MachineNode):
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
         self._true_pub = self.publish_on(PoseStamped, "tool_pose_true", STATE_QOS)
         self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", EVENT_QOS)
-        self._subscription = self.listen_to(
-            JointState, "strut_commands", self._on_commands, COMMAND_QOS
-        )
+        self._subscription = self.obey(JointState, "strut_commands", self._on_commands, self._look_at_publishers)
+        topic, count = self._subscription.topic_name, self._subscription.get_publisher_count
+        self._source = CommandSource(self, topic, count, self._options["allow_several_publishers"])
         self._own_timers = [
-            self.create_timer(1.0 / self._options["rate"], self._run),
-            self.create_timer(CHECK_PERIOD, self._check_state),
+            self.every(1.0 / self._options["rate"], self._run),
+            self.every(CHECK_PERIOD, self._check_state),
         ]
 
     # ---- faults ----
@@ -207,18 +213,33 @@ class StrutDriveNode(MachineNode):
 
     # ---- the machine ----
 
-    def _on_commands(self, message: JointState) -> None:
+    def _look_at_publishers(self) -> None:
+        self._source.look(time.monotonic())
+
+    def _on_commands(self, message: JointState, number: int | None) -> None:
         if not self._active:
             return
         now = time.monotonic()
+        self._source.hear(number, now)
         try:
-            self._reader.read(message)
-            self.drive.set_command(self._reader.lengths)
+            if self._source.problem:
+                raise CommandError(self._source.reason, self._source.problem)
+            self._obey_commands(message, now)
         except HexapodError as error:
             self._refusals.add(error.reason, str(error), now)
             self.warn_of(error.reason, f"command refused ({error.reason}): {error}")
             return
         self._commands.tick(now)
+
+    def _obey_commands(self, message: JointState, now: float) -> None:
+        """Take commands that are six lengths, in order, and no step from the last ones."""
+        stamp, lengths = nanoseconds_of(message.header.stamp), self._reader.lengths
+        self._reader.read(message)
+        self._order.check(stamp, now)
+        self._no_step.check(lengths, now)
+        self.drive.set_command(lengths)
+        self._order.passed(stamp, now)
+        self._no_step.passed(lengths, now)
 
     def _run(self) -> None:
         if not self._active:
@@ -248,23 +269,35 @@ class StrutDriveNode(MachineNode):
 
     # ---- state ----
 
-    def _state(self, now: float) -> tuple[bytes, str]:
+    def _findings(self, now: float) -> Iterator[tuple[bytes, str]]:
+        """Yield what there is to say, worst first."""
         stopped = [name for name, at_stop in zip(STRUT_NAMES, self.drive.stopped, strict=True) if at_stop]
-        if not self._active:
-            return WARN, "not active"
         if stopped:
-            return ERROR, f"at the travel stop: {', '.join(stopped)}"
-        if self._refusals.recent(now):
-            return ERROR, f"refusing commands: {self._refusals.last_reason}"
-        return OK, "running"
+            yield ERROR, f"at the travel stop: {', '.join(stopped)}"
+        if self._source.problem:
+            yield ERROR, f"refusing commands: {self._source.reason}: {self._source.problem}"
+        if reasons := self._refusals.reasons(now, self._source.reason if self._source.problem else ""):
+            yield ERROR, f"refusing commands: {reasons}"
+        if self._commands.count and 0.0 < self._options["command_timeout"] < self._commands.age(now):
+            yield WARN, "no new command"
+        elif self._source.sequence.missing(now):
+            yield WARN, "running, commands are being missed"
+        if self._log_space.problem:
+            yield WARN, self._log_space.problem
+        yield OK, "running"
 
     def _check_state(self) -> None:
+        self._look_at_publishers()
+        self._log_space.look()
         now = time.monotonic()
-        level, text = self._state(now)
+        level, text = joined(self._findings(now)) if self._active else (WARN, "not active")
         if not self._report.due(level, text, now):
             return
         values = {
+            "commanded_by": ", ".join(self._source.names),
             "commands": str(self._commands.count),
+            "commands_missed": str(self._source.sequence.missed),
+            "command_rate_hz": f"{self._commands.rate(now):.1f}",
             "command_age_s": seconds(self._commands.age(now)),
             "last_refusal": self._refusals.last_text,
             **self._refusals.values(),

@@ -1,0 +1,34 @@
+"""Parameters of the compensator node; all are fixed when it starts."""
+
+from __future__ import annotations
+
+from ..thermal import DEFAULT_TIME_CONSTANT
+from .runtime import Parameter
+
+PARAMETERS = (
+    Parameter("autostart", True, "configure and activate at start"),
+    Parameter("geometry_file", "paper.yaml", "geometry file: a path or the name of a shipped one"),
+    Parameter("model_file", "paper_machine.yaml", "model file: a path or the name of a shipped one; ideal = none"),
+    Parameter("model_folder", "", "folder from which both files may be read; empty: each one's own at the start"),
+    Parameter("base_frame", "base", "frame_id of poses in the machine base"),
+    Parameter("work_frame", "work", "frame_id of poses in the geometry file's work frame"),
+    Parameter("command_timeout", 0.1, "without a command for this long the state is stale, s; 0 = off", 0.0, 3600.0),
+    Parameter("max_command_age", 0.5, "older (or newer) stamps are refused, s; 0 = off", 0.0, 3600.0),
+    Parameter("feedback_timeout", 0.1, "without measured struts for this long there is no feedback, s", 1e-3, 3600.0),
+    Parameter("require_feedback", False, "refuse commands while there is no feedback"),
+    Parameter(
+        "following_error_limit",
+        2e-3,
+        "measured struts further than this from their commands stop the machine, m; 0 = off",
+        0.0,
+        1.0,
+    ),
+    Parameter("allow_several_publishers", False, "obey though several nodes publish commands"),
+    Parameter("ramp_rate", 1e-3, "strut speed at which a change of model or enabling is taken up, m/s", 1e-6, 1.0),
+    Parameter("enable_compensation", True, "compensate from the start"),
+    Parameter(
+        "temperature_time_constant_s", DEFAULT_TIME_CONSTANT, "low pass of temperatures, s; 0 = off", 0.0, 3600.0
+    ),
+    Parameter("marker_rate", 10.0, "markers per second, Hz; 0 = none", 0.0, 10.0),
+    Parameter("publish_array", False, "also publish strut_commands_array for ros2_controllers"),
+)

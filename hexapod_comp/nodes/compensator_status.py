@@ -1,0 +1,142 @@
+"""What the compensator counts, and what it says of itself in diagnostics; doc/states.md has the whole table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Protocol
+
+import numpy as np
+
+from ..compensation import Compensator
+from .command_source import CommandSource, OwnTopic
+from .following import Following
+from .health import ERROR, OK, WARN, Flow, Refusals, joined, seconds
+from .log_space import LogSpace
+from .stamps import StampCheck
+
+NEAR_SINGULAR = 0.9
+"""From this share of the largest allowed condition number on, diagnostics warn."""
+
+
+class Guard(Protocol):
+    """Something that stops the machine while it has a problem."""
+
+    reason: str
+    problem: str
+
+
+class CompensatorStatus:
+    """Counters of a compensator node, its guards, and the status made of them.
+
+    Parameters
+    ----------
+    options : dict
+        The node's parameters.
+    stamps : StampCheck
+        Of the commands.
+
+    Attributes
+    ----------
+    commands, feedback : Flow
+        Accepted commands and usable measured struts.
+    refusals, bad_feedback, failed_reloads : Refusals
+        What was refused.
+    source : CommandSource
+        Who commands.
+    own_topic : OwnTopic
+        Who else publishes strut commands.
+    following : Following
+        Whether the struts go where they are told.
+    log_space : LogSpace
+        Whether the log can be written.
+    """
+
+    def __init__(self, options: dict[str, Any], stamps: StampCheck) -> None:
+        self._options, self._stamps = options, stamps
+        self.commands, self.feedback = Flow(), Flow()
+        self.refusals, self.bad_feedback, self.failed_reloads = Refusals(), Refusals(), Refusals()
+        self.following = Following(options["following_error_limit"])
+        self.log_space = LogSpace()
+
+    def watch_topics(self, source: CommandSource, own_topic: OwnTopic) -> None:
+        """Take the guards of the topics of a configured node."""
+        self.source, self.own_topic = source, own_topic
+
+    def problem(self) -> Guard | None:
+        """Return the guard that stops the machine at present, if any."""
+        guards: tuple[Guard, ...] = (self.source, self.own_topic, self.following)
+        return next((guard for guard in guards if guard.problem), None)
+
+    def fed(self, now: float) -> bool:
+        """Return whether measured struts are fresh."""
+        return self.feedback.age(now) <= self._options["feedback_timeout"]
+
+    def judged(self, compensator: Compensator, now: float) -> tuple[bytes, str]:
+        """Return level and message of an active node."""
+        return joined(self._findings(compensator, now))
+
+    def _findings(self, compensator: Compensator, now: float) -> Iterator[tuple[bytes, str]]:
+        """Yield what there is to say, worst first."""
+        guard = self.problem()
+        if guard is not None:
+            yield ERROR, f"refusing commands: {guard.reason}: {guard.problem}"
+        if reasons := self.refusals.reasons(now, guard.reason if guard is not None else ""):
+            yield ERROR, f"refusing commands: {reasons}"
+        if reasons := self.bad_feedback.reasons(now):
+            yield ERROR, f"bad feedback: {reasons}"
+        if self.failed_reloads.recent(now):
+            yield WARN, "the old model stays"
+        yield from self._lost(now)
+        if self.log_space.problem:
+            yield WARN, self.log_space.problem
+        if not self.commands.count:
+            yield OK, "waiting for the first command"
+        if compensator.condition > NEAR_SINGULAR * compensator.geometry.limits.condition:
+            yield WARN, "running, near a singularity"
+        if compensator.ramping:
+            yield OK, "running, a change is ramping in"
+        yield OK, "running" if self.fed(now) else "running, pose estimated from own commands"
+
+    def _lost(self, now: float) -> Iterator[tuple[bytes, str]]:
+        """Yield what no longer comes."""
+        silent = self.commands.count and 0.0 < self._options["command_timeout"] < self.commands.age(now)
+        if silent:
+            yield WARN, "no new command"
+        if self.feedback.count and not self.fed(now):
+            yield WARN, "feedback lost, pose estimated from own commands"
+        if not silent and self.source.sequence.missing(now):
+            yield WARN, "running, commands are being missed"
+
+    def values(self, compensator: Compensator, fresh_start: bool, now: float) -> dict[str, str]:
+        """Return everything else as key and value; before the first command nothing is corrected."""
+        correction = 0.0 if fresh_start else float(np.abs(compensator.correction).max())
+        values = {
+            "model": compensator.model.name,
+            "compensation": "on" if compensator.enabled else "off",
+            "ramping": str(compensator.ramping).lower(),
+            "pose_estimated_from": "strut_states" if self.fed(now) else "own commands",
+            "commanded_by": ", ".join(self.source.names),
+            **self._flows(now),
+            "largest_correction_m": f"{correction:.9f}",
+            "condition_number": f"{compensator.condition:.3f}",
+            "outside_field": str(compensator.outside_field).lower(),
+            "last_refusal": self.refusals.last_text,
+            "last_bad_feedback": self.bad_feedback.last_text,
+            "bad_feedback": str(sum(self.bad_feedback.counts.values())),
+            "failed_reloads": str(sum(self.failed_reloads.counts.values())),
+            "last_failed_reload": self.failed_reloads.last_text,
+        }
+        values.update({f"temperature.{k}_degC": f"{v:.2f}" for k, v in compensator.temperatures.values.items()})
+        values.update(self.refusals.values())
+        return values
+
+    def _flows(self, now: float) -> dict[str, str]:
+        return {
+            "commands": str(self.commands.count),
+            "commands_missed": str(self.source.sequence.missed),
+            "command_rate_hz": f"{self.commands.rate(now):.1f}",
+            "command_age_s": seconds(self.commands.age(now)),
+            "feedback_rate_hz": f"{self.feedback.rate(now):.1f}",
+            "feedback_age_s": seconds(self.feedback.age(now)),
+            "clock_set_back": str(self._stamps.clock_set_back),
+        }

@@ -1,0 +1,82 @@
+"""The service that takes a new model while the machine moves."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from rclpy.lifecycle import LifecycleNode
+from rclpy.service import Service
+from std_srvs.srv import Trigger
+
+from ..errors import HexapodError
+from ..journal import Source
+from ..machine import MachineModel
+from .health import Refusals
+from .model_loading import Loading
+from .runtime import LateService
+
+
+class ReloadService:
+    """``~/reload_model``: answers when the file has been read elsewhere, and keeps the old model if that fails.
+
+    Parameters
+    ----------
+    node : LifecycleNode
+        Where the service is.
+    begin : callable
+        Begins to load the file; raises HexapodError where it may not be read.
+    take : callable
+        Takes the model and its text.
+    failures : Refusals
+        Where failures are counted.
+    """
+
+    def __init__(
+        self,
+        node: LifecycleNode,
+        begin: Callable[[], Loading],
+        take: Callable[[MachineModel, Source], None],
+        failures: Refusals,
+    ) -> None:
+        self._node, self._begin, self._take, self._failures = node, begin, take, failures
+        self._loading: Loading | None = None
+        self._late = LateService(node, Trigger, "~/reload_model", self._on_request)
+
+    @property
+    def service(self) -> Service:
+        """The service, to be destroyed with the node's own."""
+        return self._late.service
+
+    def _on_request(self, _: Trigger.Request) -> Trigger.Response | None:
+        if self._loading is not None:
+            return Trigger.Response(success=False, message="the model is being loaded already")
+        try:
+            self._loading = self._begin()
+        except HexapodError as error:
+            return self._failed(error)
+        return None
+
+    def look(self) -> None:
+        """Take a model that has been loaded in the meantime, and answer."""
+        loading = self._loading
+        if loading is None or not loading.done:
+            return
+        self._loading = None
+        try:
+            model, source = loading.result()
+            self._take(model, source)
+        except HexapodError as error:
+            self._late.answer(self._failed(error))
+            return
+        self._late.answer(Trigger.Response(success=True, message=f"model {model.name!r} ramps in"))
+
+    def close(self) -> None:
+        """Give up what is being loaded."""
+        self._loading = None
+        self._late.answer(Trigger.Response(success=False, message="the old model stays: the node was cleaned up"))
+
+    def _failed(self, error: HexapodError) -> Trigger.Response:
+        self._failures.add(error.reason, str(error), time.monotonic())
+        self._node.get_logger().warning(f"the old model stays: {error}")
+        return Trigger.Response(success=False, message=f"the old model stays: {error}")

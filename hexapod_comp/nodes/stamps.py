@@ -1,0 +1,94 @@
+"""Stamps of commands: neither too old nor from the future, never out of order, and clocks may be set."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from builtin_interfaces.msg import Time
+
+from ..errors import CommandError
+
+FORGET_ORDER_AFTER = 0.5
+"""After a pause this long, s, stamps may start again earlier: the sender or its clock was restarted."""
+
+CLOCK_TOLERANCE = 50_000_000
+"""This clock may fall back by so much, ns, before it counts as set back: reading two clocks takes a moment."""
+
+SHORTEST_PERIOD = 1e-4
+"""Two commands count as no closer than this when a speed is made of them, s."""
+
+LONGEST_PERIOD = 1.0
+"""Two commands further apart, s, have no speed between them."""
+
+
+def nanoseconds_of(stamp: Time) -> int:
+    """Return a stamp as nanoseconds."""
+    return stamp.sec * 1_000_000_000 + stamp.nanosec
+
+
+def period(since: int, until: int) -> float:
+    """Return the time between two stamps, ns, over which a strut's speed is taken, s; 0: it has none.
+
+    It depends on the stamps alone, so that a recorded run answers the same when it is replayed.
+    """
+    seconds = (until - since) * 1e-9
+    if not 0.0 < seconds <= LONGEST_PERIOD:
+        return 0.0
+    return max(seconds, SHORTEST_PERIOD)
+
+
+class StampCheck:
+    """Checks one stamp after the other.
+
+    Parameters
+    ----------
+    largest_age : float
+        Allowed difference to this node's clock either way, s; 0: any.
+    simulated : callable or None
+        Reads simulated time, ns; None: the system's clock.
+
+    Attributes
+    ----------
+    clock_set_back : int
+        How often this node's clock was found set back.
+    """
+
+    def __init__(self, largest_age: float, simulated: Callable[[], int] | None = None) -> None:
+        # ROS reads the system's clock too, but takes a dozen microseconds longer.
+        self._clock = time.time_ns if simulated is None else simulated
+        self._simulated, self._largest_age = simulated is not None, largest_age
+        self._last = self._clock_now = self._clock_then = 0
+        self._then = -float("inf")
+        self.clock_set_back = 0
+
+    def check(self, nanoseconds: int, now: float) -> None:
+        """Check a stamp at the monotonic time `now`, s.
+
+        Raises
+        ------
+        CommandError
+            ``stamp_past``, ``stamp_future`` or ``stamp_order``.
+        """
+        clock = self._clock_now = self._clock()
+        age = (clock - nanoseconds) * 1e-9
+        if abs(age) > self._largest_age > 0.0:
+            reason, word = ("stamp_past", "old") if age > 0.0 else ("stamp_future", "in the future")
+            raise CommandError(reason, f"stamp is {abs(age):.3f} s {word}, allowed {self._largest_age:g} s")
+        if nanoseconds < self._last and now - self._then < FORGET_ORDER_AFTER and not self._was_set_back(clock, now):
+            raise CommandError("stamp_order", "stamp is earlier than the last command's")
+
+    def accept(self, nanoseconds: int, now: float) -> None:
+        """Remember the stamp that was just checked as that of the last command accepted."""
+        self._last, self._then, self._clock_then = nanoseconds, now, self._clock_now
+
+    def forget(self) -> None:
+        """Forget the order: the next stamp may be any."""
+        self._last = 0
+
+    def _was_set_back(self, clock: int, now: float) -> bool:
+        """Return whether this node's clock was set back since the last command: then senders' clocks were too."""
+        elapsed = 0.0 if self._simulated else (now - self._then) * 1e9
+        set_back = clock - self._clock_then < elapsed - CLOCK_TOLERANCE
+        self.clock_set_back += set_back
+        return set_back
