@@ -13,11 +13,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
+from hal_stand_in import StandInHal
 from node_helpers import Bench
 from rclpy.context import Context
 from rclpy.node import Node
 
 from hexapod_comp.nodes.client import LoopClient
+from hexapod_comp.nodes.linuxcnc_bridge import LinuxcncBridgeNode
+from hexapod_comp.nodes.runtime import autostart
 
 POLICY = Path(__file__).resolve().parents[1] / "config" / "security" / "policy.xml"
 
@@ -98,7 +101,7 @@ def test_operators_and_thermometers_hear_and_ask_only_what_there_is() -> None:
         assert not allowed["reply"]
 
 
-@pytest.mark.parametrize("name", ["compensator", "strut_drive"])
+@pytest.mark.parametrize("name", ["compensator", "strut_drive", "linuxcnc_bridge"])
 def test_lifecycle_nodes_open_what_the_policy_allows(
     name: str, ros_context: Context, spin_until: Callable[..., None], capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -106,8 +109,10 @@ def test_lifecycle_nodes_open_what_the_policy_allows(
     with Bench(ros_context, spin_until, capfd) as bench:
         if name == "compensator":
             bench.compensator(publish_array=True)
-        else:
+        elif name == "strut_drive":
             bench.drive()
+        else:
+            assert autostart(bench.add(LinuxcncBridgeNode, False, {}, hal=StandInHal()))
         expect_equal(bench, bench.witness, name, read_policy()[name])
 
 

@@ -1,0 +1,500 @@
+"""Running the real LinuxCNC from a test: as an ordinary user, without a screen, alone on this machine, and to its end.
+
+LinuxCNC refuses root, asks on a terminal, keeps state under fixed shared-memory keys and in one lock file, and
+leaves both behind when it crashes. All of that is dealt with here.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import pwd
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hexapod_comp.compiling import cache_folder
+from hexapod_comp.hal_component import HalError, load_module
+
+ROOT = Path(__file__).resolve().parents[1]
+CONFIG = ROOT / "config" / "linuxcnc"
+OURS = Path(__file__).resolve().parent / "data" / "linuxcnc"
+
+LOCK = Path("/tmp/linuxcnc.lock")
+
+KEYS = {0x48414C32, 0x48484C34, 0x64, *range(0x3E9, 0x3F3)}
+"""Shared memory of HAL, RTAPI, motion and NML: rtapi.h, hal_priv.h, config.h and linuxcnc.nml of 2.9."""
+
+ALONE_WITHIN = 120.0
+"""How long another LinuxCNC on this machine is waited for, s."""
+
+START_WITHIN, STOP_WITHIN = 180.0, 30.0
+"""For a machine under load, s."""
+
+AXES = slice(1, 7)
+STRUTS = slice(7, 13)
+CORRECTIONS = slice(13, 19)
+ALIVE, STATUS = 19, 20
+"""Columns of a record by halsampler -t, see recorder.hal; column 0 is the number of the servo cycle."""
+
+DELAY = 3
+"""Servo cycles by which the struts follow the commanded axes: motion's cubic interpolation of joints, and the drive.
+
+Found by comparing both: with it they agree to 0.07 µm at 50 mm/s.
+"""
+
+PR_SET_PDEATHSIG = 1
+
+
+def why_not() -> str | None:
+    """Return why LinuxCNC cannot be run here, or None."""
+    if not os.environ.get("LINUXCNC_TESTS"):
+        return "not asked for: make test-linuxcnc"
+    missing = [name for name in ("linuxcnc", "halsampler", "script", "setpriv") if shutil.which(name) is None]
+    if missing:
+        return f"{missing[0]} is not installed; Debian: apt-get install linuxcnc-uspace"
+    try:
+        load_module("hal")
+    except HalError as error:
+        return str(error)
+    return None
+
+
+# ---- an ordinary user ----
+
+
+def as_ordinary_user() -> list[str]:
+    """Return the words before a command that run it as an ordinary user who can read interpreter and sources.
+
+    Root becomes nobody. An interpreter or a checkout under /root, say, takes the capability to read
+    everything with it, which does not make a root of nobody.
+
+    Raises
+    ------
+    RuntimeError
+        No way was found.
+    """
+    if os.geteuid() != 0:
+        return []
+    nobody = pwd.getpwnam("nobody")
+    switch = ["setpriv", f"--reuid={nobody.pw_uid}", f"--regid={nobody.pw_gid}", "--clear-groups", "--pdeathsig=TERM"]
+    said = ""
+    for capability in ("", "dac_read_search", "dac_override"):
+        extra = [f"--inh-caps=+{capability}", f"--ambient-caps=+{capability}"] if capability else []
+        trial = [*switch, *extra, sys.executable, "-c", "import hexapod_comp.nodes.linuxcnc_bridge"]
+        done = subprocess.run(trial, env=environment(Path("/nonexistent")), cwd="/", capture_output=True, text=True)
+        if done.returncode == 0:
+            return [*switch, *extra]
+        said = done.stderr
+    raise RuntimeError(f"nobody can run {sys.executable} with {ROOT}: {said}")
+
+
+def environment(home: Path) -> dict[str, str]:
+    """Return the environment of everything that is started: this test's ROS domain, a home of its own, no screen."""
+    kept = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "LANG", "LC_ALL", "LD_LIBRARY_PATH")
+    return {
+        **{name: os.environ[name] for name in kept if name in os.environ},
+        "HOME": str(home),
+        "PATH": "/usr/local/bin:/usr/bin:/bin:/usr/sbin:/sbin",
+        "PYTHONPATH": str(ROOT),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "NUMBA_CACHE_DIR": str(home / "kernels"),
+        "ROS_LOG_DIR": str(home / "ros"),
+        "OPENBLAS_NUM_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+    }
+
+
+def give(path: Path) -> None:
+    """Give a folder, with everything in it, to the ordinary user."""
+    if os.geteuid() == 0:
+        nobody = pwd.getpwnam("nobody")
+        for entry in (path, *path.rglob("*")):
+            os.chown(entry, nobody.pw_uid, nobody.pw_gid)
+
+
+def make_folder() -> Path:
+    """Make a folder for one LinuxCNC; the home in it has the compiled kernels, so that nothing compiles twice."""
+    folder = Path(tempfile.mkdtemp(prefix="hexapod_linuxcnc_", dir="/tmp"))
+    home = folder / "home"
+    (home / "ros").mkdir(parents=True)
+    kernels = cache_folder(os.environ.get("NUMBA_CACHE_DIR", ""))
+    if kernels.is_dir():
+        shutil.copytree(kernels, home / "kernels" / kernels.name)
+    return folder
+
+
+# ---- alone on this machine ----
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A piece of shared memory."""
+
+    number: str
+    owner: int
+    attached: int
+
+
+def segments() -> list[Segment]:
+    """Return LinuxCNC's shared memory on this machine."""
+    rows = [line.split() for line in Path("/proc/sysvipc/shm").read_text().splitlines()[1:]]
+    return [Segment(r[1], int(r[7]), int(r[6])) for r in rows if int(r[0]) & 0xFFFFFFFF in KEYS]
+
+
+def clean_up_after_a_crash() -> None:
+    """Remove what a LinuxCNC of our user has left that nobody uses any more.
+
+    Raises
+    ------
+    RuntimeError
+        Another LinuxCNC runs on this machine, or somebody else's has crashed.
+    """
+    end = time.monotonic() + ALONE_WITHIN
+    while any(segment.attached for segment in segments()):
+        if time.monotonic() > end:
+            raise RuntimeError(f"another LinuxCNC has been running on this machine for {ALONE_WITHIN:g} s")
+        time.sleep(0.5)
+    us = pwd.getpwnam("nobody").pw_uid if os.geteuid() == 0 else os.geteuid()
+    for segment in segments():
+        if segment.owner != us:
+            raise RuntimeError(f"user {segment.owner} has left LinuxCNC's shared memory: ipcrm -m {segment.number}")
+        subprocess.run(["ipcrm", "-m", segment.number], check=True)
+    if LOCK.exists():
+        if LOCK.stat().st_uid != us:
+            raise RuntimeError(f"{LOCK} is left by user {LOCK.stat().st_uid}: remove it")
+        LOCK.unlink()
+
+
+# ---- LinuxCNC ----
+
+
+def give_real_time() -> bool:
+    """Give LinuxCNC's realtime threads the priority that LinuxCNC takes on a real-time kernel; return whether it went.
+
+    Without it every other process on this machine stops the servo thread now and then. Only root may.
+    """
+    threads = [task for task in Path("/proc").glob("[0-9]*/task/*") if _name(task).startswith("rtapi_app:T#")]
+    try:
+        for task in threads:
+            os.sched_setscheduler(int(task.name), os.SCHED_FIFO, os.sched_param(50))
+    except PermissionError:
+        return False
+    return bool(threads)
+
+
+def _name(task: Path) -> str:
+    try:
+        return (task / "comm").read_text()
+    except OSError:  # it has ended
+        return ""
+
+
+def end_with_parent() -> None:
+    """Ask the system to end this process when the test dies."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+class Process:
+    """A process of the ordinary user with its output in a file."""
+
+    def __init__(self, command: Sequence[str], folder: Path, log: str, switch: Sequence[str]) -> None:
+        self.log = folder / log
+        with self.log.open("ab") as output:
+            self._process = subprocess.Popen(
+                [*switch, *command],
+                cwd=folder,
+                env=environment(folder / "home"),
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                preexec_fn=end_with_parent,
+            )
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    def running(self) -> bool:
+        """Return whether it has not ended."""
+        return self._process.poll() is None
+
+    def end(self, number: signal.Signals = signal.SIGTERM, timeout: float = 10.0) -> int:
+        """Send a signal and wait; kill what does not listen. Return the exit code."""
+        if self.running():
+            self._process.send_signal(number)
+        try:
+            return self._process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            return self._process.wait()
+
+    def text(self) -> str:
+        """Return what it has printed."""
+        return self.log.read_text(errors="replace")
+
+
+def until(condition: Callable[[], Any], what: str, timeout: float, log: Callable[[], str] = str) -> None:
+    """Wait for a condition."""
+    end = time.monotonic() + timeout
+    while not condition():
+        if time.monotonic() > end:
+            raise TimeoutError(f"waited {timeout:g} s in vain for {what}\n{log()[-3000:]}")
+        time.sleep(0.02)
+
+
+class Linuxcnc:
+    """A LinuxCNC with the shipped configuration, steered through console.py.
+
+    Parameters
+    ----------
+    changes : dict of str to str, optional
+        What is replaced in hexapod.inc: text by text.
+    files : dict of str to str, optional
+        Further files of the configuration, or others in place of shipped ones.
+    """
+
+    def __init__(self, changes: dict[str, str] | None = None, files: dict[str, str] | None = None) -> None:
+        self._switch = as_ordinary_user()
+        clean_up_after_a_crash()
+        self.folder = make_folder()
+        self._processes: list[Process] = []
+        self._closed, self._started = False, 0
+        self._write_configuration(changes or {}, files or {})
+        self._process = self.start_process(["script", "-qec", "linuxcnc -v headless.ini", "/dev/null"], "linuxcnc.log")
+        socket_path = self.folder / "console.sock"
+        try:
+            until(lambda: socket_path.exists() or not self._process.running(), "LinuxCNC", START_WITHIN, self.said)
+            self._socket = socket.socket(socket.AF_UNIX)
+            self._socket.connect(str(socket_path))
+        except (TimeoutError, OSError) as error:
+            self.close()
+            raise RuntimeError(f"LinuxCNC did not start: {error}\n{self.said()}") from error
+        self._lines = self._socket.makefile("rw", encoding="utf-8")
+        self.has_real_time = give_real_time()
+
+    def _write_configuration(self, changes: dict[str, str], files: dict[str, str]) -> None:
+        for source in (*CONFIG.iterdir(), OURS / "console.py", OURS / "recorder.hal"):
+            shutil.copy(source, self.folder)
+        run = f"{sys.executable} -m hexapod_comp"
+        edits = {
+            "BRIDGE = linuxcnc_bridge": f"BRIDGE = {run}.nodes.linuxcnc_bridge",
+            "SWEEP = hal_sweep": f"SWEEP = {run}.hal_sweep",
+            "MACHINE = linuxcnc_machine": f"MACHINE = {run}.linuxcnc_machine",
+            "HALFILE = machine.hal\n": "HALFILE = machine.hal\nHALFILE = recorder.hal\n",
+            **changes,
+        }
+        self._edit("hexapod.inc", edits)
+        self._edit("headless.ini", {"./headless.py": "./console.py"})
+        for name, text in files.items():
+            (self.folder / name).write_text(text)
+        give(self.folder)
+
+    def _edit(self, name: str, edits: dict[str, str]) -> None:
+        path = self.folder / name
+        text = path.read_text()
+        for old, new in edits.items():
+            assert old in text, f"{name} has no {old!r}"
+            text = text.replace(old, new)
+        path.write_text(text)
+
+    # ---- processes ----
+
+    def start_process(self, command: Sequence[str], log: str) -> Process:
+        """Start a process of the same user in the same folder and ROS domain; it ends with LinuxCNC."""
+        self._started += 1
+        process = Process(command, self.folder, log, self._switch)
+        self._processes.append(process)
+        return process
+
+    def compensator(self, model: str, **parameters: object) -> Process:
+        """Start a compensator with a model file and wait until it is ready."""
+        words = [f"{name}:={value}" for name, value in {"model_file": model, **parameters}.items()]
+        options = [word for text in words for word in ("-p", text)]
+        command = [sys.executable, "-m", "hexapod_comp.nodes.compensator", "--ros-args", *options]
+        process = self.start_process(command, f"compensator_{self._started}.log")
+        self.newest_compensator = process
+        until(lambda: ": ready" in process.text() or not process.running(), "compensator", START_WITHIN, process.text)
+        assert process.running(), process.text()
+        return process
+
+    def halcmd(self, *words: str) -> str:
+        """Run halcmd and return what it prints."""
+        process = self.start_process(["halcmd", *words], f"halcmd_{self._started}.log")
+        # Not through a pipe: what a HAL file loads lives on, and would keep it open.
+        until(lambda: not process.running(), f"halcmd {' '.join(words)}", START_WITHIN, process.text)
+        self._processes.remove(process)
+        assert process.end() == 0, process.text()
+        return process.text()
+
+    def pid_of(self, component: str) -> int:
+        """Return the process that a userspace HAL component belongs to."""
+        row = re.search(rf"^\s*\d+\s+User\s+{component}\s+(\d+)", self.halcmd("show", "comp"), re.MULTILINE)
+        assert row, f"no component {component}"
+        return int(row[1])
+
+    def give_file(self, name: str, text: str) -> str:
+        """Write a file that LinuxCNC's user can read and return its path."""
+        path = self.folder / name
+        path.write_text(text)
+        path.chmod(0o644)
+        return str(path)
+
+    def said(self) -> str:
+        """Return what LinuxCNC has printed."""
+        return self._process.text()
+
+    # ---- the console ----
+
+    def ask(self, name: str, *arguments: Any) -> Any:
+        """Have console.py do something."""
+        self._lines.write(json.dumps([name, *arguments]) + "\n")
+        self._lines.flush()
+        line = self._lines.readline()
+        assert line, f"LinuxCNC has ended\n{self.said()[-3000:]}"
+        answer = json.loads(line)
+        if "error" in answer:
+            raise RuntimeError(answer["error"])
+        return answer["ok"]
+
+    def get(self, *names: str) -> Any:
+        """Return HAL values: one, or a list."""
+        values = self.ask("get", *names)
+        return values[0] if len(names) == 1 else values
+
+    def struts(self) -> np.ndarray:
+        """Return the strut lengths at the drives, mm, shape (6,)."""
+        return np.array(self.get(*(f"strut-{i}-fb" for i in range(6))))
+
+    def enable(self, on: bool) -> None:
+        """Switch compensation, and wait until it is in, or out."""
+        self.halcmd("sets", "comp-enable", str(int(on)))
+        self.until_pin("hexapod_comp.status", 2 if on else 0)
+        time.sleep(0.05)  # the chain's own ramp may be a few cycles behind
+
+    def until_pin(self, name: str, value: Any, timeout: float = 10.0) -> None:
+        """Wait until a HAL value is something."""
+        until(lambda: self.get(name) == value, f"{name} = {value}; now {self.get(name)}", timeout, self.said)
+
+    @contextmanager
+    def recording(self) -> Iterator[Record]:
+        """Record every servo cycle inside the with block."""
+        record = Record()
+        paths = [self.folder / f"record{n}.txt" for n in range(2)]
+        words = [f"halsampler -t -c {n} > {path.name}" for n, path in enumerate(paths)]
+        readers = [self.start_process(["sh", "-c", f"exec {word}"], "halsampler.log") for word in words]
+        self.halcmd("sets", "record", "1")
+        try:
+            yield record
+        finally:
+            self.halcmd("sets", "record", "0")
+            until(lambda: self.get("sampler.0.curr-depth", "sampler.1.curr-depth") == [0, 0], "the record", 10.0)
+            for reader in readers:
+                reader.end(signal.SIGINT)
+        record.rows, record.side = (np.loadtxt(path, comments="overrun", ndmin=2) for path in paths)
+        assert self.get("sampler.0.overruns", "sampler.1.overruns") == [0, 0]
+
+    def close(self) -> None:
+        """End LinuxCNC and everything else, whatever state it is in; a second time does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        others = [process for process in self._processes if process is not self._process]
+        for process in others:
+            process.end()
+        if hasattr(self, "_lines"):
+            self._lines.write('["quit"]\n')
+            self._lines.flush()
+            self._lines.close()
+            self._socket.close()
+        try:
+            until(lambda: not self._process.running(), "LinuxCNC's end", STOP_WITHIN, self.said)
+        except TimeoutError:
+            self._kill_all()
+            raise
+        finally:
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _kill_all(self) -> None:
+        """Kill every process of this LinuxCNC: those with its home in their environment."""
+        mark = f"HOME={self.folder / 'home'}\0".encode()
+        for path in Path("/proc").glob("[0-9]*/environ"):
+            try:
+                if mark in path.read_bytes():
+                    os.kill(int(path.parent.name), signal.SIGKILL)
+            except OSError:
+                continue
+        time.sleep(0.5)
+        clean_up_after_a_crash()
+
+    def __enter__(self) -> Linuxcnc:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Record:
+    """What the realtime sampler has seen in each servo cycle; lengths in mm, angles in degrees.
+
+    Attributes
+    ----------
+    rows : ndarray, shape (N, 21)
+        See :data:`AXES` and the other columns.
+    side : ndarray, shape (M, 10)
+        Cycle, six following errors, accepted and refused corrections, whether the machine is on and homed.
+    """
+
+    rows: np.ndarray
+    side: np.ndarray
+
+    @property
+    def axes(self) -> np.ndarray:
+        """X, Y, Z (mm), A, B, C (degrees) that LinuxCNC means the tool to be at, shape (N, 6)."""
+        return self.rows[np.maximum(np.arange(len(self.rows)) - DELAY, 0), AXES]
+
+    @property
+    def struts(self) -> np.ndarray:
+        """Lengths at the drives, mm, shape (N, 6)."""
+        return self.rows[:, STRUTS]
+
+    @property
+    def corrections(self) -> np.ndarray:
+        """Corrections in force, mm, shape (N, 6)."""
+        return self.rows[:, CORRECTIONS]
+
+    @property
+    def status(self) -> np.ndarray:
+        """The bridge's pin ``status``, shape (N,)."""
+        return self.rows[:, STATUS]
+
+    @property
+    def alive(self) -> np.ndarray:
+        """Whether the bridge's heart beats, shape (N,)."""
+        return self.rows[:, ALIVE] > 0.5
+
+    @property
+    def following_error(self) -> float:
+        """Largest following error, mm."""
+        return float(np.abs(self.side[:, 1:7]).max())
+
+    @property
+    def largest_step(self) -> float:
+        """Largest change of a correction from one servo cycle to the next, mm."""
+        assert (np.diff(self.rows[:, 0]) == 1.0).all(), "cycles are missing"
+        return float(np.abs(np.diff(self.corrections, axis=0)).max())
