@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-BENCHMARKS = ("kernels", "assembly", "classification", "thermal", "start", "loop")
+BENCHMARKS = ("speed", "assembly", "classification", "thermal", "start")
 """Those of some minutes; ``benchmarks.calibration`` (an hour) and ``benchmarks.jugglebot`` are run by their names."""
 
 if __name__ == "__main__":

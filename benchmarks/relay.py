@@ -1,6 +1,10 @@
-"""A node that does nothing: the same topics and message types as the compensator, and no thought in between.
+"""A node that does nothing: topics, message types, QoS and number of messages of the compensator, and no thought.
 
-It shows what DDS and rclpy cost by themselves; :mod:`benchmarks.loop` holds the compensator against it.
+It shows what DDS and rclpy cost by themselves; :mod:`benchmarks.loop` holds the compensator against it. Like the
+compensator it runs in the package's own spin loop, answers every command with two strut messages of six
+positions and six velocities, and fifty times a second, while commands come, tells where the tool is. With the
+parameter ``serialized`` it neither looks at what comes nor makes what goes: the same bytes go out each time, but for
+the stamp. That is what no node can be faster than.
 """
 
 from __future__ import annotations
@@ -9,10 +13,19 @@ import sys
 
 from geometry_msgs.msg import PoseStamped
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
 from hexapod_comp.conversions import StrutMessage
-from hexapod_comp.nodes.runtime import COMMAND_QOS, MachineNode, run
+from hexapod_comp.nodes.runtime import COMMAND_QOS, STATE_QOS, MachineNode, Parameter, declare, run
+
+STAMP = slice(4, 12)
+"""Where a message's stamp stands among its bytes."""
+
+ESTIMATE_PERIOD = 0.02
+"""The compensator's, s."""
+
+PARAMETERS = (Parameter("serialized", False, "take and publish bytes"),)
 
 
 class RelayNode(MachineNode):
@@ -20,13 +33,19 @@ class RelayNode(MachineNode):
 
     def __init__(self) -> None:
         super().__init__("relay")
+        self._serialized = declare(self, PARAMETERS)["serialized"]
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Open topics."""
         self._command_pub = self.publish_on(JointState, "strut_commands", COMMAND_QOS)
         self._correction_pub = self.publish_on(JointState, "strut_corrections", COMMAND_QOS)
+        self._estimate_pub = self.publish_on(PoseStamped, "tool_pose_estimate", STATE_QOS)
         self._command, self._correction = StrutMessage().message, StrutMessage().message
-        self.listen_to(PoseStamped, "tool_pose_command", self._on_command, COMMAND_QOS)
+        self._bytes, self._estimate, self._answered = serialize_message(self._command), PoseStamped(), False
+        callback = self._on_bytes if self._serialized else self._on_command
+        topic = "tool_pose_command"
+        self.create_subscription(PoseStamped, topic, callback, COMMAND_QOS, raw=self._serialized)
+        self.create_timer(ESTIMATE_PERIOD, self._tell_estimate)
         return super().on_configure(state)
 
     def _on_command(self, message: PoseStamped) -> None:
@@ -35,6 +54,18 @@ class RelayNode(MachineNode):
         self._command_pub.publish(self._command)
         self._correction.header.stamp = stamp
         self._correction_pub.publish(self._correction)
+        self._answered = True
+
+    def _on_bytes(self, data: bytes) -> None:
+        stamped = self._bytes[: STAMP.start] + data[STAMP] + self._bytes[STAMP.stop :]
+        self._command_pub.publish(stamped)
+        self._correction_pub.publish(stamped)
+        self._answered = True
+
+    def _tell_estimate(self) -> None:
+        if self._answered:
+            self._answered = False
+            self._estimate_pub.publish(self._estimate)
 
 
 if __name__ == "__main__":

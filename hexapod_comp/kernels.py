@@ -30,6 +30,8 @@ from .lockstep import (
     block_condition,
     closure_error,
     fill_lane,
+    fill_poses,
+    measure_lanes,
     rotation_error,
     row_of,
     six_rows,
@@ -38,6 +40,7 @@ from .lockstep import (
     strut_between,
     struts,
     take_lane,
+    take_lengths,
     three_rows,
 )
 
@@ -291,10 +294,18 @@ def _closes(base, platform, lengths, p, r):
 
 @compiled
 def strut_lengths_many(base, platform, positions, rotations, lengths):
-    """Batch of :func:`strut_lengths_one`: (N, 3), (N, 3, 3) → (N, 6)."""
-    base, platform = six_rows(base), six_rows(platform)
-    for n in range(positions.shape[0]):
-        _write_lengths(base, platform, positions[n], rotations[n], lengths[n])
+    """Batch of :func:`strut_lengths_one`: (N, 3), (N, 3, 3) → (N, 6); in lockstep, with the same bits."""
+    count = positions.shape[0]
+    whole = count - count % LANES
+    flat_positions, flat_rotations, flat_lengths = positions.reshape(-1), rotations.reshape(-1), lengths.reshape(-1)
+    lanes = np.empty(ROWS * LANES)
+    for first in range(0, whole, LANES):
+        fill_poses(lanes, first, flat_positions, flat_rotations)
+        measure_lanes(base, platform, lanes)
+        take_lengths(lanes, first, flat_lengths)
+    six_base, six_platform = six_rows(base), six_rows(platform)
+    for n in range(whole, count):
+        _write_lengths(six_base, six_platform, positions[n], rotations[n], lengths[n])
 
 
 @compiled

@@ -271,6 +271,41 @@ def take_lane(lanes, lane, position, rotation):
 
 
 @internal
+def fill_poses(lanes, first, positions, rotations):
+    """Put eight poses of a batch into the lanes, from pose `first` of flat positions and rotations on."""
+    for lane in range(LANES):
+        at = 3 * (first + lane)
+        for k in range(3):
+            lanes[(POSITION + k) * LANES + lane] = positions[at + k]
+        for k in range(9):
+            lanes[(ROTATION + k) * LANES + lane] = rotations[3 * at + k]
+
+
+@internal
+def take_lengths(lanes, first, lengths):
+    """Copy the lanes' lengths into a batch's flat ones."""
+    for lane in range(LANES):
+        for k in range(6):
+            lengths[6 * (first + lane) + k] = lanes[(LENGTHS + k) * LANES + lane]
+
+
+@internal
+def measure_lanes(base, platform, lanes):
+    """Write the strut lengths at the pose in every lane."""
+    base, platform = six_rows(base), six_rows(platform)
+    for lane in range(LANES):
+        p, r, _ = _read_pose(lanes, lane)
+        for half in range(2):
+            i = 3 * half
+            found = (
+                norm(strut_between(base[i], platform[i], p, r)),
+                norm(strut_between(base[i + 1], platform[i + 1], p, r)),
+                norm(strut_between(base[i + 2], platform[i + 2], p, r)),
+            )
+            _write(lanes, LENGTHS + i, lane, found)
+
+
+@internal
 def solve_lanes(base, platform, lanes, count, characteristic_length, home_sign, max_condition):
     """Iterate the first `count` lanes until none moves, then mark those whose answer may be taken."""
     live = True

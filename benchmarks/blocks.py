@@ -1,0 +1,216 @@
+"""What each block of a machine model costs in the compensator's loop, µs.
+
+The same commands, a small circle that turns and comes back, go through compensators that differ by one block; they
+take turns, and a block's cost is what it adds to a command, and to an estimate of the pose from strut readings, of
+the ideal machine: all called from Python, processor time of the thread, the least of the rounds, since others on
+the machine can only add. What the ideal machine's command is made of is timed part by part.
+
+Run ``python -m benchmarks.blocks`` (``--json`` for programs).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import numba
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hexapod_comp import kernels
+from hexapod_comp.compensation import Compensator
+from hexapod_comp.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.limits import LimitTable, check_stage
+from hexapod_comp.machine import MachineModel
+from hexapod_comp.model_file import load_model
+from hexapod_comp.paths import config_file
+from hexapod_comp.pose import read_pose
+from hexapod_comp.struts import StrutErrors
+
+COMMANDS = 500
+PERIOD = 1e-3
+"""Between two commands, s."""
+
+INNER = 1000
+"""Calls of a part between two looks at the clock."""
+
+LEAD = 5e-3
+"""Of the screws where their rotation is looked at, m."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """What a block adds to a command and to an estimate, µs; for ``ideal``, what these take without any."""
+
+    name: str
+    what: str
+    command_us: float
+    estimate_us: float
+
+
+@dataclass(frozen=True)
+class Part:
+    """What a part of a command takes, µs."""
+
+    name: str
+    us: float
+
+
+def commands(geometry: HexapodGeometry) -> list[tuple[float, ...]]:
+    """Return tool poses as messages have them: a circle of 10 mm about home, tilted by ±3°, there and back."""
+    angles = np.linspace(0.0, np.pi, COMMANDS // 2)
+    turns = Rotation.from_euler("xyz", np.deg2rad(3.0) * np.column_stack([np.sin(angles), np.cos(angles), angles]))
+    circle = np.column_stack([np.sin(angles), np.cos(angles), 0.2 * np.sin(2.0 * angles)])
+    tool = Compensator(geometry, MachineModel(geometry.name)).tool_pose(geometry.home)
+    rows = np.hstack([tool.position + 0.01 * circle, (turns * Rotation.from_matrix(tool.rotation)).as_quat()])
+    return [tuple(row) for row in np.vstack([rows, rows[::-1]]).tolist()]
+
+
+def cardan(geometry: HexapodGeometry) -> HexapodGeometry:
+    """Return a machine whose screws turn with their cardan joints."""
+    across = np.cross(geometry.platform_joints - geometry.base_joints, [0.0, 0.0, 1.0])
+    axes = across / np.linalg.norm(across, axis=1, keepdims=True)
+    return dataclasses.replace(geometry, base_axes=axes, platform_axes=axes, screw_lead=np.full(6, LEAD))
+
+
+def compensators(geometry: HexapodGeometry) -> dict[tuple[str, str], Compensator]:
+    """Return one compensator per block, by name and description; first the ideal machine's, last the whole model's."""
+    whole, ideal = load_model(config_file("paper_machine.yaml"), geometry), MachineModel(geometry.name)
+    errors, knots = whole.struts, np.linspace(0.42, 0.62, 21)
+    waves = dataclasses.replace(StrutErrors(), cosine=errors.cosine, sine=errors.sine, period=errors.period)
+    scale = dataclasses.replace(StrutErrors(), offset=errors.offset, pitch=errors.pitch, backlash=errors.backlash)
+    values = 5e-6 * np.sin(np.outer(np.arange(1.0, 7.0), 40.0 * knots))
+    curved = dataclasses.replace(StrutErrors(), map_knots=knots, map_values=values)
+    grown = dataclasses.replace(StrutErrors(), expansion=np.full(6, 11.5e-6))
+    joints = {"base_deviation": whole.base_deviation, "platform_deviation": whole.platform_deviation}
+
+    def with_block(**changes: object) -> Compensator:
+        return Compensator(geometry, dataclasses.replace(ideal, **changes))
+
+    warm = with_block(struts=grown, base_expansion=11.5e-6, platform_expansion=11.5e-6)
+    for name in ("strut_1", "strut_4", "base", "platform"):
+        warm.set_temperature(name, 23.0)
+    turning = cardan(geometry)
+    return {
+        ("ideal", "the whole command, or estimate, without errors"): with_block(),
+        ("structure", "twelve joints where they really are"): with_block(**joints),
+        ("struts: scale", "offset, pitch error, backlash"): with_block(struts=scale),
+        ("struts: waves", "screw waves"): with_block(struts=waves),
+        ("struts: map", "length map, 21 knots"): with_block(struts=curved),
+        ("screw rotation", "cardan joints turn the screws, a lead"): Compensator(turning, ideal),
+        ("thermal", "struts, base and platform at their temperatures"): warm,
+        ("field", "three families of lines, cubic, six components"): with_block(field=whole.field),
+        ("all of them", "the shipped model: structure, scale, waves, field"): Compensator(geometry, whole),
+    }
+
+
+def one_round(compensator: Compensator, told: list[tuple[float, ...]]) -> tuple[float, float]:
+    """Return what a command and an estimate take, µs."""
+    compensator.reset()
+    began = time.thread_time()
+    for number, numbers in enumerate(told):
+        compensator.step(numbers, PERIOD * number)
+    stepped = time.thread_time()
+    readings = compensator.command.copy()
+    compensator.estimate(readings)
+    estimated = time.thread_time()
+    for _ in told:
+        compensator.estimate(readings)
+    ended = time.thread_time()
+    return (stepped - began) / len(told) * 1e6, (ended - estimated) / len(told) * 1e6
+
+
+def measure(rounds: int) -> list[Block]:
+    """Return every block's cost."""
+    geometry = load_geometry(config_file("paper.yaml"))
+    told, everybody = commands(geometry), compensators(geometry)
+    for compensator in everybody.values():  # compiles
+        one_round(compensator, told)
+    times = np.array([[one_round(c, told) for c in everybody.values()] for _ in range(rounds)])
+    least = times.min(axis=0)
+    added = least - least[0]
+    added[0] = least[0]
+    return [Block(*names, *row) for names, row in zip(everybody, added.tolist(), strict=True)]
+
+
+# --- parts -------------------------------------------------------------------------------------------------
+
+
+def repeated(kernel: Callable, *arguments: object) -> Callable[[], float]:
+    """Return a function that calls a kernel many times from compiled code and tells what a call takes, µs."""
+
+    @numba.njit
+    def many(count, given):
+        for _ in range(count):
+            kernel(*given)
+
+    many(1, arguments)
+
+    def run() -> float:
+        began = time.thread_time()
+        many(INNER, arguments)
+        return (time.thread_time() - began) / INNER * 1e6
+
+    return run
+
+
+def from_python(call: Callable[[], object]) -> Callable[[], float]:
+    """Return a function that tells what a call from Python takes, µs."""
+
+    def run() -> float:
+        began = time.thread_time()
+        for _ in range(INNER):
+            call()
+        return (time.thread_time() - began) / INNER * 1e6
+
+    call()
+    return run
+
+
+def parts(rounds: int) -> list[Part]:
+    """Return what the parts of the ideal machine's command take, and what comes beside commands."""
+    geometry = load_geometry(config_file("paper.yaml"))
+    home, table, lengths = geometry.home, LimitTable(geometry), np.empty(6)
+    nominal = (*geometry.kernel_joints, home.position.copy(), home.rotation.copy(), lengths)
+    limits = (table.stroke, table.cone_axes, table.cone_cosines, table.scalars)
+    compensator = Compensator(geometry, load_model(config_file("paper_machine.yaml"), geometry))
+    compensator.step(commands(geometry)[0], 0.0)
+    runs = {
+        "quaternion to rotation": repeated(read_pose, *[0.0] * 6, 1.0, np.empty(3), np.empty((3, 3))),
+        "nominal strut lengths": repeated(kernels.strut_lengths_one, *nominal),
+        "limits, each of two stages": repeated(check_stage, *nominal, limits),
+        "a temperature reading": from_python(lambda: compensator.set_temperature("strut_1", 20.5)),
+    }
+    return [Part(name, min(run() for _ in range(rounds))) for name, run in runs.items()]
+
+
+def report(blocks: list[Block], pieces: list[Part]) -> str:
+    """Return both tables for a person."""
+    lines = [f"{'block':16} {'command, µs':>12} {'estimate, µs':>13}  what"]
+    for block in blocks:
+        sign = "" if block.name == "ideal" else "+"
+        lines.append(f"{block.name:16} {block.command_us:{sign}12.2f} {block.estimate_us:{sign}13.2f}  {block.what}")
+    return "\n".join([*lines, "", *(f"{part.name:30} {part.us:8.3f} µs" for part in pieces)])
+
+
+def main() -> int:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    parser.add_argument("--rounds", type=int, default=25, help="runs of everybody (default %(default)s)")
+    options = parser.parse_args()
+    blocks, pieces = measure(options.rounds), parts(options.rounds)
+    if options.json:
+        print(json.dumps({"blocks": [asdict(b) for b in blocks], "parts": [asdict(p) for p in pieces]}, indent=1))
+    else:
+        print(report(blocks, pieces))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

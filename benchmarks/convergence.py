@@ -1,0 +1,236 @@
+"""Where forward kinematics converges, ours and LinuxCNC's genhexkins, and what their answers are worth.
+
+genhexkins takes a small rotation for a change of roll, pitch and yaw. At a yaw ψ that turns its steps by ψ, so the
+error left by a step is 2·sin(ψ/2) of the one before: linear convergence, and from 60° on none, however near the guess.
+
+Run ``python -m benchmarks.convergence``; exits 1 when ours fails at a yaw of 60–80°, or calls something solved that
+is not. Says so where there is no genhexkins (see :mod:`benchmarks.genhexkins`).
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hexapod_comp import kernels
+from hexapod_comp.kinematics import Structure, strut_lengths_batch
+
+from .genhexkins import Genhexkins, NotHere, emc_poses, si_poses
+from .poses import make_poses
+
+YAWS = np.arange(0.0, 86.0, 5.0)
+"""Where convergence is looked at, degrees."""
+
+OUTCOMES = ("solved", "NOT_FINITE", "NOT_CONVERGED", "SINGULAR", "UNREACHABLE", "OTHER_ASSEMBLY")
+"""Names of the kernels' outcomes."""
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """How many of `poses` poses at one yaw were solved, from guesses 1 mm and 1 mrad away.
+
+    Attributes
+    ----------
+    ours, theirs : int
+        Solved: the pose at which the lengths were taken, to 1 nm and 1e-8 rad.
+    """
+
+    yaw_deg: float
+    poses: int
+    ours: int
+    theirs: int
+
+
+@dataclass(frozen=True)
+class Honesty:
+    """What answers to far guesses are worth; each pair is ours, then genhexkins'.
+
+    Attributes
+    ----------
+    solved : tuple of int
+        Said to be solved.
+    not_finite, open_loops, other_mode : tuple of int
+        … of these: not finite; struts of another length than asked for, by 1 nm; another assembly mode than home.
+    """
+
+    poses: int
+    solved: tuple[int, int]
+    not_finite: tuple[int, int]
+    open_loops: tuple[int, int]
+    other_mode: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class _Answers:
+    """Answers of one of the two: who said success, and poses (m)."""
+
+    ok: np.ndarray
+    positions: np.ndarray
+    rotations: np.ndarray
+
+
+def _ours(structure: Structure, lengths: np.ndarray, positions: np.ndarray, rotations: np.ndarray) -> _Answers:
+    """Solve with the kernel from one guess each."""
+    count = len(lengths)
+    positions, rotations = positions.copy(), np.ascontiguousarray(rotations)
+    outcomes, iterations, conditions = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
+    limits = structure.characteristic_length, structure.home_sign, structure.max_condition
+    problem = structure.base_joints, structure.platform_joints, lengths, positions, rotations
+    kernels.solve_pose_many(*problem, *limits, outcomes, iterations, conditions)
+    return _Answers(outcomes == kernels.OK, positions, rotations)
+
+
+def _theirs(module: Genhexkins, lengths: np.ndarray, positions: np.ndarray, rotations: np.ndarray) -> _Answers:
+    """Solve with genhexkins from one guess each."""
+    codes, poses = module.solved(lengths, emc_poses(positions, rotations))
+    finite = np.isfinite(poses).all(axis=1)
+    found, turned = si_poses(np.where(finite[:, None], poses, 0.0))
+    found[~finite], turned[~finite] = np.nan, np.nan
+    return _Answers(codes == 0, found, turned)
+
+
+def convergence(yaws: np.ndarray, count: int = 300) -> list[Convergence]:
+    """Return who solves poses turned about z, from guesses as near as a controller's last pose."""
+    machine, rng = make_poses(1), np.random.default_rng(4)
+    structure, home = machine.structure, machine.home
+    module, rows = Genhexkins(structure), []
+    for yaw in yaws:
+        positions = home.position + rng.uniform(-0.01, 0.01, (count, 3))
+        angles = np.column_stack([rng.uniform(-3.0, 3.0, (count, 2)), np.full(count, yaw)])
+        rotations = Rotation.from_euler("xyz", angles, degrees=True).as_matrix() @ home.rotation
+        lengths = strut_lengths_batch(structure, positions, rotations)
+        near = positions + rng.uniform(-1e-3, 1e-3, (count, 3))
+        turned = Rotation.from_rotvec(rng.uniform(-1e-3, 1e-3, (count, 3))).as_matrix() @ rotations
+        answers = _ours(structure, lengths, near, turned), _theirs(module, lengths, near, turned)
+        right = [_same_pose(a, positions, rotations) for a in answers]
+        rows.append(Convergence(float(yaw), count, *(int(r.sum()) for r in right)))
+    return rows
+
+
+def _same_pose(answers: _Answers, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Return where an answer is the pose looked for."""
+    off = np.abs(answers.positions - positions).max(axis=1)
+    turned = np.abs(answers.rotations - rotations).max(axis=(1, 2))
+    return answers.ok & (off < 1e-9) & (turned < 1e-8)
+
+
+def honesty(count: int = 20_000) -> Honesty:
+    """Return what answers are worth when the guess is far: ±200 mm and ±90° about home, and lengths of any pose."""
+    machine, rng = make_poses(1), np.random.default_rng(5)
+    structure, home = machine.structure, machine.home
+    positions = home.position + rng.uniform(-0.1, 0.1, (count, 3))
+    rotations = Rotation.from_euler("xyz", rng.uniform(-40.0, 40.0, (count, 3)), degrees=True).as_matrix()
+    lengths = strut_lengths_batch(structure, positions, rotations @ home.rotation)
+    guess = home.position + rng.uniform(-0.2, 0.2, (count, 3))
+    turned = Rotation.from_euler("xyz", rng.uniform(-90.0, 90.0, (count, 3)), degrees=True).as_matrix()
+    module = Genhexkins(structure)
+    answers = _ours(structure, lengths, guess, turned), _theirs(module, lengths, guess, turned)
+    ours, theirs = (_worth(structure, a, lengths) for a in answers)
+    return Honesty(count, *zip(ours, theirs, strict=True))
+
+
+def _worth(structure: Structure, answers: _Answers, lengths: np.ndarray) -> tuple[int, int, int, int]:
+    """Return the four counts of :class:`Honesty`, by NumPy's formulas and determinant."""
+    finite = np.isfinite(answers.positions).all(axis=1) & np.isfinite(answers.rotations).all(axis=(1, 2))
+    told = answers.ok & finite
+    arms = structure.platform_joints @ np.swapaxes(answers.rotations[told], 1, 2)
+    struts = answers.positions[told][:, None] + arms - structure.base_joints
+    there = np.linalg.norm(struts, axis=2)
+    open_loops = np.abs(there - lengths[told]).max(axis=1) > 1e-9
+    signs = np.sign(np.linalg.det(np.concatenate([struts, np.cross(arms, struts)], axis=2)))
+    other = signs != structure.home_sign
+    return (
+        int(answers.ok.sum()),
+        int((answers.ok & ~finite).sum()),
+        int(open_loops.sum()),
+        int(other.sum()),
+    )
+
+
+@dataclass(frozen=True)
+class Trap:
+    """A problem without a regular answer, started where the struts are as asked for, and what both say of it.
+
+    Attributes
+    ----------
+    ours, theirs : str
+        Outcome, and what it has done to the pose given as a guess: LinuxCNC starts its next call from that.
+    """
+
+    title: str
+    ours: str
+    theirs: str
+
+
+def traps() -> list[Trap]:
+    """Return what both say at singular poses of the machine, and when an encoder reads NaN."""
+    machine = make_poses(1)
+    structure, home = machine.structure, machine.home
+    module, rows = Genhexkins(structure), []
+    for yaw in (90.0, -90.0):
+        turned = Rotation.from_euler("z", yaw, degrees=True).as_matrix() @ home.rotation
+        lengths = strut_lengths_batch(structure, home.position[None], turned[None])
+        rows.append(_sprung(module, f"home turned by {yaw:g}° about z: singular", structure, lengths, turned))
+    lengths = strut_lengths_batch(structure, home.position[None], home.rotation[None])
+    lengths[0, 2] = np.nan
+    rows.append(_sprung(module, "home, strut 3 reads NaN", structure, lengths, home.rotation))
+    return rows
+
+
+def _sprung(module: Genhexkins, title: str, structure: Structure, lengths: np.ndarray, rotation: np.ndarray) -> Trap:
+    """Ask both, from home's position and a rotation."""
+    position = make_poses(1).home.position.copy()
+    codes, poses = module.solved(lengths, emc_poses(position[None], rotation[None]))
+    rotation = np.ascontiguousarray(rotation)
+    limits = structure.characteristic_length, structure.home_sign, structure.max_condition
+    joints = structure.base_joints, structure.platform_joints
+    outcome, _, _ = kernels.solve_pose_one(*joints, lengths[0], position, rotation, *limits)
+    kept = np.isfinite(position).all() and np.isfinite(rotation).all()
+    theirs = f"returns {codes[0]}, pose {'finite' if np.isfinite(poses).all() else 'NaN'}"
+    return Trap(title, f"{OUTCOMES[outcome]}, pose {'finite' if kept else 'NaN'}", theirs)
+
+
+def report(rows: list[Convergence], worth: Honesty, caught: list[Trap]) -> str:
+    """Return the tables for a person."""
+    lines = ["solved at a yaw, from 1 mm and 1 mrad away", f"{'yaw':>6} {'hexapod_comp':>14} {'genhexkins':>12}"]
+    lines += [f"{r.yaw_deg:5.0f}° {r.ours:8d}/{r.poses} {r.theirs:8d}/{r.poses}" for r in rows]
+    lines += ["", f"of {worth.poses} far guesses {'hexapod_comp':>27} {'genhexkins':>12}"]
+    for title, (ours, theirs) in worth_rows(worth):
+        lines.append(f"{title:36} {ours:12d} {theirs:12d}")
+    lines += ["", *(f"{trap.title}: hexapod_comp {trap.ours}; genhexkins {trap.theirs}" for trap in caught)]
+    return "\n".join(lines)
+
+
+def worth_rows(worth: Honesty) -> list[tuple[str, tuple[int, int]]]:
+    """Return what a table says of :class:`Honesty`."""
+    return [
+        ("said to be solved", worth.solved),
+        ("… with a pose that is not finite", worth.not_finite),
+        ("… with struts of other lengths", worth.open_loops),
+        ("… in another assembly mode", worth.other_mode),
+    ]
+
+
+def bars_kept(rows: list[Convergence], worth: Honesty) -> bool:
+    """Return whether ours converges at 60–80°, and says nothing that is not so."""
+    at = [r for r in rows if 60.0 <= r.yaw_deg <= 80.0]
+    false = worth.not_finite[0] + worth.open_loops[0] + worth.other_mode[0]
+    return all(r.ours == r.poses for r in at) and not false
+
+
+def main() -> int:
+    """Print the tables; exit 1 when ours misses a bar."""
+    try:
+        rows, worth, caught = convergence(YAWS), honesty(), traps()
+    except NotHere as reason:
+        print(f"skipped: {reason}")
+        return 0
+    print(report(rows, worth, caught))
+    return 0 if bars_kept(rows, worth) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
