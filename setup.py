@@ -63,13 +63,13 @@ setup(
             "colcon-library-path>=0.2.1",
             "plotly>=5.18",
             "distributed>=2023.12",
-            "rosbags>=0.10",
+            "rosbags>=0.11",
         ],
         "bench": ["mujoco>=3.1", "pin>=2.7"],
         # No rosdep keys: imported where used, with a clear message when missing.
         "pages": ["plotly>=5.18"],
         "cluster": ["distributed>=2023.12"],
-        "bags": ["rosbags>=0.10"],
+        "bags": ["rosbags>=0.11"],
     },
     entry_points={
         "console_scripts": [

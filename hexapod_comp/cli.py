@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import re
 import sys
@@ -39,6 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit code: 0 fine, 1 the verb's own "no", 2 bad input, 130 interrupted.
     """
     arguments = sys.argv[1:] if argv is None else argv
+    _accept_any_terminal()
     try:
         args = make_parser().parse_args(_with_negative_values(arguments))
     except SystemExit as leaving:  # argparse has printed help or what is wrong
@@ -50,6 +52,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except HexapodError as error:
         print(f"{PROGRAM}: error: {error}", file=sys.stderr)
         return USAGE_ERROR
+    except MemoryError as error:
+        print(f"{PROGRAM}: error: this needs more memory than there is: {error}", file=sys.stderr)
+        return USAGE_ERROR
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:
@@ -58,16 +63,23 @@ def main(argv: Sequence[str] | None = None) -> int:
         return BROKEN_PIPE
 
 
+def _accept_any_terminal() -> None:
+    """Write what a terminal's encoding does not have as an escape: no reason to end with a traceback."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser with all verbs; importing them must stay cheap: ``--help`` answers at once."""
-    from .verbs import assess, check, classify, demo, export, fit, fk, ik, iso230, measure, plan, run
+    from .verbs import assess, check, classify, demo, export, fit, fk, ik, iso230, measure, plan, replay, run
 
     parser = argparse.ArgumentParser(
         PROGRAM, description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and leave")
     subparsers = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
-    for verb in (ik, fk, check, assess, run, demo, plan, measure, fit, iso230, export, classify):
+    for verb in (ik, fk, check, assess, run, demo, plan, measure, fit, iso230, export, classify, replay):
         verb.add_parser(subparsers)
     return parser
 

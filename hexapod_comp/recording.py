@@ -1,0 +1,353 @@
+"""Reading a recorded run: one machine's topics out of a bag, as plain arrays. Only this module knows ``rosbags``.
+
+A bag is a folder with ``metadata.yaml`` as ``ros2 bag record`` writes it, or a bare ``.mcap`` or ``.db3`` file. Of
+its topics a replay needs ``tool_pose_command``, ``strut_corrections`` or ``strut_commands``, and the compensator's
+journal; ``compensator/files`` spares the user the search for geometry and model; ``strut_states`` and
+``tool_pose_estimate`` are shown where there are any. All others are left alone, whatever their types.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .errors import HexapodError, InputFileError, printable
+from .geometry import STRUT_NAMES
+from .journal import JournalError, Page, Source, read_page, read_sources
+
+POSE, STRUTS, TEXT = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState", "std_msgs/msg/String"
+
+TOPICS = {
+    "tool_pose_command": POSE,
+    "strut_commands": STRUTS,
+    "strut_corrections": STRUTS,
+    "strut_states": STRUTS,
+    "tool_pose_estimate": POSE,
+}
+"""A machine's topics in its namespace, and their types."""
+
+JOURNAL, FILES = "/journal", "/files"
+"""How the topics of a compensator's journal end, after the node's name."""
+
+STORAGE = (".mcap", ".db3")
+
+MCAP_END = b"\x89MCAP0\r\n"
+"""Last bytes of an MCAP file that was closed."""
+
+CUT_OFF = (
+    "it has no end, as when the recorder is killed; `mcap recover FILE --output NEW.mcap` makes a whole file of it"
+)
+
+SPARE = 4
+"""Bytes that some writers leave behind a message."""
+
+RECORD = "record at least tool_pose_command, strut_commands, strut_corrections, compensator/journal, compensator/files"
+
+
+@dataclass(frozen=True)
+class Series:
+    """Messages of one topic, oldest first.
+
+    Attributes
+    ----------
+    stamps : ndarray of int64, shape (n,)
+        Their headers' stamps, ns.
+    times : ndarray of int64, shape (n,)
+        When the recorder got them, ns.
+    values : ndarray, shape (n, k)
+        Six struts, m; or position x, y, z, m, and quaternion x, y, z, w.
+    frames : list of str
+        frame_id of each pose; empty for struts.
+    """
+
+    stamps: np.ndarray
+    times: np.ndarray
+    values: np.ndarray
+    frames: list[str] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+
+@dataclass
+class Recording:
+    """What a bag tells about one machine.
+
+    Attributes
+    ----------
+    path : str
+        The bag.
+    node : str
+        Full name of the compensator.
+    topics : dict of str to Series
+        By the names in :data:`TOPICS`; empty where the bag has none.
+    pages : list of (int, Page)
+        The journal with the recorder's times, ns.
+    sources : dict of str to Source
+        Geometries and models by their hash.
+    notes : list of str
+        What was odd.
+    """
+
+    path: str
+    node: str
+    topics: dict[str, Series]
+    pages: list[tuple[int, Page]]
+    sources: dict[str, Source]
+    notes: list[str]
+
+
+def read_recording(
+    path: str | Path, namespace: str | None = None, progress: Callable[[int], object] = lambda messages: None
+) -> Recording:
+    """Read one machine's topics.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder, ``.mcap`` or ``.db3``.
+    namespace : str, optional
+        Needed when the bag holds several machines; ``/`` for none.
+    progress : callable, optional
+        Called with the number of messages just read.
+
+    Raises
+    ------
+    HexapodError
+        ``rosbags`` is not installed.
+    InputFileError
+        No bag, damaged, a topic is missing or of a wrong type, several machines or no such one.
+    """
+    with ExitStack() as stack:
+        readers, notes = _open(Path(path), stack)
+        connections = [c for reader in readers for c in reader.connections]
+        node = _choose(path, connections, namespace)
+        wanted = _wanted(path, connections, node)
+        collected = _Collected(path, node)
+        for reader in readers:
+            chosen = [c for c in reader.connections if c.topic in wanted]
+            for topic, time, message in _messages(path, reader, chosen):
+                collected.take(wanted[topic], time, message)
+                progress(1)
+    return collected.recording(notes)
+
+
+def _rosbags() -> Any:
+    """Return the modules of rosbags, with a clear word where it is missing."""
+    try:
+        from rosbags import rosbag2, typesys
+    except ImportError as error:
+        raise HexapodError(
+            f"reading bags needs rosbags ({error}): pip install hexapod_comp[bags], "
+            "or on a ROS machine the rosdep key python3-rosbags-pip"
+        ) from error
+    return rosbag2, typesys
+
+
+def _open(path: Path, stack: ExitStack) -> tuple[list[Any], list[str]]:
+    """Open all files of a bag; return readers, and notes."""
+    rosbag2, _ = _rosbags()
+    files, notes = _files(path)
+    readers = []
+    for file in files:
+        try:
+            readers.append(stack.enter_context(rosbag2.Reader(file)))
+        except Exception as error:
+            raise _unreadable(path, file, "", error) from error
+    if not any(reader.message_count for reader in readers):
+        raise InputFileError(path, "", "is a bag without messages")
+    return readers, notes
+
+
+def _files(path: Path) -> tuple[list[Path], list[str]]:
+    """Return what is to be opened: the folder, or its single files where ``metadata.yaml`` is missing."""
+    if path.name == "metadata.yaml":
+        path = path.parent
+    if not path.exists():
+        raise InputFileError(path, "", "there is no such file or folder")
+    if path.is_file():
+        if path.suffix not in STORAGE:
+            raise InputFileError(path, "", "must be a bag: a folder with metadata.yaml, a .mcap or a .db3 file")
+        return [path], []
+    if (path / "metadata.yaml").is_file():
+        return [path], []
+    found = sorted(file for file in path.iterdir() if file.suffix in STORAGE)
+    if not found:
+        raise InputFileError(path, "", "is no bag: it has neither metadata.yaml nor a .mcap or .db3 file")
+    return found, ["metadata.yaml is missing, as when the recorder is killed; all files of the folder were read"]
+
+
+def _unreadable(path: str | Path, file: Path, key: str, error: Exception) -> InputFileError:
+    """Return the error for what the library raises on damaged bytes.
+
+    That is whatever its parts happen to raise: struct.error, KeyError, AssertionError, errors of three
+    decompressors and of two databases; hence ``except Exception`` where it is called.
+    """
+    said = " ".join(str(part) for part in error.args) or type(error).__name__
+    problem = f"cannot be read as a bag: {printable(said)}"
+    if any(_cut_off(one) for one in (file, *file.glob("*.mcap"))):
+        problem += f"; {CUT_OFF}"
+    return InputFileError(path, key, problem)
+
+
+def _cut_off(file: Path) -> bool:
+    """Return whether a file is an MCAP file that was never closed."""
+    if file.suffix != ".mcap" or not file.is_file():
+        return False
+    with open(file, "rb") as stream:
+        stream.seek(max(0, file.stat().st_size - len(MCAP_END)))
+        return stream.read() != MCAP_END
+
+
+def _choose(path: str | Path, connections: Iterable[Any], namespace: str | None) -> str:
+    """Return the full name of the compensator meant."""
+    connections = list(connections)
+    journals = [c for c in connections if c.topic.endswith(JOURNAL)]
+    journals = [c for c in journals if c.msgtype == TEXT] or journals  # others have journals too
+    nodes = sorted({c.topic.removesuffix(JOURNAL) for c in journals})
+    if namespace is not None:
+        wanted = "/" + namespace.strip("/")
+        here = [node for node in nodes if _namespace(node) == wanted.rstrip("/")]
+    else:
+        here = nodes
+    if len(here) == 1:
+        return here[0]
+    if not nodes:
+        found = ", ".join(sorted({c.topic for c in connections})) or "none"
+        problem = f"holds no journal of a compensator, without which nothing can be replayed; {RECORD}"
+        raise InputFileError(path, "", f"{problem}. Its topics: {printable(found, 500)}")
+    names = ", ".join(_namespace(node) or "/" for node in nodes)
+    problem = "holds several machines; choose one with --namespace" if here else f"has no machine in {namespace}"
+    raise InputFileError(path, "", f"{problem}: {names}")
+
+
+def _namespace(node: str) -> str:
+    return node.rpartition("/")[0]
+
+
+def _wanted(path: str | Path, connections: Iterable[Any], node: str) -> dict[str, str]:
+    """Return what the topics to be read are called here; refuse wrong types and missing ones."""
+    names = {f"{_namespace(node)}/{name}": (name, kind) for name, kind in TOPICS.items()}
+    names |= {node + JOURNAL: (JOURNAL, TEXT), node + FILES: (FILES, TEXT)}
+    found = set()
+    for connection in connections:
+        if connection.topic not in names:
+            continue
+        name, kind = names[connection.topic]
+        if connection.msgtype != kind:
+            raise InputFileError(path, connection.topic, f"must be of type {kind}", connection.msgtype)
+        found.add(name)
+    missing = [f"{_namespace(node)}/tool_pose_command"] if "tool_pose_command" not in found else []
+    if not found & {"strut_commands", "strut_corrections"}:
+        missing.append(f"{_namespace(node)}/strut_corrections (or strut_commands), the compensator's answers")
+    if missing:
+        raise InputFileError(path, "", f"lacks {' and '.join(missing)}; {RECORD}")
+    return {topic: name for topic, (name, _) in names.items()}
+
+
+def _messages(path: str | Path, reader: Any, connections: list[Any]) -> Iterator[tuple[str, int, Any]]:
+    """Yield topic, the recorder's time (ns) and message of some connections."""
+    if not connections:
+        return
+    _, typesys = _rosbags()
+    # These types have been the same since they exist: the definitions in the bag, if any, are not needed.
+    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+    messages = reader.messages(connections)
+    while True:
+        key = ""
+        try:
+            connection, time, raw = next(messages)
+            key = f"{connection.topic} at {time} ns"
+            message = _deserialized(store, raw, connection.msgtype)
+        except StopIteration:
+            return
+        except Exception as error:
+            raise _unreadable(path, reader.path, key, error) from error
+        yield connection.topic, time, message
+
+
+def _deserialized(store: Any, raw: bytes, kind: str) -> Any:
+    """Return a message; rclpy's serialize_message leaves four bytes behind some, which the library refuses."""
+    try:
+        return store.deserialize_cdr(raw, kind)
+    except Exception:
+        try:
+            return store.deserialize_cdr(raw[:-SPARE], kind)
+        except Exception:
+            pass
+        raise
+
+
+class _Collected:
+    """Messages on their way into a Recording."""
+
+    def __init__(self, path: str | Path, node: str) -> None:
+        self._path, self._node = path, node
+        self._series: dict[str, list[tuple]] = {name: [] for name in TOPICS}
+        self._pages: list[tuple[int, Page]] = []
+        self._sources: dict[str, Source] = {}
+        self._odd: dict[str, int] = {}
+
+    def take(self, name: str, time: int, message: Any) -> None:
+        """Take one message."""
+        if name in (JOURNAL, FILES):
+            self._take_text(name, time, message.data)
+            return
+        stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+        if TOPICS[name] == POSE:
+            p, q = message.pose.position, message.pose.orientation
+            numbers = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+            self._series[name].append((time, stamp, numbers, message.header.frame_id))
+            return
+        lengths = _lengths(message)
+        if lengths is None:
+            self._odd[name] = self._odd.get(name, 0) + 1
+        else:
+            self._series[name].append((time, stamp, lengths, ""))
+
+    def _take_text(self, name: str, time: int, text: str) -> None:
+        try:
+            if name == JOURNAL:
+                self._pages.append((time, read_page(text)))
+            else:
+                self._sources |= {source.sha256: source for source in read_sources(text).values()}
+        except JournalError as error:
+            raise InputFileError(self._path, f"{self._node}{name} at {time} ns", str(error)) from error
+
+    def recording(self, notes: list[str]) -> Recording:
+        """Return what was collected."""
+        if not self._pages:
+            raise InputFileError(self._path, self._node + JOURNAL, "is there but empty: no page was recorded")
+        topics = {name: _as_series(rows, 7 if TOPICS[name] == POSE else 6) for name, rows in self._series.items()}
+        if not len(topics["strut_commands"]) and not len(topics["strut_corrections"]):
+            raise InputFileError(self._path, "", "holds not a single answer of the compensator")
+        notes = notes + [
+            f"{count} messages of {name} left out: not six positions of {', '.join(STRUT_NAMES)}"
+            for name, count in self._odd.items()
+        ]
+        pages = sorted(self._pages, key=lambda entry: entry[0])
+        return Recording(str(self._path), self._node, topics, pages, self._sources, notes)
+
+
+def _lengths(message: Any) -> tuple[float, ...] | None:
+    """Return the six struts' positions in strut order, m; None when they are not what the message holds."""
+    if len(message.name) != 6 or len(message.position) != 6:
+        return None
+    by_name = dict(zip(message.name, message.position.tolist(), strict=True))
+    return tuple(by_name[name] for name in STRUT_NAMES) if set(by_name) == set(STRUT_NAMES) else None
+
+
+def _as_series(rows: list[tuple], width: int) -> Series:
+    rows.sort(key=lambda row: row[0])
+    times, stamps, values, frames = zip(*rows, strict=True) if rows else ((), (), (), ())
+    return Series(
+        stamps=np.array(stamps, dtype=np.int64),
+        times=np.array(times, dtype=np.int64),
+        values=np.array(values, dtype=float).reshape((-1, width)),
+        frames=list(frames) if width == 7 else [],
+    )

@@ -1,0 +1,172 @@
+"""What the tests of recordings share: a compensator that keeps its journal as the node does, and writing bags.
+
+The bags are written by rosbags, the way ``ros2 bag record`` does: MCAP or sqlite3, with metadata.yaml, message
+definitions and the offered QoS. No ROS in here.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+
+from hexapod_comp.compensation import Compensator
+from hexapod_comp.compensation_kernels import pack_pose
+from hexapod_comp.errors import HexapodError
+from hexapod_comp.geometry import STRUT_NAMES, load_geometry
+from hexapod_comp.journal import Journal, load_with_source, sources_text
+from hexapod_comp.model_file import load_model
+from hexapod_comp.pose import Pose
+
+CONFIG = Path(__file__).resolve().parents[1] / "config"
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+TYPES = STORE.types
+
+KINDS = {
+    "tool_pose_command": "geometry_msgs/msg/PoseStamped",
+    "tool_pose_estimate": "geometry_msgs/msg/PoseStamped",
+    "strut_commands": "sensor_msgs/msg/JointState",
+    "strut_corrections": "sensor_msgs/msg/JointState",
+    "strut_states": "sensor_msgs/msg/JointState",
+    "compensator/journal": "std_msgs/msg/String",
+    "compensator/files": "std_msgs/msg/String",
+}
+
+FOREVER = QosTime(9223372036, 854775807)
+
+BEGAN = 1_795_000_000_000_000_000
+"""When recordings made here begin, ns."""
+
+MILLISECOND = 1_000_000
+
+Messages = list[tuple[int, str, str, bytes]]
+"""The recorder's time, ns; topic; type; serialized message."""
+
+
+def qos(kept: bool = False) -> Qos:
+    """Return a QoS as publishers offer it: reliable, kept for late subscribers or not."""
+    durability = QosDurability.TRANSIENT_LOCAL if kept else QosDurability.VOLATILE
+    times = (FOREVER, FOREVER)
+    return Qos(
+        QosHistory.KEEP_LAST,
+        10,
+        QosReliability.RELIABLE,
+        durability,
+        *times,
+        QosLiveliness.AUTOMATIC,
+        FOREVER,
+        False,
+    )
+
+
+def write_bag(folder: Path, messages: Messages, storage: str = "mcap") -> Path:
+    """Write a bag into a new folder and return it."""
+    with Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+        connections: dict[str, Any] = {}
+        for time, topic, kind, raw in messages:
+            if topic not in connections:
+                offered = [qos(kept=topic.endswith(("/journal", "/files")))]
+                connections[topic] = writer.add_connection(topic, kind, typestore=STORE, offered_qos_profiles=offered)
+            writer.write(connections[topic], time, raw)
+    return folder
+
+
+def serialized(kind: str, message: Any) -> bytes:
+    """Return a message as it travels."""
+    return bytes(STORE.serialize_cdr(message, kind))
+
+
+class RecordedMachine:
+    """A compensator and its journal, all of whose messages are kept: what a recorder would have seen.
+
+    Parameters
+    ----------
+    namespace : str
+        ``/mill`` or nothing.
+    model : str or Path
+        Model file.
+    """
+
+    def __init__(self, namespace: str = "", model: str | Path = CONFIG / "paper_machine.yaml") -> None:
+        self.namespace, self.messages = namespace, Messages()
+        self.geometry, geometry_source = load_with_source(CONFIG / "paper.yaml", load_geometry)
+        self.sources = {"geometry": geometry_source}
+        self.now, self.count, self.answered = BEGAN, 0, 0
+        self.compensator = Compensator(self.geometry, self.load(model))
+        self.frames = {"base": pack_pose(Pose.identity()), "work": pack_pose(self.geometry.work)}
+        place = lambda: (self.count, self.answered)  # noqa: E731
+        self.journal = Journal(self.compensator, place, self.sources, {"base": "base", "work": "work"})
+        self.page()
+
+    def load(self, path: str | Path) -> Any:
+        """Return a model and keep its text."""
+        model, self.sources["model"] = load_with_source(path, lambda file: load_model(file, self.geometry))
+        return model
+
+    def keep(self, topic: str, message: Any) -> None:
+        """Keep a message as recorded now."""
+        kind = KINDS[topic]
+        self.messages.append((self.now, f"{self.namespace}/{topic}", kind, serialized(kind, message)))
+
+    def header(self, stamp: int, frame: str = "") -> Any:
+        """Return a header."""
+        time = TYPES["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9)
+        return TYPES["std_msgs/msg/Header"](time, frame)
+
+    def keep_struts(self, topic: str, stamp: int, lengths: np.ndarray) -> None:
+        """Keep a message of six struts."""
+        numbers = np.array(lengths, dtype=float)
+        joint_state = TYPES["sensor_msgs/msg/JointState"]
+        self.keep(topic, joint_state(self.header(stamp), list(STRUT_NAMES), numbers, np.zeros(6), np.zeros(0)))
+
+    def keep_text(self, topic: str, text: str) -> None:
+        """Keep a page or the files."""
+        self.keep(topic, TYPES["std_msgs/msg/String"](text))
+
+    def page(self) -> None:
+        """Write the files and a page."""
+        self.keep_text("compensator/files", sources_text(self.sources))
+        self.keep_text("compensator/journal", self.journal.page(0.0))
+
+    def send(self, pose: Pose, frame: str = "base", stamped: bool = True, told: bool = True) -> bool:
+        """Send one command a millisecond after the last; return whether it was answered.
+
+        A command that is not `stamped` is answered with the time at which it came; of a refused one the
+        journal is `told`.
+        """
+        self.now += MILLISECOND
+        stamp = self.now if stamped else 0
+        quaternion = Rotation.from_matrix(pose.rotation).as_quat().tolist()
+        numbers = (*pose.position.tolist(), *quaternion)
+        point = TYPES["geometry_msgs/msg/Point"](*numbers[:3])
+        turn = TYPES["geometry_msgs/msg/Quaternion"](*numbers[3:])
+        posed = TYPES["geometry_msgs/msg/Pose"](point, turn)
+        self.keep("tool_pose_command", TYPES["geometry_msgs/msg/PoseStamped"](self.header(stamp, frame), posed))
+        try:
+            self.compensator.step(numbers, self.now * 1e-9, self.frames[frame])
+        except HexapodError as error:
+            if told:
+                self.journal.refused(stamp, error.reason, str(error))
+            return False
+        self.count, self.answered = self.count + 1, self.now
+        self.keep_struts("strut_commands", self.now, self.compensator.command)
+        self.keep_struts("strut_corrections", self.now, self.compensator.correction)
+        return True
+
+    def wave(self, count: int, start: int = 0) -> None:
+        """Send so many commands along a wave that turns every strut's direction round."""
+        for n in range(start, start + count):
+            self.send(wave_pose(n))
+
+
+def wave_pose(n: int) -> Pose:
+    """Return the pose number `n` of a smooth motion of some millimetres and a degree about home."""
+    phase = 0.02 * n
+    position = np.array([0.004 * np.sin(phase), 0.003 * np.sin(1.3 * phase), 0.4 + 0.002 * np.sin(0.7 * phase)])
+    return Pose(position, Rotation.from_euler("XYZ", [0.02 * np.sin(phase), 0.0, 0.01 * np.sin(phase)]).as_matrix())

@@ -1,0 +1,659 @@
+"""Recordings and their replay without ROS: what comes back, what is lost, and what a bag may not be.
+
+The recordings are made by a compensator that keeps its journal as the node does; the truth is the numbers that
+it gave while it was recorded. Damage is done to the messages, or to the bytes of the bag, by the test.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import csv
+import json
+import math
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip("rosbags")
+
+from replay_helpers import (
+    BEGAN,
+    CONFIG,
+    MILLISECOND,
+    STORE,
+    TYPES,
+    Messages,
+    RecordedMachine,
+    serialized,
+    wave_pose,
+    write_bag,
+)
+
+from hexapod_comp.cli import main
+from hexapod_comp.compensation import Compensator
+from hexapod_comp.errors import HexapodError, InputFileError, ModelError
+from hexapod_comp.geometry import load_geometry
+from hexapod_comp.journal import REFUSALS_PER_PAGE, JournalError, read_page, read_sources
+from hexapod_comp.machine import MachineModel
+from hexapod_comp.model_file import load_model, save_model
+from hexapod_comp.pose import Pose
+from hexapod_comp.recorded_files import Files
+from hexapod_comp.recording import Recording, read_recording
+from hexapod_comp.replaying import BEFORE, DIFFERENT, IDENTICAL, LOST, UNCERTAIN, Replay, replay
+from hexapod_comp.timeline import put_in_order
+from hexapod_comp.verbs import replay as verb
+
+FAR = Pose([0.2, 0.0, 0.4], np.eye(3))
+"""From home, struts would change by some 90 mm in one command: refused."""
+
+JOINT_STATE, TEXT = "sensor_msgs/msg/JointState", "std_msgs/msg/String"
+
+
+def warm_model(folder: Path) -> Path:
+    """Write the shipped machine's model with expansions added, so that temperatures matter."""
+    model = load_model(CONFIG / "paper_machine.yaml", load_geometry(CONFIG / "paper.yaml"))
+    struts = replace(model.struts, expansion=np.full(6, 11e-6))
+    save_model(replace(model, struts=struts, base_expansion=12e-6), folder / "warm.yaml")
+    return folder / "warm.yaml"
+
+
+def full_run(folder: Path, namespace: str = "") -> RecordedMachine:
+    """Return a run of 1,200 commands in which everything happens, a page every 100 ms."""
+    machine = RecordedMachine(namespace, warm_model(folder))
+    core = machine.compensator
+    happenings: dict[int, Callable[[], object]] = {
+        150: lambda: core.set_temperature("strut_1", 23.4),
+        151: lambda: core.set_temperature("base", 21.1),
+        350: lambda: core.enable(False),
+        650: lambda: core.enable(True),
+        900: lambda: core.reset(core.command + 1e-6),
+        950: lambda: core.set_model(machine.load(CONFIG / "paper_machine.yaml")),
+        1000: lambda: machine.send(FAR),
+        1001: lambda: core.reset(),
+    }
+    for n in range(1200):
+        happenings.get(n, lambda: None)()
+        assert machine.send(wave_pose(n))
+        if n % 100 == 99:
+            machine.page()
+    return machine
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> RecordedMachine:
+    return full_run(tmp_path_factory.mktemp("model"))
+
+
+def opened(bag: Path, namespace: str | None = None) -> tuple[Recording, Replay]:
+    """Read a bag and replay it."""
+    recording = read_recording(bag, namespace)
+    files = Files(recording, {})
+    timeline = put_in_order(recording, files.geometry(recording.pages[0][1].geometry))
+    return recording, replay(recording, timeline, files)
+
+
+def counted(result: Replay) -> dict[int, int]:
+    """Return how often each outcome is there."""
+    values, counts = np.unique(result.outcome, return_counts=True)
+    return dict(zip(values.tolist(), counts.tolist(), strict=True))
+
+
+def of_topic(messages: Messages, ending: str) -> list[int]:
+    """Return the numbers of a topic's messages."""
+    return [n for n, message in enumerate(messages) if message[1].endswith(ending)]
+
+
+def without(messages: Messages, *numbers: int) -> Messages:
+    """Return messages without some."""
+    return [message for n, message in enumerate(messages) if n not in numbers]
+
+
+def call(*arguments: object) -> int:
+    """Run the verb as the command line does, errors apart."""
+    parser = argparse.ArgumentParser()
+    verb.add_parser(parser.add_subparsers())
+    args = parser.parse_args(["replay", *map(str, arguments)])
+    return int(args.run(args))
+
+
+# ---- the same bits ----
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_everything_comes_back_bit_for_bit(run, tmp_path, storage):
+    bag = write_bag(tmp_path / "run", run.messages, storage)
+    for path in (bag, bag / "metadata.yaml", *bag.glob("run.[md]*")):
+        recording, result = opened(path)
+        assert counted(result) == {IDENTICAL: 1200}
+        assert not result.states_differ
+        assert [entry.what for _, entry in result.events] == [
+            "temperature", "temperature", "enable", "enable", "reset", "model", "reset",
+        ]  # fmt: skip
+        assert [(refused.reason, refused.from_journal) for refused in result.refused] == [("step", True)]
+        assert not recording.notes
+
+
+def test_replay_sees_a_difference_of_one_bit(run, tmp_path, capsys):
+    """One correction is moved to its neighbouring float; nothing else may be called different."""
+    messages = list(run.messages)
+    place = of_topic(messages, "strut_corrections")[700]
+    time, topic, kind, raw = messages[place]
+    message = STORE.deserialize_cdr(raw, kind)
+    message.position = message.position.copy()
+    message.position[3] = np.nextafter(message.position[3], 1.0)
+    messages[place] = time, topic, kind, serialized(kind, message)
+    bag = write_bag(tmp_path / "run", messages)
+    _, result = opened(bag)
+    assert counted(result) == {IDENTICAL: 1199, DIFFERENT: 1}
+    assert result.outcome[700] == DIFFERENT
+    assert call(bag) == 1
+    said = capsys.readouterr().out
+    assert f"stamp {time // 10**9}.{time % 10**9:09d}" in said
+    assert "strut_4, correction recorded" in said
+    assert call(bag, "--tolerance-um", "1e-6") == 0
+
+
+def test_a_change_that_the_journal_hides_is_found(run, tmp_path):
+    """A temperature of the journal is altered by 1 K: from there on until the next page answers differ."""
+    messages = list(run.messages)
+    for place in of_topic(messages, "journal"):
+        time, topic, kind, raw = messages[place]
+        text = STORE.deserialize_cdr(raw, kind).data
+        altered = text.replace('"value": 23.4', '"value": 24.4')
+        messages[place] = time, topic, kind, serialized(kind, TYPES[TEXT](altered))
+    _, result = opened(write_bag(tmp_path / "run", messages))
+    different = np.flatnonzero(result.outcome == DIFFERENT)
+    assert 150 <= different[0] < 152
+    assert different[-1] < 200
+    assert result.states_differ == [200]
+
+
+def test_commands_without_stamp_find_their_answers(tmp_path):
+    """Only the nominal lengths tell which command an answer belongs to; refused ones lie between."""
+    machine = RecordedMachine()
+    for n in range(60):
+        machine.send(wave_pose(n), stamped=False)
+        if n % 7 == 3:
+            machine.send(FAR, stamped=False, told=n % 2 == 0)
+    machine.page()
+    _, result = opened(write_bag(tmp_path / "run", machine.messages))
+    assert counted(result) == {IDENTICAL: 60}
+    assert [refused.reason for refused in result.refused] == ["step"] * 9
+
+
+def test_commands_of_one_stamp_find_their_answers(tmp_path):
+    """A middleware may bring a command twice, a sender may use a stamp again; one of them may be refused."""
+    machine = RecordedMachine()
+    for n in range(60):
+        machine.send(wave_pose(n))
+        if n % 3 == 1:
+            machine.now -= MILLISECOND
+            machine.send(FAR if n % 2 else wave_pose(n))
+            machine.now -= MILLISECOND
+            machine.send(wave_pose(n + 1))
+    machine.page()
+    _, result = opened(write_bag(tmp_path / "run", machine.messages))
+    assert counted(result) == {IDENTICAL: 90}
+    assert [refused.reason for refused in result.refused] == ["step"] * 10
+
+
+def test_a_node_that_is_restarted_begins_anew(tmp_path):
+    """Two lives of a node in one bag: counts begin at zero again, and so does its state."""
+    first, second = RecordedMachine(), RecordedMachine()
+    first.wave(120)
+    second.messages.clear()
+    second.now = first.now + 700 * MILLISECOND
+    second.page()
+    second.wave(80, 40)
+    second.page()
+    _, result = opened(write_bag(tmp_path / "run", first.messages + second.messages))
+    assert counted(result) == {IDENTICAL: 200}
+
+
+def test_pages_carry_numbers_exactly():
+    machine = RecordedMachine()
+    machine.compensator.set_temperature("strut_2", 20.1)
+    machine.wave(3)
+    snapshot, page = machine.compensator.snapshot(), read_page(machine.journal.page(0.0))
+    for name in ("state", "poses", "switches"):
+        np.testing.assert_array_equal(page.snapshot[name], np.array(snapshot[name]))
+    assert page.snapshot["temperatures"] == {"strut_2": 20.1}
+    assert page.entries[0].values == {"name": "strut_2", "value": 20.1}
+    fresh = read_page(RecordedMachine().journal.page(0.0))
+    assert np.isnan(fresh.snapshot["state"]).any(), "NaN is null on the way"
+
+
+def test_snapshot_takes_another_compensator_to_the_same_place():
+    """After a snapshot both give the same bits, in the middle of a ramp too."""
+    one = RecordedMachine()
+    one.compensator.set_temperature("platform", 25.0)
+    one.wave(50)
+    one.compensator.enable(False)
+    one.wave(5, 50)
+    other = Compensator(one.geometry, one.compensator.model)
+    other.restore(one.compensator.snapshot())
+    assert other.ramping
+    for compensator in (one.compensator, other):
+        compensator.set_temperature("strut_6", 19.0)
+        compensator.correct(wave_pose(55), 1e-3)
+    assert one.compensator.command.tobytes() == other.command.tobytes()
+    with pytest.raises(ModelError, match=r"snapshot\.state: must be 43 numbers"):
+        other.restore({"state": [1.0]})
+
+
+def test_journal_stays_short_when_something_goes_wrong_very_often():
+    """Refused first commands reset each time; refused commands may come at a kilohertz."""
+    machine = RecordedMachine()
+    for _ in range(300):
+        machine.compensator.reset(np.full(6, 0.5))
+    for n in range(300):
+        machine.journal.refused(n, "step", "too far")
+    page = read_page(machine.journal.page(0.0))
+    assert [entry.what for entry in page.entries] == ["reset"] + ["refused"] * REFUSALS_PER_PAGE
+    assert page.refused_more == 300 - REFUSALS_PER_PAGE
+
+
+# ---- what a recorder may lose ----
+
+
+def test_recording_that_begins_in_motion_is_replayed_from_its_first_page(run, tmp_path):
+    """A recorder that comes late gets the last page from before, and hears the next after at most a second."""
+    late = [message for message in run.messages if message[0] > BEGAN + 430 * MILLISECOND]
+    kept = [run.messages[of_topic(run.messages, topic)[4]] for topic in ("journal", "files")]
+    joined = late[0][0]
+    messages = [(joined, *message[1:]) for message in kept] + late
+    _, result = opened(write_bag(tmp_path / "run", messages))
+    assert counted(result) == {BEFORE: 70, IDENTICAL: 700}
+    assert (result.outcome[:70] == BEFORE).all()
+
+
+def test_recording_that_begins_at_rest_needs_no_further_page(run, tmp_path):
+    """The page from before says what the first answer follows from, when no command lies between."""
+    last = of_topic(run.messages, "journal")[4]
+    kept = [run.messages[of_topic(run.messages, "files")[4]], run.messages[last]]
+    _, result = opened(write_bag(tmp_path / "run", kept + run.messages[last + 1 :]))
+    assert counted(result) == {IDENTICAL: 800}
+
+
+@pytest.mark.parametrize("topic", ["tool_pose_command", "strut_corrections", "strut_commands", "journal"])
+def test_what_the_recorder_has_lost_is_never_called_a_difference(run, tmp_path, topic):
+    """Every message of a kind is lost once in a while; what is compared is identical, the rest is said."""
+    numbers = of_topic(run.messages, topic)[5::97] if topic != "journal" else of_topic(run.messages, topic)[3::4]
+    _, result = opened(write_bag(tmp_path / "run", without(run.messages, *numbers)))
+    found = counted(result)
+    assert DIFFERENT not in found
+    assert found[IDENTICAL] > 500
+    assert not result.states_differ
+    if topic.startswith("strut"):
+        assert found == {IDENTICAL: 1200}, "one half of an answer is enough"
+
+
+def test_both_halves_of_an_answer_lost(run, tmp_path, capsys):
+    """Its command looks refused; the count between two pages says that it was answered."""
+    halves = [of_topic(run.messages, topic)[430] for topic in ("strut_commands", "strut_corrections")]
+    _, result = opened(write_bag(tmp_path / "run", without(run.messages, *halves)))
+    found = counted(result)
+    assert DIFFERENT not in found
+    assert found[UNCERTAIN] == 1
+    assert found[IDENTICAL] + found[LOST] == 1198
+    assert found[LOST] < 70
+    assert [refused.reason for refused in result.refused] == ["not_taken", "step"]
+    assert call(tmp_path / "run") == 0
+    assert "the recorder has lost answers that the journal counts: 1" in capsys.readouterr().out
+
+
+def test_one_half_is_enough_and_other_topics_do_not_disturb(run, tmp_path):
+    """Without strut_commands, with measured struts in another order, and with a topic of a type nobody knows."""
+    messages = [message for message in run.messages if not message[1].endswith("strut_commands")]
+    names = [f"strut_{n}" for n in (6, 5, 4, 3, 2, 1)]
+    for n, broken in enumerate((False, True)):
+        numbers = np.arange(6.0 - broken)
+        message = TYPES[JOINT_STATE](RecordedMachine().header(BEGAN), names, numbers, np.zeros(0), np.zeros(0))
+        messages.append((BEGAN + n, "/strut_states", JOINT_STATE, serialized(JOINT_STATE, message)))
+    messages.append((BEGAN, "/other/journal", "std_msgs/msg/Header", b"\0\1\0\0"))
+    recording, result = opened(write_bag(tmp_path / "run", messages))
+    assert counted(result) == {IDENTICAL: 1200}
+    assert recording.topics["strut_states"].values.tolist() == [[5.0, 4.0, 3.0, 2.0, 1.0, 0.0]]
+    assert "1 messages of strut_states left out" in recording.notes[0]
+
+
+def test_spare_bytes_behind_messages_do_no_harm(run, tmp_path):
+    """What rclpy's serialize_message makes may end in four bytes that belong to nothing."""
+    messages = [(*message[:3], message[3] + b"\xe0\0\0\0") for message in run.messages]
+    _, result = opened(write_bag(tmp_path / "run", messages))
+    assert counted(result) == {IDENTICAL: 1200}
+
+
+def test_folder_of_a_killed_recorder_is_read_without_metadata(run, tmp_path):
+    """Only metadata.yaml is missing, and the bag is split in two files."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name, part in (("a", run.messages[:2000]), ("b", run.messages[2000:])):
+        bag = write_bag(tmp_path / name, part)
+        shutil.move(bag / f"{name}.mcap", folder)
+    recording, result = opened(folder)
+    assert counted(result) == {IDENTICAL: 1200}
+    assert "metadata.yaml is missing" in recording.notes[0]
+
+
+def test_bag_of_an_older_recorder(run, tmp_path):
+    """Until ROS 2 Humble sqlite bags had no message definitions, and no tables about themselves."""
+    (file,) = write_bag(tmp_path / "run", run.messages, "sqlite3").glob("*.db3")
+    with contextlib.closing(sqlite3.connect(file)) as database, database:
+        for table in ("schema", "metadata", "message_definitions"):
+            database.execute(f"DROP TABLE {table}")
+        database.execute("ALTER TABLE topics DROP COLUMN type_description_hash")
+    _, result = opened(file)
+    assert counted(result) == {IDENTICAL: 1200}
+
+
+# ---- why commands have no answer ----
+
+
+def test_refused_commands_have_reasons(tmp_path):
+    """The journal's own, else what the replay finds, else that nothing in the arithmetic refuses it."""
+    machine = RecordedMachine()
+    machine.wave(20)
+    machine.send(FAR)
+    machine.send(Pose([0.0, 0.0, 5.0], np.eye(3)), told=False)
+    machine.page()
+    machine.send(wave_pose(20))
+    messages = machine.messages[:-2]  # neither half of the last answer
+    _, result = opened(write_bag(tmp_path / "run", messages))
+    assert counted(result) == {IDENTICAL: 20}
+    reasons = [(refused.reason, refused.from_journal) for refused in result.refused]
+    assert reasons == [("step", True), ("stroke", False), ("not_taken", False)]
+
+
+# ---- with another model ----
+
+
+def offset_model(folder: Path, offset_um: float) -> Path:
+    """Write a model whose struts are all too long by an offset."""
+    data = {"format": "hexapod_comp/model", "version": 1, "machine": "paper", "name": "all too long"}
+    data |= {"date": "2026-01-31", "sources": [], "struts": {"offset_um": offset_um}}
+    path = folder / "offset.yaml"
+    path.write_text(yaml.safe_dump(data), encoding="utf-8")
+    return path
+
+
+def test_another_model_shows_what_it_would_have_corrected(tmp_path, capsys):
+    """Recorded without a model, so with corrections of zero; struts too long by 30 µm are told 30 µm less.
+
+    A difference of lengths below a metre is exact to 1e-16 m.
+    """
+    machine = RecordedMachine(model=offset_model(tmp_path, 0.0))
+    machine.wave(200)
+    machine.page()
+    bag = write_bag(tmp_path / "run", machine.messages)
+    model = offset_model(tmp_path, 30.0)
+    assert call(bag, "--model", model, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["outcomes"]["identical"] == 200
+    np.testing.assert_allclose(told["other"]["largest_difference_m"], 30e-6, rtol=0.0, atol=1e-15)
+    assert call(bag, "--model", model, "--out", tmp_path / "run.csv", "--pictures", tmp_path / "pictures") == 0
+    with open(tmp_path / "run.csv", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 200
+    assert {row["other_L3_um"] for row in rows} == {"-30.000000"}
+    assert {row["outcome"] for row in rows} == {"identical"}
+    assert "model all too long" in capsys.readouterr().out
+    assert call(bag, "--model", "ideal") == 0
+    assert "model ideal" in capsys.readouterr().out
+
+
+def test_bag_without_files_asks_for_them(tmp_path, capsys):
+    """Geometry and model in use are known by their hash only; the user has them."""
+    machine = RecordedMachine()
+    machine.wave(40)
+    machine.page()
+    messages = [message for message in machine.messages if not message[1].endswith("files")]
+    bag = write_bag(tmp_path / "run", messages)
+    with pytest.raises(InputFileError, match=r"does not carry the machine 'paper'.*--machine"):
+        call(bag)
+    with pytest.raises(InputFileError, match=r"does not carry the model 'virtual machine'.*--model"):
+        call(bag, "--machine", "paper")
+    assert call(bag, "--machine", "paper", "--model", "paper_machine") == 0
+    assert "identical bit for bit" in capsys.readouterr().out
+    assert call(bag, "--machine", "paper", "--model", "paper_lines_model") == 0
+    said = capsys.readouterr().out
+    assert "not at hand" in said
+    assert "corrections differ" in said
+
+
+# ---- what the verb writes ----
+
+
+def test_verb_writes_report_pictures_and_json(run, tmp_path, capsys):
+    bag = write_bag(tmp_path / "run", run.messages)
+    assert call(bag, "--pictures", tmp_path / "pictures") == 0
+    said = capsys.readouterr().out
+    assert "1201 commands, 1200 answered, 1 not" in said
+    assert "replayed 1200 of 1200 answers: identical bit for bit" in said
+    assert "changes between commands: 2 × enable, 1 × model, 2 × reset, 2 × temperature" in said
+    pictures = {path.name for path in (tmp_path / "pictures").iterdir()}
+    assert pictures == {"corrections.png", "commands.png", "tool.png", "refused.png"}
+    assert call(bag, "--json", "--out", tmp_path / "run.json") == 0
+    told = json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))
+    assert told["same"] is True
+    assert told["outcomes"]["identical"] == 1200
+    assert told["changes"][0]["name"] == "strut_1"
+    assert math.isclose(told["changes"][0]["value"], 23.4, rel_tol=0.0)
+
+
+def test_replay_needs_no_ros(run, tmp_path):
+    bag = write_bag(tmp_path / "run", run.messages)
+    here = Path(__file__).parent
+    env = {**os.environ, "PYTHONPATH": f"{here}{os.pathsep}{here.parent}"}
+    code = (
+        "import sys\n"
+        "for name in ('rclpy', 'std_msgs', 'sensor_msgs', 'geometry_msgs'): sys.modules[name] = None\n"
+        "import test_replay\n"
+        f"sys.exit(test_replay.call({str(bag)!r}))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
+    assert done.returncode == 0, done.stderr
+    assert "identical bit for bit" in done.stdout
+
+
+# ---- bags that cannot be used ----
+
+
+def test_several_machines_are_told_apart(run, tmp_path):
+    mill = full_run(tmp_path, "/shop/mill")
+    bag = write_bag(tmp_path / "both", run.messages + mill.messages)
+    with pytest.raises(InputFileError, match=r"several machines; choose one with --namespace: /, /shop/mill"):
+        read_recording(bag)
+    with pytest.raises(InputFileError, match=r"no machine in lathe: /, /shop/mill"):
+        read_recording(bag, "lathe")
+    for namespace, node in (("/", "/compensator"), ("shop/mill", "/shop/mill/compensator")):
+        recording, result = opened(bag, namespace)
+        assert recording.node == node
+        assert counted(result) == {IDENTICAL: 1200}
+
+
+@pytest.mark.parametrize(
+    ("left_out", "message"),
+    [
+        (("journal",), "holds no journal of a compensator.*Its topics: /compensator/files"),
+        (("tool_pose_command",), "lacks /tool_pose_command"),
+        (("strut_commands", "strut_corrections"), "lacks /strut_corrections .or strut_commands."),
+    ],
+)
+def test_missing_topics_are_named(run, tmp_path, left_out, message):
+    messages = [message for message in run.messages if not message[1].endswith(left_out)]
+    with pytest.raises(InputFileError, match=message):
+        read_recording(write_bag(tmp_path / "run", messages))
+
+
+def test_wrong_types_are_named(run, tmp_path):
+    for topic in ("tool_pose_command", "journal"):
+        messages = [
+            (time, name, "std_msgs/msg/Header" if name.endswith(topic) else kind, raw)
+            for time, name, kind, raw in run.messages[:10]
+        ]
+        with pytest.raises(InputFileError, match=rf"{topic}: must be of type \w+/msg/\w+ .found 'std_msgs/msg/Header'"):
+            read_recording(write_bag(tmp_path / topic, messages))
+
+
+def test_paths_that_are_no_bag(tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
+    (tmp_path / "zero.mcap").touch()
+    write_bag(tmp_path / "nothing", [])
+    for name, message in (
+        ("none", "no such file or folder"),
+        ("empty", "neither metadata.yaml nor"),
+        ("old.bag", "must be a bag"),
+        ("zero.mcap", "seems to be empty"),
+        ("nothing", "without messages"),
+    ):
+        with pytest.raises(InputFileError, match=message):
+            read_recording(tmp_path / name)
+    assert main(["replay", str(tmp_path / "none")]) == 2
+    assert capsys.readouterr().err == f"hexapod_comp: error: {tmp_path}/none: there is no such file or folder\n"
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_damaged_files_end_in_a_clear_error(run, tmp_path, storage):
+    """Cut anywhere, or with bytes altered anywhere: an error that names the file, or what can still be read."""
+    bag = write_bag(tmp_path / "run", run.messages[:400], storage)
+    (file,) = bag.glob("run.[md][cb]*")
+    whole, draw = file.read_bytes(), np.random.default_rng(5)
+    for case in range(60):
+        damaged = bytearray(whole)
+        if case % 2:
+            del damaged[int(draw.integers(len(whole))) :]
+        else:
+            for place in draw.integers(len(whole), size=8):
+                damaged[place] = draw.integers(256)
+        target = tmp_path / f"{case}{file.suffix}"
+        target.write_bytes(damaged)
+        with contextlib.suppress(HexapodError):  # nothing else may be raised
+            opened(target)
+        if case % 2 and storage == "mcap" and len(damaged):
+            with pytest.raises(InputFileError, match="recorder is killed"):
+                read_recording(target)
+
+
+def test_messages_that_are_damaged_are_named(run, tmp_path):
+    """A message cut short, a page that is no JSON, of another version, or without its numbers."""
+    pages = [
+        ("{", "not JSON"),
+        ("[1]", "must be of version 1"),
+        ('{"journal": 9}', "must be of version 1, not 9"),
+        ('{"journal": 1}', "not a page of the journal"),
+    ]
+    for n, (text, message) in enumerate(pages):
+        messages = [*run.messages[:10], (BEGAN, "/compensator/journal", TEXT, serialized(TEXT, TYPES[TEXT](text)))]
+        with pytest.raises(InputFileError, match=f"/compensator/journal at {BEGAN} ns: {message}"):
+            read_recording(write_bag(tmp_path / str(n), messages))
+    time, topic, kind, raw = run.messages[of_topic(run.messages, "tool_pose_command")[0]]
+    with pytest.raises(InputFileError, match=f"/tool_pose_command at {time} ns: cannot be read"):
+        read_recording(write_bag(tmp_path / "cut", [*run.messages[:8], (time, topic, kind, raw[:20])]))
+
+
+JUNK = (None, [], {}, "x", "\x1b[2J", -1, 0.5, math.inf, 1e30, 10**30, True, [None] * 6, {"x": 1})
+"""What stands in a page where something else should."""
+
+
+def places_in(content: object, path: tuple = ()) -> list[tuple]:
+    """Return the way to every value inside nested lists and mappings."""
+    items = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
+    inner = [place for key, value in items for place in places_in(value, (*path, key))]
+    return [path, *inner] if path else inner
+
+
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
+def test_pages_that_are_wrong_somewhere_never_end_in_a_traceback(tmp_path, capsys):
+    """One value of the journal is junk, 40 times: an error of the package, or a report."""
+    machine, draw = RecordedMachine(model=offset_model(tmp_path, 10.0)), np.random.default_rng(11)
+    machine.wave(20)
+    machine.compensator.set_temperature("strut_1", 21.0)
+    machine.compensator.enable(False)
+    machine.compensator.set_model(machine.load(offset_model(tmp_path, 20.0)))
+    machine.compensator.reset(machine.compensator.command)
+    machine.send(FAR)
+    machine.page()
+    machine.wave(20, 20)
+    machine.page()
+    numbers = of_topic(machine.messages, "journal")
+    for case in range(40):
+        messages = list(machine.messages)
+        place = numbers[case % len(numbers)]
+        time, topic, kind, raw = messages[place]
+        page = json.loads(STORE.deserialize_cdr(raw, kind).data)
+        ways = [way for way in places_in(page) if way[:2] != ("snapshot", "state") or way[-1] in (0, "state")]
+        *way, last = ways[int(draw.integers(len(ways)))]
+        target = page
+        for key in way:
+            target = target[key]
+        target[last] = JUNK[int(draw.integers(len(JUNK)))]
+        messages[place] = time, topic, kind, serialized(kind, TYPES[TEXT](json.dumps(page)))
+        with contextlib.suppress(HexapodError):
+            call(write_bag(tmp_path / str(case), messages))
+    assert "\x1b" not in capsys.readouterr().out
+
+
+def test_nothing_to_compare_is_an_error(run, tmp_path):
+    """Recorded in motion, and shorter than from one page to the next."""
+    last = of_topic(run.messages, "journal")[4]
+    kept = [run.messages[of_topic(run.messages, "files")[4]], run.messages[last]]
+    bag = write_bag(tmp_path / "run", kept + run.messages[last + 50 : last + 90])
+    with pytest.raises(InputFileError, match="nothing in it can be compared"):
+        call(bag)
+
+
+def test_files_of_the_journal_must_have_their_hash():
+    text = json.dumps({"journal": 1, "files": {"model": {"name": "m", "sha256": "0" * 64, "text": "x"}}})
+    with pytest.raises(JournalError, match="does not have the hash"):
+        read_sources(text)
+
+
+def test_snapshot_of_another_version_is_refused(run, tmp_path):
+    """A state vector that has another length than here comes from another version of the arithmetic."""
+    messages = list(run.messages)
+    place = of_topic(messages, "journal")[0]
+    time, topic, kind, raw = messages[place]
+    page = json.loads(STORE.deserialize_cdr(raw, kind).data)
+    page["snapshot"]["state"].append(1.0)
+    messages[place] = time, topic, kind, serialized(kind, TYPES[TEXT](json.dumps(page)))
+    with pytest.raises(HexapodError, match=r"snapshot\.state: must be 43 numbers"):
+        opened(write_bag(tmp_path / "run", messages))
+
+
+def test_bag_of_sqlite_without_its_tables(tmp_path):
+    path = tmp_path / "other.db3"
+    with sqlite3.connect(path) as database:
+        database.execute("CREATE TABLE t (a)")
+    with pytest.raises(InputFileError, match="cannot be read as a bag"):
+        read_recording(path)
+
+
+def test_without_rosbags_the_error_says_how_to_get_it(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    (tmp_path / "run.mcap").touch()
+    with pytest.raises(HexapodError, match=r"pip install hexapod_comp\[bags\].*python3-rosbags-pip"):
+        read_recording(tmp_path / "run.mcap")
+
+
+def test_ideal_model_is_recorded_as_none(tmp_path):
+    machine = RecordedMachine(model=offset_model(tmp_path, 0.0))
+    from hexapod_comp.journal import Source
+
+    machine.sources["model"] = Source.of("ideal", "")
+    machine.compensator.set_model(MachineModel(machine.geometry.name))
+    machine.wave(10)
+    machine.page()
+    _, result = opened(write_bag(tmp_path / "run", machine.messages))
+    assert counted(result) == {IDENTICAL: 10}
