@@ -1,7 +1,8 @@
 # make demo · make test: all that they need goes into .venv, once; later runs start at once and stay offline.
 
 PYTHON ?= python3
-BIN := .venv/bin
+VENV := .venv
+BIN := $(VENV)/bin
 
 # The environment brings its own ROS 2. What a sourced ROS 2 installation, or another environment,
 # leaves in these variables would be mixed into it, binary libraries included.
@@ -13,47 +14,84 @@ endif
 
 # A moved or copied tree carries a .venv that still runs the code at the old place, and an upgrade of the
 # system may have taken its Python away: make it anew.
-ifneq ($(shell test -x .venv/bin/python && cat .venv/made-in 2>/dev/null),$(CURDIR))
-.PHONY: .venv/made-in
+ifneq ($(shell test -x $(BIN)/python && cat $(VENV)/made-in 2>/dev/null),$(CURDIR))
+.PHONY: $(VENV)/made-in
 endif
 
-.PHONY: help demo test bench clean
+# LinuxCNC's modules load into the version of Python that they were built for, usually the system's.
+LINUXCNC_PYTHON ?= /usr/bin/python3
+BESIDE_LINUXCNC = $(MAKE) --no-print-directory VENV=.venv-linuxcnc PYTHON='$(LINUXCNC_PYTHON)'
+
+.PHONY: help demo test test-linuxcnc linuxcnc bench fuzz clean run-linuxcnc-tests ros
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo    run the compensator against a simulated machine; figures, out/demo.png'
 	@echo 'make test    ruff, mypy and the tests'
-	@echo 'make bench   speed beside NumPy, SciPy, MuJoCo and Pinocchio, and a relay node'
-	@echo 'make clean   remove .venv, build folders and caches (out/ stays)'
+	@echo 'make bench   speed beside NumPy, SciPy, MuJoCo, Pinocchio, LinuxCNC and a relay node'
+	@echo 'make fuzz    a nightly run of the fuzzing tests: 100,000 cases and more'
+	@echo 'make linuxcnc       .venv-linuxcnc, to run beside LinuxCNC'
+	@echo 'make test-linuxcnc  the tests with a real LinuxCNC; root installs the package first'
+	@echo 'make clean   remove .venv, .venv-linuxcnc, build folders and caches (out/ stays)'
 	@echo 'PYTHON=...   the Python (3.10 to 3.13) from which .venv is made; make clean before a change'
 
-demo: .venv/with-ros
+demo: $(VENV)/with-ros
 	@$(BIN)/hexapod_comp demo
 
-test: .venv/with-ros,test
+test: $(VENV)/with-ros,test
 	$(BIN)/ruff check
 	$(BIN)/mypy
 	@# The matrices of the tests are small: more threads of OpenBLAS would only wait for each other.
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest --ignore=test/test_linuxcnc.py
 
-bench: .venv/with-ros,bench
+bench: $(VENV)/with-ros,bench
 	@$(BIN)/python -m benchmarks
 
+fuzz: $(VENV)/with-ros,test
+	@$(BIN)/python -m benchmarks.fuzz
+
+linuxcnc:
+	@$(BESIDE_LINUXCNC) ros
+
+ros: $(VENV)/with-ros
+
+# Where .venv has the Python of LinuxCNC's modules it serves, else an environment of that Python does.
+test-linuxcnc: $(VENV)/with-ros,test
+	@$(INSTALL_LINUXCNC)
+	@if ! command -v linuxcnc >/dev/null || $(BIN)/python -c "$$HAS_HAL" 2>/dev/null; \
+	then $(MAKE) --no-print-directory run-linuxcnc-tests; \
+	else $(BESIDE_LINUXCNC) run-linuxcnc-tests; fi
+
+run-linuxcnc-tests: $(VENV)/with-ros,test
+	LINUXCNC_TESTS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest test/test_linuxcnc.py
+
 clean:
-	rm -rf .venv build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-linuxcnc build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-.venv/made-in:
+$(VENV)/made-in:
 	@'$(PYTHON)' -c "$$CHECK_PYTHON" || { [ $$? -ne 127 ] || echo "$$NO_PYTHON"; exit 1; } >&2
-	@echo "Making .venv ..."
-	@'$(PYTHON)' -m venv --clear .venv
+	@echo "Making $(VENV) ..."
+	@'$(PYTHON)' -m venv --clear $(VENV)
 	@pwd -P > $@
 
-.venv/with-%: setup.py .venv/made-in
-	@echo "Installing hexapod_comp[$*] and what it needs into .venv, once; this takes a minute or two ..."
+$(VENV)/with-%: setup.py $(VENV)/made-in
+	@echo "Installing hexapod_comp[$*] and what it needs into $(VENV), once; this takes a minute or two ..."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-input --use-pep517 --editable '.[$*]'
-	@touch .venv/with-ros $@
+	@touch $(VENV)/with-ros $@
+
+define INSTALL_LINUXCNC
+if ! command -v linuxcnc >/dev/null && [ "$$(id -u)" -eq 0 ] && command -v apt-get >/dev/null; then \
+    export DEBIAN_FRONTEND=noninteractive; echo "Installing linuxcnc-uspace ..."; apt-get update -qq; \
+    apt-get install -qq -y --no-install-recommends linuxcnc-uspace util-linux bsdutils >/dev/null || true; fi
+endef
+
+define HAS_HAL
+from hexapod_comp.hal_component import load_module
+load_module()
+endef
+export HAS_HAL
 
 define NO_PYTHON
 make: '$(PYTHON)' is not a command here. Python 3.10 to 3.13 is needed: install it, or name another one,
