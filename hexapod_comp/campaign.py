@@ -37,6 +37,9 @@ CAMPAIGN_VERSION = 1
 INSTRUMENTS = ("1-D", "5-D", "6-D")
 """Lasers on grid lines: linear only; with two straightnesses, pitch and yaw; with roll as well."""
 
+MOST_READINGS = 500_000
+"""Larger campaigns are refused: at one reading a second this one takes six days, and a unit may be wrong."""
+
 DIAGONALS = (0, 4, 16)
 """None, the box's four body diagonals, or these and the two diagonals of each of its six faces."""
 
@@ -101,8 +104,9 @@ class Campaign:
             raise InputFileError("campaign", "instrument", f"must be one of {', '.join(INSTRUMENTS)}", self.instrument)
         if self.diagonals not in DIAGONALS:
             raise InputFileError("campaign", "diagonals", f"must be one of {DIAGONALS}", self.diagonals)
-        if self.cycles < 1 or self.poses < 0:
-            raise InputFileError("campaign", "cycles, poses", "must be at least 1 and 0", [self.cycles, self.poses])
+        if not (1 <= self.cycles <= MOST_READINGS and 0 <= self.poses <= MOST_READINGS):
+            problem = f"must be at least 1 and 0, and at most {MOST_READINGS}"
+            raise InputFileError("campaign", "cycles, poses", problem, [self.cycles, self.poses])
         if not (self.instrument or self.diagonals or self.poses):
             raise InputFileError("campaign", "instrument", "or diagonals or poses are needed: nothing is measured")
         for name in ("tilt", "beam_slope", "repeatability"):
@@ -110,6 +114,17 @@ class Campaign:
                 raise InputFileError("campaign", name, "must be finite and not negative", getattr(self, name))
         if len(self.noise) != len(KINDS) or not all(0.0 <= sigma < math.inf for sigma in self.noise):
             raise InputFileError("campaign", "noise", "must be finite and not negative", list(self.noise))
+        if not self._roughly() <= MOST_READINGS:
+            problem = f"would be some {self._roughly():.3g} readings, at most {MOST_READINGS} are allowed"
+            raise InputFileError("campaign", "cell, step, cycles, poses", problem)
+
+    def _roughly(self) -> float:
+        """Return about how many readings the campaign takes, without making any."""
+        sides = np.ptp(self.box, axis=0)
+        cells, passes = sides / self.cell + 1.0, 2.0 * self.cycles * (sides / self.step + 1.0)
+        of_lines = cells.prod() * (passes / cells).sum() * len(self.channels(0)) if self.instrument else 0.0
+        of_diagonals = 2.0 * self.cycles * self.diagonals * (float(np.linalg.norm(sides)) / self.step + 1.0)
+        return float(of_lines + of_diagonals + 6.0 * self.poses)
 
     def nodes(self, axis: int) -> np.ndarray:
         """Return where the grid's lines stand along an axis, m; the last cell may be narrower."""

@@ -238,7 +238,7 @@ def _header_number(path: str | Path, header: dict[str, str], key: str, whole: bo
         number = float(header[key])
     except ValueError:
         number = math.nan
-    if not 0.0 < number < math.inf or (whole and number != int(number)):
+    if not 0.0 < number < math.inf or (whole and number != int(number)) or not _plain(header[key]):
         kind = "whole number" if whole else "number"
         raise InputFileError(path, f"header, {key}", f"must be a {kind} above zero", header[key])
     return number
@@ -315,6 +315,9 @@ def read_rtl(path: str | Path) -> Static:
         if name not in UNDERSTOOD
     ]
     notes += [] if "EOF" in file.sections else [f"{path}: has no EOF:: at its end; is it whole?"]
+    if file.sections.get("EOF"):
+        line = file.sections["EOF"][0][0]
+        raise InputFileError(path, f"line {line}", "nothing may follow EOF::; are these two files?")
     return Static(targets, rows, entries, file.sha256, tuple(notes))
 
 
@@ -351,9 +354,14 @@ def _number(path: str | Path, line: int, text: str) -> float:
         number = float(text)
     except ValueError:
         number = math.nan
-    if not math.isfinite(number) or "_" in text:
+    if not math.isfinite(number) or not _plain(text):
         raise InputFileError(path, f"line {line}", "must be a finite number", text)
     return number
+
+
+def _plain(text: str) -> bool:
+    """Return whether a number looks like one to everybody: Python also reads 1_0 and １０ as ten."""
+    return text.isascii() and "_" not in text
 
 
 def _deviations(path: str | Path, file: Sectioned, targets: int, runs: int) -> list[tuple[int, int, float, int]]:

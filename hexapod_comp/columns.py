@@ -40,7 +40,7 @@ from .gathering import assemble
 from .geometry import STRUT_NAMES, HexapodGeometry
 from .kinematics import Structure, solve_poses, strut_lengths_batch
 from .measurement import AXES, FROM_PREVIOUS, UNKNOWN, MeasurementSet, Reading, Source, attitude_error
-from .pose import Pose, rotation_from_angles
+from .pose import Pose
 from .tables import Table
 
 COLUMNS_FORMAT = "hexapod_comp/columns"
@@ -252,7 +252,7 @@ def _read_poses(table: Table, columns: PoseColumns, used: set[str]) -> _Poses:
         return _Poses(positions, np.tile(np.eye(3), (len(positions), 1, 1)))
     turns = _read_numbers(table, columns.turn, columns.angle_unit, used)
     if len(columns.turn) == 3:
-        return _Poses(positions, rotation_from_angles(turns))
+        return _Poses(positions, table.rotations(turns))
     rotations = np.empty((len(turns), 3, 3))
     for n, ((line, _), quaternion) in enumerate(zip(table.rows, turns, strict=True)):
         try:

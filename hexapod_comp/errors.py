@@ -18,6 +18,10 @@ class HexapodError(Exception):
     reason = "error"
 
 
+LONGEST_PATH = 500
+"""A file's name is shown up to this length: what is wrong with it must still fit into the message."""
+
+
 class InputFileError(HexapodError):
     """A file cannot be used: what is wrong, at which key, with which value.
 
@@ -37,9 +41,10 @@ class InputFileError(HexapodError):
 
     def __init__(self, path: str | Path, key: str, problem: str, value: Any = None):
         self.path, self.key, self.value, self.problem = str(path), key, value, problem
-        where = f"{path}: {key}" if key else str(path)
+        file = printable(str(path), LONGEST_PATH)
+        where = f"{file}: {printable(key)}" if key else file
         found = "" if value is None else f" (found {shorten(value)})"
-        super().__init__(f"{where}: {problem}{found}")
+        super().__init__(printable(f"{where}: {problem}{found}", 2000))
 
 
 class GeometryError(HexapodError):
@@ -197,3 +202,9 @@ def shorten(value: Any, limit: int = 80) -> str:
     """Return ``repr(value)`` cut to `limit` characters, so that a message stays readable."""
     text = repr(value)
     return text if len(text) <= limit else text[: limit - 1] + "…"
+
+
+def printable(text: str, limit: int = 200) -> str:
+    """Return a text out of a file on one line, of at most `limit` characters, without codes for the terminal."""
+    shown = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text[: limit + 1])
+    return shown if len(text) <= limit else shown[: limit - 1] + "…"

@@ -13,16 +13,23 @@ import re
 import tempfile
 from collections.abc import Iterator
 from decimal import Decimal
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from .errors import InputFileError
+from .errors import InputFileError, shorten
 
 MAX_FILE_BYTES = 8_000_000
 """Larger files are refused before they are read: no model comes near it."""
+
+MAX_DEPTH = 32
+"""Deeper nested YAML is refused: a model needs five levels, and the parser's own stack ends at some thousand."""
+
+MOST_NEIGHBOURS = 1000
+"""Keys looked through for the one that a misspelt key may mean: in a hostile file that would take minutes."""
 
 UNITS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "in": 0.0254},
@@ -43,7 +50,7 @@ AMBIGUOUS_NUMBER = re.compile(r"[-+]?0[0-9A-Za-z]|.*[:_]")
 
 
 class _StrictLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Safe loader that refuses a key given twice, numbers that mislead, and references (``*name``)."""
+    """Safe loader that refuses a key given twice, and numbers that mislead."""
 
 
 def _mapping_without_duplicates(loader: Any, node: yaml.MappingNode) -> dict:
@@ -51,22 +58,37 @@ def _mapping_without_duplicates(loader: Any, node: yaml.MappingNode) -> dict:
     for key_node, _ in node.value:
         key = loader.construct_object(key_node, deep=True)
         if not isinstance(key, str):
-            raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is not text", key_node.start_mark)
+            raise _complaint(f"key {shorten(key)} is not text", key_node)
         if key in seen:
-            raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)
+            raise _complaint(f"key {shorten(key)} is given twice", key_node)
         seen.add(key)
     return loader.construct_mapping(node, deep=True)
+
+
+def _complaint(problem: str, node: yaml.Node | yaml.Event) -> yaml.YAMLError:
+    """Return (not raise) an error that says where in the text it is."""
+    return yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
 
 
 def _plain_number(loader: Any, node: yaml.ScalarNode) -> int | float:
     text = loader.construct_scalar(node)
     if AMBIGUOUS_NUMBER.match(text):
-        problem = f"{text[:40]!r} is not a plain decimal number"
-        raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
-    return int(text) if node.tag.endswith(":int") else loader.construct_yaml_float(node)
+        raise _complaint(f"{shorten(text)} is not a plain decimal number", node)
+    try:
+        return int(text) if node.tag.endswith(":int") else loader.construct_yaml_float(node)
+    except ValueError as error:  # Python reads no whole number of more than 4300 digits
+        raise _complaint(f"{shorten(text)} is too long for a number", node) from error
+
+
+def _date(loader: Any, node: yaml.ScalarNode) -> Any:
+    try:
+        return loader.construct_yaml_timestamp(node)
+    except ValueError as error:
+        raise _complaint(f"{shorten(node.value)} is no date: {error}", node) from error
 
 
 _StrictLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping_without_duplicates)
+_StrictLoader.add_constructor("tag:yaml.org,2002:timestamp", _date)
 for _tag in ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float"):
     _StrictLoader.add_constructor(_tag, _plain_number)
 
@@ -118,7 +140,7 @@ def read_yaml(path: str | Path, file_format: str, version: int) -> Section:
     """
     try:
         text = read_text(path)
-        _refuse_references(text)
+        _refuse_tricks(text)
         content = yaml.load(text, Loader=_StrictLoader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         problem = getattr(error, "problem", None) or type(error).__name__
@@ -137,14 +159,21 @@ def read_yaml(path: str | Path, file_format: str, version: int) -> Section:
     return section
 
 
-def _refuse_references(text: str) -> None:
-    """Raise on ``*name``: nested references let a short file stand for more values than memory holds."""
-    if "*" not in text:
-        return
+def _refuse_tricks(text: str) -> None:
+    """Raise on what lets a short file stand for something else, before anything is made of it.
+
+    Nested references (``*name``) stand for more values than memory holds, nesting overflows the parser's stack
+    and ends the process, a tag (``!!float``) makes the loader read a value as another type.
+    """
+    depth = 0
     for event in yaml.parse(text, Loader=_StrictLoader):
         if isinstance(event, yaml.AliasEvent):
-            problem = f"reference *{event.anchor} is not understood; write the value out"
-            raise yaml.constructor.ConstructorError(None, None, problem, event.start_mark)
+            raise _complaint(f"reference *{event.anchor} is not understood; write the value out", event)
+        if getattr(event, "tag", None) is not None:
+            raise _complaint(f"tag {shorten(event.tag)} is not understood; write the plain value", event)
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MAX_DEPTH:
+            raise _complaint(f"is nested more than {MAX_DEPTH} deep", event)
 
 
 def write_text_atomically(path: str | Path, text: str) -> None:
@@ -209,7 +238,7 @@ class Section:
     def take(self, key: str) -> Any:
         """Take a required value of any kind."""
         if key not in self._left:
-            near = difflib.get_close_matches(key, self._left, 1)
+            near = difflib.get_close_matches(key, islice(self._left, MOST_NEIGHBOURS), 1)
             raise self.error(key, "is missing" + (f"; did you mean it by {near[0]!r}?" if near else ""))
         return self._left.pop(key)
 

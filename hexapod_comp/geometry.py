@@ -26,6 +26,9 @@ STRUT_NAMES = tuple(f"strut_{i}" for i in range(1, 7))
 COINCIDENT = 1e-6
 """Base joints closer than this, m, are one joint given twice."""
 
+LONGEST_AXIS = 1e9
+"""Largest component of an axis: only its direction counts, and the square of a huge one overflows."""
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -335,6 +338,10 @@ def _frozen_array(values: object, shape: tuple[int, ...], key: str) -> np.ndarra
 
 def _unit_vectors(values: object, key: str) -> np.ndarray:
     vectors = _frozen_array(values, (6, 3), key)
+    largest = np.abs(vectors).max(axis=1, keepdims=True)
+    if largest.max() > LONGEST_AXIS:
+        index = int(largest.argmax())
+        raise GeometryError(f"{key}[{index}]", f"components must be at most {LONGEST_AXIS:g}", vectors[index].tolist())
     norms = np.linalg.norm(vectors, axis=1)
     if norms.min() < COINCIDENT:
         index = int(norms.argmin())

@@ -170,15 +170,17 @@ def _refuse_mixed(folder: Path, texts: dict[str, str]) -> None:
 
 def _read_pins(path: Path, text: str) -> dict[str, float]:
     """Return the pins that a HAL file sets."""
-    pins = {"screw-lead": 0.0}
-    for number, line in enumerate(text.splitlines(), 1):
+    pins: dict[str, float] = {}
+    for number, line in enumerate(text.split("\n"), 1):
         if not line or line.startswith("#"):
             continue
         found = SETP.fullmatch(line)
         if not found:
             raise InputFileError(path, f"line {number}", "is not setp of a genhexkins pin", line)
+        if found[1] in pins:
+            raise InputFileError(path, f"line {number}", "sets a pin again", line)
         pins[found[1]] = _number(path, number, found[2])
-    return pins
+    return {"screw-lead": 0.0} | pins
 
 
 def _vectors(path: Path, pins: dict[str, float], pin: str) -> np.ndarray:
@@ -198,16 +200,19 @@ def _comp_names(path: Path, text: str) -> list[str]:
         wrong = next((s for s in sections if s["COMP_FILE_TYPE"] != str(COMP_TYPE)), None)
         names = [section["COMP_FILE"] for section in sections]
     except (configparser.Error, KeyError) as error:
-        raise InputFileError(path, "", f"is not the lines that were written: {error}") from error
+        raise InputFileError(path, "", f"is not the lines that were written: {str(error).splitlines()[0]}") from error
     if wrong is not None:
         raise InputFileError(path, f"[{wrong.name}]COMP_FILE_TYPE", f"must be {COMP_TYPE}", wrong["COMP_FILE_TYPE"])
+    for section, name in zip(sections, names, strict=True):
+        if name not in COMP_FILES:
+            raise InputFileError(path, f"[{section.name}]COMP_FILE", f"must be one of {', '.join(COMP_FILES)}", name)
     return names
 
 
 def _read_table(path: Path, text: str, size: float) -> ScrewTable:
     """Read a compensation file up to the first line that does not begin with three numbers."""
     rows: list[list[float]] = []
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(text.split("\n"), 1):
         words = line.split()[:3]
         if len(words) < 3 or line.startswith("#"):
             break
@@ -227,6 +232,6 @@ def _number(path: Path, line: int, text: str) -> float:
         value = float(text)
     except ValueError:
         value = np.nan
-    if not np.isfinite(value):
+    if not np.isfinite(value) or "_" in text or not text.isascii():  # Python reads 1_0 and １０ as ten, C does not
         raise InputFileError(path, f"line {line}", "must be a finite number", text)
     return value

@@ -18,6 +18,9 @@ from .errors import PoseError
 QUATERNION_NORM_TOLERANCE = 1e-3
 """A quaternion whose norm is further from 1 than this is refused: it was never a rotation."""
 
+LARGEST_ANGLE = 1000.0
+"""Larger angles, rad, are refused: nobody turns a tool 159 times, and at 1e16 rounding turns it anywhere."""
+
 POSE_OK, POSE_NOT_FINITE, POSE_NOT_UNIT = range(3)
 """Outcomes of :func:`read_pose`."""
 
@@ -113,8 +116,15 @@ def rotation_from_angles(angles: np.ndarray) -> np.ndarray:
     Returns
     -------
     ndarray, shape (..., 3, 3)
+
+    Raises
+    ------
+    PoseError
+        An angle above :data:`LARGEST_ANGLE`.
     """
     angles = np.asarray(angles, dtype=float)
+    if (np.abs(angles) > LARGEST_ANGLE).any():
+        raise PoseError(f"angles must lie within ±{LARGEST_ANGLE:g} rad", float(np.abs(angles).max()))
     return Rotation.from_euler("YXZ", angles[..., [1, 0, 2]]).as_matrix()
 
 

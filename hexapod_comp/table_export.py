@@ -154,6 +154,9 @@ def make_table(
     OutsideFieldError
         A node is outside the field's box, and the field refuses that.
     """
+    rows = 2.0 * float((np.ptp(box, axis=0) / step + 1.0).prod())  # before any node is made
+    if rows > 2.0 * MOST_ROWS:
+        raise ModelError("step", f"gives some {rows:.3g} rows, allowed {MOST_ROWS}; take a larger one, m", step)
     nodes = tuple(_nodes(low, high, step) for low, high in box.T)
     shape = tuple(len(n) for n in nodes)
     if 2 * math.prod(shape) > MOST_ROWS:

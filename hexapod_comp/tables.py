@@ -6,8 +6,10 @@ import csv
 import hashlib
 import io
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,12 @@ CORRECTION_COLUMNS = tuple(f"correction_L{i}" for i in range(1, 7))
 
 MAX_ROWS = 2_000_000
 """Longer files are refused: an hour's path at 500 Hz fits, a device that never ends does not."""
+
+MAX_COLUMNS = 1000
+"""Wider files are refused: other laboratories' have some dozen columns."""
+
+MAX_LINE = 1_000_000
+"""Longer lines are refused, in characters: a file without line ends would be read into memory whole."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +73,9 @@ class Table:
         self.path = path
         numbered, self.sha256 = _read_rows(path)
         self.header = [name.strip() for name in numbered[0][1]] if numbered else []
+        if len(self.header) > MAX_COLUMNS:
+            problem = f"has {len(self.header)} columns, at most {MAX_COLUMNS} are allowed"
+            raise InputFileError(path, "header", problem)
         twice = [name for name in self.header if self.header.count(name) > 1]
         if twice:
             raise InputFileError(path, "header", "column is given twice", twice[0])
@@ -136,7 +147,15 @@ class Table:
             quaternions = self.numbers(quaternion_columns)
             return positions, _rotations_from_quaternions(self.path, self.labels(), quaternions)
         angles = self.numbers(angle_columns) if angle_columns else np.zeros((len(self.rows), 3))
-        return positions, rotation_from_angles(angles)
+        return positions, self.rotations(angles)
+
+    def rotations(self, angles: np.ndarray) -> np.ndarray:
+        """Return the rotation matrices (N, 3, 3) of the rows' angles (N, 3), rad."""
+        try:
+            return rotation_from_angles(angles)
+        except PoseError as error:
+            row = int(np.abs(angles).max(axis=1).argmax())
+            raise InputFileError(self.path, f"line {self.rows[row][0]}", str(error)) from error
 
     def number(self, line: int, index: int, text: str) -> float:
         """Return the finite number in a cell."""
@@ -144,7 +163,7 @@ class Table:
             value = float(text)
         except ValueError:
             value = math.nan
-        if not math.isfinite(value) or "_" in text:  # Python reads 1_0 as ten, nobody else does
+        if not math.isfinite(value) or "_" in text or not text.isascii():  # Python reads 1_0 and １０ as ten
             where = f"line {line}, column {self.header[index]}"
             raise InputFileError(self.path, where, "must be a finite number", text)
         return value
@@ -183,7 +202,7 @@ def _read_rows(path: str | Path) -> tuple[list[tuple[int, list[str]]], str]:
         with open(path, "rb", buffering=0) as file:
             source = _Hashed(file)
             stream = io.TextIOWrapper(io.BufferedReader(source), newline="", encoding="utf-8-sig")
-            lines = csv.reader(stream, skipinitialspace=True)
+            lines = csv.reader(_bounded_lines(path, stream), skipinitialspace=True)
             for row in lines:
                 if row and not row[0].startswith("#"):
                     numbered.append((lines.line_num, row))
@@ -196,6 +215,16 @@ def _read_rows(path: str | Path) -> tuple[list[tuple[int, list[str]]], str]:
     except UnicodeDecodeError as error:
         raise InputFileError(path, f"line {len(numbered) + 1} or later", "is not UTF-8 text") from error
     return numbered, source.sha256.hexdigest()
+
+
+def _bounded_lines(path: str | Path, stream: io.TextIOWrapper) -> Iterator[str]:
+    """Yield the lines of a stream; refuse one too long, and the zero bytes that spreadsheets never write."""
+    for number, line in enumerate(iter(partial(stream.readline, MAX_LINE + 1), ""), start=1):
+        if len(line) > MAX_LINE:
+            raise InputFileError(path, f"line {number}", f"is longer than the allowed {MAX_LINE} characters")
+        if "\0" in line:
+            raise InputFileError(path, f"line {number}", "is not text: it holds a zero byte")
+        yield line
 
 
 SHIFTS = {10.0**digits: digits for digits in range(-9, 10)}

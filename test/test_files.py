@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from hexapod_comp.errors import InputFileError
-from hexapod_comp.files import MAX_FILE_BYTES, UNITS, Section, read_text, read_yaml, write_text_atomically
+from hexapod_comp.files import (
+    MAX_FILE_BYTES,
+    MOST_NEIGHBOURS,
+    UNITS,
+    Section,
+    read_text,
+    read_yaml,
+    write_text_atomically,
+)
 
 HEAD = "format: test\nversion: 1\n"
 
@@ -91,9 +99,16 @@ def test_no_mapping(tmp_path, text):
         ("a: {b: 1, b: 2}", "'b' is given twice"),
         ("1: 2", "key 1 is not text"),
         ("[1, 2]: 3", "is not text"),
-        ("a: !!python/object/apply:os.system ['true']", "could not determine a constructor"),
+        ("a: !!python/object/apply:os.system ['true']", r"line 3: is not valid YAML: tag .*os\.system' is not under"),
+        ("a: !!bool maybe", r"tag 'tag:yaml\.org,2002:bool' is not understood"),
+        ("a: !!float ''", "write the plain value"),
+        ("a: 2026-13-45", "line 3: is not valid YAML: '2026-13-45' is no date"),
+        ("a: " + "1" * 5000, r"line 3: is not valid YAML: '1+… is too long for a number"),
         ("a: &x [1]\nb: *x", r"reference \*x is not understood"),
         ("[" * 5000, "is not valid YAML"),
+        ("a: " + "[" * 33, "nested more than 32 deep"),
+        ("a: " + "{a: " * 33, "nested more than 32 deep"),
+        ("a:\n " + "- " * 100_000 + "1", "nested more than 32 deep"),
     ],
 )
 def test_yaml_that_is_refused(tmp_path, text, said):
@@ -130,6 +145,27 @@ def test_what_yaml_does_not_take_for_a_number(tmp_path, number):
     """YAML 1.1 reads 1e-3 (no point) as text, and 400 digits overflow: refused by name, never guessed."""
     with pytest.raises(InputFileError, match="a_mm: must be"):
         load(tmp_path, HEAD + f"a_mm: {number}").quantity("a", "length")
+
+
+def test_deep_nesting_does_not_end_the_process(tmp_path):
+    """The parser builds its tree by recursion in C: four million brackets overflowed its stack (SIGSEGV)."""
+    with pytest.raises(InputFileError, match="nested more than 32 deep"):
+        load(tmp_path, HEAD + "a: " + "[" * 4_000_000)
+
+
+def test_a_missing_key_among_very_many(tmp_path):
+    """Looking for the nearest of half a million names took 17 s: only the first of them are looked through."""
+    others = "".join(f"n{number}: 1\n" for number in range(MOST_NEIGHBOURS))
+    with pytest.raises(InputFileError, match=r"format: is missing; did you mean it by 'formt'\?$"):
+        load(tmp_path, "formt: test\n" + others)
+    with pytest.raises(InputFileError, match=r"format: is missing$"):
+        load(tmp_path, others + "formt: test\n")
+
+
+def test_messages_are_one_line_without_control_codes(tmp_path):
+    with pytest.raises(InputFileError) as caught:
+        load(tmp_path, HEAD + '"a\\n\\e[2J": 1').finish()
+    assert str(caught.value).endswith(r"a\n\x1b[2J: is not a known key here (found 1)")
 
 
 # Values.

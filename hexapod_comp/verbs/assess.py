@@ -36,6 +36,9 @@ example:
   largest strut change 34.198 µm (two joints in a corner of their cubes and a strut allow 44.641 µm)"""
 
 POSE_COLUMNS = ("alpha_deg", "beta_deg", "gamma_deg", "x_mm", "y_mm", "z_mm")
+MOST_RESULTS = 10_000_000
+"""Machines times poses: more results are refused, they would need gigabytes."""
+
 PERCENTILES = (50.0, 95.0, 100.0)
 NAMES = ("median", "95 %", "max")
 
@@ -79,10 +82,15 @@ def add_parser(subparsers: common.Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
     from ..assessment import assess
+    from ..errors import CommandError
     from ..imperfections import ImperfectionBounds
     from ..tables import read_poses
 
     rows, poses = read_poses(common.input_file(args.poses))
+    if args.machines * len(poses) > MOST_RESULTS:
+        most = MOST_RESULTS // len(poses)
+        problem = f"--machines: at most {most} at {len(poses)} poses, not {args.machines}"
+        raise CommandError("usage", problem)
     geometry, _ = common.load_machine(args)
     bounds = ImperfectionBounds(
         joint=args.joint_um * 1e-6,

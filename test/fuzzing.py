@@ -1,0 +1,281 @@
+"""What the fuzz tests share: how many cases, nasty values, mutations of files, and a reading of YAML of their own.
+
+A bounded number of cases runs with the other tests, the same ones every time. ``python -m benchmarks.fuzz`` sets
+``HEXAPOD_FUZZ_CASES``: then as many are shared out among the tests, new ones for every ``--hypothesis-seed``.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import json
+import math
+import os
+import re
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from hypothesis import HealthCheck, Phase, settings
+from hypothesis import strategies as st
+
+from hexapod_comp.errors import HexapodError
+
+NIGHTLY = int(os.environ.get("HEXAPOD_FUZZ_CASES", "0"))
+"""Cases of a nightly run, shared out among the tests; 0 for the bounded run."""
+
+COUNTS: Counter[str] = Counter()
+"""Cases run, and cases accepted (``… accepted``), by test."""
+
+if "HEXAPOD_FUZZ_COUNTS" in os.environ:
+    KEPT = Path(os.environ["HEXAPOD_FUZZ_COUNTS"], f"{os.getpid()}.json")
+    atexit.register(lambda: KEPT.write_text(json.dumps(COUNTS)))
+
+LONGEST_MESSAGE = 2500
+"""Characters that a complaint may have: what is wrong must be readable, whatever stands in the file."""
+
+
+def cases(bounded: int, share: float) -> settings:
+    """Return settings for a test: so many cases in the bounded run, a share (0…1) of the nightly one."""
+    return settings(
+        max_examples=max(bounded, round(NIGHTLY * share)),
+        derandomize=not NIGHTLY,
+        database=None,
+        deadline=None,
+        suppress_health_check=list(HealthCheck),
+        phases=(Phase.explicit, Phase.generate, Phase.shrink),
+        print_blob=True,
+    )
+
+
+NASTY_NUMBERS = (
+    *("0", "-0", "1", "-1", "7", "400", "1e308", "-1e308", "1e-308", "5e-324", "1e400", "-1e400", "1e-400", "1.0e+308"),
+    *("nan", ".nan", "inf", "-inf", ".inf", "-.INF", "1e3", "1.0e+3", "1.5E-3", ".5", "5.", "+3", "--3", "1-", "1e"),
+    *("0400", "0x10", "0o17", "0b11", "1:30", "1:30.5", "1_000", "1,5", "1 5", "1'000", "1.2.3", "½", "１２", "٣"),
+    *("400mm", "'400'", '"400"', "true", "no", "~", "null", "", "[1]", "{a: 1}", "!!float 5", "2026-01-31"),
+    *("9" * 20, "1" * 400, "0." + "3" * 60, "179769313486231580793e289", "4.35", "1.0000000000000002", "0.1"),
+)
+"""Numbers, and what looks like one to somebody."""
+
+NASTY_TEXTS = (
+    *("\0", "\ufeff", "\r", "\r\n", "\n", "\t", " ", "\x85", "\u2028", "\x1b[2J", "é", "\u202e", "\ud800", "\x7f"),
+    *(",", ";", '"', "'", '"\n"', ":", ": ", "#", " # ", "-", "- ", "---\n", "...\n", "?", "? ", "|", ">", "%", "@"),
+    *("[", "]", "{", "}", "[[", "]]", "[" * 50, "{a: " * 50, "&a ", "*a", "<<: ", "!!", "!!bool x", "!!float ''"),
+    *("%YAML 1.2\n---\n", "%TAG ! tag:x,2000:\n---\n", "!!binary =", "!!timestamp 0", "!!set {a}", "!!omap [a: 1]"),
+    *("EOF::", "Data:\r\n", "HEADER::\n", "RUNS::\n", "Targets :", "Sample no: ", "[JOINT_0]\n", "setp ", "# set "),
+    *("_mm", "_um", "_in", "_deg", "forward", "backward", "linear", "roll", "mm", "um", "rad", "x", "both", "home"),
+)
+"""Pieces of text that some reader takes for something special."""
+
+UNIT_NAMES = ("_m", "_mm", "_um", "_in", "_rad", "_mrad", "_urad", "_deg", "_arcsec", "_ppm", "_percent", "_s", "")
+
+numbers = st.one_of(
+    st.sampled_from(NASTY_NUMBERS),
+    st.floats(allow_nan=False, allow_infinity=False).map(repr),
+    st.floats(-1000.0, 1000.0).map(lambda v: f"{v:.6f}"),
+    st.integers(-5, 1000).map(str),
+)
+tokens = st.one_of(st.sampled_from(NASTY_TEXTS), numbers, st.text(max_size=4))
+
+NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
+UNIT = re.compile(r"_(?:mm_s|mm|um|m|in|deg|rad|urad|mrad|arcsec|ppm_per_K|ppm|percent|ms|s|degC)\b(?=\s*[:,\r\n])")
+
+
+def _number(text: str, place: int, span: int, token: str) -> str:
+    found = list(NUMBER.finditer(text))
+    return _replaced(text, found[place % len(found)].span(), token) if found else text
+
+
+def _unit(text: str, place: int, span: int, token: str) -> str:
+    found = list(UNIT.finditer(text))
+    return _replaced(text, found[place % len(found)].span(), UNIT_NAMES[span % len(UNIT_NAMES)]) if found else text
+
+
+def _replaced(text: str, span: tuple[int, int], token: str) -> str:
+    return text[: span[0]] + token + text[span[1] :]
+
+
+def _overwrite(text: str, place: int, span: int, token: str) -> str:
+    start = place % (len(text) + 1)
+    return text[:start] + token + text[start + span % 9 :]
+
+
+def _byte(text: str, place: int, span: int, token: str) -> str:
+    start = place % (len(text) + 1)
+    return text[:start] + chr(span % 256) + text[start + 1 :]
+
+
+def _cut(text: str, place: int, span: int, token: str) -> str:
+    return text[: place % (len(text) + 1)]
+
+
+def _copy(text: str, place: int, span: int, token: str) -> str:
+    start, to = place % (len(text) + 1), span % (len(text) + 1)
+    return text[:to] + text[start : start + 60] + text[to:]
+
+
+def _lines(change: Callable[[list[str], int, int], None]) -> Callable[[str, int, int, str], str]:
+    def edit(text: str, place: int, span: int, token: str) -> str:
+        lines = text.splitlines(keepends=True)
+        if lines:
+            change(lines, place % len(lines), span % len(lines))
+        return "".join(lines)
+
+    return edit
+
+
+def _drop(lines: list[str], i: int, j: int) -> None:
+    del lines[i]
+
+
+def _repeat(lines: list[str], i: int, j: int) -> None:
+    lines.insert(j, lines[i])
+
+
+def _swap(lines: list[str], i: int, j: int) -> None:
+    lines[i], lines[j] = lines[j], lines[i]
+
+
+WHOLE: tuple[Callable[[bytes], bytes], ...] = (
+    lambda data: b"\xef\xbb\xbf" + data,
+    lambda data: data.decode("latin-1").encode("utf-16"),
+    lambda data: data.decode("latin-1").encode("utf-32"),
+    lambda data: data.replace(b"\n", b"\r\n"),
+    lambda data: data.replace(b"\n", b"\r"),
+    lambda data: data + b"\0",
+    lambda data: data + data,
+    lambda data: data[::-1],
+    lambda data: data.rstrip(),
+    lambda data: b"",
+    lambda data: data.replace(b".", b","),
+    lambda data: data.replace(b" ", b"\xc2\xa0"),
+    lambda data: data.replace(b",", b";"),
+    lambda data: data.upper(),
+)
+"""What whole files suffer on their way: encodings, line ends, spreadsheets."""
+
+EDITS: tuple[Callable[[str, int, int, str], str], ...] = (
+    *(_number, _number, _number, _unit, _overwrite, _overwrite, _byte, _cut, _copy),
+    *(_lines(_drop), _lines(_repeat), _lines(_swap)),
+)
+
+places = st.integers(0, 1 << 14)
+edits = st.lists(st.tuples(st.integers(0, len(EDITS)), places, places, tokens), min_size=1, max_size=3)
+"""What is done to a file: (which edit, place, span, token) each; see :func:`mutated`."""
+
+
+def mutated(data: bytes, changes: list[tuple[int, int, int, str]]) -> bytes:
+    """Return a file after some edits; they work on bytes, which latin-1 names one by one."""
+    for kind, place, span, token in changes:
+        if kind == len(EDITS):
+            data = WHOLE[place % len(WHOLE)](data)
+        else:
+            raw = token.encode("utf-8", "surrogatepass").decode("latin-1")
+            data = EDITS[kind](data.decode("latin-1"), place, span, raw).encode("latin-1")
+    return data
+
+
+class Refused(Exception):
+    """A reader refused a file, as it should."""
+
+
+@contextlib.contextmanager
+def reader_of(test: str, *files: Path) -> Iterator[None]:
+    """Count a case, and check a refusal: a HexapodError in words for people; anything else comes through.
+
+    Raises
+    ------
+    Refused
+        Instead of the HexapodError.
+    """
+    COUNTS[test] += 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # overflows on numbers that are then refused; wrong results are looked for
+        try:
+            yield
+        except HexapodError as error:
+            check_message(str(error))
+            raise Refused from error
+    COUNTS[f"{test} accepted"] += 1
+
+
+def check_message(text: str) -> None:
+    """Check that a complaint can be read: one line, no control codes, not a book."""
+    assert text
+    assert len(text) <= LONGEST_MESSAGE, text[:300]
+    assert text.isprintable(), text
+
+
+def finite(*arrays: Any) -> None:
+    """Check that all that was read is finite."""
+    for array in arrays:
+        assert np.isfinite(np.asarray(array, dtype=float)).all(), array
+
+
+# Reading YAML once more: the tree of nodes only, every leaf its text; numbers by Decimal, units from their definitions.
+
+DEGREE = repr(math.pi / 180)
+FACTORS: dict[str, dict[str, str]] = {
+    "length": {"m": "1", "mm": "0.001", "um": "0.000001", "in": "0.0254"},
+    "angle": {"rad": "1", "mrad": "0.001", "urad": "0.000001", "deg": DEGREE, "arcsec": repr(math.pi / 648000)},
+    "ratio": {"ppm": "0.000001", "percent": "0.01"},
+    "expansion": {"ppm_per_K": "0.000001"},
+    "temperature": {"degC": "1"},
+    "speed": {"m_s": "1", "mm_s": "0.001", "m_min": repr(1 / 60)},
+    "time": {"s": "1", "ms": "0.001"},
+}
+PLAIN = re.compile(r"[-+]?(?:(?:0|[1-9]\d*)(?:\.\d*)?|\.\d+|0+\.\d*)(?:[eE][-+]?\d+)?", re.ASCII)
+"""What everybody reads as the same number."""
+
+
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+def document(data: bytes) -> Any:
+    """Return a YAML file as mappings, lists and texts; check that it has no key twice, no reference, no tag."""
+    text = data.decode("utf-8-sig")
+    for event in yaml.parse(text, Loader=LOADER):
+        assert not isinstance(event, yaml.AliasEvent)
+        assert getattr(event, "tag", None) is None
+    return _plain(yaml.compose(text, Loader=LOADER))
+
+
+def _plain(node: Any) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        keys = [key.value for key, _ in node.value]
+        assert len(set(keys)) == len(keys), keys
+        return {key.value: _plain(value) for key, value in node.value}
+    return [_plain(item) for item in node.value] if isinstance(node, yaml.SequenceNode) else node.value
+
+
+def number_of(text: str) -> Decimal:
+    """Return the number that a text is to everybody."""
+    assert PLAIN.fullmatch(text), f"{text!r} was taken for a number"
+    return Decimal(text)
+
+
+def numbers_of(tree: Any, factor: str = "1") -> np.ndarray:
+    """Return nested lists of texts as an array in SI."""
+    if isinstance(tree, list):
+        return np.array([numbers_of(item, factor) for item in tree])
+    return np.array(float(number_of(tree) * Decimal(factor)))
+
+
+def quantity(tree: dict[str, Any], name: str, kind: str, default: Any = None) -> np.ndarray:
+    """Return what stands under ``name_<unit>`` in SI, or the default; one unit only."""
+    found = [key for key in tree if key.startswith(f"{name}_") and key[len(name) + 1 :] in FACTORS[kind]]
+    if not found:
+        assert default is not None, f"{name} is missing, and was not missed"
+        return np.asarray(default, dtype=float)
+    assert len(found) == 1, found
+    return numbers_of(tree[found[0]], FACTORS[kind][found[0][len(name) + 1 :]])
+
+
+def same(read: Any, expected: Any) -> None:
+    """Check that what was read is what stands there: to three roundings, or a denormal's last digit."""
+    np.testing.assert_allclose(read, np.broadcast_to(expected, np.shape(read)), rtol=4e-16 * 3, atol=1e-322)

@@ -1,0 +1,192 @@
+"""The command line with mutated files and arguments: a result that is right, or exit code 2 and words for people.
+
+Truth: for lengths and poses, the closed form of the paper machine (node_helpers.py) on the file's own numbers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fuzzing import COUNTS, NASTY_NUMBERS, NASTY_TEXTS, cases, check_message, edits, mutated
+from hypothesis import example, given
+from hypothesis import strategies as st
+from node_helpers import closed_form_lengths
+from scipy.spatial.transform import Rotation
+from strategies import paper_geometry
+from test_carto import RTL_LINE, rtl
+from test_fuzz_files import CONFIG, GEOMETRIES, models
+from test_fuzz_tables import LENGTHS, POSES, TIDY, column, rows_of, si
+
+from hexapod_comp import cli
+from hexapod_comp.pose import Pose
+
+STROKE = paper_geometry().limits.stroke * 1e3
+
+CAMPAIGN = b"""format: hexapod_comp/campaign
+version: 1
+box_mm: [[-50, -50, 380], [50, 50, 420]]
+cell_mm: 40
+step_mm: 40
+instrument: 1-D
+poses: 2
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    made = tmp_path_factory.mktemp("commands")
+    (made / "model.yaml").write_bytes(models(made)[1])
+    (made / "paper.yaml").write_bytes(GEOMETRIES[0])
+    (made / "columns.yaml").write_bytes((CONFIG / "jugglebot_columns.yaml").read_bytes())
+    (made / "poses.csv").write_bytes(POSES[0])
+    (made / "lengths.csv").write_bytes(LENGTHS)
+    (made / "tidy.csv").write_bytes(TIDY)
+    (made / "campaign.yaml").write_bytes(CAMPAIGN)
+    (made / "budget.yaml").write_bytes((CONFIG / "error_budget.yaml").read_bytes())
+    (made / "unit.yaml").write_bytes(GEOMETRIES[1])
+    (made / "a.rtl").write_text(rtl())
+    (made / "a.rtl.yaml").write_text(RTL_LINE)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(made)  # where nonsense is written to
+        yield made
+
+
+def command(*arguments: str) -> tuple[int, str, str]:
+    """Run the command line here; return exit code, output and complaints, which must be for people."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = cli.main(arguments)
+    said = err.getvalue()
+    assert code in (0, 1, 2), said
+    assert "Traceback" not in said
+    if code == 2:
+        ours = said.partition("hexapod_comp: error: ")[2].removesuffix("\n")
+        assert ours or "error: " in said, said  # the others are argparse's, which repeats what was typed
+        if ours and not ours.startswith("unrecognized arguments"):
+            check_message(ours)
+    return code, out.getvalue(), said
+
+
+COMMANDS = (
+    ("ik", "poses.csv", ()),
+    ("ik", "model.yaml", ("poses.csv", "--model", "model.yaml")),
+    ("ik", "paper.yaml", ("poses.csv", "--machine", "paper.yaml", "--json")),
+    ("fk", "lengths.csv", ()),
+    ("fk", "model.yaml", ("lengths.csv", "--model", "model.yaml")),
+    ("check", "poses.csv", ("--stream",)),
+    ("check", "poses.csv", ("--json",)),
+    ("check", "model.yaml", ("poses.csv", "--model", "model.yaml")),
+    ("iso230", "tidy.csv", ("--targets",)),
+    ("iso230", "a.rtl", ("--json",)),
+    ("iso230", "a.rtl.yaml", ("a.rtl",)),
+    ("iso230", "columns.yaml", ("tidy.csv", "--columns", "columns.yaml")),
+    ("assess", "poses.csv", ("--machines", "2")),
+    ("fit", "tidy.csv", ("--scheme", "lines", "--out", "fitted.yaml")),
+    ("fit", "paper.yaml", ("tidy.csv", "--scheme", "lines", "--out", "fitted.yaml", "--machine", "paper.yaml")),
+    ("classify", "budget.yaml", ("--budget", "budget.yaml", "--out", "/dev/null/no")),
+    ("classify", "unit.yaml", ("--machine", "unit.yaml", "--budget", "budget.yaml", "--out", "/dev/null/no")),
+    ("export", "model.yaml", ("--model", "model.yaml", "--table", "t.csv", "--box=-9000,-9000,0,9000,9000,1")),
+    ("measure", "model.yaml", ("--campaign", "campaign.yaml", "--truth", "model.yaml", "--out", "m.csv")),
+)
+"""Verb, the file that is mutated, and the rest of the command; file names stand for files of the folder."""
+
+
+@pytest.mark.parametrize("number", range(len(COMMANDS)))
+@given(changes=edits)
+@example(changes=[])
+@cases(8, 0.002)
+def test_mutated_files(folder: Path, number: int, changes: list) -> None:
+    verb, name, rest = COMMANDS[number]
+    original = (folder / name).read_bytes()
+    data = mutated(original, changes)
+    changed = folder / f"x_{name}"
+    changed.write_bytes(data)
+    if name == "a.rtl":
+        (folder / "x_a.rtl.yaml").write_text(RTL_LINE)
+    if name == "a.rtl.yaml":
+        (folder / "x_a.rtl").write_text(rtl())
+    names = {name: str(changed)} if name != "a.rtl.yaml" else {"a.rtl": str(folder / "x_a.rtl")}
+    arguments = [names.get(word, word) for word in rest]  # the others are in the folder where this runs
+    if name not in rest and name != "a.rtl.yaml":
+        arguments.insert(0, str(changed))
+    COUNTS["commands"] += 1
+    code, out, _ = command(verb, *arguments)
+    if code == 2:
+        return
+    COUNTS["commands accepted"] += 1
+    assert out.strip()
+    if (verb, name) == ("ik", "poses.csv"):
+        right_lengths(out, data)
+    if (verb, name) == ("fk", "lengths.csv"):
+        right_poses(out, data)
+
+
+def poses_in(rows: list[dict[str, str]]) -> list[Pose]:
+    """Return the poses of a CSV file's rows, by SciPy's Euler angles or quaternions."""
+    positions = np.transpose([column(rows, axis, "length") for axis in "xyz"])
+    if "qx" in rows[0]:
+        turns = Rotation.from_quat([[si(row[f"q{c}"], "1") for c in "xyzw"] for row in rows])
+    else:
+        angles = [column(rows, name, "angle") or [0.0] * len(rows) for name in ("beta", "alpha", "gamma")]
+        turns = Rotation.from_euler("YXZ", np.transpose(angles))
+    return [Pose(p, r) for p, r in zip(positions, turns.as_matrix(), strict=True)]
+
+
+def right_lengths(out: str, data: bytes) -> None:
+    """Check the strut lengths that ik printed: a picometre, or what is left of that at 1e300 mm."""
+    printed = np.array([[float(row[f"L{i}_mm"]) for i in range(1, 7)] for row in rows_of(out.encode())])
+    expected = np.array([closed_form_lengths(pose) for pose in poses_in(rows_of(data))]) * 1e3
+    np.testing.assert_allclose(printed, expected, rtol=1e-12, atol=2e-9)
+
+
+def right_poses(out: str, data: bytes) -> None:
+    """Check the poses that fk printed: their lengths are those of the file."""
+    rows = rows_of(data)
+    given_lengths = np.transpose([column(rows, f"L{i}", "length") for i in range(1, 7)])
+    printed = np.array([closed_form_lengths(pose) for pose in poses_in(rows_of(out.encode()))])
+    np.testing.assert_allclose(printed, given_lengths, atol=1e-9)
+
+
+OPTIONS = {
+    "ik": ("--pose", "--x-mm", "--y-mm", "--z-mm", "--alpha-deg", "--machine", "--model", "--out", "--json"),
+    "fk": ("--lengths", "--guess", "--cold", "--all-modes", "--machine", "--model", "--json"),
+    "check": ("--stream", "--rate-hz", "--machine", "--model", "--json"),
+    "assess": ("--joint-um", "--strut-um", "--pitch-ppm", "--wave-um", "--wave-period-mm", "--seed", "--json"),
+    "iso230": ("--probe-mm", "--columns", "--targets", "--machine"),
+    "plan": ("--lead-mm", "--blocks", "--tolerance-um", "--expansion-ppm", "--seed", "--machine"),
+    "measure": ("--seed", "--truth", "--campaign", "--out", "--model"),
+    "fit": ("--scheme", "--lead-mm", "--blocks", "--probe-mm", "--order", "--columns", "--out", "--truth"),
+    "export": ("--units", "--box", "--step-mm", "--poses", "--tilt-deg", "--seed", "--table"),
+    "classify": ("--cells", "--clearance-mm", "--tilt-deg", "--compare", "--allow-um", "--workers", "--budget"),
+    "run": ("--rate-hz", "--machine", "--model", "--truth", "--plot"),
+    "demo": ("--rate-hz", "--machine", "--model", "--truth", "--plot"),
+}
+"""Verbs and options that are given nonsense; a file that does not exist keeps the long ones from starting."""
+
+words = st.one_of(
+    st.sampled_from([word for word in (*NASTY_NUMBERS, *NASTY_TEXTS) if "\0" not in word and "\ud800" not in word]),
+    st.lists(st.sampled_from(("0", "1", "400", "-5", "nan", "1e308", "", "x")), min_size=1, max_size=7).map(",".join),
+    st.floats().map(repr),
+    st.text(st.characters(exclude_categories=("Cs",), exclude_characters="\0"), max_size=5),
+)
+
+
+@pytest.mark.parametrize("verb", OPTIONS)
+@given(place=st.integers(0, 20), value=words, other=st.one_of(st.none(), st.tuples(st.integers(0, 20), words)))
+@cases(8, 0.001)
+def test_nonsense_options(folder: Path, verb: str, place: int, value: str, other: tuple[int, str] | None) -> None:
+    options = OPTIONS[verb]
+    arguments = [verb, options[place % len(options)], value]
+    if other is not None:
+        arguments += [options[other[0] % len(options)], other[1]]
+    if verb not in ("ik", "fk", "demo"):
+        arguments.append("no_such_file.csv")
+    if verb in ("measure", "export", "classify", "demo"):
+        arguments += ["--machine", "no_such_machine"]
+    COUNTS["options"] += 1
+    command(*arguments)
