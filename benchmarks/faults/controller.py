@@ -1,0 +1,136 @@
+"""The controller of the campaign: a machine tool's, with feed hold."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from enum import Enum
+
+import numpy as np
+
+from hexapod_comp.geometry import HexapodGeometry
+from hexapod_comp.pose import Pose
+from hexapod_comp.trajectory import Path, circle, commanded_in_base, join, move
+
+RATE = 250.0
+"""Commands per second, Hz."""
+
+FEED = 0.08
+"""Largest tool speed, m/s."""
+
+REPEAT_AFTER = 0.1
+"""A command without an answer is sent again after this long, s."""
+
+STUCK_AFTER = 0.25
+"""Without an answer for this long, s, it asks whether it must start again from where the machine stands."""
+
+
+class Mode(Enum):
+    """What the controller does at present."""
+
+    MILL = "follow the path"
+    ASK = "wait until the compensator has been reset"
+    RETURN = "move from where the machine stands to where the path was left"
+
+
+class Controller:
+    """Sends pose after pose, each after the answer to the one before; without an answer it waits and repeats.
+
+    When the compensator no longer takes commands because the machine is not where it was told to be, or after
+    the drive was restarted, it resets the compensator and moves from the measured pose back to its path.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        The machine.
+    send : callable
+        Sends a pose; returns its stamp, ns.
+    reset : callable
+        Asks for a reset of the compensator; calls back with the pose to start from, or None when it failed.
+    """
+
+    def __init__(
+        self,
+        geometry: HexapodGeometry,
+        send: Callable[[Pose], int],
+        reset: Callable[[Callable[[Pose | None], None]], None],
+    ) -> None:
+        self._geometry, self._send, self._reset = commanded_in_base(geometry), send, reset
+        self._path = endless_path(geometry)
+        self._index = 0
+        self._way: Path | None = None
+        self._way_index = 0
+        self.mode = Mode.MILL
+        self._awaited = self._sent_at = self._answered_at = 0.0
+        self._must_return = False
+
+    @property
+    def target(self) -> Pose:
+        """Where the path is at present."""
+        return self._path.pose(self._index % len(self._path))
+
+    def answered(self, stamp: int, now: float) -> None:
+        """Take the answer to a command."""
+        if stamp == self._awaited:
+            self._awaited, self._answered_at = 0, now
+            self._advance()
+
+    def start_over(self) -> None:
+        """Start from where the machine stands as soon as possible: the drive was restarted."""
+        self._must_return = True
+
+    def tick(self, now: float, stuck: bool) -> None:
+        """Do what is due at the monotonic time `now`, s; `stuck`: the machine is not where it was told to be."""
+        if self.mode is Mode.ASK:
+            return
+        if self._must_return or (stuck and now - self._answered_at > STUCK_AFTER):
+            self._ask()
+        elif now >= self.due():
+            self._awaited, self._sent_at = self._send(self._next_pose()), now
+
+    def due(self) -> float:
+        """Return when the next command is due, monotonic, s."""
+        if self.mode is Mode.ASK:
+            return float("inf")
+        return self._sent_at + (REPEAT_AFTER if self._awaited else 1.0 / RATE)
+
+    def _next_pose(self) -> Pose:
+        return self.target if self._way is None else self._way.pose(self._way_index)
+
+    def _advance(self) -> None:
+        if self._way is None:
+            self._index += 1
+            return
+        self._way_index += 1
+        if self._way_index == len(self._way):
+            self._way, self.mode = None, Mode.MILL
+
+    def _ask(self) -> None:
+        self.mode, self._must_return, self._awaited = Mode.ASK, False, 0
+        self._reset(self._return_from)
+
+    def _return_from(self, pose: Pose | None) -> None:
+        self._answered_at, self._sent_at = time.monotonic(), 0.0
+        if pose is None:
+            self.mode, self._must_return = Mode.MILL, True
+            return
+        self.mode, self._way_index = Mode.RETURN, 0
+        self._way = join([Path(pose.position[None], pose.rotation[None], RATE), self._way_back(pose)])
+
+    def _way_back(self, pose: Pose) -> Path:
+        return move(self._geometry, pose, self.target, RATE, FEED)
+
+
+def endless_path(geometry: HexapodGeometry) -> Path:
+    """Return a closed path about home, in ``base``: a circle of 16 mm, then straight strokes that reverse."""
+    machine = commanded_in_base(geometry)
+    home = geometry.home @ geometry.tool
+    ring = circle(home, radius=8e-3, feed=FEED, rate=RATE)
+    ends = [Pose(home.position + np.array([x, 0.0, z]), home.rotation) for x, z in _stroke_ends()]
+    corner = ring.pose(len(ring) - 1)
+    legs = [move(machine, a, b, RATE, FEED) for a, b in zip([corner, *ends], [*ends, corner], strict=True)]
+    return join([ring, *legs])
+
+
+def _stroke_ends() -> Iterator[tuple[float, float]]:
+    yield from ((-8e-3, 0.0), (8e-3, 2e-3), (-8e-3, 4e-3))

@@ -1,0 +1,214 @@
+"""The judge: from what was seen to what was missed. It knows nothing of the nodes but their limits."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hexapod_comp.geometry import HexapodGeometry
+
+from .record import Happened, Record, Sent, Status, Struts, Told
+from .visible import VISIBLE, Reported
+
+REPORT_WITHIN = 0.2
+"""A fault is in diagnostics this long after it is visible, s."""
+
+RECOVER_WITHIN = 1.0
+"""All is well again this long after the last fault has ended, s."""
+
+ANSWER_WITHIN = 0.2
+"""A command without an answer for this long is lost, s."""
+
+FOLLOWS_WITHIN = 1e-3
+"""A machine that follows has its measured struts this near to what they were told lately, m."""
+
+LATELY = 0.05
+"""Drives lag, and readings are on their way for a while, s."""
+
+RECENT = 0.1
+"""How old the measured struts may be from which a compensator starts afresh, s."""
+
+ROUNDING = 1e-9
+"""Allowed beyond a limit, m: the limits are decimal fractions."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What may be published: stroke (6, 2), largest step and largest correction, m."""
+
+    stroke: np.ndarray
+    step: float
+    correction: float
+
+    @staticmethod
+    def of(geometry: HexapodGeometry) -> Limits:
+        """Return a machine's."""
+        limits = geometry.limits
+        return Limits(limits.stroke, limits.step, limits.correction)
+
+
+@dataclass
+class Verdict:
+    """What the judge found in one episode.
+
+    Attributes
+    ----------
+    breaches : list of str
+        What was published and must not be.
+    reports : list of (str, Reported)
+        For each fault its kind and how long it took until it was said.
+    recovery : float
+        From the end of the last fault until all was well, s; infinite if never.
+    sent, lost : int
+        Good commands outside the faults, and how many of these got no answer.
+    """
+
+    breaches: list[str] = field(default_factory=list)
+    reports: list[tuple[str, Reported]] = field(default_factory=list)
+    recovery: float = 0.0
+    sent: int = 0
+    lost: int = 0
+
+    def misses(self) -> list[str]:
+        """Return which bars were missed, in words."""
+        found = list(self.breaches)
+        for kind, report in self.reports:
+            if report.visible and not report.delay <= REPORT_WITHIN:
+                when = "never" if math.isinf(report.delay) else f"after {report.delay * 1e3:.0f} ms"
+                found.append(f"{kind}: reported {when}")
+        if not self.recovery <= RECOVER_WITHIN:
+            found.append(f"recovery took {self.recovery:.2f} s")
+        if self.lost:
+            found.append(f"{self.lost} of {self.sent} good commands lost")
+        return found
+
+
+def judge(record: Record, limits: Limits) -> Verdict:
+    """Return the verdict over one episode."""
+    began = min((fault.began for fault in record.faults), default=math.inf)
+    ended = max((fault.ended for fault in record.faults), default=-math.inf)
+    outside = [s for s in _due(record) if not began - ANSWER_WITHIN < s.sent_at < ended + RECOVER_WITHIN]
+    return Verdict(
+        breaches=breaches(record, limits),
+        reports=[(fault.kind, reported(record, fault)) for fault in record.faults],
+        recovery=recovery(record, ended) if record.faults else 0.0,
+        sent=len(outside),
+        lost=sum(not _answered(entry) for entry in outside),
+    )
+
+
+def _due(record: Record) -> list[Sent]:
+    """Return the commands that had time to be answered."""
+    return [entry for entry in record.sent.values() if entry.sent_at < record.ended - ANSWER_WITHIN]
+
+
+def _answered(entry: Sent) -> bool:
+    return bool(entry.answered_at - entry.sent_at <= ANSWER_WITHIN)
+
+
+# ---- what must never be published ----
+
+
+def breaches(record: Record, limits: Limits) -> list[str]:
+    """Return what was published that must not be: not finite, outside the stroke, too large a step or correction."""
+    found = []
+    for previous, struts in zip([None, *record.commands], record.commands, strict=False):
+        found += [f"strut_commands {problem}" for problem in _outside(struts.lengths, limits)]
+        if previous is not None and (step := _step(record, previous, struts)) > limits.step + ROUNDING:
+            found.append(f"strut_commands step of {step * 1e3:.3f} mm at {struts.time - record.commands[0].time:.3f} s")
+    for struts in record.corrections:
+        if not np.isfinite(struts.lengths).all():
+            found.append("strut_corrections not finite")
+        elif (largest := np.abs(struts.lengths).max()) > limits.correction + ROUNDING:
+            found.append(f"strut_corrections of {largest * 1e3:.3f} mm")
+    return found
+
+
+def _outside(lengths: np.ndarray, limits: Limits) -> list[str]:
+    if not np.isfinite(lengths).all():
+        return ["not finite, or not six"]
+    low, high = limits.stroke[:, 0] - ROUNDING, limits.stroke[:, 1] + ROUNDING
+    return ["outside the stroke"] if ((lengths < low) | (lengths > high)).any() else []
+
+
+def _step(record: Record, previous: Struts, struts: Struts) -> float:
+    """Return the step of a command, m: from the one before, or from measured struts if it is a fresh start."""
+    steps = [_distance(struts.lengths, previous.lengths)]
+    if any(previous.time < start <= struts.time for start in record.fresh_starts):
+        steps += [_distance(struts.lengths, m.lengths) for m in record.measured if 0 <= struts.time - m.time < RECENT]
+    return min(steps)
+
+
+def _distance(a: np.ndarray, b: np.ndarray) -> float:
+    distance = float(np.abs(a - b).max())
+    return distance if math.isfinite(distance) else math.inf
+
+
+# ---- how soon it is said ----
+
+
+def reported(record: Record, fault: Happened) -> Reported:
+    """Return whether a fault became visible to those who must report it, and the longest time until one did."""
+    found = [_reported_by(record, fault, *expected) for expected in VISIBLE[fault.kind](record, fault)]
+    seen = [report for report in found if report.visible]
+    return max(seen, key=lambda report: report.delay, default=Reported(False))
+
+
+def _reported_by(record: Record, fault: Happened, node: str, pattern: re.Pattern, since: float) -> Reported:
+    """Return how long a node, while it ran, took to say a pattern; what it says already counts as at once."""
+    since, reachable = _when_running(record, node, since, fault.ended)
+    if not reachable:
+        return Reported(False)
+    said = record.said(node)
+    before = [status for status in said if status.time < since]
+    if before and _new(before[-1], said, pattern, fault.began):
+        return Reported(True, 0.0, before[-1].message)
+    for status in said:
+        if status.time >= since and _new(status, said, pattern, fault.began):
+            return Reported(True, _running_time(record, node, since, status.time), status.message)
+    return Reported(True, math.inf)
+
+
+def _running_time(record: Record, node: str, since: float, until: float) -> float:
+    """Return for how long a node ran between two times, s."""
+    outages = [min(until, end) - max(since, start) for start, end in record.outages[node]]
+    return until - since - sum(outage for outage in outages if outage > 0.0)
+
+
+def _new(status: Status, said: list[Status], pattern: re.Pattern, began: float) -> bool:
+    """Return whether a status says a pattern: as its message, or as a value that was another before the fault began."""
+    if pattern.search(status.message):
+        return True
+    old = [s for s in said if s.time < began]
+    told_before = old[-1].text() if old else ""
+    return any(pattern.search(line) and line not in told_before for line in status.text().split("\n")[1:])
+
+
+def _when_running(record: Record, node: str, since: float, until: float) -> tuple[float, bool]:
+    """Return when a running node could see something that lasts from `since` to `until`, and whether it could."""
+    for start, end in sorted(record.outages[node]):
+        if start <= since < end:
+            since = end
+    return since, math.isfinite(since) and (since <= until or not record.outages[node])
+
+
+# ---- recovery ----
+
+
+def recovery(record: Record, ended: float) -> float:
+    """Return how long after the end of the faults, s, commands were answered and the struts followed for good."""
+    after = [entry for entry in _due(record) if entry.sent_at >= ended]
+    bad = [entry.sent_at for entry in after if not _answered(entry)]
+    bad += [m.time for m in _astray(record) if m.time >= ended]
+    last_bad = max(bad, default=ended)
+    good = [entry.answered_at for entry in after if entry.sent_at >= last_bad and _answered(entry)]
+    return min(good) - ended if good else math.inf
+
+
+def _astray(record: Record) -> list[Struts]:
+    """Return the readings of struts that are not where they were told to be."""
+    told = Told(record.commands)
+    return [reading for reading in record.measured if not told.off(reading, LATELY) <= FOLLOWS_WITHIN]

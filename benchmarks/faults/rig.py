@@ -1,0 +1,353 @@
+"""The machine of the campaign: compensator and drive as processes, and a harness around both.
+
+The harness is the controller, the wires and the witness in one: commands go from its controller through a wire to
+the compensator, whose strut commands come back to it and go through a second wire to the drive, whose readings
+come back to it and go through a third wire to the compensator.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.experimental import EventsExecutor
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from hexapod_comp.conversions import message_pose, pose_message
+from hexapod_comp.geometry import load_geometry
+from hexapod_comp.nodes.client import LISTENER_QOS, TRACK_QOS
+from hexapod_comp.nodes.processes import NodeProcess, PrivateDomain
+from hexapod_comp.nodes.runtime import COMMAND_QOS, STATE_QOS
+from hexapod_comp.nodes.session import prepare
+from hexapod_comp.paths import config_file
+from hexapod_comp.pose import Pose
+
+from .controller import Controller, Mode
+from .logdisk import LogDisk
+from .record import Record, Sent, Status, Struts, lengths_of
+from .wire import NANOSECONDS, Wire
+
+GEOMETRY, MODEL = "paper.yaml", "paper_machine.yaml"
+
+STARTS_WITHIN = 60.0
+"""A process that is not ready this long after its start will not be, s."""
+
+MODULES = {"compensator": "compensator", "drive": "strut_drive"}
+
+REMAPS = {
+    "compensator": {},
+    "drive": {"strut_commands": "strut_commands_delivered", "strut_states": "strut_states_measured"},
+}
+"""The drive speaks and listens on topics of its own; the harness carries between them and the compensator's."""
+
+
+class RigError(RuntimeError):
+    """The machine does not come up."""
+
+
+class Rig:
+    """Processes, wires, controller and witness; a context manager.
+
+    Parameters
+    ----------
+    seed : int
+        Of the drive's noise.
+    wired : bool
+        Put the harness's wires between compensator and drive; else the two speak directly.
+    domain : bool
+        Make a private ROS domain; else the environment's is one already.
+    wrappers : dict of str to sequence of str, optional
+        Command that runs a process, by ``compensator`` and ``drive``, such as ``nsenter``.
+    """
+
+    def __init__(
+        self, seed: int = 0, wired: bool = True, domain: bool = True, wrappers: dict[str, list[str]] | None = None
+    ) -> None:
+        self.record = Record()
+        self.geometry = load_geometry(config_file(GEOMETRY))
+        self._seed, self._wired, self._wrappers = seed, wired, wrappers or {}
+        self._domain = PrivateDomain() if domain else None
+        self.processes: dict[str, NodeProcess] = {}
+        self._down_since: dict[str, float] = {}
+        self._starting: dict[str, float] = {}
+        self.wires: dict[str, Wire] = {}
+        self._estimate: PoseStamped | None = None
+        self._reset_answer: Any = None
+
+    # ---- coming and going ----
+
+    def __enter__(self) -> Rig:
+        prepare(self.geometry)
+        self.folder = Path(tempfile.mkdtemp(prefix="hexapod_comp_faults_"))
+        self.model = Path(shutil.copy(config_file(MODEL), self.folder / "model.yaml"))
+        self._geometry_file = shutil.copy(config_file(GEOMETRY), self.folder / "geometry.yaml")
+        self.log_disk = LogDisk(self.folder / "ros_log")
+        if self._domain is not None:
+            self._domain.__enter__()
+        self._log_folder_before = os.environ.get("ROS_LOG_DIR")
+        os.environ["ROS_LOG_DIR"] = str(self.log_disk.folder)
+        try:
+            self._open()
+            self.start_all()
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        for process in self.processes.values():
+            process.send(signal.SIGCONT) if process.exit_code() is None else None
+            process.stop()
+        if hasattr(self, "_executor"):
+            self._executor.shutdown()
+            self.node.destroy_node()
+            rclpy.try_shutdown(context=self._context)
+        os.environ.pop("ROS_LOG_DIR")
+        if self._log_folder_before is not None:
+            os.environ["ROS_LOG_DIR"] = self._log_folder_before
+        if self._domain is not None:
+            self._domain.__exit__(None, None, None)
+        self.log_disk.close()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _open(self) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self.node = node = rclpy.create_node("controller", context=self._context)
+        self._executor = EventsExecutor(context=self._context)
+        self._executor.add_node(node)
+        poses = node.create_publisher(PoseStamped, "tool_pose_command", COMMAND_QOS)
+        self._poses = poses
+        node.create_subscription(JointState, "strut_commands", self._on_commands, LISTENER_QOS)
+        node.create_subscription(JointState, "strut_corrections", self._on_corrections, LISTENER_QOS)
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, LISTENER_QOS)
+        node.create_subscription(PoseStamped, "tool_pose_estimate", self._on_estimate, STATE_QOS)
+        self._open_wires(node, poses)
+        self._set_parameters = node.create_client(SetParameters, "strut_drive/set_parameters")
+        self._reload = node.create_client(Trigger, "compensator/reload_model")
+        self._reset = node.create_client(Trigger, "compensator/reset")
+        self.controller = Controller(self.geometry, self._send, self._ask_for_reset)
+
+    def _open_wires(self, node: Any, poses: Any) -> None:
+        self.wires["pose"] = Wire(lambda message, now: self._deliver("pose", poses, message, now))
+        if not self._wired:
+            node.create_subscription(JointState, "strut_states", self._on_states, TRACK_QOS)
+            return
+        commands = node.create_publisher(JointState, "strut_commands_delivered", COMMAND_QOS)
+        states = node.create_publisher(JointState, "strut_states", STATE_QOS)
+        self.wires["command"] = Wire(lambda message, now: self._deliver("command", commands, message, now))
+        self.wires["feedback"] = Wire(lambda message, now: self._deliver("feedback", states, message, now))
+        node.create_subscription(
+            JointState, "strut_states_measured", lambda m: self.wires["feedback"].put(m, time.monotonic()), TRACK_QOS
+        )
+
+    def start(self, name: str) -> None:
+        """Start a process, in place of a dead one; it is ready when it has said so."""
+        if name in self.processes:
+            self.processes[name].stop()
+        parameters: dict[str, object] = {"geometry_file": str(self._geometry_file)}
+        if name == "compensator":
+            parameters.update({"model_file": str(self.model), "model_folder": str(self.folder), "marker_rate": 0.0})
+        else:
+            parameters.update({"truth_file": str(config_file(MODEL).resolve()), "noise_seed": self._seed})
+        remaps = REMAPS[name] if self._wired else {}
+        wrapper = self._wrappers.get(name, [])
+        self.processes[name] = NodeProcess(MODULES[name], parameters, remaps, wrapper)
+        self._starting[name] = time.monotonic()
+        if name == "compensator":
+            self.record.fresh_starts.append(time.monotonic())
+
+    def start_all(self) -> None:
+        """Start both processes, and wait until the machine moves."""
+        for name in MODULES:
+            self._down_since[name] = time.monotonic()
+            self.start(name)
+        self.spin(STARTS_WITHIN, lambda: not self._down_since)
+        self.controller.start_over()
+        self.spin(STARTS_WITHIN, self.running)
+        if not self.running():
+            said = "\n".join(process.output() for process in self.processes.values())
+            raise RigError(f"the machine does not come up:\n{said}")
+
+    def running(self) -> bool:
+        """Return whether both processes are up, commands are answered and the struts are measured."""
+        now = time.monotonic()
+        answered = any(now - s.answered_at < 0.1 for s in list(self.record.sent.values())[-50:])
+        measured = bool(self.record.measured) and now - self.record.measured[-1].time < 0.1
+        milling = self.controller.mode is Mode.MILL
+        return not self._down_since and answered and measured and milling
+
+    def waited(self) -> dict[int, float]:
+        """Return how long each process, this one included, has waited for a processor so far, s, by process id."""
+        ids = [os.getpid(), *(process.pid for process in self.processes.values() if process.exit_code() is None)]
+        return {pid: waited_for_processor(pid) for pid in ids}
+
+    # ---- faults of processes ----
+
+    def kill(self, name: str) -> None:
+        """End a process with kill -9."""
+        self._down_since[name] = time.monotonic()
+        self.processes[name].send(signal.SIGKILL)  # to wait for its end would stop the harness for a while
+
+    def freeze(self, name: str) -> None:
+        """Stop a process as Ctrl-Z does."""
+        self._down_since[name] = time.monotonic()
+        self.processes[name].send(signal.SIGSTOP)
+
+    def thaw(self, name: str) -> None:
+        """Let it go on."""
+        self.processes[name].send(signal.SIGCONT)
+        self._is_up(name, time.monotonic())
+
+    def is_starting(self, name: str) -> bool:
+        """Return whether a process has been started and is not ready yet."""
+        return name in self._starting
+
+    def _look_for_ready(self, now: float) -> None:
+        for name in list(self._starting):
+            process = self.processes[name]
+            if process.exit_code() is not None:
+                raise RigError(f"{name} ended with {process.exit_code()}:\n{process.output()}")
+            if "ready" in process.output():
+                del self._starting[name]
+                self._is_up(name, now)
+
+    def _is_up(self, name: str, now: float) -> None:
+        self.record.outages[MODULES[name]].append((self._down_since.pop(name, now), now))
+
+    # ---- faults by service ----
+
+    def set_drive(self, **values: float | int) -> None:
+        """Set fault parameters of the drive, without waiting."""
+        parameters = []
+        for name, value in values.items():
+            kind = ParameterType.PARAMETER_INTEGER if isinstance(value, int) else ParameterType.PARAMETER_DOUBLE
+            typed = ParameterValue(type=kind, **{"integer_value" if isinstance(value, int) else "double_value": value})
+            parameters.append(Parameter(name=name, value=typed))
+        self._set_parameters.call_async(SetParameters.Request(parameters=parameters))
+
+    def reload_model(self, then: Callable[[bool], None]) -> None:
+        """Ask the compensator to read its model anew; calls back with whether it took it."""
+        future = self._reload.call_async(Trigger.Request())
+        future.add_done_callback(lambda f: then(bool(f.result().success)))
+
+    # ---- what comes and goes ----
+
+    def _send(self, pose: Pose) -> int:
+        stamp = self.node.get_clock().now()
+        message = pose_message(pose, "base")
+        message.header.stamp = stamp.to_msg()
+        now = time.monotonic()
+        self.record.sent[stamp.nanoseconds] = Sent(now)
+        self.wires["pose"].put(message, now)
+        return stamp.nanoseconds
+
+    def _deliver(self, link: str, publisher: Any, message: Any, now: float) -> None:
+        publisher.publish(message)
+        self.record.delivered[link].append(now)
+        if link == "feedback":
+            self.record.measured.append(Struts(now, lengths_of(message.position)))
+
+    def _on_commands(self, message: JointState) -> None:
+        now = time.monotonic()
+        self.record.commands.append(Struts(now, lengths_of(message.position)))
+        stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
+        entry = self.record.sent.get(stamp)
+        if entry is not None and math.isnan(entry.answered_at):
+            entry.answered_at = now
+        self.controller.answered(stamp, now)
+        if self._wired:
+            self.wires["command"].put(message, now)
+
+    def _on_corrections(self, message: JointState) -> None:
+        self.record.corrections.append(Struts(time.monotonic(), lengths_of(message.position)))
+
+    def _on_states(self, message: JointState) -> None:
+        now = time.monotonic()
+        self.record.delivered["feedback"].append(now)
+        self.record.measured.append(Struts(now, lengths_of(message.position)))
+
+    def _on_estimate(self, message: PoseStamped) -> None:
+        self._estimate = message
+
+    def _on_diagnostics(self, array: DiagnosticArray) -> None:
+        now = time.monotonic()
+        for status in array.status:
+            values = {entry.key: entry.value for entry in status.values}
+            node, level = status.name.split(":")[0], int.from_bytes(status.level, "little")
+            self.record.statuses.append(Status(now, node, level, status.message, values))
+
+    def _stuck(self) -> bool:
+        """Return whether the compensator says that the machine is not where it was told to be."""
+        said = self.record.said("compensator")
+        words = said[-1].message if said else ""
+        return "following" in words or "refusing commands: step" in words
+
+    # ---- the controller's reset ----
+
+    def _ask_for_reset(self, then: Callable[[Pose | None], None]) -> None:
+        began = time.monotonic()
+        self._reset_answer = (began, then, None)
+        if self._reset.service_is_ready():
+            future = self._reset.call_async(Trigger.Request())
+            self._reset_answer = (began, then, future)
+
+    def _look_for_reset(self, now: float) -> None:
+        if self._reset_answer is None:
+            return
+        began, then, future = self._reset_answer
+        if isinstance(future, Future) and future.done():
+            self.record.fresh_starts.append(now)
+            # Estimates come every few ms; the next one is from the measured struts.
+            self._reset_answer, self._estimate = (began, then, now), None
+        elif isinstance(future, float) and self._estimate is not None and now > future:
+            self._reset_answer = None
+            then(message_pose(self._estimate))
+        elif now - began > 0.5:
+            self._reset_answer = None
+            then(None)
+
+    # ---- time ----
+
+    def spin(self, seconds: float, until: Callable[[], object] = lambda: False) -> None:
+        """Let the machine move for some seconds, or until a condition holds."""
+        end = time.monotonic() + seconds
+        looked = 0.0
+        while (now := time.monotonic()) < end and not until():
+            if now - looked > 0.02:
+                looked = now
+                self._look_for_ready(now)
+            self._look_for_reset(now)
+            for wire in self.wires.values():
+                wire.release(now)
+            self.controller.tick(now, self._stuck())
+            due = min(self.controller.due(), *(wire.due() for wire in self.wires.values()), end, now + 0.01)
+            self._executor.spin_once(timeout_sec=max(0.0, due - time.monotonic()))
+
+    def new_record(self) -> Record:
+        """Begin the record of another episode."""
+        self.record = self.record.continued()
+        return self.record
+
+
+def waited_for_processor(pid: int) -> float:
+    """Return how long a process's main thread was ready to run and did not get a processor, s."""
+    try:
+        return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()[1]) * 1e-9
+    except (OSError, IndexError):  # it has ended, or the kernel does not count
+        return 0.0

@@ -1,0 +1,309 @@
+"""The fault campaign's judge, its wires, and a few of its episodes. The whole campaign: python -m benchmarks.faults.
+
+The judge is judged with records made by hand, in which it is known what is wrong.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+from benchmarks.faults.campaign import draw, run_episode
+from benchmarks.faults.judge import Limits, judge
+from benchmarks.faults.kinds import KINDS
+from benchmarks.faults.logdisk import refusal_to_mount
+from benchmarks.faults.record import Happened, Record, Sent, Status, Struts
+from benchmarks.faults.rig import Rig
+from benchmarks.faults.visible import VISIBLE
+from benchmarks.faults.wire import Corrupt, Delay, Drop, Duplicate, Reorder, Wire
+from hexapod_comp.nodes.log_space import LogSpace
+
+LIMITS = Limits(np.tile([0.33, 0.88], (6, 1)), 2e-3, 2e-3)
+
+PERIOD = 0.004
+"""Of the commands in the records made here, s."""
+
+
+def quiet(seconds: float = 6.0) -> Record:
+    """Return the record of a machine that moves at 40 mm/s and has no faults."""
+    record = Record()
+    record.ended = seconds
+    for index in range(int(seconds / PERIOD)):
+        now = index * PERIOD
+        lengths = np.full(6, 0.5 + 0.01 * math.sin(4.0 * now))
+        record.sent[index] = Sent(now, now + 0.001)
+        record.commands.append(Struts(now + 0.001, lengths))
+        record.corrections.append(Struts(now + 0.001, np.full(6, 1e-4)))
+        record.measured.append(Struts(now + 0.002, lengths.copy()))
+        for link in record.delivered:
+            record.delivered[link].append(now + 0.001)
+    for second in range(int(seconds)):
+        for node in ("compensator", "strut_drive"):
+            record.statuses.append(Status(float(second), node, 0, "running", {}))
+    record.statuses.sort(key=lambda status: status.time)
+    return record
+
+
+def say(record: Record, time: float, message: str, node: str = "compensator", **values: str) -> None:
+    """Put a status into a record."""
+    record.statuses.append(Status(time, node, 2, message, values))
+    record.statuses.sort(key=lambda status: status.time)
+
+
+def test_nothing_is_found_where_nothing_is_wrong():
+    verdict = judge(quiet(), LIMITS)
+    assert verdict.misses() == []
+    assert verdict.sent == verdict.sent - verdict.lost > 1400
+
+
+@pytest.mark.parametrize(
+    ("spoil", "found"),
+    [
+        (lambda lengths: lengths + np.array([0.0, 0.0, 2.1e-3, 0.0, 0.0, 0.0]), "step of 2."),
+        (lambda lengths: lengths * np.nan, "not finite"),
+        (lambda lengths: np.where(np.arange(6) == 3, np.inf, lengths), "not finite"),
+        (lambda lengths: np.full(6, 0.881), "outside the stroke"),
+        (lambda lengths: np.full(6, 0.329), "outside the stroke"),
+    ],
+    ids=["step", "NaN", "infinite", "too long", "too short"],
+)
+def test_the_judge_catches_one_bad_command_among_1500(spoil, found):
+    record = quiet()
+    record.commands[700] = Struts(record.commands[700].time, spoil(record.commands[700].lengths))
+    assert any(found in miss for miss in judge(record, LIMITS).misses())
+
+
+@pytest.mark.parametrize(("value", "found"), [(2.1e-3, "strut_corrections of 2.1"), (math.nan, "not finite")])
+def test_the_judge_catches_one_bad_correction(value, found):
+    record = quiet()
+    record.corrections[700].lengths[2] = value
+    assert any(found in miss for miss in judge(record, LIMITS).misses())
+
+
+def test_a_fresh_start_may_step_to_the_measured_struts_and_nowhere_else():
+    """A compensator that has been reset starts from where the struts stand, 5 mm from what was told last."""
+    record = quiet()
+    for struts in (*record.commands[700:], *record.measured[680:]):
+        struts.lengths[:] += 5e-3
+    assert any("step" in miss for miss in judge(record, LIMITS).breaches)
+    record.fresh_starts.append(record.commands[700].time - 1e-4)
+    assert judge(record, LIMITS).breaches == []
+    record.commands[700].lengths[:] += 5e-3
+    assert any("step" in breach for breach in judge(record, LIMITS).breaches)
+
+
+def test_the_judge_catches_one_lost_command_outside_the_fault_and_forgives_those_inside():
+    record = quiet()
+    record.faults = [Happened("corrupt_pose", 2.0, 2.5, [2.1], "NaN, reason not_finite")]
+    say(record, 2.15, "refusing commands: not_finite")
+    record.sent[int(2.2 / PERIOD)].answered_at = math.nan
+    assert judge(record, LIMITS).misses() == []
+    record.sent[int(1.0 / PERIOD)].answered_at = math.nan
+    assert any("1 of" in miss and "lost" in miss for miss in judge(record, LIMITS).misses())
+
+
+@pytest.mark.parametrize(
+    ("at", "message", "delay"),
+    [
+        (2.15, "refusing commands: not_finite", 0.05),
+        (2.35, "refusing commands: not_finite", 0.25),
+        (2.15, "refusing commands: quaternion", math.inf),
+        (2.05, "running", math.inf),
+    ],
+    ids=["in time", "late", "of something else", "never"],
+)
+def test_how_long_a_report_took(at, message, delay):
+    record = quiet()
+    record.faults = [Happened("corrupt_pose", 2.0, 2.5, [2.1], "NaN, reason not_finite")]
+    say(record, at, message)
+    ((kind, report),) = judge(record, LIMITS).reports
+    assert (kind, report.visible) == ("corrupt_pose", True)
+    assert report.delay == pytest.approx(delay)
+    assert bool(judge(record, LIMITS).misses()) == (delay > 0.2)
+
+
+def test_what_was_said_before_the_fault_does_not_count():
+    record = quiet()
+    record.faults = [Happened("half_written_model", 2.0, 2.5, [2.1])]
+    say(record, 1.5, "running", last_failed_reload="line 3")
+    say(record, 2.2, "running", last_failed_reload="line 3")
+    assert judge(record, LIMITS).reports[0][1].delay == math.inf
+    say(record, 2.25, "running", last_failed_reload="line 7")
+    assert judge(record, LIMITS).reports[0][1].delay == pytest.approx(0.15)
+
+
+def silent(record: Record, link: str, since: float, until: float) -> None:
+    """Take a link's deliveries of a time out of a record."""
+    record.delivered[link] = [t for t in record.delivered[link] if not since < t < until]
+
+
+@pytest.mark.parametrize(
+    ("kind", "link", "node", "words"),
+    [
+        ("kill_compensator", "command", "strut_drive", "no new command"),
+        ("stop_drive", "feedback", "compensator", "feedback lost"),
+        ("drop_pose", "pose", "compensator", "no new command"),
+    ],
+)
+def test_silence_is_visible_after_the_nodes_timeout(kind, link, node, words):
+    """The last message came at 2.001 s and the timeouts are 0.1 s: visible at 2.101, said at 2.201."""
+    record = quiet()
+    silent(record, link, 2.002, 3.0)
+    record.faults = [Happened(kind, 2.002, 3.0)]
+    say(record, 2.201, words, node)
+    ((_, report),) = judge(record, LIMITS).reports
+    assert report.delay == pytest.approx(0.1, abs=1e-6)
+
+
+def test_who_is_dead_need_not_report_and_who_is_stopped_must_when_it_goes_on():
+    record = quiet()
+    record.faults = [Happened("corrupt_pose", 2.0, 2.5, [2.1], "NaN, reason not_finite")]
+    record.outages["compensator"] = [(1.9, 2.4)]
+    assert judge(record, LIMITS).reports[0][1].delay == math.inf
+    say(record, 2.5, "refusing commands: not_finite")
+    assert judge(record, LIMITS).reports[0][1].delay == pytest.approx(0.1)
+    record.outages["compensator"] = [(1.9, 3.5)]
+    assert not judge(record, LIMITS).reports[0][1].visible
+
+
+@pytest.mark.parametrize(("last_bad", "recovery"), [(2.6, 0.1), (3.8, 1.3), (5.7, math.inf)])
+def test_recovery_ends_with_the_last_command_that_was_not_answered(last_bad, recovery):
+    record = quiet()
+    record.faults = [Happened("duplicate_pose", 2.0, 2.5)]
+    for index, entry in record.sent.items():
+        if 2.5 <= index * PERIOD <= last_bad:
+            entry.answered_at = math.nan
+    if last_bad > 5.0:
+        record.ended = 5.8
+    found = judge(record, LIMITS)
+    assert found.recovery == pytest.approx(recovery, abs=2 * PERIOD)
+    assert any("recovery" in miss for miss in found.misses()) == (recovery > 1.0)
+
+
+def test_struts_that_do_not_go_where_they_are_told_are_not_recovered():
+    record = quiet()
+    record.faults = [Happened("duplicate_command", 2.0, 2.5)]
+    for reading in record.measured:
+        if 2.0 < reading.time < 4.0:
+            reading.lengths[4] += 4e-3
+    assert judge(record, LIMITS).recovery == pytest.approx(1.5, abs=0.01)
+
+
+# ---- wires ----
+
+
+def carried(rule, messages: int = 100) -> list[tuple[float, int]]:
+    """Return what a wire delivers, and when, of messages sent every 10 ms."""
+    out: list[tuple[float, int]] = []
+    wire = Wire(lambda message, now: out.append((now, message.number)))
+    wire.rule = rule
+    for tick in range(messages * 10 + 1000):
+        now = tick * 1e-3
+        if tick % 10 == 0 and tick < messages * 10:
+            wire.put(SimpleNamespace(number=tick // 10), now)
+        wire.release(now)
+    return out
+
+
+def carried_marks(rule) -> int:
+    """Return how many of 100 messages a wire notes as wrong."""
+    wire = Wire(lambda message, now: None)
+    wire.rule = rule
+    for tick in range(3000):
+        if tick % 10 == 0 and tick < 1000:
+            wire.put(SimpleNamespace(number=tick // 10), tick * 1e-3)
+        wire.release(tick * 1e-3)
+    return len(wire.marks)
+
+
+def test_wires_do_what_their_rules_say():
+    rng = np.random.default_rng(0)
+    numbers = [number for _, number in carried(Duplicate(rng, 1.0))]
+    assert numbers == sorted([*range(100)] * 2)
+    assert [number for _, number in carried(Drop(rng, 1.0))] == []
+    assert 50 < len(carried(Drop(rng, 0.3))) < 90
+    delayed = carried(Delay(rng, 0.25, False))
+    assert [number for _, number in delayed] == [*range(100)]
+    assert all(now - number * 0.01 == pytest.approx(0.25, abs=2e-3) for now, number in delayed)
+    overtaken = [number for _, number in carried(Reorder(rng, 0.2))]
+    assert sorted(overtaken) == [*range(100)] != overtaken
+    assert carried_marks(Reorder(rng, 1.0)) == 0, "all are late, none is overtaken"
+    assert 0 < carried_marks(Reorder(rng, 0.2)) <= sum(b < a for a, b in pairwise(overtaken)) * 3
+
+    def spoil(message):
+        message.number = -1
+
+    spoilt = [number for _, number in carried(Corrupt(rng, 0.2, spoil))]
+    assert len(spoilt) == 100
+    assert 5 < spoilt.count(-1) < 40
+
+
+# ---- the log's disk ----
+
+
+@pytest.mark.parametrize(
+    ("blocks", "said"), [(1000, ""), (16, ""), (15, "log disk full"), (0, "log disk full")], ids=str
+)
+def test_a_full_log_disk_is_a_problem(monkeypatch, tmp_path, blocks, said):
+    """64 KiB are 16 blocks of 4,096 byte."""
+    monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=blocks, f_frsize=4096))
+    space = LogSpace(tmp_path)
+    space.look()
+    assert space.problem.startswith(said)
+    assert bool(space.problem) == bool(said)
+
+
+def test_a_log_folder_that_is_not_there_is_no_problem_and_one_that_fails_is(monkeypatch, tmp_path):
+    space = LogSpace(tmp_path / "nowhere")
+    space.look()
+    assert space.problem == ""
+
+    def fail(_):
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(os, "statvfs", fail)
+    space.look()
+    assert space.problem == "log folder lost: Input/output error"
+
+
+# ---- episodes ----
+
+
+def test_episodes_are_the_same_for_the_same_seed_and_all_kinds_come_equally_often():
+    def drawn(seed):
+        return [[(at, f.kind, f.duration) for at, f in draw(seed, n).faults] for n in range(2 * len(KINDS))]
+
+    assert drawn(5) == drawn(5) != drawn(6)
+    firsts = [faults[0][1] for faults in drawn(5)]
+    assert sorted(firsts) == sorted([*KINDS] * 2)
+    assert 5 < sum(len(faults) == 2 for faults in drawn(5)) < 2 * len(KINDS)
+    assert set(VISIBLE) == set(KINDS)
+
+
+class Chosen:
+    """An episode told instead of drawn."""
+
+    number = -1
+
+    def __init__(self, *kinds: str) -> None:
+        self.faults = [(0.0, KINDS[kind](np.random.default_rng(3))) for kind in kinds]
+
+
+def test_a_few_episodes(isolated_ros):
+    """Three, with two faults each; the bars on time are the campaign's, which has a computer to itself."""
+    disk = () if refusal_to_mount() else ("log_disk_full",)
+    kinds = [("corrupt_pose", *disk), ("encoder_nan", "drop_pose"), ("kill_compensator", "drop_feedback")]
+    with Rig(domain=False) as rig:
+        for names in kinds:
+            outcome = run_episode(rig, Chosen(*names))
+            assert outcome.verdict.breaches == []
+            assert all(report.delay < 2.0 for _, report in outcome.verdict.reports if report.visible), outcome.line(0)
+            rig.spin(5.0, rig.running)
+            assert rig.running()
