@@ -255,7 +255,7 @@ class HalfModel(Fault):
 
     kind, touches = "half_written_model", frozenset({"compensator"})
     shortest = longest = 0.5
-    meaning = Meaning("the service reload_model has answered, with success = false", "compensator: the old model stays")
+    meaning = Meaning("the service reload_model has answered", "compensator: the old model stays")
 
     def begin(self, rig: Rig, happened: Happened) -> None:
         """Write half a file and have it read."""
@@ -267,8 +267,8 @@ class HalfModel(Fault):
 
         def answered(taken: bool) -> None:
             self._answers.append(taken)
-            if not taken:
-                happened.marks.append(time.monotonic())
+            happened.detail += ", taken as a whole one" if taken else ""
+            happened.marks.append(time.monotonic())
 
         rig.reload_model(answered)
 
