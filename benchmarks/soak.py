@@ -3,7 +3,7 @@
 Compensator and simulated drive run as processes of their own, the drive's readings go back to the compensator,
 and the tool goes round a circle. Their stderr goes into a pipe that nobody reads, as when a terminal was stopped
 with Ctrl-S. Latency is from just before a command is published to its strut commands' arrival here. For the longest
-ones the system says how long each process had been waiting for a processor in the second before
+ones the system says how long each process had been waiting for a processor in the second around
 it (/proc/PID/task/*/schedstat), and the nodes say what Python's garbage collector and Numba did.
 
 Usage: python -m benchmarks.soak [--minutes 30] [--rate-hz 1000] [--json]
@@ -42,6 +42,9 @@ NODES = ("compensator", "strut_drive")
 RADIUS, TURN_TIME = 0.012, 4.0
 """Circle about home, m, and time of one turn, s: 19 mm/s."""
 
+RUN_IN = 3.0
+"""Commands are sent, and not counted, for this long first, s: until DDS has made everybody known to everybody."""
+
 WARM_UP = 0.1
 """Share of the run after which memory should be flat; at least :data:`LEAST_WARM_UP`, s."""
 
@@ -62,17 +65,18 @@ class Gap:
 
     Attributes
     ----------
-    at : float
-        When the command left, CLOCK_MONOTONIC, s.
+    at, elapsed : float
+        When the command left, s: CLOCK_MONOTONIC, and since the start of the run.
     latency : float
         s.
     waiting : dict of str to float
-        How long each process had been waiting for a processor since the last look, s.
+        How long each process waited for a processor in the second around it, s.
     """
 
     at: float
+    elapsed: float
     latency: float
-    waiting: dict[str, float]
+    waiting: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass
@@ -138,6 +142,13 @@ class Commander:
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
         self._message = pose_message(Pose(np.array([0.0, 0.0, 0.4]), np.eye(3)), "base")
         self._sent: dict[int, float] = {}
+        self._start, self._turned = 0.0, 0.0
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget what was counted up to now."""
+        self.found = Soak(diagnostics=self.found.diagnostics)
+        self._sent.clear()
         self._waiting = self._first_waiting = self._run_queue()
 
     def close(self) -> None:
@@ -156,25 +167,28 @@ class Commander:
 
     def run(self, seconds: float) -> Soak:
         """Send for some seconds, wait for the last answers, and return the account."""
-        start = due = time.monotonic()
+        self.begin()
+        start = due = self._start = time.monotonic()
         next_look = start
         while (now := time.monotonic()) < start + seconds:
-            self._send(now - start)
+            self._send()
             if now >= next_look:
                 self._look(now - start)
                 next_look = now + 1.0
-            due = max(due + 1.0 / self._rate, now - SPIN_PERIOD)
+            due = max(due + 1.0 / self._rate, now)
             while (left := due - time.monotonic()) > 0.0:
                 self.executor.spin_once(timeout_sec=left)
         end = time.monotonic() + 2.0
         while self._sent and time.monotonic() < end:
             self.executor.spin_once(timeout_sec=SPIN_PERIOD)
+        self._look(time.monotonic() - start)
         self.found.lost = len(self._sent)
         self.found.waited = {k: v - self._first_waiting[k] for k, v in self._run_queue().items()}
         return self.found
 
-    def _send(self, elapsed: float) -> None:
-        angle = 2.0 * np.pi * elapsed / TURN_TIME
+    def _send(self) -> None:
+        self._turned += 1.0 / (self._rate * TURN_TIME)
+        angle = 2.0 * np.pi * self._turned
         position = self._message.pose.position
         position.x, position.y = RADIUS * float(np.cos(angle)) - RADIUS, RADIUS * float(np.sin(angle))
         stamp = self.node.get_clock().now()
@@ -192,7 +206,7 @@ class Commander:
         found.histogram[np.searchsorted(BINS, latency)] += 1
         found.longest = max(found.longest, latency)
         if len(found.worst) < WORST_KEPT or latency > found.worst[-1].latency:
-            found.worst.append(Gap(sent, latency, self._waited_since()))
+            found.worst.append(Gap(sent, sent - self._start, latency))
             found.worst.sort(key=lambda gap: -gap.latency)
             del found.worst[WORST_KEPT:]
 
@@ -201,13 +215,11 @@ class Commander:
             self.found.diagnostics[status.name.partition(":")[0]] = {v.key: v.value for v in status.values}
 
     def _look(self, elapsed: float) -> None:
-        """Once a second: memory, and forget how long anybody waited for a processor before."""
+        """Once a second, as it takes two milliseconds: memory, and who has waited for a processor since then."""
         self.found.memory.append((elapsed, *(_resident(self._pids[name]) for name in NODES)))
-        self._waiting = self._run_queue()
-
-    def _waited_since(self) -> dict[str, float]:
         before, self._waiting = self._waiting, self._run_queue()
-        return {name: now - before[name] for name, now in self._waiting.items()}
+        for gap in self.found.worst:
+            gap.waiting = gap.waiting or {name: now - before[name] for name, now in self._waiting.items()}
 
     def _run_queue(self) -> dict[str, float]:
         """Return how long the threads of each process have waited for a processor up to now, s."""
@@ -255,6 +267,7 @@ def soak(seconds: float, rate: float) -> Soak:
         commander = Commander(rate, pids)
         try:
             commander.wait_until_ready()
+            commander.run(RUN_IN)
             began = time.monotonic()
             found = commander.run(seconds)
         finally:
@@ -283,16 +296,16 @@ def report(found: Soak) -> list[str]:
             f"{len(collections)} garbage collections, longest {max(collections, default=0.0) * 1e6:.0f} µs; "
             f"compiled {len(compiled)}; waited {found.waited[node]:.2f} s for a processor"
         )
-    lines.append("longest latencies, ms, and how long each process had waited for a processor in the second before:")
+    lines.append("longest latencies, ms, and how long each process waited for a processor in the second around them:")
     for gap in found.worst:
-        waiting = ", ".join(f"{name} {seconds * 1e3:.2f}" for name, seconds in gap.waiting.items())
+        waiting = ", ".join(f"{name} {seconds * 1e3:.0f}" for name, seconds in gap.waiting.items())
         busy = [
             f"{node}'s collector {note['seconds'] * 1e3:.2f}"
             for node in NODES
             for note in found.notes[node]
             if note["kind"] == "gc" and gap.at - 1e-3 <= note["at"] <= gap.at + gap.latency
         ]
-        lines.append(f"  {gap.latency * 1e3:7.2f}: {', '.join([waiting, *busy])}")
+        lines.append(f"  {gap.latency * 1e3:7.2f} at {gap.elapsed:.1f} s: {', '.join([waiting, *busy])}")
     return lines
 
 

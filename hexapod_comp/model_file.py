@@ -6,6 +6,7 @@ all six or a list of six. Everything marked optional may be left out and is then
 
     format: hexapod_comp/model
     version: 1
+    closed: true                      # optional: the last key is `end`; without it the file is refused as cut off
     machine: paper                    # must be the geometry file's `machine`
     name: after the crash             # shown in diagnostics
     date: '2026-01-31'                # ISO 8601, date or date and time
@@ -52,6 +53,8 @@ all six or a list of six. Everything marked optional may be left out and is then
         direction: forward            # of motion along the axis: forward, backward or both
         dx_um: [0.1, -3.0, 0.4]       # polynomial: constant, u, u², … with u from −1 to 1 over the box
         rz_urad: [5.0]                # dx dy dz (lengths), rx ry rz (angles); one left out is zero
+
+    end: true                         # of a closed file: everything above has arrived
 
 A family of lines (all along one axis) is whole or absent: every pair of nodes in both directions.
 
@@ -125,6 +128,7 @@ def load_model(path: str | Path, geometry: HexapodGeometry) -> MachineModel:
         Naming file, key, value and what is allowed.
     """
     top = read_yaml(path, MODEL_FORMAT, MODEL_VERSION)
+    _refuse_cut_off(top)
     machine = top.text("machine")
     if machine != geometry.name:
         raise top.error("machine", f"the model is for another machine, must be {geometry.name!r}", machine)
@@ -164,8 +168,8 @@ def save_model(model: MachineModel, path: str | Path) -> None:
         The file cannot be written.
     """
     _check_origin(model.origin)
-    content: dict[str, Any] = {"format": MODEL_FORMAT, "version": MODEL_VERSION, "machine": model.machine}
-    content |= {"name": model.name, "date": model.origin.date}
+    content: dict[str, Any] = {"format": MODEL_FORMAT, "version": MODEL_VERSION, "closed": True}
+    content |= {"machine": model.machine, "name": model.name, "date": model.origin.date}
     content["sources"] = [{"file": name, "sha256": digest} for name, digest in model.origin.sources]
     if model.valid_box is not None:
         content["valid_box_mm"] = _written(model.valid_box, "length", "mm")
@@ -180,12 +184,25 @@ def save_model(model: MachineModel, path: str | Path) -> None:
         "thermal": _thermal_block(model),
         "field": _field_block(model.field),
     }
-    content |= {name: block for name, block in blocks.items() if block}
+    content |= {name: block for name, block in blocks.items() if block} | {"end": True}
     text = yaml.dump(content, Dumper=_ModelDumper, sort_keys=False, allow_unicode=True, width=math.inf)
     write_text_atomically(path, text)
 
 
 # Reading
+
+
+def _refuse_cut_off(top: Section) -> None:
+    """Raise when a closed file has lost its end: every block is optional, so what is left may read well."""
+    marks = [key for key in ("closed", "end") if key in top]
+    for key in marks:
+        value = top.take(key)
+        if value is not True:
+            raise top.error(key, "must be true, or be left out together with its fellow", value)
+    if marks == ["closed"]:
+        raise top.error("end", "is missing: the file is cut off, or still being written")
+    if marks == ["end"]:
+        raise top.error("closed", "is missing at the file's beginning")
 
 
 def _read_origin(top: Section) -> ModelOrigin:

@@ -128,8 +128,8 @@ def test_an_ideal_model_comes_back_from_a_short_file(tmp_path):
     model = MachineModel("paper", origin=ModelOrigin("2026-01-31"))
     assert_equal(there_and_back(model, tmp_path, PAPER), model)
     assert (tmp_path / "there.yaml").read_text() == (
-        "format: hexapod_comp/model\nversion: 1\nmachine: paper\nname: ideal\ndate: '2026-01-31'\n"
-        "sources: []\nreversal_threshold_um: 0.2\n"
+        "format: hexapod_comp/model\nversion: 1\nclosed: true\nmachine: paper\nname: ideal\ndate: '2026-01-31'\n"
+        "sources: []\nreversal_threshold_um: 0.2\nend: true\n"
     )
 
 
@@ -197,9 +197,10 @@ def test_the_file_opens_with_its_provenance(tmp_path):
     save_model(replace(random_model(np.random.default_rng(0), "paper"), origin=ORIGIN), tmp_path / "m.yaml")
     text = (tmp_path / "m.yaml").read_text(encoding="utf-8")
     keys = [line.split(":")[0] for line in text.splitlines() if line[0] not in " -"]
-    assert keys[:8] == [
+    assert keys[:9] == [
         "format",
         "version",
+        "closed",
         "machine",
         "name",
         "date",
@@ -207,7 +208,7 @@ def test_the_file_opens_with_its_provenance(tmp_path):
         "held_out_residual_um",
         "note",
     ]
-    assert keys[8:] == ["reversal_threshold_um", "structure", "struts", "thermal", "field"]
+    assert keys[9:] == ["reversal_threshold_um", "structure", "struts", "thermal", "field", "end"]
     assert "Größe: 4 µm" in text
 
 
@@ -444,3 +445,37 @@ def test_names_of_every_kind_come_back(tmp_path_factory, seed):
     name, note, file = (" ".join(rng.choice(words, rng.integers(1, 4))) for _ in range(3))
     model = MachineModel("paper", name, origin=ModelOrigin("2026-01-31", ((file, DIGEST),), None, note))
     assert_equal(there_and_back(model, tmp_path_factory.getbasetemp(), PAPER), model)
+
+
+def test_a_file_cut_off_anywhere_is_refused(tmp_path):
+    """Every block is optional, so a beginning of a file may read well; a hundred places, line ends among them."""
+    path, whole = tmp_path / "m.yaml", tmp_path / "whole.yaml"
+    save_model(replace(random_model(np.random.default_rng(5), "paper"), origin=ORIGIN), whole)
+    text = whole.read_text(encoding="utf-8")
+    ends = [number for number, letter in enumerate(text[:-1]) if letter == "\n"]
+    places = {*np.linspace(1, len(text) - 2, 60, dtype=int), *np.random.default_rng(6).choice(ends, 40), ends[-1]}
+    accepted = []
+    for place in sorted(places):
+        path.write_text(text[:place], encoding="utf-8")
+        with contextlib.suppress(InputFileError):
+            load_model(path, PAPER)
+            accepted.append(text[:place][-20:])
+    assert accepted == []
+    assert load_model(whole, PAPER).origin == ORIGIN
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        (BY_HAND.replace("machine: paper", "machine: paper\nclosed: true"), "end"),
+        (BY_HAND + "end: true\n", "closed"),
+        (BY_HAND.replace("machine: paper", "machine: paper\nclosed: 1") + "end: true\n", "closed"),
+        (BY_HAND.replace("machine: paper", "machine: paper\nclosed: true") + "end: false\n", "end"),
+    ],
+)
+def test_marks_of_a_closed_file_belong_together(text, key, tmp_path):
+    path = tmp_path / "m.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputFileError) as caught:
+        load_model(path, PAPER)
+    assert caught.value.key == key
