@@ -6,6 +6,7 @@ policy.xsd, version 0.2.0; sros2 takes a comment among the enclaves for one and 
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
@@ -21,6 +22,8 @@ from rclpy.node import Node
 from hexapod_comp.nodes.client import LoopClient
 from hexapod_comp.nodes.linuxcnc_bridge import LinuxcncBridgeNode
 from hexapod_comp.nodes.runtime import autostart
+
+PACKAGE = Path(__file__).resolve().parents[1] / "hexapod_comp"
 
 POLICY = Path(__file__).resolve().parents[1] / "config" / "security" / "policy.xml"
 
@@ -125,6 +128,19 @@ def test_the_client_opens_what_the_policy_allows() -> None:
         assert found == enclave.allowed
     finally:
         client.close()
+
+
+def test_nothing_is_unpickled_or_executed() -> None:
+    """What the source does not name it cannot do: a file from anywhere is data."""
+    forbidden = {"pickle", "cPickle", "dill", "marshal", "shelve", "eval", "exec", "unsafe_load", "full_load"}
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_bytes())):
+            names = {getattr(node, "id", None), getattr(node, "attr", None), getattr(node, "module", None)}
+            names |= {alias.name for alias in getattr(node, "names", []) if isinstance(alias, ast.alias)}
+            if names & forbidden:
+                found[path.name] = names & forbidden
+    assert not found
 
 
 def expect_equal(bench: Bench, witness: Node, node: str, enclave: Enclave) -> None:

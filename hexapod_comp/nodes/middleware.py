@@ -16,7 +16,7 @@ def avoid_shared_memory() -> None:
     """Let Fast DDS receive by UDP only, unless the user has a profile of their own.
 
     A process killed while it holds a lock in the shared memory of another stalls that other for seconds.
-    Latencies by UDP are the same. The environment of this process, and so of its children, is changed.
+    The environment of this process, and so of its children, is changed.
     """
     if not any(os.environ.get(name) for name in PROFILE_VARIABLES):
         os.environ[PROFILE_VARIABLES[0]] = str(config_folder() / PROFILE)
