@@ -64,7 +64,7 @@ test-linuxcnc: $(VENV)/with-ros,test
 	else $(BESIDE_LINUXCNC) run-linuxcnc-tests; fi
 
 run-linuxcnc-tests: $(VENV)/with-ros,test
-	LINUXCNC_TESTS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest test/test_linuxcnc.py
+	LINUXCNC_TESTS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -s test/test_linuxcnc.py
 
 clean:
 	rm -rf .venv .venv-linuxcnc build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
