@@ -94,7 +94,7 @@ class Soak:
     memory : list of tuple of float
         Time since the start, s, and resident memory of each node, byte.
     waited : dict of str to float
-        How long each process waited for a processor during the whole run, s.
+        How long the threads of each process, together, waited for a processor during the whole run, s.
     """
 
     commands: int = 0
