@@ -30,6 +30,7 @@ from sensor_msgs.msg import JointState
 from hexapod_comp.conversions import pose_message
 from hexapod_comp.nodes.processes import PrivateDomain
 from hexapod_comp.nodes.runtime import COMMAND_QOS
+from hexapod_comp.nodes.stamps import nanoseconds_of
 from hexapod_comp.pose import Pose
 
 RATES = (250.0, 500.0, 1000.0, 0.0)
@@ -75,7 +76,7 @@ class Line:
 
     def _answer(self, message: JointState) -> None:
         now = time.perf_counter_ns()
-        sent = self.sent.pop(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec, None)
+        sent = self.sent.pop(nanoseconds_of(message.header.stamp), None)
         if sent is not None:
             self.latencies.append(now - sent)
 

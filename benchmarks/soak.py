@@ -35,6 +35,7 @@ from sensor_msgs.msg import JointState
 from hexapod_comp.conversions import pose_message
 from hexapod_comp.nodes.processes import PrivateDomain
 from hexapod_comp.nodes.runtime import COMMAND_QOS, EVENT_QOS, SPIN_PERIOD
+from hexapod_comp.nodes.stamps import nanoseconds_of
 from hexapod_comp.pose import Pose
 
 NODES = ("compensator", "strut_drive")
@@ -199,7 +200,7 @@ class Commander:
 
     def _on_answer(self, message: JointState) -> None:
         now = time.monotonic()
-        sent = self._sent.pop(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec, None)
+        sent = self._sent.pop(nanoseconds_of(message.header.stamp), None)
         if sent is None:
             return
         latency, found = now - sent, self.found

@@ -22,6 +22,7 @@ from ..pose import Pose
 from ..trajectory import Path
 from .middleware import avoid_shared_memory
 from .runtime import COMMAND_QOS, EVENT_QOS, STATE_QOS
+from .stamps import nanoseconds_of
 
 LISTENER_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
 """Answers are all kept until they are read: a witness must not lose any."""
@@ -101,14 +102,14 @@ class LoopClient:
         rclpy.try_shutdown(context=self.context)
 
     def _on_command(self, message: JointState) -> None:
-        entry = self.sent.get(_key(message))
+        entry = self.sent.get(nanoseconds_of(message.header.stamp))
         if entry is not None:
             entry.answered_at = time.monotonic()
             self._commands.read(message)
             entry.command = self._commands.lengths.copy()
 
     def _on_correction(self, message: JointState) -> None:
-        entry = self.sent.get(_key(message))
+        entry = self.sent.get(nanoseconds_of(message.header.stamp))
         if entry is not None:
             self._corrections.read(message)
             entry.correction = self._corrections.lengths.copy()
@@ -291,7 +292,3 @@ class LoopClient:
 
 def _answered(entry: Sent) -> bool:
     return bool(np.isfinite(entry.command[0]) and np.isfinite(entry.correction[0]))
-
-
-def _key(message: JointState) -> int:
-    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec

@@ -56,8 +56,8 @@ from .runtime import (
     keep_discovery_local,
     run,
 )
-from .stamps import StampCheck, nanoseconds_of, period
-from .wire import StrutBytes, read_pose_bytes, stamp_of
+from .stamps import StampCheck, nanoseconds_of, period, stamp_of
+from .wire import StrutBytes, read_pose_bytes
 
 CHECK_PERIOD = 0.05
 """How often the node looks whether its state has changed, s."""

@@ -44,7 +44,7 @@ from .runtime import (
     keep_discovery_local,
     run,
 )
-from .stamps import nanoseconds_of
+from .stamps import nanoseconds_of, stamp_of
 
 CHECK_PERIOD = 0.05
 """How often the node looks whether its state has changed, s."""
@@ -221,7 +221,7 @@ class LinuxcncBridgeNode(MachineNode):
 
     def _send(self, now: float) -> None:
         """Publish measured struts and commanded pose, each only if all its pins are numbers."""
-        stamp = _time_now()
+        stamp = stamp_of(time.time_ns())
         if self._states.age(now) >= self._states_period:
             feedback = self._read_feedback()
             if self._finite(FEEDBACK, feedback, now):
@@ -377,11 +377,6 @@ class LinuxcncBridgeNode(MachineNode):
             "last_bad_pins": self._bad_pins.last_text,
             **self._refusals.values(),
         }
-
-
-def _time_now() -> Time:
-    now = time.time_ns()
-    return Time(sec=now // 1_000_000_000, nanosec=now % 1_000_000_000)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -27,6 +27,12 @@ def nanoseconds_of(stamp: Time) -> int:
     return stamp.sec * 1_000_000_000 + stamp.nanosec
 
 
+def stamp_of(nanoseconds: int) -> Time:
+    """Return nanoseconds as a stamp."""
+    sec, nanosec = divmod(nanoseconds, 1_000_000_000)
+    return Time(sec=sec, nanosec=nanosec)
+
+
 def period(since: int, until: int) -> float:
     """Return the time between two stamps, ns, over which a strut's speed is taken, s; 0: it has none.
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import struct
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
@@ -19,6 +18,7 @@ from sensor_msgs.msg import JointState
 from ..conversions import StrutMessage, pose_numbers, write_lengths
 from ..errors import CommandError
 from ..geometry import STRUT_NAMES
+from .stamps import nanoseconds_of, stamp_of
 
 LITTLE_ENDIAN = b"\x00\x01"
 """How plain CDR with the lowest byte first begins."""
@@ -70,13 +70,7 @@ def _read_unusual(data: bytes) -> tuple[int, str, tuple[float, ...]]:
     stamp = message.header.stamp
     if stamp.nanosec >= _SECOND:  # with the largest seconds it would not fit into an answer's stamp
         raise CommandError("message", f"nanosec of the stamp must be below {_SECOND}, not {stamp.nanosec}")
-    return stamp.sec * _SECOND + stamp.nanosec, message.header.frame_id, pose_numbers(message)
-
-
-def stamp_of(nanoseconds: int) -> Time:
-    """Return a stamp in ns as a message."""
-    sec, nanosec = divmod(nanoseconds, _SECOND)
-    return Time(sec=sec, nanosec=nanosec)
+    return nanoseconds_of(stamp), message.header.frame_id, pose_numbers(message)
 
 
 class StrutBytes:
