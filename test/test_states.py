@@ -184,14 +184,14 @@ def test_singular_pose_near(bench, tmp_path):
 
 
 def test_overload_keeps_the_newest_and_counts_the_others(bench):
-    """Fifteen commands before the node gets to work, and a queue of ten: five are counted, none comes late."""
+    """105 commands before the node gets to work, and a queue of a hundred: five are counted, none comes late."""
     bench.compensator(command_timeout=0.0)
     bench.ask(HOME)
-    sent = [bench.send(near(HOME, (0.0, 0.0, 1e-5 * n))) for n in range(1, 16)]
+    sent = [bench.send(near(HOME, (0.0, 0.0, 1e-6 * n))) for n in range(1, 106)]
     bench.until(lambda: bench.seen["strut_commands"][-1].header.stamp == sent[-1].header.stamp, "the last answer")
     values = bench.until_status(WARN, "running, commands are being missed")
     stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in bench.seen["strut_commands"]]
-    assert int(values["commands_missed"]) == 16 - len(stamps) == 5
+    assert int(values["commands_missed"]) == 106 - len(stamps) == 5
     assert stamps == sorted(stamps)
     bench.ask(HOME)
     bench.until_status(OK, "running")
@@ -202,7 +202,7 @@ def test_overload_of_the_drive_is_counted(bench):
     bench.until(lambda: bench.seen["strut_states"], "readings")
     command(bench, closed_form_lengths(HOME))
     bench.barrier()
-    for _ in range(12):
+    for _ in range(102):
         command(bench, closed_form_lengths(MOVED))
     assert bench.until_status(WARN, "running, commands are being missed", DRIVE)["commands_missed"] == "2"
     bench.until_status(OK, "running", DRIVE)

@@ -405,13 +405,13 @@ def test_misspelt_parameter_is_warned_of(bench):
 
 
 def test_quality_of_service(bench):
-    """Commands reliable, in a queue of ten; states best effort, the newest only."""
+    """Commands reliable, in a queue of a hundred; states best effort, the newest only."""
     node = bench.drive(**EXACT)
     ends = {end.topic_name: end.qos_profile for end in (*node.publishers, *node.subscriptions)}
     for name in ("strut_commands", "strut_states", "tool_pose_true"):
         qos = ends[f"/{name}"]
         commanded = name == "strut_commands"
-        assert (qos.depth, qos.history) == (10 if commanded else 1, HistoryPolicy.KEEP_LAST), name
+        assert (qos.depth, qos.history) == (100 if commanded else 1, HistoryPolicy.KEEP_LAST), name
         assert qos.reliability == (ReliabilityPolicy.RELIABLE if commanded else ReliabilityPolicy.BEST_EFFORT), name
     assert ends["/diagnostics"].reliability == ReliabilityPolicy.RELIABLE
 

@@ -38,8 +38,8 @@ from .refusing import unfailing
 SPIN_PERIOD = 0.1
 """Longest wait of one spin, s: how soon a signal is noticed (EventsExecutor.spin itself never returns)."""
 
-COMMAND_QOS = QoSProfile(depth=10, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
-"""Commands: each must arrive, and a busy processor's pause of some milliseconds must not lose any at 1 kHz."""
+COMMAND_QOS = QoSProfile(depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
+"""Commands: each must arrive. A hundred wait while a busy processor pauses for 0.1 s at 1 kHz, or a cable repeats."""
 
 STATE_QOS = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Measured states: only the newest counts, and an old one is not worth repeating."""
