@@ -25,7 +25,8 @@ from scipy.spatial.transform import Rotation
 from hexapod_comp import kernels
 from hexapod_comp.compensation import Compensator
 from hexapod_comp.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.limits import LimitTable, check_stage
+from hexapod_comp.limit_kernels import check_stage
+from hexapod_comp.limits import LimitTable
 from hexapod_comp.machine import MachineModel
 from hexapod_comp.model_file import load_model
 from hexapod_comp.paths import config_file
@@ -66,7 +67,7 @@ def commands(geometry: HexapodGeometry) -> list[tuple[float, ...]]:
     angles = np.linspace(0.0, np.pi, COMMANDS // 2)
     turns = Rotation.from_euler("xyz", np.deg2rad(3.0) * np.column_stack([np.sin(angles), np.cos(angles), angles]))
     circle = np.column_stack([np.sin(angles), np.cos(angles), 0.2 * np.sin(2.0 * angles)])
-    tool = Compensator(geometry, MachineModel(geometry.name)).tool_pose(geometry.home)
+    tool = geometry.tool_pose(geometry.home)
     rows = np.hstack([tool.position + 0.01 * circle, (turns * Rotation.from_matrix(tool.rotation)).as_quat()])
     return [tuple(row) for row in np.vstack([rows, rows[::-1]]).tolist()]
 
@@ -175,15 +176,16 @@ def from_python(call: Callable[[], object]) -> Callable[[], float]:
 def parts(rounds: int) -> list[Part]:
     """Return what the parts of the ideal machine's command take, and what comes beside commands."""
     geometry = load_geometry(config_file("paper.yaml"))
-    home, table, lengths = geometry.home, LimitTable(geometry), np.empty(6)
+    spaced = dataclasses.replace(geometry, limits=dataclasses.replace(geometry.limits, clearance=0.1))
+    home, lengths = geometry.home, np.empty(6)
     nominal = (*geometry.kernel_joints, home.position.copy(), home.rotation.copy(), lengths)
-    limits = (table.stroke, table.cone_axes, table.cone_cosines, table.scalars)
     compensator = Compensator(geometry, load_model(config_file("paper_machine.yaml"), geometry))
     compensator.step(commands(geometry)[0], 0.0)
     runs = {
         "quaternion to rotation": repeated(read_pose, *[0.0] * 6, 1.0, np.empty(3), np.empty((3, 3))),
         "nominal strut lengths": repeated(kernels.strut_lengths_one, *nominal),
-        "limits, each of two stages": repeated(check_stage, *nominal, limits),
+        "limits, each of two stages": repeated(check_stage, *nominal, LimitTable(geometry).arrays),
+        "the same with a clearance": repeated(check_stage, *nominal, LimitTable(spaced).arrays),
         "a temperature reading": from_python(lambda: compensator.set_temperature("strut_1", 20.5)),
     }
     return [Part(name, min(run() for _ in range(rounds))) for name, run in runs.items()]

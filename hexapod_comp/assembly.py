@@ -17,6 +17,7 @@ from .assembly_kernels import closed_triangles
 from .errors import KinematicsError, OtherAssemblyModeError, SingularError, UnreachableError
 from .geometry import HexapodGeometry
 from .kinematics import Structure, condition_number, jacobian, six_lengths, solve_pose
+from .limit_kernels import nearest_strut
 from .pose import Pose, rotation_angle
 
 CLOSURE = 1e-12
@@ -162,7 +163,8 @@ def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose)
     centre, homewards = _home_side(geometry, structure)
     if homewards @ (joints.mean(axis=0) - centre) < 0.0:
         found.append("platform on the other side of the base")
-    return found + _cone_objections(geometry, joints - structure.base_joints, pose.rotation)
+    found += _cone_objections(geometry, joints - structure.base_joints, pose.rotation)
+    return found + _clearance_objections(geometry, structure.base_joints.copy(), joints)
 
 
 def _cone_objections(geometry: HexapodGeometry, struts: np.ndarray, rotation: np.ndarray) -> list[str]:
@@ -179,6 +181,15 @@ def _cone_objections(geometry: HexapodGeometry, struts: np.ndarray, rotation: np
             angle, limit = np.rad2deg([angles[worst], limits[worst]])
             found.append(f"{body} joint {worst + 1} at {angle:.1f}°, allowed {limit:.1f}°")
     return found
+
+
+def _clearance_objections(geometry: HexapodGeometry, base: np.ndarray, ends: np.ndarray) -> list[str]:
+    """Return the closest pair of struts if they are closer than allowed; joints (6, 3) in ``base``."""
+    apart, allowed = geometry.struts_apart.astype(float), geometry.limits.clearance
+    (distance, one), other = min((nearest_strut(base, ends, apart, i, i), i) for i in range(6))
+    if distance >= allowed:
+        return []
+    return [f"struts {one + 1} and {other + 1} {distance * 1e3:.1f} mm apart, allowed {allowed * 1e3:.1f} mm"]
 
 
 def platform_pair_gap(structure: Structure) -> float:

@@ -109,7 +109,7 @@ def assess(
         Seed or bounds that are none.
     """
     names = names or [f"pose {n + 1}" for n in range(len(poses))]
-    platform = [geometry.work @ pose @ geometry.tool.inverse() for pose in poses]
+    platform = [geometry.platform_pose(pose) for pose in poses]
     ideal = np.array([strut_lengths(Structure.of(geometry), pose) for pose in platform])
     seeds = tuple(range(seed, seed + machines))
     runs = []
@@ -145,7 +145,7 @@ def _run_pose(
 ) -> tuple[np.ndarray, ...]:
     unknown = np.zeros(FOLLOWED)
     real, model_pose, _ = machine.commands_for(platform, MotionState())
-    taken = geometry.work.inverse() @ machine.pose_for(ideal, unknown, platform)[0] @ geometry.tool
+    taken = geometry.tool_pose(machine.pose_for(ideal, unknown, platform)[0])
     turn = Rotation.from_matrix(taken.rotation @ pose.rotation.T).as_rotvec()
     # The start is 1 mm off, so that Newton has something to do.
     start = Pose(model_pose.position + 1e-3, model_pose.rotation)

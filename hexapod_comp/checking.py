@@ -6,12 +6,12 @@ all poses, all struts and both stages (nominal and compensated), and nothing sto
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from . import limits as codes
 from .compiling import compiled
 from .errors import (
     GeometryError,
@@ -23,13 +23,14 @@ from .errors import (
 )
 from .geometry import STRUT_NAMES, HexapodGeometry
 from .kernels import condition_one, strut_lengths_one
-from .limits import STAGES, LimitTable, joint_cosines
+from .limit_kernels import joint_cosines, nearest_strut, strut_ends
+from .limits import REASONS, STAGES, LimitTable
 from .machine import MachineModel, RealMachine
 from .machine_kernels import command_one
 from .motion import MotionState
-from .trajectory import moves, platform_poses
+from .trajectory import moves
 
-LIMITS = ("stroke", "base_cone", "platform_cone", "condition", "correction", "step", "speed")
+LIMITS = ("stroke", "base_cone", "platform_cone", "clearance", "condition", "correction", "step", "speed")
 """Limits that have a margin, in the order in which they are shown."""
 
 OTHER_FINDINGS = ("assembly", "not_converged", "outside_field")
@@ -44,8 +45,9 @@ RATES = (1.0, 10_000.0)
 CHUNK = 16_384
 """Poses examined at a time: bounds the memory of long paths."""
 
-QUANTITIES, CONDITION, SIGN = 20, 18, 19
-"""Per pose and stage: 6 lengths, 6 cosines at the base joints, 6 at the platform joints, condition, sign."""
+QUANTITIES, CLEARANCE, CONDITION, SIGN = 26, 18, 24, 25
+"""Per pose and stage: 6 lengths, 6 cosines at the base joints, 6 at the platform joints, 6 distances to the
+nearest strut, condition, sign."""
 
 NOTHING, UNSOLVED, OUTSIDE = range(3)
 
@@ -114,7 +116,7 @@ class CheckResult:
     examined : int
         Poses looked at, those on the way included.
     limits : dict of str to LimitSummary
-        By the names in :data:`LIMITS`.
+        By the names in :data:`LIMITS`; without ``clearance`` where the machine has no such limit.
     breaches : list of Breach
         Every limit broken, in order of rows; per row, limit and strut the worst.
     lengths : ndarray, shape (N, 2, 6)
@@ -187,7 +189,7 @@ def check(
         run.check_moves(positions, rotations, progress)
     else:
         run.check_rows(positions, rotations, mode == "stream", progress)
-    return run.result(mode, platform_poses(geometry, positions, rotations)[0])
+    return run.result(mode, geometry.platform_poses(positions, rotations)[0])
 
 
 @dataclass
@@ -302,7 +304,7 @@ class _Run:
         in_sequence: bool,
     ) -> None:
         """Examine tool poses, (n, …), of the rows `owner`; `in_sequence`: after the ones before."""
-        values, flags = self._examine(*platform_poses(self.geometry, positions, rotations), in_sequence)
+        values, flags = self._examine(*self.geometry.platform_poses(positions, rotations), in_sequence)
         lengths = values[:, :, :6]
         at_rows = share == 1.0
         self.lengths[owner[at_rows]] = lengths[at_rows]
@@ -330,8 +332,7 @@ class _Run:
             not in_sequence,
             geometry.kernel_joints[0],
             geometry.kernel_joints[1],
-            self.table.cone_axes,
-            geometry.characteristic_length,
+            self.table.arrays,
             machine.thresholds,
             self.motion.low,
             self.motion.sense,
@@ -348,18 +349,22 @@ class _Run:
         limits, lengths = self.geometry.limits, values[:, :, :6]
         cones = np.arccos(np.clip(values[:, :, 6:18], -1.0, 1.0))
         condition = values[:, :, CONDITION : CONDITION + 1]
+        clearance = values[:, :, CLEARANCE:CONDITION]
         correction = np.zeros_like(lengths)
         correction[:, 1] = lengths[:, 1] - lengths[:, 0]
         measured = {
             "stroke": (np.minimum(lengths - limits.stroke[:, 0], limits.stroke[:, 1] - lengths), lengths),
             "base_cone": (limits.base_cone - cones[:, :, :6], cones[:, :, :6]),
             "platform_cone": (limits.platform_cone - cones[:, :, 6:], cones[:, :, 6:]),
+            "clearance": (clearance - limits.clearance, clearance),
             "condition": (limits.condition - condition, condition),
             "correction": (limits.correction - np.abs(correction), correction),
         }
         for margin, _ in measured.values():
             margin[~solved, 1] = np.inf  # said once, as not converged
         measured["correction"][0][:, 0] = np.inf
+        if not limits.clearance:
+            del measured["clearance"]
         return measured
 
     def _changes(self, changes: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -396,7 +401,8 @@ class _Run:
         outside = np.zeros(self.count, dtype=bool)
         if box is not None:
             outside = ((platform_positions < box[0]) | (platform_positions > box[1])).any(axis=1)
-        summaries = {name: self.worst[name] for name in LIMITS}
+        left_out = () if self.geometry.limits.clearance else ("clearance",)
+        summaries = {name: self.worst[name] for name in LIMITS if name not in left_out}
         return CheckResult(
             mode=mode,
             rate=self.rate,
@@ -426,7 +432,7 @@ class _Run:
             )
             return LimitError("speed", problem, value, limit, strut, STAGES[stage])
         without_strut = name in ("condition", "assembly")
-        return self.table.error(codes.REASONS.index(name), -1 if without_strut else strut, stage, value)
+        return self.table.error(REASONS.index(name), -1 if without_strut else strut, stage, value)
 
 
 @compiled
@@ -436,8 +442,7 @@ def examine_many(
     independent,
     nominal_base,
     nominal_platform,
-    cone_axes,
-    characteristic_length,
+    limits,
     thresholds,
     low,
     sense,
@@ -459,7 +464,7 @@ def examine_many(
         position, rotation = positions[n], rotations[n]
         row = values[n, 0]
         strut_lengths_one(nominal_base, nominal_platform, position, rotation, row)
-        fill(nominal_base, nominal_platform, position, rotation, cone_axes, characteristic_length, row)
+        fill(nominal_base, nominal_platform, position, rotation, limits, row)
         solved, outside = command_one(
             position,
             rotation,
@@ -480,12 +485,15 @@ def examine_many(
             continue
         row = values[n, 1]
         row[:6] = commands
-        fill(body[0], body[1], q_position, q_rotation, cone_axes, characteristic_length, row)
+        fill(body[0], body[1], q_position, q_rotation, limits, row)
 
 
 @compiled
-def fill(base, platform, position, rotation, cone_axes, characteristic_length, values):
-    """Write the joint angles' cosines, condition number and sign of det J of one pose beside its lengths."""
+def fill(base, platform, position, rotation, limits, values):
+    """Write joint cosines, clearances, condition number and sign of det J of one pose beside its lengths."""
+    _, cone_axes, _, apart, scalars = limits
+    ends = strut_ends(base, platform, position, rotation)
     for i in range(6):
         values[6 + i], values[12 + i] = joint_cosines(base, platform, position, rotation, cone_axes, i)
-    values[CONDITION], values[SIGN] = condition_one(base, platform, position, rotation, characteristic_length)
+        values[CLEARANCE + i] = nearest_strut(base, ends, apart, i, 6)[0] if scalars[5] > 0.0 else math.inf
+    values[CONDITION], values[SIGN] = condition_one(base, platform, position, rotation, scalars[3])

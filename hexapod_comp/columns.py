@@ -187,20 +187,6 @@ class _Poses:
     positions: np.ndarray
     rotations: np.ndarray
 
-    def platform(self, geometry: HexapodGeometry) -> _Poses:
-        """Return ``pose_platform_in_base`` of each."""
-        work, from_tool = geometry.work, geometry.tool.inverse()
-        rotations = work.rotation @ self.rotations
-        positions = work.position + self.positions @ work.rotation.T + rotations @ from_tool.position
-        return _Poses(positions, rotations @ from_tool.rotation)
-
-    @staticmethod
-    def of_platform(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> _Poses:
-        """Return the tool's poses for N ``pose_platform_in_base``."""
-        work, tool = geometry.work, geometry.tool
-        tips = positions + rotations @ tool.position
-        return _Poses((tips - work.position) @ work.rotation, work.rotation.T @ rotations @ tool.rotation)
-
 
 def read_wide(path: str | Path, columns_path: str | Path, geometry: HexapodGeometry) -> MeasurementSet:
     """Read a wide CSV file as one run of absolute positions and, where there are any, attitudes.
@@ -277,8 +263,8 @@ def _lengths(
     home = strut_lengths_batch(structure, geometry.home.position[None], geometry.home.rotation[None])[0]
     zero = {"home": home, "given": struts.zero_length}.get(struts.zero)
     if zero is None:
-        platform = measured.platform(geometry)
-        zero = (strut_lengths_batch(structure, platform.positions, platform.rotations) - travel).mean(axis=0)
+        platform = geometry.platform_poses(measured.positions, measured.rotations)
+        zero = (strut_lengths_batch(structure, *platform) - travel).mean(axis=0)
         shift = ", ".join(f"{name} {value * 1e3:+.3f}" for name, value in zip(STRUT_NAMES, zero - home, strict=True))
         notes.append(f"{table.path}: lengths at reading zero from the measured poses, mm from home: {shift}")
     return zero + travel
@@ -296,7 +282,7 @@ def _nominal_poses(table: Table, geometry: HexapodGeometry, lengths: np.ndarray)
         row = int(solved.ok.argmin())
         problem = "no pose of the machine as designed has these strut lengths, mm"
         raise InputFileError(table.path, f"line {table.rows[row][0]}", problem, (lengths[row] * 1e3).round(3).tolist())
-    return _Poses.of_platform(geometry, solved.positions, solved.rotations)
+    return _Poses(*geometry.tool_poses(solved.positions, solved.rotations))
 
 
 def _readings(

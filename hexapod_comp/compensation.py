@@ -40,7 +40,8 @@ from .compensation_kernels import (
 from .errors import HexapodError, ModelError, NotConvergedError, NotFiniteError, OutsideFieldError, PoseError
 from .geometry import HexapodGeometry
 from .kinematics import forward_error, strut_lengths
-from .limits import WITHIN, LimitTable
+from .limit_kernels import WITHIN
+from .limits import LimitTable
 from .machine import MachineModel, RealMachine, Temperatures
 from .motion import MotionState
 from .pose import POSE_NOT_FINITE, QUATERNION_NORM_TOLERANCE, Pose
@@ -167,8 +168,7 @@ class Compensator:
         self._switches = np.array([1.0, 0.0, ramp_rate, 0.0])
         self.condition = math.nan
         self.outside_field = False
-        self._tool_inverse = geometry.tool.inverse()
-        self._nominal_numbers = pack_nominal(geometry, self._tool_inverse, self.limits)
+        self._nominal_numbers = pack_nominal(geometry, self.limits)
         self._work = pack_pose(geometry.work)
         self._last, self._next = _Command(), _Command()
         self._take_machine(RealMachine(geometry, model))
@@ -530,14 +530,6 @@ class Compensator:
         motion.copy_from(self.motion)
         commands, _, _ = self.machine.commands_for(Pose(*self._last.platform), motion)
         return commands - self.nominal
-
-    def platform_pose(self, tool_pose: Pose) -> Pose:
-        """Return ``pose_platform_in_base`` for a ``pose_tool_in_work``."""
-        return self.geometry.work @ tool_pose @ self._tool_inverse
-
-    def tool_pose(self, platform_pose: Pose) -> Pose:
-        """Return ``pose_tool_in_work`` for a ``pose_platform_in_base``."""
-        return self.geometry.work.inverse() @ platform_pose @ self.geometry.tool
 
 
 def _pose_error(outcome: int, numbers: tuple[float, ...]) -> PoseError:

@@ -14,8 +14,9 @@ import numpy as np
 from . import kernels
 from .compiling import compiled
 from .geometry import HexapodGeometry
-from .limits import CORRECTION as CORRECTION_FOUND
-from .limits import STEP, WITHIN, LimitTable, check_change, check_stage
+from .limit_kernels import CORRECTION as CORRECTION_FOUND
+from .limit_kernels import STEP, WITHIN, check_change, check_stage
+from .limits import LimitTable
 from .machine import RealMachine
 from .machine_kernels import actual_pose_one, command_one
 from .pose import POSE_OK, Pose, read_pose
@@ -61,25 +62,24 @@ def machine_views(numbers):
     )
 
 
-def pack_nominal(geometry: HexapodGeometry, tool_inverse: Pose, limits: LimitTable) -> np.ndarray:
+def pack_nominal(geometry: HexapodGeometry, limits: LimitTable) -> np.ndarray:
     """Return what :func:`nominal_views` takes apart."""
+    tool_inverse = geometry.tool.inverse()
     parts = (
         *geometry.kernel_joints,
         tool_inverse.position,
         tool_inverse.rotation,
-        limits.stroke,
-        limits.cone_axes,
-        limits.cone_cosines,
-        limits.scalars,
+        *limits.arrays,
     )
     return np.concatenate([np.ravel(part) for part in parts])
 
 
 @compiled
 def nominal_views(numbers):
-    """Return base, platform, tool inverse (position over rotation) and the limits (four arrays)."""
+    """Return base, platform, tool inverse (position over rotation) and the limits (five arrays)."""
     cone_axes, cone_cosines = numbers[60:96].reshape((2, 6, 3)), numbers[96:108].reshape((2, 6))
-    limits = (numbers[48:60].reshape((6, 2)), cone_axes, cone_cosines, numbers[108:113])
+    apart = numbers[108:144].reshape((6, 6))
+    limits = (numbers[48:60].reshape((6, 2)), cone_axes, cone_cosines, apart, numbers[144:])
     return (
         numbers[:18].reshape((6, 3)),
         numbers[18:36].reshape((6, 3)),
@@ -165,7 +165,7 @@ def compensate_one(
     for i in range(6):
         correction[i] += next_state[BUMP + i]
         command[i] = nominal[i] + correction[i]
-    finding, strut, value, stage = check_command(nominal, correction, command, state, limits[3])
+    finding, strut, value, stage = check_command(nominal, correction, command, state, limits[4])
     if finding == WITHIN:
         stage = 1
         finding, strut, value, _ = check_stage(body[0], body[1], model_position, model_rotation, command, limits)

@@ -155,8 +155,8 @@ class LimitError(HexapodError):
     Parameters
     ----------
     reason : str
-        Which limit: ``stroke``, ``base_cone``, ``platform_cone``, ``condition``,
-        ``correction``, ``step`` or ``assembly``.
+        Which limit: ``stroke``, ``base_cone``, ``platform_cone``, ``clearance``, ``condition``,
+        ``correction``, ``step``, ``speed`` or ``assembly``.
     problem : str
         Sentence with value, limit and units.
     value, limit : float

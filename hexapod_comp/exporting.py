@@ -152,7 +152,7 @@ def commanded_box(geometry: HexapodGeometry, model: MachineModel) -> np.ndarray:
         raise ModelError("valid_box", "the model has neither a valid box nor a field; give a box of tool positions")
     corners = np.array(np.meshgrid(*box.T)).reshape(3, 8).T
     level = geometry.work.rotation @ geometry.tool.rotation.T  # of the platform, when the tool is level
-    tools = [(geometry.work.inverse() @ Pose(corner, level) @ geometry.tool).position for corner in corners]
+    tools = [geometry.tool_pose(Pose(corner, level)).position for corner in corners]
     return np.array([np.min(tools, axis=0), np.max(tools, axis=0)])
 
 

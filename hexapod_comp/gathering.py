@@ -99,11 +99,10 @@ def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> l
     """Return the commanded ``pose_platform_in_base`` of each reading; equal poses are one object."""
     known: dict[bytes, Pose] = {}
     poses = []
-    from_tool = geometry.tool.inverse()
     for reading in readings:
         key = reading.pose.position.tobytes() + reading.pose.rotation.tobytes()
         if key not in known:
-            known[key] = geometry.work @ reading.pose @ from_tool
+            known[key] = geometry.platform_pose(reading.pose)
         poses.append(known[key])
     return poses
 

@@ -24,7 +24,7 @@ STRUT_NAMES = tuple(f"strut_{i}" for i in range(1, 7))
 """Names of the six struts, in order, as they stand in messages."""
 
 COINCIDENT = 1e-6
-"""Base joints closer than this, m, are one joint given twice."""
+"""Joints closer than this, m, are one."""
 
 LONGEST_AXIS = 1e9
 """Largest component of an axis: only its direction counts, and the square of a huge one overflows."""
@@ -48,6 +48,8 @@ class Limits:
         Largest change of a strut command between two commands, m.
     speed : float
         Largest strut speed, m/s; used by ``check`` and by the trajectories that this package makes.
+    clearance : float, optional
+        Smallest distance between the axes of two struts, m; 0: not limited. Struts that share a joint do not count.
     """
 
     stroke: np.ndarray
@@ -57,6 +59,7 @@ class Limits:
     correction: float
     step: float
     speed: float
+    clearance: float = 0.0
 
     def __post_init__(self) -> None:
         for name, shape in (("stroke", (6, 2)), ("base_cone", (6,)), ("platform_cone", (6,))):
@@ -73,6 +76,8 @@ class Limits:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > least):
                 raise GeometryError(f"limits.{name}", f"must be finite and above {least:g}", value)
+        if not 0.0 <= self.clearance < np.inf:
+            raise GeometryError("limits.clearance", "must be finite and not negative, m", self.clearance)
 
 
 @dataclass(frozen=True)
@@ -168,22 +173,41 @@ class HexapodGeometry:
         return np.array(missing if base is None else base), np.array(missing if platform is None else platform)
 
     def _check_home(self, put: Callable[[str, object], None]) -> None:
-        """Refuse a home pose that the machine could not stand in."""
+        """Refuse a home pose that breaks a limit of single poses."""
+        from .limits import LimitTable  # which itself needs geometries
+
         pose = (self.home.position, self.home.rotation)
         lengths = np.empty(6)
         kernels.strut_lengths_one(*self.kernel_joints, *pose, lengths)
-        for index, (length, stroke) in enumerate(zip(lengths, self.limits.stroke, strict=True)):
-            if not stroke[0] <= length <= stroke[1]:
-                problem = (
-                    f"{STRUT_NAMES[index]} would be {length * 1e3:.3f} mm long, "
-                    f"outside its stroke {stroke[0] * 1e3:.3f}…{stroke[1] * 1e3:.3f} mm"
-                )
-                raise GeometryError("home", problem)
-        condition, sign = kernels.condition_one(*self.kernel_joints, *pose, self.characteristic_length)
-        if not condition <= self.limits.condition:
-            problem = f"condition number there must be at most {self.limits.condition:g}"
-            raise GeometryError("home", problem, float(condition))
-        put("home_sign", float(sign))
+        put("home_sign", float(kernels.condition_one(*self.kernel_joints, *pose, self.characteristic_length)[1]))
+        refusal = LimitTable(self).refusal(*pose, lengths)
+        if refusal is not None:
+            raise GeometryError("home", f"breaks a limit: {refusal}")
+
+    @property
+    def struts_apart(self) -> np.ndarray:
+        """Pairs of struts that share no joint, (6, 6) of bool: only their distance can be limited."""
+        joints = self.platform_joints
+        return np.linalg.norm(joints[:, None] - joints, axis=2) > COINCIDENT
+
+    def platform_pose(self, tool_pose: Pose) -> Pose:
+        """Return the ``pose_platform_in_base`` that belongs to a ``pose_tool_in_work``."""
+        return self.work @ tool_pose @ self.tool.inverse()
+
+    def tool_pose(self, platform_pose: Pose) -> Pose:
+        """Return the ``pose_tool_in_work`` that belongs to a ``pose_platform_in_base``."""
+        return self.work.inverse() @ platform_pose @ self.tool
+
+    def platform_poses(self, positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions (N, 3), m, and rotations (N, 3, 3) of :meth:`platform_pose` for many tool poses."""
+        turned = self.work.rotation @ rotations @ self.tool.rotation.T
+        tips = self.work.position + positions @ self.work.rotation.T
+        return tips - turned @ self.tool.position, turned
+
+    def tool_poses(self, positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions (N, 3), m, and rotations (N, 3, 3) of :meth:`tool_pose` for many platform poses."""
+        tips = positions + rotations @ self.tool.position - self.work.position
+        return tips @ self.work.rotation, self.work.rotation.T @ rotations @ self.tool.rotation
 
     @property
     def strut_names(self) -> tuple[str, ...]:
@@ -309,6 +333,7 @@ def _read_limits(section: Section, path: str | Path) -> Limits:
         "correction": float(section.quantity("correction", "length")),
         "step": float(section.quantity("step", "length")),
         "speed": float(section.quantity("speed", "speed")),
+        "clearance": float(section.quantity("clearance", "length", default=0.0)),
     }
     section.finish()
     try:

@@ -6,13 +6,21 @@ import math
 
 import numpy as np
 
-from .compiling import compiled
 from .errors import KinematicsError, LimitError, NotFiniteError
 from .geometry import STRUT_NAMES, HexapodGeometry
-from .kernels import condition_one, strut_vector
-
-WITHIN, NOT_FINITE, STROKE, BASE_CONE, PLATFORM_CONE, CONDITION, ASSEMBLY, CORRECTION, STEP = range(9)
-"""What a check found; the order is the order of the checks."""
+from .limit_kernels import (
+    ASSEMBLY,
+    BASE_CONE,
+    CLEARANCE,
+    CONDITION,
+    CORRECTION,
+    NOT_FINITE,
+    PLATFORM_CONE,
+    STEP,
+    STROKE,
+    WITHIN,
+    check_stage,
+)
 
 REASONS = (
     "",
@@ -20,6 +28,7 @@ REASONS = (
     "stroke",
     "base_cone",
     "platform_cone",
+    "clearance",
     "condition",
     "assembly",
     "correction",
@@ -45,6 +54,7 @@ class LimitTable:
         self.stroke = limits.stroke.copy()
         self.cone_axes = np.array([geometry.base_cone_axes, geometry.platform_cone_axes])
         self.cone_cosines = np.cos(np.array([limits.base_cone, limits.platform_cone]))
+        self.apart = geometry.struts_apart.astype(float)
         self.scalars = np.array(
             [
                 limits.condition,
@@ -52,16 +62,21 @@ class LimitTable:
                 limits.step,
                 geometry.characteristic_length,
                 geometry.home_sign,
+                limits.clearance,
             ]
         )
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """All of it, as :func:`~hexapod_comp.limit_kernels.check_stage` takes it."""
+        return self.stroke, self.cone_axes, self.cone_cosines, self.apart, self.scalars
 
     def refusal(
         self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray
     ) -> LimitError | KinematicsError | None:
         """Return why the nominal machine may not stand in a pose with its strut lengths, or None if it may."""
-        arrays = (self.stroke, self.cone_axes, self.cone_cosines, self.scalars)
         joints = self.geometry.kernel_joints
-        finding, strut, value, _ = check_stage(*joints, position, rotation, lengths, arrays)
+        finding, strut, value, _ = check_stage(*joints, position, rotation, lengths, self.arrays)
         return None if finding == WITHIN else self.error(finding, strut, 0, value)
 
     def error(self, code: int, strut: int, stage: int, value: float) -> LimitError | KinematicsError:
@@ -80,6 +95,11 @@ class LimitTable:
             ),
             BASE_CONE: (cone, _cone_text(name, which, "base", value, cone)),
             PLATFORM_CONE: (cone, _cone_text(name, which, "platform", value, cone)),
+            CLEARANCE: (
+                limits.clearance,
+                f"{name}: {value * 1e3:.3f} mm from the nearest other strut ({which}), "
+                f"allowed {limits.clearance * 1e3:g} mm",
+            ),
             CONDITION: (
                 limits.condition,
                 f"condition number {value:.4g} of the {which} pose is above {limits.condition:g}: near a singularity",
@@ -103,52 +123,3 @@ def _cone_text(name: str, which: str, body: str, value: float, limit: float) -> 
         f"{name}: {body} joint at {math.degrees(value):.3f}° ({which}), allowed {math.degrees(limit):g}° "
         "from its neutral direction"
     )
-
-
-@compiled
-def joint_cosines(base, platform, position, rotation, cone_axes, i):
-    """Return the cosines of strut `i`'s angles to the neutral directions of its base and platform joints."""
-    sx, sy, sz = strut_vector(base, platform, position, rotation, i)
-    length = math.sqrt(sx * sx + sy * sy + sz * sz)
-    at_base = (sx * cone_axes[0, i, 0] + sy * cone_axes[0, i, 1] + sz * cone_axes[0, i, 2]) / length
-    at_platform = 0.0
-    for k in range(3):
-        along = rotation[0, k] * sx + rotation[1, k] * sy + rotation[2, k] * sz
-        at_platform += along * cone_axes[1, i, k]
-    return at_base, at_platform / length
-
-
-@compiled
-def check_stage(base, platform, position, rotation, lengths, limits):
-    """Check lengths and pose of one stage; return (finding, strut, value, condition number).
-
-    `limits` holds stroke, cone axes, cone cosines and scalars, as in :class:`LimitTable`.
-    """
-    stroke, cone_axes, cone_cosines, scalars = limits
-    for i in range(6):
-        if not math.isfinite(lengths[i]):
-            return NOT_FINITE, i, lengths[i], math.nan
-        if lengths[i] < stroke[i, 0] or lengths[i] > stroke[i, 1]:
-            return STROKE, i, lengths[i], math.nan
-    for i in range(6):
-        at_base, at_platform = joint_cosines(base, platform, position, rotation, cone_axes, i)
-        if not at_base >= cone_cosines[0, i]:
-            return BASE_CONE, i, math.acos(max(-1.0, min(1.0, at_base))), math.nan
-        if not at_platform >= cone_cosines[1, i]:
-            return PLATFORM_CONE, i, math.acos(max(-1.0, min(1.0, at_platform))), math.nan
-    condition, sign = condition_one(base, platform, position, rotation, scalars[3])
-    if not condition <= scalars[0]:
-        return CONDITION, -1, condition, condition
-    if sign != scalars[4]:
-        return ASSEMBLY, -1, sign, condition
-    return WITHIN, -1, 0.0, condition
-
-
-@compiled
-def check_change(lengths, previous, largest, finding):
-    """Check six values against the previous six; return (finding or WITHIN, strut, change)."""
-    for i in range(6):
-        change = lengths[i] - previous[i]
-        if abs(change) > largest:  # a NaN in `previous` means that there is none
-            return finding, i, change
-    return WITHIN, -1, 0.0

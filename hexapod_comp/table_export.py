@@ -237,7 +237,7 @@ def _pose_corrections(geometry: HexapodGeometry, travel: Travel, corrections: np
     changes = np.empty((len(lengths), 6))
     for row in range(len(passes)):
         commanded = Pose(passes.positions[row], passes.rotations[row])
-        told = geometry.work.inverse() @ solve_pose(structure, lengths[row], commanded) @ geometry.tool
+        told = geometry.tool_pose(solve_pose(structure, lengths[row], commanded))
         changes[row, :3] = told.position - travel.positions[row]
         changes[row, 3:] = Rotation.from_matrix(told.rotation @ travel.rotations[row].T).as_rotvec()
     return changes

@@ -99,7 +99,7 @@ def moves(
     legs = np.arange(len(positions) - 1)
     share = np.tile(np.linspace(0.0, 1.0, COARSE + 1), len(legs))
     coarse = _interpolate(positions, rotations, np.repeat(legs, COARSE + 1), share)
-    lengths = strut_lengths_batch(Structure.of(geometry), *platform_poses(geometry, *coarse), threads=1)
+    lengths = strut_lengths_batch(Structure.of(geometry), *geometry.platform_poses(*coarse), threads=1)
     changes = np.abs(np.diff(lengths.reshape(len(legs), COARSE + 1, 6), axis=1))
     allowed = SHARE_OF_LIMIT * min(geometry.limits.speed, geometry.limits.step * rate)
     duration = PEAK_OF_QUINTIC * COARSE * changes.max(axis=(1, 2)) / allowed
@@ -178,24 +178,6 @@ def join(paths: list[Path]) -> Path:
         np.concatenate([path.rotations for path in paths]),
         paths[0].rate,
     )
-
-
-def platform_poses(
-    geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the platform poses in ``base`` that belong to N tool poses in the work frame.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        Its tool and work frame.
-    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
-        ``pose_tool_in_work``, m.
-    """
-    work, tool_inverse = geometry.work, geometry.tool.inverse()
-    turned = work.rotation @ rotations
-    in_base = work.position + positions @ work.rotation.T
-    return in_base + turned @ tool_inverse.position, turned @ tool_inverse.rotation
 
 
 def _interpolate(

@@ -61,10 +61,7 @@ class Passes:
         directions : ndarray, shape (N, 3)
             Directions of travel in the work frame.
         """
-        work, tool = geometry.work, geometry.tool
-        platform = work.rotation @ rotations @ tool.rotation.T
-        tips = work.position + positions @ work.rotation.T
-        return Passes(tips - platform @ tool.position, platform, directions @ work.rotation.T)
+        return Passes(*geometry.platform_poses(positions, rotations), directions @ geometry.work.rotation.T)
 
     def points(self, probe: np.ndarray) -> np.ndarray:
         """Return where a point of ``platform``, shape (3,), is told to be, shape (N, 3), m in ``base``."""

@@ -55,10 +55,20 @@ def isolated_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
 @pytest.fixture
 def ros_context(isolated_ros: int) -> Iterator[Context]:
     """Give a private rclpy context; nodes and executors made with it leave no trace in other tests."""
+    yield from _private_context(isolated_ros)
+
+
+@pytest.fixture(scope="module")
+def module_context(isolated_ros: int) -> Iterator[Context]:
+    """Give a context that the tests of a module share, for nodes that are never spun."""
+    yield from _private_context(isolated_ros)
+
+
+def _private_context(domain: int) -> Iterator[Context]:
     import rclpy
 
     context = rclpy.Context()
-    rclpy.init(args=[], context=context, domain_id=isolated_ros)
+    rclpy.init(args=[], context=context, domain_id=domain)
     yield context
     rclpy.try_shutdown(context=context)
 

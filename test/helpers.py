@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.geometry import HexapodGeometry, Limits
@@ -42,6 +43,12 @@ def table_lengths() -> np.ndarray:
     """Return the ideal strut lengths of 000, Table 2, shape (10, 6), m."""
     table = read_table("table2_strut_lengths_ideal.csv")
     return np.stack([table[f"L{i}"] for i in range(1, 7)], axis=1)
+
+
+def segment_distance(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> float:
+    """Return the distance of the segments a–b and c–d by bounded least squares: another method than the kernel's."""
+    shares = lsq_linear(np.stack([b - a, c - d], axis=1), c - a, (0.0, 1.0), tol=1e-14, method="bvls").x
+    return float(np.linalg.norm(a + shares[0] * (b - a) - c - shares[1] * (d - c)))
 
 
 def central_difference(

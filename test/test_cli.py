@@ -281,6 +281,7 @@ LINES = {
     "stroke": ((), [stream_pose(400), stream_pose(900), stream_pose(400)], 3, "strut_1: nominal length 953."),
     "base_cone": ((), [stream_pose(400), ("", 430, 0, 250, 0, 0, 0)], 3, "base joint at"),
     "platform_cone": ((), [stream_pose(400), ("", 0, 0, 500, 0, 0, 85)], 3, "platform joint at"),
+    "clearance": ((), [stream_pose(400), ("", 0, 0, 400, 0, 0, 60)], 3, "mm from the nearest other strut"),
     "condition": ((), [stream_pose(400), ("", 0, 0, 400, 0, 0, 89)], 3, "condition number"),
     "step": (("--stream", "--rate-hz", "50"), [stream_pose(400), stream_pose(403)], 3, "would change by 2.3"),
     "speed": (("--stream",), [stream_pose(400), stream_pose(401.5)], 3, "length would change at 29"),
@@ -302,6 +303,7 @@ def test_check_names_row_and_limit(hexapod, tmp_path: Path, limit: str) -> None:
         ("condition_number", "condition"),
     ):
         machine = re.sub(rf"{key}: \S+( \S+\])?", f"{key}: {values[name]}", machine)
+    machine = machine.replace("  step_mm", f"  clearance_mm: {220 if limit == 'clearance' else 0}\n  step_mm")
     geometry = tmp_path / "machine.yaml"
     geometry.write_text(machine)
     path = file_of(tmp_path, rows)
@@ -475,7 +477,8 @@ def test_check_json_has_every_limit(hexapod) -> None:
     report = json.loads(out)
     assert code == 0
     assert report["within_limits"] is True
-    assert [entry["limit"] for entry in report["smallest_margins"]] == list(LIMITS)
+    limited = [name for name in LIMITS if name != "clearance"]  # which the paper's machine does not limit
+    assert [entry["limit"] for entry in report["smallest_margins"]] == limited
     assert report["rows"][0]["step_nominal_mm"] is None
 
 

@@ -140,8 +140,8 @@ def test_tool_and_work_offsets_against_scipy() -> None:
         np.testing.assert_allclose(record.platform_pose.rotation, rotation.as_matrix(), atol=1e-14)
         platform = Pose(position, rotation.as_matrix())
         np.testing.assert_allclose(record.nominal, nominal_lengths(OFFSET, platform), atol=1e-14)
-        np.testing.assert_allclose(compensator.platform_pose(pose).position, position, atol=1e-15)
-        back = compensator.tool_pose(record.platform_pose)
+        np.testing.assert_allclose(OFFSET.platform_pose(pose).position, position, atol=1e-15)
+        back = OFFSET.tool_pose(record.platform_pose)
         np.testing.assert_allclose(back.position, pose.position, atol=1e-15)
 
 

@@ -50,6 +50,9 @@ STEP_BACK = (0.0002, 0.0001, -0.0003)
 
 TILTED = near(HOME, tilt_deg=20.0)
 
+CROSSED = Pose.from_angles([0.01, -0.02, 0.42], np.deg2rad([3.0, -2.0, 60.0]))
+"""Turned about z, where the struts come nearer to each other than at home."""
+
 ROUNDING = 1e-12
 """Lengths below a metre, a dozen operations: a few 1e-16 m; the wire is exact. Everything real is 1e-9 m."""
 
@@ -280,6 +283,7 @@ def test_bad_command_is_refused_and_the_last_good_one_stands(bench, case):
 LIMITS = {
     "base cone": ({"base_cone_deg": 5.0}, near(HOME, (0.1, 0.0, 0.0)), "base_cone", "allowed 5°"),
     "platform cone": ({"platform_cone_deg": 5.0}, TILTED, "platform_cone", "allowed 5°"),
+    "struts too near": ({"clearance_mm": 220.0}, CROSSED, "clearance", "from the nearest other strut"),
     "near a singularity": ({"condition_number": 1.2}, TILTED, "condition", "above 1.2"),
     "the machine turned inside out": (
         {"base_cone_deg": 180.0, "platform_cone_deg": 180.0},

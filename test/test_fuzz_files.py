@@ -120,6 +120,7 @@ def same_geometry(found: HexapodGeometry, tree: dict[str, Any]) -> None:
     same(found.limits.condition, numbers_of(limits["condition_number"]))
     for name, kind in (("correction", "length"), ("step", "length"), ("speed", "speed")):
         same(getattr(found.limits, name), quantity(limits, name, kind))
+    same(found.limits.clearance, quantity(limits, "clearance", "length", 0.0))
     same(found.screw_lead, quantity(tree["screw"], "lead", "length") if "screw" in tree else 0.0)
 
 
@@ -129,7 +130,7 @@ def works_or_refuses(geometry: HexapodGeometry, model: MachineModel) -> None:
         compensator = Compensator(geometry, model)
     except HexapodError:
         return
-    home = compensator.tool_pose(geometry.home)
+    home = geometry.tool_pose(geometry.home)
     for time in range(2):
         try:
             found = compensator.correct(home, 0.1 * time)

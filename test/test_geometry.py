@@ -218,13 +218,33 @@ def test_refused(tmp_path, old, new, said):
 def test_home_outside_the_stroke_names_the_strut(tmp_path):
     """Truth: Table 2: at 400 mm all six struts are 509.192 mm long."""
     message = refusal(tmp_path, PAPER_TEXT.replace("stroke_mm: [330, 880]", "stroke_mm: [330, 509]"))
-    assert "home: strut_1 would be 509.192 mm long, outside its stroke 330.000…509.000 mm" in message
+    assert "home: breaks a limit: strut_1: nominal length 509.19" in message
+    assert "mm is outside the stroke 330.000…509.000 mm" in message
 
 
 def test_home_at_a_singular_pose(tmp_path):
     """Truth: with the platform in the base's plane all struts lie flat and none can hold it up."""
     text = PAPER_TEXT.replace("[0, 0, 400]", "[0, 0, 0]").replace("[330, 880]", "[100, 880]")
-    assert "home: condition number there must be at most 10 (found inf)" in refusal(tmp_path, text)
+    assert "home: breaks a limit: condition number inf of the nominal pose is above 10" in refusal(tmp_path, text)
+
+
+def test_home_outside_a_cone_of_its_own_axes(tmp_path):
+    """Truth: at a height of 400 mm struts of 509.192 mm lean by arccos(400/509.192) = 38.23°."""
+    upright = "[[0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 1]]"
+    text = PAPER_TEXT.replace("base_cone_deg: 50", "base_cone_deg: 20")
+    assert "paper_dimensions" in text
+    text += f"base:\n  cone_axes: {upright}\n"
+    assert "home: breaks a limit: strut_1: base joint at 38.2" in refusal(tmp_path, text)
+
+
+def test_clearance(tmp_path):
+    """Optional; never negative; not more than there is at home: 243 mm between base joints 2 and 3."""
+    assert load_geometry(written(tmp_path, PAPER_TEXT)).limits.clearance == 0.0
+    text = PAPER_TEXT.replace("  step_mm: 2", "  clearance_mm: {}\n  step_mm: 2")
+    assert load_geometry(written(tmp_path, text.format(60))).limits.clearance == 0.06
+    load_geometry(written(tmp_path, text.format(242.9)))
+    assert "limits.clearance: must be finite and not negative" in refusal(tmp_path, text.format(-1))
+    assert "home: breaks a limit: strut_" in refusal(tmp_path, text.format(243.1))
 
 
 def test_a_lead_needs_axes(tmp_path):

@@ -7,9 +7,11 @@ by the inverse matrix); limits are set a relative 1e-9 above and below them.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
+from helpers import segment_distance
 from scipy.spatial.transform import Rotation
 from strategies import paper_geometry
 
@@ -24,6 +26,7 @@ PAPER = paper_geometry()
 HOME = PAPER.home
 HAIR = 1e-9
 WIDE = Limits(np.tile([0.1, 2.0], (6, 1)), np.full(6, np.pi), np.full(6, np.pi), 100.0, 0.01, 1.0, 1.0)
+CROSSED = Pose.from_angles([0.01, -0.02, 0.42], np.deg2rad([3.0, -2.0, 60.0]))
 TILTED = Pose.from_angles([0.02, -0.03, 0.52], np.deg2rad([12.0, -9.0, 15.0]))
 
 
@@ -113,6 +116,23 @@ def test_joint_cones(body: str, strut: int) -> None:
     assert f"{np.degrees(angle):.3f}°" in str(error)
 
 
+def least_distance(pose: Pose, base: np.ndarray) -> tuple[float, int]:
+    """Return the smallest distance of two struts that share no joint, m, and the later strut of the pair."""
+    ends = pose.position + PAPER.platform_joints @ pose.rotation.T
+    pairs = [(i, j) for i, j in combinations(range(6), 2) if i // 2 != j // 2]
+    return min((segment_distance(base[i], ends[i], base[j], ends[j]), j) for i, j in pairs)
+
+
+def test_clearance() -> None:
+    """Turned by 60° about its axis the machine's struts cross, nearer to each other than at home."""
+    distance, strut = least_distance(CROSSED, PAPER.base_joints)
+    accepted(with_limits(clearance=distance * (1.0 - HAIR)), CROSSED)
+    error = refusal(with_limits(clearance=distance * (1.0 + HAIR)), CROSSED)
+    assert (error.reason, error.strut, error.stage) == ("clearance", strut, "nominal")
+    assert error.value == pytest.approx(distance, rel=1e-9)
+    assert f"strut_{strut + 1}: {distance * 1e3:.3f} mm from the nearest other strut" in str(error)
+
+
 def test_condition_number() -> None:
     condition = condition_by_inverse(TILTED)
     accepted(with_limits(condition=condition * (1.0 + HAIR)), TILTED)
@@ -188,6 +208,21 @@ def test_compensated_cones_are_checked_too() -> None:
     accepted(geometry, there)
     error = refusal(geometry, there, MachineModel(PAPER.name, base_deviation=deviation))
     assert (error.reason, error.strut, error.stage) == ("base_cone", 3, "compensated")
+    assert error.value == pytest.approx(real, rel=1e-9)
+
+
+def test_compensated_clearances_are_checked_too() -> None:
+    """The real base joint of the nearest strut stands 2 mm aside, towards or away from the other."""
+    nominal, strut = least_distance(CROSSED, PAPER.base_joints)
+    deviations = np.zeros((2, 6, 3))
+    deviations[:, strut, 0] = 2e-3, -2e-3
+    real, deviation = min(
+        ((least_distance(CROSSED, PAPER.base_joints + one)[0], one) for one in deviations), key=lambda found: found[0]
+    )
+    geometry = with_limits(clearance=0.5 * (nominal + real))
+    accepted(geometry, CROSSED)
+    error = refusal(geometry, CROSSED, MachineModel(PAPER.name, base_deviation=deviation))
+    assert (error.reason, error.strut, error.stage) == ("clearance", strut, "compensated")
     assert error.value == pytest.approx(real, rel=1e-9)
 
 

@@ -218,7 +218,7 @@ def test_nothing_is_said_while_the_machine_is_off(bench):
     bench.until(lambda: bench.seen["strut_states"], "measured struts")
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e308])
 def test_an_axis_that_is_no_number_is_not_sent(bench, value):
     """The struts still are, diagnostics name the pin, and it goes on when the pin is well again."""
     machine = Machine(bench).start()
@@ -226,10 +226,10 @@ def test_an_axis_that_is_no_number_is_not_sent(bench, value):
     machine.hal["b"] = value
     bench.barrier()
     sent, states = len(machine.poses), len(bench.seen["strut_states"])
-    values = bench.until_status(ERROR, f"pins that are no numbers: b = {value}", NODE)
+    values = bench.until_status(ERROR, "unusable pins: b", NODE)
     bench.until(lambda: len(bench.seen["strut_states"]) > states + 20, "measured struts")
     assert len(machine.poses) <= sent + 1
-    assert values["last_bad_pins"] == f"pins that are no numbers: b = {value}"
+    assert values["last_bad_pins"] == f"pins that are no numbers within ±1e+06: b = {value}"
     machine.hal["b"] = 0.0
     machine.until_sent()
     assert all(math.isfinite(m.pose.orientation.w) for m in machine.poses)
@@ -239,7 +239,7 @@ def test_a_strut_that_is_no_number_is_not_sent(bench):
     machine = Machine(bench)
     machine.hal["joint-fb.3"] = math.nan
     machine.start().until_sent(20)
-    bench.until_status(ERROR, "pins that are no numbers: joint-fb.3 = nan", NODE)
+    bench.until_status(ERROR, "unusable pins: joint-fb.3", NODE)
     assert bench.seen["strut_states"] == []
 
 

@@ -7,9 +7,10 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from scipy.optimize import lsq_linear
+from helpers import segment_distance
 from strategies import PAPER_FILE, paper_geometry
 
+from hexapod_comp import limit_kernels
 from hexapod_comp.errors import GeometryError, PoseError
 from hexapod_comp.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.pose import Pose
@@ -63,15 +64,7 @@ def ends(geometry: HexapodGeometry, tips: np.ndarray, rotation: np.ndarray) -> n
     return origin[:, None] + geometry.platform_joints @ turned.T
 
 
-def segment_distance(a, b, c, d):
-    """Return the distance of two segments by bounded least squares: another method than the kernel's."""
-    shares = lsq_linear(np.stack([b - a, c - d], axis=1), c - a, (0.0, 1.0), tol=1e-14, method="bvls").x
-    return np.linalg.norm(a + shares[0] * (b - a) - c - shares[1] * (d - c))
-
-
-def quantities(
-    geometry: HexapodGeometry, tip: np.ndarray, rotation: np.ndarray, clearance: float = 0.0
-) -> dict[int, np.ndarray]:
+def quantities(geometry: HexapodGeometry, tip: np.ndarray, rotation: np.ndarray) -> dict[int, np.ndarray]:
     """Return margin of every limit at one pose, in plain NumPy, by finding; negative beyond it."""
     limits = geometry.limits
     end = ends(geometry, tip[None], rotation)[0]
@@ -94,7 +87,7 @@ def quantities(
         codes.STROKE_LONG: limits.stroke[:, 1] - lengths,
         codes.BASE_CONE: limits.base_cone - at_base,
         codes.PLATFORM_CONE: limits.platform_cone - at_platform,
-        codes.CLEARANCE: np.array(apart) - clearance,
+        codes.CLEARANCE: np.array(apart) - limits.clearance,
         codes.CONDITION: np.array([limits.condition - condition]),
     }
 
@@ -128,28 +121,30 @@ def test_how_low_and_how_high_the_unit_goes():
 def test_distance_of_two_segments(first, second, distance):
     """Truth: read off the coordinates."""
     first, second = np.array(first, dtype=float), np.array(second, dtype=float)
-    assert codes.segment_distance(*first, *second) == pytest.approx(distance, abs=1e-15)
-    assert codes.segment_distance(*second[::-1], *first) == pytest.approx(distance, abs=1e-15)
+    assert limit_kernels.segment_distance(*first, *second) == pytest.approx(distance, abs=1e-15)
+    assert limit_kernels.segment_distance(*second[::-1], *first) == pytest.approx(distance, abs=1e-15)
 
 
 def test_distance_of_random_segments():
     """Truth: bounded linear least squares (SciPy), exact to rounding."""
     for corners in np.random.default_rng(4).normal(size=(300, 4, 3)):
-        assert codes.segment_distance(*corners) == pytest.approx(segment_distance(*corners), abs=1e-9)
+        assert limit_kernels.segment_distance(*corners) == pytest.approx(segment_distance(*corners), abs=1e-9)
 
 
 def test_clearance_stops_the_closest_pair():
-    """Truth: all fifteen distances at home by least squares; a limit 1 µm above and below the smallest."""
-    geometry = unit()
-    tip = (geometry.home @ geometry.tool).position
-    end = ends(geometry, tip[None], LEVEL)[0]
+    """Truth: all distances by least squares, where a turn of 60° has crossed the struts; limits 1 µm off."""
+    geometry = paper_geometry()
+    turned = Pose.from_angles(np.zeros(3), np.deg2rad([0.0, 0.0, 60.0])).rotation
+    tip = geometry.home.position
+    end = ends(geometry, tip[None], turned)[0]
     apart = {
         pair: segment_distance(*(part[i] for i in pair for part in (geometry.base_joints, end)))
         for pair in combinations(range(6), 2)
+        if pair not in ((0, 1), (2, 3), (4, 5))  # these share a joint of the platform
     }
     least = min(apart.values())
     for shift, finding in ((1e-6, codes.CLEARANCE), (-1e-6, codes.WITHIN)):
-        found, struts = Examiner(geometry, least + shift).findings(tip[None], LEVEL[None])
+        found, struts = Examiner(limited(geometry, clearance=least + shift)).findings(tip[None], turned[None])
         assert found[0] == finding
         if finding == codes.CLEARANCE:
             assert apart[tuple(struts[0].tolist())] == pytest.approx(least, abs=2e-6)
@@ -158,7 +153,7 @@ def test_clearance_stops_the_closest_pair():
 def test_struts_that_share_a_joint_may_meet_there():
     """Truth: on the paper's machine struts meet in pairs, at distance 0; other pairs are 100 mm apart and more."""
     paper = paper_geometry()
-    found, _ = Examiner(paper, 0.05).findings(paper.home.position[None], LEVEL[None])
+    found, _ = Examiner(limited(paper, clearance=0.05)).findings(paper.home.position[None], LEVEL[None])
     assert found[0] == codes.WITHIN
 
 
@@ -198,22 +193,22 @@ def test_work_and_tool_frames_only_rename_poses():
 @pytest.mark.parametrize(
     ("make", "limiting"),
     [
-        pytest.param(lambda: (unit(), LEVEL, 0.0), {1, 2, 3}, id="unit"),
-        pytest.param(lambda: (unit(), tilted(unit(), 6, -3, 4), 0.0), {1, 2, 3}, id="unit tilted"),
-        pytest.param(lambda: (paper_geometry(), LEVEL, 0.2), {codes.CLEARANCE}, id="clearance"),
-        pytest.param(lambda: (limited(paper_geometry(), condition=1.6), LEVEL, 0.0), {codes.CONDITION}, id="condition"),
+        pytest.param(lambda: (unit(), LEVEL), {1, 2, 3}, id="unit"),
+        pytest.param(lambda: (unit(), tilted(unit(), 6, -3, 4)), {1, 2, 3}, id="unit tilted"),
+        pytest.param(lambda: (limited(paper_geometry(), clearance=0.2), LEVEL), {codes.CLEARANCE}, id="clearance"),
+        pytest.param(lambda: (limited(paper_geometry(), condition=1.6), LEVEL), {codes.CONDITION}, id="condition"),
     ],
 )
 def test_at_the_boundary_the_named_limit_is_reached_and_no_other_broken(make, limiting):
     """Truth: every limit computed on its own in plain NumPy. The boundary is bisected to 10⁻⁹ m; cones and
     condition change by less than 100 per metre there. A clearance found by least squares is good to 10⁻⁹ m."""
-    geometry, rotation, clearance = make()
-    found = reach(geometry, rotation, cells=10, clearance=clearance)
+    geometry, rotation = make()
+    found = reach(geometry, rotation, cells=10)
     assert limiting <= set(found.boundary.findings.tolist())
     for tip, finding, struts in zip(
         found.boundary.positions, found.boundary.findings, found.boundary.struts, strict=True
     ):
-        margins = quantities(geometry, tip, rotation, clearance)
+        margins = quantities(geometry, tip, rotation)
         assert all(margin.min() > -1e-7 for margin in margins.values())
         of = margins[int(finding)]
         at = of[struts[0]] if len(of) == 6 else of.min()

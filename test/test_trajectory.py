@@ -13,7 +13,7 @@ from strategies import paper_geometry, random_pose
 
 from hexapod_comp.geometry import HexapodGeometry
 from hexapod_comp.pose import Pose
-from hexapod_comp.trajectory import Path, circle, join, move, moves, platform_poses, pocket
+from hexapod_comp.trajectory import Path, circle, join, move, moves, pocket
 
 PAPER = paper_geometry()
 OFFSET = replace(
@@ -127,7 +127,7 @@ def test_platform_poses_by_homogeneous_matrices() -> None:
     work = matrices(OFFSET.work.position[None], OFFSET.work.rotation[None])[0]
     tool = matrices(OFFSET.tool.position[None], OFFSET.tool.rotation[None])[0]
     expected = work @ matrices(*stacked) @ np.linalg.inv(tool)
-    positions, rotations = platform_poses(OFFSET, *stacked)
+    positions, rotations = OFFSET.platform_poses(*stacked)
     np.testing.assert_allclose(positions, expected[:, :3, 3], atol=1e-15)
     np.testing.assert_allclose(rotations, expected[:, :3, :3], atol=1e-15)
 

@@ -47,6 +47,9 @@ TOLERANCES = {
 
 BLOCKS = tuple(TOLERANCES)
 
+SHORTEST_LEAD, LONGEST_LEAD = 0.1e-3, 1.0
+"""Leads that a screw can have, m; below them no measuring line could show a period."""
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -85,8 +88,9 @@ class Settings:
         unknown = set(self.blocks) - set(BLOCKS)
         if unknown:
             raise ModelError("blocks", f"must be of {', '.join(BLOCKS)}", sorted(unknown))
-        if self.lead is not None and not 0.0 < self.lead < 1.0:
-            raise ModelError("lead", "must be above zero and below 1 m", self.lead)
+        if self.lead is not None and not SHORTEST_LEAD <= self.lead <= LONGEST_LEAD:
+            allowed = f"{SHORTEST_LEAD * 1e3:g} mm to {LONGEST_LEAD * 1e3:g} mm"
+            raise ModelError("lead", f"must be {allowed}", self.lead * 1e3)
         for name, value in self.tolerances:
             if not 0.0 < value < np.inf:
                 raise ModelError(f"tolerance of {name}", "must be finite and above zero", value)

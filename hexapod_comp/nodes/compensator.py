@@ -177,7 +177,7 @@ class CompensatorNode(MachineNode):
     def _warm_up(self) -> None:
         """Run every kernel of the loop once, so that none compiles while the machine moves."""
         trial = Compensator(self.compensator.geometry, self.compensator.model)
-        home = trial.tool_pose(trial.geometry.home)
+        home = trial.geometry.tool_pose(trial.geometry.home)
         message = PoseStamped()
         write_pose(message, home.position, home.rotation)
         _, _, numbers = read_pose_bytes(serialize_message(message))

@@ -64,6 +64,9 @@ RESET_PERIOD = 0.5
 COMPLAINT_COUNTS_FOR = 1.2
 """The compensator's last diagnostics tell how it is for so long, s: it sends some every second."""
 
+LARGEST_PIN = 1e6
+"""No axis stands beyond this, in LinuxCNC's units or degrees; and nothing made of such numbers overflows."""
+
 LONGEST_FAREWELL = 1.0
 """Corrections that can be ramped out within this time are, before the process ends, s."""
 
@@ -220,14 +223,14 @@ class LinuxcncBridgeNode(MachineNode):
         )
 
     def _send(self, now: float) -> None:
-        """Publish measured struts and commanded pose, each only if all its pins are numbers."""
+        """Publish measured struts and commanded pose, each only if all its pins are usable."""
         stamp = stamp_of(time.time_ns())
         if self._states.age(now) >= self._states_period:
             feedback = self._read_feedback()
-            if self._finite(FEEDBACK, feedback, now):
+            if self._usable(FEEDBACK, feedback, now):
                 self._send_states(feedback, stamp, now)
         axes = self._read_axes()
-        if self._finite(AXES, axes, now):
+        if self._usable(AXES, axes, now):
             if self._sent.age(now) > self._options["timeout"]:
                 self._streaming_since = now
             self._write_pose(axes)
@@ -261,13 +264,14 @@ class LinuxcncBridgeNode(MachineNode):
         x, y, z, q.x, q.y, q.z, q.w = pose_from_axes(*axes)
         p.x, p.y, p.z = x * self._metres, y * self._metres, z * self._metres
 
-    def _finite(self, names: Sequence[str], values: Sequence[float], now: float) -> bool:
-        if all(map(math.isfinite, values)):
+    def _usable(self, names: Sequence[str], values: Sequence[float], now: float) -> bool:
+        bad = {name: value for name, value in zip(names, values, strict=True) if not abs(value) <= LARGEST_PIN}
+        if not bad:
             return True
-        bad = ", ".join(f"{name} = {v}" for name, v in zip(names, values, strict=True) if not math.isfinite(v))
-        text = f"pins that are no numbers: {bad}"
-        self._bad_pins.add("pins", text, now)
-        self.warn_of(text, text)
+        which, said = ", ".join(bad), ", ".join(f"{name} = {value}" for name, value in bad.items())
+        text = f"pins that are no numbers within ±{LARGEST_PIN:g}: {said}"
+        self._bad_pins.add(which, text, now)
+        self.warn_of(which, text)
         return False
 
     def _look_at_publishers(self) -> None:
@@ -327,7 +331,7 @@ class LinuxcncBridgeNode(MachineNode):
         if not self._active:
             return WARN, "not active"
         if self._bad_pins.recent(now):
-            return ERROR, self._bad_pins.last_text
+            return ERROR, f"unusable pins: {self._bad_pins.last_reason}"
         if self._refusals.recent(now):
             return ERROR, f"refusing corrections: {self._refusals.last_reason}"
         if not self._machine_on:

@@ -29,7 +29,7 @@ MOVE_FEED = 0.1
 
 def prepare(geometry: HexapodGeometry) -> None:
     """Compile, or load from the cache, what the nodes need, so that they do not both compile at once."""
-    Compensator(geometry, MachineModel(geometry.name)).correct(geometry.work.inverse() @ geometry.home @ geometry.tool)
+    Compensator(geometry, MachineModel(geometry.name)).correct(geometry.tool_pose(geometry.home))
     StrutDrive(RealMachine(geometry, MachineModel(geometry.name))).advance(0.01)
 
 

@@ -20,8 +20,9 @@ SUMMARY = "which pose of a CSV file breaks which limit, with all margins, before
 TEXT = """By default the rows are targets: the tool moves from one to the next with a rest at each, as `run`
 does, and the whole way is checked. With --stream the rows are consecutive commands at --rate-hz, and their steps
 and strut speeds are checked as they are. Limits hold for nominal and for compensated values (--model).
-Margins: stroke in mm to the nearer end, joint cones in degrees; condition number, correction (µm), step
-(mm) and speed (mm/s) are shown as values. Exit code: 0 all within, 1 a limit is broken, 2 bad input.
+Margins: stroke in mm to the nearer end, joint cones in degrees, distance of the struts' axes in mm if the machine
+limits it; condition number, correction (µm), step (mm) and speed (mm/s) are shown as values. Exit code: 0 all
+within, 1 a limit is broken, 2 bad input.
 
 example:
   $ hexapod_comp check config/table1.csv
@@ -50,6 +51,7 @@ LIMITS_SHOWN = {
     "stroke": ("stroke_margin", "mm", 1e3, 3, "margin"),
     "base_cone": ("base_cone_margin", "deg", 180.0 / math.pi, 3, "margin"),
     "platform_cone": ("platform_cone_margin", "deg", 180.0 / math.pi, 3, "margin"),
+    "clearance": ("clearance_margin", "mm", 1e3, 3, "margin"),
     "condition": ("condition", "", 1.0, 3, "value"),
     "correction": ("correction", "um", 1e6, 2, "value"),
     "step": ("step", "mm", 1e3, 4, "value"),
@@ -126,7 +128,8 @@ def _margin_table(rows: list[Row], result: CheckResult, ideal: bool) -> str:
         shown = range(MOST_ROWS)
         note = f"\n… and {len(rows) - MOST_ROWS} more rows; --out FILE writes all"
     header = ["row", "line"]
-    for column, unit, *_ in LIMITS_SHOWN.values():
+    for name in result.limits:
+        column, unit, *_ = LIMITS_SHOWN[name]
         header.append("_".join(filter(None, (column.removesuffix("_margin"), unit))))
     body = [[rows[n].label, str(rows[n].line), *_row_cells(result, n, ideal)] for n in shown]
     kind = "" if ideal else " (nominal/compensated)"
@@ -136,7 +139,7 @@ def _margin_table(rows: list[Row], result: CheckResult, ideal: bool) -> str:
 
 def _row_cells(result: CheckResult, n: int, ideal: bool) -> list[str]:
     cells = []
-    for name in LIMITS_SHOWN:
+    for name in result.limits:
         stages = (1,) if name == "correction" else (0,) if ideal else (0, 1)
         cells.append("/".join(_cell(result, name, n, stage) for stage in stages))
     return cells
@@ -160,7 +163,8 @@ def _shown(result: CheckResult, name: str, n: int, stage: int) -> float:
 def _row_values(row: Row, n: int, result: CheckResult) -> dict[str, Any]:
     """Return one row's margins and values for CSV and JSON."""
     values: dict[str, Any] = {"sequence": row.label, "line": row.line}
-    for name, (column, unit, *_) in LIMITS_SHOWN.items():
+    for name in result.limits:
+        column, unit, *_ = LIMITS_SHOWN[name]
         for stage, which in enumerate(("nominal", "compensated")):
             if name == "correction":
                 if stage:
@@ -188,8 +192,8 @@ def _allowed(limits: Limits, name: str, strut: int, value: float) -> float:
 def _smallest(limits: Limits, rows: list[Row], result: CheckResult) -> list[dict[str, Any]]:
     """Return, for each limit, the smallest margin and where it is; units as shown."""
     found = []
-    for name, (_, unit, factor, _, _) in LIMITS_SHOWN.items():
-        summary = result.limits[name]
+    for name, summary in result.limits.items():
+        _, unit, factor, *_ = LIMITS_SHOWN[name]
         place = summary.smallest()
         if place is None:
             continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,14 +39,14 @@ def add_parser(subparsers: common.Subparsers) -> None:
     add("--budget", metavar="FILE", default="error_budget.yaml", help=text)
     add("--out", metavar="DIR", required=True, help="folder for everything; made if it is missing")
     add("--cells", type=common.count, default=30, metavar="N", help="cells along the grid's longest edge (default 30)")
-    text = "smallest distance between the axes of two struts, mm (default 0: not limited)"
-    add("--clearance-mm", type=common.bound, default=0.0, metavar="MM", help=text)
+    text = "smallest distance between the axes of two struts, mm; 0: not limited (default: the geometry's)"
+    add("--clearance-mm", type=common.bound, metavar="MM", help=text)
     text = "tilts about x and y (default -4,0,4)"
     add("--tilt-deg", type=tilts_argument, default=tilts_argument("-4,0,4"), metavar="A,B,…", help=text)
     add("--method", choices=("exact", "linear"), default="exact", help="of the ranking (default exact)")
     add("--compare", type=common.count, metavar="N", help="compare exact, linear and the paper's iteration at N poses")
     add("--allow-um", type=above_zero, metavar="UM", help="allowed error of the tool: says what the errors may be")
-    add("--workers", type=common.count, default=1, metavar="N", help="processes (default 1, with all threads)")
+    add("--workers", type=workers_argument, default=1, metavar="N", help="processes (default 1, with all threads)")
     add("--scheduler", metavar="tcp://…", help="Dask scheduler that does the work instead")
     add("--seed", type=common.seed, default=0, metavar="N", help="of random poses and draws (default 0)")
     add("--no-page", action="store_true", help="leave the interactive page out")
@@ -57,6 +58,11 @@ def tilts_argument(text: str) -> tuple[float, ...]:
     import math
 
     return tuple(math.radians(v) for v in sorted({common.finite(part) for part in text.split(",")}))
+
+
+def workers_argument(text: str) -> int:
+    """Read a number of processes; each takes some 200 MB."""
+    return common.count(text, most=256)
 
 
 def above_zero(text: str) -> float:
@@ -78,6 +84,8 @@ def run(args: argparse.Namespace) -> int:
     from ..workspace.study import classify, shells_of
 
     geometry = load_geometry(config_file(args.machine))
+    if args.clearance_mm is not None:
+        geometry = replace(geometry, limits=replace(geometry.limits, clearance=args.clearance_mm * 1e-3))
     budget_file = config_file(args.budget)
     budget = load_budget(budget_file)
     try:
@@ -87,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     folder = _folder(args.out)
     common.mention_compiling("workspace.effect_kernels.extremes_many")
     turned = orientations(geometry, (args.tilt_deg, args.tilt_deg, (0.0,)))
-    found = reaches(geometry, turned, args.cells, args.clearance_mm * 1e-3)
+    found = reaches(geometry, turned, args.cells)
     names = _names(args.tilt_deg)
     with common.progress_bar(sum(int(one.within.sum()) for one in found), " poses") as bar:
         study = classify(

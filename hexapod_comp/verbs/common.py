@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from ..geometry import HexapodGeometry
     from ..machine import MachineModel
-    from ..pose import Pose
     from ..tables import Row
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -100,10 +99,10 @@ def bound(text: str) -> float:
     return number
 
 
-def count(text: str) -> int:
-    """Read a whole number above zero."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"must be a whole number above zero, not {text!r}")
+def count(text: str, most: int = 10_000_000) -> int:
+    """Read a whole number above zero, and not so large that nobody lives to see the end."""
+    if not text.isdecimal() or len(text) > 12 or not 1 <= int(text) <= most:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1 to {most}, not {text!r}")
     return int(text)
 
 
@@ -163,16 +162,6 @@ def one_row(
 def where(row: Row) -> str:
     """Say where a row stands, for messages."""
     return f"line {row.line} (row {row.label})" if row.line else "the pose"
-
-
-def to_platform(geometry: HexapodGeometry, tool_pose: Pose) -> Pose:
-    """Return ``pose_platform_in_base`` for a ``pose_tool_in_work``."""
-    return geometry.work @ tool_pose @ geometry.tool.inverse()
-
-
-def to_tool(geometry: HexapodGeometry, platform_pose: Pose) -> Pose:
-    """Return ``pose_tool_in_work`` for a ``pose_platform_in_base``."""
-    return geometry.work.inverse() @ platform_pose @ geometry.tool
 
 
 def csv_text(rows: Iterable[Mapping[str, Any]]) -> str:

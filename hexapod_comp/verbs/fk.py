@@ -91,7 +91,7 @@ def _poses(
 
     poses = _solve(args, geometry, model, rows, lengths)
     table: list[dict[str, Any]] = [
-        {"sequence": row.label, **pose_values(common.to_tool(geometry, pose))}
+        {"sequence": row.label, **pose_values(geometry.tool_pose(pose))}
         for row, pose in zip(rows, poses, strict=True)
     ]
     if args.json:
@@ -149,7 +149,7 @@ def _guess(args: argparse.Namespace, geometry: HexapodGeometry) -> Pose:
 
     if args.guess is None:
         return geometry.home
-    return common.to_platform(geometry, Pose.from_angles(*args.guess))
+    return geometry.platform_pose(Pose.from_angles(*args.guess))
 
 
 def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.ndarray) -> str:
@@ -171,7 +171,7 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
     for index, mode in enumerate(modes, start=1):
         objections = mode_objections(geometry, structure, mode)
         is_working = working is not None and _same(mode, working)
-        values = pose_values(common.to_tool(geometry, mode))
+        values = pose_values(geometry.tool_pose(mode))
         found.append({"mode": index, **values, "working": is_working, "objections": objections})
     if args.json:
         return common.json_text({"machine": geometry.name, "modes": found, "no_working_mode": reason})

@@ -16,11 +16,10 @@ import numpy as np
 from scipy import ndimage
 
 from ..errors import GeometryError
-from ..geometry import COINCIDENT, HexapodGeometry
+from ..geometry import HexapodGeometry
 from ..kinematics import over_chunks
 from ..limits import LimitTable
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
-from ..trajectory import platform_poses
 from . import reach_kernels as kernels
 
 FINDINGS = (
@@ -52,27 +51,11 @@ class Examiner:
     ----------
     geometry : HexapodGeometry
         Machine and limits.
-    clearance : float
-        Smallest distance between the axes of two struts, m; 0: not limited. Of the study, not of the geometry's
-        limits: compensator and ``check`` do not watch it. Struts that share a joint are not checked.
-
-    Raises
-    ------
-    GeometryError
-        A clearance that is negative or not finite.
     """
 
-    def __init__(self, geometry: HexapodGeometry, clearance: float = 0.0) -> None:
-        if not 0.0 <= clearance < math.inf:
-            raise GeometryError("clearance", "must be finite and not negative, m", clearance)
-        self.geometry, self.clearance = geometry, clearance
-        limits, table = geometry.limits, LimitTable(geometry)
-        scalars = np.array(
-            [limits.condition, geometry.characteristic_length, geometry.home_sign, clearance]
-        )
-        self._arrays = (table.stroke, table.cone_axes, table.cone_cosines, scalars)
-        joints = geometry.platform_joints
-        self._apart = np.linalg.norm(joints[:, None] - joints, axis=2) > COINCIDENT
+    def __init__(self, geometry: HexapodGeometry) -> None:
+        self.geometry = geometry
+        self._arrays = LimitTable(geometry).arrays
 
     def findings(
         self, positions: np.ndarray, rotations: np.ndarray, threads: int | None = None
@@ -99,9 +82,9 @@ class Examiner:
 
         def run(rows: slice) -> None:
             turned = rotations if len(rotations) == 1 else rotations[rows]
-            platform = platform_poses(self.geometry, positions[rows], turned)
+            platform = self.geometry.platform_poses(positions[rows], turned)
             poses = [np.ascontiguousarray(part) for part in platform]
-            arrays = (self._arrays, self._apart, findings[rows], struts[rows])
+            arrays = (self._arrays, findings[rows], struts[rows])
             kernels.examine_poses(*self.geometry.kernel_joints, *poses, *arrays)
 
         over_chunks(run, len(positions), threads)
@@ -171,8 +154,6 @@ class Reach:
         What limits each grid point, index into :data:`FINDINGS`.
     boundary : Boundary
         Where the grid's lines cross the boundary.
-    clearance : float
-        Smallest distance between the axes of two struts, m.
     """
 
     geometry: HexapodGeometry
@@ -180,7 +161,6 @@ class Reach:
     axes: tuple[np.ndarray, np.ndarray, np.ndarray]
     findings: np.ndarray
     boundary: Boundary
-    clearance: float = 0.0
 
     @property
     def within(self) -> np.ndarray:
@@ -222,7 +202,7 @@ class Reach:
         """A point well inside, m, shape (3,): the centroid, or the deepest grid point if that lies outside."""
         points = self.points()
         centroid = points.mean(axis=0)
-        finding, _ = Examiner(self.geometry, self.clearance).findings(centroid[None], self.rotation[None])
+        finding, _ = Examiner(self.geometry).findings(centroid[None], self.rotation[None])
         if finding[0] == kernels.WITHIN:
             return centroid
         depth = ndimage.distance_transform_edt(self.within)
@@ -280,9 +260,7 @@ def orientations(geometry: HexapodGeometry, angles: Sequence[Sequence[float]]) -
     return home_orientation(geometry) @ rotation_from_angles(grid)
 
 
-def reach(
-    geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: int = 40, clearance: float = 0.0
-) -> Reach:
+def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: int = 40) -> Reach:
     """Find what a machine reaches at one orientation.
 
     Parameters
@@ -293,8 +271,6 @@ def reach(
         Orientation of the tool in the work frame; default as at home.
     cells : int
         Cells along the longest edge of the grid.
-    clearance : float
-        As for :class:`Examiner`.
 
     Raises
     ------
@@ -306,7 +282,7 @@ def reach(
     if not CELLS[0] <= cells <= CELLS[1]:
         raise GeometryError("cells", f"must lie in {CELLS[0]}…{CELLS[1]}", cells)
     rotation = home_orientation(geometry) if rotation is None else Pose(np.zeros(3), rotation).rotation
-    examiner = Examiner(geometry, clearance)
+    examiner = Examiner(geometry)
     box = _search(examiner, rotation)
     outermost = possible_box(geometry, rotation)
     while True:
@@ -316,13 +292,11 @@ def reach(
             if not (findings == kernels.WITHIN).any():
                 raise GeometryError("cells", "are too coarse: the grid misses the small workspace; take more", cells)
             boundary = _crossings(examiner, rotation, axes, findings)
-            return Reach(geometry, rotation, axes, findings, boundary, clearance)
+            return Reach(geometry, rotation, axes, findings, boundary)
         box = grown
 
 
-def reaches(
-    geometry: HexapodGeometry, rotations: np.ndarray, cells: int = 40, clearance: float = 0.0
-) -> tuple[Reach, ...]:
+def reaches(geometry: HexapodGeometry, rotations: np.ndarray, cells: int = 40) -> tuple[Reach, ...]:
     """Find what a machine reaches at each of some orientations, shape (M, 3, 3); see :func:`reach`.
 
     Raises
@@ -330,7 +304,7 @@ def reaches(
     GeometryError
         At one of them nothing is within the limits; names it.
     """
-    return tuple(reach(geometry, rotation, cells, clearance) for rotation in rotations)
+    return tuple(reach(geometry, rotation, cells) for rotation in rotations)
 
 
 def possible_box(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
@@ -344,7 +318,7 @@ def possible_box(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
     GeometryError
         The balls have nothing in common.
     """
-    at_origin, turned = platform_poses(geometry, np.zeros((1, 3)), rotation[None])
+    at_origin, turned = geometry.platform_poses(np.zeros((1, 3)), rotation[None])
     struts = at_origin[0] + geometry.platform_joints @ turned[0].T - geometry.base_joints
     centres, longest = -struts @ geometry.work.rotation, geometry.limits.stroke[:, 1:]
     box = np.array([(centres - longest).max(axis=0), (centres + longest).min(axis=0)])
@@ -423,7 +397,7 @@ def poses_at(
     geometry: HexapodGeometry, points: np.ndarray, rotation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the platform poses in ``base`` of tool tips (N, 3), m in the work frame, at one orientation."""
-    positions, rotations = platform_poses(geometry, points, rotation[None])
+    positions, rotations = geometry.platform_poses(points, rotation[None])
     return positions, np.repeat(rotations, len(points), axis=0)
 
 

@@ -162,7 +162,7 @@ def section(reach: Reach, height: float, rings: int = 13, sectors: int = 72) -> 
     """
     _check_mesh(rings, sectors)
     origin = np.array([*reach.centre[:2], height])
-    finding, _ = Examiner(reach.geometry, reach.clearance).findings(origin[None], reach.rotation[None])
+    finding, _ = Examiner(reach.geometry).findings(origin[None], reach.rotation[None])
     if finding[0] != kernels.WITHIN:
         low, high = axis_range(reach) * 1e3
         raise GeometryError("height", f"must lie in {low:.1f}…{high:.1f} mm, where the axis is within reach", height)
@@ -214,7 +214,7 @@ def _cast(
 
     Returns boundary points (N, 3), findings, struts, and whether the ray enters the reach again.
     """
-    examiner = Examiner(reach.geometry, reach.clearance)
+    examiner = Examiner(reach.geometry)
     corners = np.array([[axis[0], axis[-1]] for axis in reach.axes])
     farthest = np.linalg.norm(np.abs(corners - origin[:, None]).max(axis=1))  # all of the grid, hence of the reach
     shares = np.linspace(0.0, farthest, SAMPLES)
