@@ -208,6 +208,31 @@ def test_nodes_receive_by_udp_only(client, pair):
         assert "/dev/shm/fastrtps_port" not in maps
 
 
+def dropped(pid: int) -> int:
+    """Return how many datagrams found a process's UDP sockets full: the last column of /proc/net/udp."""
+    links = [os.readlink(link) for link in Path(f"/proc/{pid}/fd").iterdir() if link.is_symlink()]
+    own = {link[len("socket:[") : -1] for link in links if link.startswith("socket:[")}
+    rows = [line.split() for line in Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]]
+    return sum(int(row[12]) for row in rows if row[9] in own)
+
+
+def test_a_command_for_which_a_socket_had_no_room_is_repeated_at_once(client, pair):
+    """A stopped process's socket is full of readings after a second; it goes on when the next command has been lost.
+
+    Fast DDS repeats what was lost when the writer's heartbeat tells of it: by itself every 3 s, when a command
+    would be too old to be obeyed. No later command brings one earlier here.
+    """
+    compensator, _ = pair
+    ask(client, HOME)
+    compensator.send(signal.SIGSTOP)
+    try:
+        client.spin_until(lambda: dropped(compensator.pid), 10.0, "the socket to be full")
+        entry = client.send(HOME)
+    finally:
+        compensator.send(signal.SIGCONT)
+    client.spin_until(lambda: answered(entry), 5.0, "the answer to a command that was lost")
+
+
 @pytest.mark.parametrize("variable", PROFILE_VARIABLES)
 def test_the_users_own_fast_dds_profile_stays(monkeypatch, variable):
     for name in PROFILE_VARIABLES:
