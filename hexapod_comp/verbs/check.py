@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     rows, positions, rotations = read_pose_arrays(common.input_file(args.poses))
     geometry, model = common.load_machine(args)
     mode = "stream" if args.stream else "moves"
-    common.mention_compiling("checking.examine_many")
+    common.mention_compiling("checking_kernels.examine_many")
     with common.progress_bar(len(rows), " poses") as bar:
         result = check(geometry, model, positions, rotations, mode, args.rate_hz, bar.update)
     if args.json:

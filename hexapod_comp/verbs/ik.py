@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
 
     rows, positions, rotations = _given_pose(args) or read_pose_arrays(common.input_file(args.poses))
     geometry, model = common.load_machine(args)
-    common.mention_compiling("checking.examine_many")
+    common.mention_compiling("checking_kernels.examine_many")
     result = check(geometry, model, positions, rotations, "poses")
     _refuse_lengthless(result, rows)
     with_model = args.model != "ideal"
