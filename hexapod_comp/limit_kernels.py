@@ -55,42 +55,27 @@ def nearest_strut(base, ends, apart, i, count):
 def segment_distance(a, b, c, d):
     """Return the smallest distance, m, between the segments from `a` to `b` and from `c` to `d`, each (3,).
 
-    Where the lines come closest inside both segments it is the lines' distance; otherwise an end of one
-    segment is one of the two closest points.
+    Of the closest points a + s·u and c + t·v, s is that of the lines, held within its segment, t belongs to it;
+    where t leaves its segment, it is held there, and s belongs to it.
     """
-    least = min(
-        min(_point_distance(a, c, d), _point_distance(b, c, d)),
-        min(_point_distance(c, a, b), _point_distance(d, a, b)),
-    )
     uu, uv, vv, uw, vw = 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(3):
         u, v, w = b[k] - a[k], d[k] - c[k], a[k] - c[k]
         uu, uv, vv, uw, vw = uu + u * u, uv + u * v, vv + v * v, uw + u * w, vw + v * w
     determinant = uu * vv - uv * uv
-    if determinant <= 0.0:  # parallel: an end is always among the closest
-        return least
-    s, t = (uv * vw - vv * uw) / determinant, (uu * vw - uv * uw) / determinant
-    if not (0.0 < s < 1.0 and 0.0 < t < 1.0):
-        return least
+    s = _share(uv * vw - vv * uw, determinant)  # parallel lines: any s is as good
+    t = _share(uv * s + vw, vv)
+    s = _share(uv * t - uw, uu)
     square = 0.0
     for k in range(3):
         square += (a[k] + s * (b[k] - a[k]) - c[k] - t * (d[k] - c[k])) ** 2
-    return min(least, math.sqrt(square))
+    return math.sqrt(square)
 
 
 @compiled
-def _point_distance(point, start, end):
-    """Return the distance from a point to a segment, m."""
-    along, square = 0.0, 0.0
-    for k in range(3):
-        u = end[k] - start[k]
-        along += (point[k] - start[k]) * u
-        square += u * u
-    share = 0.0 if square == 0.0 else max(0.0, min(1.0, along / square))
-    total = 0.0
-    for k in range(3):
-        total += (point[k] - start[k] - share * (end[k] - start[k])) ** 2
-    return math.sqrt(total)
+def _share(part, whole):
+    """Return the quotient, held within 0…1; 0 where there is nothing to divide by."""
+    return max(0.0, min(1.0, part / whole)) if whole > 0.0 else 0.0
 
 
 @compiled
