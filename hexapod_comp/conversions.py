@@ -105,6 +105,10 @@ def write_lengths(lengths, period, position, velocity):
         position[i] = lengths[i]
 
 
+LARGEST_LENGTH = 1e3
+"""No strut is so long, m; the squares of much larger numbers overflow."""
+
+
 class StrutReader:
     """Reads JointState messages of six struts, matched by name.
 
@@ -133,8 +137,9 @@ class StrutReader:
         if len(message.position) != 6:
             raise CommandError("strut_count", f"six positions are needed, not {len(message.position)}")
         lengths = np.frombuffer(message.position, dtype=float)[self._order]
-        if not math.isfinite(lengths.dot(lengths)):
-            raise CommandError("not_finite", f"strut lengths must be finite, not {lengths.tolist()}")
+        if not all(abs(length) < LARGEST_LENGTH for length in message.position):
+            allowed = f"finite and below {LARGEST_LENGTH:g} m"
+            raise CommandError("not_finite", f"strut lengths must be {allowed}, not {lengths.tolist()}")
         self.lengths[:] = lengths
 
 
