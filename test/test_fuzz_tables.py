@@ -237,7 +237,8 @@ def test_static_laser_files(folder: Path, line: bool, changes: list) -> None:
         return
     sound(found)
     text = parts[0].decode("utf-8-sig", "replace") if b"\x00" not in parts[0] else parts[0].decode("latin-1")
-    section = text.partition("DEVIATIONS::")[2].partition("::")[0].replace("\r", "\n")
+    *_, section = re.split(r"^\s*DEVIATIONS::", text.replace("\r", "\n"), maxsplit=1, flags=re.MULTILINE)
+    section = section.partition("::")[0]
     listed = re.findall(r"^\s*(\d+)\s+(\d+)\s+(\S+)\s*?$", section, re.MULTILINE)
     assert [(run, target) for run, target, _, _ in static.rows] == [(int(a), int(b)) for a, b, _ in listed]
     deviations = [si(value, "1") for _, _, value in listed]
@@ -317,7 +318,7 @@ def test_linuxcnc_files(exported: Path, which: str, changes: list) -> None:
     if which == HAL_FILE:
         for body, joint, axis, value in SETP.findall(text.replace("\r", "\n")):
             joints = found.base_joints if body == "base" else found.platform_joints
-            same(joints[int(joint), "xyz".index(axis)], float(number_of(value)) * 1e-3)
+            same(joints[int(joint), "xyz".index(axis)], number_in_c(value) * 1e-3)
     for strut, table in enumerate(found.tables):
         finite(table.nominal, table.trims)
         assert (np.diff(table.nominal) > 0.0).all()
@@ -326,13 +327,18 @@ def test_linuxcnc_files(exported: Path, which: str, changes: list) -> None:
             same(np.column_stack([table.nominal, *table.trims]), np.array(rows) * 1e-3)
 
 
+def number_in_c(word: str) -> float:
+    """Return what C's strtod, and so LinuxCNC, reads: leading zeros mean nothing."""
+    return float(number_of(re.sub(r"^([-+]?)0+(?=\d)", r"\1", word)))
+
+
 def leading_rows(text: str) -> list[list[float]]:
     """Return what LinuxCNC reads of a compensation file: up to the first line without three numbers."""
     rows: list[list[float]] = []
     for line in re.split(r"\r\n|\r|\n", text):
         words = line.split()[:3]
         try:
-            rows.append([float(number_of(re.sub(r"^([-+]?)0+(?=\d)", r"\1", word))) for word in words])
+            rows.append([number_in_c(word) for word in words])
         except AssertionError:
             break
         if len(words) < 3:
