@@ -80,21 +80,21 @@ def _share(part, whole):
 
 @compiled
 def check_joints(base, platform, position, rotation, limits):
-    """Check joint cones and strut clearance; return (finding, strut, value)."""
+    """Check joint cones and strut clearance; return (finding, strut, value, second strut or −1)."""
     _, cone_axes, cone_cosines, apart, scalars = limits
     for i in range(6):
         at_base, at_platform = joint_cosines(base, platform, position, rotation, cone_axes, i)
         if not at_base >= cone_cosines[0, i]:
-            return BASE_CONE, i, math.acos(max(-1.0, min(1.0, at_base)))
+            return BASE_CONE, i, math.acos(max(-1.0, min(1.0, at_base))), -1
         if not at_platform >= cone_cosines[1, i]:
-            return PLATFORM_CONE, i, math.acos(max(-1.0, min(1.0, at_platform)))
+            return PLATFORM_CONE, i, math.acos(max(-1.0, min(1.0, at_platform))), -1
     if scalars[5] > 0.0:
         ends = strut_ends(base, platform, position, rotation)
         for i in range(6):
-            distance, _ = nearest_strut(base, ends, apart, i, i)
+            distance, other = nearest_strut(base, ends, apart, i, i)
             if not distance >= scalars[5]:
-                return CLEARANCE, i, distance
-    return WITHIN, -1, 0.0
+                return CLEARANCE, other, distance, i
+    return WITHIN, -1, 0.0, -1
 
 
 @compiled
@@ -109,7 +109,7 @@ def check_stage(base, platform, position, rotation, lengths, limits):
             return NOT_FINITE, i, lengths[i], math.nan
         if lengths[i] < stroke[i, 0] or lengths[i] > stroke[i, 1]:
             return STROKE, i, lengths[i], math.nan
-    finding, strut, value = check_joints(base, platform, position, rotation, limits)
+    finding, strut, value, _ = check_joints(base, platform, position, rotation, limits)
     if finding != WITHIN:
         return finding, strut, value, math.nan
     condition, sign = condition_one(base, platform, position, rotation, scalars[3])

@@ -117,10 +117,10 @@ def test_joint_cones(body: str, strut: int) -> None:
 
 
 def least_distance(pose: Pose, base: np.ndarray) -> tuple[float, int]:
-    """Return the smallest distance of two struts that share no joint, m, and the later strut of the pair."""
+    """Return the smallest distance of two struts that share no joint, m, and the first of the two."""
     ends = pose.position + PAPER.platform_joints @ pose.rotation.T
     pairs = [(i, j) for i, j in combinations(range(6), 2) if i // 2 != j // 2]
-    return min((segment_distance(base[i], ends[i], base[j], ends[j]), j) for i, j in pairs)
+    return min((segment_distance(base[i], ends[i], base[j], ends[j]), i) for i, j in pairs)
 
 
 def test_clearance() -> None:

@@ -10,11 +10,11 @@ import pytest
 from helpers import segment_distance
 from strategies import PAPER_FILE, paper_geometry
 
-from hexapod_comp import limit_kernels
+from hexapod_comp import limit_kernels as codes
 from hexapod_comp.errors import GeometryError, PoseError
 from hexapod_comp.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.pose import Pose
-from hexapod_comp.workspace import reach_kernels as codes
+from hexapod_comp.workspace import reach_kernels
 from hexapod_comp.workspace.reach import (
     FINDINGS,
     Boundary,
@@ -83,8 +83,8 @@ def quantities(geometry: HexapodGeometry, tip: np.ndarray, rotation: np.ndarray)
         if np.linalg.norm(geometry.platform_joints[i] - geometry.platform_joints[j]) > 1e-6
     ]
     return {
-        codes.STROKE_SHORT: lengths - limits.stroke[:, 0],
-        codes.STROKE_LONG: limits.stroke[:, 1] - lengths,
+        reach_kernels.STROKE_SHORT: lengths - limits.stroke[:, 0],
+        reach_kernels.STROKE_LONG: limits.stroke[:, 1] - lengths,
         codes.BASE_CONE: limits.base_cone - at_base,
         codes.PLATFORM_CONE: limits.platform_cone - at_platform,
         codes.CLEARANCE: np.array(apart) - limits.clearance,
@@ -104,7 +104,7 @@ def test_how_low_and_how_high_the_unit_goes():
     end = np.array([[0.0, 0.0, 0.10], [0.0, 0.0, 0.30]])
     points, findings, _ = Examiner(unit()).boundary(start, end, LEVEL)
     np.testing.assert_allclose(points[:, 2], [low, high], atol=1e-6)
-    assert findings.tolist() == [codes.STROKE_SHORT, codes.STROKE_LONG]
+    assert findings.tolist() == [reach_kernels.STROKE_SHORT, reach_kernels.STROKE_LONG]
 
 
 @pytest.mark.parametrize(
@@ -121,8 +121,8 @@ def test_how_low_and_how_high_the_unit_goes():
 def test_distance_of_two_segments(first, second, distance):
     """Truth: read off the coordinates."""
     first, second = np.array(first, dtype=float), np.array(second, dtype=float)
-    assert limit_kernels.segment_distance(*first, *second) == pytest.approx(distance, abs=1e-15)
-    assert limit_kernels.segment_distance(*second[::-1], *first) == pytest.approx(distance, abs=1e-15)
+    assert codes.segment_distance(*first, *second) == pytest.approx(distance, abs=1e-15)
+    assert codes.segment_distance(*second[::-1], *first) == pytest.approx(distance, abs=1e-15)
 
 
 def test_distance_of_random_segments():
@@ -132,7 +132,7 @@ def test_distance_of_random_segments():
         if n % 3 == 0:
             along, aside = rng.normal(), 10.0 ** rng.uniform(-17.0, -3.0)
             corners[3] = corners[2] + along * (corners[1] - corners[0]) + aside * corners[3]
-        assert limit_kernels.segment_distance(*corners) == pytest.approx(segment_distance(*corners), abs=1e-9)
+        assert codes.segment_distance(*corners) == pytest.approx(segment_distance(*corners), abs=1e-9)
 
 
 def test_clearance_stops_the_closest_pair():
@@ -244,7 +244,7 @@ class Ball(Examiner):
 
     def findings(self, positions, rotations, threads=None):
         far = np.linalg.norm(positions[:, None] - self.centres, axis=2).min(axis=1) > 0.08
-        return np.where(far, codes.STROKE_LONG, 0).astype(np.int8), np.full((len(far), 2), -1, np.int8)
+        return np.where(far, reach_kernels.STROKE_LONG, 0).astype(np.int8), np.full((len(far), 2), -1, np.int8)
 
 
 def ball_reach(*centres: tuple[float, float, float]) -> Reach:
@@ -262,7 +262,7 @@ def test_volume_and_box_of_a_ball():
     assert found.parts == 1
     regions = found.regions()
     assert set(regions) == {"top", "bottom", *(f"side {k}…{k + 60}°" for k in range(0, 360, 60))}
-    assert all(shares == {FINDINGS[codes.STROKE_LONG]: 1.0} for shares in regions.values())
+    assert all(shares == {FINDINGS[reach_kernels.STROKE_LONG]: 1.0} for shares in regions.values())
 
 
 def test_a_reach_in_two_parts():

@@ -18,6 +18,7 @@ from scipy import ndimage
 from ..errors import GeometryError
 from ..geometry import HexapodGeometry
 from ..kinematics import over_chunks
+from ..limit_kernels import WITHIN
 from ..limits import LimitTable
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
 from . import reach_kernels as kernels
@@ -32,7 +33,7 @@ FINDINGS = (
     "condition number",
     "assembly mode",
 )
-"""What limits a pose, in words; the index is the code in :mod:`.reach_kernels`."""
+"""What limits a pose, in words; the index is the code in :mod:`.reach_kernels` and :mod:`..limit_kernels`."""
 
 SEARCH_CELLS = (24, 48, 96)
 """Cells along the longest edge with which the reach is looked for, one after the other until it is found."""
@@ -107,7 +108,7 @@ class Examiner:
         for _ in range(HALVINGS):
             middle = 0.5 * (inside + outside)
             found, who = self.findings(middle, rotations)
-            beyond = found != kernels.WITHIN
+            beyond = found != WITHIN
             inside[~beyond], outside[beyond] = middle[~beyond], middle[beyond]
             findings[beyond], struts[beyond] = found[beyond], who[beyond]
         return inside, findings, struts
@@ -165,7 +166,7 @@ class Reach:
     @property
     def within(self) -> np.ndarray:
         """Grid points within all limits, bool, shape (X, Y, Z)."""
-        return self.findings == kernels.WITHIN
+        return self.findings == WITHIN
 
     @property
     def spacing(self) -> float:
@@ -203,7 +204,7 @@ class Reach:
         points = self.points()
         centroid = points.mean(axis=0)
         finding, _ = Examiner(self.geometry).findings(centroid[None], self.rotation[None])
-        if finding[0] == kernels.WITHIN:
+        if finding[0] == WITHIN:
             return centroid
         depth = ndimage.distance_transform_edt(self.within)
         deepest = np.unravel_index(depth.argmax(), depth.shape)
@@ -287,9 +288,9 @@ def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: 
     outermost = possible_box(geometry, rotation)
     while True:
         axes, findings = _grid(examiner, rotation, box, cells)
-        grown = _grown(box, findings == kernels.WITHIN, outermost)
+        grown = _grown(box, findings == WITHIN, outermost)
         if np.array_equal(grown, box):
-            if not (findings == kernels.WITHIN).any():
+            if not (findings == WITHIN).any():
                 raise GeometryError("cells", "are too coarse: the grid misses the small workspace; take more", cells)
             boundary = _crossings(examiner, rotation, axes, findings)
             return Reach(geometry, rotation, axes, findings, boundary)
@@ -332,7 +333,7 @@ def _search(examiner: Examiner, rotation: np.ndarray) -> np.ndarray:
     possible = possible_box(examiner.geometry, rotation)
     for cells in SEARCH_CELLS:
         axes, findings = _grid(examiner, rotation, possible, cells)
-        where = np.argwhere(findings == kernels.WITHIN)
+        where = np.argwhere(findings == WITHIN)
         if len(where):
             step = axes[0][1] - axes[0][0]
             low = np.array([axis[i] for axis, i in zip(axes, where.min(axis=0), strict=True)])
@@ -372,7 +373,7 @@ def _crossings(
     examiner: Examiner, rotation: np.ndarray, axes: tuple[np.ndarray, ...], findings: np.ndarray
 ) -> Boundary:
     """Bisect every edge of the grid that has one end within reach."""
-    within = findings == kernels.WITHIN
+    within = findings == WITHIN
     inside, outside, axis, outward = [], [], [], []
     for k in range(3):
         before = np.take(within, np.arange(len(axes[k]) - 1), k)

@@ -8,13 +8,13 @@ import numpy as np
 
 from ..compiling import compiled
 from ..kernels import condition_one, strut_vector
-from ..limit_kernels import joint_cosines, nearest_strut, strut_ends
+from ..limit_kernels import ASSEMBLY, CONDITION, WITHIN, check_joints
 
 NOBODY = np.int64(-1)
 """No strut is concerned, or no second one."""
 
-(WITHIN, STROKE_SHORT, STROKE_LONG, BASE_CONE, PLATFORM_CONE, CLEARANCE, CONDITION, ASSEMBLY) = range(8)
-"""What limits a pose; the order is the order of the checks."""
+STROKE_SHORT, STROKE_LONG = 1, 2
+"""Instead of :data:`~hexapod_comp.limit_kernels.STROKE`; the other findings are those of that module."""
 
 
 @compiled
@@ -41,7 +41,7 @@ def examine_poses(base, platform, positions, rotations, arrays, findings, struts
 @compiled
 def _examine_pose(base, platform, position, rotation, arrays):
     """Return (finding, strut, second strut) of one pose."""
-    stroke, cone_axes, cosines, apart, scalars = arrays
+    stroke, scalars = arrays[0], arrays[4]
     for i in range(6):
         sx, sy, sz = strut_vector(base, platform, position, rotation, i)
         length = math.sqrt(sx * sx + sy * sy + sz * sz)
@@ -49,18 +49,9 @@ def _examine_pose(base, platform, position, rotation, arrays):
             return STROKE_SHORT, i, NOBODY
         if not length <= stroke[i, 1]:
             return STROKE_LONG, i, NOBODY
-    for i in range(6):
-        at_base, at_platform = joint_cosines(base, platform, position, rotation, cone_axes, i)
-        if not at_base >= cosines[0, i]:
-            return BASE_CONE, i, NOBODY
-        if not at_platform >= cosines[1, i]:
-            return PLATFORM_CONE, i, NOBODY
-    if scalars[5] > 0.0:
-        ends = strut_ends(base, platform, position, rotation)
-        for i in range(6):
-            distance, other = nearest_strut(base, ends, apart, i, i)
-            if not distance >= scalars[5]:
-                return CLEARANCE, other, i
+    finding, strut, _, other = check_joints(base, platform, position, rotation, arrays)
+    if finding != WITHIN:
+        return finding, strut, other
     condition, sign = condition_one(base, platform, position, rotation, scalars[3])
     if not condition <= scalars[0]:
         return CONDITION, NOBODY, NOBODY

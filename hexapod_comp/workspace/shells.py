@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import GeometryError
 from ..geometry import HexapodGeometry
-from . import reach_kernels as kernels
+from ..limit_kernels import WITHIN
 from .reach import Examiner, Reach, poses_at
 
 FRACTIONS = (0.4, 0.7, 1.0)
@@ -163,7 +163,7 @@ def section(reach: Reach, height: float, rings: int = 13, sectors: int = 72) -> 
     _check_mesh(rings, sectors)
     origin = np.array([*reach.centre[:2], height])
     finding, _ = Examiner(reach.geometry).findings(origin[None], reach.rotation[None])
-    if finding[0] != kernels.WITHIN:
+    if finding[0] != WITHIN:
         low, high = axis_range(reach) * 1e3
         raise GeometryError("height", f"must lie in {low:.1f}…{high:.1f} mm, where the axis is within reach", height)
     azimuth = np.linspace(0.0, 2.0 * np.pi, sectors + 1)
@@ -220,7 +220,7 @@ def _cast(
     shares = np.linspace(0.0, farthest, SAMPLES)
     samples = origin + shares[:, None] * directions[:, None]
     found, _ = examiner.findings(samples.reshape(-1, 3), reach.rotation[None])
-    within = (found == kernels.WITHIN).reshape(len(directions), SAMPLES)
+    within = (found == WITHIN).reshape(len(directions), SAMPLES)
     within[:, 0] = True
     exits = within.argmin(axis=1)
     ray = np.arange(len(directions))
