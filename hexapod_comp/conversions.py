@@ -105,8 +105,8 @@ def write_lengths(lengths, period, position, velocity):
         position[i] = lengths[i]
 
 
-LARGEST_LENGTH = 1e3
-"""No strut is so long, m; the squares of much larger numbers overflow."""
+LARGEST_LENGTH = 1e150
+"""The squares of larger numbers, m, overflow; whether a strut can be so long is a question for limits."""
 
 
 class StrutReader:
