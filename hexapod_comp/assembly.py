@@ -185,7 +185,9 @@ def _cone_objections(geometry: HexapodGeometry, struts: np.ndarray, rotation: np
 
 def _clearance_objections(geometry: HexapodGeometry, base: np.ndarray, ends: np.ndarray) -> list[str]:
     """Return the closest pair of struts if they are closer than allowed; joints (6, 3) in ``base``."""
-    apart, allowed = geometry.struts_apart.astype(float), geometry.limits.clearance
+    apart, allowed = geometry.struts_apart, geometry.limits.clearance
+    if not allowed:
+        return []
     (distance, one), other = min((nearest_strut(base, ends, apart, i, i), i) for i in range(6))
     if distance >= allowed:
         return []

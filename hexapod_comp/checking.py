@@ -236,7 +236,8 @@ class _Run:
         self.geometry, self.rate, self.count = geometry, rate, count
         self.machine = RealMachine(geometry, model)
         self.table = LimitTable(geometry)
-        self.worst = {name: _Worst.empty(count) for name in (*LIMITS, *OTHER_FINDINGS)}
+        self.limits = tuple(name for name in LIMITS if name != "clearance" or geometry.limits.clearance)
+        self.worst = {name: _Worst.empty(count) for name in (*self.limits, *OTHER_FINDINGS)}
         self.lengths = np.full((count, 2, 6), np.nan)
         self.unchecked = np.zeros(count, dtype=bool)
         self.outside_field = np.zeros(count, dtype=bool)
@@ -339,22 +340,21 @@ class _Run:
         limits, lengths = self.geometry.limits, values[:, :, :6]
         cones = np.arccos(np.clip(values[:, :, 6:18], -1.0, 1.0))
         condition = values[:, :, CONDITION : CONDITION + 1]
-        clearance = values[:, :, CLEARANCE:CONDITION]
         correction = np.zeros_like(lengths)
         correction[:, 1] = lengths[:, 1] - lengths[:, 0]
         measured = {
             "stroke": (np.minimum(lengths - limits.stroke[:, 0], limits.stroke[:, 1] - lengths), lengths),
             "base_cone": (limits.base_cone - cones[:, :, :6], cones[:, :, :6]),
             "platform_cone": (limits.platform_cone - cones[:, :, 6:], cones[:, :, 6:]),
-            "clearance": (clearance - limits.clearance, clearance),
             "condition": (limits.condition - condition, condition),
             "correction": (limits.correction - np.abs(correction), correction),
         }
+        if limits.clearance:
+            clearance = values[:, :, CLEARANCE:CONDITION]
+            measured["clearance"] = (clearance - limits.clearance, clearance)
         for margin, _ in measured.values():
             margin[~solved, 1] = np.inf  # said once, as not converged
         measured["correction"][0][:, 0] = np.inf
-        if not limits.clearance:
-            del measured["clearance"]
         return measured
 
     def _changes(self, changes: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -391,8 +391,7 @@ class _Run:
         outside = np.zeros(self.count, dtype=bool)
         if box is not None:
             outside = ((platform_positions < box[0]) | (platform_positions > box[1])).any(axis=1)
-        left_out = () if self.geometry.limits.clearance else ("clearance",)
-        summaries = {name: self.worst[name] for name in LIMITS if name not in left_out}
+        summaries = {name: self.worst[name] for name in self.limits}
         return CheckResult(
             mode=mode,
             rate=self.rate,

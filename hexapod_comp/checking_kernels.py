@@ -76,8 +76,11 @@ def examine_many(
 def fill(base, platform, position, rotation, limits, values):
     """Write joint cosines, clearances, condition number and sign of det J of one pose beside its lengths."""
     _, cone_axes, _, apart, scalars = limits
-    ends = strut_ends(base, platform, position, rotation)
     for i in range(6):
         values[6 + i], values[12 + i] = joint_cosines(base, platform, position, rotation, cone_axes, i)
-        values[CLEARANCE + i] = nearest_strut(base, ends, apart, i, 6)[0] if scalars[5] > 0.0 else math.inf
+        values[CLEARANCE + i] = math.inf
+    if scalars[5] > 0.0:
+        ends = strut_ends(base, platform, position, rotation)
+        for i in range(6):
+            values[CLEARANCE + i] = nearest_strut(base, ends, apart, i, 6)[0]
     values[CONDITION], values[SIGN] = condition_one(base, platform, position, rotation, scalars[3])

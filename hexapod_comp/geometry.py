@@ -186,9 +186,9 @@ class HexapodGeometry:
 
     @property
     def struts_apart(self) -> np.ndarray:
-        """Pairs of struts that share no joint, (6, 6) of bool: only their distance can be limited."""
+        """1 for pairs of struts that share no joint, (6, 6), 0 for the others: their distance cannot be limited."""
         joints = self.platform_joints
-        return np.linalg.norm(joints[:, None] - joints, axis=2) > COINCIDENT
+        return (np.linalg.norm(joints[:, None] - joints, axis=2) > COINCIDENT).astype(float)
 
     def platform_pose(self, tool_pose: Pose) -> Pose:
         """Return the ``pose_platform_in_base`` that belongs to a ``pose_tool_in_work``."""

@@ -46,16 +46,20 @@ class LimitTable:
     ----------
     geometry : HexapodGeometry
         The machine.
+
+    Attributes
+    ----------
+    arrays : tuple of ndarray
+        Stroke (6, 2), cone axes (2, 6, 3), cone cosines (2, 6), pairs of struts that are apart (6, 6), and the other
+        limits: what :func:`~hexapod_comp.limit_kernels.check_stage` takes.
     """
 
     def __init__(self, geometry: HexapodGeometry) -> None:
         limits = geometry.limits
         self.geometry = geometry
-        self.stroke = limits.stroke.copy()
-        self.cone_axes = np.array([geometry.base_cone_axes, geometry.platform_cone_axes])
-        self.cone_cosines = np.cos(np.array([limits.base_cone, limits.platform_cone]))
-        self.apart = geometry.struts_apart.astype(float)
-        self.scalars = np.array(
+        cone_axes = np.array([geometry.base_cone_axes, geometry.platform_cone_axes])
+        cone_cosines = np.cos(np.array([limits.base_cone, limits.platform_cone]))
+        scalars = np.array(
             [
                 limits.condition,
                 limits.correction,
@@ -65,11 +69,7 @@ class LimitTable:
                 limits.clearance,
             ]
         )
-
-    @property
-    def arrays(self) -> tuple[np.ndarray, ...]:
-        """All of it, as :func:`~hexapod_comp.limit_kernels.check_stage` takes it."""
-        return self.stroke, self.cone_axes, self.cone_cosines, self.apart, self.scalars
+        self.arrays = (limits.stroke.copy(), cone_axes, cone_cosines, geometry.struts_apart, scalars)
 
     def refusal(
         self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray

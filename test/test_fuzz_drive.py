@@ -41,7 +41,6 @@ class DriveRig(Rig):
 
     def __init__(self, context: Any, truth: str) -> None:
         super().__init__(context, StrutDriveNode, {"rate": 1000.0, "truth_file": truth})
-
         self.obeyed = HOME_LENGTHS
 
     def deliver(self, topic: str, message: Any) -> None:
