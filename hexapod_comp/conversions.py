@@ -110,7 +110,7 @@ LARGEST_LENGTH = 1e150
 
 
 class StrutReader:
-    """Reads JointState messages of six struts, matched by name.
+    """Picks the six struts out of JointState messages by name; other joints beside them do not matter.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ class StrutReader:
 
     def __init__(self) -> None:
         self.lengths = np.zeros(6)
-        self._names: list[str] = []
+        self._names: list[str] | None = None
         self._order = np.arange(6)
 
     def read(self, message: JointState) -> None:
@@ -134,10 +134,11 @@ class StrutReader:
         if message.name != self._names:
             self._order = strut_order(message.name)
             self._names = list(message.name)
-        if len(message.position) != 6:
-            raise CommandError("strut_count", f"six positions are needed, not {len(message.position)}")
+        joints, positions = len(message.name), len(message.position)
+        if joints != positions:
+            raise CommandError("strut_count", f"each of {joints} names needs a position, there are {positions}")
         lengths = np.frombuffer(message.position, dtype=float)[self._order]
-        if not all(abs(length) < LARGEST_LENGTH for length in message.position):
+        if not all(abs(length) < LARGEST_LENGTH for length in lengths.tolist()):
             allowed = f"finite and below {LARGEST_LENGTH:g} m"
             raise CommandError("not_finite", f"strut lengths must be {allowed}, not {lengths.tolist()}")
         self.lengths[:] = lengths
@@ -149,10 +150,13 @@ def strut_order(names: Sequence[str]) -> np.ndarray:
     Raises
     ------
     CommandError
-        ``strut_names`` or ``strut_count``.
+        ``strut_names``: one is missing, or there twice.
     """
-    if len(names) != 6:
-        raise CommandError("strut_count", f"six strut names are needed, not {len(names)}")
-    if sorted(names) != sorted(STRUT_NAMES):
-        raise CommandError("strut_names", f"names must be {', '.join(STRUT_NAMES)}, not {', '.join(names)}")
-    return np.array([list(names).index(name) for name in STRUT_NAMES])
+    found: dict[str, list[int]] = {name: [] for name in STRUT_NAMES}
+    for place, name in enumerate(names):
+        if name in found:
+            found[name].append(place)
+    wrong = [f"{name} {'twice' if places else 'missing'}" for name, places in found.items() if len(places) != 1]
+    if wrong:
+        raise CommandError("strut_names", f"each strut must be named once: {', '.join(wrong)}")
+    return np.array([places[0] for places in found.values()])

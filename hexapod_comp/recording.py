@@ -327,7 +327,7 @@ class _Collected:
         if not len(topics["strut_commands"]) and not len(topics["strut_corrections"]):
             raise InputFileError(self._path, "", "holds not a single answer of the compensator")
         notes = notes + [
-            f"{count} messages of {name} left out: not six positions of {', '.join(STRUT_NAMES)}"
+            f"{count} messages of {name} left out: not a position for each of {', '.join(STRUT_NAMES)}"
             for name, count in self._odd.items()
         ]
         pages = sorted(self._pages, key=lambda entry: entry[0])
@@ -336,10 +336,10 @@ class _Collected:
 
 def _lengths(message: Any) -> tuple[float, ...] | None:
     """Return the six struts' positions in strut order, m; None when they are not what the message holds."""
-    if len(message.name) != 6 or len(message.position) != 6:
+    names, positions = list(message.name), message.position.tolist()
+    if len(names) != len(positions) or any(names.count(name) != 1 for name in STRUT_NAMES):
         return None
-    by_name = dict(zip(message.name, message.position.tolist(), strict=True))
-    return tuple(by_name[name] for name in STRUT_NAMES) if set(by_name) == set(STRUT_NAMES) else None
+    return tuple(positions[names.index(name)] for name in STRUT_NAMES)
 
 
 def _as_series(rows: list[tuple], width: int) -> Series:

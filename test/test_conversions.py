@@ -139,9 +139,11 @@ def test_struts_are_matched_by_name(order):
 @pytest.mark.parametrize(
     ("names", "count", "reason"),
     [
-        (STRUT_NAMES[:5], 6, "strut_count"),
-        ((*STRUT_NAMES, "strut_7"), 7, "strut_count"),
-        ((), 6, "strut_count"),
+        (STRUT_NAMES[:5], 6, "strut_names"),
+        ((*STRUT_NAMES, "strut_1"), 7, "strut_names"),
+        ((), 6, "strut_names"),
+        ((), 0, "strut_names"),
+        ((*STRUT_NAMES, "gripper"), 6, "strut_count"),
         (STRUT_NAMES, 5, "strut_count"),
         (STRUT_NAMES, 7, "strut_count"),
         (STRUT_NAMES, 0, "strut_count"),
@@ -160,6 +162,26 @@ def test_wrong_names_and_counts_are_refused_every_time(names, count, reason):
         assert caught.value.reason == reason
     np.testing.assert_array_equal(reader.lengths, np.arange(1.0, 7.0))
     reader.read(strut_message(np.full(6, 0.5)))
+    np.testing.assert_array_equal(reader.lengths, 0.5)
+
+
+@pytest.mark.parametrize("count", [6, 0])
+def test_a_message_without_names_is_refused_from_the_first_one_on(count):
+    """Which number is which strut's nobody has said, also while no message with names has come yet."""
+    reader = StrutReader()
+    with pytest.raises(CommandError, match="named once: strut_1 missing, strut_2 missing") as caught:
+        reader.read(strut_message(np.full(count, 0.5), ()))
+    assert caught.value.reason == "strut_names"
+    np.testing.assert_array_equal(reader.lengths, 0.0)
+
+
+def test_other_joints_beside_the_struts_do_not_matter():
+    """A controller's JointState holds all its joints, in any order; what the others read is not ours to judge."""
+    reader = StrutReader()
+    names = ("spindle", "strut_6", "strut_5", "strut_4", "table", "strut_3", "strut_2", "strut_1", "spindle")
+    reader.read(strut_message(np.array([math.nan, 0.6, 0.5, 0.4, 1e300, 0.3, 0.2, 0.1, -1.0]), names))
+    np.testing.assert_array_equal(reader.lengths, [0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    reader.read(strut_message(np.array([0.5] * 6)))
     np.testing.assert_array_equal(reader.lengths, 0.5)
 
 

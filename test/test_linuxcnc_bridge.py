@@ -322,7 +322,7 @@ def test_bad_corrections_are_never_applied(bench, speak):
         (([1e-6, math.nan, 0.0, 0.0, 0.0, 0.0],), "not_finite"),
         (([1e-6] * 5 + [math.inf],), "not_finite"),
         (([501e-6] + [0.0] * 5,), "correction"),
-        (([1e-6] * 5, None, STRUT_NAMES[:5]), "strut_count"),
+        (([1e-6] * 5, None, STRUT_NAMES[:5]), "strut_names"),
         (([1e-6] * 6, None, ("a", *STRUT_NAMES[1:])), "strut_names"),
         (([1e-6] * 6, bench.stamp(-5.0)), "stamp"),
         (([1e-6] * 6, bench.stamp(100.0)), "stamp"),

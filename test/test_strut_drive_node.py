@@ -204,7 +204,8 @@ BAD = {
     "infinite": (np.array([0.5, 0.5, 0.5, 0.5, 0.5, math.inf]), STRUT_NAMES, "not_finite"),
     "other names": (np.full(6, 0.5), tuple("abcdef"), "strut_names"),
     "a name twice": (np.full(6, 0.5), ("strut_2", *STRUT_NAMES[1:]), "strut_names"),
-    "five names": (np.full(6, 0.5), STRUT_NAMES[:5], "strut_count"),
+    "no names": (np.full(6, 0.5), (), "strut_names"),
+    "five names": (np.full(6, 0.5), STRUT_NAMES[:5], "strut_names"),
     "five positions": (np.full(5, 0.5), STRUT_NAMES, "strut_count"),
 }
 

@@ -215,7 +215,7 @@ def _far_strut(message: Any) -> None:
 STRUT_SPOILS: dict[str, tuple[Callable[[Any], None], str]] = {
     "NaN": (_nan_strut, "not_finite"),
     "a name": (_other_name, "strut_names"),
-    "five struts": (_five_struts, "strut_count"),
+    "five struts": (_five_struts, "strut_names"),
 }
 
 SPOILS: dict[str, dict[str, tuple[Callable[[Any], None], str]]] = {
