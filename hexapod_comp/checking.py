@@ -247,7 +247,7 @@ class _Run:
     def _start(self) -> None:
         """Forget where the machine comes from."""
         self.motion = MotionState()
-        self.previous = np.full((1, 2, 6), np.nan)
+        self.previous: np.ndarray = np.full((1, 2, 6), np.nan)
 
     def check_rows(
         self, positions: np.ndarray, rotations: np.ndarray, stream: bool, progress: Callable[[int], object]

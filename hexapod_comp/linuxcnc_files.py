@@ -151,7 +151,7 @@ def read_genhexkins(folder: str | Path, unit: str) -> Genhexkins:
     texts = {name: read_text(folder / name) for name in (HAL_FILE, INI_FILE, *COMP_FILES)}
     _refuse_mixed(folder, texts)
     pins = _read_pins(folder / HAL_FILE, texts[HAL_FILE])
-    vectors = {name: np.zeros((6, 3)) for name in PINS.values()}
+    vectors: dict[str, np.ndarray] = {name: np.zeros((6, 3)) for name in PINS.values()}
     for pin, name in PINS.items():
         if not pin.endswith("-n") or pins["screw-lead"] != 0.0:
             vectors[name] = _vectors(folder / HAL_FILE, pins, pin) * (1.0 if pin.endswith("-n") else size)

@@ -125,7 +125,8 @@ def rotation_from_angles(angles: np.ndarray) -> np.ndarray:
     angles = np.asarray(angles, dtype=float)
     if (np.abs(angles) > LARGEST_ANGLE).any():
         raise PoseError(f"angles must lie within ±{LARGEST_ANGLE:g} rad", float(np.abs(angles).max()))
-    return Rotation.from_euler("YXZ", angles[..., [1, 0, 2]]).as_matrix()
+    rows = angles[..., [1, 0, 2]].reshape(-1, 3)  # older SciPy takes no further axes
+    return Rotation.from_euler("YXZ", rows).as_matrix().reshape(*angles.shape, 3)
 
 
 def angles_from_rotation(rotation: np.ndarray) -> np.ndarray:

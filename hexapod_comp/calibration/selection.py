@@ -16,6 +16,9 @@ FIRST_ROUNDS, ROUNDS = 10, 4
 CLEAR = 2.0
 """A general block stays when its gain is so many times its standard error over the folds."""
 
+LEAST_GAIN = 1e-4
+"""A block does not help when its gain is below this: it is rounding, which depends on the libraries, or of no use."""
+
 EXPECTED = ("pitch", "wave", "backlash")
 """Errors that every screw has: they stay when they help at all. Of a length map or a field nobody knows beforehand."""
 
@@ -47,6 +50,8 @@ def select(
     space: ParameterSpace, problem: LinearProblem, noise: np.ndarray, progress: Callable[[str], object]
 ) -> tuple[list[Decision], Posterior]:
     """Decide on each block by leaving out one line, or one scattered pose, after the other.
+
+    Where there is only one, nothing is left to fit without it, and no block is kept.
 
     All blocks start in. The general one that helps least goes, until every one that is left helps clearly;
     then the expected ones that do not help at all. Taking them in one by one instead can let a field explain
@@ -85,13 +90,13 @@ def select(
         kept.remove(min(doubtful, key=lambda name: gains[name][0] / max(gains[name][1], 1e-12)))
     for name in (name for name in names if name in EXPECTED):
         gains[name] = trials.gain(("structure", *kept), name)
-    useless = [name for name in EXPECTED if name in kept and gains[name][0] <= 0.0]
+    useless = [name for name in EXPECTED if name in kept and gains[name][0] <= LEAST_GAIN]
     kept = [name for name in kept if name not in useless]
     return [Decision(name, name in kept, *gains[name]) for name in names], trials.everything
 
 
 def _clear(gain: tuple[float, float] | None) -> bool:
-    return gain is not None and gain[0] > CLEAR * gain[1]
+    return gain is not None and gain[0] > max(LEAST_GAIN, CLEAR * gain[1])
 
 
 class _Trials:
@@ -108,6 +113,8 @@ class _Trials:
         """Return by which share a block among `names` lowers the squared error, and its standard error."""
         with_it = self._errors(names)
         without = self._errors(tuple(name for name in names if name != block))
+        if len(without) < 2:
+            return 0.0, 0.0
         less = (without - with_it) / max(without.sum(), np.finfo(float).tiny)
         return float(less.sum()), float(np.sqrt(len(less) * less.var()))
 
