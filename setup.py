@@ -1,12 +1,27 @@
-"""Package metadata, read by pip (virtual environment) and by colcon (ROS 2 workspace) alike."""
+"""Package metadata, read by pip (virtual environment) and by colcon (ROS 2 workspace) alike.
+
+Name, version, maintainer and licence stand in package.xml, and nowhere else.
+"""
 
 from __future__ import annotations
 
 import os
+from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
-NAME = "hexapod_comp"
+HERE = Path(__file__).resolve().parent
+PACKAGE_XML = ElementTree.parse(HERE / "package.xml")
+MAINTAINER = PACKAGE_XML.find("maintainer")
+
+
+def stated(tag: str) -> str:
+    """Return the text of an element of package.xml, on one line."""
+    return " ".join((PACKAGE_XML.findtext(tag) or "").split())
+
+
+NAME = stated("name")
 
 
 def shared_files(folder: str) -> list[tuple[str, list[str]]]:
@@ -22,13 +37,29 @@ def shared_files(folder: str) -> list[tuple[str, list[str]]]:
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version=stated("version"),
     description="Error compensation for hexapod machine tools: tool poses in, compensated strut lengths out",
-    license="Apache-2.0",
-    maintainer="hexapod_comp maintainers",
-    maintainer_email="maintainers@hexapod-comp.example",
+    long_description=(HERE / "README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
+    license=stated("license"),
+    license_files=["LICENSE"],
+    maintainer=stated("maintainer"),
+    maintainer_email="" if MAINTAINER is None else MAINTAINER.get("email", ""),
+    keywords="hexapod, Stewart platform, machine tool, calibration, error compensation, ROS 2, LinuxCNC",
+    classifiers=[
+        "Development Status :: 4 - Beta",
+        "Environment :: Console",
+        "Intended Audience :: Manufacturing",
+        "Intended Audience :: Science/Research",
+        "Operating System :: POSIX :: Linux",
+        "Programming Language :: Python :: 3 :: Only",
+        *(f"Programming Language :: Python :: 3.{minor}" for minor in (10, 11, 12, 13)),
+        "Topic :: Scientific/Engineering",
+        "Typing :: Typed",
+    ],
     python_requires=">=3.10,<3.14",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    package_data={NAME: ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -58,6 +89,7 @@ setup(
             "hypothesis>=6.98",
             "ruff==0.17.*",
             "mypy==2.4.*",
+            "setuptools>=70.1",  # builds wheels by itself
             "colcon-core>=0.18",
             "colcon-ros>=0.5",
             "colcon-library-path>=0.2.1",

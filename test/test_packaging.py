@@ -9,6 +9,7 @@ import runpy
 import shutil
 import subprocess
 import sys
+import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
@@ -22,7 +23,7 @@ from hexapod_comp.paths import config_file, shipped_names
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "hexapod_comp"
 FOLDERS = ("hexapod_comp", "config", "launch", "resource")
-FILES = ("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "LICENSE")
+FILES = ("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "LICENSE", "README.md")
 
 # Import name → key in rosdep's python.yaml and name on PyPI, where the three differ. ROS packages are
 # imported under their own name, which is also their key.
@@ -65,6 +66,58 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = subprocess.run(command, cwd=workspace, capture_output=True, text=True, timeout=100, check=False)
     assert run.returncode == 0, run.stdout + run.stderr
     return workspace / "install" / "hexapod_comp"
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the source archive, and the wheel from that archive: what it lacks, the wheel lacks too."""
+    folder = tmp_path_factory.mktemp("archives")
+    source = folder / "checkout"
+    shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(".*", "__pycache__", "out", "*.egg-info", "build"))
+    python, quiet = sys.executable, {"capture_output": True, "check": True}
+    subprocess.run([python, "setup.py", "-q", "sdist", "--dist-dir", str(folder)], cwd=source, **quiet)
+    (archive,) = folder.glob("*.tar.gz")
+    options = ["--no-deps", "--no-build-isolation", "--no-index", "--wheel-dir", str(folder)]
+    subprocess.run([python, "-m", "pip", "wheel", *options, str(archive)], **quiet)
+    (found,) = folder.glob("*.whl")
+    return found
+
+
+def test_the_wheel_runs_and_says_what_it_is(wheel: Path, tmp_path: Path):
+    """Installed by pip alone: the command, its version, its configuration files, its types."""
+    target = tmp_path / "prefix"
+    options = ["--no-deps", "--no-index", "--ignore-installed", "--prefix", str(target)]
+    subprocess.run([sys.executable, "-m", "pip", "install", "-q", *options, str(wheel)], check=True)
+    site_packages = next(target.glob("**/hexapod_comp/__init__.py")).parents[1]
+    environment = os.environ | {"PYTHONPATH": str(site_packages)}
+    command = [sys.executable, "-m", "hexapod_comp", "--version"]  # which it reads beside its configuration files
+    output = subprocess.check_output(command, env=environment, cwd=tmp_path, text=True, timeout=60)
+    assert output == f"hexapod_comp {_version()}\n"
+    assert (site_packages / "hexapod_comp" / "py.typed").is_file()
+    metadata = next(site_packages.glob("hexapod_comp-*.dist-info/METADATA")).read_text(encoding="utf-8")
+    assert metadata.count("Classifier: ") >= 8
+    assert "make demo" in metadata.partition("\n\n")[2]
+
+
+def test_the_source_archive_carries_all_that_its_checks_need(wheel: Path):
+    """``make test`` and ``make docs`` run in it: everything that git has, but the folders of hosting sites."""
+    (archive,) = wheel.parent.glob("*.tar.gz")
+    with tarfile.open(archive) as opened:
+        held = {name.partition("/")[2] for name in opened.getnames()}
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if listed.returncode:
+        pytest.skip("not a git checkout")
+    needed = {name for name in listed.stdout.splitlines() if not name.startswith((".git", "resource/"))}
+    assert needed <= held
+
+
+def test_citation_and_changelog_name_the_version():
+    assert re.search(rf"^version: {_version()}$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
+    assert re.search(rf"^{_version()} \(", (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8"), re.MULTILINE)
+
+
+def _version() -> str:
+    return ElementTree.parse(ROOT / "package.xml").findtext("version") or ""
 
 
 @pytest.mark.parametrize("name", ["compensator", "strut_drive", "hexapod_comp"])
