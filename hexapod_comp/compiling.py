@@ -17,7 +17,15 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numba
+from .errors import MissingPackageError
+
+try:
+    import numba
+except ImportError as error:
+    raise MissingPackageError(
+        f"needs Numba, which compiles the kinematics ({error}): apt install python3-numba, or where there is none "
+        "(Ubuntu 24.04): pip install numba, in a virtual environment made with --system-site-packages"
+    ) from error
 
 FOLDER_PREFIX = "kernels-"
 

@@ -11,14 +11,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from .compiling import compiled
+from .compiling import compiled, numba
 
-internal = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+internal = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 """Decorator of what only kernels call: it is cached within them, and has no entry from Python."""
 
-inlined = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True)
+inlined = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True)
 """… and of small parts that must become part of their caller, or its loop cannot become SIMD."""
 
 SMALLEST_PIVOT = 1e-14

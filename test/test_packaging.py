@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import os
 import re
 import runpy
@@ -195,6 +196,37 @@ def test_package_xml_lists_what_the_source_imports():
     needed = {_rosdep_key(name) for folder in (PACKAGE, ROOT / "launch") for name in _imports(folder)}
     assert needed <= listed
     assert {key for key in listed if key.startswith("python3-")} <= needed
+
+
+@pytest.mark.filterwarnings("ignore:.*parse_:DeprecationWarning")  # catkin_pkg under a newer pyparsing
+@pytest.mark.parametrize(
+    ("distribution", "packaged"), [("humble", True), ("jazzy", False), ("kilted", False), ("", True)]
+)
+def test_rosdep_is_asked_for_numba_only_where_ubuntu_packages_it(distribution: str, packaged: bool):
+    """Ubuntu 24.04, the system of Jazzy and Kilted, has no python3-numba: rosdep install would end there."""
+    package = importlib.import_module("catkin_pkg.package").parse_package(ROOT / "package.xml")
+    package.evaluate_conditions({"ROS_DISTRO": distribution})  # as rosdep, colcon and bloom do
+    kept = {dependency.name for dependency in package.exec_depends if dependency.evaluated_condition}
+    assert ("python3-numba" in kept) is packaged
+    assert {"python3-numpy", "rclpy"} <= kept
+
+
+@pytest.mark.parametrize(
+    "words", [("hexapod_comp", "ik", "--pose", "0,0,400"), ("hexapod_comp.nodes.compensator",)], ids=["ik", "node"]
+)
+def test_missing_numba_is_said_in_one_line_that_tells_where_to_get_it(words: tuple[str, ...], tmp_path: Path):
+    (tmp_path / "numba.py").write_text("raise ImportError(\"No module named 'numba'\")\n")
+    path = os.pathsep.join([str(tmp_path), str(ROOT), *sys.path])
+    environment = os.environ | {"PYTHONPATH": path}
+    run = subprocess.run(
+        [sys.executable, "-m", *words], env=environment, capture_output=True, text=True, check=False
+    )
+    assert run.returncode != 0
+    assert run.stdout == ""
+    line = run.stderr.removesuffix("\n")
+    assert "\n" not in line
+    assert "No module named 'numba'" in line
+    assert "pip install numba" in line
 
 
 def test_package_xml_lists_what_the_tests_import():
