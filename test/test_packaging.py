@@ -24,6 +24,7 @@ from hexapod_comp.paths import config_file, shipped_names
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "hexapod_comp"
 FOLDERS = ("hexapod_comp", "config", "launch", "resource")
+MADE = ("__pycache__", ".hypothesis", "out", "*.egg-info", "build", "install", "log")
 FILES = ("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "LICENSE", "README.md")
 
 # Import name → key in rosdep's python.yaml and name on PyPI, where the three differ. ROS packages are
@@ -74,7 +75,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build the source archive, and the wheel from that archive: what it lacks, the wheel lacks too."""
     folder = tmp_path_factory.mktemp("archives")
     source = folder / "checkout"
-    shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(".*", "__pycache__", "out", "*.egg-info", "build"))
+    shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(".git*", ".venv*", ".*_cache", *MADE))
     python, quiet = sys.executable, {"capture_output": True, "check": True}
     subprocess.run([python, "setup.py", "-q", "sdist", "--dist-dir", str(folder)], cwd=source, **quiet)
     (archive,) = folder.glob("*.tar.gz")
