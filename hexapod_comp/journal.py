@@ -1,22 +1,27 @@
-"""The compensator's journal: what changed its state between two commands, written so that it can be replayed.
+"""The compensator's journal: what the compensator consumed, in its order, written so that it can be replayed.
 
-A command's answer follows from the commands before it, which a recording holds, and from what happened to the
-compensator in between: temperatures, models, switching, starts. A page names those changes in order, and closes
-with a snapshot of everything that decides the next answer. So any page is enough to go on from: a lost one costs
-no more than what lies before the next, and a recording may begin in the middle of a motion.
+An answer follows from the commands before it and from what happened to the compensator in between: temperatures,
+models, switching, starts. A page holds all of them in the order in which they were taken, with the answers that were
+given; so a replay need not guess which answer belongs to which command. Pages are numbered: a lost one shows. Every
+:data:`SNAPSHOT_PERIOD` a page closes with a snapshot of everything that decides the next answer. From there a replay
+can go on, so a recording may begin in the middle of a motion.
 
 A page is JSON: people read it with ``ros2 topic echo``, and its numbers come back as the very same floats, as
-Python writes the shortest digits that do. NaN, for which JSON has no word, is null.
+Python writes the shortest digits that do. NaN, for which JSON has no word, is null. Commands and answers come a
+thousand times a second: they are the bytes of an array of :data:`ANSWER`, in base64.
 """
 
 from __future__ import annotations
 
+import base64
+import binascii
 import hashlib
 import json
 import math
 import platform
 import secrets
-from collections.abc import Callable, Mapping
+import struct
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -28,11 +33,27 @@ from .errors import HexapodError, InputFileError
 from .files import read_text
 from .machine import MachineModel
 
-FORMAT = 1
+FORMAT = 2
 """Version of pages."""
 
-SNAPSHOT_PERIOD = 1.0
-"""Longest time between two pages, s: what a lost message costs a replay."""
+OLDER = (
+    "is of version {found}, which does not hold what the compensator consumed, in its order; this release reads "
+    "version {format}. Replay the recording with the release that made it"
+)
+
+SNAPSHOT_PERIOD = 0.4
+"""Longest time between two snapshots, s: what a lost message costs a replay. A late subscriber is given the ten
+newest pages; at one every 50 ms a snapshot is among them."""
+
+ROLES = ("base", "work")
+"""Frames of commanded poses; an answer names its frame by its place here."""
+
+ANSWER = np.dtype([("stamp", "<i8"), ("frame", "u1"), ("pose", "<f8", 7), ("lengths", "<f8", (2, 6))])
+"""One answered command: the time that the compensator was given, ns; frame; position, m, and quaternion x, y, z, w;
+strut commands and corrections that it answered, m."""
+
+_ASKED = struct.Struct("<qB7d")
+"""The first three fields of an ANSWER: packed so in a fifth of the time."""
 
 REFUSALS_PER_PAGE = 20
 """A page names no more refused commands than this; it counts the others."""
@@ -91,29 +112,13 @@ def load_with_source(path: str | Path, load: Callable[[str | Path], Loaded]) -> 
 
 
 @dataclass(frozen=True)
-class Mark:
-    """A place between two answered commands.
-
-    Attributes
-    ----------
-    count : int
-        Commands answered before it since the node started.
-    stamp : int
-        Stamp of the last of them, ns; 0 when there is none.
-    """
-
-    count: int
-    stamp: int
-
-
-@dataclass(frozen=True)
 class Entry:
     """One change, or one refused command.
 
     Attributes
     ----------
-    mark : Mark
-        Where it happened.
+    after : int
+        Commands answered before it since the session began.
     what : str
         ``temperature``, ``model``, ``enable``, ``reset`` or ``refused``.
     values : dict of str to object
@@ -121,9 +126,32 @@ class Entry:
         ``measured`` (m, or None) of a reset; ``stamp`` (ns), ``reason`` and ``text`` of a refused command.
     """
 
-    mark: Mark
+    after: int
     what: str
     values: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Everything that decides the next answer.
+
+    Attributes
+    ----------
+    state : dict
+        As :meth:`Compensator.snapshot`, arrays in place of lists.
+    model, geometry : dict of str to str
+        ``name`` and ``sha256`` of what was in use.
+    frames : dict of str to str
+        frame_id of poses in the machine's ``base`` and in its ``work`` frame.
+    made_with : dict of str to str
+        Versions that the last bit may depend on.
+    """
+
+    state: dict[str, Any]
+    model: dict[str, str]
+    geometry: dict[str, str]
+    frames: dict[str, str]
+    made_with: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -136,32 +164,36 @@ class Page:
         Differs from one configuration of a node to the next.
     number : int
         Of this page in its session, from 1.
+    begins : int
+        Commands answered before this page since the session began.
+    answers : ndarray of ANSWER
+        Commands answered since the page before, and the answers.
     entries : tuple of Entry
-        What happened since the page before.
+        What else happened since then.
     refused_more : int
         Refused commands that the page does not name.
-    mark : Mark
-        Where the snapshot was taken.
-    snapshot : dict
-        As :meth:`Compensator.snapshot`, arrays in place of lists.
-    model, geometry : dict of str to str
-        ``name`` and ``sha256`` of what was in use.
-    frames : dict of str to str
-        frame_id of poses in the machine's ``base`` and in its ``work`` frame.
-    made_with : dict of str to str
-        Versions that the last bit may depend on.
+    snapshot : Snapshot or None
+        Taken after all of that.
     """
 
     session: str
     number: int
+    begins: int
+    answers: np.ndarray
     entries: tuple[Entry, ...]
     refused_more: int
-    mark: Mark
-    snapshot: dict[str, Any]
-    model: dict[str, str]
-    geometry: dict[str, str]
-    frames: dict[str, str]
-    made_with: dict[str, str]
+    snapshot: Snapshot | None
+
+    def steps(self) -> Iterator[Entry | None]:
+        """Yield what happened, in its order: entries, and None for each answered command."""
+        entries = iter(self.entries)
+        upcoming = next(entries, None)
+        for number in range(len(self.answers) + 1):
+            while upcoming is not None and upcoming.after <= self.begins + number:
+                yield upcoming
+                upcoming = next(entries, None)
+            if number < len(self.answers):
+                yield None
 
 
 class Journal:
@@ -171,32 +203,32 @@ class Journal:
     ----------
     compensator : Compensator
         Watched from now on.
-    place : callable
-        Returns commands answered so far and the stamp of the last, ns.
     sources : mapping of str to Source
-        ``geometry`` and ``model`` in use; looked up whenever a page is written.
+        ``geometry`` and ``model`` in use; looked up whenever they are named.
     frames : dict of str to str
-        See :class:`Page`.
+        See :class:`Snapshot`.
     """
 
-    def __init__(
-        self,
-        compensator: Compensator,
-        place: Callable[[], tuple[int, int]],
-        sources: Mapping[str, Source],
-        frames: dict[str, str],
-    ) -> None:
-        self._compensator, self._place, self._sources = compensator, place, sources
+    def __init__(self, compensator: Compensator, sources: Mapping[str, Source], frames: dict[str, str]) -> None:
+        self._compensator, self._sources = compensator, sources
         self._always = {"frames": frames, "made_with": made_with()}
-        self._session, self._number = secrets.token_hex(4), 0
+        self._places = {frames[role]: place for place, role in enumerate(ROLES)}
+        self._session, self._number, self._count = secrets.token_hex(4), 0, 0
+        self._answers, self._begins = bytearray(), 0
         self._entries: list[dict[str, Any]] = []
         self._refused = 0
         self._last = -math.inf
         compensator.on_change = self.note
 
+    def answered(self, stamp: int, frame_id: str, numbers: tuple[float, ...]) -> None:
+        """Write down a command just answered: its time, ns, frame, position, m, and quaternion."""
+        self._answers += _ASKED.pack(stamp, self._places[frame_id], *numbers)
+        self._answers += self._compensator.command.tobytes() + self._compensator.correction.tobytes()
+        self._count += 1
+
     def note(self, what: str, value: Any) -> None:
         """Write down a change that has just been made."""
-        entry = {"after": self._place(), "what": what, **_values(what, value, self._sources)}
+        entry = {"after": self._count, "what": what, **_values(what, value, self._sources)}
         if self._entries and what == "reset":
             last = self._entries[-1]
             # Every refused first command resets anew; only the last reset counts, and a page stays short.
@@ -208,30 +240,41 @@ class Journal:
         """Write down a refused command with its stamp, ns."""
         self._refused += 1
         if self._refused <= REFUSALS_PER_PAGE:
-            place = {"after": self._place(), "what": "refused"}
-            self._entries.append({**place, "stamp": stamp, "reason": reason, "text": text})
+            entry = {"after": self._count, "what": "refused", "stamp": stamp, "reason": reason, "text": text}
+            self._entries.append(entry)
 
     def due(self, now: float) -> bool:
         """Return whether a page should be written at the monotonic time `now`, s."""
-        return bool(self._entries) or now - self._last >= SNAPSHOT_PERIOD
+        return bool(self._answers or self._entries) or self._snapshot_due(now)
+
+    def _snapshot_due(self, now: float) -> bool:
+        return now - self._last >= SNAPSHOT_PERIOD
 
     def page(self, now: float) -> str:
         """Return the next page and begin a new one."""
-        self._number, self._last = self._number + 1, now
+        self._number += 1
         content = {
             "journal": FORMAT,
             "session": self._session,
             "number": self._number,
+            "begins": self._begins,
+            "answers": base64.b64encode(self._answers).decode(),
             "entries": self._entries,
             "refused_more": max(0, self._refused - REFUSALS_PER_PAGE),
-            "after": self._place(),
-            "snapshot": _nullified(self._compensator.snapshot()),
+            "snapshot": self._snapshot(now) if self._snapshot_due(now) else None,
+        }
+        self._answers, self._begins = bytearray(), self._count
+        self._entries, self._refused = [], 0
+        return json.dumps(content, ensure_ascii=False)
+
+    def _snapshot(self, now: float) -> dict[str, Any]:
+        self._last = now
+        return {
+            "state": _nullified(self._compensator.snapshot()),
             "model": _identity(self._compensator.model, self._sources["model"]),
             "geometry": {"name": self._compensator.geometry.name, "sha256": self._sources["geometry"].sha256},
             **self._always,
         }
-        self._entries, self._refused = [], 0
-        return json.dumps(content, ensure_ascii=False)
 
 
 def _values(what: str, value: Any, sources: Mapping[str, Source]) -> dict[str, Any]:
@@ -327,20 +370,21 @@ def read_page(text: str) -> Page:
     """
     content = _content(text)
     try:
-        return Page(
+        page = Page(
             session=str(content["session"]),
             number=int(content["number"]),
+            begins=int(content["begins"]),
+            answers=np.frombuffer(base64.b64decode(content["answers"], validate=True), ANSWER),
             entries=tuple(_read_entry(entry) for entry in content["entries"]),
             refused_more=int(content["refused_more"]),
-            mark=_read_mark(content["after"]),
-            snapshot=_read_snapshot(content["snapshot"]),
-            model=_words(content["model"], "name", "sha256"),
-            geometry=_words(content["geometry"], "name", "sha256"),
-            frames=_words(content["frames"], "base", "work"),
-            made_with=_words(content["made_with"]),
+            snapshot=None if content["snapshot"] is None else _read_snapshot(content["snapshot"]),
         )
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, binascii.Error) as error:
         raise JournalError(f"not a page of the journal: {error!r}") from error
+    places = [page.begins, *(entry.after for entry in page.entries), page.begins + len(page.answers)]
+    if places != sorted(places) or (page.answers["frame"] >= len(ROLES)).any():
+        raise JournalError("its entries and answers are not in an order that a journal can have")
+    return page
 
 
 def _content(text: str) -> dict[str, Any]:
@@ -348,15 +392,12 @@ def _content(text: str) -> dict[str, Any]:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise JournalError(f"not JSON: {error}") from error
-    if not isinstance(content, dict) or content.get("journal") != FORMAT:
-        found = content.get("journal") if isinstance(content, dict) else content
+    found = content.get("journal") if isinstance(content, dict) else content
+    if isinstance(found, int) and 0 < found < FORMAT:
+        raise JournalError(OLDER.format(found=int(found), format=FORMAT))
+    if not isinstance(content, dict) or found != FORMAT:
         raise JournalError(f"must be of version {FORMAT}, not {str(found)[:40]}")
     return content
-
-
-def _read_mark(content: Any) -> Mark:
-    count, stamp = content
-    return Mark(int(count), int(stamp))
 
 
 def _measured(content: Any) -> list[float] | None:
@@ -378,12 +419,20 @@ SNAPSHOT_ARRAYS = ("state", "poses", "switches")
 
 def _read_entry(content: Any) -> Entry:
     what = content["what"]
-    return Entry(_read_mark(content["after"]), what, {key: read(content[key]) for key, read in ENTRIES[what].items()})
+    return Entry(int(content["after"]), what, {key: read(content[key]) for key, read in ENTRIES[what].items()})
 
 
-def _read_snapshot(content: Any) -> dict[str, Any]:
-    arrays = {key: np.array([math.nan if v is None else float(v) for v in content[key]]) for key in SNAPSHOT_ARRAYS}
-    return {**arrays, "temperatures": {str(key): float(value) for key, value in content["temperatures"].items()}}
+def _read_snapshot(content: Any) -> Snapshot:
+    state = content["state"]
+    arrays = {key: np.array([math.nan if v is None else float(v) for v in state[key]]) for key in SNAPSHOT_ARRAYS}
+    temperatures = {str(key): float(value) for key, value in state["temperatures"].items()}
+    return Snapshot(
+        state={**arrays, "temperatures": temperatures},
+        model=_words(content["model"], "name", "sha256"),
+        geometry=_words(content["geometry"], "name", "sha256"),
+        frames=_words(content["frames"], *ROLES),
+        made_with=_words(content["made_with"]),
+    )
 
 
 def _words(content: Any, *required: str) -> dict[str, str]:

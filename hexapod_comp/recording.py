@@ -1,35 +1,38 @@
 """Reading a recorded run: one machine's topics out of a bag, as plain arrays. Only this module knows ``rosbags``.
 
 A bag is a folder with ``metadata.yaml`` as ``ros2 bag record`` writes it, or a bare ``.mcap`` or ``.db3`` file. Of
-its topics a replay needs ``tool_pose_command``, ``strut_corrections`` or ``strut_commands``, and the compensator's
-journal; ``compensator/files`` spares the user the search for geometry and model; ``strut_states`` and
-``tool_pose_estimate`` are shown where there are any. All others are left alone, whatever their types.
+its topics a replay needs the compensator's journal alone; ``compensator/files`` spares the user the search for geometry
+and model; ``strut_states`` and ``tool_pose_estimate`` are shown where there are any. All others are left alone,
+whatever their types.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .errors import HexapodError, InputFileError, printable
-from .geometry import STRUT_NAMES
-from .journal import JournalError, Page, Source, read_page, read_sources
+from .geometry import STRUT_NAMES, HexapodGeometry, load_geometry
+from .journal import JournalError, Page, Snapshot, Source, read_page, read_sources
+from .machine import MachineModel
+from .model_file import load_model
 
 POSE, STRUTS, TEXT = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState", "std_msgs/msg/String"
 
 TOPICS = {
-    "tool_pose_command": POSE,
-    "strut_commands": STRUTS,
-    "strut_corrections": STRUTS,
     "strut_states": STRUTS,
     "tool_pose_estimate": POSE,
 }
-"""A machine's topics in its namespace, and their types."""
+"""A machine's topics in its namespace that are shown, and their types."""
+
+COMMANDS = "tool_pose_command"
+"""Topic of commands: counted, not read. What the compensator took, its journal says."""
 
 JOURNAL, FILES = "/journal", "/files"
 """How the topics of a compensator's journal end, after the node's name."""
@@ -46,7 +49,10 @@ CUT_OFF = (
 SPARE = 4
 """Bytes that some writers leave behind a message."""
 
-RECORD = "record at least tool_pose_command, strut_commands, strut_corrections, compensator/journal, compensator/files"
+RECORD = "record at least compensator/journal and compensator/files"
+
+IDEAL = Source.of("", "").sha256
+"""Hash of the model that is none."""
 
 
 @dataclass(frozen=True)
@@ -60,15 +66,12 @@ class Series:
     times : ndarray of int64, shape (n,)
         When the recorder got them, ns.
     values : ndarray, shape (n, k)
-        Six struts, m; or position x, y, z, m, and quaternion x, y, z, w.
-    frames : list of str
-        frame_id of each pose; empty for struts.
+        Six struts, m; or position x, y, z, m.
     """
 
     stamps: np.ndarray
     times: np.ndarray
     values: np.ndarray
-    frames: list[str] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -87,9 +90,13 @@ class Recording:
     topics : dict of str to Series
         By the names in :data:`TOPICS`; empty where the bag has none.
     pages : list of (int, Page)
-        The journal with the recorder's times, ns.
+        The journal with the recorder's times, ns; session by session, in the pages' own order.
+    answers : ndarray of ANSWER
+        Those of all pages, one after the other.
     sources : dict of str to Source
         Geometries and models by their hash.
+    heard : int
+        Commands that the recorder heard; the compensator may have taken fewer.
     notes : list of str
         What was odd.
     """
@@ -98,8 +105,15 @@ class Recording:
     node: str
     topics: dict[str, Series]
     pages: list[tuple[int, Page]]
+    answers: np.ndarray
     sources: dict[str, Source]
+    heard: int
     notes: list[str]
+
+    @property
+    def first(self) -> Snapshot:
+        """The first snapshot."""
+        return next(page.snapshot for _, page in self.pages if page.snapshot is not None)
 
 
 def read_recording(
@@ -121,7 +135,7 @@ def read_recording(
     HexapodError
         ``rosbags`` is not installed.
     InputFileError
-        No bag, damaged, a topic is missing or of a wrong type, several machines or no such one.
+        No bag, damaged, of an earlier version, without journal, several machines or no such one.
     """
     with ExitStack() as stack:
         readers, notes = _open(Path(path), stack)
@@ -134,7 +148,8 @@ def read_recording(
             for topic, time, message in _messages(path, reader, chosen):
                 collected.take(wanted[topic], time, message)
                 progress(1)
-    return collected.recording(notes)
+    heard = sum(c.msgcount for c in connections if c.topic == f"{_namespace(node)}/{COMMANDS}")
+    return collected.recording(notes, heard)
 
 
 def _rosbags() -> Any:
@@ -231,22 +246,13 @@ def _namespace(node: str) -> str:
 
 
 def _wanted(path: str | Path, connections: Iterable[Any], node: str) -> dict[str, str]:
-    """Return what the topics to be read are called here; refuse wrong types and missing ones."""
+    """Return what the topics to be read are called here; refuse wrong types."""
     names = {f"{_namespace(node)}/{name}": (name, kind) for name, kind in TOPICS.items()}
     names |= {node + JOURNAL: (JOURNAL, TEXT), node + FILES: (FILES, TEXT)}
-    found = set()
     for connection in connections:
-        if connection.topic not in names:
-            continue
-        name, kind = names[connection.topic]
+        kind = names.get(connection.topic, ("", connection.msgtype))[1]
         if connection.msgtype != kind:
             raise InputFileError(path, connection.topic, f"must be of type {kind}", connection.msgtype)
-        found.add(name)
-    missing = [f"{_namespace(node)}/tool_pose_command"] if "tool_pose_command" not in found else []
-    if not found & {"strut_commands", "strut_corrections"}:
-        missing.append(f"{_namespace(node)}/strut_corrections (or strut_commands), the compensator's answers")
-    if missing:
-        raise InputFileError(path, "", f"lacks {' and '.join(missing)}; {RECORD}")
     return {topic: name for topic, (name, _) in names.items()}
 
 
@@ -300,15 +306,14 @@ class _Collected:
             return
         stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
         if TOPICS[name] == POSE:
-            p, q = message.pose.position, message.pose.orientation
-            numbers = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
-            self._series[name].append((time, stamp, numbers, message.header.frame_id))
+            point = message.pose.position
+            self._series[name].append((time, stamp, (point.x, point.y, point.z)))
             return
         lengths = _lengths(message)
         if lengths is None:
             self._odd[name] = self._odd.get(name, 0) + 1
         else:
-            self._series[name].append((time, stamp, lengths, ""))
+            self._series[name].append((time, stamp, lengths))
 
     def _take_text(self, name: str, time: int, text: str) -> None:
         try:
@@ -319,19 +324,37 @@ class _Collected:
         except JournalError as error:
             raise InputFileError(self._path, f"{self._node}{name} at {time} ns", str(error)) from error
 
-    def recording(self, notes: list[str]) -> Recording:
+    def recording(self, notes: list[str], heard: int) -> Recording:
         """Return what was collected."""
-        if not self._pages:
-            raise InputFileError(self._path, self._node + JOURNAL, "is there but empty: no page was recorded")
-        topics = {name: _as_series(rows, 7 if TOPICS[name] == POSE else 6) for name, rows in self._series.items()}
-        if not len(topics["strut_commands"]) and not len(topics["strut_corrections"]):
-            raise InputFileError(self._path, "", "holds not a single answer of the compensator")
+        pages = _in_order(self._pages)
+        if not any(page.snapshot for _, page in pages):
+            problem = "holds no snapshot of the compensator's state: record for longer than half a second"
+            raise InputFileError(self._path, self._node + JOURNAL, problem)
+        answers, pages = _gathered(pages)
+        if not len(answers):
+            raise InputFileError(self._path, self._node + JOURNAL, "holds not a single answer of the compensator")
+        topics = {name: _as_series(rows, 3 if TOPICS[name] == POSE else 6) for name, rows in self._series.items()}
         notes = notes + [
             f"{count} messages of {name} left out: not a position for each of {', '.join(STRUT_NAMES)}"
             for name, count in self._odd.items()
         ]
-        pages = sorted(self._pages, key=lambda entry: entry[0])
-        return Recording(str(self._path), self._node, topics, pages, self._sources, notes)
+        return Recording(str(self._path), self._node, topics, pages, answers, self._sources, heard, notes)
+
+
+def _in_order(pages: list[tuple[int, Page]]) -> list[tuple[int, Page]]:
+    """Return pages session by session; each once, if a recorder that joined twice has it twice."""
+    pages = sorted(pages, key=lambda entry: entry[0])
+    sessions = {session: n for n, session in enumerate(dict.fromkeys(page.session for _, page in pages))}
+    once = {(sessions[page.session], page.number): (time, page) for time, page in reversed(pages)}
+    return [once[key] for key in sorted(once)]
+
+
+def _gathered(pages: list[tuple[int, Page]]) -> tuple[np.ndarray, list[tuple[int, Page]]]:
+    """Return all answers in one array, and the pages with views of it."""
+    answers = np.concatenate([page.answers for _, page in pages])
+    ends = np.cumsum([len(page.answers) for _, page in pages])
+    views = np.split(answers, ends[:-1])
+    return answers, [(time, replace(page, answers=view)) for (time, page), view in zip(pages, views, strict=True)]
 
 
 def _lengths(message: Any) -> tuple[float, ...] | None:
@@ -344,10 +367,74 @@ def _lengths(message: Any) -> tuple[float, ...] | None:
 
 def _as_series(rows: list[tuple], width: int) -> Series:
     rows.sort(key=lambda row: row[0])
-    times, stamps, values, frames = zip(*rows, strict=True) if rows else ((), (), (), ())
+    times, stamps, values = zip(*rows, strict=True) if rows else ((), (), ())
     return Series(
         stamps=np.array(stamps, dtype=np.int64),
         times=np.array(times, dtype=np.int64),
         values=np.array(values, dtype=float).reshape((-1, width)),
-        frames=list(frames) if width == 7 else [],
     )
+
+
+class Files:
+    """Finds geometries and models by their hash: in the recording, and among files that the user names.
+
+    Parameters
+    ----------
+    recording : Recording
+        Carries its own, unless they were not recorded.
+    given : mapping of str to Source
+        More, by hash.
+    """
+
+    def __init__(self, recording: Recording, given: Mapping[str, Source]) -> None:
+        self._path = recording.path
+        self._sources = {**recording.sources, **given}
+        self._loaded: dict[tuple[str, str], Any] = {}
+        pages = [page for _, page in recording.pages]
+        snapshots = [page.snapshot for page in pages if page.snapshot is not None]
+        self.used = {one["sha256"] for snapshot in snapshots for one in (snapshot.geometry, snapshot.model)}
+        self.used |= {str(entry.values["sha256"]) for page in pages for entry in page.entries if entry.what == "model"}
+
+    @property
+    def used_ideal(self) -> bool:
+        """Whether there was a time without a model."""
+        return IDEAL in self.used
+
+    def missing(self) -> str | None:
+        """Return the hash of a file that was in use and is not at hand, None when all are."""
+        absent = (s for s in sorted(self.used) if s != IDEAL and not getattr(self._sources.get(s), "text", None))
+        return next(absent, None)
+
+    def geometry(self, identity: Mapping[str, str]) -> HexapodGeometry:
+        """Return a geometry by its name and hash."""
+        key = identity["sha256"], ""
+        if key not in self._loaded:
+            self._loaded[key] = self._load("machine", identity, load_geometry)
+        return self._loaded[key]
+
+    def model(self, identity: Mapping[str, str], geometry: HexapodGeometry) -> MachineModel:
+        """Return a model by its name and hash."""
+        key = identity["sha256"], geometry.name
+        if key not in self._loaded:
+            if identity["sha256"] == IDEAL:
+                self._loaded[key] = MachineModel(geometry.name)
+            else:
+                self._loaded[key] = self._load("model", identity, lambda path: load_model(path, geometry))
+        return self._loaded[key]
+
+    def _load(self, what: str, identity: Mapping[str, str], load: Callable[[Path], Any]) -> Any:
+        source = self._sources.get(identity["sha256"])
+        if source is None or source.text is None:
+            problem = (
+                f"does not carry the {what} {identity.get('name', '')!r} that was in use; "
+                f"give its file with --{what} (sha256 {identity['sha256']})"
+            )
+            raise InputFileError(self._path, "", problem)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "text.yaml"
+            path.write_text(source.text, encoding="utf-8")
+            try:
+                return load(path)
+            except InputFileError as error:
+                # A file of another version of this package, most likely: name the bag, not our copy.
+                raise InputFileError(self._path, f"{source.name}: {error.key}", error.problem, error.value) from error

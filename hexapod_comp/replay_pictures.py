@@ -12,8 +12,8 @@ from .errors import printable
 from .geometry import STRUT_NAMES, HexapodGeometry
 from .journal import Entry
 from .plotting import WITH, WITHOUT, save
-from .replay_report import LONGEST_GAP, Report, following_error, since, tool_tracks
-from .replaying import BEFORE, DIFFERENT, LOST, UNCERTAIN
+from .replay_report import LONGEST_GAP, Report, following_error, since, tool_positions
+from .replaying import BEFORE, DIFFERENT, LOST
 
 EVENT_COLOURS = {"temperature": "#8a6d3b", "model": "#7b3294", "enable": "#2e8b57", "reset": "#555555"}
 
@@ -43,7 +43,7 @@ def write_pictures(report: Report, geometry: HexapodGeometry | None, folder: str
         figures["following_error"] = following_figure(report)
     if geometry is not None:
         figures["tool"] = tool_figure(report, geometry)
-    if report.replayed is not None and report.replayed.refused:
+    if report.refused:
         figures["refused"] = refused_figure(report)
     if report.other is not None or not report.same:
         figures["difference"] = difference_figure(report)
@@ -80,18 +80,15 @@ def _mark_events(report: Report, axes: Axes) -> None:
     if replayed is None:
         return
     seconds = report.seconds
-    for row, entry in replayed.events:
-        at = seconds[min(row, len(seconds) - 1)]
+    for event in replayed.changes:
+        at, entry = seconds[min(event.row, len(seconds) - 1)], event.entry
         axes.axvline(at, color=EVENT_COLOURS.get(entry.what, "black"), lw=0.8, ls="--")
-        if len(replayed.events) <= MOST_LABELS:
-            text = (
-                entry.what if "name" not in entry.values else f"{entry.what} {printable(str(entry.values['name']), 20)}"
-            )
+        if len(replayed.changes) <= MOST_LABELS:
             axes.annotate(
-                text, (at, 1.0), (2, -3), xycoords=("data", "axes fraction"), textcoords="offset points",
+                _label(entry), (at, 1.0), (2, -3), xycoords=("data", "axes fraction"), textcoords="offset points",
                 rotation=90, va="top", fontsize=6,
             )  # fmt: skip
-    lost = np.isin(replayed.outcome, (LOST, BEFORE, UNCERTAIN))
+    lost = np.isin(replayed.outcome, (LOST, BEFORE))
     if lost.any():
         low, high = axes.get_ylim()
         axes.fill_between(seconds, low, high, where=lost.tolist(), color="grey", alpha=0.2, lw=0.0, step="mid")
@@ -108,7 +105,7 @@ def corrections_figure(report: Report) -> Figure:
     """Show the recorded corrections over time; changes are marked, what was not replayed is grey."""
     figure = _figure(report, "Strut corrections: command − nominal")
     axes = figure.subplots()
-    _struts(axes, report.seconds, report.timeline.answers.corrections * 1e6)
+    _struts(axes, report.seconds, report.corrections * 1e6)
     axes.set(ylabel="µm")
     _mark_events(report, axes)
     return figure
@@ -118,10 +115,10 @@ def commands_figure(report: Report) -> Figure:
     """Show the commanded lengths, strut by strut, and the measured ones where there are any."""
     figure = _figure(report, "Strut lengths", 6.5)
     panels = figure.subplots(2, 3, sharex=True)
-    commands, states = report.timeline.answers.commands * 1e3, report.recording.topics["strut_states"]
+    commands, states = report.commands * 1e3, report.recording.topics["strut_states"]
     for n, axes in enumerate(panels.ravel()):
         if len(states) and states.stamps.all():
-            measured = since(states.stamps, report.timeline.answers.stamps)
+            measured = since(states.stamps, report.recording.answers["stamp"])
             axes.plot(*_broken(measured, states.values[:, n] * 1e3), color=WITHOUT, lw=1.6, label="measured")
         axes.plot(*_broken(report.seconds, commands[:, n]), color=WITH, lw=0.8, label="command")
         axes.set(title=STRUT_NAMES[n])
@@ -137,7 +134,7 @@ def following_figure(report: Report) -> Figure:
     """Show by how much the measured struts were off their commands."""
     figure = _figure(report, "Following error: measured − commanded, the drives' lag included")
     axes = figure.subplots()
-    seconds, error = following_error(report.recording, report.timeline)
+    seconds, error = following_error(report)
     _struts(axes, seconds, error * 1e6)
     axes.set(ylabel="µm")
     return figure
@@ -146,8 +143,9 @@ def following_figure(report: Report) -> Figure:
 def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
     """Show the commanded tool path from above and from the side, and where the compensator thought the tool was."""
     figure = _figure(report, "Tool in base", 5.0)
-    rows, positions, estimates = tool_tracks(report.recording, report.timeline, geometry.work)
-    both = len(estimates) > 1 and len(rows) > 1
+    positions = tool_positions(report.recording, geometry.work)
+    estimates = report.recording.topics["tool_pose_estimate"]
+    both = len(estimates) > 1 and len(positions) > 1
     panels = figure.subplots(1, 3 if both else 2)
     for axes, (first, second) in zip(panels, ((0, 1), (0, 2)), strict=False):
         if len(estimates):
@@ -158,8 +156,8 @@ def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
         axes.axis("equal")
     panels[0].legend(fontsize=7)
     if both:
-        at = since(estimates.stamps, report.timeline.answers.stamps)
-        _off(panels[2], report.seconds[rows], positions, at, estimates.values[:, :3])
+        at = since(estimates.stamps, report.recording.answers["stamp"])
+        _off(panels[2], report.seconds, positions, at, estimates.values[:, :3])
     return figure
 
 
@@ -174,15 +172,13 @@ def _off(axes: Axes, seconds: np.ndarray, wanted: np.ndarray, at: np.ndarray, po
 
 
 def refused_figure(report: Report) -> Figure:
-    """Show when commands stayed without answer, by reason."""
-    figure = _figure(report, "Commands without answer", 3.5)
+    """Show when commands were refused, by reason."""
+    figure = _figure(report, "Refused commands", 3.5)
     axes = figure.subplots()
-    refused = report.replayed.refused if report.replayed is not None else []
-    asked, answers = report.recording.topics["tool_pose_command"], report.timeline.answers
-    reasons = sorted({entry.reason for entry in refused})
+    reasons = sorted({event.entry.values["reason"] for event in report.refused})
     for height, reason in enumerate(reasons):
-        numbers = [entry.number for entry in refused if entry.reason == reason]
-        axes.plot(since(asked.times[numbers], answers.times), np.full(len(numbers), height), "|", ms=14)
+        times = [report.since_first_page(e.time) for e in report.refused if e.entry.values["reason"] == reason]
+        axes.plot(times, np.full(len(times), height), "|", ms=14)
     axes.set_yticks(range(len(reasons)), [printable(reason, 30) for reason in reasons])
     axes.set(xlabel="time, s")
     axes.margins(y=0.3)

@@ -11,16 +11,15 @@ from typing import Any
 import numpy as np
 
 from .errors import printable
-from .journal import made_with
+from .journal import ROLES, made_with
 from .pose import Pose
-from .recording import Recording, Series
-from .replaying import BEFORE, DIFFERENT, IDENTICAL, LOST, UNCERTAIN, Replay, Timeline
+from .recording import Recording
+from .replaying import BEFORE, DIFFERENT, IDENTICAL, LOST, Event, Replay
 from .texts import aligned
 
 OUTCOMES = {
     IDENTICAL: "identical",
     DIFFERENT: "different",
-    UNCERTAIN: "uncertain",
     LOST: "not replayed",
     BEFORE: "before the journal",
 }
@@ -41,8 +40,6 @@ class Report:
     ----------
     recording : Recording
         What was read.
-    timeline : Timeline
-        The same in order.
     replayed : Replay or None
         With what was in use; None when geometry or model were not at hand.
     other : Replay or None
@@ -54,7 +51,6 @@ class Report:
     """
 
     recording: Recording
-    timeline: Timeline
     replayed: Replay | None
     other: Replay | None = None
     other_name: str = ""
@@ -63,7 +59,33 @@ class Report:
     @property
     def seconds(self) -> np.ndarray:
         """Time of each answer since the first, s, by their stamps."""
-        return since(self.timeline.answers.stamps, self.timeline.answers.stamps)
+        stamps = self.recording.answers["stamp"]
+        return since(stamps, stamps)
+
+    @property
+    def commands(self) -> np.ndarray:
+        """Recorded strut commands, shape (n, 6), m."""
+        return self.recording.answers["lengths"][:, 0]
+
+    @property
+    def corrections(self) -> np.ndarray:
+        """Recorded corrections, shape (n, 6), m."""
+        return self.recording.answers["lengths"][:, 1]
+
+    @property
+    def refused(self) -> list[Event]:
+        """Refused commands that the journal names."""
+        run = self.replayed or self.other
+        return [] if run is None else run.refused
+
+    @property
+    def refusals(self) -> int:
+        """How many commands were refused."""
+        return len(self.refused) + sum(page.refused_more for _, page in self.recording.pages)
+
+    def since_first_page(self, time: int) -> float:
+        """Return a recorder's time, ns, as seconds since the recorder's first page with answers."""
+        return (time - next(at for at, page in self.recording.pages if len(page.answers))) * 1e-9
 
     @property
     def same(self) -> bool:
@@ -88,17 +110,14 @@ def text(report: Report) -> str:
 
 
 def _heading(report: Report) -> Iterator[str]:
-    recording, answers = report.recording, report.timeline.answers
-    page = recording.pages[0][1]
-    machine, model = printable(page.geometry["name"]), printable(page.model["name"])
+    recording, stamps = report.recording, report.recording.answers["stamp"]
+    machine, model = (printable(one["name"]) for one in (recording.first.geometry, recording.first.model))
     yield f"{recording.path}: {printable(recording.node)}, machine {machine}, model {model}"
-    began = datetime.fromtimestamp(answers.stamps[0] * 1e-9, timezone.utc)
-    duration = (answers.stamps[-1] - answers.stamps[0]) * 1e-9
-    asked = len(recording.topics["tool_pose_command"])
-    answered = int((answers.asked >= 0).sum())
+    began = datetime.fromtimestamp(stamps[0] * 1e-9, timezone.utc)
+    heard = f"; the recorder heard {recording.heard}" if recording.heard else ""
     yield (
-        f"from {began:%Y-%m-%d %H:%M:%S} UTC, {duration:.1f} s: {asked} commands, {answered} answered, "
-        f"{len(report.timeline.unanswered)} not; {len(answers) - answered} answers without command"
+        f"from {began:%Y-%m-%d %H:%M:%S} UTC, {report.seconds[-1]:.1f} s: {len(stamps) + report.refusals} commands "
+        f"taken, {len(stamps)} answered, {report.refusals} refused{heard}"
     )
 
 
@@ -113,14 +132,13 @@ def _verdict(report: Report) -> Iterator[str]:
     yield f"replayed {compared} of {len(replayed.answers)} answers: {word}" + (
         f", {found[DIFFERENT]} different" if found[DIFFERENT] else ""
     )
-    if report.timeline.lost:
-        yield f"the recorder has lost answers that the journal counts: {report.timeline.lost}"
-    if found[UNCERTAIN] or found[LOST]:
-        count = found[UNCERTAIN] + found[LOST]
-        yield f"left out: {count} answers after lost messages, up to the next page of the journal"
+    if replayed.lost:
+        yield f"the recorder has lost answers that the journal counts: {replayed.lost}"
+    if found[LOST]:
+        yield f"left out: {found[LOST]} answers after lost pages of the journal, up to its next snapshot"
     if found[BEFORE]:
-        yield f"left out: {found[BEFORE]} answers before the journal's first page"
-    changes = Counter(entry.what for _, entry in replayed.events)
+        yield f"left out: {found[BEFORE]} answers before the journal's first snapshot"
+    changes = Counter(event.entry.what for event in replayed.changes)
     told = ", ".join(f"{count} × {what}" for what, count in sorted(changes.items())) or "none"
     yield f"changes between commands: {told}; {len(report.recording.pages)} pages of the journal"
 
@@ -140,8 +158,6 @@ def _difference(report: Report) -> Iterator[str]:
     yield f"largest difference {worst * 1e6:.9g} µm" + (
         f", accepted up to {report.tolerance * 1e6:g} µm" if report.same else ""
     )
-    if row >= replayed.unconfirmed:
-        yield "it lies after the journal's last page: that the recorder lost a command just before cannot be excluded"
     yield from _versions(report, worst)
 
 
@@ -149,27 +165,23 @@ def _first(replayed: Replay, row: int) -> str:
     """Say how the first different answer differs."""
     if row in replayed.refused_now:
         return f"the replay refuses the command ({replayed.refused_now[row]})"
-    for name, recorded, now in (
-        ("correction", replayed.answers.corrections[row], replayed.corrections[row]),
-        ("command", replayed.answers.commands[row], replayed.commands[row]),
-    ):
-        struts = [n for n in range(6) if not np.isnan(recorded[n]) and recorded[n].tobytes() != now[n].tobytes()]
-        if struts:
-            n = struts[0]
-            return f"strut_{n + 1}, {name} recorded {recorded[n] * 1e6!r} µm, replayed {now[n] * 1e6!r} µm"
-    return "the recorded numbers are not finite"
+    recorded, now = replayed.answers["lengths"][row], replayed.lengths[row]
+    places = ((kind, n) for kind in (1, 0) for n in range(6))
+    kind, n = next(place for place in places if recorded[place].tobytes() != now[place].tobytes())
+    was, is_now = (float(one[kind, n]) * 1e6 for one in (recorded, now))
+    return f"strut_{n + 1}, {('command', 'correction')[kind]} recorded {was!r} µm, replayed {is_now!r} µm"
 
 
 def _place(report: Report, row: int) -> str:
-    if row >= len(report.timeline.answers):
+    if row >= len(report.recording.answers):
         return "the end"
-    stamp = int(report.timeline.answers.stamps[row])
+    stamp = int(report.recording.answers["stamp"][row])
     return f"answer {row + 1} (stamp {stamp // 10**9}.{stamp % 10**9:09d}, {report.seconds[row]:.3f} s)"
 
 
 def _versions(report: Report, worst: float) -> Iterator[str]:
     """Say what this machine does not have in common with the one that was recorded."""
-    recorded, here = report.recording.pages[0][1].made_with, made_with()
+    recorded, here = report.recording.first.made_with, made_with()
     differing = [
         f"{key} {printable(recorded[key])}, here {here[key]}"
         for key in here
@@ -205,35 +217,32 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _figures(report: Report) -> Iterator[str]:
-    corrections = report.timeline.answers.corrections
+    corrections = report.corrections
     if np.isfinite(corrections).any():
         largest = int(np.nanargmax(np.abs(corrections)))
         row, strut = divmod(largest, 6)
         value = corrections[row, strut] * 1e6
         yield f"largest correction {value:.3f} µm, strut_{strut + 1}, {_place(report, row)}"
-    _, error = following_error(report.recording, report.timeline)
+    _, error = following_error(report)
     if len(error):
         shown = " ".join(f"{_rms(column):.2f}/{np.abs(column).max() * 1e6:.2f}" for column in error.T)
         yield f"following error (measured − commanded, drives' lag included), RMS/largest µm per strut: {shown}"
 
 
 def _refused(report: Report) -> Iterator[str]:
-    refused = report.replayed.refused if report.replayed is not None else []
-    if not refused:
+    if not report.refusals:
         return
-    asked = report.recording.topics["tool_pose_command"]
-    yield f"commands without answer: {len(refused)}"
+    unnamed = report.refusals - len(report.refused)
+    yield f"refused commands: {report.refusals}" + (f", {unnamed} of them not named in the journal" if unnamed else "")
     rows = []
-    for reason, count in Counter(entry.reason for entry in refused).most_common():
-        first = next(entry for entry in refused if entry.reason == reason)
-        when = (asked.times[first.number] - asked.times[0]) * 1e-9
-        source = "" if first.from_journal else "by the replay: "
-        said = printable(first.text)
-        rows.append([printable(reason), str(count), f"{when:.3f}", source + said])
+    for reason, count in Counter(event.entry.values["reason"] for event in report.refused).most_common():
+        first = next(event for event in report.refused if event.entry.values["reason"] == reason)
+        when = report.since_first_page(first.time)
+        rows.append([printable(reason), str(count), f"{when:.2f}", printable(first.entry.values["text"])])
     yield aligned(["reason", "count", "first_s", ""], rows)
 
 
-def following_error(recording: Recording, timeline: Timeline) -> tuple[np.ndarray, np.ndarray]:
+def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
     """Return by how much the measured struts were off their commands.
 
     Returns
@@ -243,61 +252,38 @@ def following_error(recording: Recording, timeline: Timeline) -> tuple[np.ndarra
     error : ndarray, shape (m, 6)
         Measured minus commanded, m, the commands taken straight from one to the next.
     """
-    states, answers = recording.topics["strut_states"], timeline.answers
-    known = np.isfinite(answers.commands).all(axis=1)
-    if known.sum() < 2 or not len(states):
+    states, when = report.recording.topics["strut_states"], report.seconds
+    if len(when) < 2 or not len(states):
         return np.zeros(0), np.zeros((0, 6))
-    when, at = (answers.stamps, states.stamps) if states.stamps.all() else (answers.times, states.times)
-    when, commands = since(when[known], when[known]), answers.commands[known]
-    at = since(at, (answers.stamps if states.stamps.all() else answers.times)[known])
+    # Drives that do not stamp are taken by the recorder's clock.
+    at = since(states.stamps if states.stamps.all() else states.times, report.recording.answers["stamp"])
     after = np.clip(np.searchsorted(when, at), 1, len(when) - 1)
     inside = (at >= when[0]) & (at <= when[-1]) & (when[after] - when[after - 1] <= LONGEST_GAP)
-    wanted = np.stack([np.interp(at[inside], when, column) for column in commands.T], axis=1)
+    wanted = np.stack([np.interp(at[inside], when, column) for column in report.commands.T], axis=1)
     return at[inside], states.values[inside] - wanted
 
 
-def tool_tracks(recording: Recording, timeline: Timeline, work: Pose) -> tuple[np.ndarray, np.ndarray, Series]:
-    """Return where the tool was commanded in ``base``, and the estimates.
-
-    Parameters
-    ----------
-    recording, timeline : Recording, Timeline
-        What was read.
-    work : Pose
-        The work frame seen from ``base``.
-
-    Returns
-    -------
-    rows : ndarray of int
-        Answers whose commands are known.
-    positions : ndarray, shape (len(rows), 3)
-        m.
-    estimates : Series
-        As recorded, in ``base``.
-    """
-    asked, answers = recording.topics["tool_pose_command"], timeline.answers
-    rows = np.flatnonzero(answers.asked >= 0)
-    numbers = answers.asked[rows]
-    positions = asked.values[numbers, :3].copy()
-    frames = recording.pages[0][1].frames
-    in_work = np.array([asked.frames[n] == frames["work"] for n in numbers], dtype=bool)
+def tool_positions(recording: Recording, work: Pose) -> np.ndarray:
+    """Return where the tool was commanded in ``base``, (n, 3), m, with the work frame seen from ``base``."""
+    positions = recording.answers["pose"][:, :3].copy()
+    in_work = recording.answers["frame"] == ROLES.index("work")
     positions[in_work] = work.position + positions[in_work] @ work.rotation.T
-    return rows, positions, recording.topics["tool_pose_estimate"]
+    return positions
 
 
 def rows_of(report: Report) -> list[dict[str, Any]]:
     """Return one CSV row per answer: stamps, commands (mm), corrections (µm) recorded, replayed and with the other."""
-    answers, replayed, other = report.timeline.answers, report.replayed, report.other
+    stamps, replayed, other = report.recording.answers["stamp"], report.replayed, report.other
     rows = []
-    for n, (stamp, time) in enumerate(zip(answers.stamps.tolist(), report.seconds.tolist(), strict=True)):
+    for n, (stamp, time) in enumerate(zip(stamps.tolist(), report.seconds.tolist(), strict=True)):
         row: dict[str, Any] = {"stamp_ns": stamp, "time_s": time}
-        row |= {f"L{i + 1}_mm": v * 1e3 for i, v in enumerate(answers.commands[n].tolist())}
-        row |= _micrometres("recorded", answers.corrections[n])
+        row |= {f"L{i + 1}_mm": v * 1e3 for i, v in enumerate(report.commands[n].tolist())}
+        row |= _micrometres("recorded", report.corrections[n])
         if replayed is not None:
-            row |= _micrometres("replayed", replayed.corrections[n])
+            row |= _micrometres("replayed", replayed.lengths[n, 1])
             row["outcome"] = OUTCOMES[int(replayed.outcome[n])]
         if other is not None:
-            row |= _micrometres("other", other.corrections[n])
+            row |= _micrometres("other", other.lengths[n, 1])
         rows.append(row)
     return rows
 
@@ -309,21 +295,22 @@ def _micrometres(name: str, corrections: np.ndarray) -> dict[str, float]:
 def as_json(report: Report) -> dict[str, Any]:
     """Return the report as plain data; lengths in m."""
     recording, replayed, other = report.recording, report.replayed, report.other
-    page = recording.pages[0][1]
     content: dict[str, Any] = {
         "bag": recording.path,
         "node": recording.node,
-        "geometry": page.geometry,
-        "model": page.model,
-        "commands": len(recording.topics["tool_pose_command"]),
-        "answers": len(report.timeline.answers),
-        "answers_lost": report.timeline.lost,
+        "geometry": recording.first.geometry,
+        "model": recording.first.model,
+        "commands": len(recording.answers) + report.refusals,
+        "commands_heard_by_recorder": recording.heard,
+        "answers": len(recording.answers),
+        "answers_lost": replayed.lost if replayed is not None else None,
         "same": report.same if replayed is not None else None,
-        "made_with": page.made_with,
+        "made_with": recording.first.made_with,
+        "refused": report.refusals,
         "notes": recording.notes,
     }
     if replayed is not None:
-        content |= _replay_json(recording, replayed)
+        content |= _replay_json(replayed)
     if other is not None:
         difference = np.abs(other.difference)
         content["other"] = {
@@ -334,16 +321,16 @@ def as_json(report: Report) -> dict[str, Any]:
     return content
 
 
-def _replay_json(recording: Recording, replayed: Replay) -> dict[str, Any]:
-    asked, different = recording.topics["tool_pose_command"], np.flatnonzero(replayed.outcome == DIFFERENT)
+def _replay_json(replayed: Replay) -> dict[str, Any]:
+    different = np.flatnonzero(replayed.outcome == DIFFERENT)
     found = Counter(replayed.outcome.tolist())
     first = None
     if len(different):
         row = int(different[0])
         first = {
-            "stamp_ns": int(replayed.answers.stamps[row]),
-            "recorded_correction_m": replayed.answers.corrections[row],
-            "replayed_correction_m": replayed.corrections[row],
+            "stamp_ns": _stamp(replayed, row),
+            "recorded_correction_m": replayed.answers["lengths"][row, 1],
+            "replayed_correction_m": replayed.lengths[row, 1],
             "refused_now": replayed.refused_now.get(row),
         }
     return {
@@ -352,21 +339,18 @@ def _replay_json(recording: Recording, replayed: Replay) -> dict[str, Any]:
         "largest_difference_m": float(np.nanmax(np.abs(replayed.difference[different]), initial=0.0)),
         "states_differ": len(replayed.states_differ),
         "changes": [
-            {"before_stamp_ns": _stamp(replayed, row), "what": entry.what, **entry.values}
-            for row, entry in replayed.events
+            {"before_stamp_ns": _stamp(replayed, event.row), "what": event.entry.what, **event.entry.values}
+            for event in replayed.changes
         ],
-        "refused": [
-            {
-                "stamp_ns": int(asked.stamps[entry.number]),
-                "reason": entry.reason,
-                "text": entry.text,
-                "by": "journal" if entry.from_journal else "replay",
-            }
-            for entry in replayed.refused
+        "refusals": [
+            {"before_stamp_ns": _stamp(replayed, event.row), "stamp_ns": values["stamp"]}
+            | {key: values[key] for key in ("reason", "text")}
+            for event in replayed.refused
+            for values in (event.entry.values,)
         ],
     }
 
 
 def _stamp(replayed: Replay, row: int) -> int | None:
-    """Return the stamp of the answer that a change precedes; None after the last."""
-    return int(replayed.answers.stamps[row]) if row < len(replayed.answers) else None
+    """Return the stamp of the answer that an event precedes; None after the last."""
+    return int(replayed.answers["stamp"][row]) if row < len(replayed.answers) else None

@@ -1,59 +1,51 @@
 """Running a recorded run through the compensator again: the same answers, bit for bit, or where they part.
 
-Everything that decides an answer is in the recording: the commands before it, and in the journal what happened to
-the compensator between them. What a recorder has lost cannot be run again; the next page of the journal, at most a
-second later, gives the state to go on from, and what lies between is counted, not judged.
+Everything that decides an answer is in the journal, in its order. What a recorder has lost cannot be run again; the
+next snapshot, at most half a second later, gives the state to go on from, and what lies between is counted, not judged.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from .answers import Answers
 from .compensation import Compensator
-from .compensation_kernels import pack_pose
-from .errors import CommandError, HexapodError
+from .compensation_kernels import BUMP, CHANGED, COMMAND, CORRECTION, NOMINAL, SENSE, pack_pose
+from .errors import HexapodError
 from .geometry import HexapodGeometry
-from .journal import Entry, Page
+from .journal import Entry, Page, Snapshot
+from .machine import MachineModel
 from .pose import Pose
-from .recorded_files import Files
-from .recording import Recording
-from .timeline import Timeline
+from .recording import Files, Recording
 
-IDENTICAL, DIFFERENT, UNCERTAIN, LOST, BEFORE = range(5)
-"""What came of an answer: the same bits; others; others after a loss of the recorder; not replayed because of
-such a loss; not replayed because no page of the journal lies before it."""
+IDENTICAL, DIFFERENT, LOST, BEFORE = range(4)
+"""What came of an answer: the same bits; others; not replayed because the recorder has lost a page before it; not
+replayed because no snapshot lies before it."""
 
-TRIALS = 1000
-"""So many unexplained commands are tried once more, to see why they were refused."""
-
-NOT_TAKEN = "not_taken"
-"""Reason of a command that nothing refuses."""
+Progress = Callable[[int], object]
+"""Called with the number of answers just compared."""
 
 
 @dataclass(frozen=True)
-class Refused:
-    """A command without answer.
+class Event:
+    """An entry of the journal in its place.
 
     Attributes
     ----------
-    number : int
-        Which of the recorded commands.
-    reason, text : str
-        As in diagnostics, and the sentence.
-    from_journal : bool
-        The compensator itself has said so; else the replay has found it.
+    row : int
+        Number of the answer that it precedes.
+    time : int
+        When the recorder heard of it, ns: up to 50 ms later.
+    entry : Entry
+        What happened.
     """
 
-    number: int
-    reason: str
-    text: str
-    from_journal: bool
+    row: int
+    time: int
+    entry: Entry
 
 
 @dataclass
@@ -62,33 +54,30 @@ class Replay:
 
     Attributes
     ----------
-    answers : Answers
+    answers : ndarray of ANSWER
         The recorded ones, n of them.
     outcome : ndarray of int, shape (n,)
-        One of the module's five constants.
-    commands, corrections : ndarray, shape (n, 6)
-        Replayed, m; NaN where there is none.
-    refused : list of Refused
-        Commands without answer.
+        One of the module's four constants.
+    lengths : ndarray, shape (n, 2, 6)
+        Replayed strut commands and corrections, m; NaN where there is none.
     refused_now : dict of int to str
         Answers whose commands the replay refuses, with its reason.
-    events : list of (int, Entry)
-        Changes, each with the number of the answer that it precedes.
+    changes, refused : list of Event
+        What happened between the answered commands.
     states_differ : list of int
-        Answers before which the journal's state was another than the replay's.
-    unconfirmed : int
-        First answer after the last page: what the recorder lost from there on nobody can tell.
+        Answers before which the journal's snapshot was another than the replay's.
+    lost : int
+        Answers that the journal counts, and whose pages the recorder has lost.
     """
 
-    answers: Answers
+    answers: np.ndarray
     outcome: np.ndarray
-    commands: np.ndarray
-    corrections: np.ndarray
-    refused: list[Refused] = field(default_factory=list)
+    lengths: np.ndarray
     refused_now: dict[int, str] = field(default_factory=dict)
-    events: list[tuple[int, Entry]] = field(default_factory=list)
+    changes: list[Event] = field(default_factory=list)
+    refused: list[Event] = field(default_factory=list)
     states_differ: list[int] = field(default_factory=list)
-    unconfirmed: int = 0
+    lost: int = 0
 
     @property
     def compared(self) -> int:
@@ -102,116 +91,17 @@ class Replay:
 
     @property
     def difference(self) -> np.ndarray:
-        """Replayed minus recorded corrections, shape (n, 6), m; commands where corrections were not recorded."""
-        recorded = self.answers.corrections
-        return np.where(np.isnan(recorded), self.commands - self.answers.commands, self.corrections - recorded)
+        """Replayed minus recorded corrections, shape (n, 6), m."""
+        return self.lengths[:, 1] - self.answers["lengths"][:, 1]
 
 
-class _Machine:
-    """A compensator that is taken through a timeline."""
-
-    def __init__(self, recording: Recording, files: Files) -> None:
-        self._asked = recording.topics["tool_pose_command"]
-        self._files = files
-        self._running: tuple[str, str] | None = None
-        self.compensator: Compensator | None = None
-        self._frames: dict[str, np.ndarray] = {}
-
-    def take_over(self, page: Page) -> bool:
-        """Go on from a page's snapshot; return whether that is another state than the present one."""
-        identity = page.geometry["sha256"], page.model["sha256"]
-        if self.compensator is None or identity != self._running:
-            geometry = self._files.geometry(page.geometry)
-            self.compensator = Compensator(geometry, self._files.model(page.model, geometry))
-            self._running = identity
-            self._frames = packed_frames(page, geometry)
-        elif _same_state(self.compensator.snapshot(), page.snapshot):
-            return False
-        self.compensator.restore(page.snapshot)
-        return True
-
-    def apply(self, entry: Entry) -> None:
-        """Make a change that the journal tells of."""
-        if self.compensator is None:
-            return
-        if entry.what == "model":
-            model = self._files.model(entry.values, self.compensator.geometry)
-            self.compensator.set_model(model)
-            if self._running is not None:
-                self._running = self._running[0], entry.values["sha256"]
-            return
-        apply(self.compensator, entry)
-
-    def step(self, number: int, stamp: int) -> Compensator:
-        """Give one recorded command, answered with `stamp`, ns; return the compensator with its answer."""
-        if self.compensator is None:
-            raise CommandError(NOT_TAKEN, "nothing is known of the compensator's state")
-        give(self.compensator, self._frames, self._asked.frames[number], self._asked.values[number], stamp)
-        return self.compensator
-
-    def trial(self, number: int) -> HexapodError | None:
-        """Give one command and take it back; return why it is refused, if it is."""
-        if self.compensator is None:
-            return None
-        before = self.compensator.snapshot()
-        try:
-            self.step(number, int(self._asked.stamps[number]))
-        except HexapodError as error:
-            return error
-        self.compensator.restore(before)
-        return None
-
-
-def apply(compensator: Compensator, entry: Entry) -> None:
-    """Make a change of temperature or switching, or a start, that the journal tells of."""
-    values = entry.values
-    if entry.what == "temperature":
-        compensator.set_temperature(values["name"], float(values["value"]))
-    elif entry.what == "enable":
-        compensator.enable(bool(values["on"]))
-    elif entry.what == "reset":
-        measured = values["measured"]
-        compensator.reset(None if measured is None else np.array(measured, dtype=float))
-
-
-def packed_frames(page: Page, geometry: HexapodGeometry) -> dict[str, np.ndarray]:
-    """Return the frames of commanded poses by their frame_id, packed as the compensator takes them."""
-    frames = {page.frames["base"]: pack_pose(Pose.identity())}
-    frames[page.frames["work"]] = pack_pose(geometry.work)
-    return frames
-
-
-def give(
-    compensator: Compensator, frames: Mapping[str, np.ndarray], frame_id: str, numbers: np.ndarray, stamp: int
-) -> None:
-    """Give a recorded command as the node does, the answer's stamp (ns) for its time."""
-    frame = frames.get(frame_id)
-    if frame is None:
-        raise CommandError("frame_id", f"frame_id must be one of {', '.join(frames)}, not {frame_id!r}")
-    compensator.step(tuple(numbers.tolist()), stamp * 1e-9, frame)
-
-
-def _same_state(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Return whether two snapshots are the same, all NaN being one number."""
-    arrays = ("state", "poses", "switches")
-    same = all(np.array_equal(np.asarray(one[name]), np.asarray(other[name]), equal_nan=True) for name in arrays)
-    return same and dict(one["temperatures"]) == dict(other["temperatures"])
-
-
-def replay(
-    recording: Recording,
-    timeline: Timeline,
-    files: Files,
-    progress: Callable[[int], object] = lambda answers: None,
-) -> Replay:
+def replay(recording: Recording, files: Files, progress: Progress = lambda answers: None) -> Replay:
     """Run a recording through the compensator again.
 
     Parameters
     ----------
     recording : Recording
         What was read.
-    timeline : Timeline
-        The same in order.
     files : Files
         Geometry and model in use.
     progress : callable, optional
@@ -222,114 +112,149 @@ def replay(
     InputFileError
         Geometry or model in use are not at hand.
     """
-    run = _Run(recording, timeline, files)
-    for row in range(len(timeline.answers) + 1):
-        run.happen(row)
-        if row < len(timeline.answers):
-            run.answer(row)
-            progress(1)
-    run.examine(None)
-    return run.result
+    return _AsItWas(recording, progress, files).run()
+
+
+def what_if(
+    recording: Recording, geometry: HexapodGeometry, model: MachineModel, progress: Progress = lambda answers: None
+) -> Replay:
+    """Run the recorded commands through another model, or another geometry.
+
+    Temperatures, switching and starts are those of the recording; its own models are not. The corrections
+    begin at the other model's: nothing ramps. All answers are run; nothing is left out after lost pages.
+    """
+    run = _Run(recording, progress)
+    compensator = Compensator(geometry, model)
+    compensator.restore(_begin(compensator, recording.first))
+    run.take(compensator)
+    return run.run()
+
+
+def _begin(compensator: Compensator, snapshot: Snapshot) -> dict[str, Any]:
+    """Return a snapshot with no more than what another machine can take over: directions and switches."""
+    fresh, recorded = compensator.snapshot(), snapshot.state
+    state, switches = np.array(recorded["state"]), np.array(recorded["switches"])
+    if state.shape == np.shape(fresh["state"]):
+        fresh["state"][SENSE:NOMINAL] = np.nan_to_num(state[SENSE:NOMINAL]).tolist()
+        fresh["state"][CORRECTION:COMMAND], fresh["state"][BUMP : BUMP + 6] = [np.nan] * 6, [0.0] * 6
+    if switches.shape == np.shape(fresh["switches"]):
+        fresh["switches"] = switches
+        fresh["switches"][CHANGED] = 0.0
+    fresh["temperatures"] = recorded["temperatures"]
+    return fresh
 
 
 class _Run:
-    """A replay under way."""
+    """A replay under way: all pages, step by step."""
 
-    def __init__(self, recording: Recording, timeline: Timeline, files: Files) -> None:
-        answers = timeline.answers
-        self._timeline, self._machine = timeline, _Machine(recording, files)
-        self._known, self._outcome_unknown = False, BEFORE
-        self._unanswered = iter(timeline.unanswered)
-        self._next_unanswered = next(self._unanswered, None)
-        self._said = _said(recording)
-        self._asked = recording.topics["tool_pose_command"]
-        self._trials = 0
-        shape = len(answers), 6
-        self.result = Replay(answers, np.full(len(answers), BEFORE), np.full(shape, np.nan), np.full(shape, np.nan))
-        self.result.unconfirmed = timeline.unconfirmed
+    compensator: Compensator
 
-    def happen(self, row: int) -> None:
-        """Make the changes that come before an answer."""
-        for entry, page in self._timeline.events.get(row, ()):
-            if entry is None:
-                self._turn(row, page)
-            elif entry.what != "refused":
-                self.result.events.append((row, entry))
-                if self._known:
-                    self._machine.apply(entry)
+    def __init__(self, recording: Recording, progress: Progress) -> None:
+        self._recording, self._progress = recording, progress
+        self._answers, count = recording.answers, len(recording.answers)
+        self.result = Replay(self._answers, np.full(count, BEFORE), np.full((count, 2, 6), np.nan))
 
-    def _turn(self, row: int, page: Page) -> None:
-        """Take over a page's snapshot; that it is another state matters only where nothing was lost."""
-        changed = self._machine.take_over(page)
-        if changed and self._known and row and not self._timeline.doubtful[row - 1]:
-            self.result.states_differ.append(row)
-        self._known = True
+    def take(self, compensator: Compensator) -> None:
+        """Give the commands from now on to a compensator."""
+        self.compensator = compensator
+        self._frames = pack_pose(Pose.identity()), pack_pose(compensator.geometry.work)  # as journal.ROLES
 
-    def answer(self, row: int) -> None:
-        """Give the command that was answered, and compare."""
-        result, number = self.result, int(self._timeline.answers.asked[row])
-        if number >= 0:
-            self.examine(number)
-        if not self._known:
-            result.outcome[row] = self._outcome_unknown
-            return
-        if number < 0:
-            result.outcome[row] = LOST
-            self._lose()
-            return
-        same = self._step(row, number)
-        if same:
-            result.outcome[row] = IDENTICAL
-        elif self._timeline.doubtful[row]:
-            result.outcome[row] = UNCERTAIN
-            self._lose()
-        else:
-            result.outcome[row] = DIFFERENT
+    def run(self) -> Replay:
+        """Return what comes of it."""
+        row, result = 0, self.result
+        for time, page in self._recording.pages:
+            self.begin(page)
+            for entry in page.steps():
+                if entry is None:
+                    result.outcome[row] = self.answer(row)
+                    row += 1
+                    self._progress(1)
+                elif entry.what == "refused":
+                    result.refused.append(Event(row, time, entry))
+                else:
+                    result.changes.append(Event(row, time, entry))
+                    self.change(entry)
+            if page.snapshot is not None:
+                self.check(page.snapshot, row)
+        return result
 
-    def _lose(self) -> None:
-        """Go on at the next page only."""
-        self._known, self._outcome_unknown = False, LOST
+    def begin(self, page: Page) -> None:
+        """Begin a page."""
 
-    def _step(self, row: int, number: int) -> bool:
-        answers, result = self._timeline.answers, self.result
+    def check(self, snapshot: Snapshot, row: int) -> None:
+        """Compare states before answer `row`."""
+
+    def change(self, entry: Entry) -> None:
+        """Make a change that the journal tells of."""
+        values = entry.values
+        if entry.what == "temperature":
+            self.compensator.set_temperature(values["name"], float(values["value"]))
+        elif entry.what == "enable":
+            self.compensator.enable(bool(values["on"]))
+        elif entry.what == "reset":
+            measured = values["measured"]
+            self.compensator.reset(None if measured is None else np.array(measured, dtype=float))
+
+    def answer(self, row: int) -> int:
+        """Give the command that was answered, as the node did; return what comes of it."""
+        asked, given = self._answers[row], self.result.lengths[row]
         try:
-            compensator = self._machine.step(number, int(answers.stamps[row]))
+            frame = self._frames[asked["frame"]]
+            self.compensator.step(tuple(asked["pose"].tolist()), int(asked["stamp"]) * 1e-9, frame)
         except HexapodError as error:
-            result.refused_now[row] = f"{error.reason}: {error}"
-            return False
-        result.commands[row], result.corrections[row] = compensator.command, compensator.correction
-        return all(
-            np.isnan(recorded).all() or recorded.tobytes() == replayed.tobytes()
-            for recorded, replayed in (
-                (answers.commands[row], compensator.command),
-                (answers.corrections[row], compensator.correction),
-            )
-        )
-
-    def examine(self, before: int | None) -> None:
-        """Say why the commands before a number, or all that are left, have no answer."""
-        while self._next_unanswered is not None and (before is None or self._next_unanswered < before):
-            self.result.refused.append(self._explained(self._next_unanswered))
-            self._next_unanswered = next(self._unanswered, None)
-
-    def _explained(self, number: int) -> Refused:
-        said = self._said.get(int(self._asked.stamps[number]))
-        if said:
-            return Refused(number, *said.pop(0), from_journal=True)
-        self._trials += 1
-        error = self._machine.trial(number) if self._known and self._trials <= TRIALS else None
-        if error is not None:
-            return Refused(number, error.reason, str(error), from_journal=False)
-        text = "not active, or the command did not reach it, or the recorder lost its answer"
-        return Refused(number, NOT_TAKEN, text, from_journal=False)
+            self.result.refused_now[row] = f"{error.reason}: {error}"
+            return DIFFERENT
+        given[0], given[1] = self.compensator.command, self.compensator.correction
+        return IDENTICAL if given.tobytes() == asked["lengths"].tobytes() else DIFFERENT
 
 
-def _said(recording: Recording) -> dict[int, list[tuple[str, str]]]:
-    """Return what the journal says about refused commands, by stamp."""
-    said: dict[int, list[tuple[str, str]]] = defaultdict(list)
-    for _, page in recording.pages:
-        for entry in page.entries:
-            if entry.what == "refused":
-                stamp, reason, text = (entry.values[key] for key in ("stamp", "reason", "text"))
-                said[int(stamp)].append((str(reason), str(text)))
-    return said
+class _AsItWas(_Run):
+    """A replay with what was in use."""
+
+    def __init__(self, recording: Recording, progress: Progress, files: Files) -> None:
+        super().__init__(recording, progress)
+        self._files = files
+        self._known, self._otherwise = False, BEFORE
+        self._in_use = "", ""
+        self._next = "", 0, 0
+
+    def begin(self, page: Page) -> None:
+        """Notice lost pages: from there on nothing is known until the next snapshot."""
+        session, _, begins = self._next
+        self._known &= self._next == (page.session, page.number, page.begins)
+        if session == page.session:
+            self.result.lost += max(0, page.begins - begins)
+        self._next = page.session, page.number + 1, page.begins + len(page.answers)
+
+    def change(self, entry: Entry) -> None:
+        """Make a change that the journal tells of."""
+        if not self._known:
+            return
+        if entry.what == "model":
+            self.compensator.set_model(self._files.model(entry.values, self.compensator.geometry))
+            self._in_use = self._in_use[0], entry.values["sha256"]
+        super().change(entry)
+
+    def answer(self, row: int) -> int:
+        """Compare an answer, if the state before it is known."""
+        return super().answer(row) if self._known else self._otherwise
+
+    def check(self, snapshot: Snapshot, row: int) -> None:
+        """Compare states, and go on from the recorded one."""
+        in_use = snapshot.geometry["sha256"], snapshot.model["sha256"]
+        same = in_use == self._in_use
+        if not same:
+            geometry = self._files.geometry(snapshot.geometry)
+            self.take(Compensator(geometry, self._files.model(snapshot.model, geometry)))
+        if not same or not _same_state(self.compensator.snapshot(), snapshot.state):
+            self.compensator.restore(snapshot.state)
+            if self._known:
+                self.result.states_differ.append(row)
+        self._in_use, self._known, self._otherwise = in_use, True, LOST
+
+
+def _same_state(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Return whether two snapshots are the same, all NaN being one number."""
+    arrays = ("state", "poses", "switches")
+    same = all(np.array_equal(np.asarray(one[name]), np.asarray(other[name]), equal_nan=True) for name in arrays)
+    return same and dict(one["temperatures"]) == dict(other["temperatures"])

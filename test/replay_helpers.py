@@ -19,7 +19,7 @@ from hexapod_comp.compensation import Compensator
 from hexapod_comp.compensation_kernels import pack_pose
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.geometry import STRUT_NAMES, load_geometry
-from hexapod_comp.journal import Journal, load_with_source, sources_text
+from hexapod_comp.journal import SNAPSHOT_PERIOD, Journal, load_with_source, sources_text
 from hexapod_comp.model_file import load_model
 from hexapod_comp.pose import Pose
 
@@ -97,11 +97,11 @@ class RecordedMachine:
         self.namespace, self.messages = namespace, Messages()
         self.geometry, geometry_source = load_with_source(CONFIG / "paper.yaml", load_geometry)
         self.sources = {"geometry": geometry_source}
-        self.now, self.count, self.answered = BEGAN, 0, 0
+        self.now, self.answers = BEGAN, list[np.ndarray]()
         self.compensator = Compensator(self.geometry, self.load(model))
         self.frames = {"base": pack_pose(Pose.identity()), "work": pack_pose(self.geometry.work)}
-        place = lambda: (self.count, self.answered)  # noqa: E731
-        self.journal = Journal(self.compensator, place, self.sources, {"base": "base", "work": "work"})
+        self.journal = Journal(self.compensator, self.sources, {"base": "base", "work": "work"})
+        self.elapsed = 0.0
         self.page()
 
     def load(self, path: str | Path) -> Any:
@@ -129,16 +129,16 @@ class RecordedMachine:
         """Keep a page or the files."""
         self.keep(topic, TYPES["std_msgs/msg/String"](text))
 
-    def page(self) -> None:
+    def page(self, snapshot: bool = True) -> None:
         """Write the files and a page."""
         self.keep_text("compensator/files", sources_text(self.sources))
-        self.keep_text("compensator/journal", self.journal.page(0.0))
+        self.elapsed += 2.0 * SNAPSHOT_PERIOD * snapshot
+        self.keep_text("compensator/journal", self.journal.page(self.elapsed))
 
-    def send(self, pose: Pose, frame: str = "base", stamped: bool = True, told: bool = True) -> bool:
+    def send(self, pose: Pose, frame: str = "base", stamped: bool = True) -> bool:
         """Send one command a millisecond after the last; return whether it was answered.
 
-        A command that is not `stamped` is answered with the time at which it came; of a refused one the
-        journal is `told`.
+        A command that is not `stamped` is answered with the time at which it came.
         """
         self.now += MILLISECOND
         stamp = self.now if stamped else 0
@@ -151,10 +151,10 @@ class RecordedMachine:
         try:
             self.compensator.step(numbers, self.now * 1e-9, self.frames[frame])
         except HexapodError as error:
-            if told:
-                self.journal.refused(stamp, error.reason, str(error))
+            self.journal.refused(stamp, error.reason, str(error))
             return False
-        self.count, self.answered = self.count + 1, self.now
+        self.journal.answered(self.now, frame, numbers)
+        self.answers.append(np.array([self.compensator.command, self.compensator.correction]))
         self.keep_struts("strut_commands", self.now, self.compensator.command)
         self.keep_struts("strut_corrections", self.now, self.compensator.correction)
         return True

@@ -130,7 +130,7 @@ class CompensatorNode(MachineNode):
         self._reach = Reach(geometry)
         self._open_topics()
         frames = {name: self._options[f"{name}_frame"] for name in ("base", "work")}
-        self._journal = JournalTopics(self, self.compensator, self._place, self._sources, frames)
+        self._journal = JournalTopics(self, self.compensator, self._sources, frames)
         name = f"{self.get_fully_qualified_name()[1:]}: {geometry.name}"
         self._report = HealthReport(name, geometry.name)
         self.get_logger().info(
@@ -267,6 +267,7 @@ class CompensatorNode(MachineNode):
             self._refuse(error, now)
             return
         self._publish_command(when)
+        self._journal.answered(when, frame_id, numbers)
         if self._fresh_start:
             self._fresh_start = False
             self._look_closer()
@@ -415,10 +416,6 @@ class CompensatorNode(MachineNode):
         self._answered = 0
         self._stamps.forget()
         self._following.forget()
-
-    def _place(self) -> tuple[int, int]:
-        """Return how many commands have been answered, and the stamp of the last answer, ns."""
-        return self._commands.count, self._command_out.stamp
 
     def _refuse(self, error: HexapodError, now: float) -> None:
         self._status.refusals.add(error.reason, str(error), now)

@@ -2,14 +2,13 @@
 
 Two topics beside the node's own, both reliable and kept for late subscribers, so that a recorder which joins in
 the middle of a motion gets what it needs: ``~/journal`` (std_msgs/String, JSON: :mod:`hexapod_comp.journal`) with
-a page when something has changed and at least once a second, and ``~/files`` with the geometry and the model in
-use, word for word.
+a page at each tick that has something to tell, and with each snapshot, and ``~/files`` with the geometry and the
+model in use, word for word.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -25,7 +24,7 @@ JOURNAL_QOS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
-"""Pages: each counts, and who comes late needs the last."""
+"""Pages: each counts, and who comes late needs the last snapshot."""
 
 
 class JournalTopics:
@@ -38,15 +37,14 @@ class JournalTopics:
         self,
         node: LifecycleNode,
         compensator: Compensator,
-        place: Callable[[], tuple[int, int]],
         sources: dict[str, Source],
         frames: dict[str, str],
     ) -> None:
         self._sources, self._published = sources, dict[str, Source]()
         self._pages = node.create_publisher(String, "~/journal", JOURNAL_QOS)
         self._files = node.create_publisher(String, "~/files", JOURNAL_QOS)
-        self._journal = Journal(compensator, place, sources, frames)
-        self.refused = self._journal.refused
+        self._journal = Journal(compensator, sources, frames)
+        self.answered, self.refused = self._journal.answered, self._journal.refused
         self.tick(time.monotonic())  # so that no command comes before the first page
 
     @property
@@ -64,6 +62,6 @@ class JournalTopics:
         self._pages.publish(String(data=self._journal.page(now)))
 
     def close(self, now: float) -> None:
-        """Publish a last page, which confirms what was answered since the one before, and wait for its arrival."""
+        """Publish a last page, with what was answered since the one before, and wait for its arrival."""
         self._pages.publish(String(data=self._journal.page(now)))
         self._pages.wait_for_all_acked(ACKNOWLEDGED_WITHIN)

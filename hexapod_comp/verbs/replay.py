@@ -12,15 +12,14 @@ if TYPE_CHECKING:
     from ..geometry import HexapodGeometry
     from ..journal import Source
     from ..machine import MachineModel
-    from ..recorded_files import Files
-    from ..recording import Recording
+    from ..recording import Files, Recording
     from ..replay_report import Report
 
 SUMMARY = "run a recorded bag through the compensator again: the same corrections, bit for bit?"
 
 TEXT = """BAG is a folder that `ros2 bag record` has written (MCAP or sqlite3), or one of its files. It must hold
-tool_pose_command, strut_commands, strut_corrections and compensator/journal; with compensator/files the geometry
-and the model that were in use come along. strut_states and tool_pose_estimate are shown in the pictures.
+compensator/journal; with compensator/files the geometry and the model that were in use come along. strut_states and
+tool_pose_estimate are shown in the pictures.
 
 With --model (or --machine) of another file than was in use, the report also says what that would have corrected.
 Exit code 0: the same bits, or within --tolerance-um; 1: not the same; 2: the bag cannot be used.
@@ -29,13 +28,13 @@ example:
   $ ros2 bag record --storage mcap --output run --all
   $ hexapod_comp replay run --pictures out/replay
   run: /compensator, machine paper, model shipped example: the virtual machine of the demo
-  from 2026-11-21 20:11:05 UTC, 12.0 s: 3001 commands, 3000 answered, 1 not; 0 answers without command
+  from 2026-11-21 20:11:05 UTC, 12.0 s: 3001 commands taken, 3000 answered, 1 refused
   replayed 3000 of 3000 answers: identical bit for bit
   …"""
 
 NOTHING = (
-    "nothing in it can be compared: no answer follows a page of the journal without a message lost between; "
-    "record for longer than a second, with all the topics that the help names"
+    "nothing in it can be compared: no answer follows a snapshot of the journal without a page lost between; "
+    "record for longer than a second"
 )
 
 
@@ -77,27 +76,23 @@ def run(args: argparse.Namespace) -> int:
 def _replayed(args: argparse.Namespace, recording: Recording) -> tuple[Report, HexapodGeometry]:
     """Replay with what was in use, where that is at hand, and with what the options name, where that is another."""
     from ..errors import InputFileError
-    from ..recorded_files import Files
+    from ..recording import Files
     from ..replay_report import Report
-    from ..replaying import replay
-    from ..timeline import put_in_order
-    from ..what_if import what_if
+    from ..replaying import replay, what_if
 
     files = Files(recording, _given(args))
     other = _other(args, recording, files)
     as_it_was = other is None or files.missing() is None
-    geometry = files.geometry(recording.pages[0][1].geometry) if as_it_was or other is None else other[0]
-    timeline = put_in_order(recording, geometry)
-    report = Report(recording, timeline, None, tolerance=args.tolerance_um * 1e-6)
-    with common.progress_bar(len(timeline.answers) * (as_it_was + bool(other)), " answers") as bar:
+    report = Report(recording, None, tolerance=args.tolerance_um * 1e-6)
+    with common.progress_bar(len(recording.answers) * (as_it_was + bool(other)), " answers") as bar:
         if as_it_was:
-            report.replayed = replay(recording, timeline, files, bar.update)
+            report.replayed = replay(recording, files, bar.update)
             if other is None and not report.replayed.compared:
                 raise InputFileError(args.bag, "", NOTHING)
         if other is not None:
-            report.other = what_if(recording, timeline, *other, bar.update)
+            report.other = what_if(recording, *other, bar.update)
             report.other_name = f"machine {other[0].name}, model {other[1].name}"
-    return report, geometry
+    return report, files.geometry(recording.first.geometry) if as_it_was or other is None else other[0]
 
 
 def _show(args: argparse.Namespace, report: Report) -> None:
@@ -129,10 +124,10 @@ def _other(args: argparse.Namespace, recording: Recording, files: Files) -> tupl
     from ..model_file import load_model
     from ..paths import config_file
 
-    page, ideal = recording.pages[0][1], args.model == "ideal"
+    first, ideal = recording.first, args.model == "ideal"
     if not (set(_given(args)) - files.used or (ideal and not files.used_ideal)):
         return None
-    geometry = load_geometry(config_file(args.machine)) if args.machine else files.geometry(page.geometry)
+    geometry = load_geometry(config_file(args.machine)) if args.machine else files.geometry(first.geometry)
     if ideal:
         return geometry, MachineModel(geometry.name)
-    return geometry, load_model(config_file(args.model), geometry) if args.model else files.model(page.model, geometry)
+    return geometry, load_model(config_file(args.model), geometry) if args.model else files.model(first.model, geometry)
