@@ -39,9 +39,6 @@ BARS = {
 """How many times faster than genhexkins ours must be, with any of its two criteria."""
 
 
-THREADS = ", all threads"
-
-
 @dataclass(frozen=True)
 class Result:
     """Median time per pose, how many times ours that is, and the largest difference to our numbers."""
@@ -78,7 +75,7 @@ def our_inverse(poses: Poses) -> list[Contender]:
 
 
 def our_inverse_batch(poses: Poses) -> list[Contender]:
-    """Kernel and checked call on one thread, checked call on all."""
+    """Kernel and checked call on one thread; on all of them: :mod:`.batches`."""
     count = len(poses.positions)
     joints = poses.structure.base_joints, poses.structure.platform_joints
     lengths = np.empty((count, 6))
@@ -86,13 +83,12 @@ def our_inverse_batch(poses: Poses) -> list[Contender]:
     def kernel() -> None:
         kernels.strut_lengths_many(*joints, poses.positions, poses.rotations, lengths)
 
-    def checked(threads: int | None) -> np.ndarray:
-        return strut_lengths_batch(poses.structure, poses.positions, poses.rotations, threads)
+    def checked() -> np.ndarray:
+        return strut_lengths_batch(poses.structure, poses.positions, poses.rotations, threads=1)
 
     return [
         Contender("inverse", OURS, "batch", count, kernel, lambda: lengths),
-        Contender("inverse", f"{OURS}, checked", "batch", count, lambda: checked(1)),
-        Contender("inverse", OURS + THREADS, "batch", count, lambda: checked(None)),
+        Contender("inverse", f"{OURS}, checked", "batch", count, checked),
     ]
 
 
@@ -120,7 +116,7 @@ def our_forward(task: str, poses: Poses) -> list[Contender]:
 
 
 def our_forward_batch(task: str, poses: Poses) -> list[Contender]:
-    """Kernel and checked call on one thread, checked call on all; every pose from home."""
+    """Kernel and checked call on one thread; every pose from home."""
     structure, home, count = poses.structure, poses.home, len(poses.positions)
     limits = structure.characteristic_length, structure.home_sign, structure.max_condition
     positions, rotations = np.empty((count, 3)), np.empty((count, 3, 3))
@@ -131,14 +127,13 @@ def our_forward_batch(task: str, poses: Poses) -> list[Contender]:
         problem = structure.base_joints, structure.platform_joints, poses.lengths, positions, rotations
         kernels.solve_pose_many(*problem, *limits, outcomes, iterations, conditions)
 
-    def checked(threads: int | None) -> np.ndarray:
-        found = solve_poses(structure, poses.lengths, home, threads)
+    def checked() -> np.ndarray:
+        found = solve_poses(structure, poses.lengths, home, threads=1)
         return joined(found.positions, found.rotations)
 
     return [
         Contender(task, OURS, "batch", count, kernel, lambda: joined(positions, rotations)),
-        Contender(task, f"{OURS}, checked", "batch", count, lambda: checked(1)),
-        Contender(task, OURS + THREADS, "batch", count, lambda: checked(None)),
+        Contender(task, f"{OURS}, checked", "batch", count, checked),
     ]
 
 
@@ -176,11 +171,10 @@ def contenders(singles: int, batch: int) -> tuple[list[Contender], list[str]]:
 
 
 def timed(one: Contender) -> float:
-    """Run somebody once; return µs per pose: processor time of one thread, the clock's time of several."""
-    clock = time.perf_counter if one.name.endswith(THREADS) else time.thread_time
-    start = clock()
+    """Run somebody once; return µs per pose, processor time."""
+    start = time.thread_time()
     own = one.run()
-    took = own if isinstance(own, float) else clock() - start
+    took = own if isinstance(own, float) else time.thread_time() - start
     return took / one.poses * 1e6
 
 

@@ -1,4 +1,4 @@
-"""Speed side by side in one run: kernels, convergence, model blocks, and the compensator beside a relay.
+"""Speed side by side in one run: kernels, batches, convergence, model blocks, the compensator beside a relay.
 
 ``python -m benchmarks.speed`` measures (six minutes), prints, and exits 1 when a bar is missed. With ``--doc`` it
 also writes doc/speed.md and its picture, doc/pictures/speed.png. ``--save FILE`` keeps the figures,
@@ -19,7 +19,7 @@ from pathlib import Path
 from hexapod_comp.files import write_text_atomically
 from hexapod_comp.plotting import save
 
-from . import blocks, convergence, genhexkins, kernels, loop
+from . import batches, blocks, convergence, genhexkins, kernels, loop
 from .speed_picture import speed_picture
 from .speed_text import page
 
@@ -50,6 +50,7 @@ class Speed:
     parts: list[blocks.Part]
     loop: list[loop.Row]
     floor: list[loop.Row]
+    batches: list[batches.Row]
     missing: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
 
@@ -85,6 +86,7 @@ def measure(quick: bool) -> Speed:
         blocks.parts(3 if quick else 25),
         loop.measure(**size),
         loop.measure(**{**size, "bouts": max(1, size["bouts"] // 3)}, floor=True),
+        batches.measure(1_000_000, 0.4) if quick else batches.measure(),
         missing,
     )
     speed.problems = _problems(speed)
@@ -100,7 +102,7 @@ def _convergence() -> tuple[list[convergence.Convergence], convergence.Honesty |
 
 def _problems(speed: Speed) -> list[str]:
     """Return which bars were missed."""
-    found = kernels.problems(speed.kernels)
+    found = kernels.problems(speed.kernels) + batches.problems(speed.batches)
     if speed.honesty is not None and not convergence.bars_kept(speed.convergence, speed.honesty):
         found.append("forward kinematics: fails at a yaw of 60–80°, or calls something solved that is not")
     for row in speed.loop:
@@ -132,6 +134,7 @@ def load(text: str) -> Speed:
         rows(blocks.Part, "parts"),
         loops("loop"),
         loops("floor"),
+        rows(batches.Row, "batches"),
         told["missing"],
         told["problems"],
     )
@@ -139,7 +142,7 @@ def load(text: str) -> Speed:
 
 def report(speed: Speed) -> str:
     """Return all tables for a person."""
-    texts = [kernels.report(speed.kernels, speed.missing)]
+    texts = [kernels.report(speed.kernels, speed.missing), batches.report(speed.batches)]
     if speed.honesty is not None:
         texts.append(convergence.report(speed.convergence, speed.honesty, speed.traps))
     texts += [blocks.report(speed.blocks, speed.parts), loop.report(speed.loop)]

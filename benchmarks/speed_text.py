@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from .batches import BAR
+from .batches import Row as Batch
 from .convergence import Honesty, worth_rows
 from .loop import BAR_MEDIAN, BAR_P99, BAR_RATE, Row
 
@@ -42,6 +44,18 @@ addresses looked up before. It ends when every strut is right to its default, 1e
 to the size of our last step. `kinematicsForward` solves twice, the second time for the pins of a display; the row
 `second solve` tells what that takes, so that it can be taken off. Bars: batches ≥ 4 ×, single forward calls ≥ 1.3 ×
 faster, whichever way it ends.
+"""
+
+BATCHES = """
+## Batches on all cores
+
+One call for N poses, as users make it, with all its checks: on one thread, and the default, all cores. ns per pose by
+the clock, best and median of up to 201 rounds in turn; beside it the processor time of all threads. The ratio is the
+median of the rounds' ratios by the clock; bar: the default is never slower ({bar} × allows for chance). The calling
+thread begins alone; others help when it has worked for 10 ms and as much is left.
+
+| task | poses | best: one | default | median: one | default | processor: one | default | ratio |
+|---|---:|---:|---:|---:|---:|---:|---:|---:|
 """
 
 CONVERGENCE = """
@@ -105,7 +119,10 @@ def page(speed: Speed) -> str:
     parts = [OPENING.format(where="Measured on: " + where, verdict=verdict), KERNELS.format(rounds=25)]
     parts.append(_kernel_table(speed))
     if speed.honesty is not None:
-        parts += [GENHEXKINS, _convergence(speed, speed.honesty)]
+        parts.append(GENHEXKINS)
+    parts += [BATCHES.format(bar=BAR), batch_table(speed.batches)]
+    if speed.honesty is not None:
+        parts += [_convergence(speed, speed.honesty)]
     parts += [BLOCKS.format(rounds=25), _blocks(speed)]
     parts += [LOOP.format(rate=BAR_RATE, median=BAR_MEDIAN, p99=BAR_P99), _loop_table(speed.loop)]
     parts += [FLOOR, _loop_table(speed.floor)]
@@ -121,6 +138,15 @@ def _kernel_table(speed: Speed) -> str:
     for r in speed.kernels:
         difference = f"{r.max_difference:.1e}" if r.max_difference else "0"
         lines.append(f"| {r.task} | {r.shape} | {r.name} | {r.us_per_pose:.3f} | {r.times_ours:.2f} | {difference} |")
+    return "\n".join(lines) + "\n"
+
+
+def batch_table(rows: list[Batch]) -> str:
+    """Return the table of the batches, without its head."""
+    lines = []
+    for r in rows:
+        pairs = (f"{value:.1f}" for pair in (r.best, r.median, r.processor) for value in pair)
+        lines.append(f"| {r.task} | {r.poses:,} | " + " | ".join(pairs) + f" | {r.ratio:.2f} |")
     return "\n".join(lines) + "\n"
 
 

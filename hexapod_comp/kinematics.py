@@ -6,7 +6,9 @@ structure and the real one.
 
 from __future__ import annotations
 
+import collections
 import os
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -27,8 +29,14 @@ from .errors import (
 from .geometry import STRUT_NAMES, HexapodGeometry
 from .pose import Pose
 
-BATCH_CHUNK = 2048
-"""Poses per task of a batch: long enough to hide the thread pool, short enough to share the cores evenly."""
+ALONE = 0.01
+"""Work of the calling thread, s, before others help: they take 0.1 ms to start, and some ms to end on busy cores."""
+
+SLICE = 1e-3
+"""Work on a slice of a batch, s: long beside taking the next one, short beside waiting for somebody's last one."""
+
+FIRST_SLICE = 256
+"""Poses in a batch's first slice; each of the next has twice as many until one takes its time."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +144,7 @@ def strut_lengths_batch(
     positions, rotations : array_like, shape (N, 3), (N, 3, 3)
         Platform poses in ``base``, m.
     threads : int, optional
-        Threads to use; all cores by default.
+        Most threads to use; all cores by default. A batch of some milliseconds stays on the calling thread.
 
     Raises
     ------
@@ -156,6 +164,8 @@ def strut_lengths_batch(
         )
 
     over_chunks(run, len(positions), threads)
+    if not np.isfinite(lengths).all():
+        _refuse_not_finite(positions, rotations)
     return lengths
 
 
@@ -240,7 +250,7 @@ def solve_poses(
     guess : Pose
         Start for every row.
     threads : int, optional
-        Threads to use; all cores by default.
+        Most threads to use; all cores by default. A batch of some milliseconds stays on the calling thread.
 
     Returns
     -------
@@ -251,12 +261,12 @@ def solve_poses(
     if lengths.ndim != 2 or lengths.shape[1] != 6:
         raise KinematicsError(f"lengths must have shape (N, 6), not {lengths.shape}", lengths.shape)
     count = len(lengths)
-    positions = np.tile(guess.position, (count, 1))
-    rotations = np.tile(guess.rotation, (count, 1, 1))
+    positions, rotations = np.empty((count, 3)), np.empty((count, 3, 3))
     outcomes, iterations = np.empty(count, np.int64), np.empty(count, np.int64)
     conditions = np.empty(count)
 
     def run(rows: slice) -> None:
+        positions[rows], rotations[rows] = guess.position, guess.rotation
         kernels.solve_pose_many(
             structure.base_joints,
             structure.platform_joints,
@@ -279,16 +289,50 @@ def solve_poses(
 
 
 def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = None) -> None:
-    """Call `run` on slices that cover ``range(count)``, on several threads; for kernels without the GIL."""
-    slices = [slice(start, min(start + BATCH_CHUNK, count)) for start in range(0, count, BATCH_CHUNK)]
-    workers = min(threads or os.cpu_count() or 1, len(slices))
-    if workers <= 1:
-        for rows in slices:
-            run(rows)
-        return
-    with ThreadPoolExecutor(workers) as pool:
-        for _ in pool.map(run, slices):
-            pass
+    """Call `run` on slices that cover ``range(count)``; for kernels without the GIL.
+
+    The calling thread begins alone. Others help only when it has worked for :data:`ALONE` of processor time and what
+    is left would take it as long again, so that no batch is slower for the help, whatever its kernel costs. It goes on
+    to take slices as they do, and waits only for those that others have begun.
+
+    Parameters
+    ----------
+    run : callable
+        Gets each slice once, from any thread, in any order.
+    count : int
+        Rows in the batch.
+    threads : int, optional
+        Most threads to use, the calling one included; all cores that this process may use by default.
+    """
+    workers = threads or len(os.sched_getaffinity(0))
+    size, done, took, began = FIRST_SLICE, 0, 0.0, time.thread_time()
+    while done < count:
+        if workers > 1 and took > ALONE and took * (count - done) > ALONE * done:
+            _share([slice(k, min(k + size, count)) for k in range(done, count, size)], run, workers)
+            return
+        stop = min(done + size, count)
+        run(slice(done, stop))
+        before, took = took, time.thread_time() - began
+        done, size = stop, size * 2 if took - before < 0.5 * SLICE else size
+
+
+def _share(slices: list[slice], run: Callable[[slice], None], workers: int) -> None:
+    """Work on slices together with other threads; the first error ends the work and is raised."""
+    left = iter(slices)
+
+    def work() -> None:
+        try:
+            for rows in left:
+                run(rows)
+        except BaseException:
+            collections.deque(left, maxlen=0)  # nobody begins with what is left
+            raise
+
+    with ThreadPoolExecutor(workers - 1) as pool:
+        helpers = [pool.submit(work) for _ in range(min(workers, len(slices)) - 1)]
+        work()
+    for helper in helpers:
+        helper.result()
 
 
 def forward_error(outcome: int, condition: float, max_condition: float) -> KinematicsError:
@@ -374,8 +418,12 @@ def _batch_poses(positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarr
     if positions.ndim != 2 or positions.shape[1] != 3 or rotations.shape != (len(positions), 3, 3):
         problem = f"poses must have shapes (N, 3) and (N, 3, 3), not {positions.shape} and {rotations.shape}"
         raise KinematicsError(problem)
+    return positions, rotations
+
+
+def _refuse_not_finite(positions: np.ndarray, rotations: np.ndarray) -> None:
+    """Raise for the first pose that is not finite; lengths can also overflow."""
     finite = np.isfinite(positions).all(axis=1) & np.isfinite(rotations).all(axis=(1, 2))
     if not finite.all():
         row = int(np.argmin(finite))
         raise NotFiniteError(f"pose {row} is not finite", positions[row].tolist())
-    return positions, rotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from helpers import (
 from scipy.spatial.transform import Rotation
 from strategies import paper_geometry
 
-from hexapod_comp import kernels
+from hexapod_comp import kernels, kinematics
 from hexapod_comp.errors import (
     KinematicsError,
     NotFiniteError,
@@ -227,13 +228,75 @@ def test_batch_of_lengths_equals_single_bit_for_bit(machine: HexapodGeometry) ->
         assert (strut_lengths(structure, Pose(positions[n], rotations[n])) == lengths[n]).all()
 
 
-def test_number_of_threads_does_not_change_a_bit() -> None:
+def test_number_of_threads_does_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kinematics, "ALONE", -1.0)  # others help from the second slice on
     positions, rotations = poses_about(HOME, 5000, seed=8)
     lengths = strut_lengths_batch(IDEAL, positions, rotations, threads=1)
     assert (lengths == strut_lengths_batch(IDEAL, positions, rotations, threads=3)).all()
     one, three = (solve_poses(IDEAL, lengths, HOME, threads=n) for n in (1, 3))
     assert (one.positions == three.positions).all()
     assert (one.rotations == three.rotations).all()
+
+
+@pytest.mark.parametrize("alone", [-1.0, 0.0, np.inf])
+@pytest.mark.parametrize("threads", [None, 1, 3])
+@pytest.mark.parametrize("count", [0, 1, 255, 256, 257, 5000])
+def test_every_row_is_in_one_slice(
+    monkeypatch: pytest.MonkeyPatch, count: int, threads: int | None, alone: float
+) -> None:
+    monkeypatch.setattr(kinematics, "ALONE", alone)
+    slices: list[slice] = []
+    kinematics.over_chunks(slices.append, count, threads)
+    assert sorted(n for rows in slices for n in range(rows.start, rows.stop)) == list(range(count))
+    assert all(rows.stop > rows.start for rows in slices)
+
+
+def test_small_batches_stay_on_the_calling_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """20,000 poses, 1 and 7 ms of work: to wake others for them once made the default four times slower."""
+    positions, rotations = poses_about(HOME, 20_000, seed=8)
+    lengths = strut_lengths_batch(IDEAL, positions, rotations, threads=1)
+    solve_poses(IDEAL, lengths[:1], HOME)  # compiles, which is work too
+    monkeypatch.setattr(kinematics, "ThreadPoolExecutor", None)
+    assert (strut_lengths_batch(IDEAL, positions, rotations) == lengths).all()
+    assert solve_poses(IDEAL, lengths, HOME).ok.all()
+
+
+def test_large_batches_are_shared() -> None:
+    """A slice that waits for another one to begin ends only if two threads work at once; until then there is one."""
+    together, seen = threading.Barrier(2), set()
+
+    def run(rows: slice) -> None:
+        start = time.thread_time()
+        while time.thread_time() - start < 0.002:
+            pass
+        if threading.active_count() > before and len(seen) < 2:
+            seen.add(threading.get_ident())
+            together.wait(60.0)
+
+    before = threading.active_count()
+    kinematics.over_chunks(run, 256 * 60, threads=2)
+    assert len(seen) == 2
+
+
+@pytest.mark.parametrize("fails", ["caller", "helper"])
+def test_the_first_error_ends_a_shared_batch(monkeypatch: pytest.MonkeyPatch, fails: str) -> None:
+    """It is raised whoever meets it, and of what is left nobody begins anything: neither has to be waited for."""
+    monkeypatch.setattr(kinematics, "ALONE", -1.0)
+    caller, begun, failed = threading.get_ident(), [], threading.Event()
+
+    def run(rows: slice) -> None:
+        begun.append(rows)
+        if rows.start == 0:
+            return  # the caller is still alone
+        if (threading.get_ident() == caller) == (fails == "caller"):
+            failed.set()
+            raise ZeroDivisionError
+        assert failed.wait(60.0)
+        time.sleep(0.01)  # the other one is on its way out
+
+    with pytest.raises(ZeroDivisionError):
+        kinematics.over_chunks(run, 256 * 200, threads=2)
+    assert len(begun) < 100
 
 
 def test_empty_batch() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import KinematicsError
 from ..geometry import HexapodGeometry
-from ..kinematics import BATCH_CHUNK, Structure, over_chunks, strut_lengths
+from ..kinematics import Structure, over_chunks, strut_lengths
 from .effect_kernels import effect_vectors_many, extremes_many, sizes_many
 from .sources import SingleErrors
 
@@ -151,18 +151,22 @@ def extremes(
     positions, rotations = _poses(positions, rotations)
     machine, parts, exact = _arguments(geometry, errors, method)
     kinds, types = np.array(errors.kind, dtype=np.int64), len(errors.kinds)
-    slices = -(-len(positions) // BATCH_CHUNK)
-    values = np.tile([-np.inf, np.inf, -np.inf, np.inf], (slices, types, 1))
-    at, failed = np.full((slices, types, 4, 2), -1), np.zeros((slices, types), np.int64)
+    of_slice: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def run(rows: slice) -> None:
-        n = rows.start // BATCH_CHUNK
-        out = values[n], at[n], failed[n]
-        extremes_many(machine, positions[rows], rotations[rows], parts, exact, kinds, *out)
-        at[n, ..., 0] += np.where(at[n, ..., 0] < 0, 0, rows.start)
+        values = np.tile([-np.inf, np.inf, -np.inf, np.inf], (types, 1))
+        at, failed = np.full((types, 4, 2), -1), np.zeros(types, np.int64)
+        extremes_many(machine, positions[rows], rotations[rows], parts, exact, kinds, values, at, failed)
+        at[..., 0] += np.where(at[..., 0] < 0, 0, rows.start)
+        of_slice[rows.start] = values, at, failed
 
     over_chunks(run, len(positions), threads)
-    values, at = _first_best(values, at)
+    slices = [of_slice[start] for start in sorted(of_slice)]
+    failed = np.array([part[2] for part in slices], np.int64).reshape(-1, types)
+    values, at = _first_best(
+        np.array([part[0] for part in slices]).reshape(-1, types, 4),
+        np.array([part[1] for part in slices], int).reshape(-1, types, 4, 2),
+    )
     found = at[..., 0] >= 0
     return Extremes(
         errors=errors,
