@@ -26,7 +26,6 @@ from hexapod_comp import kernels
 from hexapod_comp.compensation import Compensator
 from hexapod_comp.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.limit_kernels import check_stage
-from hexapod_comp.limits import LimitTable
 from hexapod_comp.machine import MachineModel
 from hexapod_comp.model_file import load_model
 from hexapod_comp.paths import config_file
@@ -184,8 +183,8 @@ def parts(rounds: int) -> list[Part]:
     runs = {
         "quaternion to rotation": repeated(read_pose, *[0.0] * 6, 1.0, np.empty(3), np.empty((3, 3))),
         "nominal strut lengths": repeated(kernels.strut_lengths_one, *nominal),
-        "limits, each of two stages": repeated(check_stage, *nominal, LimitTable(geometry).arrays),
-        "the same with a clearance": repeated(check_stage, *nominal, LimitTable(spaced).arrays),
+        "limits, each of two stages": repeated(check_stage, *nominal, geometry.limit_numbers),
+        "the same with a clearance": repeated(check_stage, *nominal, spaced.limit_numbers),
         "a temperature reading": from_python(lambda: compensator.set_temperature("strut_1", 20.5)),
     }
     return [Part(name, min(run() for _ in range(rounds))) for name, run in runs.items()]

@@ -16,8 +16,8 @@ from .assembly_elimination import joint_circles, start_angles
 from .assembly_kernels import closed_triangles
 from .errors import KinematicsError, OtherAssemblyModeError, SingularError, UnreachableError
 from .geometry import HexapodGeometry
-from .kinematics import Structure, condition_number, jacobian, six_lengths, solve_pose
-from .limit_kernels import nearest_strut
+from .kinematics import Structure, jacobian, six_lengths, solve_pose
+from .limit_kernels import Quantities, examine
 from .pose import Pose, rotation_angle
 
 CLOSURE = 1e-12
@@ -153,45 +153,32 @@ def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose)
     list of str
         One short phrase per objection, with found and allowed values.
     """
-    found = []
-    condition, sign = condition_number(structure, pose)
-    if sign != structure.home_sign:
-        found.append("det J of the other sign")
-    if not condition <= structure.max_condition:
-        found.append(f"condition number {condition:.4g} above {structure.max_condition:.4g}")
-    joints = pose.position + structure.platform_joints @ pose.rotation.T
+    at = structure.base_joints, structure.platform_joints, pose.position, pose.rotation
+    measured, limits = Quantities.empty(1), geometry.limits
+    kernels.strut_lengths_one(*at, measured.lengths[0, 0])
+    examine(*at, geometry.limit_numbers, measured, 0, 0)
+    broken = {
+        name: (int(margin.argmin()), value.ravel()[margin.argmin()])
+        for name, (margin, value) in limits.margins(measured).items()
+        if not (margin >= 0.0).all()
+    }
+    found = ["det J of the other sign"] if measured.sign[0, 0] != structure.home_sign else []
+    if "condition" in broken:
+        found.append(f"condition number {broken['condition'][1]:.4g} above {limits.condition:.4g}")
     centre, homewards = _home_side(geometry, structure)
-    if homewards @ (joints.mean(axis=0) - centre) < 0.0:
+    if homewards @ (pose.position + pose.rotation @ structure.platform_joints.mean(axis=0) - centre) < 0.0:
         found.append("platform on the other side of the base")
-    found += _cone_objections(geometry, joints - structure.base_joints, pose.rotation)
-    return found + _clearance_objections(geometry, structure.base_joints.copy(), joints)
-
-
-def _cone_objections(geometry: HexapodGeometry, struts: np.ndarray, rotation: np.ndarray) -> list[str]:
-    """Return the worst joint of each body that is outside its cone; strut vectors (6, 3) in ``base``."""
-    found = []
-    directions = struts / np.linalg.norm(struts, axis=1)[:, None]
-    for body, seen, axes, limits in (
-        ("base", directions, geometry.base_cone_axes, geometry.limits.base_cone),
-        ("platform", directions @ rotation, geometry.platform_cone_axes, geometry.limits.platform_cone),
-    ):
-        angles = np.arccos(np.clip((seen * axes).sum(axis=1), -1.0, 1.0))  # rounding may leave 1 + 2e-16
-        worst = int((angles - limits).argmax())
-        if angles[worst] > limits[worst]:
-            angle, limit = np.rad2deg([angles[worst], limits[worst]])
-            found.append(f"{body} joint {worst + 1} at {angle:.1f}°, allowed {limit:.1f}°")
+    for body, allowed in (("base", limits.base_cone), ("platform", limits.platform_cone)):
+        if f"{body}_cone" in broken:
+            joint, angle = broken[f"{body}_cone"]
+            degrees = f"{np.rad2deg(angle):.1f}°, allowed {np.rad2deg(allowed[joint]):.1f}°"
+            found.append(f"{body} joint {joint + 1} at {degrees}")
+    if "clearance" in broken:
+        strut, distance = broken["clearance"]
+        one, other = sorted((strut + 1, int(measured.nearest[0, 0, strut]) + 1))
+        millimetres = f"{distance * 1e3:.1f} mm apart, allowed {limits.clearance * 1e3:.1f} mm"
+        found.append(f"struts {one} and {other} {millimetres}")
     return found
-
-
-def _clearance_objections(geometry: HexapodGeometry, base: np.ndarray, ends: np.ndarray) -> list[str]:
-    """Return the closest pair of struts if they are closer than allowed; joints (6, 3) in ``base``."""
-    apart, allowed = geometry.struts_apart, geometry.limits.clearance
-    if not allowed:
-        return []
-    (distance, one), other = min((nearest_strut(base, ends, apart, i, i), i) for i in range(6))
-    if distance >= allowed:
-        return []
-    return [f"struts {one + 1} and {other + 1} {distance * 1e3:.1f} mm apart, allowed {allowed * 1e3:.1f} mm"]
 
 
 def platform_pair_gap(structure: Structure) -> float:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .checking_kernels import CLEARANCE, CONDITION, OUTSIDE, QUANTITIES, SIGN, UNSOLVED, examine_many
+from .checking_kernels import OUTSIDE, UNSOLVED, examine_many
 from .errors import (
     GeometryError,
     HexapodError,
@@ -21,7 +21,8 @@ from .errors import (
     OutsideFieldError,
 )
 from .geometry import STRUT_NAMES, HexapodGeometry
-from .limits import REASONS, STAGES, LimitTable
+from .limit_kernels import Quantities
+from .limits import REASONS, STAGES
 from .machine import MachineModel, RealMachine
 from .motion import MotionState
 from .trajectory import moves
@@ -235,7 +236,6 @@ class _Run:
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, count: int, rate: float) -> None:
         self.geometry, self.rate, self.count = geometry, rate, count
         self.machine = RealMachine(geometry, model)
-        self.table = LimitTable(geometry)
         self.limits = tuple(name for name in LIMITS if name != "clearance" or geometry.limits.clearance)
         self.worst = {name: _Worst.empty(count) for name in (*self.limits, *OTHER_FINDINGS)}
         self.lengths = np.full((count, 2, 6), np.nan)
@@ -295,15 +295,15 @@ class _Run:
         in_sequence: bool,
     ) -> None:
         """Examine tool poses, (n, …), of the rows `owner`; `in_sequence`: after the ones before."""
-        values, flags = self._examine(*self.geometry.platform_poses(positions, rotations), in_sequence)
-        lengths = values[:, :, :6]
+        found, flags = self._examine(*self.geometry.platform_poses(positions, rotations), in_sequence)
+        lengths = found.lengths
         at_rows = share == 1.0
         self.lengths[owner[at_rows]] = lengths[at_rows]
         self.examined += len(owner)
         self.outside_field[owner[flags == OUTSIDE]] = True
         solved = flags != UNSOLVED
         with np.errstate(invalid="ignore", over="ignore"):
-            measured = {**self._static(values, solved), **self._other(values, flags)}
+            measured = {**self._static(found, solved), **self._other(found.sign[:, :, None], flags)}
             if in_sequence:
                 changes = np.diff(np.concatenate([self.previous, lengths]), axis=0)
                 measured |= self._changes(changes)
@@ -313,9 +313,9 @@ class _Run:
 
     def _examine(
         self, positions: np.ndarray, rotations: np.ndarray, in_sequence: bool
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> tuple[Quantities, np.ndarray]:
         machine, geometry = self.machine, self.geometry
-        values = np.empty((len(positions), 2, QUANTITIES))
+        found = Quantities.empty(len(positions), 2)
         flags = np.empty(len(positions), np.int64)
         examine_many(
             np.ascontiguousarray(positions),
@@ -323,35 +323,25 @@ class _Run:
             not in_sequence,
             geometry.kernel_joints[0],
             geometry.kernel_joints[1],
-            self.table.arrays,
+            geometry.limit_numbers,
             machine.thresholds,
             self.motion.low,
             self.motion.sense,
             machine.body,
             machine.strut_arrays,
             machine.field_arrays,
-            values,
+            found,
             flags,
         )
-        return values, flags
+        for quantity in found:
+            quantity[flags == UNSOLVED, 1] = np.nan
+        return found, flags
 
-    def _static(self, values: np.ndarray, solved: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    def _static(self, found: Quantities, solved: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Return margin and value, (n, 2, k), of the limits of single poses."""
-        limits, lengths = self.geometry.limits, values[:, :, :6]
-        cones = np.arccos(np.clip(values[:, :, 6:18], -1.0, 1.0))
-        condition = values[:, :, CONDITION : CONDITION + 1]
-        correction = np.zeros_like(lengths)
-        correction[:, 1] = lengths[:, 1] - lengths[:, 0]
-        measured = {
-            "stroke": (np.minimum(lengths - limits.stroke[:, 0], limits.stroke[:, 1] - lengths), lengths),
-            "base_cone": (limits.base_cone - cones[:, :, :6], cones[:, :, :6]),
-            "platform_cone": (limits.platform_cone - cones[:, :, 6:], cones[:, :, 6:]),
-            "condition": (limits.condition - condition, condition),
-            "correction": (limits.correction - np.abs(correction), correction),
-        }
-        if limits.clearance:
-            clearance = values[:, :, CLEARANCE:CONDITION]
-            measured["clearance"] = (clearance - limits.clearance, clearance)
+        limits, correction = self.geometry.limits, np.zeros_like(found.lengths)
+        correction[:, 1] = found.lengths[:, 1] - found.lengths[:, 0]
+        measured = {**limits.margins(found), "correction": (limits.correction - np.abs(correction), correction)}
         for margin, _ in measured.values():
             margin[~solved, 1] = np.inf  # said once, as not converged
         measured["correction"][0][:, 0] = np.inf
@@ -368,9 +358,8 @@ class _Run:
             margin[np.isnan(changes)] = np.inf  # nothing to compare with
         return measured
 
-    def _other(self, values: np.ndarray, flags: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    def _other(self, sign: np.ndarray, flags: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Return what is so or not as margins of −1 or ∞, with the value that matters."""
-        sign = values[:, :, SIGN : SIGN + 1]
         refusing = self.machine.model.field.outside == "refuse"
         never = np.zeros(len(flags), dtype=bool)
         found = {
@@ -421,4 +410,4 @@ class _Run:
             )
             return LimitError("speed", problem, value, limit, strut, STAGES[stage])
         without_strut = name in ("condition", "assembly")
-        return self.table.error(REASONS.index(name), -1 if without_strut else strut, stage, value)
+        return self.geometry.limits.error(REASONS.index(name), -1 if without_strut else strut, stage, value)

@@ -41,7 +41,6 @@ from .errors import HexapodError, ModelError, NotConvergedError, NotFiniteError,
 from .geometry import HexapodGeometry
 from .kinematics import forward_error, strut_lengths
 from .limit_kernels import WITHIN
-from .limits import LimitTable
 from .machine import MachineModel, RealMachine, Temperatures
 from .motion import MotionState
 from .pose import POSE_NOT_FINITE, QUATERNION_NORM_TOLERANCE, Pose
@@ -162,13 +161,12 @@ class Compensator:
         self, geometry: HexapodGeometry, model: MachineModel, ramp_rate: float = DEFAULT_RAMP_RATE
     ) -> None:
         self.geometry = geometry
-        self.limits = LimitTable(geometry)
         self.temperatures = Temperatures()
         self.machine = RealMachine(geometry, model)
         self._switches = np.array([1.0, 0.0, ramp_rate, 0.0])
         self.condition = math.nan
         self.outside_field = False
-        self._nominal_numbers = pack_nominal(geometry, self.limits)
+        self._nominal_numbers = pack_nominal(geometry)
         self._work = pack_pose(geometry.work)
         self._last, self._next = _Command(), _Command()
         self._take_machine(RealMachine(geometry, model))
@@ -403,7 +401,7 @@ class Compensator:
         if status == OUTSIDE and self.model.field.outside == "refuse":
             raise self._outside_error(self._next)
         if finding != WITHIN:
-            raise self.limits.error(finding, strut, stage, value)
+            raise self.geometry.limits.error(finding, strut, stage, value)
         self._last, self._next = self._next, self._last
         self.condition, self.outside_field = condition, status == OUTSIDE
         self._switches[CHANGED] = 0.0

@@ -15,8 +15,7 @@ from . import kernels
 from .compiling import compiled
 from .geometry import HexapodGeometry
 from .limit_kernels import CORRECTION as CORRECTION_FOUND
-from .limit_kernels import STEP, WITHIN, check_change, check_stage
-from .limits import LimitTable
+from .limit_kernels import STEP, WITHIN, check_change, check_stage, limits_of
 from .machine import RealMachine
 from .machine_kernels import actual_pose_one, command_one
 from .pose import POSE_OK, Pose, read_pose
@@ -62,29 +61,21 @@ def machine_views(numbers):
     )
 
 
-def pack_nominal(geometry: HexapodGeometry, limits: LimitTable) -> np.ndarray:
+def pack_nominal(geometry: HexapodGeometry) -> np.ndarray:
     """Return what :func:`nominal_views` takes apart."""
     tool_inverse = geometry.tool.inverse()
-    parts = (
-        *geometry.kernel_joints,
-        tool_inverse.position,
-        tool_inverse.rotation,
-        *limits.arrays,
-    )
+    parts = (*geometry.kernel_joints, tool_inverse.position, tool_inverse.rotation, *geometry.limit_numbers)
     return np.concatenate([np.ravel(part) for part in parts])
 
 
 @compiled
 def nominal_views(numbers):
-    """Return base, platform, tool inverse (position over rotation) and the limits (five arrays)."""
-    cone_axes, cone_cosines = numbers[60:96].reshape((2, 6, 3)), numbers[96:108].reshape((2, 6))
-    apart = numbers[108:144].reshape((6, 6))
-    limits = (numbers[48:60].reshape((6, 2)), cone_axes, cone_cosines, apart, numbers[144:])
+    """Return base, platform, tool inverse (position over rotation) and the limits."""
     return (
         numbers[:18].reshape((6, 3)),
         numbers[18:36].reshape((6, 3)),
         numbers[36:48].reshape((4, 3)),
-        limits,
+        limits_of(numbers[48:]),
     )
 
 
@@ -137,7 +128,7 @@ def compensate_one(
     nominal, correction = next_state[NOMINAL:CORRECTION], next_state[CORRECTION:COMMAND]
     command = next_state[COMMAND:BUMP]
     kernels.strut_lengths_one(nominal_base, nominal_platform, platform_position, platform_rotation, nominal)
-    finding, strut, value, condition = check_stage(
+    finding, strut, value, _, condition = check_stage(
         nominal_base, nominal_platform, platform_position, platform_rotation, nominal, limits
     )
     if finding != WITHIN:
@@ -165,10 +156,10 @@ def compensate_one(
     for i in range(6):
         correction[i] += next_state[BUMP + i]
         command[i] = nominal[i] + correction[i]
-    finding, strut, value, stage = check_command(nominal, correction, command, state, limits[4])
+    finding, strut, value, stage = check_command(nominal, correction, command, state, limits)
     if finding == WITHIN:
         stage = 1
-        finding, strut, value, _ = check_stage(body[0], body[1], model_position, model_rotation, command, limits)
+        finding, strut, value, _, _ = check_stage(body[0], body[1], model_position, model_rotation, command, limits)
     return OUTSIDE if outside else SOLVED, finding, strut, stage, value, condition
 
 
@@ -211,15 +202,15 @@ def compensate_quaternion(
 
 
 @compiled
-def check_command(nominal, correction, command, state, scalars):
+def check_command(nominal, correction, command, state, limits):
     """Check correction and steps; return (finding, strut, value, stage)."""
     for i in range(6):
-        if not abs(correction[i]) <= scalars[1]:
+        if not abs(correction[i]) <= limits.correction:
             return CORRECTION_FOUND, i, correction[i], 1
-    finding, strut, value = check_change(nominal, state[NOMINAL:CORRECTION], scalars[2], STEP)
+    finding, strut, value = check_change(nominal, state[NOMINAL:CORRECTION], limits.step, STEP)
     if finding != WITHIN:
         return finding, strut, value, 0
-    finding, strut, value = check_change(command, state[COMMAND:BUMP], scalars[2], STEP)
+    finding, strut, value = check_change(command, state[COMMAND:BUMP], limits.step, STEP)
     return finding, strut, value, 1
 
 

@@ -12,7 +12,6 @@ import numpy as np
 from .errors import InputFileError
 from .geometry import HexapodGeometry
 from .kinematics import Structure, strut_lengths
-from .limits import LimitTable
 from .measurement import (
     BACKWARD,
     CHANNELS,
@@ -161,7 +160,7 @@ def _collect_stations(
     known: dict[tuple, int] = {}
     rows: list[tuple] = []
     index = np.empty(len(readings), dtype=int)
-    limits, nominal = LimitTable(geometry), Structure.of(geometry)
+    nominal = Structure.of(geometry)
     here: tuple | None = None
     before: int | None = None
     for n, (r, pose, run) in enumerate(zip(readings, poses, runs, strict=True)):
@@ -174,7 +173,7 @@ def _collect_stations(
         key = (place, r.direction, None if came_from is None else before, r.temperatures)
         if key not in known:
             lengths = strut_lengths(nominal, pose)
-            _check_reach(limits, pose, lengths, r)
+            _check_reach(geometry, pose, lengths, r)
             commands = np.array(lengths if r.commands is None else r.commands, dtype=float)
             sense = _sense(geometry, r.direction, run, pose, commands, came_from)
             known[key] = len(rows)
@@ -184,9 +183,9 @@ def _collect_stations(
     return Stations(*columns), index
 
 
-def _check_reach(limits: LimitTable, pose: Pose, lengths: np.ndarray, reading: Reading) -> None:
+def _check_reach(geometry: HexapodGeometry, pose: Pose, lengths: np.ndarray, reading: Reading) -> None:
     """Refuse a commanded pose that the machine cannot have taken."""
-    refusal = limits.refusal(pose.position, pose.rotation, lengths)
+    refusal = geometry.refusal(pose.position, pose.rotation, lengths)
     if refusal is not None:
         problem = f"the commanded pose is out of the machine's reach: {refusal}"
         raise InputFileError(reading.source.file, _line(reading), problem)

@@ -13,71 +13,21 @@ from pathlib import Path
 import numpy as np
 
 from . import kernels
-from .errors import GeometryError, InputFileError, PoseError
+from .errors import GeometryError, InputFileError, KinematicsError, LimitError, PoseError
 from .files import Section, read_yaml
+from .limit_kernels import WITHIN, LimitNumbers, check_stage
+from .limits import STRUT_NAMES as STRUT_NAMES
+from .limits import Limits, frozen_array
 from .pose import Pose
 
 GEOMETRY_FORMAT = "hexapod_comp/geometry"
 GEOMETRY_VERSION = 1
-
-STRUT_NAMES = tuple(f"strut_{i}" for i in range(1, 7))
-"""Names of the six struts, in order, as they stand in messages."""
 
 COINCIDENT = 1e-6
 """Joints closer than this, m, are one."""
 
 LONGEST_AXIS = 1e9
 """Largest component of an axis: only its direction counts, and the square of a huge one overflows."""
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What the machine may do; every check refuses, none clamps.
-
-    Parameters
-    ----------
-    stroke : ndarray, shape (6, 2)
-        Shortest and longest strut length, m.
-    base_cone, platform_cone : ndarray, shape (6,)
-        Largest angle of each strut to the joint's neutral direction, rad.
-    condition : float
-        Largest condition number of the Jacobian (see :func:`hexapod_comp.kinematics.condition_number`).
-    correction : float
-        Largest magnitude of a strut correction, m.
-    step : float
-        Largest change of a strut command between two commands, m.
-    speed : float
-        Largest strut speed, m/s; used by ``check`` and by the trajectories that this package makes.
-    clearance : float, optional
-        Smallest distance between the axes of two struts, m; 0: not limited. Struts that share a joint do not count.
-    """
-
-    stroke: np.ndarray
-    base_cone: np.ndarray
-    platform_cone: np.ndarray
-    condition: float
-    correction: float
-    step: float
-    speed: float
-    clearance: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name, shape in (("stroke", (6, 2)), ("base_cone", (6,)), ("platform_cone", (6,))):
-            object.__setattr__(self, name, _frozen_array(getattr(self, name), shape, f"limits.{name}"))
-        for index, (shortest, longest) in enumerate(self.stroke):
-            if not 0.0 < shortest < longest:
-                problem = "shortest length must be positive and below the longest"
-                raise GeometryError(f"limits.stroke[{index}]", problem, [float(shortest), float(longest)])
-        for name in ("base_cone", "platform_cone"):
-            for index, angle in enumerate(getattr(self, name)):
-                if not 0.0 < angle <= np.pi:
-                    raise GeometryError(f"limits.{name}[{index}]", "must lie in (0, π] rad", float(angle))
-        for name, least in (("condition", 1.0), ("correction", 0.0), ("step", 0.0), ("speed", 0.0)):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > least):
-                raise GeometryError(f"limits.{name}", f"must be finite and above {least:g}", value)
-        if not 0.0 <= self.clearance < np.inf:
-            raise GeometryError("limits.clearance", "must be finite and not negative, m", self.clearance)
 
 
 @dataclass(frozen=True)
@@ -133,15 +83,17 @@ class HexapodGeometry:
     """Private writable copies of the joints for compiled kernels, which would compile twice for read-only ones."""
     characteristic_length: float = field(init=False)
     """RMS radius of the platform joints about their centroid, m; makes the condition number unit-free."""
+    limit_numbers: LimitNumbers = field(init=False, repr=False)
+    """The limits for compiled kernels."""
 
     def __post_init__(self) -> None:
         def put(name: str, value: object) -> None:
             object.__setattr__(self, name, value)
 
-        put("base_joints", _frozen_array(self.base_joints, (6, 3), "base.joints"))
-        put("platform_joints", _frozen_array(self.platform_joints, (6, 3), "platform.joints"))
+        put("base_joints", frozen_array(self.base_joints, (6, 3), "base.joints"))
+        put("platform_joints", frozen_array(self.platform_joints, (6, 3), "platform.joints"))
         put("kernel_joints", (self.base_joints.copy(), self.platform_joints.copy()))
-        put("screw_lead", _frozen_array(self.screw_lead, (6,), "screw.lead"))
+        put("screw_lead", frozen_array(self.screw_lead, (6,), "screw.lead"))
         _refuse_coincident(self.base_joints)
         spread = self.platform_joints - self.platform_joints.mean(axis=0)
         put("characteristic_length", float(np.sqrt((spread**2).sum(axis=1).mean())))
@@ -174,21 +126,25 @@ class HexapodGeometry:
 
     def _check_home(self, put: Callable[[str, object], None]) -> None:
         """Refuse a home pose that breaks a limit of single poses."""
-        from .limits import LimitTable  # which itself needs geometries
-
         pose = (self.home.position, self.home.rotation)
         lengths = np.empty(6)
         kernels.strut_lengths_one(*self.kernel_joints, *pose, lengths)
         put("home_sign", float(kernels.condition_one(*self.kernel_joints, *pose, self.characteristic_length)[1]))
-        refusal = LimitTable(self).refusal(*pose, lengths)
+        cone_axes, joints = np.array([self.base_cone_axes, self.platform_cone_axes]), self.platform_joints
+        # The distance of struts that share a joint cannot be limited.
+        apart = (np.linalg.norm(joints[:, None] - joints, axis=2) > COINCIDENT).astype(float)
+        put("limit_numbers", self.limits.numbers(cone_axes, apart, self.characteristic_length, self.home_sign))
+        refusal = self.refusal(*pose, lengths)
         if refusal is not None:
             raise GeometryError("home", f"breaks a limit: {refusal}")
 
-    @property
-    def struts_apart(self) -> np.ndarray:
-        """1 for pairs of struts that share no joint, (6, 6), 0 for the others: their distance cannot be limited."""
-        joints = self.platform_joints
-        return (np.linalg.norm(joints[:, None] - joints, axis=2) > COINCIDENT).astype(float)
+    def refusal(
+        self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray
+    ) -> LimitError | KinematicsError | None:
+        """Return why the nominal machine may not stand in a platform pose with its strut lengths, None if it may."""
+        found = check_stage(*self.kernel_joints, position, rotation, lengths, self.limit_numbers)
+        finding, strut, value, _, _ = found
+        return None if finding == WITHIN else self.limits.error(finding, strut, 0, value)
 
     def platform_pose(self, tool_pose: Pose) -> Pose:
         """Return the ``pose_platform_in_base`` that belongs to a ``pose_tool_in_work``."""
@@ -208,11 +164,6 @@ class HexapodGeometry:
         """Return positions (N, 3), m, and rotations (N, 3, 3) of :meth:`tool_pose` for many platform poses."""
         tips = positions + rotations @ self.tool.position - self.work.position
         return tips @ self.work.rotation, self.work.rotation.T @ rotations @ self.tool.rotation
-
-    @property
-    def strut_names(self) -> tuple[str, ...]:
-        """Names of the struts in order."""
-        return STRUT_NAMES
 
 
 def paper_joints(a: float, b: float, d: float) -> tuple[np.ndarray, np.ndarray]:
@@ -350,19 +301,8 @@ def _refuse_coincident(base_joints: np.ndarray) -> None:
                 raise GeometryError(f"base.joints[{i}]", problem, base_joints[i].tolist())
 
 
-def _frozen_array(values: object, shape: tuple[int, ...], key: str) -> np.ndarray:
-    """Return a private read-only float copy of the given shape."""
-    array = np.array(values, dtype=float, order="C")
-    if array.shape != shape:
-        raise GeometryError(key, f"must have shape {shape}, not {array.shape}")
-    if not np.isfinite(array).all():
-        raise GeometryError(key, "must be finite", array.tolist())
-    array.flags.writeable = False
-    return array
-
-
 def _unit_vectors(values: object, key: str) -> np.ndarray:
-    vectors = _frozen_array(values, (6, 3), key)
+    vectors = frozen_array(values, (6, 3), key)
     largest = np.abs(vectors).max(axis=1, keepdims=True)
     if largest.max() > LONGEST_AXIS:
         index = int(largest.argmax())

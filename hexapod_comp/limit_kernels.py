@@ -1,16 +1,120 @@
-"""Compiled: what keeps a machine from standing in a pose, or from going there in one step."""
+"""Compiled: what keeps a machine from standing in a pose, or from going there in one step.
+
+There are two ways to ask. :func:`examine` measures every limited quantity of a pose: for checks before a move and
+for cold starts, which name all that is wrong. :func:`check_stage` measures the same and stops at the first limit
+that is broken: for the compensator, whose commands must not wait, and for millions of poses. A test holds the two
+together.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from .compiling import compiled
-from .kernels import condition_one, strut_vector
+from .kernels import condition_one, strut_lengths_one, strut_vector
 
-WITHIN, NOT_FINITE, STROKE, BASE_CONE, PLATFORM_CONE, CLEARANCE, CONDITION, ASSEMBLY, CORRECTION, STEP = range(10)
-"""What a check found; the order is the order of the checks."""
+(
+    WITHIN,
+    STROKE_SHORT,
+    STROKE_LONG,
+    BASE_CONE,
+    PLATFORM_CONE,
+    CLEARANCE,
+    CONDITION,
+    ASSEMBLY,
+    NOT_FINITE,
+    CORRECTION,
+    STEP,
+) = range(11)
+"""What a check found."""
+
+LIMIT_NUMBERS = 102
+"""Length of a vector of :class:`LimitNumbers`."""
+
+
+class LimitNumbers(NamedTuple):
+    """Every limit of a machine, and what its quantities are measured against; SI units.
+
+    Attributes
+    ----------
+    stroke : ndarray, shape (6, 2)
+        Shortest and longest strut length, m.
+    cone_axes : ndarray, shape (2, 6, 3)
+        Neutral directions of the joints, at the base and at the platform, each in its body's frame.
+    cone_cosines : ndarray, shape (2, 6)
+        Cosines of the largest angles to them.
+    apart : ndarray, shape (6, 6)
+        1 for pairs of struts whose distance counts, 0 for those that share a joint.
+    condition, correction, step, clearance : float
+        Largest condition number; largest correction and change of length, m; smallest distance of two struts, m,
+        0 when it is not limited.
+    characteristic_length : float
+        See :func:`~hexapod_comp.kernels.condition_one`, m.
+    home_sign : float
+        Sign of det J in the working assembly mode.
+    """
+
+    stroke: np.ndarray
+    cone_axes: np.ndarray
+    cone_cosines: np.ndarray
+    apart: np.ndarray
+    condition: float
+    correction: float
+    step: float
+    clearance: float
+    characteristic_length: float
+    home_sign: float
+
+
+@compiled
+def limits_of(numbers):
+    """Return the limits that stand one after the other in a vector, (LIMIT_NUMBERS,); its parts, not copies."""
+    return LimitNumbers(
+        stroke=numbers[:12].reshape((6, 2)),
+        cone_axes=numbers[12:48].reshape((2, 6, 3)),
+        cone_cosines=numbers[48:60].reshape((2, 6)),
+        apart=numbers[60:96].reshape((6, 6)),
+        condition=numbers[96],
+        correction=numbers[97],
+        step=numbers[98],
+        clearance=numbers[99],
+        characteristic_length=numbers[100],
+        home_sign=numbers[101],
+    )
+
+
+class Quantities(NamedTuple):
+    """The limited quantities of N poses in S stages.
+
+    Attributes
+    ----------
+    lengths : ndarray, shape (N, S, 6)
+        Of the struts, m.
+    cosines : ndarray, shape (N, S, 2, 6)
+        Of the struts' angles to the neutral directions of their joints, at the base and at the platform.
+    distances, nearest : ndarray, shape (N, S, 6)
+        From each strut to the nearest other one that counts, m, and its index; ∞ and −1 where there is none, or
+        the machine does not limit the distance.
+    condition, sign : ndarray, shape (N, S)
+        Condition number, and sign of det J.
+    """
+
+    lengths: np.ndarray
+    cosines: np.ndarray
+    distances: np.ndarray
+    nearest: np.ndarray
+    condition: np.ndarray
+    sign: np.ndarray
+
+    @staticmethod
+    def empty(poses: int, stages: int = 1) -> Quantities:
+        """Return quantities that nothing has been written to."""
+        shape = poses, stages
+        sixes = np.empty((*shape, 6)), np.empty((*shape, 2, 6)), np.empty((*shape, 6)), np.empty((*shape, 6))
+        return Quantities(*sixes, np.empty(shape), np.empty(shape))
 
 
 @compiled
@@ -37,18 +141,30 @@ def strut_ends(base, platform, position, rotation):
 
 
 @compiled
-def nearest_strut(base, ends, apart, i, count):
-    """Return distance, m, and index of the strut among the first `count` that is nearest to strut `i`.
+def nearest_strut(base, ends, apart, i):
+    """Return distance, m, and index of the strut before strut `i` that is nearest to it; ∞ and −1 for none.
 
-    Only struts that are `apart` from it count; ∞ and −1 when there is none.
+    Only struts that are `apart` from it count.
     """
     least, nearest = math.inf, -1
-    for j in range(count):
-        if j != i and apart[i, j] > 0.0:
+    for j in range(i):
+        if apart[i, j] > 0.0:
             distance = segment_distance(base[i], ends[i], base[j], ends[j])
-            if not distance >= least:
+            if distance < least or distance != distance:
                 least, nearest = distance, j
     return least, nearest
+
+
+@compiled
+def nearest_struts(base, ends, apart, distances, nearest):
+    """Write for each strut what :func:`nearest_strut` returns, of all struts; `distances` begin at ∞."""
+    for i in range(6):
+        for j in range(i):
+            if apart[i, j] > 0.0:
+                distance = segment_distance(base[i], ends[i], base[j], ends[j])
+                for one, other in ((i, j), (j, i)):
+                    if distance < distances[one] or distance != distance:
+                        distances[one], nearest[one] = distance, other
 
 
 @compiled
@@ -79,45 +195,78 @@ def _share(part, whole):
 
 
 @compiled
+def examine(base, platform, position, rotation, limits, found, n, stage):
+    """Write all quantities of one pose into `found` at `n` and `stage`, beside its lengths, which are there."""
+    for i in range(6):
+        at_base, at_platform = joint_cosines(base, platform, position, rotation, limits.cone_axes, i)
+        found.cosines[n, stage, 0, i], found.cosines[n, stage, 1, i] = at_base, at_platform
+        found.distances[n, stage, i], found.nearest[n, stage, i] = math.inf, -1.0
+    if limits.clearance > 0.0:
+        ends = strut_ends(base, platform, position, rotation)
+        nearest_struts(base, ends, limits.apart, found.distances[n, stage], found.nearest[n, stage])
+    condition, sign = condition_one(base, platform, position, rotation, limits.characteristic_length)
+    found.condition[n, stage], found.sign[n, stage] = condition, sign
+
+
+@compiled
 def check_joints(base, platform, position, rotation, limits):
     """Check joint cones and strut clearance; return (finding, strut, value, second strut or −1)."""
-    _, cone_axes, cone_cosines, apart, scalars = limits
     for i in range(6):
-        at_base, at_platform = joint_cosines(base, platform, position, rotation, cone_axes, i)
-        if not at_base >= cone_cosines[0, i]:
+        at_base, at_platform = joint_cosines(base, platform, position, rotation, limits.cone_axes, i)
+        if not at_base >= limits.cone_cosines[0, i]:
             return BASE_CONE, i, math.acos(max(-1.0, min(1.0, at_base))), -1
-        if not at_platform >= cone_cosines[1, i]:
+        if not at_platform >= limits.cone_cosines[1, i]:
             return PLATFORM_CONE, i, math.acos(max(-1.0, min(1.0, at_platform))), -1
-    if scalars[5] > 0.0:
+    if limits.clearance > 0.0:
         ends = strut_ends(base, platform, position, rotation)
         for i in range(6):
-            distance, other = nearest_strut(base, ends, apart, i, i)
-            if not distance >= scalars[5]:
+            distance, other = nearest_strut(base, ends, limits.apart, i)
+            if not distance >= limits.clearance:
                 return CLEARANCE, other, distance, i
     return WITHIN, -1, 0.0, -1
 
 
 @compiled
 def check_stage(base, platform, position, rotation, lengths, limits):
-    """Check lengths and pose of one stage; return (finding, strut, value, condition number).
-
-    `limits` is :attr:`~hexapod_comp.limits.LimitTable.arrays`.
-    """
-    stroke, scalars = limits[0], limits[4]
+    """Check lengths and pose of one stage; return (finding, strut, value, second strut or −1, condition number)."""
     for i in range(6):
         if not math.isfinite(lengths[i]):
-            return NOT_FINITE, i, lengths[i], math.nan
-        if lengths[i] < stroke[i, 0] or lengths[i] > stroke[i, 1]:
-            return STROKE, i, lengths[i], math.nan
-    finding, strut, value, _ = check_joints(base, platform, position, rotation, limits)
+            return NOT_FINITE, i, lengths[i], -1, math.nan
+        if lengths[i] < limits.stroke[i, 0]:
+            return STROKE_SHORT, i, lengths[i], -1, math.nan
+        if lengths[i] > limits.stroke[i, 1]:
+            return STROKE_LONG, i, lengths[i], -1, math.nan
+    finding, strut, value, other = check_joints(base, platform, position, rotation, limits)
     if finding != WITHIN:
-        return finding, strut, value, math.nan
-    condition, sign = condition_one(base, platform, position, rotation, scalars[3])
-    if not condition <= scalars[0]:
-        return CONDITION, -1, condition, condition
-    if sign != scalars[4]:
-        return ASSEMBLY, -1, sign, condition
-    return WITHIN, -1, 0.0, condition
+        return finding, strut, value, other, math.nan
+    condition, sign = condition_one(base, platform, position, rotation, limits.characteristic_length)
+    if not condition <= limits.condition:
+        return CONDITION, -1, condition, -1, condition
+    if sign != limits.home_sign:
+        return ASSEMBLY, -1, sign, -1, condition
+    return WITHIN, -1, 0.0, -1, condition
+
+
+@compiled
+def check_poses(base, platform, positions, rotations, limits, findings, struts):
+    """Write what limits each of N platform poses, and which struts; one rotation may serve all poses.
+
+    Parameters
+    ----------
+    base, platform : ndarray, shape (6, 3)
+        Joints, m.
+    positions, rotations : ndarray, shape (N, 3), (N or 1, 3, 3)
+        ``pose_platform_in_base``, m.
+    limits : LimitNumbers
+    findings : ndarray of int8, shape (N,)
+    struts : ndarray of int8, shape (N, 2)
+    """
+    lengths = np.empty(6)
+    for n in range(len(positions)):
+        rotation = rotations[min(n, len(rotations) - 1)]
+        strut_lengths_one(base, platform, positions[n], rotation, lengths)
+        finding, one, _, other, _ = check_stage(base, platform, positions[n], rotation, lengths, limits)
+        findings[n], struts[n, 0], struts[n, 1] = finding, one, other
 
 
 @compiled

@@ -14,7 +14,6 @@ from .errors import HexapodError, NotConvergedError
 from .geometry import HexapodGeometry
 from .kernels import OK
 from .kinematics import Structure, forward_error, strut_lengths_batch
-from .limits import LimitTable
 from .machine import RealMachine
 from .machine_kernels import command_one
 from .motion import FOLLOWED
@@ -85,9 +84,8 @@ class Passes:
 
     def refusals(self, geometry: HexapodGeometry) -> list[HexapodError | None]:
         """Return, for each pass, why the nominal machine may not take its pose, or None."""
-        table = LimitTable(geometry)
         lengths = nominal_commands(geometry, self)
-        return [table.refusal(*pose) for pose in zip(self.positions, self.rotations, lengths, strict=True)]
+        return [geometry.refusal(*pose) for pose in zip(self.positions, self.rotations, lengths, strict=True)]
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,7 @@
 """Every limit at its edge: a hair inside passes, a hair outside is refused and says what, where and how much.
 
+Limits are asked in two ways, by what stops at the first breach and by what measures everything: both say the same.
+
 The limited quantities come from NumPy alone (distances between joints, angles by arctan2, condition number
 by the inverse matrix); limits are set a relative 1e-9 above and below them.
 """
@@ -12,15 +14,22 @@ from itertools import combinations
 import numpy as np
 import pytest
 from helpers import segment_distance
+from hypothesis import given
 from scipy.spatial.transform import Rotation
-from strategies import paper_geometry
+from strategies import fixed, paper_geometry, random_model, random_pose, seeds, skewed_geometry
 
+from hexapod_comp import limit_kernels as codes
+from hexapod_comp.assembly import mode_objections
+from hexapod_comp.checking import check
 from hexapod_comp.compensation import Compensator
-from hexapod_comp.errors import LimitError
-from hexapod_comp.geometry import HexapodGeometry, Limits
+from hexapod_comp.errors import HexapodError, LimitError
+from hexapod_comp.geometry import HexapodGeometry
+from hexapod_comp.kinematics import Structure, strut_lengths
+from hexapod_comp.limits import REASONS, Limits
 from hexapod_comp.machine import MachineModel
 from hexapod_comp.pose import Pose
 from hexapod_comp.struts import StrutErrors
+from hexapod_comp.workspace.reach import Examiner
 
 PAPER = paper_geometry()
 HOME = PAPER.home
@@ -260,3 +269,160 @@ def test_nothing_is_refused_just_inside_all_limits_at_random_poses() -> None:
             condition=max(condition_by_inverse(pose), condition_by_inverse(HOME)) * (1.0 + HAIR),
         )
         accepted(replace(PAPER, limits=limits), pose)
+
+
+# --- both ways of asking -----------------------------------------------------------------------------------
+
+TOOL = Pose.from_angles([0.01, -0.02, 0.08], np.deg2rad([20.0, -10.0, 40.0]))
+WORK = Pose.from_angles([0.1, 0.05, 0.2], np.deg2rad([3.0, 5.0, -70.0]))
+OVER = np.diag([1.0, -1.0, -1.0])
+"""Turns a machine upside down."""
+
+
+def tight(geometry: HexapodGeometry, clearance: float, **frames: object) -> HexapodGeometry:
+    """Return a machine whose every limit some poses about home break, and no few keep."""
+    lengths = strut_lengths(Structure.of(geometry), geometry.home)
+    stroke = np.stack([lengths - 0.05, lengths + 0.05], axis=1)
+    limits = Limits(stroke, np.full(6, 0.11), np.full(6, 0.26), 3.2, 80e-6, 1.0, 1.0, clearance)
+    return replace(geometry, limits=limits, **frames)
+
+
+def hanging() -> HexapodGeometry:
+    home = Pose(OVER @ HOME.position, OVER @ HOME.rotation @ OVER)
+    return HexapodGeometry(
+        "hanging", PAPER.base_joints @ OVER, PAPER.platform_joints @ OVER, home, WIDE, work=WORK, tool=TOOL
+    )
+
+
+MACHINES = {
+    "paper": tight(PAPER, 0.0),
+    "paper with a clearance": tight(PAPER, 0.23),
+    "6-6 in turned frames": tight(skewed_geometry(), 0.01, tool=TOOL, work=WORK),
+    "hanging": tight(hanging(), 0.23),
+}
+
+
+def first_broken(limits: Limits, numbers: codes.LimitNumbers, found: codes.Quantities) -> set[tuple[str, int]]:
+    """Return, of all limits that the full examination finds broken, what a check in the documented order meets first.
+
+    Reason and strut; two struts for a clearance, which concerns both; nothing for a pose within the limits.
+    """
+    margins = {name: (margin[0, 0], value[0, 0]) for name, (margin, value) in limits.margins(found).items()}
+    broken = {name: ~(margin >= 0.0) for name, (margin, _) in margins.items()}
+    for i in np.flatnonzero(broken["stroke"]):
+        return {("stroke" if np.isfinite(margins["stroke"][1][i]) else "not_finite", int(i))}
+    for i in range(6):
+        for cone in ("base_cone", "platform_cone"):
+            if broken[cone][i]:
+                return {(cone, i)}
+    if "clearance" in broken and broken["clearance"].any():
+        return {("clearance", int(i)) for i in np.flatnonzero(broken["clearance"])}
+    if broken["condition"][0]:
+        return {("condition", -1)}
+    return {("assembly", -1)} if found.sign[0, 0] != numbers.home_sign else set()
+
+
+def hold_together(machine: HexapodGeometry, limits: Limits, pose: Pose, lengths: np.ndarray) -> str:
+    """Fail unless both ways of asking say the same of a pose of the nominal machine; return what they say."""
+    given = machine.limit_numbers
+    numbers = limits.numbers(given.cone_axes, given.apart, given.characteristic_length, given.home_sign)
+    at = *machine.kernel_joints, pose.position, pose.rotation
+    found = codes.Quantities.empty(1)
+    found.lengths[0, 0] = lengths
+    codes.examine(*at, numbers, found, 0, 0)
+    finding, strut, _, other, _ = codes.check_stage(*at, lengths, numbers)
+    expected = first_broken(limits, numbers, found)
+    if finding == codes.WITHIN:
+        assert expected == set()
+    else:
+        assert (REASONS[finding], strut) in expected
+        assert other < 0 or (REASONS[finding], other) in expected
+    return REASONS[finding]
+
+
+def at_the_edge(limits: Limits, lengths: np.ndarray, found: codes.Quantities) -> list[Limits]:
+    """Return limits at the very quantities of a pose, and some steps of floating point beside them."""
+    angles = np.arccos(np.clip(found.cosines[0, 0], -1.0, 1.0))
+    values: list[tuple[str, tuple, float]] = []
+    for i in range(6):
+        values += [("stroke", (i, side), lengths[i]) for side in range(2)]
+        values += [(f"{body}_cone", (i,), angles[side, i]) for side, body in enumerate(("base", "platform"))]
+    values += [("condition", (), found.condition[0, 0])]
+    values += [("clearance", (), least) for least in found.distances[0, 0] if limits.clearance and np.isfinite(least)]
+    every = []
+    for name, place, value in values:
+        for steps in (-1000, -30, -1, 0, 1, 30, 1000):  # a cosine near 1 resolves some 100 steps of its angle
+            changed = np.array(getattr(limits, name))
+            changed[place] = value + steps * np.spacing(value)
+            every.append(replace(limits, **{name: changed if place else float(changed)}))
+    return every
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_both_ways_of_asking_agree_to_the_last_bit(name: str) -> None:
+    """At random poses, and with every limit at the pose's own quantity: an angle rounds where its cosine does not."""
+    machine, rng = MACHINES[name], np.random.default_rng(13)
+    said = set()
+    for _ in range(150):
+        pose = random_pose(rng, machine.home, 0.06, 25.0)
+        said.add(hold_together(machine, machine.limits, pose, strut_lengths(Structure.of(machine), pose)))
+    assert said >= {"", "stroke", "base_cone", "platform_cone"}
+    wide = replace(WIDE, clearance=1e-6 if machine.limits.clearance else 0.0)
+    for _ in range(5):
+        pose = random_pose(rng, machine.home, 0.06, 25.0)
+        lengths, found = strut_lengths(Structure.of(machine), pose), codes.Quantities.empty(1)
+        given = machine.limit_numbers._replace(clearance=wide.clearance)
+        codes.examine(*machine.kernel_joints, pose.position, pose.rotation, given, found, 0, 0)
+        verdicts = [hold_together(machine, limits, pose, lengths) for limits in at_the_edge(wide, lengths, found)]
+        assert set(verdicts) >= {"", "stroke", "base_cone", "platform_cone", "condition"}
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 0.0])
+@pytest.mark.parametrize("name", MACHINES)
+def test_both_ways_of_asking_refuse_what_is_no_number(name: str, bad: float) -> None:
+    """Lengths, positions and rotations that are none; a platform joint in its base joint: a strut without direction."""
+    machine = MACHINES[name]
+    for strut in range(6):
+        lengths = strut_lengths(Structure.of(machine), machine.home)
+        lengths[strut] = bad
+        assert hold_together(machine, machine.limits, machine.home, lengths) in ("not_finite", "stroke")
+    lengths = strut_lengths(Structure.of(machine), machine.home)
+    if not np.isfinite(bad):
+        for part in ("position", "rotation"):
+            pose = Pose(machine.home.position.copy(), machine.home.rotation.copy())
+            getattr(pose, part).flags.writeable = True
+            getattr(pose, part)[...] = bad
+            assert hold_together(machine, machine.limits, pose, lengths) != ""
+    joints = machine.home.rotation @ machine.platform_joints[2]
+    assert hold_together(machine, machine.limits, Pose(machine.base_joints[2] - joints, machine.home.rotation), lengths)
+
+
+def compensators_refusal(machine: HexapodGeometry, model: MachineModel, tool: Pose) -> tuple[str, int | None] | None:
+    """Return reason and strut with which a fresh compensator refuses a tool pose, None where it does not."""
+    try:
+        Compensator(machine, model).correct(tool)
+    except HexapodError as error:
+        return error.reason, getattr(error, "strut", None)
+    return None
+
+
+@pytest.mark.parametrize("name", MACHINES)
+@fixed
+@given(seed=seeds)
+def test_check_reach_cold_start_and_compensator_agree(name: str, seed: int) -> None:
+    """A model with all errors, random tool poses: who refuses, refuses for a reason that the others know."""
+    machine, rng = MACHINES[name], np.random.default_rng(seed)
+    structure, model = Structure.of(machine), random_model(rng, machine.name)
+    poses = [random_pose(rng, machine.home, 0.04, 12.0) for _ in range(4)]
+    told = [machine.tool_pose(pose) for pose in poses]
+    positions, rotations = np.array([p.position for p in told]), np.array([p.rotation for p in told])
+    result = check(machine, model, positions, rotations, "poses")
+    reach, _ = Examiner(machine).findings(positions, rotations)
+    for row, (pose, tool) in enumerate(zip(poses, told, strict=True)):
+        breaches = {(b.limit, getattr(b.error, "strut", None)) for b in result.breaches if b.row == row}
+        assert compensators_refusal(machine, model, tool) in (breaches or {None})
+        # Tool poses round on their way through the frames; the poses are random, none is at an edge.
+        nominal = machine.refusal(pose.position, pose.rotation, strut_lengths(structure, pose))
+        assert REASONS[reach[row]] == ("" if nominal is None else nominal.reason)
+        if nominal is None or nominal.reason != "stroke":
+            assert bool(mode_objections(machine, structure, pose)) == (nominal is not None)

@@ -15,7 +15,6 @@ from hexapod_comp import limit_kernels as codes
 from hexapod_comp.errors import GeometryError, PoseError
 from hexapod_comp.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.pose import Pose
-from hexapod_comp.workspace import reach_kernels
 from hexapod_comp.workspace.reach import (
     FINDINGS,
     Boundary,
@@ -84,8 +83,8 @@ def quantities(geometry: HexapodGeometry, tip: np.ndarray, rotation: np.ndarray)
         if np.linalg.norm(geometry.platform_joints[i] - geometry.platform_joints[j]) > 1e-6
     ]
     return {
-        reach_kernels.STROKE_SHORT: lengths - limits.stroke[:, 0],
-        reach_kernels.STROKE_LONG: limits.stroke[:, 1] - lengths,
+        codes.STROKE_SHORT: lengths - limits.stroke[:, 0],
+        codes.STROKE_LONG: limits.stroke[:, 1] - lengths,
         codes.BASE_CONE: limits.base_cone - at_base,
         codes.PLATFORM_CONE: limits.platform_cone - at_platform,
         codes.CLEARANCE: np.array(apart) - limits.clearance,
@@ -105,7 +104,7 @@ def test_how_low_and_how_high_the_unit_goes():
     end = np.array([[0.0, 0.0, 0.10], [0.0, 0.0, 0.30]])
     points, findings, _ = Examiner(unit()).boundary(start, end, LEVEL)
     np.testing.assert_allclose(points[:, 2], [low, high], atol=1e-6)
-    assert findings.tolist() == [reach_kernels.STROKE_SHORT, reach_kernels.STROKE_LONG]
+    assert findings.tolist() == [codes.STROKE_SHORT, codes.STROKE_LONG]
 
 
 @pytest.mark.parametrize(
@@ -246,7 +245,7 @@ class Ball(Examiner):
 
     def findings(self, positions, rotations, threads=None):
         far = np.linalg.norm(positions[:, None] - self.centres, axis=2).min(axis=1) > 0.08
-        return np.where(far, reach_kernels.STROKE_LONG, 0).astype(np.int8), np.full((len(far), 2), -1, np.int8)
+        return np.where(far, codes.STROKE_LONG, 0).astype(np.int8), np.full((len(far), 2), -1, np.int8)
 
 
 def ball_reach(*centres: tuple[float, float, float]) -> Reach:
@@ -264,7 +263,7 @@ def test_volume_and_box_of_a_ball():
     assert found.parts == 1
     regions = found.regions()
     assert set(regions) == {"top", "bottom", *(f"side {k}…{k + 60}°" for k in range(0, 360, 60))}
-    assert all(shares == {FINDINGS[reach_kernels.STROKE_LONG]: 1.0} for shares in regions.values())
+    assert all(shares == {FINDINGS[codes.STROKE_LONG]: 1.0} for shares in regions.values())
 
 
 def test_a_reach_in_two_parts():

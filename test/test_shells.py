@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from test_reach import LEVEL, UNIT_FILE, tilted, unit
 
+from hexapod_comp import limit_kernels as codes
 from hexapod_comp.errors import GeometryError
 from hexapod_comp.geometry import load_geometry
-from hexapod_comp.workspace import reach_kernels as codes
 from hexapod_comp.workspace.reach import Examiner, Reach, reach
 from hexapod_comp.workspace.shells import Shell, axis_range, mesh_volume, section, shell
 

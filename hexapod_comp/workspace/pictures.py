@@ -28,7 +28,7 @@ from .reach import FINDINGS
 COLOURS = "viridis"
 """Colour map of effects: even steps for the eye, also in grey and to the colour-blind."""
 
-CAUSE_COLOURS = ("#ffffff", "#20639b", "#c1432e", "#e3a72f", "#3c8d5a", "#7b4ea3", "#444444", "#d77fb3")
+CAUSE_COLOURS = ("#ffffff", "#20639b", "#c1432e", "#e3a72f", "#3c8d5a", "#7b4ea3", "#444444", "#d77fb3", "#000000")
 """Of the findings, in their order."""
 
 VIEW_AZIMUTH, VIEW_ELEVATION = -60.0, 20.0

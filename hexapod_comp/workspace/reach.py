@@ -18,10 +18,8 @@ from scipy import ndimage
 from ..errors import GeometryError
 from ..geometry import HexapodGeometry
 from ..kinematics import over_chunks
-from ..limit_kernels import WITHIN
-from ..limits import LimitTable
+from ..limit_kernels import STROKE_LONG, WITHIN, check_poses
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
-from . import reach_kernels as kernels
 
 FINDINGS = (
     "within",
@@ -32,8 +30,9 @@ FINDINGS = (
     "strut clearance",
     "condition number",
     "assembly mode",
+    "not a finite number",
 )
-"""What limits a pose, in words; the index is the code in :mod:`.reach_kernels` and :mod:`..limit_kernels`."""
+"""What limits a pose, in words; the index is the code in :mod:`..limit_kernels`."""
 
 SEARCH_CELLS = (24, 48, 96)
 """Cells along the longest edge with which the reach is looked for, one after the other until it is found."""
@@ -56,7 +55,6 @@ class Examiner:
 
     def __init__(self, geometry: HexapodGeometry) -> None:
         self.geometry = geometry
-        self._arrays = LimitTable(geometry).arrays
 
     def findings(
         self, positions: np.ndarray, rotations: np.ndarray, threads: int | None = None
@@ -85,8 +83,8 @@ class Examiner:
             turned = rotations if len(rotations) == 1 else rotations[rows]
             platform = self.geometry.platform_poses(positions[rows], turned)
             poses = [np.ascontiguousarray(part) for part in platform]
-            arrays = (self._arrays, findings[rows], struts[rows])
-            kernels.examine_poses(*self.geometry.kernel_joints, *poses, *arrays)
+            results = findings[rows], struts[rows]
+            check_poses(*self.geometry.kernel_joints, *poses, self.geometry.limit_numbers, *results)
 
         over_chunks(run, len(positions), threads)
         return findings, struts
@@ -324,7 +322,7 @@ def possible_box(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
     centres, longest = -struts @ geometry.work.rotation, geometry.limits.stroke[:, 1:]
     box = np.array([(centres - longest).max(axis=0), (centres + longest).min(axis=0)])
     if not (box[0] < box[1]).all():
-        raise _empty(rotation, f"{FINDINGS[kernels.STROKE_LONG]}: no point is near enough to all base joints")
+        raise _empty(rotation, f"{FINDINGS[STROKE_LONG]}: no point is near enough to all base joints")
     return box
 
 
