@@ -215,20 +215,10 @@ class Bench:
         return future.result()
 
     def _client(self, kind: type, name: str) -> Any:
-        """Return a client whose service is there.
-
-        Within one process Fast DDS now and then never matches a client with its service; a new one does.
-        """
-        for attempt in range(3):
-            if name not in self._clients:
-                self._clients[name] = self.witness.create_client(kind, name)
-            try:
-                self.until(self._clients[name].service_is_ready, f"service {name}", 10.0 if attempt == 2 else 2.0)
-                break
-            except TimeoutError:
-                if attempt == 2:
-                    raise
-                self.witness.destroy_client(self._clients.pop(name))
+        """Return a client whose service is there."""
+        if name not in self._clients:
+            self._clients[name] = self.witness.create_client(kind, name)
+        self.until(self._clients[name].service_is_ready, f"service {name}")
         return self._clients[name]
 
     def change(self, transition: str, node: str = "compensator") -> bool:

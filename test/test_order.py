@@ -7,6 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from node_helpers import CONFIG, HOME, Bench, closed_form_lengths, near
+from rclpy.duration import Duration
+from rclpy.time import Time
 from sensor_msgs.msg import JointState
 
 from hexapod_comp.errors import CommandError, LimitError
@@ -77,9 +79,12 @@ def test_nan_and_huge_steps_are_refused():
             guard.check(np.where(np.arange(6) == 2, value, lengths), 1.004)
 
 
-def strut_message(bench: Bench, lengths: np.ndarray, seconds_from_now: float = 0.0) -> JointState:
+def strut_message(bench: Bench, lengths: np.ndarray, before: JointState | None = None) -> JointState:
+    """Return a message stamped now, or 50 ms before another: however long that took, it has been overtaken."""
     message = JointState(name=list(STRUT_NAMES), position=lengths.tolist(), velocity=[0.0] * 6)
-    message.header.stamp = bench.stamp(seconds_from_now)
+    message.header.stamp = bench.now()
+    if before is not None:
+        message.header.stamp = (Time.from_msg(before.header.stamp) - Duration(seconds=0.05)).to_msg()
     return message
 
 
@@ -87,9 +92,9 @@ def test_the_drive_refuses_overtaken_commands_and_steps(bench):
     """Its parameter rate is low, so that nothing else happens; what it obeys last stays in force."""
     bench.drive(rate=50.0)
     good = closed_form_lengths(HOME)
-    bench.publish("strut_commands", strut_message(bench, good))
-    bench.barrier()
-    bench.publish("strut_commands", strut_message(bench, good + 1e-4, -0.05))
+    first = strut_message(bench, good)
+    bench.publish("strut_commands", first)  # both wait in the node's queue, so it reads them without a pause
+    bench.publish("strut_commands", strut_message(bench, good + 1e-4, first))
     bench.until_status(ERROR, "refusing commands: stamp_order", "strut_drive")
     bench.publish("strut_commands", strut_message(bench, np.where(np.arange(6) == 1, 1e30, good)))
     bench.until_status(ERROR, "refusing commands: step", "strut_drive")
@@ -100,9 +105,9 @@ def test_the_drive_refuses_overtaken_commands_and_steps(bench):
 def test_the_compensator_does_not_use_overtaken_readings(bench):
     bench.compensator()
     lengths = closed_form_lengths(HOME)
-    bench.feed(lengths)
+    first = bench.feed(lengths)
     bench.barrier()
-    bench.publish("strut_states", strut_message(bench, closed_form_lengths(near(HOME, (1e-3, 0.0, 0.0))), -0.05))
+    bench.publish("strut_states", strut_message(bench, closed_form_lengths(near(HOME, (1e-3, 0.0, 0.0))), first))
     bench.until_status(ERROR, "bad feedback: stamp_order")
     assert len(bench.seen["tool_pose_estimate"]) == 1
 

@@ -159,7 +159,7 @@ def test_commands_end(bench):
     _, _ = loop(bench)
     last = bench.settle(HOME)
     bench.until_status(WARN, "no new command")
-    assert float(bench.until_status(WARN, "no new command", DRIVE)["command_age_s"]) > 0.1
+    assert float(bench.until_status(WARN, "no new command", DRIVE)["command_age_s"]) >= 0.1  # said in ms
     assert bench.seen["strut_commands"][-1].header.stamp == last.command.header.stamp
     np.testing.assert_allclose(measured(bench), last.lengths, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(bench.ask(HOME).lengths, last.lengths, rtol=0.0, atol=ROUNDING)
@@ -229,10 +229,10 @@ def test_clock_is_set(bench, hours):
 
 def test_clock_of_the_sender_is_set(bench):
     """0.3 s back: out of order until half a second has passed without an accepted command, or it has caught up."""
-    bench.compensator(command_timeout=0.0)
-    bench.ask(HOME)
+    bench.compensator(command_timeout=0.0, max_command_age=0.0)
     late = pose_message(HOME, "base")
     late.header.stamp = bench.stamp(-0.3)
+    bench.ask(HOME)
     bench.send(late)
     bench.until_status(ERROR, "refusing commands: stamp_order")
 
@@ -242,7 +242,7 @@ def test_clock_of_the_sender_is_set(bench):
         bench.barrier()
         return len(bench.seen["strut_commands"]) == 2
 
-    bench.until(accepted, "the order to be forgotten", 1.0)
+    bench.until(accepted, "the order to be forgotten")
 
 
 def test_simulated_time_starts_again(bench):

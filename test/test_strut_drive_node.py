@@ -112,9 +112,11 @@ def test_speed_limit_is_kept(bench):
     Not all: the drives run in ticks of 0.125 ms, and a reading after a short interval may hold one more.
     """
     bench.drive(max_speed=0.02, **EXACT)
-    bench.until(lambda: bench.seen["strut_states"], "readings")
     lengths = closed_form_lengths(near(HOME, (0.0, 0.0, 0.005)))
-    began = time.monotonic()
+    bench.until(lambda: bench.seen["strut_states"], "readings")
+    began, asked = time.monotonic(), time.time()
+    # The drive obeys a command from its last reading on, which under load may be long before the command.
+    bench.until(lambda: stamped(bench.seen["strut_states"][-1]) > asked, "a reading")
     command(bench, lengths)
     until_at(bench, lengths, 1e-6)
     assert time.monotonic() - began >= (lengths - closed_form_lengths(HOME)).max() / 0.02
@@ -356,6 +358,20 @@ def test_lifecycle_goes_round(bench):
         assert bench.change("deactivate", NODE)
         assert bench.change("cleanup", NODE)
     assert bench.state(NODE) == "unconfigured"
+
+
+def test_destroyed_node_offers_no_lifecycle_services(bench):
+    """Not even while somebody still refers to it: nobody would answer, and clients would find two of each."""
+    node = bench.drive(start=False, **EXACT)
+
+    def offered() -> bool:
+        return (f"/{NODE}/change_state", ["lifecycle_msgs/srv/ChangeState"]) in services()
+
+    services = bench.witness.get_service_names_and_types
+    bench.until(offered, "a service to change its state")
+    bench.executor.remove_node(node)
+    node.destroy_node()
+    bench.until(lambda: not offered(), "the service to be gone")
 
 
 def test_bad_truth_file_fails_and_names_file_and_key(bench, tmp_path):

@@ -231,6 +231,15 @@ class MachineNode(LifecycleNode):
     def say_goodbye(self) -> None:
         """Publish what must still be said before the node ends."""
 
+    def destroy_node(self) -> None:
+        """Leave ROS at once, lifecycle services included.
+
+        rclpy leaves those to the garbage collector: a node that somebody still refers to would go on to offer
+        services that nobody answers.
+        """
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
+
 
 def numbered(callback: Callable[[Any, int | None], None]) -> Callable[..., None]:
     """Return a callback for rclpy that hands on a message and its publisher's sequence number.
