@@ -324,7 +324,9 @@ class Linuxcnc:
 
     def compensator(self, model: str, **parameters: object) -> Process:
         """Start a compensator with a model file and wait until it is ready."""
-        words = [f"{name}:={value}" for name, value in {"model_file": model, **parameters}.items()]
+        # Started in the middle of a motion, the bridge does not tell it of struts that move: see doc/linuxcnc.md.
+        given = {"model_file": model, "start_without_feedback_after": 0.5, **parameters}
+        words = [f"{name}:={value}" for name, value in given.items()]
         options = [word for text in words for word in ("-p", text)]
         command = [sys.executable, "-m", "hexapod_comp.nodes.compensator", "--ros-args", *options]
         process = self.start_process(command, f"compensator_{self._started}.log")

@@ -74,6 +74,9 @@ TRANSITIONS = {
 LOG_LINE = re.compile(r"\[\w+\] \[[\d.]+\] \[[\w.]+\]: (.*)")
 """How ROS logs: [WARN] [time] [node]: text."""
 
+AT_ONCE = 1e-6
+"""A wait that is over, s."""
+
 HOME = Pose([0.0, 0.0, 0.4], np.eye(3))
 """Home of the paper's machine."""
 
@@ -156,9 +159,12 @@ class Bench:
     # ---- nodes ----
 
     def compensator(self, start: bool = True, **parameters: object) -> CompensatorNode:
-        """Add a compensator; `start` configures and activates it and waits until it is connected."""
+        """Add a compensator; `start` configures and activates it and waits until it is connected.
+
+        Its machine has no feedback unless a test gives some, and need not wait for it unless a test says so.
+        """
         self.hush("strut_commands")
-        return self.add(CompensatorNode, start, parameters)
+        return self.add(CompensatorNode, start, {"start_without_feedback_after": AT_ONCE, **parameters})
 
     def drive(self, start: bool = True, **parameters: object) -> StrutDriveNode:
         """Add a strut drive, which the witness commands unless there is a compensator to do it."""

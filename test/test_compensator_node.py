@@ -551,11 +551,6 @@ def test_first_command_after_every_activation_starts_from_the_measured_struts(be
     bench.ask(elsewhere)
 
 
-def test_without_feedback_the_first_command_may_be_anywhere(bench):
-    bench.compensator()
-    bench.ask(near(HOME, (0.05, 0.05, 0.05), 10.0))
-
-
 # ---- changes ramp ----
 
 

@@ -32,7 +32,7 @@ from fuzzing import COUNTS, cases
 from geometry_msgs.msg import PoseStamped
 from hypothesis import example, given
 from hypothesis import strategies as st
-from node_helpers import HOME, Bench, closed_form_lengths
+from node_helpers import AT_ONCE, HOME, Bench, closed_form_lengths
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import Trigger
@@ -72,6 +72,7 @@ class CompensatorRig(Rig):
     def __init__(self, context: Any, model: str) -> None:
         # Struts that are not where they were told stop the machine (tested elsewhere): here they may be anywhere.
         options = {"following_error_limit": 0.0, "marker_rate": 0.0, "publish_array": True, "model_file": model}
+        options["start_without_feedback_after"] = AT_ONCE
         super().__init__(context, CompensatorNode, options)
         self.last: np.ndarray | None = None
 

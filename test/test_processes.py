@@ -7,15 +7,16 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from node_helpers import HOME, closed_form_lengths, near
+from sensor_msgs.msg import JointState
 
-from hexapod_comp.nodes.client import LoopClient, Sent
+from hexapod_comp.nodes.client import LISTENER_QOS, LoopClient, Sent
 from hexapod_comp.nodes.middleware import PROFILE_VARIABLES, avoid_shared_memory
 from hexapod_comp.nodes.processes import NodeProcess
 from hexapod_comp.nodes.session import connect
@@ -147,6 +148,45 @@ def test_compensator_survives_the_end_of_the_drive(client, pair):
         again.send(signal.SIGKILL)
         assert_ends_well(compensator, signal.SIGINT)  # without waiting for the dead to acknowledge
     finally:
+        again.stop()
+
+
+def test_a_compensator_restarted_under_a_stream_waits_for_the_struts(client, pair):
+    """kill -9, and the controller streams on by 120 mm: the successor never commands more than a step from the struts.
+
+    It hears the controller before it hears the drive: by itself now and then, here always, since the drive is stopped
+    until its first answer or refusal. The step allowed is 2 mm.
+    """
+    compensator, drive = pair
+    published: list[np.ndarray] = []
+    client.node.create_subscription(
+        JointState, "strut_commands", lambda message: published.append(np.array(message.position)), LISTENER_QOS
+    )
+    heights = iter(np.clip(np.arange(0.0, 60.0, 4e-4), 0.0, 0.12))  # 100 mm/s at 250 Hz; then it stays up there
+
+    def stream(until: Callable[[], object]) -> None:
+        end = time.monotonic() + 60.0
+        while not until():
+            assert time.monotonic() < end, client.diagnostics
+            rest = client.send(near(HOME, (0.0, 0.0, next(heights)))).sent_at + 0.004
+            client.spin_until(lambda rest=rest: time.monotonic() >= rest, 1.0, "the next command to be due")
+
+    stream(lambda: len(published) > 50)
+    compensator.send(signal.SIGKILL)
+    drive.send(signal.SIGSTOP)
+    before, last = len(published), published[-1]
+    client.diagnostics = {}
+    again = NodeProcess("compensator", {"ramp_rate": 1.0})
+    try:
+        stream(lambda: "refused.no_feedback" in client.diagnostics or len(published) > before)
+        drive.send(signal.SIGCONT)
+        stream(lambda: "refused.step" in client.diagnostics or len(published) > before)
+        steps = np.abs(np.diff(published, axis=0)).max(axis=1)
+        assert steps.max() <= 2e-3 + 1e-9, f"it stepped by {steps.max() * 1e3:.1f} mm"
+        client.spin_until(client.settled(), 5.0, "the tool to rest")
+        assert np.abs(ask(client, client.estimate).command - last).max() <= 2e-3 + 1e-9
+    finally:
+        drive.send(signal.SIGCONT)
         again.stop()
 
 

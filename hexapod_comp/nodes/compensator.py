@@ -81,7 +81,7 @@ class CompensatorNode(MachineNode):
         self._stamps = StampCheck(self._options["max_command_age"], clock)
         self._status = status = CompensatorStatus(self._options, self._stamps)
         self._commands, self._feedback, self._following = status.commands, status.feedback, status.following
-        self._struts, self._measured = StrutReader(), np.full(6, np.nan)
+        self._last_known, self._struts = status.last_known, StrutReader()
         self._order = InOrder("strut_states")
         self._answered = 0
         self._fresh_start = self._looks_closer = True
@@ -142,6 +142,7 @@ class CompensatorNode(MachineNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start to take commands; of those that came before none is replayed."""
         self._forget()
+        self._last_known.begin(time.monotonic())
         self._active = True
         self.get_logger().info("ready")
         return super().on_activate(state)
@@ -151,6 +152,7 @@ class CompensatorNode(MachineNode):
         self._active = False
         self._reload.close()
         self._journal.close(time.monotonic())
+        self._forget()
         self._close_topics()
         self._compensator = None
         return super().on_cleanup(state)
@@ -289,7 +291,7 @@ class CompensatorNode(MachineNode):
             since = f"for {seconds(self._feedback.age(now))} s" if self._feedback.count else "yet"
             raise CommandError("no_feedback", f"no strut_states {since}")
         if self._fresh_start:
-            self.compensator.reset(self._measured if fed else None)
+            self.compensator.reset(self._last_known.struts(now, fed))
 
     def _look_closer(self) -> None:
         """Find out whether the next commands must be examined."""
@@ -318,17 +320,17 @@ class CompensatorNode(MachineNode):
                 self._status.bad_feedback.add(error.reason, str(error), now)
                 self.warn_of("feedback " + error.reason, f"strut_states ignored: {error}")
             return
-        self._measured[:] = struts
+        self._last_known.measure(struts, now)
         self._order.passed(stamp, now)
         self._feedback.tick(now)
         if self._active:
-            self._watch_following(now)
+            self._watch_following(struts, now)
             self._publish_estimate(pose, message.header.stamp)
 
-    def _watch_following(self, now: float) -> None:
+    def _watch_following(self, measured: np.ndarray, now: float) -> None:
         """Hold the measured struts against their commands; even one reading that is off is said."""
         known = self._following.problem
-        self._following.check(self._measured, now)
+        self._following.check(measured, now)
         if self._following.problem and not known:
             self._looks_closer = True
             self._status.bad_feedback.add(self._following.reason, self._following.problem, now)
@@ -365,7 +367,7 @@ class CompensatorNode(MachineNode):
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._forget()
         response.success = True
-        response.message = "the next command may be one allowed step from the measured struts"
+        response.message = "the next command may be one allowed step from where the struts were known to be last"
         return response
 
     # ---- messages out ----
@@ -410,6 +412,9 @@ class CompensatorNode(MachineNode):
     # ---- state ----
 
     def _forget(self) -> None:
+        """Forget the last command, but not where it has sent the struts."""
+        if not self._fresh_start:
+            self._last_known.tell(self.compensator.command, self._commands.last)
         self.compensator.reset()
         self._unestimated = None
         self._fresh_start = self._looks_closer = True

@@ -17,6 +17,13 @@ PARAMETERS = (
     Parameter("feedback_timeout", 0.1, "without measured struts for this long there is no feedback, s", 1e-3, 3600.0),
     Parameter("require_feedback", False, "refuse commands while there is no feedback"),
     Parameter(
+        "start_without_feedback_after",
+        0.0,
+        "without measured struts for this long after the start the first command may be anywhere, s; 0 = never",
+        0.0,
+        3600.0,
+    ),
+    Parameter(
         "following_error_limit",
         2e-3,
         "measured struts further than this from their commands stop the machine, m; 0 = off",

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..compensation import Compensator
 from .command_source import CommandSource, OwnTopic
-from .following import Following
+from .following import Following, LastKnown
 from .health import ERROR, OK, WARN, Flow, Refusals, joined, seconds
 from .log_space import LogSpace
 from .stamps import StampCheck
@@ -47,6 +47,8 @@ class CompensatorStatus:
         Who else publishes strut commands.
     following : Following
         Whether the struts go where they are told.
+    last_known : LastKnown
+        Where a start begins.
     log_space : LogSpace
         Whether the log can be written.
     """
@@ -56,6 +58,7 @@ class CompensatorStatus:
         self.commands, self.feedback = Flow(), Flow()
         self.refusals, self.bad_feedback, self.failed_reloads = Refusals(), Refusals(), Refusals()
         self.following = Following(options["following_error_limit"])
+        self.last_known = LastKnown(options["start_without_feedback_after"])
         self.log_space = LogSpace()
 
     def watch_topics(self, source: CommandSource, own_topic: OwnTopic) -> None:
@@ -89,6 +92,8 @@ class CompensatorStatus:
         yield from self._lost(now)
         if self.log_space.problem:
             yield WARN, self.log_space.problem
+        if self.last_known.waits(now):
+            yield WARN, "waiting for strut_states: where the struts stand is not known"
         if not self.commands.count:
             yield OK, "waiting for the first command"
         if compensator.condition > NEAR_SINGULAR * compensator.geometry.limits.condition:

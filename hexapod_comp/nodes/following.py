@@ -1,13 +1,14 @@
-"""Measured struts: whether a machine can stand so, and whether the struts go where they are told."""
+"""Measured struts: whether a machine can stand so, whether they go where they are told, where a start begins."""
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
 
 from ..compiling import compiled
-from ..errors import LimitError
+from ..errors import CommandError, LimitError
 from ..geometry import STRUT_NAMES, HexapodGeometry
 
 KEPT = 512
@@ -110,6 +111,70 @@ class Following:
                 break
         commands = np.frombuffer(b"".join(recent)).reshape((-1, 6))
         return commands.min(axis=0), commands.max(axis=0)
+
+
+class LastKnown:
+    """Where the struts stand, as far as is known: as measured last, or else as told last. A start goes on from there.
+
+    A controller streams on while a compensator restarts, and DDS may let it be heard before the drive is. So "no
+    reading yet" does not mean that the struts may be sent anywhere: a start waits for one.
+
+    Parameters
+    ----------
+    anywhere_after : float
+        For a machine without feedback: when nothing has become known so long after the start, the first command
+        may be anywhere, s; 0 = never.
+    """
+
+    def __init__(self, anywhere_after: float) -> None:
+        self._anywhere_after, self._began = anywhere_after, math.inf
+        self._measured, self._told = np.empty(6), np.empty(6)
+        self._measured_at = self._told_at = -math.inf
+
+    def begin(self, now: float) -> None:
+        """Start, at the monotonic time `now`, s."""
+        self._began = now
+
+    def measure(self, struts: np.ndarray, now: float) -> None:
+        """Take a good reading, shape (6,), m, that came at the monotonic time `now`, s."""
+        self._measured[:], self._measured_at = struts, now
+
+    def tell(self, command: np.ndarray, at: float) -> None:
+        """Take the last command before all of them are forgotten, shape (6,), m, published at a monotonic time, s."""
+        self._told[:], self._told_at = command, at
+
+    def waits(self, now: float) -> bool:
+        """Return whether a start must wait until something is known."""
+        unknown = self._measured_at == self._told_at == -math.inf
+        return unknown and not 0.0 < self._anywhere_after <= now - self._began
+
+    def struts(self, now: float, fresh: bool) -> np.ndarray | None:
+        """Return where the struts stand, shape (6,), m; None when nobody knows and the start may be anywhere.
+
+        Parameters
+        ----------
+        now : float
+            Monotonic time, s.
+        fresh : bool
+            Readings are coming: the last one counts, lag and all. Otherwise it counts only when it came so long
+            after the last command that the struts had got there.
+
+        Raises
+        ------
+        CommandError
+            ``no_feedback``: nothing is known.
+        """
+        if self.waits(now):
+            raise CommandError("no_feedback", f"no strut_states yet: where the struts stand is not known{self._hint()}")
+        after = self._told_at + (-FOLLOWED_WITHIN if fresh else FOLLOWED_WITHIN)
+        if self._measured_at > -math.inf and self._measured_at >= after:
+            return self._measured
+        return self._told if self._told_at > -math.inf else None
+
+    def _hint(self) -> str:
+        if self._anywhere_after:
+            return f"; from {self._anywhere_after:g} s after the start on the first command may be anywhere"
+        return "; a machine without feedback needs start_without_feedback_after"
 
 
 @compiled
