@@ -1,4 +1,4 @@
-"""The controller of the campaign: a machine tool's, with feed hold."""
+"""The controller of the campaign: a machine tool's, with feed hold, which a fault may take from it."""
 
 from __future__ import annotations
 
@@ -36,6 +36,8 @@ class Mode(Enum):
 class Controller:
     """Sends pose after pose, each after the answer to the one before; without an answer it waits and repeats.
 
+    While it is `heedless`, it goes on along its path whatever is answered, as a controller without feed hold does.
+
     When the compensator no longer takes commands because the machine is not where it was told to be, or after
     the drive was restarted, it resets the compensator and moves from the measured pose back to its path.
 
@@ -60,7 +62,7 @@ class Controller:
         self._index = 0
         self._way: Path | None = None
         self._way_index = 0
-        self.mode = Mode.MILL
+        self.mode, self.heedless = Mode.MILL, False
         self._awaited = self._sent_at = self._answered_at = 0.0
         self._must_return = False
 
@@ -83,7 +85,9 @@ class Controller:
         """Do what is due at the monotonic time `now`, s; `stuck`: the machine is not where it was told to be."""
         if self.mode is Mode.ASK:
             return
-        if self._must_return or (stuck and now - self._answered_at > STUCK_AFTER):
+        if self.heedless:
+            self._go_on(now)
+        elif self._must_return or (stuck and now - self._answered_at > STUCK_AFTER):
             self._ask()
         elif now >= self.due():
             self._awaited, self._sent_at = self._send(self._next_pose()), now
@@ -93,6 +97,12 @@ class Controller:
         if self.mode is Mode.ASK:
             return float("inf")
         return self._sent_at + (REPEAT_AFTER if self._awaited else 1.0 / RATE)
+
+    def _go_on(self, now: float) -> None:
+        if now >= self.due():
+            self.mode, self._way, self._index = Mode.MILL, None, self._index + 1
+            self._awaited, self._sent_at = 0, now
+            self._send(self.target)
 
     def _next_pose(self) -> Pose:
         return self.target if self._way is None else self._way.pose(self._way_index)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -20,6 +21,9 @@ STOPPED_FOR = 2.0
 
 RESTARTED_AFTER = 0.2
 """A supervisor starts a dead process again after this long, s."""
+
+UNHEARD_FOR = 0.2
+"""After a start or a reset under a stream the drive is not heard for this long, s."""
 
 OLDEST_COMMAND = 0.5
 """Commands older than this are refused, s: the compensator's default max_command_age."""
@@ -88,6 +92,58 @@ class Kill(Fault):
             return False
         if self.name == "drive":
             rig.controller.start_over()
+        return True
+
+
+class Restart(Kill):
+    """`kill -9` of the compensator, while the controller streams on; the drive is heard 0.2 s after it is ready."""
+
+    name = "compensator"
+
+    def begin(self, rig: Rig, happened: Happened) -> None:
+        """Kill it."""
+        super().begin(rig, happened)
+        rig.controller.heedless = True
+        rig.wires["feedback"].rule = wire.Drop(self.rng, 1.0)
+        self._heard_at = math.inf
+
+    def over(self, rig: Rig) -> bool:
+        """Return whether the stream has gone on for a while with and without the drive; it then is held again."""
+        now = time.monotonic()
+        if rig.is_starting(self.name):
+            return False
+        if self._heard_at == math.inf:
+            self._heard_at = now + UNHEARD_FOR
+        if now >= self._heard_at:
+            rig.wires["feedback"].mend(now)
+        rig.controller.heedless = now < self._heard_at + UNHEARD_FOR
+        return not rig.controller.heedless
+
+
+class Reset(Fault):
+    """`~/reset` while the controller streams on, after 0.4 s in which neither it nor the drive was heard."""
+
+    shortest = longest = 0.4
+
+    def begin(self, rig: Rig, happened: Happened) -> None:
+        """Cut both off."""
+        rig.controller.heedless = True
+        for link in ("pose", "feedback"):
+            rig.wires[link].rule = wire.Drop(self.rng, 1.0)
+
+    def end(self, rig: Rig, happened: Happened) -> None:
+        """Reset, and let the controller be heard again."""
+        rig.reset()
+        rig.wires["pose"].mend(time.monotonic())
+        self._heard_at = time.monotonic() + UNHEARD_FOR
+
+    def over(self, rig: Rig) -> bool:
+        """Return whether the stream has gone on for a while; then the drive is heard again."""
+        now = time.monotonic()
+        if now < self._heard_at:
+            return False
+        rig.wires["feedback"].mend(now)
+        rig.controller.heedless = False
         return True
 
 
@@ -333,6 +389,8 @@ KINDS: dict[str, type[Fault]] = {
         *_process_kinds("compensator", "command", {"compensator", "command"}),
         *_process_kinds("drive", "feedback", {"drive", "feedback"}),
         *(kind for link in LINKS for kind in _wired_kinds(link)),
+        _make(Restart, "restart_under_stream", {"compensator", *LINKS}, SILENT["command"]),
+        _make(Reset, "reset_under_stream", {"compensator", *LINKS}, SILENT["feedback"]),
         Stuck,
         Jumping,
         LostEncoder,

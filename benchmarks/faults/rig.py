@@ -246,6 +246,11 @@ class Rig:
         future = self._reload.call_async(Trigger.Request())
         future.add_done_callback(lambda f: then(bool(f.result().success)))
 
+    def reset(self) -> None:
+        """Ask the compensator to forget its last command, as an operator does, without waiting."""
+        self._reset.call_async(Trigger.Request())
+        self.record.fresh_starts.append(time.monotonic())
+
     # ---- what comes and goes ----
 
     def _send(self, pose: Pose) -> int:

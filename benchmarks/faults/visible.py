@@ -111,6 +111,8 @@ VISIBLE: dict[str, Callable[[Record, Happened], list[Expected]]] = {
     **{f"duplicate_{link}": nothing for link in SILENCE},
     **{f"reorder_{link}": partial(refusal, link) for link in SILENCE},
     **{f"corrupt_{link}": partial(refusal, link) for link in SILENCE},
+    "restart_under_stream": partial(silence, "command"),
+    "reset_under_stream": partial(silence, "feedback"),
     "stuck_strut": following_error,
     "jumping_strut": following_error,
     "encoder_nan": partial(at_mark, [("compensator", "bad feedback: not_finite")]),
