@@ -9,6 +9,7 @@ whatever their types.
 from __future__ import annotations
 
 import tempfile
+from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ from .geometry import STRUT_NAMES, HexapodGeometry, load_geometry
 from .journal import JournalError, Page, Snapshot, Source, read_page, read_sources
 from .machine import MachineModel
 from .model_file import load_model
+from .unpacking import Allowance, UnpackingError, bounded, refuse_overlapping_chunks, refuse_too_much_at_once
 
 POSE, STRUTS, TEXT = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState", "std_msgs/msg/String"
 
@@ -135,18 +137,23 @@ def read_recording(
     HexapodError
         ``rosbags`` is not installed.
     InputFileError
-        No bag, damaged, of an earlier version, without journal, several machines or no such one.
+        No bag, damaged, of an earlier version, without journal, several machines or no such one; or it
+        unpacks to more than its size makes believable.
     """
+    _rosbags()
     with ExitStack() as stack:
-        readers, notes = _open(Path(path), stack)
+        files, notes = _files(Path(path))
+        size = _size(files)
+        stack.enter_context(bounded(Allowance(size)))
+        readers = _open(Path(path), files, stack)
         connections = [c for reader in readers for c in reader.connections]
         node = _choose(path, connections, namespace)
         wanted = _wanted(path, connections, node)
-        collected = _Collected(path, node)
+        collected = _Collected(path, node, Allowance(size))
         for reader in readers:
             chosen = [c for c in reader.connections if c.topic in wanted]
-            for topic, time, message in _messages(path, reader, chosen):
-                collected.take(wanted[topic], time, message)
+            for topic, time, message, length in _messages(path, reader, chosen):
+                collected.take(wanted[topic], time, message, length)
                 progress(1)
     heard = sum(c.msgcount for c in connections if c.topic == f"{_namespace(node)}/{COMMANDS}")
     return collected.recording(notes, heard)
@@ -164,19 +171,25 @@ def _rosbags() -> Any:
     return rosbag2, typesys
 
 
-def _open(path: Path, stack: ExitStack) -> tuple[list[Any], list[str]]:
-    """Open all files of a bag; return readers, and notes."""
+def _open(path: Path, files: list[Path], stack: ExitStack) -> list[Any]:
+    """Open all files of a bag; return their readers."""
     rosbag2, _ = _rosbags()
-    files, notes = _files(path)
     readers = []
     for file in files:
         try:
             readers.append(stack.enter_context(rosbag2.Reader(file)))
+            refuse_overlapping_chunks(readers[-1])
         except Exception as error:
             raise _unreadable(path, file, "", error) from error
     if not any(reader.message_count for reader in readers):
         raise InputFileError(path, "", "is a bag without messages")
-    return readers, notes
+    return readers
+
+
+def _size(files: list[Path]) -> int:
+    """Return the bytes of a bag's files."""
+    inside = [one for file in files for one in (file.iterdir() if file.is_dir() else [file])]
+    return sum(file.stat().st_size for file in inside if file.is_file())
 
 
 def _files(path: Path) -> tuple[list[Path], list[str]]:
@@ -203,6 +216,8 @@ def _unreadable(path: str | Path, file: Path, key: str, error: Exception) -> Inp
     That is whatever its parts happen to raise: struct.error, KeyError, AssertionError, errors of three
     decompressors and of two databases; hence ``except Exception`` where it is called.
     """
+    if isinstance(error, UnpackingError):
+        return InputFileError(path, key, str(error))
     said = " ".join(str(part) for part in error.args) or type(error).__name__
     problem = f"cannot be read as a bag: {printable(said)}"
     if any(_cut_off(one) for one in (file, *file.glob("*.mcap"))):
@@ -256,8 +271,8 @@ def _wanted(path: str | Path, connections: Iterable[Any], node: str) -> dict[str
     return {topic: name for topic, (name, _) in names.items()}
 
 
-def _messages(path: str | Path, reader: Any, connections: list[Any]) -> Iterator[tuple[str, int, Any]]:
-    """Yield topic, the recorder's time (ns) and message of some connections."""
+def _messages(path: str | Path, reader: Any, connections: list[Any]) -> Iterator[tuple[str, int, Any, int]]:
+    """Yield topic, the recorder's time (ns), message and its length (bytes) of some connections."""
     if not connections:
         return
     _, typesys = _rosbags()
@@ -269,12 +284,13 @@ def _messages(path: str | Path, reader: Any, connections: list[Any]) -> Iterator
         try:
             connection, time, raw = next(messages)
             key = f"{connection.topic} at {time} ns"
+            refuse_too_much_at_once(len(raw), "a message")
             message = _deserialized(store, raw, connection.msgtype)
         except StopIteration:
             return
         except Exception as error:
             raise _unreadable(path, reader.path, key, error) from error
-        yield connection.topic, time, message
+        yield connection.topic, time, message, len(raw)
 
 
 def _deserialized(store: Any, raw: bytes, kind: str) -> Any:
@@ -289,31 +305,47 @@ def _deserialized(store: Any, raw: bytes, kind: str) -> Any:
         raise
 
 
+class _Columns:
+    """One topic's messages on their way into a Series: plain numbers, a fifth of the memory of tuples."""
+
+    def __init__(self) -> None:
+        self.times, self.stamps, self.values = array("q"), array("q"), array("d")
+
+    def series(self, width: int) -> Series:
+        """Return them, oldest first."""
+        times = np.array(self.times, dtype=np.int64)
+        order = np.argsort(times, kind="stable")
+        values = np.array(self.values, dtype=float).reshape((-1, width))[order]
+        return Series(stamps=np.array(self.stamps, dtype=np.int64)[order], times=times[order], values=values)
+
+
 class _Collected:
     """Messages on their way into a Recording."""
 
-    def __init__(self, path: str | Path, node: str) -> None:
-        self._path, self._node = path, node
-        self._series: dict[str, list[tuple]] = {name: [] for name in TOPICS}
+    def __init__(self, path: str | Path, node: str, allowance: Allowance) -> None:
+        self._path, self._node, self._allowance = path, node, allowance
+        self._columns = {name: _Columns() for name in TOPICS}
         self._pages: list[tuple[int, Page]] = []
         self._sources: dict[str, Source] = {}
         self._odd: dict[str, int] = {}
 
-    def take(self, name: str, time: int, message: Any) -> None:
-        """Take one message."""
+    def take(self, name: str, time: int, message: Any, length: int) -> None:
+        """Take one message of some length, bytes: pages of a database may hold many of one piece of file."""
+        try:
+            self._allowance.take(length)
+        except UnpackingError as error:
+            raise InputFileError(self._path, f"{name} at {time} ns", str(error)) from error
         if name in (JOURNAL, FILES):
             self._take_text(name, time, message.data)
             return
-        stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
-        if TOPICS[name] == POSE:
-            point = message.pose.position
-            self._series[name].append((time, stamp, (point.x, point.y, point.z)))
-            return
-        lengths = _lengths(message)
-        if lengths is None:
+        columns, point = self._columns[name], getattr(message, "pose", None)
+        numbers = _lengths(message) if point is None else (point.position.x, point.position.y, point.position.z)
+        if numbers is None:
             self._odd[name] = self._odd.get(name, 0) + 1
-        else:
-            self._series[name].append((time, stamp, lengths))
+            return
+        columns.times.append(time)
+        columns.stamps.append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
+        columns.values.extend(numbers)
 
     def _take_text(self, name: str, time: int, text: str) -> None:
         try:
@@ -333,7 +365,7 @@ class _Collected:
         answers, pages = _gathered(pages)
         if not len(answers):
             raise InputFileError(self._path, self._node + JOURNAL, "holds not a single answer of the compensator")
-        topics = {name: _as_series(rows, 3 if TOPICS[name] == POSE else 6) for name, rows in self._series.items()}
+        topics = {name: columns.series(3 if TOPICS[name] == POSE else 6) for name, columns in self._columns.items()}
         notes = notes + [
             f"{count} messages of {name} left out: not a position for each of {', '.join(STRUT_NAMES)}"
             for name, count in self._odd.items()
@@ -363,16 +395,6 @@ def _lengths(message: Any) -> tuple[float, ...] | None:
     if len(names) != len(positions) or any(names.count(name) != 1 for name in STRUT_NAMES):
         return None
     return tuple(positions[names.index(name)] for name in STRUT_NAMES)
-
-
-def _as_series(rows: list[tuple], width: int) -> Series:
-    rows.sort(key=lambda row: row[0])
-    times, stamps, values = zip(*rows, strict=True) if rows else ((), (), ())
-    return Series(
-        stamps=np.array(stamps, dtype=np.int64),
-        times=np.array(times, dtype=np.int64),
-        values=np.array(values, dtype=float).reshape((-1, width)),
-    )
 
 
 class Files:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
@@ -65,9 +65,13 @@ def qos(kept: bool = False) -> Qos:
     )
 
 
-def write_bag(folder: Path, messages: Messages, storage: str = "mcap") -> Path:
+def write_bag(
+    folder: Path, messages: Messages, storage: str = "mcap", compression: CompressionMode = CompressionMode.NONE
+) -> Path:
     """Write a bag into a new folder and return it."""
-    with Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+    writer = Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()])
+    writer.set_compression(compression, CompressionFormat.ZSTD)
+    with writer:
         connections: dict[str, Any] = {}
         for time, topic, kind, raw in messages:
             if topic not in connections:

@@ -20,6 +20,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ import yaml
 
 pytest.importorskip("rosbags")
 
+import lz4.frame
 from replay_helpers import (
     BEGAN,
     CONFIG,
@@ -39,7 +41,9 @@ from replay_helpers import (
     wave_pose,
     write_bag,
 )
+from rosbags.rosbag2 import CompressionMode, storage_mcap
 
+from hexapod_comp import unpacking
 from hexapod_comp.cli import main
 from hexapod_comp.compensation import Compensator
 from hexapod_comp.errors import HexapodError, InputFileError, ModelError
@@ -688,3 +692,85 @@ def test_ideal_model_is_recorded_as_none(tmp_path):
     machine.page()
     _, result = opened(write_bag(tmp_path / "run", machine.messages))
     assert counted(result) == {IDENTICAL: 10}
+
+
+COMPRESSED = [
+    ("mcap", CompressionMode.STORAGE),
+    ("mcap", CompressionMode.MESSAGE),
+    ("mcap", CompressionMode.FILE),
+    ("sqlite3", CompressionMode.MESSAGE),
+    ("sqlite3", CompressionMode.FILE),
+]
+
+
+@pytest.mark.parametrize(("storage", "mode"), COMPRESSED)
+def test_compressed_bags_come_back_bit_for_bit(run, tmp_path, storage, mode):
+    _, result = opened(write_bag(tmp_path / "run", run.messages, storage, mode))
+    assert counted(result) == {IDENTICAL: 1200}
+
+
+@pytest.mark.parametrize(
+    ("bound", "message"), [("FREE", "more than a recording of"), ("AT_ONCE", "more than the allowed|blob too big")]
+)
+@pytest.mark.parametrize(("storage", "mode"), COMPRESSED)
+def test_bag_that_unpacks_to_too_much_is_refused(run, tmp_path, monkeypatch, storage, mode, bound, message):
+    """A text of 8 MB of blanks packs into some hundred bytes; the bounds are lowered, to test fast."""
+    blanks = serialized(TEXT, TYPES[TEXT](" " * 8 * unpacking.MEGABYTE))
+    messages = [*run.messages[:50], (BEGAN, "/compensator/journal", TEXT, blanks)]
+    bag = write_bag(tmp_path / "run", messages, storage, mode)
+    monkeypatch.setattr(unpacking, "RATIO", 1)
+    monkeypatch.setattr(unpacking, bound, 2 * unpacking.MEGABYTE)
+    unpacked = []
+    monkeypatch.setattr(unpacking.Allowance, "take", spied(unpacking.Allowance.take, unpacked))
+    with pytest.raises(InputFileError, match=message):
+        read_recording(bag)
+    assert sum(unpacked) <= 4 * unpacking.MEGABYTE or mode == CompressionMode.FILE  # files go to the disk first
+
+
+def spied(take: Callable, seen: list[int]) -> Callable:
+    """Return `take` that notes what it counts."""
+
+    def noting(self: object, count: int) -> None:
+        seen.append(count)
+        take(self, count)
+
+    return noting
+
+
+def test_chunks_packed_by_lz4_are_bounded_too(monkeypatch):
+    monkeypatch.setattr(unpacking, "AT_ONCE", 2 * unpacking.MEGABYTE)
+    own = storage_mcap.DECOMPRESSORS
+    with unpacking.bounded(unpacking.Allowance(0)):
+        unpack = storage_mcap.DECOMPRESSORS["lz4"]
+        assert unpack(lz4.frame.compress(b"hexapod" * 99), 693) == b"hexapod" * 99
+        with pytest.raises(unpacking.UnpackingError, match="allowed 2 MB"):
+            unpack(lz4.frame.compress(bytes(3 * unpacking.MEGABYTE)), 100)
+    assert storage_mcap.DECOMPRESSORS is own
+
+
+def test_chunks_of_one_time_are_bounded_together():
+    """Chunks are merged by time: a hundred of the same second would be in memory together, one after another not."""
+    chunk = lambda began, ended: SimpleNamespace(  # noqa: E731
+        message_start_time=began, message_end_time=ended, uncompressed_size=unpacking.AT_ONCE // 4
+    )
+    reader = lambda chunks: SimpleNamespace(storage=SimpleNamespace(chunks=chunks))  # noqa: E731
+    unpacking.refuse_overlapping_chunks(reader([chunk(n, n + 2) for n in range(100)]))
+    with pytest.raises(unpacking.UnpackingError, match="at one time"):
+        unpacking.refuse_overlapping_chunks(reader([chunk(n, n + 5) for n in range(100)]))
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "ALTER TABLE messages ADD COLUMN more BLOB AS (zeroblob(900000000))",
+        "CREATE VIEW message_definitions_2 AS SELECT 1",
+    ],
+)
+def test_tables_that_compute_what_they_hold_are_refused(run, tmp_path, statement):
+    bag = write_bag(tmp_path / "run", run.messages[:50], "sqlite3")
+    (file,) = bag.glob("*.db3")
+    with contextlib.closing(sqlite3.connect(file)) as database:
+        database.execute(statement)
+        database.commit()
+    with pytest.raises(InputFileError, match="computes what it seems to hold"):
+        read_recording(bag)
