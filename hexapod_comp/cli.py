@@ -10,6 +10,7 @@ import sys
 from collections.abc import Sequence
 
 from .errors import HexapodError
+from .outputs import inputs_protected
 
 PROGRAM = "hexapod_comp"
 
@@ -46,7 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as leaving:  # argparse has printed help or what is wrong
         return leaving.code if isinstance(leaving.code, int) else USAGE_ERROR
     try:
-        code = int(args.run(args))
+        with inputs_protected(args):
+            code = int(args.run(args))
         sys.stdout.flush()
         return code
     except HexapodError as error:

@@ -21,6 +21,7 @@ import numpy as np
 import yaml
 
 from .errors import InputFileError, shorten
+from .outputs import refuse_replacing_input
 
 MAX_FILE_BYTES = 8_000_000
 """Larger files are refused before they are read: no model comes near it."""
@@ -178,6 +179,7 @@ def _refuse_tricks(text: str) -> None:
 
 def write_text_atomically(path: str | Path, text: str) -> None:
     """Write a file so that a reader, or a crash, never sees half of it; into a pipe or device, just write."""
+    refuse_replacing_input(path)
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():
         _write_into(path, text)

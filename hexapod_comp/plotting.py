@@ -14,6 +14,7 @@ from matplotlib.patches import Rectangle
 from .errors import InputFileError
 from .geometry import STRUT_NAMES, HexapodGeometry
 from .motion import follow
+from .outputs import refuse_replacing_input
 from .pose import Pose
 from .session_records import PathRecord, PoseRecord, SessionResult, Track
 
@@ -34,6 +35,7 @@ def save(figure: Figure, path: str | Path) -> None:
     InputFileError
         It cannot be written.
     """
+    refuse_replacing_input(path)
     target = Path(path)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)

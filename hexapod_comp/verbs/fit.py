@@ -261,7 +261,9 @@ def _save_arrays(path: str, **arrays: ArrayLike) -> None:
     import numpy as np
 
     from ..errors import InputFileError
+    from ..outputs import refuse_replacing_input
 
+    refuse_replacing_input(path)
     try:
         with open(path, "wb") as stream:
             np.savez_compressed(stream, allow_pickle=False, **arrays)
