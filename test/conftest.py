@@ -12,12 +12,29 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from hexapod_comp.geometry import load_geometry
 from hexapod_comp.nodes.processes import reserve_domain
 from hexapod_comp.paths import config_file
 
 if TYPE_CHECKING:
     from rclpy.context import Context
     from rclpy.executors import Executor
+
+
+ROS_FIXTURES = {"ros_context", "module_context", "client"}
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Compile what nodes need before the first test with one: on a busy machine that outlasts a test's time limit."""
+    if session.config.option.collectonly or not any(_has_nodes(item) for item in session.items):
+        return
+    from hexapod_comp.nodes.session import prepare
+
+    prepare(load_geometry(config_file("paper.yaml")))
+
+
+def _has_nodes(item: pytest.Item) -> bool:
+    return not ROS_FIXTURES.isdisjoint(getattr(item, "fixturenames", ()))
 
 
 @pytest.hookimpl(wrapper=True)
@@ -28,7 +45,7 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[object]:
     nodes are being discovered, Fast DDS waits for a callback that waits for the GIL, for ever.
     """
     result = yield
-    if {"ros_context", "client"} & set(getattr(item, "fixturenames", ())):
+    if _has_nodes(item):
         gc.collect()
         gc.freeze()  # what is left lives on, and need not be looked at again after every test
     return result
