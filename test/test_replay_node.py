@@ -128,6 +128,27 @@ def test_a_run_with_everything_is_replayed_bit_for_bit(bench, tmp_path):
     assert len(recording.sources) >= 3, "geometry and both models"
 
 
+def test_a_start_from_the_last_command_is_replayed_bit_for_bit(bench, tmp_path):
+    """A reset and an activation without feedback: the page says where the next command began."""
+    bench.compensator(model_file=model_file(tmp_path, struts={"offset_um": 30.0, "backlash_um": 8.0}))
+    recorder = Recorder(bench)
+    answers = [bench.ask(along(n)) for n in range(40)]
+    assert bench.trigger("reset").success
+    bench.send(near(HOME, (0.05, 0.0, 0.0)))  # further than a step from the last command
+    bench.barrier()
+    answers += [bench.ask(along(n)) for n in range(41, 60)]
+    assert bench.change("deactivate")
+    assert bench.change("activate")
+    answers += [bench.ask(along(n)) for n in range(60, 80)]
+    recorder.stop()
+    _, result = replayed(write_bag(tmp_path / "run", recorder.messages))
+    assert (result.outcome == IDENTICAL).all()
+    assert result.lengths[:, 0].tobytes() == np.array([answer.lengths for answer in answers]).tobytes()
+    assert [event.entry.values["reason"] for event in result.refused] == ["step"]
+    resets = [event.entry.values["measured"] for event in result.changes if event.entry.what == "reset"]
+    assert resets[-2:] == [answers[39].lengths.tolist(), answers[58].lengths.tolist()]
+
+
 def test_recording_may_begin_in_motion_and_two_machines_share_a_bag(ros_context, spin_until, capfd, tmp_path):
     """A recorder that comes late replays what its first snapshot precedes; each machine has its own namespace."""
     messages = Messages()
