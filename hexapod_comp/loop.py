@@ -97,14 +97,19 @@ def witnessed(
     compare: bool,
     namespace: str = "",
 ) -> SessionResult:
-    """Run poses of the work frame and a path in ``base`` through the loop, with a progress bar."""
+    """Run poses of the work frame and a path in ``base`` through the loop, with a progress bar.
+
+    The result's poses are in the work frame, as the user's file says them; the nodes are told, and tell, ``base``.
+    """
     session = _session_module()
     client = session.LoopClient(namespace=namespace)
     try:
         session.connect(client, nodes)
         with _progress() as bar:
             targets = [geometry.work @ pose for pose in poses]
-            return session.run_session(client, geometry, targets, path, rate, compare, bar.update, _announce)
+            result = session.run_session(client, geometry, targets, path, rate, compare, bar.update, _announce)
+        result.poses = [record.seen_from(geometry.work) for record in result.poses]
+        return result
     finally:
         client.close()
 
@@ -190,8 +195,9 @@ def _left(name: str, before: np.ndarray, after: np.ndarray, bars: tuple[float, f
 
 
 def as_json(rows: list[Row], result: SessionResult) -> dict[str, object]:
-    """Return a session as plain data: mm, degrees; errors in µm and µrad."""
+    """Return a session as plain data: mm, degrees, tool in ``work``; errors in µm and µrad."""
     return {
+        "frame": "work",
         "model": result.model,
         "sent": result.sent,
         "lost": result.lost,

@@ -89,7 +89,7 @@ def _path(axes: Axes, record: PathRecord) -> None:
     for track, colour, label in _passes(record):
         drawn = (track.feet + magnified * (track.positions - track.feet)) * 1e3
         axes.plot(drawn[:, 0], drawn[:, 1], color=colour, lw=0.8, label=label)
-    axes.set(title=f"Tool path, deviation × {magnified:g}", xlabel="x, mm", ylabel="y, mm", aspect="equal")
+    axes.set(title=f"Tool path in base, deviation × {magnified:g}", xlabel="x, mm", ylabel="y, mm", aspect="equal")
     axes.legend(loc="upper right")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -15,16 +15,16 @@ TRACK_WINDOW = 25
 
 @dataclass
 class PoseRecord:
-    """What happened at one commanded pose; m, rotation matrices.
+    """What happened at one commanded pose; m, rotation matrices; all poses in one frame, ``base`` at first.
 
     Attributes
     ----------
     target : Pose
-        Commanded ``pose_tool_in_base``.
+        Commanded pose of the tool.
     command, correction : ndarray, shape (6,)
         Compensated strut commands and their correction, m.
     estimate : Pose
-        Estimated ``pose_tool_in_base`` with compensation.
+        Estimated pose of the tool with compensation.
     true_without, true_with : Pose or None
         Where the tool really was, when anybody can tell.
     """
@@ -35,6 +35,15 @@ class PoseRecord:
     estimate: Pose | None = None
     true_without: Pose | None = None
     true_with: Pose | None = None
+
+    def seen_from(self, frame: Pose) -> PoseRecord:
+        """Return the same with its poses in another frame, whose own pose is given in the present one."""
+        inverse = frame.inverse()
+        estimate, without, compensated = (
+            None if pose is None else inverse @ pose for pose in (self.estimate, self.true_without, self.true_with)
+        )
+        target = inverse @ self.target
+        return replace(self, target=target, estimate=estimate, true_without=without, true_with=compensated)
 
     def errors(self) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
         """Return (position error m, rotation error rad) without and with compensation."""

@@ -11,9 +11,9 @@ from .session_records import PathRecord, PoseRecord, SessionResult
 
 
 def pose_block(title: str, record: PoseRecord) -> str:
-    """Return the lines about one pose: mm, degrees, µm, µrad."""
+    """Return the lines about one pose of the tool in the work frame: mm, degrees, µm, µrad."""
     lines = [
-        f"{title}",
+        f"{title}: tool in work",
         f"  commanded   {_pose_text(record.target)}",
         f"  struts      {_row(record.command * 1e3, '11.4f')} mm",
         f"  correction  {_row(record.correction * 1e6, '+11.2f')} µm",

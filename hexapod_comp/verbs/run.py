@@ -13,7 +13,8 @@ EXAMPLE = """example:
   hexapod_comp run poses.csv --attach --rate-hz 100     (nodes already running in this ROS domain)
 
 The tool moves from pose to pose within the machine's limits, rests at each, and its error is taken from
-tool_pose_true. Columns of the file: x_mm, y_mm, z_mm, alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw)."""
+tool_pose_true. Columns of the file: x_mm, y_mm, z_mm, alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw). The file's
+poses and those of the report are the tool's in the work frame."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
