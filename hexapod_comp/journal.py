@@ -258,14 +258,15 @@ class Journal:
             "session": self._session,
             "number": self._number,
             "begins": self._begins,
-            "answers": base64.b64encode(self._answers).decode(),
             "entries": self._entries,
             "refused_more": max(0, self._refused - REFUSALS_PER_PAGE),
             "snapshot": self._snapshot(now) if self._snapshot_due(now) else None,
         }
+        answers = base64.b64encode(self._answers).decode()
         self._answers, self._begins = bytearray(), self._count
         self._entries, self._refused = [], 0
-        return json.dumps(content, ensure_ascii=False)
+        # Put in by hand: looking for what must be escaped in so long a string takes longer than all the rest.
+        return f'{json.dumps(content, ensure_ascii=False)[:-1]}, "answers": "{answers}"}}'
 
     def _snapshot(self, now: float) -> dict[str, Any]:
         self._last = now
