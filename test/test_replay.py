@@ -336,6 +336,15 @@ def test_what_the_recorder_has_lost_is_never_called_a_difference(run, tmp_path, 
     assert f"the recorder has lost answers that the journal counts: {result.lost}" in capsys.readouterr().out
 
 
+def test_a_journal_without_its_end_is_noticed(run, tmp_path, capsys):
+    """The node is killed: what it took since its last page is on the topic, and not in the journal."""
+    last = of_topic(run.messages, "journal")[-1]
+    bag = write_bag(tmp_path / "run", without(run.messages, last))
+    assert counted(opened(bag)[1]) == {IDENTICAL: 1180}
+    assert call(bag) == 0
+    assert "1181 commands taken, 1180 answered, 1 refused; the recorder heard 1201" in capsys.readouterr().out
+
+
 def test_pages_that_come_twice_or_late_do_no_harm(run, tmp_path):
     """A recorder that joins twice is given old pages again; two recordings may have been put together."""
     pages = of_topic(run.messages, "journal")
@@ -637,6 +646,25 @@ def test_pages_that_are_wrong_somewhere_never_end_in_a_traceback(tmp_path, capsy
         with contextlib.suppress(HexapodError):
             call(write_bag(tmp_path / str(case), messages))
     assert "\x1b" not in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value", "ignore:Mean of empty slice")
+def test_answers_that_are_wrong_somewhere_never_end_in_a_traceback(run, tmp_path, capsys):
+    """Bytes of commands and answers are junk, 30 times: an error of the package, or a report that sees it."""
+    draw = np.random.default_rng(12)
+    for case in range(30):
+
+        def spoil(page: dict) -> None:
+            answers = bytearray(base64.b64decode(page["answers"]))
+            for place in draw.integers(len(answers), size=5):
+                answers[place] ^= int(draw.integers(1, 256))
+            page["answers"] = base64.b64encode(answers).decode()
+
+        bag = write_bag(tmp_path / str(case), altered(run.messages[:300], 1 + case % 3, spoil))
+        with contextlib.suppress(HexapodError):
+            assert call(bag) == 1
+            assert call(bag, "--tolerance-um", "1e9", "--json") in (0, 1)
+    assert "Traceback" not in capsys.readouterr().err
 
 
 def test_nothing_to_compare_is_an_error(run, tmp_path):
