@@ -16,26 +16,15 @@ import numpy as np
 
 from . import kernels
 from .compensation_kernels import (
-    BUMP,
-    CHANGED,
-    COMMAND,
-    CORRECTION,
-    ENABLED,
-    LOW,
     NO_POSE,
-    NOMINAL,
     OUTSIDE,
-    SENSE,
     STATE_SIZE,
-    TIME,
     UNSOLVED,
+    State,
     compensate_one,
     compensate_quaternion,
     estimate_one,
-    pack_machine,
-    pack_nominal,
-    pack_pose,
-    pose_views,
+    state_of,
 )
 from .errors import HexapodError, ModelError, NotConvergedError, NotFiniteError, OutsideFieldError, PoseError
 from .geometry import HexapodGeometry
@@ -44,9 +33,6 @@ from .limit_kernels import WITHIN
 from .machine import MachineModel, RealMachine, Temperatures
 from .motion import MotionState
 from .pose import POSE_NOT_FINITE, QUATERNION_NORM_TOLERANCE, Pose
-
-RESUMES = 3
-"""Place of a fourth switch, beside those of the kernels: the next command starts from the measured struts."""
 
 DEFAULT_RAMP_RATE = 1e-3
 """How fast a change of model, temperature or enabling moves a strut, m/s."""
@@ -105,27 +91,56 @@ class Correction:
     outside_box: bool
 
 
+def pack_machine(machine: RealMachine) -> np.ndarray:
+    """Return what :func:`~hexapod_comp.compensation_kernels.machine_views` takes apart."""
+    return _joined(
+        *machine.body, machine.strut_arrays[0], machine.field_arrays[0], machine.thresholds, machine.solver
+    )
+
+
+def pack_nominal(geometry: HexapodGeometry) -> np.ndarray:
+    """Return what :func:`~hexapod_comp.compensation_kernels.nominal_views` takes apart."""
+    tool = geometry.tool.inverse()
+    return _joined(*geometry.kernel_joints, tool.position, tool.rotation, *geometry.limit_numbers)
+
+
+def pack_pose(pose: Pose) -> np.ndarray:
+    """Return position, then rotation matrix by rows, shape (12,)."""
+    return _joined(pose.position, pose.rotation)
+
+
+def _joined(*parts: Any) -> np.ndarray:
+    return np.concatenate([np.ravel(part) for part in parts])
+
+
 class _Command:
-    """One command's numbers: a state vector and two poses, and the views that give them names."""
+    """One command's state: its vector, and the parts that have names."""
 
-    __slots__ = ("bump", "command", "correction", "model", "motion", "nominal", "platform", "poses", "state")
+    __slots__ = ("motion", "numbers", "state")
 
-    def __init__(self) -> None:
-        self.state, self.poses = np.empty(STATE_SIZE), np.empty(24)
-        self.motion = MotionState(self.state[LOW:SENSE], self.state[SENSE:NOMINAL])
-        self.nominal = self.state[NOMINAL:CORRECTION]
-        self.correction = self.state[CORRECTION:COMMAND]
-        self.command = self.state[COMMAND:BUMP]
-        self.bump = self.state[BUMP:TIME]
-        position, rotation, model_position, model_rotation = pose_views.py_func(self.poses)
-        self.platform, self.model = (position, rotation), (model_position, model_rotation)
-        self.correction[:], self.bump[:] = math.nan, 0.0
+    def __init__(self, ramp_rate: float) -> None:
+        self.numbers = np.full(STATE_SIZE, math.nan)
+        self.state: State = state_of.py_func(self.numbers)
+        self.motion = MotionState(self.state.motion_low, self.state.motion_sense)
+        self.state.ramp[:], self.state.ramp_rate[:] = 0.0, ramp_rate
+        self.state.enabled[:], self.state.changed[:] = 1.0, 0.0
         self.clear()
+
+    @property
+    def platform(self) -> Pose:
+        """Commanded ``pose_platform_in_base``."""
+        return Pose(self.state.platform_position, self.state.platform_rotation)
 
     def clear(self) -> None:
         """Forget lengths and motion; the correction stays, as what the struts stand at."""
-        self.motion.low[:], self.motion.sense[:] = math.nan, 0.0
-        self.nominal[:], self.command[:], self.state[TIME] = math.nan, math.nan, math.nan
+        state = self.state
+        state.motion_low[:], state.motion_sense[:] = math.nan, 0.0
+        state.nominal[:], state.command[:], state.time[:], state.resumes[:] = math.nan, math.nan, math.nan, 0.0
+        self.must_ramp()
+
+    def must_ramp(self) -> None:
+        """Let the next command start from the correction that the struts stand at, if there is one."""
+        self.state.changed[:] = float(not math.isnan(self.state.correction[0]))
 
 
 class Compensator:
@@ -163,12 +178,11 @@ class Compensator:
         self.geometry = geometry
         self.temperatures = Temperatures()
         self.machine = RealMachine(geometry, model)
-        self._switches = np.array([1.0, 0.0, ramp_rate, 0.0])
         self.condition = math.nan
         self.outside_field = False
         self._nominal_numbers = pack_nominal(geometry)
         self._work = pack_pose(geometry.work)
-        self._last, self._next = _Command(), _Command()
+        self._last, self._next = _Command(ramp_rate), _Command(ramp_rate)
         self._take_machine(RealMachine(geometry, model))
         self._model_pose, self._tool_pose = np.empty(12), np.empty(12)
         self.on_change: Callable[[str, Any], None] = lambda what, value: None
@@ -177,17 +191,17 @@ class Compensator:
     @property
     def command(self) -> np.ndarray:
         """Strut commands last accepted, m; NaN before the first, the measured struts after a reset."""
-        return self._last.command
+        return self._last.state.command
 
     @property
     def nominal(self) -> np.ndarray:
         """Nominal strut lengths of the last command, m; NaN before the first."""
-        return self._last.nominal
+        return self._last.state.nominal
 
     @property
     def correction(self) -> np.ndarray:
         """Corrections of the last command, m; NaN before the first."""
-        return self._last.correction
+        return self._last.state.correction
 
     @property
     def motion(self) -> MotionState:
@@ -202,12 +216,12 @@ class Compensator:
     @property
     def ramping(self) -> bool:
         """Whether a change has not been fully taken up yet."""
-        return bool(self._last.bump.any() or self._switches[CHANGED])
+        return bool(self._last.state.ramp.any() or self._last.state.changed[0])
 
     @property
     def enabled(self) -> bool:
         """Whether it compensates."""
-        return bool(self._switches[ENABLED])
+        return bool(self._last.state.enabled[0])
 
     def set_model(self, model: MachineModel) -> None:
         """Replace the model; the corrections ramp from the old one's to the new one's."""
@@ -223,16 +237,16 @@ class Compensator:
             # turn directions round, and a backlash would step when they turn back.
             self.motion.low[:] += after - before
         self._take_machine(machine)
-        self._switches[CHANGED] = 1.0
+        self._last.state.changed[:] = 1.0
 
     def _followed(self, machine: RealMachine) -> np.ndarray | None:
         """Return the nine values whose directions are followed, at the last command, under a machine's model.
 
         None before the first command, and where the model's field cannot be undone: it is refused there.
         """
-        if not np.isfinite(self._last.nominal).all():
+        if not np.isfinite(self.nominal).all():
             return None
-        platform, motion = Pose(*self._last.platform), MotionState()
+        platform, motion = self._last.platform, MotionState()
         motion.copy_from(self.motion)
         try:
             _, model_pose, _ = machine.commands_for(platform, motion)
@@ -264,8 +278,8 @@ class Compensator:
     def enable(self, enabled: bool) -> None:
         """Switch compensation on or off; the corrections ramp."""
         if enabled != self.enabled:
-            self._switches[ENABLED] = float(enabled)
-            self._switches[CHANGED] = float(not math.isnan(self._last.correction[0]))
+            self._last.state.enabled[:] = float(enabled)
+            self._last.must_ramp()
             self.on_change("enable", enabled)
 
     def reset(self, measured: np.ndarray | None = None) -> None:
@@ -289,18 +303,17 @@ class Compensator:
         if measured.shape != (6,) or not np.isfinite(measured).all():
             raise NotFiniteError("measured strut lengths must be six finite numbers, m", measured.tolist())
         self._forget()
-        self._last.command[:] = measured
-        self._switches[RESUMES] = 1.0
+        self._last.state.command[:], self._last.state.resumes[:] = measured, 1.0
         self.on_change("reset", measured)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return what, beside geometry and model, decides the next command: lists of numbers by name."""
-        return {
-            "state": self._last.state.tolist(),
-            "poses": self._last.poses.tolist(),
-            "switches": self._switches.tolist(),
-            "temperatures": dict(self.temperatures.values),
-        }
+        """Return what, beside geometry and model, decides the next answer, by name.
+
+        ``temperatures``, °C by name, and each field of :class:`~hexapod_comp.compensation_kernels.State`: a list of
+        numbers, matrices by rows.
+        """
+        numbers = {name: part.ravel().tolist() for name, part in self._last.state._asdict().items()}
+        return {**numbers, "temperatures": dict(self.temperatures.values)}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Take over a :meth:`snapshot` of a compensator with this geometry and model.
@@ -308,25 +321,27 @@ class Compensator:
         Raises
         ------
         ModelError
-            It does not have the numbers that a snapshot has, or a temperature is not allowed.
+            It does not have the names that a snapshot has, or under one of them not as many numbers; or a
+            temperature is not allowed.
         """
-        targets = {"state": self._last.state, "poses": self._last.poses, "switches": self._switches}
-        values = {name: np.asarray(snapshot.get(name, ()), dtype=float) for name in targets}
-        for name, target in targets.items():
-            if values[name].shape != target.shape:
-                raise ModelError(f"snapshot.{name}", f"must be {target.size} numbers", values[name].size)
-        temperatures = Temperatures(snapshot.get("temperatures"))
+        parts = self._last.state._asdict()
+        for name in sorted({*parts, "temperatures"} ^ {*snapshot}):
+            problem = "is missing" if name in parts or name == "temperatures" else "is nothing that this release knows"
+            raise ModelError(f"snapshot.{name}", problem)
+        values = {name: np.asarray(snapshot[name], dtype=float) for name in parts}
+        for name, part in parts.items():
+            if values[name].shape != (part.size,):
+                raise ModelError(f"snapshot.{name}", f"must be {part.size} numbers", values[name].size)
+        temperatures = Temperatures(snapshot["temperatures"])
         self._take_machine(RealMachine(self.geometry, self.model, temperatures))
         self.temperatures = temperatures
-        for name, target in targets.items():
-            target[:] = values[name]
+        for name, part in parts.items():
+            part[...] = values[name].reshape(part.shape)
 
     def _forget(self) -> None:
         home = self.geometry.home
-        self._switches[RESUMES] = 0.0
         self._last.clear()
         self._model_pose[:3], self._model_pose[3:] = home.position, home.rotation.ravel()
-        self._switches[CHANGED] = float(not math.isnan(self._last.correction[0]))
 
     def step(self, numbers: tuple[float, ...], time: float, frame: np.ndarray | None = None) -> np.ndarray:
         """Compensate one commanded tool pose: the loop's entry.
@@ -341,7 +356,7 @@ class Compensator:
             stamps give the same answers bit for bit, and no jump of a clock can step.
         frame : ndarray, shape (12,), optional
             Frame of the commanded pose seen from ``base``, packed by
-            :func:`~hexapod_comp.compensation_kernels.pack_pose`; the geometry's work frame by default.
+            :func:`pack_pose`; the geometry's work frame by default.
 
         Returns
         -------
@@ -353,23 +368,14 @@ class Compensator:
         PoseError, LimitError, KinematicsError, OutsideFieldError
             The command is refused and nothing has changed.
         """
-        if self._switches[RESUMES]:
+        if self._last.state.resumes[0]:
             return self._resume(lambda: self._run_numbers(numbers, time, frame), numbers)
         return self._finish(self._run_numbers(numbers, time, frame), numbers)
 
     def _run_numbers(self, numbers: tuple[float, ...], time: float, frame: np.ndarray | None) -> tuple:
         """Work out the next command from a message's numbers; what it is worth, :meth:`_finish` says."""
-        upcoming = self._next
-        return compensate_quaternion(
-            *numbers,
-            time,
-            self._work if frame is None else frame,
-            self._fixed,
-            self._switches,
-            self._last.state,
-            upcoming.state,
-            upcoming.poses,
-        )
+        frame = self._work if frame is None else frame
+        return compensate_quaternion(*numbers, time, frame, self._fixed, self._last.numbers, self._next.numbers)
 
     def _resume(self, run: Callable[[], tuple], numbers: tuple[float, ...] = ()) -> np.ndarray:
         """Take the first command after a reset to measured struts, starting from where they stand.
@@ -378,18 +384,17 @@ class Compensator:
         could be one; the first command is then the measured struts, and ramps. A trial run finds the nominal
         lengths.
         """
-        last, before = self._last, (self._last.correction.copy(), self._switches[CHANGED])
+        last = self._last.state
+        before = last.correction.copy(), last.changed.copy()
         run()
-        standing = last.command - self._next.nominal
+        standing = last.command - self._next.state.nominal
         if (np.abs(standing) <= self.geometry.limits.correction).all():
-            last.correction[:], self._switches[CHANGED] = standing, 1.0
+            last.correction[:], last.changed[:] = standing, 1.0
         try:
-            command = self._finish(run(), numbers)
+            return self._finish(run(), numbers)
         except HexapodError:
-            last.correction[:], self._switches[CHANGED] = before
+            last.correction[:], last.changed[:] = before
             raise
-        self._switches[RESUMES] = 0.0
-        return command
 
     def _finish(self, found: tuple, numbers: tuple[float, ...] = ()) -> np.ndarray:
         """Accept the command under way, or raise what was found."""
@@ -404,8 +409,7 @@ class Compensator:
             raise self.geometry.limits.error(finding, strut, stage, value)
         self._last, self._next = self._next, self._last
         self.condition, self.outside_field = condition, status == OUTSIDE
-        self._switches[CHANGED] = 0.0
-        return self._last.command
+        return self._last.state.command
 
     def estimate(self, struts: np.ndarray) -> np.ndarray:
         """Return where the tool is when the struts read `struts`, through the model.
@@ -429,7 +433,7 @@ class Compensator:
         tool = self.geometry.tool
         outcome, condition = estimate_one(
             struts,
-            self._last.state,
+            self._last.numbers,
             self._fixed,
             tool.position,
             tool.rotation,
@@ -447,8 +451,8 @@ class Compensator:
 
     def _outside_error(self, command: _Command) -> HexapodError:
         box = self.model.field.box * 1e3
-        position, rotation = command.platform
-        point = (position + rotation @ self.model.field.probe) * 1e3
+        platform = command.platform
+        point = (platform.position + platform.rotation @ self.model.field.probe) * 1e3
         low, high = (", ".join(f"{v:g}" for v in corner) for corner in box)
         problem = f"the measured point ({point[0]:.3f}, {point[1]:.3f}, {point[2]:.3f}) mm is outside the field's box"
         return OutsideFieldError(f"{problem} ({low})…({high}) mm", point, box)
@@ -468,7 +472,7 @@ class Compensator:
         LimitError, KinematicsError, OutsideFieldError
             The command is refused and nothing has changed.
         """
-        if self._switches[RESUMES]:
+        if self._last.state.resumes[0]:
             self._resume(lambda: self._run_pose(tool_pose, time))
         else:
             self._finish(self._run_pose(tool_pose, time))
@@ -476,22 +480,12 @@ class Compensator:
 
     def _run_pose(self, tool_pose: Pose, time: float) -> tuple:
         """Work out the next command from a pose."""
-        upcoming = self._next
-        return compensate_one(
-            tool_pose.position,
-            tool_pose.rotation,
-            time,
-            self._work,
-            self._fixed,
-            self._switches,
-            self._last.state,
-            upcoming.state,
-            upcoming.poses,
-        )
+        pose = tool_pose.position, tool_pose.rotation
+        return compensate_one(*pose, time, self._work, self._fixed, self._last.numbers, self._next.numbers)
 
     def record(self, tool_pose: Pose) -> Correction:
         """Return the record of the command just accepted for `tool_pose`."""
-        platform = Pose(*self._last.platform)
+        platform = self._last.platform
         box = self.model.valid_box
         outside_box = box is not None and bool(
             (platform.position < box[0]).any() or (platform.position > box[1]).any()
@@ -499,7 +493,7 @@ class Compensator:
         return Correction(
             tool_pose=tool_pose,
             platform_pose=platform,
-            model_pose=Pose(*self._last.model),
+            model_pose=Pose(self._last.state.model_position, self._last.state.model_rotation),
             sense=self.motion.sense.copy(),
             temperatures=dict(self.temperatures.values),
             nominal=self.nominal.copy(),
@@ -516,9 +510,10 @@ class Compensator:
     def predicted_error(self) -> np.ndarray:
         """Return the tool error that nominal lengths would leave at the last command (see `Correction`)."""
         matrix, twist = np.empty((6, 6)), self._model_correction() * -1.0
-        kernels.jacobian_one(*self.geometry.kernel_joints, *self._last.platform, matrix)
+        platform = self._last.platform
+        kernels.jacobian_one(*self.geometry.kernel_joints, platform.position, platform.rotation, matrix)
         kernels.solve_six(matrix, twist)
-        lever = self._last.platform[1] @ self.geometry.tool.position
+        lever = platform.rotation @ self.geometry.tool.position
         twist[:3] += np.cross(twist[3:], lever)
         return twist
 
@@ -526,7 +521,7 @@ class Compensator:
         """Return what the model would correct at the last command, ramp and switch left aside."""
         motion = MotionState()
         motion.copy_from(self.motion)
-        commands, _, _ = self.machine.commands_for(Pose(*self._last.platform), motion)
+        commands, _, _ = self.machine.commands_for(self._last.platform, motion)
         return commands - self.nominal
 
 

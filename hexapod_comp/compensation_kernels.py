@@ -1,34 +1,29 @@
 """Compiled steps of the compensator's loop.
 
-Handing an array to a compiled function costs more than most of what is computed with it, so everything
-that stays the same between two commands travels in two vectors, and everything that changes in a third.
-Each vector is packed and taken apart by two functions that stand side by side here.
+Handing an array to a compiled function costs more than most of what is computed with it, and a named tuple more
+still. So everything that stays the same between two commands travels in two vectors, and everything that changes in
+a third; here they are taken apart, and their parts get names.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from . import kernels
 from .compiling import compiled
-from .geometry import HexapodGeometry
-from .limit_kernels import CORRECTION as CORRECTION_FOUND
-from .limit_kernels import STEP, WITHIN, check_change, check_stage, limits_of
-from .machine import RealMachine
+from .limit_kernels import CORRECTION, STEP, WITHIN, check_change, check_stage, limits_of
 from .machine_kernels import actual_pose_one, command_one
-from .pose import POSE_OK, Pose, read_pose
+from .pose import POSE_OK, read_pose
 from .struts import PARAMETERS
 
 SOLVED, UNSOLVED, OUTSIDE, NO_POSE = range(4)
 """How it went: solved, field not undone, solved with the field held at its boundary, input is no pose."""
 
-LOW, SENSE, NOMINAL, CORRECTION, COMMAND, BUMP, TIME, STATE_SIZE = 0, 9, 18, 24, 30, 36, 42, 43
-"""Where the parts of a state begin: motion windows and directions (9 each), six struts each, time of the command."""
-
-ENABLED, CHANGED, RAMP_RATE = range(3)
-"""What the compensator is told from outside: share of the correction, whether anything changed, m/s."""
+STATE_SIZE = 71
+"""Length of a vector of :class:`State`."""
 
 LONGEST_RAMP_STEP = 0.02
 """A pause between commands counts as no more than this in a ramp, s: a late command must not step."""
@@ -36,15 +31,76 @@ LONGEST_RAMP_STEP = 0.02
 TABLE_END = 72 + 6 * PARAMETERS
 
 
-def pack_machine(machine: RealMachine) -> np.ndarray:
-    """Return what :func:`machine_views` takes apart."""
-    parts = (*machine.body, machine.strut_arrays[0], machine.field_arrays[0], machine.thresholds, machine.solver)
-    return np.concatenate([np.ravel(part) for part in parts])
+class State(NamedTuple):
+    """What one command leaves behind, and all that decides the next answer beside geometry, model and temperatures.
+
+    Parts of one vector, which single numbers are too: arrays of one. A recording holds them under these names, so a
+    new meaning needs a new name.
+
+    Attributes
+    ----------
+    motion_low, motion_sense : ndarray, shape (9,)
+        Windows and directions of motion, see :class:`~hexapod_comp.motion.MotionState`.
+    nominal, correction, command : ndarray, shape (6,)
+        Of the struts, m; after a reset to measured struts, the command is where they stand.
+    ramp : ndarray, shape (6,)
+        The part of the correction that a change has still to take away, m.
+    time : ndarray, shape (1,)
+        Of the command, s.
+    platform_position, platform_rotation, model_position, model_rotation : ndarray, shape (3,), (3, 3)
+        ``pose_platform_in_base`` commanded, m, and the model pose q with q ∘ E(q) = that pose.
+    enabled, changed, resumes : ndarray, shape (1,)
+        1 or 0: corrections are on; model, temperatures or enabling have changed since the last command; the next
+        command starts from measured struts.
+    ramp_rate : ndarray, shape (1,)
+        Largest speed of the ramp, m/s.
+    """
+
+    motion_low: np.ndarray
+    motion_sense: np.ndarray
+    nominal: np.ndarray
+    correction: np.ndarray
+    command: np.ndarray
+    ramp: np.ndarray
+    time: np.ndarray
+    platform_position: np.ndarray
+    platform_rotation: np.ndarray
+    model_position: np.ndarray
+    model_rotation: np.ndarray
+    enabled: np.ndarray
+    changed: np.ndarray
+    resumes: np.ndarray
+    ramp_rate: np.ndarray
+
+
+@compiled
+def state_of(numbers):
+    """Return the state that a vector, (STATE_SIZE,), holds: its parts, not copies."""
+    return State(
+        motion_low=numbers[:9],
+        motion_sense=numbers[9:18],
+        nominal=numbers[18:24],
+        correction=numbers[24:30],
+        command=numbers[30:36],
+        ramp=numbers[36:42],
+        time=numbers[42:43],
+        platform_position=numbers[43:46],
+        platform_rotation=numbers[46:55].reshape((3, 3)),
+        model_position=numbers[55:58],
+        model_rotation=numbers[58:67].reshape((3, 3)),
+        enabled=numbers[67:68],
+        changed=numbers[68:69],
+        resumes=numbers[69:70],
+        ramp_rate=numbers[70:71],
+    )
 
 
 @compiled
 def machine_views(numbers):
-    """Return the body (four arrays), strut table, probe, thresholds, solver's scalars."""
+    """Return what :func:`hexapod_comp.compensation.pack_machine` packs.
+
+    The body (four arrays), strut table, probe, thresholds, solver's scalars.
+    """
     end = TABLE_END
     body = (
         numbers[:18].reshape((6, 3)),
@@ -61,33 +117,18 @@ def machine_views(numbers):
     )
 
 
-def pack_nominal(geometry: HexapodGeometry) -> np.ndarray:
-    """Return what :func:`nominal_views` takes apart."""
-    tool_inverse = geometry.tool.inverse()
-    parts = (*geometry.kernel_joints, tool_inverse.position, tool_inverse.rotation, *geometry.limit_numbers)
-    return np.concatenate([np.ravel(part) for part in parts])
-
-
 @compiled
 def nominal_views(numbers):
-    """Return base, platform, tool inverse (position over rotation) and the limits."""
+    """Return what :func:`hexapod_comp.compensation.pack_nominal` packs.
+
+    Base, platform, tool inverse (position over rotation) and the limits.
+    """
     return (
         numbers[:18].reshape((6, 3)),
         numbers[18:36].reshape((6, 3)),
         numbers[36:48].reshape((4, 3)),
         limits_of(numbers[48:]),
     )
-
-
-def pack_pose(pose: Pose) -> np.ndarray:
-    """Return position, then rotation matrix by rows, shape (12,)."""
-    return np.concatenate([pose.position, pose.rotation.ravel()])
-
-
-@compiled
-def pose_views(poses):
-    """Return positions and rotations of the two poses, (24,), that a command leaves behind."""
-    return poses[:3], poses[3:12].reshape((3, 3)), poses[12:15], poses[15:].reshape((3, 3))
 
 
 @compiled
@@ -100,86 +141,46 @@ def compose(p1, r1, p2, r2, position, rotation):
 
 
 @compiled
-def compensate_one(
-    position,
-    rotation,
-    time,
-    frame,
-    fixed,
-    switches,
-    state,
-    next_state,
-    poses,
-):
+def compensate_one(position, rotation, time, frame, fixed, numbers, next_numbers):
     """Run the whole chain for one command; return (status, finding, strut, stage, value, condition number).
 
-    `fixed` holds the machine's numbers, the nominal ones, and the arrays whose size varies. `state` stays as
-    it is; `next_state` and `poses` (platform pose, model pose) are written, and count only when nothing was
-    found.
+    `fixed` holds the machine's numbers, the nominal ones, and the arrays whose size varies. The state in `numbers`
+    stays as it is; the one in `next_numbers` is written, and counts only when nothing was found.
     """
     machine_numbers, nominal_numbers, varied = fixed
     body, table, probe, thresholds, _ = machine_views(machine_numbers)
     nominal_base, nominal_platform, tool, limits = nominal_views(nominal_numbers)
     struts, field = (table, *varied[:2]), (probe, *varied[2:])
-    platform_position, platform_rotation, model_position, model_rotation = pose_views(poses)
-    half_position, half_rotation = np.empty(3), np.empty((3, 3))
-    compose(frame[:3], frame[3:].reshape((3, 3)), position, rotation, half_position, half_rotation)
-    compose(half_position, half_rotation, tool[0], tool[1:], platform_position, platform_rotation)
-    nominal, correction = next_state[NOMINAL:CORRECTION], next_state[CORRECTION:COMMAND]
-    command = next_state[COMMAND:BUMP]
-    kernels.strut_lengths_one(nominal_base, nominal_platform, platform_position, platform_rotation, nominal)
-    finding, strut, value, _, condition = check_stage(
-        nominal_base, nominal_platform, platform_position, platform_rotation, nominal, limits
-    )
+    next_numbers[:] = numbers
+    last, new = state_of(numbers), state_of(next_numbers)
+    at = np.empty(3), np.empty((3, 3))
+    compose(frame[:3], frame[3:].reshape((3, 3)), position, rotation, at[0], at[1])
+    compose(at[0], at[1], tool[0], tool[1:], new.platform_position, new.platform_rotation)
+    platform, model = (new.platform_position, new.platform_rotation), (new.model_position, new.model_rotation)
+    kernels.strut_lengths_one(nominal_base, nominal_platform, *platform, new.nominal)
+    finding, strut, value, _, condition = check_stage(nominal_base, nominal_platform, *platform, new.nominal, limits)
     if finding != WITHIN:
         return SOLVED, finding, strut, 0, value, condition
-    next_state[:NOMINAL] = state[:NOMINAL]
-    solved, outside = command_one(
-        platform_position,
-        platform_rotation,
-        thresholds,
-        next_state[LOW:SENSE],
-        next_state[SENSE:NOMINAL],
-        body,
-        struts,
-        field,
-        model_position,
-        model_rotation,
-        command,
-    )
+    motion = new.motion_low, new.motion_sense
+    solved, outside = command_one(*platform, thresholds, *motion, body, struts, field, *model, new.command)
     if not solved:
         return UNSOLVED, WITHIN, -1, 1, math.nan, condition
     for i in range(6):
-        correction[i] = switches[ENABLED] * (command[i] - nominal[i])
-    next_state[TIME] = time
-    ramp_bump(correction, state, next_state[BUMP:TIME], switches, time)
+        new.correction[i] = last.enabled[0] * (new.command[i] - new.nominal[i])
+    new.time[0], new.changed[0], new.resumes[0] = time, 0.0, 0.0
+    shrink_ramp(last, new)
     for i in range(6):
-        correction[i] += next_state[BUMP + i]
-        command[i] = nominal[i] + correction[i]
-    finding, strut, value, stage = check_command(nominal, correction, command, state, limits)
+        new.correction[i] += new.ramp[i]
+        new.command[i] = new.nominal[i] + new.correction[i]
+    finding, strut, value, stage = check_command(last, new, limits)
     if finding == WITHIN:
         stage = 1
-        finding, strut, value, _, _ = check_stage(body[0], body[1], model_position, model_rotation, command, limits)
+        finding, strut, value, _, _ = check_stage(body[0], body[1], *model, new.command, limits)
     return OUTSIDE if outside else SOLVED, finding, strut, stage, value, condition
 
 
 @compiled
-def compensate_quaternion(
-    x,
-    y,
-    z,
-    qx,
-    qy,
-    qz,
-    qw,
-    time,
-    frame,
-    fixed,
-    switches,
-    state,
-    next_state,
-    poses,
-):
+def compensate_quaternion(x, y, z, qx, qy, qz, qw, time, frame, fixed, numbers, next_numbers):
     """Run :func:`compensate_one` on a position and a quaternion, as messages carry them.
 
     When the status is NO_POSE, the finding is the outcome of :func:`hexapod_comp.pose.read_pose`.
@@ -188,63 +189,44 @@ def compensate_quaternion(
     outcome = read_pose(x, y, z, qx, qy, qz, qw, position, rotation)
     if outcome != POSE_OK:
         return NO_POSE, outcome, -1, 0, math.nan, math.nan
-    return compensate_one(
-        position,
-        rotation,
-        time,
-        frame,
-        fixed,
-        switches,
-        state,
-        next_state,
-        poses,
-    )
+    return compensate_one(position, rotation, time, frame, fixed, numbers, next_numbers)
 
 
 @compiled
-def check_command(nominal, correction, command, state, limits):
+def check_command(last, new, limits):
     """Check correction and steps; return (finding, strut, value, stage)."""
     for i in range(6):
-        if not abs(correction[i]) <= limits.correction:
-            return CORRECTION_FOUND, i, correction[i], 1
-    finding, strut, value = check_change(nominal, state[NOMINAL:CORRECTION], limits.step, STEP)
+        if not abs(new.correction[i]) <= limits.correction:
+            return CORRECTION, i, new.correction[i], 1
+    finding, strut, value = check_change(new.nominal, last.nominal, limits.step, STEP)
     if finding != WITHIN:
         return finding, strut, value, 0
-    finding, strut, value = check_change(command, state[COMMAND:BUMP], limits.step, STEP)
+    finding, strut, value = check_change(new.command, last.command, limits.step, STEP)
     return finding, strut, value, 1
 
 
 @compiled
-def ramp_bump(correction, state, next_bump, switches, time):
-    """Write the part of the last correction that has not been given up yet.
+def shrink_ramp(last, new):
+    """Write the part of the last correction that is still to be taken away, beside the new one without it.
 
-    When model, temperatures or enabling have changed since the last command, the bump takes up the whole
+    When model, temperatures or enabling have changed since the last command, the ramp takes up the whole
     difference, so that the command does not move; it then shrinks in proportion, its largest element at no
     more than the ramp rate.
     """
-    pause = time - state[TIME]
-    ramp = 0.0 if math.isnan(pause) else switches[RAMP_RATE] * min(max(pause, 0.0), LONGEST_RAMP_STEP)
+    pause = new.time[0] - last.time[0]
+    step = 0.0 if math.isnan(pause) else last.ramp_rate[0] * min(max(pause, 0.0), LONGEST_RAMP_STEP)
     largest = 0.0
     for i in range(6):
-        next_bump[i] = state[BUMP + i]
-        if switches[CHANGED] != 0.0 and not math.isnan(state[CORRECTION + i]):
-            next_bump[i] = state[CORRECTION + i] - correction[i]
-        largest = max(largest, abs(next_bump[i]))
-    keep = 0.0 if largest <= ramp else 1.0 - ramp / largest
+        if last.changed[0] != 0.0 and not math.isnan(last.correction[i]):
+            new.ramp[i] = last.correction[i] - new.correction[i]
+        largest = max(largest, abs(new.ramp[i]))
+    keep = 0.0 if largest <= step else 1.0 - step / largest
     for i in range(6):
-        next_bump[i] *= keep
+        new.ramp[i] *= keep
 
 
 @compiled
-def estimate_one(
-    readings,
-    state,
-    fixed,
-    tool_position,
-    tool_rotation,
-    model_pose,
-    tool_pose,
-):
+def estimate_one(readings, numbers, fixed, tool_position, tool_rotation, model_pose, tool_pose):
     """Run the model forwards from six strut readings; return (outcome, condition number).
 
     `model_pose` (12,) is the guess and, when the outcome is OK, becomes the solution; `tool_pose` (12,) in ``base``
@@ -256,7 +238,7 @@ def estimate_one(
     position, rotation = np.empty(3), np.empty((3, 3))
     outcome, _, condition, _ = actual_pose_one(
         readings,
-        state[SENSE:NOMINAL],
+        state_of(numbers).motion_sense,
         body,
         struts,
         field,

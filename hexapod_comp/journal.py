@@ -33,13 +33,14 @@ from .errors import HexapodError, InputFileError
 from .files import read_text
 from .machine import MachineModel
 
-FORMAT = 2
+FORMAT = 3
 """Version of pages."""
 
-OLDER = (
-    "is of version {found}, which does not hold what the compensator consumed, in its order; this release reads "
-    "version {format}. Replay the recording with the release that made it"
-)
+OLDER = {
+    1: "does not hold what the compensator consumed, in its order",
+    2: "holds the compensator's state as numbers without names, which another release may order differently",
+}
+"""Why older versions cannot be replayed."""
 
 SNAPSHOT_PERIOD = 0.4
 """Longest time between two snapshots, s: what a lost message costs a replay. A late subscriber is given the ten
@@ -394,8 +395,9 @@ def _content(text: str) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise JournalError(f"not JSON: {error}") from error
     found = content.get("journal") if isinstance(content, dict) else content
-    if isinstance(found, int) and 0 < found < FORMAT:
-        raise JournalError(OLDER.format(found=int(found), format=FORMAT))
+    if isinstance(found, int) and found in OLDER:
+        advice = f"this release reads version {FORMAT}. Replay the recording with the release that made it"
+        raise JournalError(f"is of version {int(found)}, which {OLDER[found]}; {advice}")
     if not isinstance(content, dict) or found != FORMAT:
         raise JournalError(f"must be of version {FORMAT}, not {str(found)[:40]}")
     return content
@@ -414,9 +416,6 @@ ENTRIES: dict[str, dict[str, Callable[[Any], Any]]] = {
 }
 """What each kind of entry says, and how it is read."""
 
-SNAPSHOT_ARRAYS = ("state", "poses", "switches")
-"""Lists of numbers in a snapshot, see :meth:`Compensator.snapshot`."""
-
 
 def _read_entry(content: Any) -> Entry:
     what = content["what"]
@@ -424,9 +423,12 @@ def _read_entry(content: Any) -> Entry:
 
 
 def _read_snapshot(content: Any) -> Snapshot:
-    state = content["state"]
-    arrays = {key: np.array([math.nan if v is None else float(v) for v in state[key]]) for key in SNAPSHOT_ARRAYS}
-    temperatures = {str(key): float(value) for key, value in state["temperatures"].items()}
+    temperatures = {str(key): float(value) for key, value in content["state"]["temperatures"].items()}
+    arrays = {
+        str(name): np.array([math.nan if v is None else float(v) for v in numbers])
+        for name, numbers in content["state"].items()
+        if name != "temperatures"
+    }
     return Snapshot(
         state={**arrays, "temperatures": temperatures},
         model=_words(content["model"], "name", "sha256"),

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from .compensation import Compensator
-from .compensation_kernels import BUMP, CHANGED, COMMAND, CORRECTION, NOMINAL, SENSE, pack_pose
+from .compensation import Compensator, pack_pose
 from .errors import HexapodError
 from .geometry import HexapodGeometry
 from .journal import Entry, Page, Snapshot
@@ -132,16 +131,9 @@ def what_if(
 
 def _begin(compensator: Compensator, snapshot: Snapshot) -> dict[str, Any]:
     """Return a snapshot with no more than what another machine can take over: directions and switches."""
-    fresh, recorded = compensator.snapshot(), snapshot.state
-    state, switches = np.array(recorded["state"]), np.array(recorded["switches"])
-    if state.shape == np.shape(fresh["state"]):
-        fresh["state"][SENSE:NOMINAL] = np.nan_to_num(state[SENSE:NOMINAL]).tolist()
-        fresh["state"][CORRECTION:COMMAND], fresh["state"][BUMP : BUMP + 6] = [np.nan] * 6, [0.0] * 6
-    if switches.shape == np.shape(fresh["switches"]):
-        fresh["switches"] = switches
-        fresh["switches"][CHANGED] = 0.0
-    fresh["temperatures"] = recorded["temperatures"]
-    return fresh
+    kept = ("temperatures", "motion_sense", "enabled", "resumes", "ramp_rate")
+    fresh = compensator.snapshot() | {name: value for name, value in snapshot.state.items() if name in kept}
+    return fresh | {"motion_sense": np.nan_to_num(fresh["motion_sense"])}
 
 
 class _Run:
@@ -255,6 +247,6 @@ class _AsItWas(_Run):
 
 def _same_state(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Return whether two snapshots are the same, all NaN being one number."""
-    arrays = ("state", "poses", "switches")
-    same = all(np.array_equal(np.asarray(one[name]), np.asarray(other[name]), equal_nan=True) for name in arrays)
-    return same and dict(one["temperatures"]) == dict(other["temperatures"])
+    if one.keys() != other.keys() or one["temperatures"] != other["temperatures"]:
+        return False
+    return all(np.array_equal(one[name], other[name], equal_nan=True) for name in one if name != "temperatures")

@@ -15,8 +15,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.compensation import Compensator
-from hexapod_comp.compensation_kernels import pack_pose
+from hexapod_comp.compensation import Compensator, pack_pose
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.journal import SNAPSHOT_PERIOD, Journal, load_with_source, sources_text

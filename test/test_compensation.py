@@ -18,8 +18,8 @@ from strategies import (
     skewed_geometry,
 )
 
-from hexapod_comp.compensation import Compensator, Correction
-from hexapod_comp.compensation_kernels import LONGEST_RAMP_STEP, pack_pose
+from hexapod_comp.compensation import Compensator, Correction, pack_pose
+from hexapod_comp.compensation_kernels import LONGEST_RAMP_STEP
 from hexapod_comp.errors import HexapodError, LimitError, ModelError, NotFiniteError, OutsideFieldError
 from hexapod_comp.field import GridField
 from hexapod_comp.geometry import HexapodGeometry, Limits

@@ -48,7 +48,15 @@ from hexapod_comp.cli import main
 from hexapod_comp.compensation import Compensator
 from hexapod_comp.errors import HexapodError, InputFileError, ModelError
 from hexapod_comp.geometry import load_geometry
-from hexapod_comp.journal import ANSWER, REFUSALS_PER_PAGE, SNAPSHOT_PERIOD, JournalError, read_page, read_sources
+from hexapod_comp.journal import (
+    ANSWER,
+    FORMAT,
+    REFUSALS_PER_PAGE,
+    SNAPSHOT_PERIOD,
+    JournalError,
+    read_page,
+    read_sources,
+)
 from hexapod_comp.machine import MachineModel
 from hexapod_comp.model_file import load_model, save_model
 from hexapod_comp.pose import Pose
@@ -236,16 +244,17 @@ def test_pages_carry_numbers_exactly():
     machine.wave(3)
     snapshot, page = machine.compensator.snapshot(), read_page(machine.journal.page(9.0))
     assert page.snapshot is not None
-    for name in ("state", "poses", "switches"):
-        np.testing.assert_array_equal(page.snapshot.state[name], np.array(snapshot[name]))
-    assert page.snapshot.state["temperatures"] == {"strut_2": 20.1}
+    assert page.snapshot.state.pop("temperatures") == snapshot.pop("temperatures") == {"strut_2": 20.1}
+    assert page.snapshot.state.keys() == snapshot.keys()
+    for name, numbers in snapshot.items():
+        np.testing.assert_array_equal(page.snapshot.state[name], np.array(numbers))
     assert page.entries[0].values == {"name": "strut_2", "value": 20.1}
     assert page.answers["lengths"].tobytes() == np.array(machine.answers).tobytes()
     assert page.answers["stamp"].tolist() == [BEGAN + n * MILLISECOND for n in (1, 2, 3)]
     np.testing.assert_array_equal(page.answers["pose"][2, :3], wave_pose(2).position)
     fresh = read_page(RecordedMachine().journal.page(9.0))
     assert fresh.snapshot is not None
-    assert np.isnan(fresh.snapshot.state["state"]).any(), "NaN is null on the way"
+    assert np.isnan(fresh.snapshot.state["command"]).all(), "NaN is null on the way"
 
 
 def test_pages_without_a_snapshot_are_small():
@@ -271,8 +280,19 @@ def test_snapshot_takes_another_compensator_to_the_same_place():
         compensator.set_temperature("strut_6", 19.0)
         compensator.correct(wave_pose(55), 1e-3)
     assert one.compensator.command.tobytes() == other.command.tobytes()
-    with pytest.raises(ModelError, match=r"snapshot\.state: must be 43 numbers"):
-        other.restore({"state": [1.0]})
+    before, whole = repr(other.snapshot()), one.compensator.snapshot()
+    for change, complaint in (
+        ({"nominal": [1.0]}, r"snapshot\.nominal: must be 6 numbers"),
+        ({"platform_rotation": np.eye(3)}, r"snapshot\.platform_rotation: must be 9 numbers"),
+        ({"speed": [1.0]}, r"snapshot\.speed: is nothing that this release knows"),
+        ({"temperatures": {"strut_7": 20.0}}, "temperature: must be of one of"),
+    ):
+        with pytest.raises(ModelError, match=complaint):
+            other.restore(whole | change)
+    for name in whole:
+        with pytest.raises(ModelError, match=rf"snapshot\.{name}: is missing"):
+            other.restore({key: value for key, value in whole.items() if key != name})
+    assert repr(other.snapshot()) == before, "what is refused changes nothing"
 
 
 def test_journal_stays_short_when_something_goes_wrong_very_often():
@@ -580,7 +600,7 @@ def test_damaged_files_end_in_a_clear_error(run, tmp_path, storage):
 
 def page_text(**changes: object) -> str:
     """Return an empty page with changes."""
-    content = {"journal": 2, "session": "x", "number": 1, "begins": 0, "answers": "", "entries": []}
+    content = {"journal": FORMAT, "session": "x", "number": 1, "begins": 0, "answers": "", "entries": []}
     return json.dumps({**content, "refused_more": 0, "snapshot": None, **changes})
 
 
@@ -588,10 +608,11 @@ def test_messages_that_are_damaged_are_named(run, tmp_path):
     """A message cut short, a page that is no JSON, of another version, or without its numbers."""
     pages = [
         ("{", "not JSON"),
-        ("[1]", "must be of version 2"),
-        ('{"journal": 9}', "must be of version 2, not 9"),
+        ("[1]", "must be of version 3"),
+        ('{"journal": 9}', "must be of version 3, not 9"),
         ('{"journal": 1}', "is of version 1, which does not hold"),
-        ('{"journal": 2}', "not a page of the journal"),
+        ('{"journal": 2}', "is of version 2, which holds the compensator's state as numbers without names"),
+        ('{"journal": 3}', "not a page of the journal"),
         (page_text(answers="AAAA"), "not a page of the journal"),
         (page_text(answers="?"), "not a page of the journal"),
         (page_text(entries=[{"after": 3, "what": "enable", "on": True}]), "not in an order"),
@@ -636,7 +657,7 @@ def test_pages_that_are_wrong_somewhere_never_end_in_a_traceback(tmp_path, capsy
         place = numbers[case % len(numbers)]
         time, topic, kind, raw = messages[place]
         page = json.loads(STORE.deserialize_cdr(raw, kind).data)
-        ways = [way for way in places_in(page) if way[:3] != ("snapshot", "state", "state") or way[-1] in (0, "state")]
+        ways = [way for way in places_in(page) if way[:2] != ("snapshot", "state") or way[-1] == 0 or len(way) < 4]
         *way, last = ways[int(draw.integers(len(ways)))]
         target = page
         for key in way:
@@ -683,16 +704,38 @@ def test_nothing_to_compare_is_an_error(run, tmp_path):
 
 
 def test_files_of_the_journal_must_have_their_hash():
-    text = json.dumps({"journal": 2, "files": {"model": {"name": "m", "sha256": "0" * 64, "text": "x"}}})
+    text = json.dumps({"journal": FORMAT, "files": {"model": {"name": "m", "sha256": "0" * 64, "text": "x"}}})
     with pytest.raises(JournalError, match="does not have the hash"):
         read_sources(text)
 
 
-def test_snapshot_of_another_version_is_refused(run, tmp_path):
-    """A state vector that has another length than here comes from another version of the arithmetic."""
-    messages = altered(run.messages, 0, lambda page: page["snapshot"]["state"]["state"].append(1.0))
-    with pytest.raises(HexapodError, match=r"snapshot\.state: must be 43 numbers"):
-        opened(write_bag(tmp_path / "run", messages))
+def renamed(page: dict) -> None:
+    page["snapshot"]["state"]["offset"] = page["snapshot"]["state"].pop("ramp")
+
+
+def test_snapshot_with_other_names_or_numbers_is_refused(run, tmp_path):
+    """A state with other parts than here comes from another version of the arithmetic."""
+    messages = altered(run.messages, 0, renamed)
+    with pytest.raises(HexapodError, match=r"snapshot\.offset: is nothing that this release knows"):
+        opened(write_bag(tmp_path / "renamed", messages))
+    messages = altered(run.messages, 0, lambda page: page["snapshot"]["state"]["ramp"].append(1.0))
+    with pytest.raises(HexapodError, match=r"snapshot\.ramp: must be 6 numbers"):
+        opened(write_bag(tmp_path / "longer", messages))
+
+
+def test_order_of_the_names_does_not_matter(run, tmp_path):
+    """Names, not places, say what a number is: with all of them in reverse order the replay is as identical."""
+
+    def reverse(page: dict) -> None:
+        if page["snapshot"] is not None:
+            page["snapshot"]["state"] = dict(reversed(page["snapshot"]["state"].items()))
+
+    messages = run.messages
+    for n in range(len(of_topic(messages, "journal"))):
+        messages = altered(messages, n, reverse)
+    _, result = opened(write_bag(tmp_path / "run", messages))
+    assert result.identical
+    assert not result.states_differ
 
 
 def test_bag_of_sqlite_without_its_tables(tmp_path):

@@ -24,8 +24,7 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
-from ..compensation import Compensator
-from ..compensation_kernels import pack_pose
+from ..compensation import Compensator, pack_pose
 from ..conversions import StrutReader, write_pose
 from ..errors import CommandError, HexapodError
 from ..geometry import HexapodGeometry, load_geometry
