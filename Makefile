@@ -22,18 +22,23 @@ endif
 LINUXCNC_PYTHON ?= /usr/bin/python3
 BESIDE_LINUXCNC = $(MAKE) --no-print-directory VENV=.venv-linuxcnc PYTHON='$(LINUXCNC_PYTHON)'
 
-.PHONY: help demo test test-linuxcnc linuxcnc bench fuzz clean run-linuxcnc-tests ros
+# Which versions of Python `make test-all` takes, of those that are here.
+VERSIONS ?= 3.10 3.11 3.12 3.13
+
+.PHONY: help demo test test-all constraints test-linuxcnc linuxcnc bench fuzz clean run-linuxcnc-tests ros
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo    run the compensator against a simulated machine; figures, out/demo.png'
 	@echo 'make test    ruff, mypy and the tests'
+	@echo 'make test-all     the same with every Python found here, each in .venv-3.x; VERSIONS="3.10 3.13" for some'
+	@echo 'make constraints  renew constraints.txt: the versions of all that is installed'
 	@echo 'make bench   speed beside NumPy, SciPy, MuJoCo, Pinocchio, LinuxCNC and a relay node'
 	@echo 'make fuzz    a nightly run of the fuzzing tests: 100,000 cases and more'
 	@echo 'make linuxcnc       .venv-linuxcnc, to run beside LinuxCNC'
 	@echo 'make test-linuxcnc  the tests with a real LinuxCNC; root installs the package first'
-	@echo 'make clean   remove .venv, .venv-linuxcnc, build folders and caches (out/ stays)'
+	@echo 'make clean   remove .venv, .venv-…, build folders and caches (out/ stays)'
 	@echo 'PYTHON=...   the Python (3.10 to 3.13) from which .venv is made; make clean before a change'
 
 demo: $(VENV)/with-ros
@@ -44,6 +49,21 @@ test: $(VENV)/with-ros,test
 	$(BIN)/mypy
 	@# The matrices of the tests are small: more threads of OpenBLAS would only wait for each other.
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest --ignore=test/test_linuxcnc.py
+
+test-all:
+	@PYTHON='$(PYTHON)' tools/pythons | { passed=; failed=; while read -r version python; do \
+	    case ' $(VERSIONS) ' in *" $$version "*) ;; *) continue;; esac; \
+	    echo "== Python $$version: $$python"; \
+	    if $(MAKE) --no-print-directory VENV=.venv-$$version PYTHON="$$python" test </dev/null; \
+	    then passed="$$passed $$version"; else failed="$$failed $$version"; fi; done; \
+	    echo "make: tests passed with Python:$${passed:- none}; failed:$${failed:- none}"; \
+	    [ -n "$$passed" ] && [ -z "$$failed" ]; }
+
+# On purpose only: until then everybody gets the versions that were tested.
+constraints: $(VENV)/made-in
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check 'uv>=0.5'
+	$(BIN)/uv pip compile setup.py --extra ros --extra test --universal --python-version 3.10 --upgrade --quiet \
+	    --no-annotate --custom-compile-command 'make constraints' --output-file constraints.txt
 
 bench: $(VENV)/with-ros,bench
 	@$(BIN)/python -m benchmarks
@@ -67,7 +87,7 @@ run-linuxcnc-tests: $(VENV)/with-ros,test
 	LINUXCNC_TESTS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -s test/test_linuxcnc.py
 
 clean:
-	rm -rf .venv .venv-linuxcnc build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-* build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/made-in:
@@ -76,9 +96,10 @@ $(VENV)/made-in:
 	@'$(PYTHON)' -m venv --clear $(VENV)
 	@pwd -P > $@
 
-$(VENV)/with-%: setup.py $(VENV)/made-in
+$(VENV)/with-%: setup.py constraints.txt $(VENV)/made-in
 	@echo "Installing hexapod_comp[$*] and what it needs into $(VENV), once; this takes a minute or two ..."
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-input --use-pep517 --editable '.[$*]'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-input --use-pep517 \
+	    --constraint constraints.txt --editable '.[$*]'
 	@touch $(VENV)/with-ros $@
 
 define INSTALL_LINUXCNC

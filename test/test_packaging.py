@@ -17,6 +17,8 @@ from unittest import mock
 from xml.etree import ElementTree
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.paths import config_file, shipped_names
@@ -29,7 +31,7 @@ FILES = ("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "LICENSE", "R
 
 # Import name → key in rosdep's python.yaml and name on PyPI, where the three differ. ROS packages are
 # imported under their own name, which is also their key.
-PYTHON3 = ("hypothesis", "matplotlib", "numba", "numpy", "pytest", "scipy", "tqdm", "yaml")
+PYTHON3 = ("hypothesis", "matplotlib", "numba", "numpy", "packaging", "pytest", "scipy", "tqdm", "yaml")
 ROSDEP_KEYS = {name: f"python3-{name}" for name in PYTHON3}
 PYPI_NAMES = {"yaml": "pyyaml"}
 # setuptools runs setup.py wherever that is read, mpl_toolkits comes with matplotlib and llvmlite with Numba, hal and
@@ -113,9 +115,35 @@ def test_the_source_archive_carries_all_that_its_checks_need(wheel: Path):
     assert needed <= held
 
 
+@pytest.mark.parametrize("version", ["3.10", "3.11", "3.12", "3.13"])
+def test_constraints_pin_all_that_make_installs(version: str, monkeypatch: pytest.MonkeyPatch):
+    """One exact version for each requirement, which it satisfies; after a change of setup.py: ``make constraints``."""
+    monkeypatch.chdir(ROOT)
+    here = {"python_version": version, "python_full_version": f"{version}.0", "sys_platform": "linux"}
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pins = [Requirement(line) for line in lines if line and not line.startswith("#")]
+    pins = [pin for pin in pins if pin.marker is None or pin.marker.evaluate(here)]
+    pinned = {canonicalize_name(pin.name): pin.specifier for pin in pins}
+    assert len(pinned) == len(pins)
+    assert all([specifier.operator for specifier in found] == ["=="] for found in pinned.values())
+    setup = _setup_arguments()
+    wanted = [Requirement(line) for line in (*setup["install_requires"], *setup["extras_require"]["ros"])]
+    wanted += [Requirement(line) for line in setup["extras_require"]["test"]]
+    for requirement in wanted:
+        (exact,) = pinned[canonicalize_name(requirement.name)]
+        assert requirement.specifier.contains(exact.version), requirement
+
+
 def test_citation_and_changelog_name_the_version():
     assert re.search(rf"^version: {_version()}$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
     assert re.search(rf"^{_version()} \(", (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8"), re.MULTILINE)
+
+
+def _setup_arguments() -> dict:
+    """Return what setup.py, run in the current folder, tells setuptools."""
+    with mock.patch("setuptools.setup") as setup:
+        runpy.run_path("setup.py")
+    return setup.call_args.kwargs
 
 
 def _version() -> str:
@@ -237,9 +265,7 @@ def test_package_xml_lists_what_the_tests_import():
 
 def test_setup_py_agrees_with_the_imports_and_package_xml(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(ROOT)
-    with mock.patch("setuptools.setup") as setup:
-        runpy.run_path("setup.py")
-    metadata = setup.call_args.kwargs
+    metadata = _setup_arguments()
     required = {re.split(r"[^\w.-]", line)[0].lower() for line in metadata["install_requires"]}
     assert required == {PYPI_NAMES.get(name, name) for name in _imports(PACKAGE) - _ros_dependencies()}
     package_xml = ElementTree.parse(ROOT / "package.xml")
