@@ -35,7 +35,8 @@ PYTHON3 = ("hypothesis", "matplotlib", "numba", "numpy", "packaging", "pytest", 
 ROSDEP_KEYS = {name: f"python3-{name}" for name in PYTHON3}
 PYPI_NAMES = {"yaml": "pyyaml"}
 # setuptools runs setup.py wherever that is read, mpl_toolkits comes with matplotlib and llvmlite with Numba, apsw
-# and lz4 with rosbags, hal and linuxcnc with LinuxCNC, benchmarks are the source tree's; the others are optional extras and benchmark tools.
+# and lz4 with rosbags, hal and linuxcnc with LinuxCNC, benchmarks are the source tree's; the others are optional
+# extras and benchmark tools.
 COMING_WITH = {"setuptools", "mpl_toolkits", "llvmlite", "apsw", "lz4", "hal", "linuxcnc", "benchmarks"}
 EXEMPT = COMING_WITH | {"plotly", "distributed", "rosbags", "mujoco", "pinocchio"}
 WITHOUT_ROS = """
