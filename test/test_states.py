@@ -86,11 +86,14 @@ def met(bench: Bench, drive: LifecycleNode, compensator: LifecycleNode) -> None:
 
 
 def end(bench: Bench, node: LifecycleNode) -> None:
-    """End a node."""
+    """End a node; nothing of it is left: its publishers live on until the executor has let go of their events."""
+    count = bench.witness.count_publishers
+    before = {publisher.topic_name: count(publisher.topic_name) for publisher in node.publishers}
     node.trigger_deactivate()
     bench.executor.remove_node(node)
     bench.nodes.remove(node)
     node.destroy_node()
+    bench.until(lambda: all(count(topic) < number for topic, number in before.items()), "its publishers to be gone")
 
 
 def command(bench: Bench, lengths: np.ndarray) -> None:
