@@ -46,6 +46,8 @@ START_WITHIN = 180.0
 
 OURS, RELAY = "ours", "relay"
 
+MODEL = "model_file:=paper_machine.yaml"
+
 
 class Line:
     """Commands to one of the two nodes and its answers."""
@@ -194,7 +196,7 @@ def measure(bouts: int, rounds: int, seconds: float, floor: bool = False) -> lis
     """Run everything and return one row per rate; `floor`: against the relay that does not even look at messages."""
     with ExitStack() as stack:
         stack.enter_context(PrivateDomain())
-        stack.enter_context(process("hexapod_comp.nodes.compensator", OURS, "marker_rate:=0.0"))
+        stack.enter_context(process("hexapod_comp.nodes.compensator", OURS, "marker_rate:=0.0", MODEL))
         stack.enter_context(process("benchmarks.relay", RELAY, f"serialized:={str(floor).lower()}"))
         context = rclpy.Context()
         rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)

@@ -17,7 +17,10 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
 from hexapod_comp.conversions import StrutMessage
-from hexapod_comp.nodes.runtime import COMMAND_QOS, STATE_QOS, MachineNode, Parameter, declare, run
+from hexapod_comp.nodes.arguments import Program
+from hexapod_comp.nodes.parameters import Parameter, declare
+from hexapod_comp.nodes.running import run
+from hexapod_comp.nodes.runtime import COMMAND_QOS, STATE_QOS, MachineNode
 
 STAMP = slice(4, 12)
 """Where a message's stamp stands among its bytes."""
@@ -69,4 +72,4 @@ class RelayNode(MachineNode):
 
 
 if __name__ == "__main__":
-    sys.exit(run(RelayNode))
+    sys.exit(run(RelayNode, Program("relay", "Answers each pose with strut messages that never change.", PARAMETERS)))

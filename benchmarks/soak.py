@@ -34,7 +34,8 @@ from sensor_msgs.msg import JointState
 
 from hexapod_comp.conversions import pose_message
 from hexapod_comp.nodes.processes import PrivateDomain
-from hexapod_comp.nodes.runtime import COMMAND_QOS, EVENT_QOS, SPIN_PERIOD
+from hexapod_comp.nodes.running import SPIN_PERIOD
+from hexapod_comp.nodes.runtime import COMMAND_QOS, EVENT_QOS
 from hexapod_comp.nodes.stamps import nanoseconds_of
 from hexapod_comp.pose import Pose
 
@@ -251,6 +252,7 @@ def nodes(folder: Path) -> Iterator[dict[str, int]]:
         try:
             for name in NODES:
                 command = [sys.executable, "-m", "benchmarks.soak_node", str(folder / f"{name}.jsonl"), name]
+                command += ["--ros-args", "-p", "compensator:model_file:=paper_machine.yaml"]
                 children[name] = subprocess.Popen(command, stderr=sink, stdin=subprocess.DEVNULL)
             yield {name: child.pid for name, child in children.items()}
         finally:

@@ -57,7 +57,7 @@ def main() -> int:
     events, name, *arguments = sys.argv[1:]
     Notes(Path(events))
     module = importlib.import_module(f"hexapod_comp.nodes.{name}")
-    return module.main([sys.argv[0], *arguments])
+    return module.main(arguments)
 
 
 if __name__ == "__main__":

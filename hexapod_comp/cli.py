@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import io
 import os
 import re
 import sys
@@ -11,6 +10,7 @@ from collections.abc import Sequence
 
 from .errors import HexapodError
 from .outputs import inputs_protected
+from .texts import accept_any_terminal
 
 PROGRAM = "hexapod_comp"
 
@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit code: 0 fine, 1 the verb's own "no", 2 bad input, 130 interrupted.
     """
     arguments = sys.argv[1:] if argv is None else argv
-    _accept_any_terminal()
+    accept_any_terminal()
     try:
         args = make_parser().parse_args(_with_negative_values(arguments))
     except SystemExit as leaving:  # argparse has printed help or what is wrong
@@ -63,13 +63,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader has gone (| head); the interpreter must not complain when it flushes at its end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
-
-
-def _accept_any_terminal() -> None:
-    """Write what a terminal's encoding does not have as an escape: no reason to end with a traceback."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -5,9 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+LONGEST_TEXT = 2000
+"""No message, log line or value in diagnostics is longer than this, whatever a stranger has sent."""
+
 
 class HexapodError(Exception):
     """Root of all errors that this package raises on purpose.
+
+    Its text may quote what came from outside, so it is made :func:`printable` here, for all of them at once.
+
+    Parameters
+    ----------
+    text : str
+        What is wrong, with the value found and what is allowed.
 
     Attributes
     ----------
@@ -16,6 +26,14 @@ class HexapodError(Exception):
     """
 
     reason = "error"
+
+    def __init__(self, text: str = ""):
+        super().__init__(printable(text, LONGEST_TEXT))
+
+    def with_lines(self, lines: str) -> HexapodError:
+        """Return the error with lines below its text that are shown as they are: what our own process has logged."""
+        self.args = (f"{self}\n{lines}",)
+        return self
 
 
 class MissingPackageError(HexapodError, ImportError):
@@ -50,7 +68,7 @@ class InputFileError(HexapodError):
         file = printable(str(path), LONGEST_PATH)
         where = f"{file}: {printable(key)}" if key else file
         found = "" if value is None else f" (found {shorten(value)})"
-        super().__init__(printable(f"{where}: {problem}{found}", 2000))
+        super().__init__(f"{where}: {problem}{found}")
 
 
 class GeometryError(HexapodError):
@@ -206,11 +224,19 @@ class CommandError(HexapodError):
 
 def shorten(value: Any, limit: int = 80) -> str:
     """Return ``repr(value)`` cut to `limit` characters, so that a message stays readable."""
+    if isinstance(value, str | bytes) and len(value) > limit:
+        return repr(value[:limit])[: limit - 1] + "…"  # the rest, of any size, is never copied
     text = repr(value)
     return text if len(text) <= limit else text[: limit - 1] + "…"
 
 
 def printable(text: str, limit: int = 200) -> str:
-    """Return a text out of a file on one line, of at most `limit` characters, without codes for the terminal."""
+    """Return a text on one line, of at most `limit` characters, without codes for the terminal.
+
+    What comes from outside (a file, a message, the network's names) passes here before it is shown: a line break
+    would forge lines of the log, an escape code moves the cursor, and ten megabytes are no message.
+    """
+    if len(text) <= limit and text.isprintable():
+        return text
     shown = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text[: limit + 1])
-    return shown if len(text) <= limit else shown[: limit - 1] + "…"
+    return shown if len(shown) <= limit else shown[: limit - 1] + "…"

@@ -1,7 +1,9 @@
-"""Numbers and tables as text, for reports."""
+"""Numbers and tables as text, for reports, and streams that take any text."""
 
 from __future__ import annotations
 
+import io
+import sys
 from collections.abc import Iterable, Sequence
 
 
@@ -18,3 +20,10 @@ def aligned(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
         widths[-1] = 0
     shown = [[cell.rjust(width) for cell, width in zip(line, widths, strict=True)] for line in lines]
     return "\n".join("  ".join(cells).rstrip() for cells in shown)
+
+
+def accept_any_terminal() -> None:
+    """Write what a terminal's encoding does not have as an escape: no reason to end with a traceback."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")

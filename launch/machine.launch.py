@@ -25,7 +25,7 @@ def generate_launch_description() -> LaunchDescription:
         [
             argument("namespace", default_value="", description="Holds this machine's nodes and topics."),
             argument("geometry", default_value="", description="Geometry file; empty: as in the node."),
-            argument("model", default_value="", description="Model file; empty: as in the node."),
+            argument("model", default_value="", description="Model file; empty: ideal, corrects nothing."),
             argument("truth", default_value="", description="What strut_drive hides; empty: as in the node."),
             argument("params_file", default_value="", description="Parameters of both nodes (YAML)."),
             argument("autostart", default_value="true", choices=FLAG, description="Activate unasked."),

@@ -37,7 +37,7 @@ from visualization_msgs.msg import MarkerArray
 from hexapod_comp.conversions import pose_message
 from hexapod_comp.geometry import STRUT_NAMES
 from hexapod_comp.nodes.compensator import CompensatorNode
-from hexapod_comp.nodes.runtime import autostart
+from hexapod_comp.nodes.running import autostart
 from hexapod_comp.nodes.strut_drive import StrutDriveNode
 from hexapod_comp.pose import Pose
 
@@ -159,12 +159,14 @@ class Bench:
     # ---- nodes ----
 
     def compensator(self, start: bool = True, **parameters: object) -> CompensatorNode:
-        """Add a compensator; `start` configures and activates it and waits until it is connected.
+        """Add a compensator, with the virtual machine's model unless another is given.
 
-        Its machine has no feedback unless a test gives some, and need not wait for it unless a test says so.
+        `start` configures and activates it and waits until it is connected. Its machine has no feedback unless a test
+        gives some, and need not wait for it unless a test says so.
         """
         self.hush("strut_commands")
-        return self.add(CompensatorNode, start, {"start_without_feedback_after": AT_ONCE, **parameters})
+        defaults = {"model_file": "paper_machine.yaml", "start_without_feedback_after": AT_ONCE}
+        return self.add(CompensatorNode, start, {**defaults, **parameters})
 
     def drive(self, start: bool = True, **parameters: object) -> StrutDriveNode:
         """Add a strut drive, which the witness commands unless there is a compensator to do it."""

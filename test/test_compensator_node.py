@@ -19,6 +19,7 @@ from geometry_msgs.msg import PoseStamped
 from helpers import table_lengths, table_poses
 from lifecycle_msgs.srv import GetState
 from node_helpers import (
+    AT_ONCE,
     CONFIG,
     HOME,
     SENT,
@@ -42,7 +43,8 @@ from hexapod_comp.nodes import compensator as compensator_module
 from hexapod_comp.nodes import health, runtime, stamps
 from hexapod_comp.nodes.compensator import CompensatorNode
 from hexapod_comp.nodes.health import ERROR, OK, WARN, Flow, HealthReport, Refusals
-from hexapod_comp.nodes.runtime import ParameterError, Throttle
+from hexapod_comp.nodes.parameters import ParameterError
+from hexapod_comp.nodes.runtime import Throttle
 from hexapod_comp.pose import Pose
 
 STEP_BACK = (0.0002, 0.0001, -0.0003)
@@ -1155,8 +1157,20 @@ def test_standard_messages_on_the_topics_of_the_readme(bench):
     assert bench.call(GetState, "compensator/get_state").current_state.label == "active"
 
 
-def test_shipped_files_are_the_default(bench):
-    bench.compensator()
+def test_a_bare_start_corrects_nothing_and_says_so(bench):
+    """Somebody else's errors must not move a machine whose model was not named."""
+    bench.hush("strut_commands")
+    bench.add(CompensatorNode, True, {"start_without_feedback_after": AT_ONCE})
+    assert bench.logged("with the ideal model, which corrects nothing (parameter model_file)")
+    answer = bench.settle(near(HOME, (0.01, 0.02, 0.03), 3.0))
+    np.testing.assert_array_equal(answer.corrections, 0.0)
+    bench.until_status(OK, "running")
+    assert bench.values()["model"] == "ideal"
+
+
+def test_a_shipped_model_is_found_by_name(bench):
+    bench.compensator(model_file="paper_machine")
     shipped = yaml.safe_load((CONFIG / "paper_machine.yaml").read_text(encoding="utf-8"))
     bench.until(bench.status, "a status")
     assert bench.values()["model"] == shipped["name"]
+    assert bench.logged(f"with model {shipped['name']!r}")

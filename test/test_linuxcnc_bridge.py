@@ -32,7 +32,8 @@ from hexapod_comp.geometry import STRUT_NAMES
 from hexapod_comp.hal_component import HalComponent, HalError, load_module, pins, quaternion_from_axes
 from hexapod_comp.nodes.health import ERROR, OK, WARN
 from hexapod_comp.nodes.linuxcnc_bridge import LinuxcncBridgeNode
-from hexapod_comp.nodes.runtime import ParameterError, autostart
+from hexapod_comp.nodes.parameters import ParameterError
+from hexapod_comp.nodes.running import autostart
 from hexapod_comp.pose import Pose
 
 NODE = "linuxcnc_bridge"

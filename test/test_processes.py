@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import subprocess
@@ -16,6 +17,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from node_helpers import HOME, closed_form_lengths, near
 from sensor_msgs.msg import JointState
 
+from hexapod_comp.errors import printable
+from hexapod_comp.nodes.arguments import outside_ros
 from hexapod_comp.nodes.client import LISTENER_QOS, LoopClient, Sent
 from hexapod_comp.nodes.middleware import PROFILE_VARIABLES, avoid_shared_memory
 from hexapod_comp.nodes.processes import NodeProcess
@@ -37,7 +40,8 @@ def client(isolated_ros) -> Iterator[LoopClient]:
 def pair(client) -> Iterator[tuple[NodeProcess, NodeProcess]]:
     """Compensator and strut drive, connected with each other and with the client."""
     # The struts start from where they are measured; at this rate the correction is in with the second command.
-    nodes = NodeProcess("compensator", {"ramp_rate": 1.0}), NodeProcess("strut_drive", {})
+    parameters = {"model_file": "paper_machine.yaml", "ramp_rate": 1.0}
+    nodes = NodeProcess("compensator", parameters), NodeProcess("strut_drive", {})
     try:
         connect(client, nodes)
         yield nodes
@@ -183,7 +187,7 @@ def test_a_compensator_restarted_under_a_stream_waits_for_the_struts(client, pai
     drive.send(signal.SIGSTOP)
     before, last = len(published), published[-1]
     client.diagnostics = {}
-    again = NodeProcess("compensator", {"ramp_rate": 1.0})
+    again = NodeProcess("compensator", {"model_file": "paper_machine.yaml", "ramp_rate": 1.0})
     try:
         stream(lambda: "refused.no_feedback" in client.diagnostics or len(published) > before)
         drive.send(signal.SIGCONT)
@@ -204,11 +208,10 @@ def test_a_compensator_restarted_under_a_stream_waits_for_the_struts(client, pai
     [
         (["-p", "geometry_file:=nowhere.yaml"], ["cannot configure", "nowhere.yaml", "paper.yaml"]),
         (["-p", "autostart:=maybe"], ["cannot start", "parameter autostart", "must be bool", "'maybe'"]),
-        (["-p", "no_assignment"], ["no_assignment"]),
         (["-p", "compensator:ramp_rate:=-1.0", "-p", "strut_drive:lag:=-1.0"], ["cannot start: parameter", "-1.0"]),
         (["-p", "compensator:ramp_rate:=50", "-p", "strut_drive:lag:=50"], ["cannot start: parameter", "…1, not 50"]),
     ],
-    ids=["no such file", "wrong type", "not an argument", "below its range", "an int above its range"],
+    ids=["no such file", "wrong type", "below its range", "an int above its range"],
 )
 def test_bad_start_ends_with_1_and_a_clear_word(isolated_ros, arguments, texts):
     for code, said in run_both("--ros-args", *arguments):
@@ -216,6 +219,72 @@ def test_bad_start_ends_with_1_and_a_clear_word(isolated_ros, arguments, texts):
         assert "Traceback" not in said
         for text in texts:
             assert text in said
+
+
+PROGRAMS = {
+    "compensator": ("model_file  [ideal]", "tool_pose_command"),
+    "strut_drive": ("truth_file  [paper_machine.yaml]", "strut_commands"),
+    "linuxcnc_bridge": ("units  [mm]", "strut_corrections"),
+}
+
+
+def run_program(name: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", f"hexapod_comp.nodes.{name}", *arguments]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=60.0, check=False, env={**os.environ, **environment}
+    )
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_help_lists_every_parameter_and_the_topics(name):
+    done = run_program(name, "--help")
+    assert done.returncode == 0
+    assert done.stderr == ""
+    assert done.stdout.startswith(f"usage: {name} ")
+    assert all(text in done.stdout for text in PROGRAMS[name])
+    module = importlib.import_module(f"hexapod_comp.nodes.{name}")
+    declared = [*module.PARAMETERS, *getattr(module, "FAULT_PARAMETERS", ())]
+    assert all(f"  {parameter.name}  [" in done.stdout for parameter in declared)
+    assert max(map(len, done.stdout.splitlines())) <= 120
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["-p", "model_file:=mine.yaml"],
+        ["model_file:=mine.yaml"],
+        ["--model", "mine.yaml"],
+        ["--hel"],
+        ["mine\n\x1b[2J"],
+        ["--ros-args", "-p", "autostart:=false", "--", "late"],
+        ["--ros-args", "-p", "no_assignment"],
+        ["--ros-args", "--parms-file", "x.yaml"],
+    ],
+    ids=["-p without --ros-args", "ROS 1", "option", "shortened", "forged", "behind --", "no value", "unknown to ROS"],
+)
+def test_an_argument_that_nobody_reads_ends_with_2_and_is_named(arguments):
+    """Before, all but the last two started the node with its defaults."""
+    done = run_program("compensator", *arguments)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    said = done.stderr.splitlines()[-1]
+    assert said.startswith("compensator: error: ")
+    assert said.isprintable()
+    assert printable(arguments[-1]) in said
+
+
+def test_all_programs_refuse_what_they_do_not_know_on_any_terminal():
+    for name in PROGRAMS:
+        done = run_program(name, "-p", "x:=µ", PYTHONIOENCODING="ascii")
+        assert done.returncode == 2
+        assert f"{name} --ros-args" in done.stderr
+        assert "Traceback" not in done.stderr
+        assert run_program(name, "--help", PYTHONIOENCODING="ascii").returncode == 0
+
+
+def test_arguments_of_ros_stand_between_its_two_marks():
+    given = ["a", "--ros-args", "-r", "__node:=x", "--", "b", "--ros-args", "-p", "c:=1"]
+    assert outside_ros(given) == ["a", "b"]
 
 
 def test_nodes_end_when_their_parent_is_killed(isolated_ros):

@@ -21,7 +21,7 @@ from rclpy.node import Node
 
 from hexapod_comp.nodes.client import LoopClient
 from hexapod_comp.nodes.linuxcnc_bridge import LinuxcncBridgeNode
-from hexapod_comp.nodes.runtime import autostart
+from hexapod_comp.nodes.running import autostart
 
 PACKAGE = Path(__file__).resolve().parents[1] / "hexapod_comp"
 

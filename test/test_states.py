@@ -27,7 +27,7 @@ from hexapod_comp.nodes.command_source import CommandSource, Sequence
 from hexapod_comp.nodes.compensator import CHECK_PERIOD, CompensatorNode
 from hexapod_comp.nodes.following import Following
 from hexapod_comp.nodes.health import ERROR, OK, WARN
-from hexapod_comp.nodes.runtime import ParameterError
+from hexapod_comp.nodes.parameters import ParameterError
 from hexapod_comp.nodes.stamps import period
 from hexapod_comp.nodes.strut_drive import StrutDriveNode
 

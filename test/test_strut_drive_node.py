@@ -19,7 +19,7 @@ from sensor_msgs.msg import JointState
 from hexapod_comp.conversions import message_pose
 from hexapod_comp.geometry import STRUT_NAMES
 from hexapod_comp.nodes.health import ERROR, OK, WARN
-from hexapod_comp.nodes.runtime import ParameterError
+from hexapod_comp.nodes.parameters import ParameterError
 from hexapod_comp.nodes.strut_drive import StrutDriveNode
 from hexapod_comp.pose import Pose
 

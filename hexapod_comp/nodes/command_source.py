@@ -12,6 +12,9 @@ from typing import Any
 
 from rclpy.lifecycle import LifecycleNode
 
+from ..errors import shorten
+from .guarding import described
+
 SPEAKERS_WITHIN = 1.0
 """Who speaks again this long after another has taken over is not a predecessor that was stopped, s."""
 
@@ -92,20 +95,37 @@ class Publishers:
         How many there were at the last look, −1 before.
     names : tuple of str
         Full names of their nodes, each once.
+    untold : str
+        Why the names cannot be told, empty where they can. Who cannot tell who commands must not obey.
     """
 
     def __init__(self, node: LifecycleNode, topic: str, count: Callable[[], int]) -> None:
         self._node, self.topic, self._count_now = node, topic, count
         self.count = -1
         self.names: tuple[str, ...] = ()
+        self.untold = ""
 
     def look(self) -> None:
         """Look again: at the names only when they may have changed, or when they matter."""
         count = self._count_now()
-        if count != self.count or count > 1 or UNKNOWN_NAME in self.names:
+        if count != self.count or count > 1 or self.untold or UNKNOWN_NAME in self.names:
             self.count = count
-            found = self._node.get_publishers_info_by_topic(self.topic) if count else ()
-            self.names = tuple(sorted({_full_name(info) for info in found}))
+            self.names, self.untold = self._found() if count else ((), "")
+
+    @property
+    def reason(self) -> str:
+        """Name under which refusals are counted."""
+        return "unknown_publisher" if self.untold else "several_publishers"
+
+    def _found(self) -> tuple[tuple[str, ...], str]:
+        """Return the names, and why there are none: a node's name may be any bytes, which rclpy cannot give."""
+        try:
+            found = self._node.get_publishers_info_by_topic(self.topic)
+            return tuple(sorted({_full_name(info) for info in found})), ""
+        except UnicodeDecodeError as error:
+            return (), f"a node's name is not UTF-8: {shorten(error.object)}"
+        except Exception as error:  # of many kinds: what the graph holds is others' doing
+            return (), described(error)
 
 
 def _full_name(info: Any) -> str:
@@ -128,12 +148,15 @@ class CommandSource:
         Several may command; they are named all the same.
     """
 
-    reason = "several_publishers"
-
     def __init__(self, node: LifecycleNode, topic: str, count: Callable[[], int], allowed: bool) -> None:
         self._publishers, self._allowed = Publishers(node, topic, count), allowed
         self.sequence = Sequence()
         self.problem = ""
+
+    @property
+    def reason(self) -> str:
+        """Name under which refusals are counted."""
+        return self._publishers.reason
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -157,7 +180,9 @@ class CommandSource:
         self.problem = ""
         if self._allowed:
             return
-        if len(names) > 1:
+        if self._publishers.untold:
+            self.problem = f"who publishes {topic} cannot be told: {self._publishers.untold}"
+        elif len(names) > 1:
             self.problem = f"several publishers of {topic}: {', '.join(names)}"
         elif self._publishers.count > 1 and self.sequence.two_speak(now):
             self.problem = f"two publishers of {topic} speak in turn, both called {', '.join(names) or UNKNOWN_NAME}"
@@ -179,8 +204,6 @@ class OwnTopic:
         Others may publish; they are named all the same.
     """
 
-    reason = "several_publishers"
-
     def __init__(self, node: LifecycleNode, topic: str, allowed: bool) -> None:
         self._own = node.get_fully_qualified_name()
         self._publishers = Publishers(node, topic, lambda: node.count_publishers(topic))
@@ -188,9 +211,15 @@ class OwnTopic:
         self.names: tuple[str, ...] = ()
         self.problem = ""
 
+    @property
+    def reason(self) -> str:
+        """Name under which refusals are counted."""
+        return self._publishers.reason
+
     def look(self, now: float) -> None:
         """Look who publishes."""
         self._publishers.look()
         self.names = tuple(name for name in self._publishers.names if name != self._own)
-        told = self.names and not self._allowed
-        self.problem = f"{self._publishers.topic} is also published by {', '.join(self.names)}" if told else ""
+        others = ", ".join(self.names) or self._publishers.untold
+        told = others and not self._allowed
+        self.problem = f"{self._publishers.topic} is also published by {others}" if told else ""

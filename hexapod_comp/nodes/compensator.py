@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.serialization import serialize_message
@@ -26,7 +25,7 @@ from visualization_msgs.msg import MarkerArray
 
 from ..compensation import Compensator, pack_pose
 from ..conversions import StrutReader, write_pose
-from ..errors import CommandError, HexapodError
+from ..errors import CommandError, HexapodError, shorten
 from ..geometry import HexapodGeometry, load_geometry
 from ..journal import Source, load_with_source
 from ..machine import MachineModel
@@ -35,26 +34,18 @@ from ..paths import confined_file, folder_of
 from ..pose import Pose
 from ..thermal import TemperatureFilter
 from .command_source import CommandSource, OwnTopic
-from .compensator_parameters import PARAMETERS
+from .compensator_parameters import PARAMETERS, PROGRAM
 from .compensator_status import CompensatorStatus
 from .following import Reach
-from .health import WARN, HealthReport, seconds
+from .health import WARN, seconds
 from .journal import JournalTopics
 from .markers import machine_markers
 from .model_loading import Loading
 from .order import InOrder
+from .parameters import ParameterError, declare
 from .reloading import ReloadService
-from .runtime import (
-    ACKNOWLEDGED_WITHIN,
-    COMMAND_QOS,
-    EVENT_QOS,
-    STATE_QOS,
-    MachineNode,
-    ParameterError,
-    declare,
-    keep_discovery_local,
-    run,
-)
+from .running import keep_discovery_local, run
+from .runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, STATE_QOS, MachineNode
 from .stamps import StampCheck, nanoseconds_of, period, stamp_of
 from .wire import StrutBytes, read_pose_bytes
 
@@ -130,12 +121,11 @@ class CompensatorNode(MachineNode):
         self._open_topics()
         frames = {name: self._options[f"{name}_frame"] for name in ("base", "work")}
         self._journal = JournalTopics(self, self.compensator, self._sources, frames)
-        name = f"{self.get_fully_qualified_name()[1:]}: {geometry.name}"
-        self._report = HealthReport(name, geometry.name)
-        self.get_logger().info(
-            f"configured machine {geometry.name!r} with model {self.compensator.model.name!r} "
-            f"in {time.perf_counter() - began:.2f} s"
-        )
+        model = f"model {self.compensator.model.name!r}"
+        if self._options["model_file"] == "ideal":
+            model = "the ideal model, which corrects nothing (parameter model_file)"
+        took = time.perf_counter() - began
+        self.get_logger().info(f"configured machine {geometry.name!r} with {model} in {took:.2f} s")
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -191,7 +181,7 @@ class CompensatorNode(MachineNode):
         self._command_pub = self.publish_on(JointState, "strut_commands", COMMAND_QOS)
         self._correction_pub = self.publish_on(JointState, "strut_corrections", COMMAND_QOS)
         self._estimate_pub = self.publish_on(PoseStamped, "tool_pose_estimate", STATE_QOS)
-        self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", EVENT_QOS)
+        self.open_diagnostics(self.compensator.geometry.name)
         self._marker_pub = self.create_publisher(MarkerArray, "~/markers", EVENT_QOS)
         self._array_pub = None
         if self._options["publish_array"]:
@@ -281,7 +271,8 @@ class CompensatorNode(MachineNode):
     def _examine(self, frame_id: str, now: float) -> None:
         """Refuse an unknown frame, while a guard has a problem, or missing feedback; start from what there is."""
         if frame_id not in self._frames:
-            raise CommandError("frame_id", f"frame_id must be one of {', '.join(self._frames)}, not {frame_id!r}")
+            allowed = ", ".join(self._frames)
+            raise CommandError("frame_id", f"frame_id must be one of {allowed}, not {shorten(frame_id)}")
         guard = self._status.problem()
         if guard is not None:
             raise CommandError(guard.reason, guard.problem)
@@ -434,10 +425,7 @@ class CompensatorNode(MachineNode):
         self._reload.look()
         self._journal.tick(now)
         level, text = self._status.judged(self.compensator, now) if self._active else (WARN, "not active")
-        if self._report.due(level, text, now):
-            values = self._status.values(self.compensator, self._fresh_start, now)
-            stamp = self.get_clock().now().to_msg()
-            self._diagnostics_pub.publish(self._report.message(level, text, values, stamp))
+        self.tell(level, text, lambda: self._status.values(self.compensator, self._fresh_start, now))
 
     def _tell_problem(self) -> None:
         """Log what stops the machine, once."""
@@ -451,7 +439,7 @@ class CompensatorNode(MachineNode):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; the entry of the executable ``compensator``."""
     keep_discovery_local()
-    return run(CompensatorNode, argv)
+    return run(CompensatorNode, PROGRAM, argv)
 
 
 if __name__ == "__main__":

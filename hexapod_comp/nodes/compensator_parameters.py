@@ -1,14 +1,15 @@
-"""Parameters of the compensator node; all are fixed when it starts."""
+"""Parameters of the compensator node, which are fixed when it starts, and its help."""
 
 from __future__ import annotations
 
 from ..thermal import DEFAULT_TIME_CONSTANT
-from .runtime import Parameter
+from .arguments import Program
+from .parameters import Parameter
 
 PARAMETERS = (
     Parameter("autostart", True, "configure and activate at start"),
     Parameter("geometry_file", "paper.yaml", "geometry file: a path or the name of a shipped one"),
-    Parameter("model_file", "paper_machine.yaml", "model file: a path or the name of a shipped one; ideal = none"),
+    Parameter("model_file", "ideal", "model file: a path or the name of a shipped one; ideal = corrects nothing"),
     Parameter("model_folder", "", "folder from which both files may be read; empty: each one's own at the start"),
     Parameter("base_frame", "base", "frame_id of poses in the machine base"),
     Parameter("work_frame", "work", "frame_id of poses in the geometry file's work frame"),
@@ -38,4 +39,24 @@ PARAMETERS = (
     ),
     Parameter("marker_rate", 10.0, "markers per second, Hz; 0 = none", 0.0, 10.0),
     Parameter("publish_array", False, "also publish strut_commands_array for ros2_controllers"),
+)
+
+TOPICS = """
+in   tool_pose_command       PoseStamped: commanded tool pose, frame_id base or work
+     strut_states            JointState: measured strut lengths, m
+     temperatures            Temperature: °C; frame_id names strut_1 to strut_6, base or platform
+out  strut_commands          JointState: compensated strut lengths, m
+     strut_corrections       JointState: command − nominal, m
+     tool_pose_estimate      PoseStamped: from measured struts, in base
+     /diagnostics, ~/markers, ~/journal, ~/files
+ask  ~/enable_compensation   SetBool
+     ~/reload_model, ~/reset Trigger
+"""
+
+PROGRAM = Program(
+    "compensator",
+    "Compensates a hexapod's errors: tool poses in, strut commands out.",
+    PARAMETERS,
+    TOPICS,
+    "-p geometry_file:=mine.yaml -p model_file:=model.yaml",
 )

@@ -21,8 +21,13 @@ NEAR_SINGULAR = 0.9
 class Guard(Protocol):
     """Something that stops the machine while it has a problem."""
 
-    reason: str
-    problem: str
+    @property
+    def reason(self) -> str:
+        """Name under which refusals are counted."""
+
+    @property
+    def problem(self) -> str:
+        """What is wrong, empty while all is well."""
 
 
 class CompensatorStatus:

@@ -9,6 +9,8 @@ from collections.abc import Iterable
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from ..errors import LONGEST_TEXT, printable
+
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 REFUSAL_SHOWN_FOR = 1.0
@@ -102,8 +104,9 @@ class HealthReport:
 
     def message(self, level: bytes, text: str, values: dict[str, str], stamp: Time) -> DiagnosticArray:
         """Return the diagnostics message."""
-        status = DiagnosticStatus(level=level, name=self._name, message=text, hardware_id=self._hardware_id)
-        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        name, hardware_id, text = printable(self._name), printable(self._hardware_id), printable(text, LONGEST_TEXT)
+        status = DiagnosticStatus(level=level, name=name, message=text, hardware_id=hardware_id)
+        status.values = [KeyValue(key=key, value=printable(value, LONGEST_TEXT)) for key, value in values.items()]
         array = DiagnosticArray(status=[status])
         array.header.stamp = stamp
         return array

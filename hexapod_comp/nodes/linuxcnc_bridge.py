@@ -31,19 +31,11 @@ from ..correction_guard import ON_LOSS, CorrectionGuard, GuardStatus
 from ..errors import CommandError
 from ..hal_component import COUNTS, METRES, HalComponent, pose_from_axes
 from .command_source import CommandSource
-from .health import ERROR, OK, WARN, Flow, HealthReport, Refusals, seconds
-from .linuxcnc_parameters import AXES, CORRECTIONS, COUNTERS, FEEDBACK, FLAGS, PARAMETERS, PINS, SWITCHES
-from .runtime import (
-    ACKNOWLEDGED_WITHIN,
-    COMMAND_QOS,
-    EVENT_QOS,
-    STATE_QOS,
-    MachineNode,
-    ParameterError,
-    declare,
-    keep_discovery_local,
-    run,
-)
+from .health import ERROR, OK, WARN, Flow, Refusals, seconds
+from .linuxcnc_parameters import AXES, CORRECTIONS, COUNTERS, FEEDBACK, FLAGS, PARAMETERS, PINS, PROGRAM, SWITCHES
+from .parameters import ParameterError, declare
+from .running import keep_discovery_local, run
+from .runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, STATE_QOS, MachineNode
 from .stamps import nanoseconds_of, stamp_of
 
 CHECK_PERIOD = 0.05
@@ -114,7 +106,7 @@ class LinuxcncBridgeNode(MachineNode):
         self._compensator = f"{self.get_namespace()}/compensator:".lstrip("/")
         self._resets, self._latency, self._last_text = 0, 0.0, ""
         self._question: Future | None = None
-        self._report: HealthReport | None = None
+        self._talks = False
         self._hal: HalComponent | None = HalComponent(self._options["component"], PINS, hal)
         self._open_pins(self._hal)
         self._make_messages()
@@ -145,15 +137,14 @@ class LinuxcncBridgeNode(MachineNode):
         """Open topics."""
         self._pose_pub = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS)
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
-        self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", EVENT_QOS)
+        self.open_diagnostics(self._options["component"])
+        self._talks = True
         self._subscription = self.obey(JointState, "strut_corrections", self._on_correction, self._look_at_publishers)
         topic, count = self._subscription.topic_name, self._subscription.get_publisher_count
         self._source = CommandSource(self, topic, count, self._options["allow_several_publishers"])
         self._complaints = self.listen_to(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
         self._reset_client = self.create_client(Trigger, "compensator/reset")
         self._check = self.every(CHECK_PERIOD, self._check_state)
-        component = self._options["component"]
-        self._report = HealthReport(f"{self.get_fully_qualified_name()[1:]}: {component}", component)
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -164,7 +155,7 @@ class LinuxcncBridgeNode(MachineNode):
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close topics; the HAL component stays."""
-        self._active, self._report = False, None
+        self._active = self._talks = False
         self.destroy_timer(self._check)
         self.destroy_client(self._reset_client)
         for subscription in (self._subscription, self._complaints):
@@ -183,7 +174,7 @@ class LinuxcncBridgeNode(MachineNode):
         while any(self._guard.output) and time.monotonic() < end:
             self._cycle()
             time.sleep(period)
-        if self._report is not None:
+        if self._talks:
             self._check_state()
             self._diagnostics_pub.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
@@ -343,7 +334,7 @@ class LinuxcncBridgeNode(MachineNode):
         return STATUS_TEXTS[status]
 
     def _check_state(self) -> None:
-        if self._report is None:
+        if not self._talks:
             return
         now = time.monotonic()
         self._source.look(now)
@@ -351,10 +342,7 @@ class LinuxcncBridgeNode(MachineNode):
         if text != self._last_text:
             self._last_text = text
             self._say(level, text)
-        if not self._report.due(level, text, now):
-            return
-        stamp = self.get_clock().now().to_msg()
-        self._diagnostics_pub.publish(self._report.message(level, text, self._values(now), stamp))
+        self.tell(level, text, lambda: self._values(now))
 
     def _say(self, level: bytes, text: str) -> None:
         if level != OK:
@@ -386,7 +374,7 @@ class LinuxcncBridgeNode(MachineNode):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; the entry of the executable ``linuxcnc_bridge``."""
     keep_discovery_local()
-    return run(LinuxcncBridgeNode, argv)
+    return run(LinuxcncBridgeNode, PROGRAM, argv)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
-"""Parameters of the LinuxCNC bridge, and the pins of its HAL component."""
+"""Parameters and help of the LinuxCNC bridge, and the pins of its HAL component."""
 
 from __future__ import annotations
 
 from ..hal_component import pins
-from .runtime import Parameter
+from .arguments import Program
+from .parameters import Parameter
 
 PARAMETERS = (
     Parameter("autostart", True, "configure and activate at start"),
@@ -35,4 +36,22 @@ PINS = (
     *pins("out", "bit", *FLAGS),
     *pins("out", "s32", "status"),
     *pins("out", "u32", *COUNTERS),
+)
+
+TOPICS = """
+in   strut_corrections   JointState: what the compensator adds to the struts, m
+     /diagnostics        DiagnosticArray: what the compensator complains of
+out  tool_pose_command   PoseStamped: LinuxCNC's commanded axes
+     strut_states        JointState: LinuxCNC's measured struts, m
+     /diagnostics
+ask  compensator/reset   Trigger, of the compensator
+HAL  hexapod_comp.x … correction.0 … status: doc/linuxcnc.md lists the pins
+"""
+
+PROGRAM = Program(
+    "linuxcnc_bridge",
+    "Connects LinuxCNC with the compensator; load it from a HAL file: loadusr -Wn hexapod_comp linuxcnc_bridge.",
+    PARAMETERS,
+    TOPICS,
+    "-p units:=inch",
 )

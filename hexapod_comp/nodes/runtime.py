@@ -1,42 +1,28 @@
-"""What both nodes share: parameters, the spin loop, signals, log throttling."""
+"""What the nodes share: topics, timers and services under one guard, throttled log, diagnostics."""
 
 from __future__ import annotations
 
 import copy
-import difflib
 import functools
-import gc
 import inspect
-import os
-import signal
-import sys
-import threading
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any, cast
 
-import rclpy
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
-from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.signals import SignalHandlerOptions
+from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from ..errors import HexapodError
-from .log_relay import LogRelay
-from .middleware import avoid_shared_memory
-from .refusing import unfailing
-
-SPIN_PERIOD = 0.1
-"""Longest wait of one spin, s: how soon a signal is noticed (EventsExecutor.spin itself never returns)."""
+from .guarding import Guard, PlainLogger
+from .health import HealthReport, joined
 
 COMMAND_QOS = QoSProfile(depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 """Commands: each must arrive. A hundred wait while a busy processor pauses for 0.1 s at 1 kHz, or a cable repeats."""
@@ -51,117 +37,45 @@ ACKNOWLEDGED_WITHIN = Duration(seconds=0.4)
 """How long the last message waits to be acknowledged: that may take DDS 3 s, and the dead never do it."""
 
 
-class ParameterError(HexapodError):
-    """A parameter's value is not allowed."""
-
-    reason = "bad_parameter"
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One parameter of a node.
-
-    Parameters
-    ----------
-    name : str
-        Its name.
-    default : bool, int, float or str
-        Default, which also fixes the type; an int is accepted for a float.
-    description : str
-        What it means, with its unit.
-    low, high : float, optional
-        Allowed range of a number.
-    read_only : bool
-        Fixed at start; the others may be set while the node runs.
-    """
-
-    name: str
-    default: bool | int | float | str
-    description: str
-    low: float | None = None
-    high: float | None = None
-    read_only: bool = True
-
-
-def declare(node: LifecycleNode, parameters: Sequence[Parameter]) -> dict[str, Any]:
-    """Declare parameters and return their checked values.
-
-    Raises
-    ------
-    ParameterError
-        Wrong type or out of range; names parameter, value and what is allowed.
-    """
-    values = {}
-    for parameter in parameters:
-        descriptor = ParameterDescriptor(
-            description=_described(parameter), read_only=parameter.read_only, dynamic_typing=True
-        )
-        if isinstance(parameter.default, float) and parameter.low is not None:
-            bounds = FloatingPointRange(from_value=float(parameter.low), to_value=float(parameter.high or 1e9))
-            descriptor.floating_point_range = [bounds]
-        try:
-            found = node.declare_parameter(parameter.name, parameter.default, descriptor).value
-        except rclpy.exceptions.InvalidParameterValueException as error:
-            raise ParameterError(f"parameter {parameter.name}: {error}") from error
-        values[parameter.name] = checked(parameter, found)
-    _warn_of_strangers(node)
-    return values
-
-
-def _described(parameter: Parameter) -> str:
-    if parameter.low is None:
-        return parameter.description
-    upper = "" if parameter.high is None else f" to {parameter.high:g}"
-    return f"{parameter.description} (from {parameter.low:g}{upper})"
-
-
-def checked(parameter: Parameter, value: Any) -> Any:
-    """Return `value` as the parameter's type, or refuse it.
-
-    Raises
-    ------
-    ParameterError
-        Wrong type or out of range; an int is taken for a float.
-    """
-    wanted = type(parameter.default)
-    if wanted is float and type(value) is int:
-        value = float(value)
-    if type(value) is not wanted:
-        raise ParameterError(f"parameter {parameter.name}: must be {wanted.__name__}, not {value!r}")
-    if isinstance(value, int | float) and wanted is not bool:
-        low = -float("inf") if parameter.low is None else parameter.low
-        high = float("inf") if parameter.high is None else parameter.high
-        if not low <= value <= high:
-            raise ParameterError(f"parameter {parameter.name}: must lie in {low:g}…{high:g}, not {value!r}")
-    return value
-
-
-def _warn_of_strangers(node: LifecycleNode) -> None:
-    """Warn of overrides that no declared parameter takes: most likely misspelt."""
-    declared = set(node.get_parameters_by_prefix(""))
-    for name in getattr(node, "_parameter_overrides", {}):
-        if name not in declared and not name.startswith("qos_overrides."):
-            near = difflib.get_close_matches(name, declared, 1)
-            hint = f"; did you mean {near[0]}?" if near else ""
-            node.get_logger().warning(f"there is no parameter {name}, it is ignored{hint}")
-
-
 class MachineNode(LifecycleNode):
-    """What the package's lifecycle nodes have in common: when they act, throttled warnings, topics.
+    """What the package's lifecycle nodes have in common: when they act, throttled log, diagnostics, topics.
 
-    Topics have a QoS that a user may override by parameters. rclpy writes the overrides into the profile
-    that it is given, so every topic gets a copy of its own.
+    Whatever ROS calls here, it calls through a :class:`~.guarding.Guard`. Topics have a QoS that a user may override
+    by parameters. rclpy writes the overrides into the profile that it is given, so every topic gets a copy of its own.
     """
 
     wants_autostart = True
 
     def __init__(self, name: str, **options: Any) -> None:
-        super().__init__(name, **options)
         self._active = False
         self._throttle = Throttle()
-        for service in self.services:  # those that rclpy has made
-            service.callback = unfailing(service, self.get_logger().warning)
+        self.guard = Guard(self.warn_of, self.complain_of)
+        super().__init__(name, **options)
+        self._logger = PlainLogger(self.get_logger().name)
+        for service in self.services:  # the lifecycle's are not made by create_service
+            service.callback = self.guard.answering(service.srv_name, service.srv_type, service.callback)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[..., Any], *arguments: Any, **options: Any
+    ) -> Subscription:
+        """Return a subscription whose callback is guarded."""
+        guarded = self.guard.around(topic, callback)
+        return super().create_subscription(msg_type, topic, guarded, *arguments, **options)
+
+    def create_timer(
+        self, timer_period_sec: float, callback: Callable[..., Any], *arguments: Any, **options: Any
+    ) -> Timer:
+        """Return a timer whose callback is guarded."""
+        guarded = self.guard.around(getattr(callback, "__name__", "timer").strip("_"), callback)
+        return super().create_timer(timer_period_sec, guarded, *arguments, **options)
+
+    def create_service(
+        self, srv_type: Any, srv_name: str, callback: Callable[..., Any], *arguments: Any, **options: Any
+    ) -> Service:
+        """Return a service that refuses a request where its callback raises."""
+        guarded = self.guard.answering(srv_name, srv_type, callback)
+        return super().create_service(srv_type, srv_name, guarded, *arguments, **options)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop acting; the struts keep their last command."""
@@ -175,9 +89,27 @@ class MachineNode(LifecycleNode):
 
     def warn_of(self, cause: str, text: str) -> None:
         """Log a warning, once per cause and second."""
-        held = self._throttle.passes(cause)
-        if held is not None:
-            self.get_logger().warning(text + (f" ({held} more like it)" if held else ""))
+        if (told := self._throttle.told(cause, text)) is not None:
+            self.get_logger().warning(told)
+
+    def complain_of(self, cause: str, text: str) -> None:
+        """Log an error, once per cause and second."""
+        if (told := self._throttle.told(cause, text)) is not None:
+            self.get_logger().error(told)
+
+    def open_diagnostics(self, what: str) -> None:
+        """Make the publisher of the status of this node; `what` is the machine or component that it serves."""
+        self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", EVENT_QOS)
+        self._report = HealthReport(f"{self.get_fully_qualified_name()[1:]}: {what}", what)
+
+    def tell(self, level: bytes, text: str, values: Callable[[], dict[str, str]]) -> None:
+        """Publish level, text and values when they are due, with what the guard has caught."""
+        now = time.monotonic()
+        level, text = joined([*self.guard.findings(now), (level, text)])
+        if self._report.due(level, text, now):
+            stamp = self.get_clock().now().to_msg()
+            everything = {**values(), **self.guard.values()}
+            self._diagnostics_pub.publish(self._report.message(level, text, everything, stamp))
 
     def publish_on(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
         """Return a publisher."""
@@ -223,7 +155,8 @@ class MachineNode(LifecycleNode):
                 matched()
 
         try:
-            subscription = make(event_callbacks=SubscriptionEventCallbacks(matched=on_matched))
+            guarded = self.guard.around(f"matching of {topic}", on_matched)
+            subscription = make(event_callbacks=SubscriptionEventCallbacks(matched=guarded))
         except UnsupportedEventTypeError:
             subscription = make()
         return subscription
@@ -308,66 +241,7 @@ class Throttle:
         self._last[cause] = now
         return self._held.pop(cause, 0)
 
-
-def autostart(node: LifecycleNode) -> bool:
-    """Configure and activate a node; return whether both went well."""
-    done = TransitionCallbackReturn.SUCCESS
-    return node.trigger_configure() == done and node.trigger_activate() == done
-
-
-def keep_discovery_local() -> None:
-    """Keep discovery to this machine, and out of shared memory, unless the user's environment says otherwise."""
-    avoid_shared_memory()
-    if "ROS_STATIC_PEERS" not in os.environ:
-        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-
-
-def run(make_node: Callable[[], MachineNode], argv: Sequence[str] | None = None) -> int:
-    """Run a node until SIGINT or SIGTERM.
-
-    Signals only set a flag, since rclpy's own handling loses the last message and exits non-zero on a
-    second Ctrl-C, which ``ros2 launch`` sends.
-
-    Returns
-    -------
-    int
-        0 after a signal, 1 when the node could not start.
-    """
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    with LogRelay():
-        return _run_until(stop, make_node, argv)
-
-
-def _run_until(stop: threading.Event, make_node: Callable[[], MachineNode], argv: Sequence[str] | None) -> int:
-    try:
-        rclpy.init(args=list(argv) if argv is not None else None, signal_handler_options=SignalHandlerOptions.NO)
-    except (rclpy.exceptions.ROSInterruptException, RuntimeError, ValueError) as error:
-        print(f"cannot start ROS: {error}", file=sys.stderr)
-        return 1
-    try:
-        node = make_node()
-    except HexapodError as error:
-        print(f"cannot start: {error}", file=sys.stderr)
-        rclpy.try_shutdown()
-        return 1
-    executor = EventsExecutor()
-    executor.add_node(node)
-    try:
-        if node.wants_autostart and not autostart(node):
-            return 1
-        # What is loaded by now stays; the collector need not look at it again while the machine moves.
-        gc.collect()
-        gc.freeze()
-        while not stop.is_set() and rclpy.ok():
-            executor.spin_once(timeout_sec=SPIN_PERIOD)
-        node.say_goodbye()
-        return 0
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown()
-        # Python puts its own handlers back while it shuts down; a second Ctrl-C would then end us with -2.
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.SIG_IGN)
+    def told(self, cause: str, text: str) -> str | None:
+        """Return the text to be logged, which says what was held back, or None to hold this one back."""
+        held = self.passes(cause)
+        return None if held is None else text + (f" ({held} more like it)" if held else "")

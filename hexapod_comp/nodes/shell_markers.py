@@ -18,7 +18,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from ..errors import GeometryError
 from ..workspace.pictures import COLOURS, Layer, Quantity
-from .runtime import keep_discovery_local
+from .running import keep_discovery_local
 
 SHELL_QOS = QoSProfile(
     depth=1,

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
@@ -29,53 +28,14 @@ from ..model_file import load_model
 from ..paths import config_file
 from ..simulation import DriveParameters, Faults, StrutDrive
 from .command_source import CommandSource
-from .health import ERROR, OK, WARN, Flow, HealthReport, Refusals, joined, seconds
+from .health import ERROR, OK, WARN, Flow, Refusals, joined, seconds
 from .log_space import LogSpace
 from .order import InOrder, NoStep
-from .runtime import (
-    ACKNOWLEDGED_WITHIN,
-    EVENT_QOS,
-    STATE_QOS,
-    MachineNode,
-    Parameter,
-    checked,
-    declare,
-    keep_discovery_local,
-    run,
-)
+from .parameters import checked, declare
+from .running import keep_discovery_local, run
+from .runtime import ACKNOWLEDGED_WITHIN, STATE_QOS, MachineNode
 from .stamps import nanoseconds_of
-
-PARAMETERS = (
-    Parameter("autostart", True, "configure and activate at start"),
-    Parameter("geometry_file", "paper.yaml", "geometry file: a path or the name of a shipped one"),
-    Parameter(
-        "truth_file",
-        "paper_machine.yaml",
-        "hidden truth: a model file, ideal for none, or random for one drawn from truth_seed",
-    ),
-    Parameter("truth_seed", 1, "seed of a random truth", 0, 2**31),
-    Parameter("noise_seed", 0, "seed of the noise", 0, 2**31),
-    Parameter("base_frame", "base", "frame_id of the true tool pose"),
-    Parameter("command_timeout", 0.1, "without a command for this long diagnostics warn, s; 0 = off", 0.0, 3600.0),
-    Parameter("allow_several_publishers", False, "obey though several nodes publish strut commands"),
-    Parameter("rate", 500.0, "readings published per second, Hz", 1.0, 2000.0),
-    Parameter("step", 0.1e-6, "length of one motor step, m; 0 = none", 0.0, 1e-3),
-    Parameter("lag", 0.005, "time by which the drives follow a moving command, s", 1e-3, 1.0),
-    Parameter("max_speed", 0.0, "largest motor speed, m/s; 0 = the geometry's limit", 0.0, 10.0),
-    Parameter("max_acceleration", 10.0, "largest motor acceleration, m/s²", 1e-3, 1e4),
-    Parameter("encoder_resolution", 0.1e-6, "length of one encoder count, m; 0 = none", 0.0, 1e-3),
-    Parameter("encoder_noise", 0.05e-6, "standard deviation of an encoder reading, m", 0.0, 1e-3),
-    Parameter("tracker_noise", 0.0, "standard deviation of the true pose's coordinates, m", 0.0, 1e-3),
-)
-
-FAULT_PARAMETERS = (
-    Parameter("fault_stuck_strut", 0, "strut 1 to 6 that does not move; 0 = none", 0, 6, read_only=False),
-    Parameter("fault_encoder_lost", 0, "strut 1 to 6 whose encoder reads NaN; 0 = none", 0, 6, read_only=False),
-    Parameter("fault_feedback_delay", 0.0, "age of readings when they are published, s", 0.0, 10.0, read_only=False),
-    Parameter("fault_feedback_drop", 0.0, "share of readings that are never published", 0.0, 1.0, read_only=False),
-    Parameter("fault_jump_strut", 1, "strut 1 to 6 that fault_jump knocks away", 1, 6, read_only=False),
-    Parameter("fault_jump", 0.0, "distance of a knock, m; each setting knocks once", -0.1, 0.1, read_only=False),
-)
+from .strut_drive_parameters import FAULT_PARAMETERS, PARAMETERS, PROGRAM
 
 LONGEST_PAUSE = 0.25
 """After a longer pause (a stopped process), the machine has moved on by no more than this, s."""
@@ -123,7 +83,6 @@ class StrutDriveNode(MachineNode):
             return TransitionCallbackReturn.FAILURE
         self._open_topics()
         self._order, self._no_step, self._log_space = InOrder("strut_commands"), NoStep(geometry), LogSpace()
-        self._report = HealthReport(f"{self.get_fully_qualified_name()[1:]}: {geometry.name}", geometry.name)
         self.get_logger().info(f"configured machine {geometry.name!r} with hidden truth {machine.model.name!r}")
         return super().on_configure(state)
 
@@ -169,7 +128,7 @@ class StrutDriveNode(MachineNode):
     def _open_topics(self) -> None:
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
         self._true_pub = self.publish_on(PoseStamped, "tool_pose_true", STATE_QOS)
-        self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", EVENT_QOS)
+        self.open_diagnostics(self.drive.machine.geometry.name)
         self._subscription = self.obey(JointState, "strut_commands", self._on_commands, self._look_at_publishers)
         topic, count = self._subscription.topic_name, self._subscription.get_publisher_count
         self._source = CommandSource(self, topic, count, self._options["allow_several_publishers"])
@@ -291,9 +250,10 @@ class StrutDriveNode(MachineNode):
         self._log_space.look()
         now = time.monotonic()
         level, text = joined(self._findings(now)) if self._active else (WARN, "not active")
-        if not self._report.due(level, text, now):
-            return
-        values = {
+        self.tell(level, text, lambda: self._values(now))
+
+    def _values(self, now: float) -> dict[str, str]:
+        return {
             "commanded_by": ", ".join(self._source.names),
             "commands": str(self._commands.count),
             "commands_missed": str(self._source.sequence.missed),
@@ -302,14 +262,12 @@ class StrutDriveNode(MachineNode):
             "last_refusal": self._refusals.last_text,
             **self._refusals.values(),
         }
-        stamp = self.get_clock().now().to_msg()
-        self._diagnostics_pub.publish(self._report.message(level, text, values, stamp))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; the entry of the executable ``strut_drive``."""
     keep_discovery_local()
-    return run(StrutDriveNode, argv)
+    return run(StrutDriveNode, PROGRAM, argv)
 
 
 if __name__ == "__main__":
