@@ -13,6 +13,7 @@ from .calibration.joint_fit import JointFit
 from .calibration.lines import LineFit, LinesFit
 from .calibration.observability import left_in_space
 from .errors import CalibrationError
+from .exporting import commanded_box
 from .field import COMPONENTS, CROSS_AXES
 from .geometry import STRUT_NAMES, HexapodGeometry
 from .kinematics import Structure, strut_lengths_batch
@@ -86,12 +87,9 @@ def strut_error_figure(
     CalibrationError
         No model, or one without a box: nobody knows how far the line goes.
     """
-    boxes = [model.valid_box for model in models.values() if model.valid_box is not None]
-    if not models or len(boxes) < len(models):
+    if not models or any(model.valid_box is None for model in models.values()):
         raise CalibrationError("picture of strut errors", "needs models, each with the box in which it holds")
-    lever = geometry.tool.position
-    corners = (boxes[0] @ geometry.work.rotation) + lever - geometry.work.position @ geometry.work.rotation
-    box = np.array([corners.min(axis=0), corners.max(axis=0)])
+    box = commanded_box(geometry, next(iter(models.values())))
     middle = box.mean(axis=0)
     along = np.linspace(box[0, 0], box[1, 0], SAMPLES)
     line = (middle[1] if y is None else y, middle[2] if z is None else z)
@@ -241,18 +239,19 @@ def left_error_figure(fit: JointFit) -> Figure:
     """
     if fit.model.valid_box is None:
         raise CalibrationError("picture of the error left", "needs readings that span a box")
-    low, high = fit.space.box
+    low, high = fit.space.work_box
     x, y = (np.linspace(low[a], high[a], MAP_NODES) for a in range(2))
     heights = np.linspace(low[2], high[2], 3)
     points = np.stack(np.meshgrid(heights, y, x, indexing="ij"), axis=-1)[..., ::-1].reshape(-1, 3)
-    left = left_in_space(fit.space, fit.solution.x, fit.covariance, points).reshape(3, MAP_NODES, MAP_NODES) * 1e6
+    places = fit.space.places(points)
+    left = left_in_space(fit.space, fit.solution.x, fit.covariance, places).reshape(3, MAP_NODES, MAP_NODES) * 1e6
     figure = Figure(figsize=(11, 3.9), layout="constrained")
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
     levels = np.linspace(np.nanmin(left), np.nanmax(left), 13)
     for axes, height, values in zip(panels, heights, left, strict=True):
         drawn = axes.contourf(x * 1e3, y * 1e3, np.ma.masked_invalid(values), levels, cmap="viridis")
-        axes.set(title=f"z = {height * 1e3:.0f} mm", xlabel="x, mm", aspect="equal")
-    panels[0].set_ylabel("y, mm")
+        axes.set(title=f"z = {height * 1e3:.0f} mm", xlabel="x in work, mm", aspect="equal")
+    panels[0].set_ylabel("y in work, mm")
     figure.colorbar(drawn, ax=panels, label="RMS error in space to expect, µm")
     figure.suptitle("what is left after compensation, level tool, datum aligned")
     return figure

@@ -137,23 +137,26 @@ class ExportCheck:
 def commanded_box(geometry: HexapodGeometry, model: MachineModel) -> np.ndarray:
     """Return the box of level tool positions in ``work`` for which a model was measured, shape (2, 3), m.
 
-    It is the model's valid box, else the box of its field, both boxes of platform positions; with a work
-    frame that is turned, the box around it.
+    It is the model's valid box of platform positions, or where its field's box of measured points lets the
+    platform be. With a work frame that is turned it is the largest box of the work frame, alike in proportions to
+    the one around it, that fits inside: poses outside were not measured.
 
     Raises
     ------
     ModelError
         The model has neither.
     """
+    level = geometry.work.rotation @ geometry.tool.rotation.T  # of the platform, when the tool is level
     box = model.valid_box
     if box is None and any(family.shape[4] for family in model.field.lines):
-        box = model.field.box
+        box = model.field.box - level @ model.field.probe
     if box is None:
         raise ModelError("valid_box", "the model has neither a valid box nor a field; give a box of tool positions")
-    corners = np.array(np.meshgrid(*box.T)).reshape(3, 8).T
-    level = geometry.work.rotation @ geometry.tool.rotation.T  # of the platform, when the tool is level
-    tools = [geometry.tool_pose(Pose(corner, level)).position for corner in corners]
-    return np.array([np.min(tools, axis=0), np.max(tools, axis=0)])
+    centre, half = geometry.tool_pose(Pose(box.mean(axis=0), level)).position, 0.5 * np.ptp(box, axis=0)
+    turned = np.abs(geometry.work.rotation)
+    around = turned.T @ half
+    inside = around * (half / (turned @ around)).min()
+    return np.array([centre - inside, centre + inside])
 
 
 def draw_travel(box: np.ndarray, count: int, seed: int, tilt: float = 0.0) -> Travel:

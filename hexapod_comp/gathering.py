@@ -13,6 +13,7 @@ from .errors import InputFileError
 from .geometry import HexapodGeometry
 from .kinematics import Structure, strut_lengths
 from .measurement import (
+    ANGULAR_KINDS,
     BACKWARD,
     CHANNELS,
     FORWARD,
@@ -30,6 +31,13 @@ from .travel import Passes
 
 SAME = 1e-9
 """Commands nearer to each other than this, m, are the same command."""
+
+
+LARGEST_READING = 10.0
+"""No machine errs by more, and no instrument's zero lies further off, m or rad."""
+
+SMALLEST_UNCERTAINTY = 1e-12
+"""No instrument reads better, m or rad; and the square of its inverse is still a number."""
 
 
 def assemble(
@@ -111,10 +119,17 @@ def _check_readings(readings: Sequence[Reading]) -> None:
     for r in readings:
         if r.channel not in CHANNELS:
             raise InputFileError(r.source.file, _line(r), f"channel must be one of {', '.join(CHANNELS)}", r.channel)
+        unit = "rad" if KINDS[KIND_OF[CHANNELS.index(r.channel)]] in ANGULAR_KINDS else "m"
         if not np.isfinite(r.value):
             raise InputFileError(r.source.file, _line(r), "value must be finite", r.value)
+        if abs(r.value) > LARGEST_READING:
+            problem = f"value must be within ±{LARGEST_READING:g} {unit}: it is the error, actual minus commanded"
+            raise InputFileError(r.source.file, _line(r), problem, r.value)
         if r.uncertainty <= 0.0 or np.isinf(r.uncertainty):
             raise InputFileError(r.source.file, _line(r), "uncertainty must be finite and above zero", r.uncertainty)
+        if not (np.isnan(r.uncertainty) or SMALLEST_UNCERTAINTY <= r.uncertainty <= LARGEST_READING):
+            problem = f"uncertainty must be {SMALLEST_UNCERTAINTY:g}…{LARGEST_READING:g} {unit}"
+            raise InputFileError(r.source.file, _line(r), problem, r.uncertainty)
 
 
 def _line(reading: Reading) -> str:

@@ -13,12 +13,14 @@ direction, under the same temperatures share a *station*.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from .errors import CalibrationError
 from .geometry import HexapodGeometry
 from .machine import REFERENCE_TEMPERATURE, Temperatures
 from .pose import Pose
@@ -47,6 +49,15 @@ ANGULAR_KINDS = ("rotation", "attitude")
 
 FORWARD, BACKWARD, UNKNOWN, FROM_PREVIOUS = 1, -1, 0, 2
 """How a station was approached; FROM_PREVIOUS: from the command in the row before."""
+
+SAME_ATTITUDE = 1e-6
+"""Attitudes that differ by less, rad, are one."""
+
+LEAST_SIDE = 1e-6
+"""A box of which a side is shorter, m, is a line or a plane."""
+
+LEAST_NOISE = 1e-9
+"""No instrument reads better, m or rad; also keeps readings without noise from having infinite weight."""
 
 LEAST_TRAVEL = 1e-6
 """Components of a line shorter than this, m, are no travel along that axis."""
@@ -223,6 +234,39 @@ class MeasurementSet:
         """Index into :data:`KINDS` of each reading."""
         return KIND_OF[self.channel]
 
+    @property
+    def stated(self) -> np.ndarray:
+        """Standard deviation of each reading, shape (N,), m or rad: its file's, else :data:`DEFAULT_UNCERTAINTY`."""
+        defaults = np.array([DEFAULT_UNCERTAINTY[kind] for kind in KINDS])[self.kind]
+        return np.where(np.isfinite(self.uncertainty), self.uncertainty, defaults)
+
+    def stated_of(self, kind: int) -> float:
+        """Return the root mean square of :attr:`stated` over a kind's readings, m or rad; 1 where there are none."""
+        mine = self.stated[self.kind == kind]
+        return float(np.sqrt((mine**2).mean())) if len(mine) else 1.0
+
+    def misfit(self, found: Mapping[int, float], times: float) -> str:
+        """Return what is wrong when kinds of reading are further off than they may be; empty when none is.
+
+        Parameters
+        ----------
+        found : mapping of int to float
+            What is left of each kind (its index), standard deviation, m or rad.
+        times : float
+            How many times the stated one it may be.
+        """
+        far = []
+        for kind, value in found.items():
+            stated = self.stated_of(kind)
+            if value > times * stated:
+                unit = "µrad" if KINDS[kind] in ANGULAR_KINDS else "µm"
+                given = np.isfinite(self.uncertainty[self.kind == kind]).any()
+                source = "stated" if given else "assumed, since the file states none"
+                ratio = f"{value / stated:.3g} times the {stated * 1e6:.3g} {unit} {source}"
+                far.append(f"{KINDS[kind]} by {value * 1e6:.3g} {unit}, {ratio}")
+        problem = f"readings are off by more than {times:g} times their noise"
+        return f"{problem}: {'; '.join(far)}" if far else ""
+
     def directions(self) -> np.ndarray:
         """Return w of each reading, shape (N, 6): value = w · (dx, dy, dz, rx, ry, rz) in ``base``."""
         axes = self.geometry.work.rotation.T  # row a: the work frame's axis a, in base
@@ -240,6 +284,38 @@ class MeasurementSet:
         """Return the commanded place of the measured point at each station, shape (M, 3), m in ``base``."""
         return self.stations.positions + self.stations.rotations @ self.probe
 
+    def level(self) -> np.ndarray:
+        """Return the platform's attitude that reports call level, shape (3, 3), in ``base``.
+
+        The tool parallel to the work frame, where the stations surround such an attitude or have it. Otherwise
+        the machine was measured turned, and the station nearest to the mean of all attitudes stands for them.
+        """
+        rotations = self.stations.rotations
+        parallel = self.geometry.work.rotation @ self.geometry.tool.rotation.T
+        mean = Rotation.from_matrix(rotations).mean().as_matrix()
+        away = np.linalg.norm(attitude_error(rotations, mean), axis=1)
+        if np.linalg.norm(attitude_error(parallel, mean)) <= away.max() + SAME_ATTITUDE:
+            return parallel
+        return rotations[away.argmin()]
+
+    def tool_box(self) -> np.ndarray:
+        """Return the lowest and highest commanded tool position, shape (2, 3), m in ``work``."""
+        positions, _ = self.geometry.tool_poses(self.stations.positions, self.stations.rotations)
+        return np.array([positions.min(axis=0), positions.max(axis=0)])
+
+    def platform_box(self) -> np.ndarray:
+        """Return the lowest and highest commanded platform position, shape (2, 3), m in ``base``.
+
+        Of the stations that are level, where these span a box: with a long tool, tilted ones reach further, but
+        not with a level tool. Otherwise of all stations.
+        """
+        positions = self.stations.positions
+        turned = np.linalg.norm(attitude_error(self.stations.rotations, self.level()), axis=1)
+        of_level = positions[turned <= SAME_ATTITUDE]
+        if len(of_level) and spans(of_level):
+            positions = of_level
+        return np.array([positions.min(axis=0), positions.max(axis=0)])
+
     def along(self) -> np.ndarray:
         """Return each reading's commanded coordinate along its line, from the run's first point, m, (N,)."""
         origins = np.array([run.origin for run in self.runs]).reshape(-1, 3)
@@ -255,6 +331,35 @@ class MeasurementSet:
     def with_values(self, value: np.ndarray) -> MeasurementSet:
         """Return the same stations with other readings, shape (N,), m or rad."""
         return replace(self, value=value)
+
+
+def refuse_unmoved(measurements: MeasurementSet, left: np.ndarray) -> None:
+    """Refuse a kind of reading that shows nothing: an instrument without any noise would have infinite weight.
+
+    Parameters
+    ----------
+    measurements : MeasurementSet
+        The readings.
+    left : ndarray, shape (N,)
+        What the nominal machine and the instruments' unknown zeros leave of them, m or rad.
+
+    Raises
+    ------
+    CalibrationError
+        Of a kind nothing is left, to :data:`LEAST_NOISE`.
+    """
+    for k in np.unique(measurements.kind):
+        mine = measurements.kind == k
+        if np.abs(left[mine]).max() <= LEAST_NOISE:
+            zero = not measurements.value[mine].any()
+            problem = "are all zero" if zero else "never change within a run, or are just what the machine was told"
+            hint = "was the instrument connected? Such readings tell nothing; leave them out"
+            raise CalibrationError(f"{KINDS[k]}", f"the {mine.sum()} readings {problem}: {hint}")
+
+
+def spans(points: np.ndarray) -> bool:
+    """Return whether points (n, 3), m, span a box."""
+    return bool((np.ptp(points, axis=0) >= LEAST_SIDE).all())
 
 
 def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:

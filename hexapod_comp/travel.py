@@ -162,13 +162,21 @@ def at(position: np.ndarray) -> str:
 
 
 def random_passes(
-    geometry: HexapodGeometry, box: np.ndarray, points: int, tilt: float, rng: np.random.Generator
+    geometry: HexapodGeometry,
+    box: np.ndarray,
+    points: int,
+    tilt: float,
+    rng: np.random.Generator,
+    level: np.ndarray | None = None,
 ) -> Passes:
-    """Return passes through random points of a box of the work frame: all one way, then all back."""
+    """Return passes through random points of a box of the work frame: all one way, then all back.
+
+    Tilts start from a level tool, shape (3, 3) in the work frame; by default parallel to it.
+    """
     positions = rng.uniform(box[0], box[1], (points, 3))
     directions = rng.standard_normal((points, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     tilts = np.append(rng.uniform(-tilt, tilt, (points, 2)), np.zeros((points, 1)), axis=1)
     there_and_back = np.concatenate([way * directions for way in BOTH_WAYS])
-    rotations = rotation_from_angles(tilts)
+    rotations = rotation_from_angles(tilts) @ (np.eye(3) if level is None else level)
     return Passes.of_tool(geometry, np.tile(positions, (2, 1)), np.tile(rotations, (2, 1, 1)), there_and_back)

@@ -233,7 +233,7 @@ def test_pictures_are_pictures(done: Calibration) -> None:
 def test_nothing_else_is_written(done: Calibration) -> None:
     """No half-written or temporary file beside the ones that were asked for."""
     names = {"campaign.yaml", "measured.csv", "model.yaml", "fit.json", "fit.npz", "report.txt", "pictures"}
-    assert {path.name for path in done.folder.iterdir()} - {"five.yaml"} == names
+    assert {path.name for path in done.folder.iterdir()} - {"five.yaml", "noisy"} == names
 
 
 def test_without_options_only_the_model_is_written(hexapod: Program, fitted: Calibration) -> None:
@@ -298,6 +298,87 @@ def test_scheme_lines_has_no_covariance(hexapod: Program, done: Calibration, tmp
     assert not list(tmp_path.iterdir())
 
 
+# Readings that do not bear the model out.
+
+ALL = ("--out", "m.yaml", "--json", "j.json", "--covariance", "c.npz", "--report", "r.txt", "--pictures", "p")
+
+
+@pytest.fixture(scope="module")
+def noisy(done: Calibration) -> Path:
+    """Measure with a laser thirty times as noisy as is assumed of one."""
+    (done.folder / "noisy").mkdir()
+    campaign, measured = done.folder / "noisy" / "campaign.yaml", done.folder / "noisy" / "noisy.csv"
+    campaign.write_text(CAMPAIGN + "noise: {linear_um: 30}\n")
+    said_by("measure", "--campaign", campaign, "--seed", 1, "--out", measured)
+    return measured
+
+
+def test_noise_far_above_the_stated_writes_nothing(
+    hexapod: Program, noisy: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Exit code 1, what is wrong at the top of the report, no file of any kind."""
+    monkeypatch.chdir(tmp_path)
+    code, out, err = hexapod("fit", noisy, "--lead-mm", 10, "--blocks", "pitch", *ALL)
+    assert code == 1
+    said = r"NOT WRITTEN: .*linear by (\S+) µm, (\S+) times the 1 µm assumed, since the file states none"
+    found = re.match(said, out)
+    assert found, out
+    assert [float(v) for v in found.groups()] == pytest.approx([30.0, 30.0], rel=0.1)
+    assert "residuals; held out" in out, "the report says the rest"
+    assert err == "hexapod_comp: error: nothing was written; the report says why, --force writes it\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_forced_model_says_so(
+    hexapod: Program, noisy: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """At the top of the report, in its file, and in the model for whoever runs it."""
+    monkeypatch.chdir(tmp_path)
+    code, out, err = hexapod("fit", noisy, "--lead-mm", 10, "--blocks", "pitch", "--force", *ALL[:-2])
+    assert (code, err) == (0, "")
+    assert out.startswith("WRITTEN BY FORCE: this model is not to be trusted: readings are off by more than 10 times")
+    assert out.startswith(Path("r.txt").read_text())
+    model = load_model("m.yaml", load_geometry(config_file("paper")))
+    assert model.origin.note.startswith("FORCED: readings are off by more than 10 times their noise: linear by ")
+    assert {path.name for path in tmp_path.iterdir()} == {"m.yaml", "j.json", "c.npz", "r.txt"}
+
+
+def test_noise_that_is_stated_is_welcome(hexapod: Program, noisy: Path, tmp_path: Path) -> None:
+    """The same readings with the uncertainty that they have."""
+    header, *rows = noisy.read_text().splitlines()
+    stated = tmp_path / "stated.csv"
+    stated.write_text("\n".join([header + ",uncertainty", *(row + ",30" for row in rows)]) + "\n")
+    code, out, err = hexapod("fit", stated, "--blocks", "pitch", "--out", tmp_path / "m.yaml")
+    assert (code, err) == (0, "")
+    assert out.startswith("machine paper")
+
+
+def test_micrometres_called_millimetres_write_nothing(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
+    """By either scheme: that of lines leaves the screws' waves, a few micrometres, which now are millimetres."""
+    wrong = tmp_path / "mm.csv"
+    wrong.write_text(done.measured.read_text().replace(",um\n", ",mm\n"))
+    code, out, _ = hexapod("fit", wrong, "--scheme", "lines", "--out", tmp_path / "m.yaml")
+    assert code == 1
+    assert re.match(r"NOT WRITTEN: .*readings are off by more than 10 times their noise: linear by .* assumed", out)
+    code, _, err = hexapod("fit", wrong, "--lead-mm", 10, "--blocks", "pitch", "--out", tmp_path / "m.yaml")
+    assert code == 1 or "do units" in err
+    assert list(tmp_path.iterdir()) == [wrong]
+
+
+@pytest.mark.parametrize("scheme", ["joint", "lines"])
+def test_a_dead_instrument_is_refused(hexapod: Program, done: Calibration, tmp_path: Path, scheme: str) -> None:
+    header, *rows = done.measured.read_text().splitlines()
+    dead = tmp_path / "dead.csv"
+    column = header.split(",").index("value") - len(header.split(","))  # the run's name may hold commas
+    cells = [row.split(",") for row in rows]
+    for row in cells:
+        row[column] = "0"
+    dead.write_text("\n".join([header, *(",".join(row) for row in cells)]) + "\n")
+    outcome = hexapod("fit", dead, "--scheme", scheme, "--out", tmp_path / "m.yaml")
+    assert_refused(outcome, "linear: the 1000 readings are all zero")
+    assert list(tmp_path.iterdir()) == [dead]
+
+
 # What is refused: nothing is written, one line says what and where.
 
 
@@ -329,6 +410,14 @@ WRONG = {
                           TIDY + LINE.format(x=0) + LINE.format(x=900)),
     "too few": Wrong("f.csv", r"11 readings .* leave 10 numbers for the structure's 33", "f.csv",
                      TIDY + "".join(LINE.format(x=10 * n) for n in range(11))),
+    "endless": Wrong("v.csv", r"v\.csv: line 2: value must be within ±10 m: .*\(found 1e\+302\)", "v.csv",
+                     TIDY + "l,forward,0,0,400,linear,1e308,um\n" + LINE.format(x=9)),
+    "turns": Wrong("v.csv", r"v\.csv: line 2: value must be within ±10 rad", "v.csv",
+                   TIDY + "l,forward,0,0,400,rotation_x,11,rad\n" + LINE.format(x=9)),
+    "below any instrument": Wrong("v.csv", r"v\.csv: line 2: uncertainty must be 1e-12…10 m", "v.csv",
+                                  TIDY.replace("unit", "unit,uncertainty") + "l,forward,0,0,400,linear,1,um,1e-300\n"),
+    "no certainty": Wrong("v.csv", r"v\.csv: line 2: uncertainty must be 1e-12…10 m", "v.csv",
+                          TIDY.replace("unit", "unit,uncertainty") + "l,forward,0,0,400,linear,1,um,1e300\n"),
     "the same file twice": Wrong("{measured} {measured}", "is the same file as"),
     "unknown block": Wrong("{measured} --blocks pitch,colour", r"blocks: must be of structure, .*'colour'"),
     "no lead": Wrong("{measured} --lead-mm 0", r"lead: must be 0\.1 mm to 1000 mm \(found 0\.0\)"),

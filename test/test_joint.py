@@ -440,12 +440,10 @@ def test_a_tracker_at_tilted_poses_is_enough():
     assert fit.level.low < after < fit.level.high
 
 
-def test_readings_that_are_all_zero_make_the_nominal_machine():
-    """Nothing to explain, nothing explained, and no division by the error that is not there."""
-    ours = template(small.campaign(), small.paper())
-    fit = fit_joint(ours, FEW)
-    np.testing.assert_allclose(fit.solution.x, 0.0, atol=1e-12)
-    assert not any(d.kept for d in fit.decisions)
+def test_readings_that_are_all_zero_are_refused():
+    """A disconnected instrument, not a perfect machine: without noise it would have infinite weight."""
+    with pytest.raises(CalibrationError, match=r"^linear: the 410 readings are all zero"):
+        fit_joint(template(small.campaign(), small.paper()), FEW)
 
 
 def test_readings_without_noise_are_welcome():
@@ -456,11 +454,13 @@ def test_readings_without_noise_are_welcome():
     assert small.tool_error(truth, fit.model)[0] < 10e-9
 
 
-def test_columns_that_never_change_are_no_accident():
-    """A constant is a zero, so nothing is left but rounding: no division by it, and no machine made of it."""
+def test_a_channel_that_never_changes_is_refused():
+    """A constant is an unknown zero, so nothing is left: one dead channel among others that live is enough."""
     ours = readings()
-    fit = fit_joint(ours.with_values(1e-6 * ours.channel), FEW)
-    np.testing.assert_allclose(fit.solution.x, 0.0, atol=1e-12)
+    straightness = ours.kind == KINDS.index("straightness")
+    stuck = ours.with_values(np.where(straightness, 3e-6, ours.value))
+    with pytest.raises(CalibrationError, match=r"^straightness: the \d+ readings never change within a run"):
+        fit_joint(stuck, FEW)
 
 
 def test_uncertainties_below_any_instrument_are_refused():

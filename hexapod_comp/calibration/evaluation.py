@@ -86,6 +86,7 @@ def held_out(
     repeatability: float = 0.0,
     tilt: float = 0.0,
     sensed: Temperatures | None = None,
+    level: np.ndarray | None = None,
 ) -> HeldOut:
     """Return the error of the tool at random points of a box, passed there and back in random directions.
 
@@ -107,6 +108,8 @@ def held_out(
         Largest tilt of the tool about x and y, rad.
     sensed : Temperatures, optional
         What the compensator believes the temperatures to be; 20 °C by default.
+    level : ndarray, shape (3, 3), optional
+        Attitude of a level tool in the work frame; parallel to it by default.
 
     Raises
     ------
@@ -116,7 +119,7 @@ def held_out(
     if points < 3:
         raise ModelError("points", "must be at least three", points)
     rng = np.random.default_rng(seed)
-    passes = random_passes(truth.geometry, box, points, tilt, rng)
+    passes = random_passes(truth.geometry, box, points, tilt, rng, level)
     positions, rotations = run(truth, passes, model, sensed)
     tool = truth.geometry.tool.position
     actual = positions + rotations @ tool + repeatability * rng.standard_normal(positions.shape)
@@ -165,6 +168,7 @@ def paper_metric(
     lines: int = 20,
     seed: int = 0,
     sensed: Temperatures | None = None,
+    level: np.ndarray | None = None,
 ) -> PaperMetric:
     """Return the mean absolute displacement error along lines parallel to the grid, without and with a model.
 
@@ -190,6 +194,8 @@ def paper_metric(
         Picks the lines.
     sensed : Temperatures, optional
         What the compensator believes the temperatures to be; 20 °C by default.
+    level : ndarray, shape (3, 3), optional
+        Attitude of a level tool in the work frame; parallel to it by default.
 
     Raises
     ------
@@ -199,7 +205,7 @@ def paper_metric(
     rng = np.random.default_rng(seed)
     errors: list[list[np.ndarray]] = [[], []]
     for axis in range(3):
-        passes = _check_lines(truth.geometry, box, axis, step, lines, rng)
+        passes = _check_lines(truth.geometry, box, axis, step, lines, rng, np.eye(3) if level is None else level)
         for found, told in zip(errors, (None, model), strict=True):
             found.append(_laser_readings(truth, passes, told, lines, sensed))
     before, after = (np.abs(np.concatenate(found)) for found in errors)
@@ -207,7 +213,13 @@ def paper_metric(
 
 
 def _check_lines(
-    geometry: HexapodGeometry, box: np.ndarray, axis: int, step: float, lines: int, rng: np.random.Generator
+    geometry: HexapodGeometry,
+    box: np.ndarray,
+    axis: int,
+    step: float,
+    lines: int,
+    rng: np.random.Generator,
+    level: np.ndarray,
 ) -> Passes:
     """Return passes along lines parallel to an axis of the work frame: line by line, forward, then back."""
     box = np.asarray(box, dtype=float)
@@ -221,8 +233,8 @@ def _check_lines(
     points[..., across] = rng.uniform(box[0, across], box[1, across], (lines, 2))[:, None]
     directions = np.zeros_like(points)
     directions[..., axis] = np.where(np.arange(len(along)) <= len(between), *BOTH_WAYS)
-    level = np.broadcast_to(np.eye(3), (lines * len(along), 3, 3))
-    return Passes.of_tool(geometry, points.reshape(-1, 3), level, directions.reshape(-1, 3))
+    rotations = np.broadcast_to(level, (lines * len(along), 3, 3))
+    return Passes.of_tool(geometry, points.reshape(-1, 3), rotations, directions.reshape(-1, 3))
 
 
 def _laser_readings(
@@ -277,14 +289,15 @@ def worth(
     seed: int = 0,
     repeatability: float = 0.0,
     sensed: Temperatures | None = None,
+    level: np.ndarray | None = None,
 ) -> Worth:
     """Return what a model is worth on a virtual machine; parameters as :func:`held_out` has them.
 
     `repeatability` spoils the points in space; the paper's metric does without.
     """
-    before = held_out(truth, None, box, points, seed, repeatability)
-    after = held_out(truth, model, box, points, seed, repeatability, sensed=sensed)
-    return Worth(before, after, paper_metric(truth, model, box, seed=seed, sensed=sensed))
+    before = held_out(truth, None, box, points, seed, repeatability, level=level)
+    after = held_out(truth, model, box, points, seed, repeatability, sensed=sensed, level=level)
+    return Worth(before, after, paper_metric(truth, model, box, seed=seed, sensed=sensed, level=level))
 
 
 def _length(vectors: np.ndarray) -> np.ndarray:

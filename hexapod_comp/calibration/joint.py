@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from ..errors import CalibrationError, KinematicsError, ModelError
-from ..measurement import DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
+from ..measurement import KINDS, LEAST_NOISE, MeasurementSet
 from .sensitivity import derivatives, predict
 from .space import ParameterSpace
 
@@ -37,9 +37,6 @@ HYPER = 0.1
 
 LARGEST_TOLERANCE = {"structure": 5e-3}
 """No machine is built worse than this, m; a misfit that grows the tolerance further has another cause."""
-
-LEAST_NOISE = 1e-9
-"""No instrument reads better, m or rad; also keeps readings without noise from having infinite weight."""
 
 LEAST_FREEDOM = 10.0
 """Noise is estimated from at least so many readings beyond those that the parameters use up."""
@@ -186,9 +183,7 @@ class JointProblem:
     def __init__(self, measurements: MeasurementSet, space: ParameterSpace) -> None:
         self.measurements, self.space = measurements, space
         self.cells = Cells.of(measurements)
-        defaults = np.array([DEFAULT_UNCERTAINTY[kind] for kind in KINDS])[measurements.kind]
-        given = np.isfinite(measurements.uncertainty)
-        self.uncertainty = np.where(given, measurements.uncertainty, defaults)
+        self.uncertainty = measurements.stated
         self._unknowns = self._make_unknowns()
         needed = len(space.blocks[0].labels)
         free = len(self.cells.station) - sum(q.shape[1] for _, q in self._unknowns)
@@ -275,13 +270,8 @@ class JointProblem:
             normal[k] = part.T @ part
             moment[k] = part.T @ target[kind == k]
             square[k] += target[kind == k] @ target[kind == k]
-        least_noise = LEAST_NOISE / np.array([self.stated(k) for k in range(kinds)])
+        least_noise = LEAST_NOISE / np.array([self.measurements.stated_of(k) for k in range(kinds)])
         return LinearProblem(target, rows, kind, self.cells.fold, normal, moment, square, freedom, least_noise)
-
-    def stated(self, kind: int) -> float:
-        """Return the standard deviation of a kind's readings as stated, root mean square, m or rad."""
-        mine = self.uncertainty[self.measurements.kind == kind]
-        return float(np.sqrt((mine**2).mean())) if len(mine) else 1.0
 
     def robust_weights(self, residuals: np.ndarray) -> np.ndarray:
         """Return Huber's weights of residuals (N,), 1 for all that are no surprise.

@@ -10,8 +10,17 @@ import numpy as np
 
 from ..errors import CalibrationError
 from ..machine import REFERENCE_TEMPERATURE, MachineModel, ModelOrigin
-from ..measurement import ANGULAR_KINDS, KINDS, MeasurementSet, Source
-from .joint import HUBER, OUTLIER, JointProblem, Posterior, Solution, held_out, iterate, physical_covariance
+from ..measurement import ANGULAR_KINDS, KINDS, MeasurementSet, Source, refuse_unmoved
+from .joint import (
+    HUBER,
+    OUTLIER,
+    JointProblem,
+    Posterior,
+    Solution,
+    held_out,
+    iterate,
+    physical_covariance,
+)
 from .observability import Observability, ToolError, expected_error, observe, without_trace
 from .selection import Decision, select
 from .smooth_field import DIGITS
@@ -25,6 +34,10 @@ LARGEST_NOISE = 0.02
 
 SCATTERED = 1.5
 """Readings whose noise is found so many times as large as stated are remarked on."""
+
+MISFIT = 10.0
+"""Readings whose noise is found so many times as large as stated are not described: units, instrument or machine
+are others than said."""
 
 WARM = 0.2
 """Readings taken further than this from the reference temperature, K, need an expansion: 1 µm on half a metre."""
@@ -125,6 +138,11 @@ class JointFit:
     notes: tuple[str, ...]
 
     @property
+    def misfit(self) -> str:
+        """Why the model is not to be trusted: readings further off than :data:`MISFIT` allows; empty if none is."""
+        return self.measurements.misfit({KINDS.index(c.kind): c.found for c in self.channels}, MISFIT)
+
+    @property
     def covariance(self) -> np.ndarray:
         """Covariance of the parameters, shape (size, size), SI."""
         return physical_covariance(self.space, self.solution.posterior)
@@ -154,7 +172,7 @@ def fit_joint(
     Raises
     ------
     CalibrationError
-        Too few readings, a fit that does not settle, forward and backward swapped.
+        Too few readings, or such that show nothing, a fit that does not settle, forward and backward swapped.
     """
     settings = settings or Settings()
     everything = JointProblem(measurements, ParameterSpace(measurements, settings))
@@ -226,7 +244,9 @@ def _decide(
     """Return what becomes of every block, and what the readings allow if none is ruled out."""
     x, _, noise = _carried_over(before, everything.space)
     weights = np.ones(len(everything.measurements)) if before is None else before[1].weights
-    problem, _ = everything.linearise(x, weights)
+    problem, residuals = everything.linearise(x, weights)
+    if before is None:
+        refuse_unmoved(everything.measurements, residuals)
     return select(everything.space, problem, noise, progress)
 
 
@@ -314,7 +334,7 @@ def _channels(joint: JointProblem, solution: Solution) -> list[ChannelFit]:
     result = []
     for k in np.unique(kinds):
         mine = problem.kind == k
-        stated = joint.stated(k)
+        stated = joint.measurements.stated_of(k)
         mean_square = float((errors[mine] ** 2 / readings_of_cell[mine]).mean())
         factor = float(posterior.noise[k])
         result.append(

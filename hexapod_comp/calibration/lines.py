@@ -44,7 +44,7 @@ from numpy.polynomial import Legendre, Polynomial, legendre
 from ..errors import CalibrationError
 from ..field import CROSS_AXES, GridField
 from ..machine import MachineModel, ModelOrigin
-from ..measurement import AXES, MeasurementSet
+from ..measurement import AXES, KINDS, LEAST_NOISE, MeasurementSet, refuse_unmoved
 from .grid_readings import (
     Readings,
     check_complete,
@@ -65,6 +65,10 @@ POINTS_PER_COEFFICIENT = 3
 
 FEWEST_POINTS = 2 * POINTS_PER_COEFFICIENT
 """Below this not even a straight line is left."""
+
+MISFIT, LINES_MISFIT = 10.0, 100.0
+"""Repeated readings may scatter so many times as much as stated, and so far may readings lie off their polynomial,
+which leaves out the screws' waves (on the shipped machine 15 times a rotation's noise)."""
 
 DIRECTIONS = (1, -1)
 """Forward, backward: the order of a field's polynomials."""
@@ -132,11 +136,15 @@ class LinesFit:
         Every polynomial.
     notes : tuple of str
         What was odd, left out or assumed.
+    misfit : str
+        Why the model is not to be trusted: readings that scatter more than :data:`MISFIT` allows when repeated, or
+        lie further off their polynomials than :data:`LINES_MISFIT`; empty if none does.
     """
 
     model: MachineModel
     lines: tuple[LineFit, ...]
     notes: tuple[str, ...]
+    misfit: str = ""
 
 
 def fit_lines(
@@ -175,6 +183,9 @@ def fit_lines(
     empty = GridField(grid, _no_lines(grid), probe=measurements.probe)
     field, fits = _fit_families(readings, empty, order, datum)
     notes += _fit_notes(fits, order)
+    left = _without_means(measurements)
+    if np.abs(left).max() <= LEAST_NOISE:  # one silent kind among others does this scheme no harm
+        refuse_unmoved(measurements, left)
     model = MachineModel(
         machine=measurements.geometry.name,
         name=name or f"lines, {'5-D' if (readings.component >= 3).any() else '1-D'}",
@@ -182,7 +193,37 @@ def fit_lines(
         valid_box=valid_box_of(measurements, grid),
         origin=ModelOrigin(date or calendar.today().isoformat(), measurements.files, None, _origin_note(order)),
     )
-    return LinesFit(model, tuple(fits), tuple(dict.fromkeys((*measurements.notes, *notes))))
+    notes = list(dict.fromkeys((*measurements.notes, *notes)))
+    return LinesFit(model, tuple(fits), tuple(notes), _misfit(measurements, fits))
+
+
+def _without_means(measurements: MeasurementSet) -> np.ndarray:
+    """Return the readings less the mean of their channel in their run, shape (N,), m or rad."""
+    groups = np.unique(np.stack([measurements.run, measurements.channel]), axis=1, return_inverse=True)[1].ravel()
+    means = np.bincount(groups, measurements.value) / np.bincount(groups)
+    return measurements.value - means[groups]
+
+
+def _misfit(measurements: MeasurementSet, fits: Sequence[LineFit]) -> str:
+    """Return what :attr:`LinesFit.misfit` says."""
+    repeated: dict[int, float] = {}
+    left: dict[int, float] = {}
+    for kind in np.unique(measurements.kind):
+        mine = [fit for fit in fits if _kind(fit) == KINDS[kind]]
+        for found, values in (
+            (repeated, [fit.repeat_std for fit in mine if np.isfinite(fit.repeat_std)]),
+            (left, [fit.residual_std for fit in mine]),
+        ):
+            if values:
+                found[int(kind)] = float(np.sqrt(np.mean(np.square(values))))
+    return measurements.misfit(repeated, MISFIT) or measurements.misfit(left, LINES_MISFIT)
+
+
+def _kind(fit: LineFit) -> str:
+    """Return the kind of channel that a polynomial was fitted to."""
+    if fit.component >= 3:
+        return "rotation"
+    return "linear" if fit.component == fit.axis else "straightness"
 
 
 def _origin_note(order: OrderRule) -> str:

@@ -301,8 +301,9 @@ def left_in_space(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, 
     points : ndarray, shape (n, 3)
         Places of the measured point, m in ``base``.
     """
-    level = np.tile(np.eye(3), (len(points), 1, 1))
-    every = Passes(points - space.probe, level, np.tile(np.eye(3)[0], (len(points), 1)))
+    level = np.tile(space.level, (len(points), 1, 1))
+    along_x = np.tile(space.geometry.work.rotation[:, 0], (len(points), 1))
+    every = Passes(points - space.level @ space.probe, level, along_x)
     reachable = np.array([refusal is None for refusal in every.refusals(space.geometry)])
     left = np.full(len(points), np.nan)
     if not reachable.any():
@@ -343,15 +344,17 @@ def _datum(points: np.ndarray) -> np.ndarray:
 def box_stations(space: ParameterSpace, tilt: float = 0.0) -> Stations | None:
     """Return random reachable stations in the measured box, each passed there and back in a random direction.
 
-    First all there, then all back. The tool is tilted by `tilt`, rad, each time about another horizontal axis.
+    The box is the work frame's. First all there, then all back. The tool is tilted by `tilt`, rad, from level,
+    each time about another horizontal axis of the work frame.
     """
     rng = np.random.default_rng(SEED)
-    points = rng.uniform(space.box[0], space.box[1], (POINTS, 3))
+    points = space.places(rng.uniform(space.work_box[0], space.work_box[1], (POINTS, 3)))
     directions = rng.standard_normal((POINTS, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     headings = rng.uniform(0.0, 2.0 * np.pi, POINTS)
     angles = tilt * np.stack([np.cos(headings), np.sin(headings), np.zeros(POINTS)], axis=1)
-    rotations = rotation_from_angles(angles)
+    work = space.geometry.work.rotation
+    rotations = work @ rotation_from_angles(angles) @ work.T @ space.level
     every = Passes(points - rotations @ space.probe, rotations, directions)
     reachable = np.array([refusal is None for refusal in every.refusals(space.geometry)])
     if not reachable.any():

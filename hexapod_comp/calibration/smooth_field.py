@@ -8,6 +8,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from ..field import CROSS_AXES, GridField
+from ..measurement import LEAST_SIDE
 
 COMPONENT_UNITS = (("dx", "m"), ("dy", "m"), ("dz", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 
@@ -25,9 +26,6 @@ DIGITS = 11
 
 CHECKED = 400
 """Random points at which that is checked."""
-
-LEAST_SIDE = 1e-6
-"""A box thinner than this, m, is flat: its points differ by rounding."""
 
 MOST_NODES = 17
 """Nodes along the longest axis at most: more make the model file too long to read."""

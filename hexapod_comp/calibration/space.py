@@ -17,9 +17,9 @@ from ..field import GridField, no_field
 from ..geometry import COINCIDENT, STRUT_NAMES, HexapodGeometry
 from ..kinematics import Structure, strut_lengths
 from ..machine import MachineModel
-from ..measurement import AXES, MeasurementSet
+from ..measurement import AXES, MeasurementSet, spans
 from ..struts import StrutErrors
-from .smooth_field import COMPONENT_UNITS, LEAST_SIDE, SmoothField
+from .smooth_field import COMPONENT_UNITS, SmoothField
 
 KNOT_DISTANCE = 0.017
 """Largest distance of the length map's knots, m: a wave of 60 mm has then three and a half knots."""
@@ -151,6 +151,14 @@ class ParameterSpace:
         Commands of the length map's knots, m.
     field : SmoothField
         The field's basis.
+    box : ndarray, shape (2, 3)
+        Lowest and highest commanded place of the measured point, m in ``base``: where the field is.
+    platform_box : ndarray, shape (2, 3)
+        The same of the platform's positions, m in ``base``: where the model holds.
+    work_box : ndarray, shape (2, 3)
+        The same of the measured point, m in the work frame, in which campaigns are boxes.
+    level : ndarray, shape (3, 3)
+        Attitude of the platform, in ``base``, with a level tool (:meth:`MeasurementSet.level`).
     """
 
     def __init__(self, measurements: MeasurementSet, settings: Settings) -> None:
@@ -164,11 +172,19 @@ class ParameterSpace:
         self.knots = _knots(commands.min(), commands.max())
         points = measurements.points()
         self.box = np.array([points.min(axis=0), points.max(axis=0)])
+        self.platform_box, self.level = measurements.platform_box(), measurements.level()
+        in_work = (points - geometry.work.position) @ geometry.work.rotation
+        self.work_box = np.array([in_work.min(axis=0), in_work.max(axis=0)])
         self.field = SmoothField(self.box, settings.field_degree)
         self.probe = measurements.probe
         self.blocks = tuple(self._make_blocks())
         self.size = self.blocks[-1].part.stop
         self._cardinal = CubicSpline(self.knots, np.eye(len(self.knots)), bc_type="natural")
+
+    def places(self, in_work: np.ndarray) -> np.ndarray:
+        """Return points (n, 3) of the work frame in ``base``, m."""
+        work = self.geometry.work
+        return work.position + in_work @ work.rotation.T
 
     def _make_blocks(self) -> list[Block]:
         names = [name for name in BLOCKS if self._has(name)]
@@ -283,7 +299,7 @@ class ParameterSpace:
             field=self._grid_field(x) if with_field else no_field(),
             base_expansion=s.base_expansion,
             platform_expansion=s.platform_expansion,
-            valid_box=self.box if (np.ptp(self.box, axis=0) >= LEAST_SIDE).all() else None,
+            valid_box=self.platform_box if spans(self.platform_box) else None,
         )
 
     def field_coefficients(self, x: np.ndarray) -> np.ndarray:

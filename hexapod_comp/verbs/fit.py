@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +21,12 @@ if TYPE_CHECKING:
     from ..measurement import MeasurementSet
 
 SUMMARY = "fit a model of the machine's errors to measurements"
+
+REFUSED = "NOT WRITTEN: this model is not to be trusted"
+FORCED = "WRITTEN BY FORCE: this model is not to be trusted"
+"""Top of the report where readings do not bear the model out."""
+
+ADVICE = "Do units, lead, geometry and the instrument's uncertainty fit?"
 
 TEXT = """Reads tidy CSV (one reading a row, what measure writes), .rtl and .rtx files of the laser software (each with
 its line file NAME.rtl.yaml beside it), or with --columns the wide CSV files of other labs.
@@ -46,6 +53,7 @@ def add_parser(subparsers: common.Subparsers) -> None:
     parser.add_argument("--covariance", metavar="FILE.npz", help="write the parameters' covariance (joint)")
     parser.add_argument("--pictures", metavar="DIR", help="folder for pictures; made if it is missing")
     parser.add_argument("--truth", metavar="FILE", help="model of the virtual machine that was measured")
+    parser.add_argument("--force", action="store_true", help="write a model that the readings do not bear out")
     add_joint_options(parser)
     parser.add_argument("--not-robust", action="store_true", help="trust readings that disagree with the rest (joint)")
     text = "what picks the polynomials' order (lines; default adjusted-r2)"
@@ -149,8 +157,15 @@ def run(args: argparse.Namespace) -> int:
     except CalibrationError:
         common.say_notes(measured.notes)  # they may say why
         raise
-    text = "\n".join(part for part in (result.text, _iso_text(measured), _worth_text(truth, result.model)) if part)
-    save_model(result.model, args.out)
+    if result.misfit and not args.force:
+        print(f"{REFUSED}: {result.misfit}. {ADVICE}\n\n{result.text}")
+        print("hexapod_comp: error: nothing was written; the report says why, --force writes it", file=sys.stderr)
+        return 1
+    parts = (result.text, _iso_text(measured), _worth_text(truth, result.model, measured))
+    text = "\n".join(part for part in parts if part)
+    if result.misfit:
+        text = f"{FORCED}: {result.misfit}. {ADVICE}\n\n{text}"
+    save_model(result.saved, args.out)
     print(text)
     print(f"model: {args.out}")
     if args.report is not None:
@@ -186,7 +201,16 @@ class _Result:
     model: MachineModel
     text: str
     pictures: Callable[[], dict[str, Figure]]
+    misfit: str
     save_more: Callable[[], None] = lambda: None
+
+    @property
+    def saved(self) -> MachineModel:
+        """The model, with a remark to whoever runs it where it was forced."""
+        if not self.misfit:
+            return self.model
+        origin = self.model.origin
+        return replace(self.model, origin=replace(origin, note=f"FORCED: {self.misfit}. {origin.note}"))
 
 
 def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: Settings) -> _Result:
@@ -215,7 +239,7 @@ def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: Setting
         return made
 
     model = fit.model if args.name is None else replace(fit.model, name=args.name)
-    return _Result(model, report(fit), pictures, save_more)
+    return _Result(model, report(fit), pictures, fit.misfit, save_more)
 
 
 def _lines(args: argparse.Namespace, measured: MeasurementSet) -> _Result:
@@ -231,7 +255,7 @@ def _lines(args: argparse.Namespace, measured: MeasurementSet) -> _Result:
         of_struts = strut_error_figure(measured.geometry, {fit.model.name: fit.model})
         return {"lines.png": fitted_lines_figure(fit), "strut_errors.png": of_struts}
 
-    return _Result(fit.model, report(fit, every_line=args.every_line), pictures)
+    return _Result(fit.model, report(fit, every_line=args.every_line), pictures, fit.misfit)
 
 
 def _iso_text(measured: MeasurementSet) -> str:
@@ -242,18 +266,21 @@ def _iso_text(measured: MeasurementSet) -> str:
     return table(tests) + "\n" if tests else ""
 
 
-def _worth_text(truth: object, model: MachineModel) -> str:
+def _worth_text(truth: object, model: MachineModel, measured: MeasurementSet) -> str:
     """Return what the model is worth on the virtual machine that was measured."""
     from ..calibration.evaluation import worth
     from ..calibration.lines_report import worth_text
     from ..errors import CalibrationError
     from ..machine import RealMachine
+    from ..measurement import spans
 
     if not isinstance(truth, RealMachine):
         return ""
-    if model.valid_box is None:
+    box, geometry = measured.tool_box(), measured.geometry
+    if not spans(box):
         raise CalibrationError("--truth", "the readings span no box in which the model could be judged")
-    return worth_text(worth(truth, model, model.valid_box)) + "\n"
+    level = geometry.work.rotation.T @ measured.level() @ geometry.tool.rotation
+    return worth_text(worth(truth, model, box, level=level)) + "\n"
 
 
 def _save_arrays(path: str, **arrays: ArrayLike) -> None:
