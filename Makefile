@@ -48,7 +48,7 @@ test: $(VENV)/with-ros,test
 	$(BIN)/ruff check
 	$(BIN)/mypy
 	@# The matrices of the tests are small: more threads of OpenBLAS would only wait for each other.
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest --ignore=test/test_linuxcnc.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest --ignore=test/linuxcnc/test_linuxcnc.py
 
 test-all:
 	@PYTHON='$(PYTHON)' tools/pythons | { passed=; failed=; while read -r version python; do \
@@ -84,7 +84,7 @@ test-linuxcnc: $(VENV)/with-ros,test
 	else $(BESIDE_LINUXCNC) run-linuxcnc-tests; fi
 
 run-linuxcnc-tests: $(VENV)/with-ros,test
-	LINUXCNC_TESTS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -s test/test_linuxcnc.py
+	LINUXCNC_TESTS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -s test/linuxcnc/test_linuxcnc.py
 
 clean:
 	rm -rf .venv .venv-* build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
@@ -109,7 +109,7 @@ if ! command -v linuxcnc >/dev/null && [ "$$(id -u)" -eq 0 ] && command -v apt-g
 endef
 
 define HAS_HAL
-from hexapod_comp.hal_component import load_module
+from hexapod_comp.linuxcnc.hal import load_module
 load_module()
 endef
 export HAS_HAL

@@ -109,9 +109,9 @@ setup(
             f"hexapod_comp = {NAME}.cli:main",
             f"compensator = {NAME}.nodes.compensator:main",
             f"strut_drive = {NAME}.nodes.strut_drive:main",
-            f"linuxcnc_bridge = {NAME}.nodes.linuxcnc_bridge:main",
-            f"linuxcnc_machine = {NAME}.linuxcnc_machine:main",
-            f"hal_sweep = {NAME}.hal_sweep:main",
+            f"linuxcnc_bridge = {NAME}.linuxcnc.bridge:main",
+            f"linuxcnc_machine = {NAME}.linuxcnc.watch:main",
+            f"hal_sweep = {NAME}.linuxcnc.hal_sweep:main",
         ],
     },
 )

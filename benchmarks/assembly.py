@@ -23,10 +23,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.assembly import assembly_modes, mode_objections, working_mode
 from hexapod_comp.errors import OtherAssemblyModeError
-from hexapod_comp.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.kinematics import Structure, strut_lengths
+from hexapod_comp.machine.assembly import assembly_modes, mode_objections, working_mode
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.kinematics import Structure, strut_lengths
 from hexapod_comp.pose import Pose
 
 PAPER = Path(__file__).resolve().parents[1] / "config" / "paper.yaml"

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from hexapod_comp.kinematics import solve_poses, strut_lengths_batch
+from hexapod_comp.machine.kinematics import solve_poses, strut_lengths_batch
 
 from .poses import WIDE, Poses, make_poses
 

@@ -22,15 +22,15 @@ import numba
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp import kernels
-from hexapod_comp.compensation import Compensator
-from hexapod_comp.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.limit_kernels import check_stage
-from hexapod_comp.machine import MachineModel
-from hexapod_comp.model_file import load_model
-from hexapod_comp.paths import config_file
-from hexapod_comp.pose import read_pose
-from hexapod_comp.struts import StrutErrors
+from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.formats.paths import config_file
+from hexapod_comp.kernels import kinematics as kernels
+from hexapod_comp.kernels.limits import check_stage
+from hexapod_comp.kernels.pose import read_pose
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.model import MachineModel
+from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.machine.struts import StrutErrors
 
 COMMANDS = 500
 PERIOD = 1e-3

@@ -26,15 +26,15 @@ import numpy as np
 from tqdm import tqdm
 
 from hexapod_comp.calibration.evaluation import Worth, worth
-from hexapod_comp.calibration.joint_fit import fit_joint
+from hexapod_comp.calibration.fit import fit_joint
 from hexapod_comp.calibration.lines import fit_lines
-from hexapod_comp.calibration.space import Settings
-from hexapod_comp.campaign import Campaign, load_campaign, template
-from hexapod_comp.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.imperfections import ImperfectionBounds, draw_model
-from hexapod_comp.machine import MachineModel, RealMachine
-from hexapod_comp.smooth_imperfections import with_length_map, with_wavy_field
-from hexapod_comp.virtual_instruments import measure
+from hexapod_comp.calibration.parameters import Settings
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.measurements.campaign import Campaign, load_campaign, template
+from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
+from hexapod_comp.virtual.instruments import measure
+from hexapod_comp.virtual.smooth_imperfections import with_length_map, with_wavy_field
 
 CONFIG = Path(__file__).resolve().parents[1] / "config"
 LEAD = 0.01

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from hexapod_comp.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.pose import Pose, rotation_from_angles
 from hexapod_comp.workspace.effects import Extremes, effect_vectors, extremes, merged
 from hexapod_comp.workspace.sources import BASE_JOINT, LENGTH, PLATFORM_JOINT, Budget, SingleErrors

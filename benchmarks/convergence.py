@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp import kernels
-from hexapod_comp.kinematics import Structure, strut_lengths_batch
+from hexapod_comp.kernels import kinematics as kernels
+from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
 
 from .genhexkins import Genhexkins, NotHere, emc_poses, si_poses
 from .poses import make_poses

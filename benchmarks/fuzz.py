@@ -2,8 +2,8 @@
 
     python -m benchmarks.fuzz [--cases N] [--seed N] [--jobs N] [-k WORD]
 
-The tests are those of ``test/test_fuzz_*.py``, which ``make test`` runs at a bounded size, the same cases every time;
-here every seed makes other cases. Exit code 1: some case failed; hypothesis has then shrunk it and printed it.
+The tests are those of ``test/fuzz/test_fuzz_*.py``, which ``make test`` runs at a bounded size, the same cases every
+time; here every seed makes other cases. Exit code 1: some case failed; hypothesis has then shrunk it and printed it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def main() -> int:
     args = parser.parse_args()
     began = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
-        files = sorted((ROOT / "test").glob("test_fuzz_*.py"))
+        files = sorted((ROOT / "test" / "fuzz").glob("test_fuzz_*.py"))
         with ThreadPoolExecutor(max(1, args.jobs)) as pool:
             codes = list(pool.map(lambda file: run(file, args, folder), files))
         counts: Counter[str] = Counter()

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp import kernels
-from hexapod_comp.kinematics import Structure
+from hexapod_comp.kernels import kinematics as kernels
+from hexapod_comp.machine.kinematics import Structure
 
 from .poses import NEAR, WIDE, Contender, Poses, joined
 

@@ -24,13 +24,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.calibration.joint_fit import fit_joint
+from hexapod_comp.calibration.fit import fit_joint
+from hexapod_comp.calibration.parameters import Settings
 from hexapod_comp.calibration.sensitivity import predict
-from hexapod_comp.calibration.space import Settings
-from hexapod_comp.columns import read_wide
-from hexapod_comp.geometry import load_geometry
-from hexapod_comp.kinematics import Structure, strut_lengths_batch
-from hexapod_comp.measurement import AXES, CHANNELS, KINDS, MeasurementSet
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
+from hexapod_comp.measurements.readings import AXES, CHANNELS, KINDS, MeasurementSet
+from hexapod_comp.measurements.wide_csv import read_wide
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data" / "jugglebot_hexapod"

@@ -16,8 +16,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from hexapod_comp import kernels
-from hexapod_comp.kinematics import solve_pose, solve_poses, strut_lengths, strut_lengths_batch
+from hexapod_comp.kernels import kinematics as kernels
+from hexapod_comp.machine.kinematics import solve_pose, solve_poses, strut_lengths, strut_lengths_batch
 from hexapod_comp.pose import Pose
 
 from . import genhexkins, peers

@@ -27,8 +27,8 @@ from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
-from hexapod_comp.conversions import pose_message
-from hexapod_comp.nodes.processes import PrivateDomain
+from hexapod_comp.loop.processes import PrivateDomain
+from hexapod_comp.nodes.messages import pose_message
 from hexapod_comp.nodes.runtime import COMMAND_QOS
 from hexapod_comp.nodes.stamps import nanoseconds_of
 from hexapod_comp.pose import Pose

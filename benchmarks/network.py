@@ -17,8 +17,8 @@ from functools import partial
 
 import numpy as np
 
+from hexapod_comp.formats.texts import aligned
 from hexapod_comp.nodes.middleware import avoid_shared_memory
-from hexapod_comp.texts import aligned
 
 from .faults import visible
 from .faults.cable import Cable

@@ -6,17 +6,15 @@ import numpy as np
 from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp import kernels
-from hexapod_comp.kinematics import Structure
+from hexapod_comp.kernels import kinematics as kernels
+from hexapod_comp.machine.kinematics import Structure
 
 from .poses import WIDE, Contender, Poses, joined
 
 # --- NumPy and SciPy ---------------------------------------------------------------------------------------
 
 
-def numpy_struts(
-    structure: Structure, positions: np.ndarray, rotations: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def numpy_struts(structure: Structure, positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return arms R·t_i and strut vectors, shape (..., 6, 3), for one pose or many."""
     arms = structure.platform_joints @ np.swapaxes(rotations, -1, -2)
     return arms, positions[..., None, :] + arms - structure.base_joints
@@ -105,9 +103,7 @@ def mujoco_xml(structure: Structure) -> str:
         places = (" ".join(f"{x:.17g}" for x in joint) for joint in joints)
         return "".join(f'<site name="{body}{i}" pos="{place}"/>' for i, place in enumerate(places))
 
-    tendons = "".join(
-        f'<spatial><site site="base{i}"/><site site="platform{i}"/></spatial>' for i in range(6)
-    )
+    tendons = "".join(f'<spatial><site site="base{i}"/><site site="platform{i}"/></spatial>' for i in range(6))
     return (
         f"<mujoco><worldbody>{sites(structure.base_joints, 'base')}<body><freejoint/>"
         f'<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>{sites(structure.platform_joints, "platform")}'

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.geometry import load_geometry
-from hexapod_comp.kinematics import Structure, strut_lengths_batch
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
 from hexapod_comp.pose import Pose
 
 PAPER = Path(__file__).resolve().parents[1] / "config" / "paper.yaml"

@@ -16,8 +16,8 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
-from hexapod_comp.conversions import StrutMessage
 from hexapod_comp.nodes.arguments import Program
+from hexapod_comp.nodes.messages import StrutMessage
 from hexapod_comp.nodes.parameters import Parameter, declare
 from hexapod_comp.nodes.running import run
 from hexapod_comp.nodes.runtime import COMMAND_QOS, STATE_QOS, MachineNode

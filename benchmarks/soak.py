@@ -32,8 +32,8 @@ from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
-from hexapod_comp.conversions import pose_message
-from hexapod_comp.nodes.processes import PrivateDomain
+from hexapod_comp.loop.processes import PrivateDomain
+from hexapod_comp.nodes.messages import pose_message
 from hexapod_comp.nodes.running import SPIN_PERIOD
 from hexapod_comp.nodes.runtime import COMMAND_QOS, EVENT_QOS
 from hexapod_comp.nodes.stamps import nanoseconds_of

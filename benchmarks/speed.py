@@ -16,8 +16,8 @@ from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from hexapod_comp.files import write_text_atomically
-from hexapod_comp.plotting import save
+from hexapod_comp.formats.figures import save
+from hexapod_comp.formats.yaml import write_text_atomically
 
 from . import batches, blocks, convergence, genhexkins, kernels, loop
 from .speed_picture import speed_picture

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hexapod_comp.plotting import WITH, WITHOUT
+from hexapod_comp.formats.figures import WITH, WITHOUT
 
 from .loop import BAR_MEDIAN, BAR_P99, Row
 from .poses import NEAR, OURS, WIDE

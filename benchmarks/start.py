@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 
-from hexapod_comp.nodes.processes import NodeProcess, PrivateDomain
+from hexapod_comp.loop.processes import NodeProcess, PrivateDomain
 
 BAR = 3.0
 """Longest start allowed, s."""

@@ -24,12 +24,12 @@ from tqdm import tqdm
 
 from benchmarks.calibration import CONFIG, LARGE
 from hexapod_comp.calibration.evaluation import run
-from hexapod_comp.campaign import load_campaign
-from hexapod_comp.geometry import STRUT_NAMES, load_geometry
-from hexapod_comp.imperfections import draw_model
-from hexapod_comp.machine import REFERENCE_TEMPERATURE, MachineModel, RealMachine, Temperatures
-from hexapod_comp.thermal import DEFAULT_TIME_CONSTANT, TemperatureFilter
-from hexapod_comp.travel import Passes, random_passes
+from hexapod_comp.compensation.thermal import DEFAULT_TIME_CONSTANT, TemperatureFilter
+from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
+from hexapod_comp.machine.model import REFERENCE_TEMPERATURE, MachineModel, RealMachine, Temperatures
+from hexapod_comp.machine.travel import Passes, random_passes
+from hexapod_comp.measurements.campaign import load_campaign
+from hexapod_comp.virtual.imperfections import draw_model
 
 STEEL = 11.5e-6
 """Expansion of struts, base and platform, 1/K."""

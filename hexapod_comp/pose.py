@@ -12,17 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .compiling import compiled
 from .errors import PoseError
-
-QUATERNION_NORM_TOLERANCE = 1e-3
-"""A quaternion whose norm is further from 1 than this is refused: it was never a rotation."""
+from .kernels.pose import QUATERNION_NORM_TOLERANCE, rotation_flaw
 
 LARGEST_ANGLE = 1000.0
 """Larger angles, rad, are refused: nobody turns a tool 159 times, and at 1e16 rounding turns it anywhere."""
 
-POSE_OK, POSE_NOT_FINITE, POSE_NOT_UNIT = range(3)
-"""Outcomes of :func:`read_pose`."""
 
 ROTATION_TOLERANCE = 1e-9
 """Largest deviation of RᵀR from the identity that passes as rounding."""
@@ -139,55 +134,13 @@ def angles_from_rotation(rotation: np.ndarray) -> np.ndarray:
     beta = np.arctan2(r[..., 0, 2], r[..., 2, 2])
     # From the first row of Ry(−β)·R = Rx(α)·Rz(γ), which keeps its digits where cos α vanishes.
     cosine, sine = np.cos(beta), np.sin(beta)
-    gamma = np.arctan2(
-        sine * r[..., 2, 1] - cosine * r[..., 0, 1], cosine * r[..., 0, 0] - sine * r[..., 2, 0]
-    )
+    gamma = np.arctan2(sine * r[..., 2, 1] - cosine * r[..., 0, 1], cosine * r[..., 0, 0] - sine * r[..., 2, 0])
     return np.stack([alpha, beta, gamma], axis=-1)
 
 
 def rotation_angle(rotation: np.ndarray) -> float:
     """Return the angle of a rotation matrix, radians in [0, π]."""
     return float(Rotation.from_matrix(rotation).magnitude())
-
-
-@compiled
-def rotation_flaw(r):
-    """Return the largest element of |RᵀR − 1|, infinite for a left-handed matrix, NaN for one with NaN in it."""
-    flaw = 0.0
-    for i in range(3):
-        for j in range(i + 1):
-            dot = r[0, i] * r[0, j] + r[1, i] * r[1, j] + r[2, i] * r[2, j]
-            part = abs(dot - (1.0 if i == j else 0.0))
-            if not part <= flaw:
-                flaw = part
-    x = r[1, 0] * r[2, 1] - r[2, 0] * r[1, 1]
-    y = r[2, 0] * r[0, 1] - r[0, 0] * r[2, 1]
-    z = r[0, 0] * r[1, 1] - r[1, 0] * r[0, 1]
-    if x * r[0, 2] + y * r[1, 2] + z * r[2, 2] < 0.0:
-        return math.inf
-    return flaw
-
-
-@compiled
-def read_pose(x, y, z, qx, qy, qz, qw, position, rotation):
-    """Write position and rotation matrix of a position and a quaternion; return the outcome."""
-    square = qx * qx + qy * qy + qz * qz + qw * qw
-    if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z) and math.isfinite(square)):
-        return POSE_NOT_FINITE
-    if abs(math.sqrt(square) - 1.0) > QUATERNION_NORM_TOLERANCE:
-        return POSE_NOT_UNIT
-    s = 2.0 / square
-    position[0], position[1], position[2] = x, y, z
-    rotation[0, 0] = 1.0 - s * (qy * qy + qz * qz)
-    rotation[0, 1] = s * (qx * qy - qz * qw)
-    rotation[0, 2] = s * (qx * qz + qy * qw)
-    rotation[1, 0] = s * (qx * qy + qz * qw)
-    rotation[1, 1] = 1.0 - s * (qx * qx + qz * qz)
-    rotation[1, 2] = s * (qy * qz - qx * qw)
-    rotation[2, 0] = s * (qx * qz - qy * qw)
-    rotation[2, 1] = s * (qy * qz + qx * qw)
-    rotation[2, 2] = 1.0 - s * (qx * qx + qy * qy)
-    return POSE_OK
 
 
 def _finite(values: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:

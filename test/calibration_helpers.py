@@ -12,18 +12,18 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.calibration.space import ParameterSpace, Settings
-from hexapod_comp.campaign import Campaign, template
-from hexapod_comp.gathering import assemble
-from hexapod_comp.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.imperfections import ImperfectionBounds, draw_model
-from hexapod_comp.machine import MachineModel, RealMachine
-from hexapod_comp.measurement import AXES, FROM_PREVIOUS, MeasurementSet, Reading, Source
-from hexapod_comp.motion import MotionState
-from hexapod_comp.paths import config_file
+from hexapod_comp.calibration.parameters import ParameterSpace, Settings
+from hexapod_comp.formats.paths import config_file
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.machine.motion import MotionState
+from hexapod_comp.machine.travel import Passes
+from hexapod_comp.measurements.campaign import Campaign, template
+from hexapod_comp.measurements.readings import AXES, FROM_PREVIOUS, MeasurementSet, Reading, Source
+from hexapod_comp.measurements.runs import assemble
 from hexapod_comp.pose import Pose
-from hexapod_comp.travel import Passes
-from hexapod_comp.virtual_instruments import measure
+from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
+from hexapod_comp.virtual.instruments import measure
 
 INCH = 0.0254
 BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])

@@ -25,7 +25,7 @@ from node_helpers import HOME, closed_form_lengths, model_file
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
-from hexapod_comp.geometry import STRUT_NAMES
+from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.nodes.running import autostart
 from hexapod_comp.nodes.runtime import MachineNode
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.geometry import HexapodGeometry, Limits
+from hexapod_comp.machine.geometry import HexapodGeometry, Limits
 from hexapod_comp.pose import Pose
 
 DATA = Path(__file__).parent / "data"
@@ -51,9 +51,7 @@ def segment_distance(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray)
     return float(np.linalg.norm(a + shares[0] * (b - a) - c - shares[1] * (d - c)))
 
 
-def central_difference(
-    function: Callable[[np.ndarray], np.ndarray], at: np.ndarray, step: float = 1e-5
-) -> np.ndarray:
+def central_difference(function: Callable[[np.ndarray], np.ndarray], at: np.ndarray, step: float = 1e-5) -> np.ndarray:
     """Return the derivative of `function` at a point by central differences.
 
     Parameters

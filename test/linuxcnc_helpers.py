@@ -26,8 +26,8 @@ from typing import Any
 
 import numpy as np
 
-from hexapod_comp.compiling import cache_folder
-from hexapod_comp.hal_component import HalError, load_module
+from hexapod_comp.kernels.compiling import cache_folder
+from hexapod_comp.linuxcnc.hal import HalError, load_module
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFIG = ROOT / "config" / "linuxcnc"
@@ -94,7 +94,7 @@ def as_ordinary_user() -> list[str]:
     said = ""
     for capability in ("", "dac_read_search", "dac_override"):
         extra = [f"--inh-caps=+{capability}", f"--ambient-caps=+{capability}"] if capability else []
-        trial = [*switch, *extra, sys.executable, "-c", "import hexapod_comp.nodes.linuxcnc_bridge"]
+        trial = [*switch, *extra, sys.executable, "-c", "import hexapod_comp.linuxcnc.bridge"]
         done = subprocess.run(trial, env=environment(Path("/nonexistent")), cwd="/", capture_output=True, text=True)
         if done.returncode == 0:
             return [*switch, *extra]

@@ -34,9 +34,9 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
-from hexapod_comp.conversions import pose_message
-from hexapod_comp.geometry import STRUT_NAMES
+from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.nodes.compensator import CompensatorNode
+from hexapod_comp.nodes.messages import pose_message
 from hexapod_comp.nodes.running import autostart
 from hexapod_comp.nodes.strut_drive import StrutDriveNode
 from hexapod_comp.pose import Pose

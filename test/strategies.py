@@ -13,11 +13,11 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.field import CROSS_AXES, GridField
-from hexapod_comp.geometry import HexapodGeometry, Limits, load_geometry
-from hexapod_comp.machine import MachineModel
+from hexapod_comp.machine.field import CROSS_AXES, GridField
+from hexapod_comp.machine.geometry import HexapodGeometry, Limits, load_geometry
+from hexapod_comp.machine.model import MachineModel
+from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.pose import Pose
-from hexapod_comp.struts import StrutErrors
 
 PAPER_FILE = Path(__file__).resolve().parents[1] / "config" / "paper.yaml"
 
@@ -73,9 +73,7 @@ def random_pose(rng: np.random.Generator, home: Pose, reach: float = 0.05, tilt:
     return Pose(home.position + rng.uniform(-reach, reach, 3), turn.as_matrix() @ home.rotation)
 
 
-def random_field(
-    rng: np.random.Generator, size: float = 20e-6, powers: int = 4, **other: object
-) -> GridField:
+def random_field(rng: np.random.Generator, size: float = 20e-6, powers: int = 4, **other: object) -> GridField:
     """Return a field with all six components on every line, coefficients of `size` m and rad."""
     shapes = [(2, len(UNEVEN_GRID[a]), len(UNEVEN_GRID[b]), 6, powers) for a, b in CROSS_AXES]
     lines = [rng.uniform(-size, size, shape) for shape in shapes]

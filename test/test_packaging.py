@@ -21,7 +21,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from hexapod_comp.errors import InputFileError
-from hexapod_comp.paths import config_file, shipped_names
+from hexapod_comp.formats.paths import config_file, shipped_names
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "hexapod_comp"
@@ -180,7 +180,7 @@ def test_every_module_is_installed(installed: Path):
 def test_installed_command_runs_and_finds_its_own_config(installed: Path, tmp_path: Path):
     site_packages = next(installed.glob("**/hexapod_comp/__init__.py")).parents[1]
     environment = os.environ | {"PYTHONPATH": str(site_packages)}
-    code = "from hexapod_comp.paths import config_file; print(config_file('paper'), config_file('own/deep'))"
+    code = "from hexapod_comp.formats.paths import config_file; print(config_file('paper'), config_file('own/deep'))"
     found = subprocess.check_output([sys.executable, "-c", code], env=environment, cwd=tmp_path, text=True)
     share = installed / "share" / "hexapod_comp" / "config"
     assert found.strip() == f"{share / 'paper.yaml'} {share / 'own' / 'deep.yaml'}"
@@ -212,7 +212,7 @@ def test_the_core_imports_without_ros():
     modules = ["hexapod_comp"]
     for path in sorted(PACKAGE.rglob("*.py")):
         dotted = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-        if path.name not in ("__init__.py", "conversions.py") and path.parent.name != "nodes":
+        if path.name != "__init__.py" and path.parent.name not in ("nodes", "linuxcnc"):
             modules.append(dotted)
     blocked = ",".join(sorted({"rclpy", "launch", "launch_ros", *_ros_dependencies()}))
     run = subprocess.run(
@@ -248,9 +248,7 @@ def test_missing_numba_is_said_in_one_line_that_tells_where_to_get_it(words: tup
     (tmp_path / "numba.py").write_text("raise ImportError(\"No module named 'numba'\")\n")
     path = os.pathsep.join([str(tmp_path), str(ROOT), *sys.path])
     environment = os.environ | {"PYTHONPATH": path}
-    run = subprocess.run(
-        [sys.executable, "-m", *words], env=environment, capture_output=True, text=True, check=False
-    )
+    run = subprocess.run([sys.executable, "-m", *words], env=environment, capture_output=True, text=True, check=False)
     assert run.returncode != 0
     assert run.stdout == ""
     line = run.stderr.removesuffix("\n")

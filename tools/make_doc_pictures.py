@@ -16,18 +16,18 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from hexapod_comp.calibration.joint_fit import JointFit, fit_joint
+from hexapod_comp.calibration.fit import JointFit, fit_joint
 from hexapod_comp.calibration.lines import fit_lines
-from hexapod_comp.calibration.space import Settings
-from hexapod_comp.calibration_pictures import joint_figure, strut_error_figure
-from hexapod_comp.campaign import load_campaign, template
-from hexapod_comp.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.machine import RealMachine
-from hexapod_comp.measurement import MeasurementSet
-from hexapod_comp.model_file import load_model
-from hexapod_comp.plotting import direction_figure, machine_figure, weights_figure
+from hexapod_comp.calibration.parameters import Settings
+from hexapod_comp.calibration.pictures import joint_figure, strut_error_figure
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.model import RealMachine
+from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.machine.pictures import direction_figure, machine_figure, weights_figure
+from hexapod_comp.measurements.campaign import load_campaign, template
+from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.pose import Pose
-from hexapod_comp.virtual_instruments import measure
+from hexapod_comp.virtual.instruments import measure
 from hexapod_comp.workspace.effects import effects
 from hexapod_comp.workspace.pictures import TRANSLATION, Layer, shells_figure
 from hexapod_comp.workspace.reach import reach

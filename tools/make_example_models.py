@@ -26,12 +26,12 @@ import numpy as np
 from hexapod_comp.calibration.evaluation import INCH, Worth, worth
 from hexapod_comp.calibration.lines import fit_lines
 from hexapod_comp.calibration.lines_report import worth_text
-from hexapod_comp.campaign import Campaign, template
-from hexapod_comp.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.imperfections import ImperfectionBounds, draw_model
-from hexapod_comp.machine import MachineModel, ModelOrigin, RealMachine
-from hexapod_comp.model_file import load_model, save_model
-from hexapod_comp.virtual_instruments import measure
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
+from hexapod_comp.machine.model_file import load_model, save_model
+from hexapod_comp.measurements.campaign import Campaign, template
+from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
+from hexapod_comp.virtual.instruments import measure
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -13,7 +13,7 @@ import time
 
 from tqdm import tqdm
 
-from hexapod_comp.texts import aligned
+from hexapod_comp.formats.texts import aligned
 
 from .campaign import STARVED, Episode, Outcome, campaign, draw, rows
 from .judge import RECOVER_WITHIN, REPORT_WITHIN

@@ -8,9 +8,9 @@ from enum import Enum
 
 import numpy as np
 
-from hexapod_comp.geometry import HexapodGeometry
+from hexapod_comp.machine.geometry import HexapodGeometry
+from hexapod_comp.machine.trajectory import Path, circle, commanded_in_base, join, move
 from hexapod_comp.pose import Pose
-from hexapod_comp.trajectory import Path, circle, commanded_in_base, join, move
 
 RATE = 250.0
 """Commands per second, Hz."""

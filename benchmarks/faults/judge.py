@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hexapod_comp.geometry import HexapodGeometry
+from hexapod_comp.machine.geometry import HexapodGeometry
 
 from .record import Happened, Record, Sent, Status, Struts, Told
 from .visible import VISIBLE, Reported

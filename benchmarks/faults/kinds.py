@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hexapod_comp.geometry import STRUT_NAMES
+from hexapod_comp.machine.geometry import STRUT_NAMES
 
 from . import wire
 from .record import LINKS, Happened

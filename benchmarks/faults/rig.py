@@ -28,13 +28,13 @@ from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from hexapod_comp.conversions import message_pose, pose_message
-from hexapod_comp.geometry import load_geometry
+from hexapod_comp.formats.paths import config_file
+from hexapod_comp.loop.processes import NodeProcess, PrivateDomain
+from hexapod_comp.loop.session import prepare
+from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.nodes.client import LISTENER_QOS, TRACK_QOS
-from hexapod_comp.nodes.processes import NodeProcess, PrivateDomain
+from hexapod_comp.nodes.messages import message_pose, pose_message
 from hexapod_comp.nodes.runtime import COMMAND_QOS, STATE_QOS
-from hexapod_comp.nodes.session import prepare
-from hexapod_comp.paths import config_file
 from hexapod_comp.pose import Pose
 
 from .controller import Controller, Mode

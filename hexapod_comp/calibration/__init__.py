@@ -1,0 +1,1 @@
+"""From readings to a machine model, and what that model is worth."""

@@ -13,10 +13,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import ModelError
-from ..field import CROSS_AXES
-from ..geometry import HexapodGeometry
-from ..machine import MachineModel, RealMachine, Temperatures
-from ..travel import BOTH_WAYS, Passes, drive, model_commands, nominal_commands, random_passes
+from ..machine.field import CROSS_AXES
+from ..machine.geometry import HexapodGeometry
+from ..machine.model import MachineModel, RealMachine, Temperatures
+from ..machine.travel import BOTH_WAYS, Passes, drive, model_commands, nominal_commands, random_passes
 
 INCH = 0.0254
 
@@ -44,7 +44,7 @@ def run(
     NotConvergedError
         The model's field is no small correction.
     KinematicsError
-        As :func:`hexapod_comp.kinematics.solve_pose`.
+        As :func:`hexapod_comp.machine.kinematics.solve_pose`.
     """
     if model is None:
         commands = nominal_commands(truth.geometry, passes)

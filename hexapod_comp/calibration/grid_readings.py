@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import CalibrationError
-from ..field import COMPONENTS, CROSS_AXES
-from ..kinematics import Structure, strut_lengths_batch
-from ..machine import REFERENCE_TEMPERATURE
-from ..measurement import AXES, CHANNELS, KINDS, LEAST_TRAVEL, MeasurementSet
+from ..machine.field import COMPONENTS, CROSS_AXES
+from ..machine.kinematics import Structure, strut_lengths_batch
+from ..machine.model import REFERENCE_TEMPERATURE
+from ..measurements.readings import AXES, CHANNELS, KINDS, LEAST_TRAVEL, MeasurementSet
 
 WARM = 0.5
 """Temperatures further than this from the reference, K, are mentioned: the scheme has no temperature."""

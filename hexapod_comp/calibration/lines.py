@@ -1,7 +1,7 @@
 """Scheme ``lines``, paper 001's: a polynomial along each measured grid line, forward and backward apart.
 
 Every line of a full rectangular grid gets one polynomial per direction and component, by linear regression
-on the mean of its cycles; between the lines :class:`hexapod_comp.field.GridField` weights bilinearly. The
+on the mean of its cycles; between the lines :class:`hexapod_comp.machine.field.GridField` weights bilinearly. The
 inverse kinematics then makes strut lengths of it, as everywhere.
 
 **What a line does not say.** A laser reads from a zero that nobody knows against the next line's, and a
@@ -42,9 +42,9 @@ import numpy as np
 from numpy.polynomial import Legendre, Polynomial, legendre
 
 from ..errors import CalibrationError
-from ..field import CROSS_AXES, GridField
-from ..machine import MachineModel, ModelOrigin
-from ..measurement import AXES, KINDS, LEAST_NOISE, MeasurementSet, refuse_unmoved
+from ..machine.field import CROSS_AXES, GridField
+from ..machine.model import MachineModel, ModelOrigin
+from ..measurements.readings import AXES, KINDS, LEAST_NOISE, MeasurementSet, refuse_unmoved
 from .grid_readings import (
     Readings,
     check_complete,
@@ -85,10 +85,10 @@ class LineFit:
     axis : int
         Along which it runs.
     nodes : tuple of (int, int)
-        Node indices across, in the order of :data:`hexapod_comp.field.CROSS_AXES`, of every line that it
+        Node indices across, in the order of :data:`hexapod_comp.machine.field.CROSS_AXES`, of every line that it
         stands for.
     component : int
-        Index into :data:`hexapod_comp.field.COMPONENTS`.
+        Index into :data:`hexapod_comp.machine.field.COMPONENTS`.
     direction : int
         1, −1, or 0 for a line that was read in one direction, or in none, and stands for both.
     coordinates, values : ndarray, shape (n,)
@@ -310,9 +310,7 @@ def _said(field: GridField, readings: Readings, component: int) -> np.ndarray:
     said = np.zeros(len(readings.value))
     if not any(family[:, :, :, component].any() for family in field.lines):
         return said
-    for n, (point, axis, direction) in enumerate(
-        zip(readings.point, readings.axis, readings.direction, strict=True)
-    ):
+    for n, (point, axis, direction) in enumerate(zip(readings.point, readings.axis, readings.direction, strict=True)):
         sense = np.zeros(3)
         sense[axis] = direction
         said[n] = field.evaluate(point, sense)[0][component]
@@ -400,9 +398,7 @@ def _averaged(values: np.ndarray, number: np.ndarray, places: int) -> tuple[np.n
     return mean, float(np.sqrt(spread / freedom)) if freedom else float("nan")
 
 
-def _straightened(
-    means: dict[int, tuple[np.ndarray, float]], u: np.ndarray
-) -> dict[int, tuple[np.ndarray, float]]:
+def _straightened(means: dict[int, tuple[np.ndarray, float]], u: np.ndarray) -> dict[int, tuple[np.ndarray, float]]:
     """Return mean readings less the straight line through all of them, both directions together."""
     values = np.concatenate([mean for mean, _ in means.values()])
     places = np.tile(u, len(means))
@@ -422,9 +418,7 @@ def _zeroed(fits: list[LineFit], u: float) -> list[LineFit]:
     return shifted
 
 
-def _regress(
-    u: np.ndarray, values: np.ndarray, order: OrderRule, name: str
-) -> tuple[np.ndarray, float, float, float]:
+def _regress(u: np.ndarray, values: np.ndarray, order: OrderRule, name: str) -> tuple[np.ndarray, float, float, float]:
     """Return coefficients in powers of u, R², adjusted R² and the standard deviation of the residuals.
 
     Legendre's polynomials keep the regression well conditioned (001 has powers of x: the same functions).
@@ -480,4 +474,3 @@ def _with_family(field: GridField, axis: int, fits: Sequence[LineFit]) -> GridFi
             family[d, i, j, fit.component, : len(fit.coefficients)] = fit.coefficients
     lines = [family if a == axis else other for a, other in enumerate(field.lines)]
     return replace(field, lines=(lines[0], lines[1], lines[2]))
-

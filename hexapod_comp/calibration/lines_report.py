@@ -7,9 +7,9 @@ from itertools import groupby
 
 import numpy as np
 
-from ..field import COMPONENTS
-from ..measurement import AXES
-from ..texts import aligned, number
+from ..formats.texts import aligned, number
+from ..machine.field import COMPONENTS
+from ..measurements.readings import AXES
 from .evaluation import Worth
 from .lines import LineFit, LinesFit
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..machine import REFERENCE_TEMPERATURE, Temperatures
-from ..measurement import Stations
+from ..machine.model import REFERENCE_TEMPERATURE, Temperatures
+from ..machine.travel import BOTH_WAYS, Passes, nominal_commands
+from ..measurements.readings import Stations
 from ..pose import rotation_from_angles
-from ..travel import BOTH_WAYS, Passes, nominal_commands
-from .joint import LinearProblem, Posterior, physical_covariance
+from .estimation import LinearProblem, Posterior, physical_covariance
+from .parameters import ParameterSpace
 from .sensitivity import derivatives, predict
-from .space import ParameterSpace
 
 SEEN = 1.0
 """A direction is observable when its tolerance changes the readings by more than so many standard deviations."""

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..campaign import Campaign
-from ..measurement import DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
-from .joint import JointProblem, physical_covariance, solve
-from .joint_fit import TILT, unseen_errors
+from ..measurements.campaign import Campaign
+from ..measurements.readings import DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
+from .estimation import JointProblem, physical_covariance, solve
+from .fit import TILT, unseen_errors
 from .observability import Observability, ToolError, expected_error, observe
-from .space import ParameterSpace, Settings
+from .parameters import ParameterSpace, Settings
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .joint import LinearProblem, Posterior, held_out, solve
-from .space import ParameterSpace
+from .estimation import LinearProblem, Posterior, held_out, solve
+from .parameters import ParameterSpace
 
 FIRST_ROUNDS, ROUNDS = 10, 4
 """Rounds of estimating tolerances and noise: for all blocks, and for each set with fewer, which starts there."""

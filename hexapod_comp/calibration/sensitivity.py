@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..machine import MachinesByTemperature
-from ..measurement import Stations, attitude_error
-from .space import ParameterSpace
+from ..machine.model import MachinesByTemperature
+from ..measurements.readings import Stations, attitude_error
+from .parameters import ParameterSpace
 
 
 @dataclass(frozen=True)
@@ -79,9 +79,7 @@ def _without_negative_backlash(
     return x, sense
 
 
-def _errors(
-    space: ParameterSpace, stations: Stations, positions: np.ndarray, rotations: np.ndarray
-) -> np.ndarray:
+def _errors(space: ParameterSpace, stations: Stations, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     """Return e between commanded and actual platform poses, shape (M, 6)."""
     actual = positions + rotations @ space.probe
     commanded = stations.positions + stations.rotations @ space.probe

@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 from numpy.polynomial import legendre
 
-from ..field import CROSS_AXES, GridField
-from ..measurement import LEAST_SIDE
+from ..machine.field import CROSS_AXES, GridField
+from ..measurements.readings import LEAST_SIDE
 
 COMPONENT_UNITS = (("dx", "m"), ("dy", "m"), ("dz", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 

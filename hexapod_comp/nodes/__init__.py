@@ -5,6 +5,6 @@ import sys
 from ..errors import MissingPackageError
 
 try:
-    from .. import compiling  # noqa: F401
+    from ..kernels import compiling  # noqa: F401
 except MissingPackageError as error:
     sys.exit(f"cannot start: {error}")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from rclpy.utilities import remove_ros_args
 
 from ..errors import LONGEST_TEXT, printable
-from ..texts import accept_any_terminal
+from ..formats.texts import accept_any_terminal
 from .parameters import Parameter, described
 
 ROS_ARGUMENTS, END_OF_ROS_ARGUMENTS = "--ros-args", "--"

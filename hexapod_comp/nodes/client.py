@@ -16,10 +16,10 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 
-from ..conversions import StrutReader, message_pose, pose_message
 from ..errors import HexapodError
+from ..machine.trajectory import Path
 from ..pose import Pose
-from ..trajectory import Path
+from .messages import StrutReader, message_pose, pose_message
 from .middleware import avoid_shared_memory
 from .runtime import COMMAND_QOS, EVENT_QOS, STATE_QOS
 from .stamps import nanoseconds_of

@@ -1,6 +1,6 @@
 """The compensator node: tool pose commands in, compensated strut commands and pose estimates out.
 
-It holds no mathematics: it converts, calls :class:`~hexapod_comp.compensation.Compensator`, publishes, and
+It holds no mathematics: it converts, calls :class:`~hexapod_comp.compensation.compensator.Compensator`, publishes, and
 reports what it refused. Run it with ``ros2 run hexapod_comp compensator`` or
 ``python -m hexapod_comp.nodes.compensator``; the README lists topics, services and parameters.
 """
@@ -23,16 +23,15 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
-from ..compensation import Compensator, pack_pose
-from ..conversions import StrutReader, write_pose
+from ..compensation.compensator import Compensator, pack_pose
+from ..compensation.journal import Source, load_with_source
+from ..compensation.thermal import TemperatureFilter
 from ..errors import CommandError, HexapodError, shorten
-from ..geometry import HexapodGeometry, load_geometry
-from ..journal import Source, load_with_source
-from ..machine import MachineModel
-from ..model_file import load_model
-from ..paths import confined_file, folder_of
+from ..formats.paths import confined_file, folder_of
+from ..machine.geometry import HexapodGeometry, load_geometry
+from ..machine.model import MachineModel
+from ..machine.model_file import load_model
 from ..pose import Pose
-from ..thermal import TemperatureFilter
 from .command_source import CommandSource, OwnTopic
 from .compensator_parameters import PARAMETERS, PROGRAM
 from .compensator_status import CompensatorStatus
@@ -40,6 +39,7 @@ from .following import Reach
 from .health import WARN, seconds
 from .journal import JournalTopics
 from .markers import machine_markers
+from .messages import StrutReader, write_pose
 from .model_loading import Loading
 from .order import InOrder
 from .parameters import ParameterError, declare

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..thermal import DEFAULT_TIME_CONSTANT
+from ..compensation.thermal import DEFAULT_TIME_CONSTANT
 from .arguments import Program
 from .parameters import Parameter
 

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..compensation import Compensator
+from ..compensation.compensator import Compensator
 from .command_source import CommandSource, OwnTopic
 from .following import Following, LastKnown
 from .health import ERROR, OK, WARN, Flow, Refusals, joined, seconds

@@ -7,9 +7,9 @@ from collections import deque
 
 import numpy as np
 
-from ..compiling import compiled
 from ..errors import CommandError, LimitError
-from ..geometry import STRUT_NAMES, HexapodGeometry
+from ..kernels.struts import within
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 
 KEPT = 512
 """Commands remembered: half a second at 1 kHz."""
@@ -175,12 +175,3 @@ class LastKnown:
         if self._anywhere_after:
             return f"; from {self._anywhere_after:g} s after the start on the first command may be anywhere"
         return "; a machine without feedback needs start_without_feedback_after"
-
-
-@compiled
-def within(values, others, limit):
-    """Return whether six values differ from six others by no more than a limit."""
-    worst = 0.0
-    for i in range(6):
-        worst = max(worst, abs(values[i] - others[i]))
-    return worst <= limit

@@ -1,8 +1,9 @@
 """Publishing the compensator's journal, which makes a recording of a run replayable.
 
 Two topics beside the node's own, both reliable and kept for late subscribers, so that a recorder which joins in
-the middle of a motion gets what it needs: ``~/journal`` (std_msgs/String, JSON: :mod:`hexapod_comp.journal`) with
-a page at each tick that has something to tell, and with each snapshot, and ``~/files`` with the geometry and the
+the middle of a motion gets what it needs: ``~/journal``
+(std_msgs/String, JSON; see :mod:`hexapod_comp.compensation.journal`) with a page at each tick that has something to
+tell, and with each snapshot, and ``~/files`` with the geometry and the
 model in use, word for word.
 """
 
@@ -14,8 +15,8 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
-from ..compensation import Compensator
-from ..journal import Journal, Source, sources_text
+from ..compensation.compensator import Compensator
+from ..compensation.journal import Journal, Source, sources_text
 from .runtime import ACKNOWLEDGED_WITHIN
 
 JOURNAL_QOS = QoSProfile(
@@ -28,7 +29,7 @@ JOURNAL_QOS = QoSProfile(
 
 
 class JournalTopics:
-    """The journal of a configured node; arguments are the node, and those of :class:`~hexapod_comp.journal.Journal`.
+    """The journal of a configured node; arguments are the node, and those of ``compensation.journal.Journal``.
 
     Nothing is published while a command is handled: what happens is noted, and goes out with :meth:`tick`.
     """

@@ -8,7 +8,7 @@ from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from ..geometry import HexapodGeometry
+from ..machine.geometry import HexapodGeometry
 
 STRUT_DIAMETER = 0.02
 JOINT_DIAMETER = 0.035

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from ..paths import config_folder
+from ..formats.paths import config_folder
 
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 """Where Fast DDS looks for a user's profile: up to version 2 (ROS 2 Jazzy), and from version 3."""

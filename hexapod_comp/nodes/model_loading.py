@@ -19,13 +19,13 @@ from typing import cast
 
 import numpy as np
 
+from ..compensation.journal import Source, load_with_source
 from ..errors import HexapodError
-from ..field import GridField
-from ..geometry import HexapodGeometry
-from ..journal import Source, load_with_source
-from ..machine import MachineModel, ModelOrigin
-from ..model_file import load_model
-from ..struts import StrutErrors
+from ..machine.field import GridField
+from ..machine.geometry import HexapodGeometry
+from ..machine.model import MachineModel, ModelOrigin
+from ..machine.model_file import load_model
+from ..machine.struts import StrutErrors
 
 LOADED_WITHIN = 30.0
 """A file that takes longer to read is given up, s; the shipped ones take one second, nearly all of it imports."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import CommandError, LimitError
-from ..geometry import STRUT_NAMES, HexapodGeometry
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from .stamps import FORGET_ORDER_AFTER
 
 OVERTAKEN_BY = 1_000_000_000

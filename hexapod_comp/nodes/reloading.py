@@ -9,9 +9,9 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.service import Service
 from std_srvs.srv import Trigger
 
+from ..compensation.journal import Source
 from ..errors import HexapodError
-from ..journal import Source
-from ..machine import MachineModel
+from ..machine.model import MachineModel
 from .health import Refusals
 from .model_loading import Loading
 from .runtime import LateService

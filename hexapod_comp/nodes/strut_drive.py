@@ -1,6 +1,6 @@
 """The simulated strut-drive node: strut commands in, encoder readings and the true tool pose out.
 
-It stands for the six drives and the machine on them: :class:`~hexapod_comp.simulation.StrutDrive` with a
+It stands for the six drives and the machine on them: :class:`~hexapod_comp.virtual.machine.StrutDrive` with a
 hidden truth. Run it with ``ros2 run hexapod_comp strut_drive`` or
 ``python -m hexapod_comp.nodes.strut_drive``.
 """
@@ -19,17 +19,17 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter as RosParameter
 from sensor_msgs.msg import JointState
 
-from ..conversions import StrutMessage, StrutReader, write_pose
 from ..errors import CommandError, HexapodError, KinematicsError
-from ..geometry import STRUT_NAMES, HexapodGeometry, load_geometry
-from ..imperfections import ImperfectionBounds, draw_model
-from ..machine import MachineModel, RealMachine
-from ..model_file import load_model
-from ..paths import config_file
-from ..simulation import DriveParameters, Faults, StrutDrive
+from ..formats.paths import config_file
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry, load_geometry
+from ..machine.model import MachineModel, RealMachine
+from ..machine.model_file import load_model
+from ..virtual.imperfections import ImperfectionBounds, draw_model
+from ..virtual.machine import DriveParameters, Faults, StrutDrive
 from .command_source import CommandSource
 from .health import ERROR, OK, WARN, Flow, Refusals, joined, seconds
 from .log_space import LogSpace
+from .messages import StrutMessage, StrutReader, write_pose
 from .order import InOrder, NoStep
 from .parameters import checked, declare
 from .running import keep_discovery_local, run

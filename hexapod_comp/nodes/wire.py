@@ -15,9 +15,10 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 
-from ..conversions import StrutMessage, pose_numbers, write_lengths
 from ..errors import CommandError
-from ..geometry import STRUT_NAMES
+from ..kernels.struts import write_lengths
+from ..machine.geometry import STRUT_NAMES
+from .messages import StrutMessage, pose_numbers
 from .stamps import nanoseconds_of, stamp_of
 
 LITTLE_ENDIAN = b"\x00\x01"
@@ -43,7 +44,7 @@ def read_pose_bytes(data: bytes) -> tuple[int, str, tuple[float, ...]]:
     frame_id : str
         Frame of the pose.
     numbers : tuple of seven float
-        x, y, z (m) and the quaternion x, y, z, w, as :func:`~hexapod_comp.conversions.pose_numbers` gives them.
+        x, y, z (m) and the quaternion x, y, z, w, as :func:`~hexapod_comp.nodes.messages.pose_numbers` gives them.
 
     Raises
     ------

@@ -1,0 +1,1 @@
+"""Which error hurts where: the workspace study of v. Daake, Vetter, Böhm and Zirn."""

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import KinematicsError
-from ..geometry import HexapodGeometry
-from ..kinematics import Structure, over_chunks, strut_lengths
-from .effect_kernels import effect_vectors_many, extremes_many, sizes_many
+from ..kernels.effects import effect_vectors_many, extremes_many, sizes_many
+from ..machine.geometry import HexapodGeometry
+from ..machine.kinematics import Structure, over_chunks, strut_lengths
 from .sources import SingleErrors
 
 EXACT, LINEAR = "exact", "linear"

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import GeometryError, HexapodError
-from ..files import write_text_atomically
-from ..geometry import HexapodGeometry
+from ..formats.yaml import write_text_atomically
+from ..machine.geometry import HexapodGeometry
 from .pictures import VIEW_AZIMUTH, VIEW_ELEVATION, WEDGE, Quantity, outline
 
 MOST_BYTES = 7_000_000

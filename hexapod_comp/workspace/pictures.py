@@ -1,7 +1,7 @@
 """Pictures of the workspace study: coloured shells, what limits them, the ranked table as bars.
 
 Functions take plain arrays (points, values) and return a matplotlib figure, as those of
-:mod:`hexapod_comp.plotting` do.
+:mod:`hexapod_comp.loop.pictures` do.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
 from ..errors import GeometryError
-from ..geometry import HexapodGeometry
+from ..machine.geometry import HexapodGeometry
 from .reach import FINDINGS
 
 COLOURS = "viridis"

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import KinematicsError
-from ..geometry import HexapodGeometry
+from ..formats.texts import aligned, number
+from ..machine.geometry import HexapodGeometry
 from ..pose import angles_from_rotation
-from ..texts import aligned, number
 from .effects import Extremes
 from .sources import SOURCE_TYPES
 
@@ -153,9 +153,7 @@ def _row(extremes: Extremes, geometry: HexapodGeometry, title: str, kinds: list[
     return RankingRow(title, a, b, c, d, int(extremes.failed[kinds].sum()))
 
 
-def _extreme(
-    extremes: Extremes, geometry: HexapodGeometry, title: str, kinds: list[int], column: int
-) -> Extreme:
+def _extreme(extremes: Extremes, geometry: HexapodGeometry, title: str, kinds: list[int], column: int) -> Extreme:
     """Return one column's extreme over some types."""
     values = extremes.values[kinds, column]
     if np.isnan(values).all():

@@ -16,9 +16,9 @@ import numpy as np
 from scipy import ndimage
 
 from ..errors import GeometryError
-from ..geometry import HexapodGeometry
-from ..kinematics import over_chunks
-from ..limit_kernels import STROKE_LONG, WITHIN, check_poses
+from ..kernels.limits import STROKE_LONG, WITHIN, check_poses
+from ..machine.geometry import HexapodGeometry
+from ..machine.kinematics import over_chunks
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
 
 FINDINGS = (
@@ -32,7 +32,7 @@ FINDINGS = (
     "assembly mode",
     "not a finite number",
 )
-"""What limits a pose, in words; the index is the code in :mod:`..limit_kernels`."""
+"""What limits a pose, in words; the index is the code in :mod:`..kernels.limits`."""
 
 SEARCH_CELLS = (24, 48, 96)
 """Cells along the longest edge with which the reach is looked for, one after the other until it is found."""
@@ -392,9 +392,7 @@ def _grid_points(axes: tuple[np.ndarray, ...]) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def poses_at(
-    geometry: HexapodGeometry, points: np.ndarray, rotation: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def poses_at(geometry: HexapodGeometry, points: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the platform poses in ``base`` of tool tips (N, 3), m in the work frame, at one orientation."""
     positions, rotations = geometry.platform_poses(points, rotation[None])
     return positions, np.repeat(rotations, len(points), axis=0)

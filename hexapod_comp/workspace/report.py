@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..texts import aligned, number
+from ..formats.texts import aligned, number
 from .combining import Allocation
 from .ranking import ranking_rows, ranking_text
 from .study import Study

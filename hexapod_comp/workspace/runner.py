@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import HexapodError
-from ..geometry import HexapodGeometry
+from ..machine.geometry import HexapodGeometry
 from .effects import EXACT, Extremes, extremes, merged
 from .reach import Reach, poses_at
 from .sources import SingleErrors

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import GeometryError
-from ..geometry import HexapodGeometry
-from ..limit_kernels import WITHIN
+from ..kernels.limits import WITHIN
+from ..machine.geometry import HexapodGeometry
 from .reach import Examiner, Reach, poses_at
 
 FRACTIONS = (0.4, 0.7, 1.0)

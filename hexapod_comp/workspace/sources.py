@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputFileError, ModelError
-from ..files import Section, read_yaml
-from ..geometry import HexapodGeometry
-from .effect_kernels import BASE_JOINT, LENGTH, PLATFORM_JOINT, TOOL
+from ..formats.yaml import Section, read_yaml
+from ..kernels.effects import BASE_JOINT, LENGTH, PLATFORM_JOINT, TOOL
+from ..machine.geometry import HexapodGeometry
 
 BUDGET_FORMAT = "hexapod_comp/error_budget"
 BUDGET_VERSION = 1

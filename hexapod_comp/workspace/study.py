@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..geometry import HexapodGeometry
+from ..machine.geometry import HexapodGeometry
 from ..pose import Pose
 from .combining import RSS, WORST_CASE, Allocation, MonteCarlo, allocate, monte_carlo, root_sum_of_squares, worst_case
 from .effects import EXACT, LINEAR, Extremes, effect_vectors, effects

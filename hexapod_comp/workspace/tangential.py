@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import KinematicsError, NotConvergedError, SingularError
-from ..geometry import HexapodGeometry
+from ..machine.geometry import HexapodGeometry
 from ..pose import Pose
 from .sources import BASE_JOINT, LENGTH, PLATFORM_JOINT, TOOL, SingleErrors
 

@@ -1,0 +1,459 @@
+"""Scheme ``joint``: structure, struts and field from all readings at once.
+
+Gauss–Newton on the exact machine. Each linear problem is Bayesian: every block of parameters has a prior
+whose size is estimated from the data (MacKay's fixed point), as is the noise of every kind of channel. What
+an instrument does not know (each run's zero, the slope of its beam) is projected out beforehand, so it costs
+no parameters and needs no prior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from ..errors import CalibrationError, KinematicsError, ModelError
+from ..measurements.readings import KINDS, LEAST_NOISE, MeasurementSet
+from .parameters import ParameterSpace
+from .sensitivity import derivatives, predict
+
+STEPS = 20
+"""Most Gauss–Newton steps; a handful is enough for deviations of a tenth of a millimetre."""
+
+SLOW, LEAST_SHARE = 0.7, 0.3
+"""A step whose change is not below so much of the last one's is shortened by half, to this share at least:
+tolerances and parameters that wait for each other could otherwise swing for ever."""
+
+SETTLED = 1e-2
+"""The fit stops when no parameter moves by more than this share of its standard deviation."""
+
+SCALE_ROUNDS = 12
+"""Rounds of estimating tolerances and noise for one linearisation."""
+
+HYPER = 0.1
+"""How many parameters the first guess of a tolerance is worth."""
+
+LARGEST_TOLERANCE = {"structure": 5e-3}
+"""No machine is built worse than this, m; a misfit that grows the tolerance further has another cause."""
+
+LEAST_FREEDOM = 10.0
+"""Noise is estimated from at least so many readings beyond those that the parameters use up."""
+
+HUBER = 2.5
+"""Residuals beyond so many standard deviations lose weight in proportion."""
+
+MEDIAN_TO_SIGMA = 1.4826
+"""Standard deviation of a normal distribution over the median of its absolute values."""
+
+OUTLIER = 5.0
+"""Residuals beyond so many standard deviations are listed."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Readings of one channel at one station are one cell: they differ by noise only.
+
+    Attributes
+    ----------
+    of_reading : ndarray of int, shape (N,)
+        Cell of each reading.
+    station, channel, kind, group : ndarray of int, shape (C,)
+        Of each cell; a group is one channel of one run, whose unknowns its cells share.
+    directions : ndarray, shape (C, 6)
+        w of each cell.
+    along : ndarray, shape (C,)
+        Commanded coordinate along the line, m.
+    fold : ndarray of int, shape (C,)
+        What is left out together in cross-validation: a line's run, or a scattered pose.
+    """
+
+    of_reading: np.ndarray
+    station: np.ndarray
+    channel: np.ndarray
+    kind: np.ndarray
+    group: np.ndarray
+    directions: np.ndarray
+    along: np.ndarray
+    fold: np.ndarray
+
+    @staticmethod
+    def of(measurements: MeasurementSet) -> Cells:
+        """Return the cells of a set."""
+        m = measurements
+        keys = np.stack([m.station, m.channel], axis=1)
+        _, first, of_reading = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        groups = np.unique(np.stack([m.run, m.channel], axis=1), axis=0, return_inverse=True)[1].ravel()
+        is_line = np.array([run.is_line for run in m.runs])[m.run[first]]
+        poses = np.hstack([m.stations.positions, m.stations.rotations.reshape(-1, 9)]).round(9)
+        pose = np.unique(poses, axis=0, return_inverse=True)[1].ravel()[m.station[first]]
+        fold_key = np.where(is_line, -1 - m.run[first], pose)
+        return Cells(
+            of_reading=of_reading.ravel(),
+            station=m.station[first],
+            channel=m.channel[first],
+            kind=m.kind[first],
+            group=np.where(is_line, groups[first], -1),
+            directions=m.directions()[first],
+            along=m.along()[first],
+            fold=np.unique(fold_key, return_inverse=True)[1].ravel(),
+        )
+
+
+@dataclass(frozen=True)
+class LinearProblem:
+    """The fit linearised at one parameter vector x = root·y, free of what instruments do not know.
+
+    Attributes
+    ----------
+    target : ndarray, shape (C,)
+        Cells' values that the parameters explain, over their standard deviation at unit noise factors.
+    rows : ndarray, shape (C, size)
+        Their derivatives by y, alike.
+    kind, fold : ndarray of int, shape (C,)
+        As in :class:`Cells`.
+    normal : ndarray, shape (kinds, size, size)
+        rowsᵀ·rows of each kind.
+    moment : ndarray, shape (kinds, size)
+        rowsᵀ·target of each kind.
+    square : ndarray, shape (kinds,)
+        Sum of squared targets, the scatter of readings about their cell's mean included.
+    freedom : ndarray, shape (kinds,)
+        Readings minus unknowns projected out.
+    least_noise : ndarray, shape (kinds,)
+        Smallest noise factors that an instrument can have.
+    """
+
+    target: np.ndarray
+    rows: np.ndarray
+    kind: np.ndarray
+    fold: np.ndarray
+    normal: np.ndarray
+    moment: np.ndarray
+    square: np.ndarray
+    freedom: np.ndarray
+    least_noise: np.ndarray
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """What a linear problem says about the parameters y that it uses.
+
+    Attributes
+    ----------
+    used : ndarray of int, shape (n,)
+        Which parameters; the others' blocks are out.
+    y : ndarray, shape (n,)
+        The most probable ones.
+    covariance : ndarray, shape (n, n)
+        Theirs.
+    tolerances : ndarray, shape (blocks,)
+        Size of each block's prior; zero: the block is out.
+    noise : ndarray, shape (kinds,)
+        Factor on the standard deviation of each kind's readings.
+    determined : ndarray, shape (n,)
+        Share of each parameter that comes from the data; the rest comes from the prior.
+    """
+
+    used: np.ndarray
+    y: np.ndarray
+    covariance: np.ndarray
+    tolerances: np.ndarray
+    noise: np.ndarray
+    determined: np.ndarray
+
+
+class JointProblem:
+    """Readings against parameters.
+
+    Parameters
+    ----------
+    measurements : MeasurementSet
+        The readings.
+    space : ParameterSpace
+        The parameters.
+
+    Raises
+    ------
+    CalibrationError
+        Fewer readings than unknowns: nothing would be determined.
+    """
+
+    def __init__(self, measurements: MeasurementSet, space: ParameterSpace) -> None:
+        self.measurements, self.space = measurements, space
+        self.cells = Cells.of(measurements)
+        self.uncertainty = measurements.stated
+        self._unknowns = self._make_unknowns()
+        needed = len(space.blocks[0].labels)
+        free = len(self.cells.station) - sum(q.shape[1] for _, q in self._unknowns)
+        if free < needed:
+            problem = f"{len(measurements)} readings at {len(self.cells.station)} distinct places leave {free} "
+            raise CalibrationError("measurements", problem + f"numbers for the structure's {needed} parameters")
+
+    def _make_unknowns(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return, for each channel of each run, its cells and what of them its instrument does not know."""
+        c = self.cells
+        result = []
+        for group in np.unique(c.group[c.group >= 0]):
+            members = np.flatnonzero(c.group == group)
+            columns = [np.ones(len(members))]
+            if KINDS[c.kind[members[0]]] == "straightness" and np.ptp(c.along[members]) > 0.0:
+                columns.append(c.along[members] - c.along[members].mean())
+            result.append((members, np.stack(columns, axis=1)))
+        return result
+
+    def linearise(self, x: np.ndarray, reading_weights: np.ndarray) -> tuple[LinearProblem, np.ndarray]:
+        """Return the linear problem at a parameter vector, and each reading's residual there, m or rad.
+
+        Parameters
+        ----------
+        x : ndarray, shape (size,)
+            Parameters, SI.
+        reading_weights : ndarray, shape (N,)
+            Trust in each reading, 0…1.
+
+        Raises
+        ------
+        CalibrationError
+            No machine is like that, or it cannot take one of the poses.
+        """
+        c, m = self.cells, self.measurements
+        expected, rows = self._expected(x)
+        weights = reading_weights / self.uncertainty**2
+        total = np.bincount(c.of_reading, weights)
+        misfit = m.value - expected[c.of_reading]
+        mean = np.bincount(c.of_reading, weights * misfit) / total
+        scale = np.sqrt(total)
+        target, rows = scale * mean, scale[:, None] * rows
+        unknown = np.zeros(len(mean))
+        for members, columns in self._unknowns:
+            q, _ = np.linalg.qr(scale[members, None] * columns)
+            explained = q @ (q.T @ target[members])
+            target[members] -= explained
+            unknown[members] = explained / scale[members]
+            rows[members] -= q @ (q.T @ rows[members])
+        residuals = misfit - unknown[c.of_reading]
+        scatter = np.bincount(m.kind, weights * (misfit - mean[c.of_reading]) ** 2, len(KINDS))
+        # Huber's proposal 2: noise comes from the residuals cut off, weight² · residual², or outliers blow it up.
+        beyond = np.bincount(m.kind, weights * (1.0 - reading_weights) * residuals**2, len(KINDS))
+        return self._problem(target + rows @ x, self.space.whitened(rows), scatter - beyond), residuals
+
+    def _expected(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what each cell should read, shape (C,), and its derivatives, (C, size), m and rad.
+
+        Raises
+        ------
+        CalibrationError
+            No machine is like that, or it cannot take one of the poses.
+        """
+        c, stations = self.cells, self.measurements.stations
+        try:
+            prediction = predict(self.space, x, stations)
+        except (ModelError, KinematicsError) as error:
+            hint = "do units, directions and commanded poses fit, and are all blocks allowed?"
+            problem = f"left the machines that can be ({error}); {hint}"
+            raise CalibrationError("joint fit", problem) from error
+        slopes = derivatives(self.space, prediction, stations)[c.station]
+        expected = np.einsum("ci,ci->c", c.directions, prediction.errors[c.station])
+        return expected, np.einsum("ci,cip->cp", c.directions, slopes)
+
+    def _problem(self, target: np.ndarray, rows: np.ndarray, scatter: np.ndarray) -> LinearProblem:
+        """Gather the sums that everything later needs."""
+        kind, size, kinds = self.cells.kind, self.space.size, len(KINDS)
+        normal, moment, square = np.zeros((kinds, size, size)), np.zeros((kinds, size)), scatter.copy()
+        freedom = np.bincount(self.measurements.kind, minlength=kinds).astype(float)
+        for members, columns in self._unknowns:
+            freedom[kind[members[0]]] -= columns.shape[1]
+        for k in np.unique(kind):
+            part = rows[kind == k]
+            normal[k] = part.T @ part
+            moment[k] = part.T @ target[kind == k]
+            square[k] += target[kind == k] @ target[kind == k]
+        least_noise = LEAST_NOISE / np.array([self.measurements.stated_of(k) for k in range(kinds)])
+        return LinearProblem(target, rows, kind, self.cells.fold, normal, moment, square, freedom, least_noise)
+
+    def robust_weights(self, residuals: np.ndarray) -> np.ndarray:
+        """Return Huber's weights of residuals (N,), 1 for all that are no surprise.
+
+        What is a surprise is measured by the median of each kind's residuals, which gross errors do not move.
+        """
+        size = np.abs(residuals) / self.uncertainty
+        weights = np.ones(len(size))
+        for k in np.unique(self.measurements.kind):
+            mine = self.measurements.kind == k
+            cut = HUBER * MEDIAN_TO_SIGMA * np.median(size[mine])
+            if cut > 0.0:
+                weights[mine] = np.minimum(1.0, cut / np.maximum(size[mine], cut))
+        return weights
+
+
+def solve(
+    space: ParameterSpace,
+    problem: LinearProblem,
+    tolerances: np.ndarray,
+    noise: np.ndarray,
+    rounds: int = SCALE_ROUNDS,
+) -> Posterior:
+    """Return the posterior of a linear problem; tolerances and noise factors are estimated with it.
+
+    Parameters
+    ----------
+    space : ParameterSpace
+        Blocks and their priors' shapes.
+    problem : LinearProblem
+        The data.
+    tolerances : ndarray, shape (blocks,)
+        To start from; a block with zero is left out.
+    noise : ndarray, shape (kinds,)
+        To start from.
+    rounds : int
+        Fixed-point rounds; 0 takes tolerances and noise as they are.
+    """
+    used = np.flatnonzero(space.spread(tolerances))
+    normal = problem.normal[:, used[:, None], used]
+    moment = problem.moment[:, used]
+    for turn in range(rounds + 1):
+        spread = space.spread(tolerances)[used]
+        precision = np.tensordot(noise**-2, normal, 1)
+        whitened = spread[:, None] * precision * spread
+        whitened[np.diag_indices_from(whitened)] += 1.0
+        inverse = _inverse(whitened)
+        z = inverse @ (spread * (noise**-2 @ moment))
+        posterior = Posterior(
+            used, spread * z, spread[:, None] * inverse * spread, tolerances, noise, 1.0 - np.diag(inverse)
+        )
+        if turn < rounds:
+            noise = _noise(problem, normal, moment, posterior)
+            tolerances = _tolerances(space, posterior, z)
+    return posterior
+
+
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    """Return the inverse of a positive definite matrix.
+
+    Raises
+    ------
+    CalibrationError
+        It is not, to rounding: readings outweigh the priors more than 1e16 times.
+    """
+    try:
+        return cho_solve(cho_factor(matrix, lower=True), np.eye(len(matrix)))
+    except LinAlgError as error:
+        problem = "are too few to tell noise from the machine's errors, or their uncertainty is below any instrument's"
+        raise CalibrationError("measurements", problem) from error
+
+
+def _noise(problem: LinearProblem, normal: np.ndarray, moment: np.ndarray, posterior: Posterior) -> np.ndarray:
+    """Return new noise factors: squared residuals over what freedom the parameters leave."""
+    result, y = posterior.noise.copy(), posterior.y
+    for k in np.flatnonzero(problem.freedom > 0.0):
+        rest = problem.square[k] - 2.0 * y @ moment[k] + y @ normal[k] @ y
+        freedom = problem.freedom[k] - (posterior.covariance * normal[k]).sum() / result[k] ** 2
+        if freedom > LEAST_FREEDOM and rest > 0.0:
+            result[k] = np.sqrt(rest / freedom)
+    return np.maximum(result, problem.least_noise)
+
+
+def _tolerances(space: ParameterSpace, posterior: Posterior, z: np.ndarray) -> np.ndarray:
+    """Return new tolerances: MacKay's fixed point, squared parameters over how many are determined.
+
+    The first guess counts as a tenth of a parameter, which keeps an empty block from collapsing.
+    """
+    result, start = posterior.tolerances.copy(), space.start_tolerances()
+    for n, block in enumerate(space.blocks):
+        mine = (posterior.used >= block.part.start) & (posterior.used < block.part.stop)
+        if mine.any():
+            first = HYPER * (start[n] / result[n]) ** 2
+            factor = np.sqrt((z[mine] @ z[mine] + first) / (posterior.determined[mine].sum() + HYPER))
+            result[n] = min(result[n] * np.clip(factor, 0.1, 10.0), LARGEST_TOLERANCE.get(block.name, np.inf))
+    return result
+
+
+def held_out(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
+    """Return the errors, in standard deviations, at cells whose fold the fit did not see, shape (C,).
+
+    Leaving fold g out of a linear least-squares fit changes its residuals r to (I − H_gg)⁻¹·r, with H the
+    hat matrix: exact, and no fit is repeated.
+    """
+    scale = 1.0 / posterior.noise[problem.kind]
+    rows = scale[:, None] * problem.rows[:, posterior.used]
+    residual = scale * problem.target - rows @ posterior.y
+    half = rows @ np.linalg.cholesky(posterior.covariance)
+    order = np.argsort(problem.fold, kind="stable")
+    result = np.empty(len(residual))
+    for members in np.split(order, np.flatnonzero(np.diff(problem.fold[order])) + 1):
+        left_out = np.eye(len(members)) - half[members] @ half[members].T
+        result[members] = np.linalg.solve(left_out, residual[members])
+    return result
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A settled fit.
+
+    Attributes
+    ----------
+    problem : LinearProblem
+        Linearised at the answer.
+    posterior : Posterior
+        The answer.
+    x : ndarray, shape (size,)
+        Its parameters, SI.
+    residuals, weights : ndarray, shape (N,)
+        Of each reading, m or rad; and the trust it got, 0…1.
+    steps : int
+        Gauss–Newton steps.
+    """
+
+    problem: LinearProblem
+    posterior: Posterior
+    x: np.ndarray
+    residuals: np.ndarray
+    weights: np.ndarray
+    steps: int
+
+
+def iterate(
+    joint: JointProblem,
+    x: np.ndarray,
+    tolerances: np.ndarray,
+    noise: np.ndarray,
+    progress: Callable[[str], object],
+) -> Solution:
+    """Run Gauss–Newton steps until the parameters settle.
+
+    Raises
+    ------
+    CalibrationError
+        They do not.
+    """
+    weights, robust = np.ones(len(joint.measurements)), joint.space.settings.robust
+    share, last = 1.0, np.inf
+    for step in range(1, STEPS + 1):
+        problem, residuals = joint.linearise(x, weights)
+        posterior = solve(joint.space, problem, tolerances, noise)
+        tolerances, noise = posterior.tolerances, posterior.noise
+        change = _change(joint.space.physical(posterior.y) - x, joint.space, posterior)
+        progress(f"step {step}: largest change {change:.2g} standard deviations")
+        if step > 2 and change > SLOW * last:
+            share = max(LEAST_SHARE, 0.5 * share)
+        x, last = x + share * (joint.space.physical(posterior.y) - x), change
+        if (change < SETTLED and (step > 2 or not robust)) or step == STEPS:
+            break
+        if robust and step > 1:
+            weights = joint.robust_weights(residuals)
+    if change > 1.0:
+        raise CalibrationError("joint fit", f"did not settle within {STEPS} steps")
+    return Solution(problem, posterior, x, residuals, weights, step)
+
+
+def _change(change: np.ndarray, space: ParameterSpace, posterior: Posterior) -> float:
+    """Return the largest change of a parameter x in its standard deviation."""
+    deviations = np.sqrt(np.diag(physical_covariance(space, posterior)))
+    return float((np.abs(change) / deviations).max())
+
+
+def physical_covariance(space: ParameterSpace, posterior: Posterior) -> np.ndarray:
+    """Return the covariance of the parameters x, shape (size, size), SI; all blocks must be in use."""
+    return space.physical(space.physical(posterior.covariance).T)

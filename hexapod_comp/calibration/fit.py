@@ -1,0 +1,366 @@
+"""Fit a machine model to measurements with scheme ``joint``, and say what the fit is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import date
+
+import numpy as np
+
+from ..errors import CalibrationError
+from ..machine.model import REFERENCE_TEMPERATURE, MachineModel, ModelOrigin
+from ..measurements.readings import ANGULAR_KINDS, KINDS, MeasurementSet, Source, refuse_unmoved
+from .estimation import HUBER, OUTLIER, JointProblem, Posterior, Solution, held_out, iterate, physical_covariance
+from .observability import Observability, ToolError, expected_error, observe, without_trace
+from .parameters import ParameterSpace, Settings
+from .selection import Decision, select
+from .smooth_field import DIGITS
+
+SURE = 4.0
+"""Backlash so many standard deviations below zero is no noise."""
+
+LARGEST_NOISE = 0.02
+"""A machine that leaves more than this of its readings, m or rad, is not the one that was measured."""
+
+SCATTERED = 1.5
+"""Readings whose noise is found so many times as large as stated are remarked on."""
+
+MISFIT = 10.0
+"""Readings whose noise is found so many times as large as stated are not described: units, instrument or machine
+are others than said."""
+
+WARM = 0.2
+"""Readings taken further than this from the reference temperature, K, need an expansion: 1 µm on half a metre."""
+
+TILT = np.radians(10.0)
+"""Tilt at which the report says what the model is worth for a tilted tool."""
+
+
+@dataclass(frozen=True)
+class ChannelFit:
+    """How one kind of channel was met.
+
+    Attributes
+    ----------
+    kind : str
+        Of :data:`hexapod_comp.measurements.readings.KINDS`.
+    readings : int
+        How many.
+    stated, found : float
+        Standard deviation of a reading: as the file or the default says (root mean square), and as fitted.
+    chi_square : float
+        Squared residuals over the stated variance, per degree of freedom.
+    held_out : float
+        RMS error at readings whose line or pose was left out, their noise included, m or rad.
+    """
+
+    kind: str
+    readings: int
+    stated: float
+    found: float
+    chi_square: float
+    held_out: float
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A reading that disagrees with all others.
+
+    Attributes
+    ----------
+    source : Source
+        Where it stands.
+    channel : int
+        Index of its channel.
+    residual : float
+        m or rad.
+    sigmas : float
+        The same in standard deviations.
+    """
+
+    source: Source
+    channel: int
+    residual: float
+    sigmas: float
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """A model with everything that is known about it.
+
+    Attributes
+    ----------
+    model : MachineModel
+        The machine as fitted.
+    measurements : MeasurementSet
+        What it was fitted to.
+    space : ParameterSpace
+        Names, blocks and priors of the parameters.
+    solution : Solution
+        Parameters, covariance, residuals.
+    decisions : tuple of Decision
+        Which blocks stay, and why.
+    channels : tuple of ChannelFit
+        χ² and held-out error of each kind of channel.
+    observability : Observability
+        What the data determine.
+    unseen_errors : tuple of str
+        Machine errors that the readings cannot show (:data:`~.observability.MACHINE_ERRORS`).
+    level, tilted : ToolError or None
+        The tool error to expect with this model, for a level tool and for one tilted by :data:`TILT`.
+    outliers : tuple of Outlier
+        Largest first.
+    notes : tuple of str
+        What a reader must know.
+    """
+
+    model: MachineModel
+    measurements: MeasurementSet
+    space: ParameterSpace
+    solution: Solution
+    decisions: tuple[Decision, ...]
+    channels: tuple[ChannelFit, ...]
+    observability: Observability
+    unseen_errors: tuple[str, ...]
+    level: ToolError | None
+    tilted: ToolError | None
+    outliers: tuple[Outlier, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def misfit(self) -> str:
+        """Why the model is not to be trusted: readings further off than :data:`MISFIT` allows; empty if none is."""
+        return self.measurements.misfit({KINDS.index(c.kind): c.found for c in self.channels}, MISFIT)
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance of the parameters, shape (size, size), SI."""
+        return physical_covariance(self.space, self.solution.posterior)
+
+    @property
+    def standard_errors(self) -> np.ndarray:
+        """Standard errors of the parameters, shape (size,), SI."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def fit_joint(
+    measurements: MeasurementSet,
+    settings: Settings | None = None,
+    progress: Callable[[str], object] = lambda text: None,
+) -> JointFit:
+    """Fit structure, struts and field to all readings at once.
+
+    Parameters
+    ----------
+    measurements : MeasurementSet
+        Readings of any kind.
+    settings : Settings, optional
+        What else is known.
+    progress : callable
+        Told in a few words what goes on.
+
+    Raises
+    ------
+    CalibrationError
+        Too few readings, or such that show nothing, a fit that does not settle, forward and backward swapped.
+    """
+    settings = settings or Settings()
+    everything = JointProblem(measurements, ParameterSpace(measurements, settings))
+    decisions, possible = _decide(everything, None, progress)
+    space, joint, solution = _solve(measurements, decisions, settings, None, progress)
+    if solution.weights.min() < HUBER / OUTLIER:  # the choice was made with readings that turned out to be wrong
+        again, possible = _decide(everything, (space, solution), progress)
+        if [d.kept for d in again] != [d.kept for d in decisions]:
+            space, joint, solution = _solve(measurements, again, settings, (space, solution), progress)
+        decisions = again
+    channels = tuple(_channels(joint, solution))
+    notes = [*measurements.notes, *_ignored(measurements, settings, space)]
+    notes += [*_check_backlash(space, solution), *_check_noise(channels)]
+    progress("what is it worth?")
+    covariance = physical_covariance(space, solution.posterior)
+    allowed = _allowed(everything.space, possible, (space, solution))
+    level, tilted = (expected_error(space, solution.x, covariance, tilt, allowed=allowed) for tilt in (0.0, TILT))
+    if level is not None and level.after > level.before:
+        notes.append("the model is not expected to help: the readings determine too little of this machine")
+    return JointFit(
+        model=_named(space, solution, measurements, channels, len(decisions)),
+        measurements=measurements,
+        space=space,
+        solution=solution,
+        decisions=tuple(decisions),
+        channels=channels,
+        observability=observe(space, solution.problem, solution.posterior),
+        unseen_errors=unseen_errors(measurements, settings),
+        level=level,
+        tilted=tilted,
+        outliers=tuple(_outliers(joint, solution)),
+        notes=tuple(notes),
+    )
+
+
+def _solve(
+    measurements: MeasurementSet,
+    decisions: list[Decision],
+    settings: Settings,
+    before: tuple[ParameterSpace, Solution] | None,
+    progress: Callable[[str], object],
+) -> tuple[ParameterSpace, JointProblem, Solution]:
+    """Return a settled fit with the blocks decided on, starting from another one's answer."""
+    space = ParameterSpace(measurements, replace(settings, blocks=tuple(d.block for d in decisions if d.kept)))
+    joint = JointProblem(measurements, space)
+    x, tolerances, noise = _carried_over(before, space)
+    return space, joint, iterate(joint, x, tolerances, noise, progress)
+
+
+def _carried_over(
+    before: tuple[ParameterSpace, Solution] | None, space: ParameterSpace
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return parameters, tolerances and noise to start from: another answer's, or the nominal machine's."""
+    x, tolerances = np.zeros(space.size), space.start_tolerances()
+    if before is None:
+        return x, tolerances, np.ones(len(KINDS))
+    old_space, solution = before
+    for n, block in enumerate(space.blocks):
+        for m, old in enumerate(old_space.blocks):
+            if old.name == block.name:
+                x[block.part] = solution.x[old.part]
+                tolerances[n] = solution.posterior.tolerances[m]
+    return x, tolerances, solution.posterior.noise
+
+
+def _decide(
+    everything: JointProblem, before: tuple[ParameterSpace, Solution] | None, progress: Callable[[str], object]
+) -> tuple[list[Decision], Posterior]:
+    """Return what becomes of every block, and what the readings allow if none is ruled out."""
+    x, _, noise = _carried_over(before, everything.space)
+    weights = np.ones(len(everything.measurements)) if before is None else before[1].weights
+    problem, residuals = everything.linearise(x, weights)
+    if before is None:
+        refuse_unmoved(everything.measurements, residuals)
+    return select(everything.space, problem, noise, progress)
+
+
+def _allowed(
+    everything: ParameterSpace, possible: Posterior, answer: tuple[ParameterSpace, Solution]
+) -> tuple[ParameterSpace, np.ndarray, np.ndarray]:
+    """Return what the readings allow, as :func:`expected_error` wants it, seen from an answer."""
+    x, _, _ = _carried_over(answer, everything)
+    return everything, everything.physical(possible.y) - x, physical_covariance(everything, possible)
+
+
+def unseen_errors(measurements: MeasurementSet, settings: Settings) -> tuple[str, ...]:
+    """Return the machine errors that the readings cannot show, whatever blocks are allowed in a fit.
+
+    Parameters
+    ----------
+    measurements : MeasurementSet
+        The readings; their values do not matter.
+    settings : Settings
+        Of the fit.
+    """
+    space = ParameterSpace(measurements, replace(settings, blocks=("field displacement", "field rotation")))
+    joint = JointProblem(measurements, space)
+    problem, _ = joint.linearise(np.zeros(space.size), np.ones(len(measurements)))
+    return without_trace(space, problem)
+
+
+def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
+    """Return remarks on negative backlash; refuse the fit when most struts have it.
+
+    Raises
+    ------
+    CalibrationError
+        Forward and backward are swapped: a nut cannot lead its screw.
+    """
+    block = space.block("backlash")
+    if block is None:
+        return []
+    values = solution.x[block.part]
+    sigmas = values / np.sqrt(np.diag(physical_covariance(space, solution.posterior))[block.part])
+    negative = np.flatnonzero(sigmas < -SURE)
+    if len(negative) > 3:
+        found = ", ".join(f"{v * 1e6:.2f}" for v in values)
+        problem = f"forward and backward look swapped: the struts would have a backlash of {found} µm"
+        raise CalibrationError("direction", problem)
+    return [f"strut_{i + 1}: backlash of {values[i] * 1e6:.2f} µm found, taken as none" for i in negative]
+
+
+def _ignored(measurements: MeasurementSet, settings: Settings, space: ParameterSpace) -> list[str]:
+    """Return remarks on what the fit was not told and therefore takes for something else."""
+    notes = []
+    if not np.isfinite(space.periods).all():
+        notes.append("the screws' lead is not known: a periodic error of the screws, if they have one, is not fitted")
+    warmth = np.abs(measurements.stations.temperatures - REFERENCE_TEMPERATURE).max()
+    if warmth > WARM and not (settings.strut_expansion or settings.base_expansion or settings.platform_expansion):
+        notes.append(f"read up to {warmth:.1f} K from 20 °C, but no expansion is given: growth is taken for an error")
+    return notes
+
+
+def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:
+    """Return remarks on readings that scatter more than they should; refuse those that no machine explains.
+
+    Raises
+    ------
+    CalibrationError
+        What is left of a kind of reading is larger than any machine's error.
+    """
+    for c in channels:
+        if c.found > LARGEST_NOISE:
+            unit = "rad" if c.kind in ANGULAR_KINDS else "m"
+            problem = f"{c.kind} readings are off by {c.found:.3g} {unit} (allowed {LARGEST_NOISE:g}); do units fit?"
+            raise CalibrationError("measurements", problem)
+    noisy = [f"{c.kind} {c.found / c.stated:.1f} times" for c in channels if c.found > SCATTERED * c.stated]
+    if not noisy:
+        return []
+    problem = "readings scatter more than stated: something of the machine, or of an instrument, is not in the model"
+    return [f"{problem}, and the expected tool error may be too low ({', '.join(noisy)})"]
+
+
+def _channels(joint: JointProblem, solution: Solution) -> list[ChannelFit]:
+    """Return how each kind of channel was met."""
+    problem, posterior, kinds = solution.problem, solution.posterior, joint.measurements.kind
+    errors = held_out(problem, posterior) * posterior.noise[problem.kind]
+    readings_of_cell = np.bincount(joint.cells.of_reading, minlength=len(problem.kind))
+    result = []
+    for k in np.unique(kinds):
+        mine = problem.kind == k
+        stated = joint.measurements.stated_of(k)
+        mean_square = float((errors[mine] ** 2 / readings_of_cell[mine]).mean())
+        factor = float(posterior.noise[k])
+        result.append(
+            ChannelFit(
+                kind=KINDS[k],
+                readings=int((kinds == k).sum()),
+                stated=stated,
+                found=factor * stated,
+                chi_square=factor**2,
+                held_out=stated * float(np.sqrt(mean_square)),
+            )
+        )
+    return result
+
+
+def _outliers(joint: JointProblem, solution: Solution) -> list[Outlier]:
+    """Return the readings that are too far off to be noise, the worst first."""
+    m = joint.measurements
+    sigmas = solution.residuals / (joint.uncertainty * solution.posterior.noise[m.kind])
+    worst = np.argsort(-np.abs(sigmas))
+    far = worst[np.abs(sigmas[worst]) > OUTLIER]
+    return [Outlier(m.sources[i], int(m.channel[i]), float(solution.residuals[i]), float(sigmas[i])) for i in far]
+
+
+def _named(
+    space: ParameterSpace,
+    solution: Solution,
+    measurements: MeasurementSet,
+    channels: tuple[ChannelFit, ...],
+    tried: int,
+) -> MachineModel:
+    """Return the fitted model with its origin."""
+    kept = ", ".join(block.name for block in space.blocks)
+    lengths = [c.held_out for c in channels if c.kind not in ANGULAR_KINDS]
+    note = f"scheme joint, {len(measurements)} readings, blocks {kept} (of {tried + 1} tried)"
+    residual = float(np.sqrt(np.mean(np.square(lengths)))) if lengths else None
+    origin = ModelOrigin(date.today().isoformat(), measurements.files, residual, note)
+    return replace(space.model(solution.x.round(DIGITS)), origin=origin)

@@ -1,0 +1,367 @@
+"""The parameters of a joint calibration: which there are, how large they may be, what machine they make.
+
+Parameters come in blocks. Each block has a prior: zero mean and a covariance of known shape whose size, the
+block's *tolerance*, is estimated with the rest. The prior fixes what the data cannot see (the gauge) at the
+nominal machine and keeps the smooth blocks smooth; where the data speak it is far too weak to be heard.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from ..errors import CalibrationError, ModelError
+from ..machine.field import GridField, no_field
+from ..machine.geometry import COINCIDENT, STRUT_NAMES, HexapodGeometry
+from ..machine.kinematics import Structure, strut_lengths
+from ..machine.model import MachineModel
+from ..machine.struts import StrutErrors
+from ..measurements.readings import AXES, MeasurementSet, spans
+from .smooth_field import COMPONENT_UNITS, SmoothField
+
+KNOT_DISTANCE = 0.017
+"""Largest distance of the length map's knots, m: a wave of 60 mm has then three and a half knots."""
+
+MOST_BEYOND = 0.05
+"""Encoders may read this far beyond the stroke, m: their zeros are not the geometry's."""
+
+LARGEST_EXPANSION = 100e-6
+"""No machine is built of anything that grows more, 1/K."""
+
+MAP_CORRELATION_LENGTH = 0.04
+"""How far the errors of a length map are alike, m (Matérn 5/2)."""
+
+TOLERANCES = {
+    "structure": 100e-6,
+    "pitch": 100e-6,
+    "wave": 5e-6,
+    "backlash": 5e-6,
+    "map": 5e-6,
+    "field displacement": 5e-6,
+    "field rotation": 20e-6,
+    "field reversal": 1e-6,
+}
+"""First guess of the blocks' standard deviations, m, m/m or rad; the fit goes on from there."""
+
+BLOCKS = tuple(TOLERANCES)
+
+SHORTEST_LEAD, LONGEST_LEAD = 0.1e-3, 1.0
+"""Leads that a screw can have, m; below them no measuring line could show a period."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a joint fit is told besides the measurements.
+
+    Parameters
+    ----------
+    blocks : tuple of str
+        Blocks that may be used, of :data:`BLOCKS`; the structure belongs to every fit.
+    shared_platform_joints : bool
+        Platform joints that coincide nominally are one ball joint: the paper's machine then has 33 structure
+        parameters instead of 42.
+    lead : float or None
+        Period of the screws' errors, m; None: the geometry's leads, and no wave block where there are none.
+    field_degree : int
+        Degree of the field's polynomials along the longest side of its box.
+    strut_expansion, base_expansion, platform_expansion : float
+        Thermal expansion, 1/K: given, never fitted.
+    tolerances : dict
+        Standard deviations to start from, by block.
+    robust : bool
+        Give readings that disagree with the rest less weight.
+    """
+
+    blocks: tuple[str, ...] = BLOCKS
+    shared_platform_joints: bool = True
+    lead: float | None = None
+    field_degree: int = 6
+    strut_expansion: float = 0.0
+    base_expansion: float = 0.0
+    platform_expansion: float = 0.0
+    tolerances: tuple[tuple[str, float], ...] = tuple(TOLERANCES.items())
+    robust: bool = True
+
+    def __post_init__(self) -> None:
+        unknown = set(self.blocks) - set(BLOCKS)
+        if unknown:
+            raise ModelError("blocks", f"must be of {', '.join(BLOCKS)}", sorted(unknown))
+        if self.lead is not None and not SHORTEST_LEAD <= self.lead <= LONGEST_LEAD:
+            allowed = f"{SHORTEST_LEAD * 1e3:g} mm to {LONGEST_LEAD * 1e3:g} mm"
+            raise ModelError("lead", f"must be {allowed}", self.lead * 1e3)
+        for name, value in self.tolerances:
+            if not 0.0 < value < np.inf:
+                raise ModelError(f"tolerance of {name}", "must be finite and above zero", value)
+        for body in ("strut", "base", "platform"):
+            value = getattr(self, f"{body}_expansion")
+            if not 0.0 <= value <= LARGEST_EXPANSION:
+                raise ModelError(f"{body} expansion", f"must be 0…{LARGEST_EXPANSION * 1e6:g} ppm/K", value * 1e6)
+        if not 1 <= self.field_degree <= 8:
+            raise ModelError("field_degree", "must be 1…8", self.field_degree)
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block of parameters x = root · y; the prior of every y is N(0, tolerance²).
+
+    Attributes
+    ----------
+    name : str
+        One of :data:`BLOCKS`.
+    part : slice
+        Where it stands in the parameter vector.
+    root : ndarray, shape (n, n)
+        Root of the prior's correlation.
+    labels : tuple of str
+        Names of the parameters.
+    unit : str
+        SI unit of the parameters.
+    """
+
+    name: str
+    part: slice
+    root: np.ndarray
+    labels: tuple[str, ...]
+    unit: str
+
+
+class ParameterSpace:
+    """All parameters of a joint fit, in SI, and the machine that a vector of them makes.
+
+    Parameters
+    ----------
+    measurements : MeasurementSet
+        Tells which commands the length map, and which box the field must cover.
+    settings : Settings
+        Which blocks.
+
+    Attributes
+    ----------
+    blocks : tuple of Block
+        In the order of the vector.
+    size : int
+        Length of the vector.
+    platform_groups : ndarray of int, shape (6,)
+        Which ball joint each strut ends in.
+    periods : ndarray, shape (6,)
+        Screw wave period, m.
+    knots : ndarray, shape (n,)
+        Commands of the length map's knots, m.
+    field : SmoothField
+        The field's basis.
+    box : ndarray, shape (2, 3)
+        Lowest and highest commanded place of the measured point, m in ``base``: where the field is.
+    platform_box : ndarray, shape (2, 3)
+        The same of the platform's positions, m in ``base``: where the model holds.
+    work_box : ndarray, shape (2, 3)
+        The same of the measured point, m in the work frame, in which campaigns are boxes.
+    level : ndarray, shape (3, 3)
+        Attitude of the platform, in ``base``, with a level tool (:meth:`MeasurementSet.level`).
+    """
+
+    def __init__(self, measurements: MeasurementSet, settings: Settings) -> None:
+        geometry = measurements.geometry
+        self.geometry, self.settings = geometry, settings
+        self.home_lengths = strut_lengths(Structure.of(geometry), geometry.home)
+        self.platform_groups = _groups(geometry, settings.shared_platform_joints)
+        self.periods = _periods(geometry, settings.lead)
+        commands = measurements.stations.commands
+        _check_commands(geometry, commands)
+        self.knots = _knots(commands.min(), commands.max())
+        points = measurements.points()
+        self.box = np.array([points.min(axis=0), points.max(axis=0)])
+        self.platform_box, self.level = measurements.platform_box(), measurements.level()
+        in_work = (points - geometry.work.position) @ geometry.work.rotation
+        self.work_box = np.array([in_work.min(axis=0), in_work.max(axis=0)])
+        self.field = SmoothField(self.box, settings.field_degree)
+        self.probe = measurements.probe
+        self.blocks = tuple(self._make_blocks())
+        self.size = self.blocks[-1].part.stop
+        self._cardinal = CubicSpline(self.knots, np.eye(len(self.knots)), bc_type="natural")
+
+    def places(self, in_work: np.ndarray) -> np.ndarray:
+        """Return points (n, 3) of the work frame in ``base``, m."""
+        work = self.geometry.work
+        return work.position + in_work @ work.rotation.T
+
+    def _make_blocks(self) -> list[Block]:
+        names = [name for name in BLOCKS if self._has(name)]
+        blocks, start = [], 0
+        for name in names:
+            root, labels, unit = self._describe(name)
+            blocks.append(Block(name, slice(start, start + len(labels)), root, labels, unit))
+            start += len(labels)
+        return blocks
+
+    def _has(self, name: str) -> bool:
+        if name == "structure":
+            return True
+        if name == "wave" and not np.isfinite(self.periods).all():
+            return False
+        return name in self.settings.blocks
+
+    def _describe(self, name: str) -> tuple[np.ndarray, tuple[str, ...], str]:
+        """Return root, labels and unit of a block."""
+        if name == "structure":
+            labels = [f"base {i + 1} {a}" for i in range(6) for a in AXES]
+            labels += [f"platform {g + 1} {a}" for g in range(self.platform_groups.max() + 1) for a in AXES]
+            labels += [f"{s} offset" for s in STRUT_NAMES]
+            return np.eye(len(labels)), tuple(labels), "m"
+        if name == "wave":
+            labels = [f"{s} wave {part}" for s in STRUT_NAMES for part in ("cosine", "sine")]
+            return np.eye(12), tuple(labels), "m"
+        if name == "map":
+            root = np.kron(np.eye(6), _correlation_root(self.knots))
+            labels = [f"{s} map at {1e3 * k:.0f} mm" for s in STRUT_NAMES for k in self.knots]
+            return root, tuple(labels), "m"
+        if name == "field reversal":
+            terms = self.field.reversal_terms
+            labels = [f"{c} {t} reversal {a}" for a in AXES for c, _ in COMPONENT_UNITS for t in terms]
+            return np.diag(np.tile(self.field.reversal_prior, 18)), tuple(labels), "m, rad"
+        if name.startswith("field"):
+            which = 0 if name.endswith("displacement") else 3
+            terms = self.field.terms
+            labels = [f"{COMPONENT_UNITS[which + c][0]} {t}" for c in range(3) for t in terms]
+            return np.diag(np.tile(self.field.prior, 3)), tuple(labels), "m" if which == 0 else "rad"
+        labels = [f"{s} {name}" for s in STRUT_NAMES]
+        return np.eye(6), tuple(labels), "m/m" if name == "pitch" else "m"
+
+    def block(self, name: str) -> Block | None:
+        """Return a block by name, None when this fit has none."""
+        return next((b for b in self.blocks if b.name == name), None)
+
+    def start_tolerances(self) -> np.ndarray:
+        """Return the blocks' first tolerances, shape (number of blocks,)."""
+        known = dict(self.settings.tolerances)
+        return np.array([known.get(b.name, TOLERANCES[b.name]) for b in self.blocks])
+
+    def spread(self, tolerances: np.ndarray) -> np.ndarray:
+        """Return each parameter's tolerance from its block's, shape (size,)."""
+        return np.repeat(tolerances, [len(b.labels) for b in self.blocks])
+
+    def whitened(self, rows: np.ndarray) -> np.ndarray:
+        """Return derivatives (n, size) by x as derivatives by y, with x = root·y block by block."""
+        return np.hstack([rows[:, b.part] @ b.root for b in self.blocks])
+
+    def physical(self, y: np.ndarray) -> np.ndarray:
+        """Return x = root·y for y of shape (size, …)."""
+        return np.concatenate([b.root @ y[b.part] for b in self.blocks])
+
+    def prior_covariance(self, tolerances: np.ndarray) -> np.ndarray:
+        """Return the prior's covariance of x, shape (size, size), SI."""
+        return self.physical(self.physical(np.diag(self.spread(tolerances) ** 2)).T)
+
+    def spline_weights(self, commands: np.ndarray) -> np.ndarray:
+        """Return what each knot's value adds at some commands (n,), shape (n, knots)."""
+        return self._cardinal(np.clip(commands, self.knots[0], self.knots[-1]))
+
+    def model(self, x: np.ndarray, name: str = "joint calibration", with_field: bool = True) -> MachineModel:
+        """Return the machine that a parameter vector means.
+
+        Negative backlash, which noise can make of a small one, is taken as none; the fit has by then
+        refused what is more than noise.
+
+        Parameters
+        ----------
+        x : ndarray, shape (size,)
+            Parameters, SI.
+        name : str
+            Name of the model.
+        with_field : bool
+            False leaves the field out: the fit adds it from its own basis.
+        """
+        s = self.settings
+        joints, offset = np.split(self._values(x, "structure"), [-6])
+        structure = joints.reshape(-1, 3)
+        wave = self._values(x, "wave", 12).reshape(6, 2)
+        values = self._values(x, "map", 0).reshape(6, -1)
+        has_map = bool(values.size) and bool(values.any())
+        struts = StrutErrors(
+            offset=offset,
+            pitch=self._values(x, "pitch", 6),
+            reference_length=self.home_lengths,
+            cosine=wave[:, 0],
+            sine=wave[:, 1],
+            period=np.where(np.isfinite(self.periods), self.periods, 0.01),
+            backlash=np.maximum(self._values(x, "backlash", 6), 0.0),
+            expansion=np.full(6, s.strut_expansion),
+            map_knots=self.knots if has_map else np.zeros(0),
+            map_values=values if has_map else np.zeros((6, 0)),
+        )
+        return MachineModel(
+            machine=self.geometry.name,
+            name=name,
+            base_deviation=structure[:6],
+            platform_deviation=structure[6:][self.platform_groups],
+            struts=struts,
+            field=self._grid_field(x) if with_field else no_field(),
+            base_expansion=s.base_expansion,
+            platform_expansion=s.platform_expansion,
+            valid_box=self.platform_box if spans(self.platform_box) else None,
+        )
+
+    def field_coefficients(self, x: np.ndarray) -> np.ndarray:
+        """Return the field's coefficients, shape (6, terms), m and rad."""
+        count = 3 * len(self.field.terms)
+        parts = [self._values(x, f"field {kind}", count) for kind in ("displacement", "rotation")]
+        return np.concatenate(parts).reshape(6, -1)
+
+    def field_reversal(self, x: np.ndarray) -> np.ndarray:
+        """Return the field's forward minus backward, shape (3, 6, reversal terms), m and rad."""
+        count = len(self.field.reversal_terms)
+        return self._values(x, "field reversal", 18 * count).reshape(3, 6, count)
+
+    def field_errors(self, x: np.ndarray, points: np.ndarray, sense: np.ndarray) -> np.ndarray:
+        """Return the field at points (n, 3), m, passed in directions (n, 3), shape (n, 6), m and rad."""
+        return self.field.evaluate(self.field_coefficients(x), self.field_reversal(x), points, sense)
+
+    def _grid_field(self, x: np.ndarray) -> GridField:
+        coefficients, reversal = self.field_coefficients(x), self.field_reversal(x)
+        if not (coefficients.any() or reversal.any()):
+            return no_field()
+        return replace(self.field.as_grid(coefficients, reversal), probe=self.probe)
+
+    def _values(self, x: np.ndarray, name: str, missing: int = 0) -> np.ndarray:
+        """Return the parameters of a block, zeros where there is none."""
+        block = self.block(name)
+        return x[block.part] if block is not None else np.zeros(missing)
+
+
+def _groups(geometry: HexapodGeometry, shared: bool) -> np.ndarray:
+    """Return which ball joint of the platform each strut ends in, numbered in order, shape (6,)."""
+    if not shared:
+        return np.arange(6)
+    joints = geometry.platform_joints
+    same = np.linalg.norm(joints[:, None] - joints[None], axis=2) < COINCIDENT
+    first = same.argmax(axis=1)
+    return np.unique(first, return_inverse=True)[1]
+
+
+def _periods(geometry: HexapodGeometry, lead: float | None) -> np.ndarray:
+    """Return the periods of the screws' errors, m; NaN where the screw is not known."""
+    if lead is not None:
+        return np.full(6, lead)
+    return np.where(geometry.screw_lead != 0.0, np.abs(geometry.screw_lead), np.nan)
+
+
+def _check_commands(geometry: HexapodGeometry, commands: np.ndarray) -> None:
+    """Refuse strut readings that are no lengths of this machine's struts."""
+    low, high = geometry.limits.stroke.min() - MOST_BEYOND, geometry.limits.stroke.max() + MOST_BEYOND
+    if not (low <= commands.min() and commands.max() <= high):
+        found = f"{commands.min():.4g}…{commands.max():.4g} m"
+        problem = f"run over {found}, the struts over {low:.4g}…{high:.4g} m; do units fit?"
+        raise CalibrationError("strut readings", problem)
+
+
+def _knots(low: float, high: float) -> np.ndarray:
+    """Return equidistant knots over the commands seen, at most :data:`KNOT_DISTANCE` apart."""
+    span = max(high - low, KNOT_DISTANCE)
+    return np.linspace(low, low + span, int(np.ceil(span / KNOT_DISTANCE)) + 1)
+
+
+def _correlation_root(knots: np.ndarray) -> np.ndarray:
+    """Return a root of the Matérn 5/2 correlation between the knots of one strut, shape (n, n)."""
+    d = np.sqrt(5.0) * np.abs(knots[:, None] - knots) / MAP_CORRELATION_LENGTH
+    return np.linalg.cholesky((1.0 + d + d * d / 3.0) * np.exp(-d) + 1e-9 * np.eye(len(knots)))

@@ -1,0 +1,255 @@
+"""Pictures of calibrations: what a model says of the struts, and how polynomials lie among their readings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..errors import CalibrationError
+from ..formats.figures import WITH, WITHOUT
+from ..kernels.struts import smooth_error
+from ..machine.field import COMPONENTS, CROSS_AXES
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry
+from ..machine.kinematics import Structure, strut_lengths_batch
+from ..machine.model import MachineModel, RealMachine
+from ..machine.travel import Passes, commanded_box
+from ..measurements.readings import AXES, KINDS
+from .evaluation import run
+from .fit import JointFit
+from .lines import LineFit, LinesFit
+from .observability import left_in_space
+
+SAMPLES = 161
+"""Points of a curve."""
+
+MAP_NODES = 21
+"""Points along x and y of a map."""
+
+ARROWS = {1: "→", -1: "←"}
+
+
+def strut_length_errors(
+    geometry: HexapodGeometry, model: MachineModel, along_x: np.ndarray, y: float, z: float
+) -> np.ndarray:
+    """Return ΔL = L_actual − L_ideal (001) along a line in x, forward and backward, shape (2, n, 6), m.
+
+    L_ideal are the nominal lengths of the commanded pose; L_actual those of the pose to which the machine,
+    told L_ideal, really goes as the model has it. To first order the strut correction is −ΔL.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        The machine as designed.
+    model : MachineModel
+        What is believed of its errors.
+    along_x : ndarray, shape (n,)
+        Places of the tool in the work frame, m.
+    y, z : float
+        Where the line stands, m.
+    """
+    points = np.stack([along_x, np.full_like(along_x, y), np.full_like(along_x, z)], axis=1)
+    level = np.tile(np.eye(3), (len(points), 1, 1))
+    nominal = Structure.of(geometry)
+    errors = []
+    for way in ARROWS:
+        passes = Passes.of_tool(geometry, points, level, np.tile([float(way), 0.0, 0.0], (len(points), 1)))
+        actual = run(RealMachine(geometry, model), passes, None)
+        errors.append(
+            strut_lengths_batch(nominal, *actual) - strut_lengths_batch(nominal, passes.positions, passes.rotations)
+        )
+    return np.array(errors)
+
+
+def strut_error_figure(
+    geometry: HexapodGeometry,
+    models: Mapping[str, MachineModel],
+    y: float | None = None,
+    z: float | None = None,
+) -> Figure:
+    """Show 001's Figures 3 and 4: the six struts' length errors along x, forward (a) and backward (b).
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        The machine as designed.
+    models : mapping of str to MachineModel
+        One row of two panels each, under its title; 001 has a row from 1-D and one from 5-D data.
+    y, z : float, optional
+        Where the line stands in the work frame, m; the middle of the first model's box by default.
+
+    Raises
+    ------
+    CalibrationError
+        No model, or one without a box: nobody knows how far the line goes.
+    """
+    if not models or any(model.valid_box is None for model in models.values()):
+        raise CalibrationError("picture of strut errors", "needs models, each with the box in which it holds")
+    box = commanded_box(geometry, next(iter(models.values())))
+    middle = box.mean(axis=0)
+    along = np.linspace(box[0, 0], box[1, 0], SAMPLES)
+    line = (middle[1] if y is None else y, middle[2] if z is None else z)
+    figure = Figure(figsize=(11, 3.8 * len(models)), layout="constrained")
+    rows = figure.subplots(len(models), 2, squeeze=False, sharex=True, sharey="row")
+    for panels, (title, model) in zip(rows, models.items(), strict=True):
+        errors = strut_length_errors(geometry, model, along, *line)
+        for axes, lengths, letter, way in zip(panels, errors, "ab", ("forward →", "backward ←"), strict=True):
+            _strut_curves(axes, along, lengths)
+            axes.set(title=f"{title}, ({letter}) {way}", xlabel="x, mm", ylabel="ΔL = actual − ideal, µm")
+    rows[0, 0].legend(ncols=2, fontsize=7)
+    figure.suptitle(f"Strut length error along x at y = {line[0] * 1e3:g} mm, z = {line[1] * 1e3:g} mm")
+    return figure
+
+
+def _strut_curves(axes: Axes, along: np.ndarray, lengths: np.ndarray) -> None:
+    for name, values in zip(STRUT_NAMES, lengths.T, strict=True):
+        axes.plot(along * 1e3, values * 1e6, lw=1.0, label=name)
+
+
+def fitted_lines_figure(fit: LinesFit, axis: int = 0, component: int | None = None) -> Figure:
+    """Show the polynomials of one family and component among the readings that they were fitted to.
+
+    Parameters
+    ----------
+    fit : LinesFit
+        Result of scheme ``lines``.
+    axis : int
+        Along which the lines run.
+    component : int, optional
+        Index into :data:`hexapod_comp.machine.field.COMPONENTS`; the displacement along the lines by default.
+
+    Raises
+    ------
+    CalibrationError
+        The component was not measured on these lines.
+    """
+    component = axis if component is None else component
+    lines = [line for line in fit.lines if (line.axis, line.component) == (axis, component)]
+    if not lines:
+        raise CalibrationError(f"{COMPONENTS[component]} on {AXES[axis]} lines", "was not fitted")
+    rows, columns = (sorted({line.nodes[0][k] for line in lines}) for k in (0, 1))
+    figure = Figure(figsize=(2.6 * len(columns) + 1.0, 1.7 * len(rows) + 1.0), layout="constrained")
+    panels = figure.subplots(len(rows), len(columns), squeeze=False, sharex=True, sharey=True)
+    for line in lines:
+        i, j = line.nodes[0]
+        _line_panel(panels[rows.index(i), columns.index(j)], line, fit.model.field.grid)
+    _label_edges(panels, axis, component)
+    figure.suptitle(f"{COMPONENTS[component]} on lines along {AXES[axis]}: mean readings and polynomials")
+    return figure
+
+
+def _line_panel(axes: Axes, line: LineFit, grid: Sequence[np.ndarray]) -> None:
+    nodes = grid[line.axis]
+    colour, way = (WITH, "forward") if line.direction >= 0 else (WITHOUT, "backward")
+    u = np.linspace(-1.0, 1.0, SAMPLES)
+    along = 0.5 * (nodes[0] + nodes[-1] + u * (nodes[-1] - nodes[0]))
+    axes.plot(line.coordinates * 1e3, line.values * 1e6, ".", color=colour, ms=4)
+    curve = np.polynomial.polynomial.polyval(u, line.coefficients)
+    axes.plot(along * 1e3, curve * 1e6, color=colour, lw=1.0, label=way)
+    places = zip(CROSS_AXES[line.axis], line.nodes[0], strict=True)
+    same = {a for k, a in enumerate(CROSS_AXES[line.axis]) if len({node[k] for node in line.nodes}) > 1}
+    where = [f"{AXES[a]} {'all' if a in same else f'{grid[a][n] * 1e3:.0f}'}" for a, n in places]
+    axes.set_title(", ".join(where), fontsize=7)
+
+
+def _label_edges(panels: np.ndarray, axis: int, component: int) -> None:
+    for axes in panels[-1]:
+        axes.set_xlabel(f"{AXES[axis]}, mm")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("µm" if component < 3 else "µrad")
+    panels[0, 0].legend(fontsize=6)
+
+
+def joint_figure(fit: JointFit) -> Figure:
+    """Show a joint fit: its residuals, the struts' errors, what the data determine, and what error to expect."""
+    figure = Figure(figsize=(11, 7.6), layout="constrained")
+    panels = figure.subplots(2, 2)
+    _residual_panel(panels[0, 0], fit)
+    _strut_panel(panels[0, 1], fit)
+    _sight_panel(panels[1, 0], fit)
+    _tool_error_panel(panels[1, 1], fit)
+    figure.suptitle(f"{fit.measurements.geometry.name}: scheme joint, {len(fit.measurements)} readings")
+    return figure
+
+
+def _residual_panel(axes: Axes, fit: JointFit) -> None:
+    """Show the residuals of each kind of channel against what noise alone would look like."""
+    kinds = fit.measurements.kind
+    edges = np.linspace(-5.0, 5.0, 51)
+    for channel in fit.channels:
+        residuals = fit.solution.residuals[kinds == KINDS.index(channel.kind)] / channel.found
+        label = f"{channel.kind}, {channel.readings}"
+        axes.hist(np.clip(residuals, -5.0, 5.0), edges.tolist(), density=True, histtype="step", label=label)
+    axes.plot(edges, np.exp(-0.5 * edges**2) / np.sqrt(2.0 * np.pi), "k:", lw=1.0, label="normal")
+    axes.set(title="residuals", xlabel="residual over the noise found", ylabel="density")
+    axes.legend(fontsize=7)
+
+
+def _strut_panel(axes: Axes, fit: JointFit) -> None:
+    """Show what each strut does with its commands, offset and backlash aside."""
+    struts = RealMachine(fit.measurements.geometry, fit.model).strut_arrays
+    commands = fit.measurements.stations.commands
+    for strut, name in enumerate(STRUT_NAMES):
+        at = np.linspace(commands[:, strut].min(), commands[:, strut].max(), 4 * SAMPLES)
+        errors = [smooth_error(c, *struts, strut)[0] - fit.model.struts.offset[strut] for c in at]
+        axes.plot(at * 1e3, np.array(errors) * 1e6, lw=0.8, label=name)
+    axes.set(title="strut errors: pitch, screw wave, length map", xlabel="command, mm", ylabel="error, µm")
+    axes.legend(ncols=2, fontsize=7)
+
+
+def _sight_panel(axes: Axes, fit: JointFit) -> None:
+    """Show how many parameters of each block the data determine."""
+    blocks = fit.observability.blocks
+    names = [block.name for block in blocks]
+    axes.barh(names, [block.parameters for block in blocks], color="#d0d0d0", label="parameters")
+    axes.barh(names, [block.determined for block in blocks], height=0.5, color=WITH, label="determined by data")
+    axes.invert_yaxis()
+    axes.set(title="what the readings determine", xlabel="parameters")
+    axes.legend(fontsize=7)
+
+
+def _tool_error_panel(axes: Axes, fit: JointFit) -> None:
+    """Show the tool error to expect, before and after, for a level and for a tilted tool."""
+    cases = {"level": fit.level, "tilted 10°": fit.tilted}
+    known = {name: error for name, error in cases.items() if error is not None}
+    places = np.arange(len(known))
+    before = [error.before * 1e6 for error in known.values()]
+    after = np.array([error.after * 1e6 for error in known.values()])
+    low, high = (np.array([getattr(error, end) * 1e6 for error in known.values()]) for end in ("low", "high"))
+    axes.bar(places - 0.2, before, 0.35, color=WITHOUT, label="as the machine is")
+    spread = [np.maximum(after - low, 0.0), np.maximum(high - after, 0.0)]
+    axes.bar(places + 0.2, after, 0.35, color=WITH, yerr=spread, capsize=4, label="with the model (95 %)")
+    axes.set_xticks(places, list(known))
+    axes.set(title="tool error to expect, datum aligned", ylabel="RMS in space, µm", yscale="log")
+    axes.set_ylim(top=4.0 * max(before))  # room for the legend
+    axes.legend(fontsize=7)
+
+
+def left_error_figure(fit: JointFit) -> Figure:
+    """Show where in the measured box what error is left after compensation: the RMS to expect, at three heights.
+
+    Raises
+    ------
+    CalibrationError
+        The readings span no box.
+    """
+    if fit.model.valid_box is None:
+        raise CalibrationError("picture of the error left", "needs readings that span a box")
+    low, high = fit.space.work_box
+    x, y = (np.linspace(low[a], high[a], MAP_NODES) for a in range(2))
+    heights = np.linspace(low[2], high[2], 3)
+    points = np.stack(np.meshgrid(heights, y, x, indexing="ij"), axis=-1)[..., ::-1].reshape(-1, 3)
+    places = fit.space.places(points)
+    left = left_in_space(fit.space, fit.solution.x, fit.covariance, places).reshape(3, MAP_NODES, MAP_NODES) * 1e6
+    figure = Figure(figsize=(11, 3.9), layout="constrained")
+    panels = figure.subplots(1, 3, sharex=True, sharey=True)
+    levels = np.linspace(np.nanmin(left), np.nanmax(left), 13)
+    for axes, height, values in zip(panels, heights, left, strict=True):
+        drawn = axes.contourf(x * 1e3, y * 1e3, np.ma.masked_invalid(values), levels, cmap="viridis")
+        axes.set(title=f"z = {height * 1e3:.0f} mm", xlabel="x in work, mm", aspect="equal")
+    panels[0].set_ylabel("y in work, mm")
+    figure.colorbar(drawn, ax=panels, label="RMS error in space to expect, µm")
+    figure.suptitle("what is left after compensation, level tool, datum aligned")
+    return figure

@@ -1,0 +1,173 @@
+"""What a fit of scheme ``joint``, or a plan for one, prints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from ..formats.texts import aligned, number
+from ..measurements.readings import ANGULAR_KINDS, CHANNELS
+from .fit import JointFit
+from .observability import BlockSight, Observability, ToolError
+from .plan import Plan
+
+MOST_LISTED = 10
+"""Outliers and notes beyond these are counted, not listed."""
+
+TRUST = 0.1
+"""A tilted tool that keeps more than this share of its error is warned of, when parameters are not seen."""
+
+
+def report(fit: JointFit) -> str:
+    """Return the report of a joint fit."""
+    parts = [
+        _headline(fit),
+        *_expected(fit.level, fit.tilted, fit.observability),
+        *_notes(fit),
+        _channel_table(fit),
+        _decision_table(fit),
+        observability_text(fit.observability, fit.unseen_errors),
+        *_outliers(fit),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _notes(fit: JointFit) -> Iterator[str]:
+    if fit.notes:
+        yield "\n".join(f"note: {note}" for note in fit.notes)
+
+
+def _headline(fit: JointFit) -> str:
+    m = fit.measurements
+    kept = ", ".join(block.name for block in fit.space.blocks)
+    return (
+        f"machine {m.geometry.name}: {len(m)} readings of {len(m.runs)} runs at {len(m.stations)} stations\n"
+        f"scheme joint: {fit.space.size} parameters ({kept}), settled after {fit.solution.steps} steps"
+    )
+
+
+def _expected(level: ToolError | None, tilted: ToolError | None, seen: Observability) -> Iterator[str]:
+    """Yield what tool error the model leaves, and whether it can be trusted with a tilted tool."""
+    if level is None:
+        return
+    lines = ["expected tool error at random points of the measured box, both directions, the datum aligned:"]
+    lines.append(f"  level tool:  {tool_error_text(level)}")
+    if tilted is not None:
+        lines.append(f"  tilted 10°:  {tool_error_text(tilted)}")
+        if seen.structure_rank < seen.structure_size and tilted.after > TRUST * tilted.before:
+            lines.append("  The readings do not show what tilting does: do not trust this model with a tilted tool.")
+    yield "\n".join(lines)
+
+
+def tool_error_text(error: ToolError) -> str:
+    """Return before, after and the interval of a tool error in µm and µrad."""
+    removed = 100.0 * (1.0 - error.after / error.before)
+    return (
+        f"{error.before * 1e6:.2f} → {error.after * 1e6:.3f} µm RMS "
+        f"({error.low * 1e6:.3f}…{error.high * 1e6:.3f} with 95 %), {removed:.1f} % less; "
+        f"rotation {error.rotation_before * 1e6:.1f} → {error.rotation_after * 1e6:.2f} µrad RMS"
+    )
+
+
+def _channel_table(fit: JointFit) -> str:
+    header = ("channel", "readings", "stated σ", "found σ", "χ²/freedom", "held out", "")
+    rows = []
+    for c in fit.channels:
+        unit = "urad" if c.kind in ANGULAR_KINDS else "um"
+        cells = (number(c.stated * 1e6, 2), number(c.found * 1e6, 2), number(c.chi_square, 3))
+        rows.append((c.kind, str(c.readings), *cells, number(c.held_out * 1e6, 2), unit))
+    return "residuals; held out: a line or a pose at a time, noise included\n" + aligned(header, rows)
+
+
+def _decision_table(fit: JointFit) -> str:
+    header = ("block", "kept", "gain", "±", "")
+    rows = [
+        (d.block, "yes" if d.kept else "no", number(100.0 * d.gain, 2), number(100.0 * d.uncertainty, 2), "%")
+        for d in fit.decisions
+    ]
+    return "blocks; gain: how much less squared error at held-out readings\n" + aligned(header, rows)
+
+
+def observability_text(seen: Observability, unseen_errors: tuple[str, ...]) -> str:
+    """Return what the data determine: block by block, rank, indices, weak and unseen directions."""
+    header = ("block", "parameters", "determined", "tolerance", "median error", "")
+    lines = [aligned(header, [_sight_row(b) for b in seen.blocks])]
+    lines.append(
+        f"{seen.structure_rank} of {seen.structure_size} structure parameters are observable; "
+        f"of all {seen.size} parameters {seen.rank} are, condition number {seen.condition:.0f}"
+    )
+    if seen.indices:
+        lines.append("observability indices: " + ", ".join(f"{k} {v:.3g}" for k, v in seen.indices.items()))
+    lines += [f"weak ({strength:.1f} σ): {names}" for strength, names in seen.weak]
+    if seen.unseen:
+        lines.append("not seen (left near nominal): " + ", ".join(seen.unseen))
+    if unseen_errors:
+        lines.append("machine errors that leave no trace in these readings: " + ", ".join(unseen_errors))
+    return "\n".join(lines)
+
+
+def _sight_row(b: BlockSight) -> tuple[str, ...]:
+    unit = {"m": "um", "rad": "urad", "m/m": "ppm", "m, rad": "um, urad"}[b.unit]
+    cells = (number(b.determined, 1), number(b.tolerance * 1e6, 2), number(b.error * 1e6, 3))
+    return (b.name, str(b.parameters), *cells, unit)
+
+
+def _outliers(fit: JointFit) -> Iterator[str]:
+    """Yield the list of readings that disagree with all others."""
+    if not fit.outliers:
+        return
+    lines = [f"readings that disagree with all others, and got little weight: {len(fit.outliers)}"]
+    for o in fit.outliers[:MOST_LISTED]:
+        unit = "urad" if CHANNELS[o.channel].partition("_")[0] in ANGULAR_KINDS else "um"
+        lines.append(f"  {o.source}: {CHANNELS[o.channel]} is {o.residual * 1e6:.2f} {unit} off ({o.sigmas:.1f} σ)")
+    if len(fit.outliers) > MOST_LISTED:
+        lines.append(f"  and {len(fit.outliers) - MOST_LISTED} more")
+    yield "\n".join(lines)
+
+
+def as_json(fit: JointFit) -> dict:
+    """Return a joint fit as plain numbers, SI, for ``--json``."""
+    x, errors = fit.solution.x, fit.standard_errors
+    labels = [(label, block.unit) for block in fit.space.blocks for label in block.labels]
+    return {
+        "machine": fit.measurements.geometry.name,
+        "scheme": "joint",
+        "parameters": [
+            {"name": name, "value": float(v), "standard_error": float(e), "unit": unit}
+            for (name, unit), v, e in zip(labels, x, errors, strict=True)
+        ],
+        "blocks": [vars(d) for d in fit.decisions],
+        "channels": [vars(c) for c in fit.channels],
+        "expected_tool_error": None if fit.level is None else vars(fit.level),
+        "expected_tool_error_tilted": None if fit.tilted is None else vars(fit.tilted),
+        "observability": {**vars(fit.observability), "blocks": [vars(b) for b in fit.observability.blocks]},
+        "unseen_errors": fit.unseen_errors,
+        "outliers": [
+            {"source": str(o.source), "channel": CHANNELS[o.channel], "residual": o.residual, "sigmas": o.sigmas}
+            for o in fit.outliers
+        ],
+        "notes": fit.notes,
+    }
+
+
+def plan_report(plan: Plan) -> str:
+    """Return the report of a plan."""
+    m = plan.measurements
+    head = (
+        f"machine {m.geometry.name}: {len(m)} readings of {len(m.runs)} runs at {len(m.stations)} stations, "
+        f"{plan.space.size} parameters"
+    )
+    seen = observability_text(plan.observability, plan.unseen_errors)
+    return "\n\n".join([head, *_expected(plan.level, plan.tilted, plan.observability), seen]) + "\n"
+
+
+def plan_json(plan: Plan) -> dict:
+    """Return a plan as plain numbers, SI, for ``--json``."""
+    return {
+        "machine": plan.measurements.geometry.name,
+        "readings": len(plan.measurements),
+        "parameters": plan.space.size,
+        "expected_tool_error": None if plan.level is None else vars(plan.level),
+        "expected_tool_error_tilted": None if plan.tilted is None else vars(plan.tilted),
+        "observability": {**vars(plan.observability), "blocks": [vars(b) for b in plan.observability.blocks]},
+        "unseen_errors": plan.unseen_errors,
+    }

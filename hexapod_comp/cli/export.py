@@ -1,0 +1,239 @@
+"""``hexapod_comp export``: a model for controllers that do not run this package."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from typing import TYPE_CHECKING, Any
+
+from ..formats import texts
+from . import common
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ..export.worth import Comparison, ExportCheck, ExportTrial, Size
+    from ..machine.model import MachineModel
+
+SUMMARY = "write a model as LinuxCNC configuration or as a trilinear table, and check what it leaves"
+
+TEXT = """--linuxcnc writes into a folder: genhexkins.hal (setp lines with the real joints), strut_1.comp … strut_6.comp
+(offset, pitch, screw wave, length map and backlash of each strut, at most 256 points) and comp.ini (lines to copy
+into the ini file). --table writes corrections of struts and of poses on a grid of positions of a level tool, forward
+and backward, as CSV. Files of the same names are replaced.
+
+Every file is then read back, and the machine that the model describes is driven through it along random poses, level
+and tilted, forward and backward: the report gives the tool's 3-D error before and after, and the size of what
+the export cannot carry. The exit code is 1 when it would make the error larger.
+
+example:
+  $ hexapod_comp export --machine paper.yaml --model paper_machine.yaml --linuxcnc linuxcnc --table table.csv"""
+
+HARMLESS = 10e-9
+"""An error that grows by less than this, m, has not grown: the files' digits and LinuxCNC's floats count for more."""
+
+
+def add_parser(subparsers: common.Subparsers) -> None:
+    """Add the verb."""
+    parser = common.add_verb(subparsers, "export", run, SUMMARY, TEXT)
+    common.add_machine_options(parser)
+    parser.add_argument("--linuxcnc", metavar="DIR", help="folder for LinuxCNC's files; made if it is missing")
+    parser.add_argument("--table", metavar="FILE.csv", help="CSV file for the trilinear table")
+    parser.add_argument(
+        "--units", choices=("mm", "inch"), default="mm", help="LinuxCNC's machine unit, [TRAJ]LINEAR_UNITS (default mm)"
+    )
+    parser.add_argument(
+        "--box",
+        type=box_argument,
+        metavar="X0,Y0,Z0,X1,Y1,Z1",
+        help="lowest and highest tool position, mm (default: the model's valid box, else its field's)",
+    )
+    parser.add_argument(
+        "--step-mm", type=step_argument, default=25.4, metavar="MM", help="largest step of the table (default 25.4)"
+    )
+    parser.add_argument(
+        "--poses", type=check_count, default=1000, metavar="N", help="random poses to check (default 1000, the least)"
+    )
+    parser.add_argument("--tilt-deg", type=common.bound, default=5.0, metavar="DEG", help="tilt to check (default 5)")
+    parser.add_argument("--seed", type=common.seed, default=0, metavar="N", help="of the random poses (default 0)")
+    parser.add_argument("--json", action="store_true", help="report as JSON, for programs; units are in the keys")
+
+
+def box_argument(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Read two corners in mm; return the lowest and the highest, m."""
+    numbers = common.lengths_argument(text)
+    low, high = numbers[:3], numbers[3:]
+    if not all(a < b for a, b in zip(low, high, strict=True)):
+        raise argparse.ArgumentTypeError(f"must be the lowest corner, then the highest, not {text}")
+    return low, high
+
+
+def step_argument(text: str) -> float:
+    """Read a step in mm, above zero."""
+    step = common.finite(text)
+    if step <= 0.0:
+        raise argparse.ArgumentTypeError(f"must be above zero, not {text}")
+    return step
+
+
+def check_count(text: str) -> int:
+    """Read how many poses to check: a thousand or more."""
+    number = common.count(text)
+    if number < 1000:
+        raise argparse.ArgumentTypeError(f"must be 1000 or more, not {text}")
+    return number
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the verb."""
+    import numpy as np
+
+    from ..errors import InputFileError
+    from ..export.worth import ExportTrial
+    from ..machine.travel import commanded_box
+
+    if args.linuxcnc is None and args.table is None:
+        raise InputFileError("export", "--linuxcnc, --table", "at least one is needed: nothing to write")
+    geometry, model = common.load_machine(args)
+    common.mention_compiling("model.actual_pose_one")
+    box = commanded_box(geometry, model) if args.box is None else np.array(args.box)
+    trial = ExportTrial(geometry, model, box, args.poses, args.seed, math.radians(args.tilt_deg))
+    written, checks = [], []
+    if args.linuxcnc is not None:
+        files, result = _linuxcnc(args, trial, box)
+        written += files
+        checks.append(result)
+    if args.table is not None:
+        written.append(args.table)
+        checks += _table(args, trial, box)
+    if args.json:
+        print(common.json_text(_as_json(args, model, box, written, checks)), end="")
+    else:
+        print(_report(args, model, box, written, checks))
+    worse = [c for _, c, _ in checks if c.level.after.rms > c.level.before.rms + HARMLESS]
+    return 1 if worse else 0
+
+
+Result = tuple[str, "ExportCheck", list[str]]
+"""Name of a way to use an export, what it leaves, and notes."""
+
+
+def _titles(model: MachineModel, box: np.ndarray) -> list[str]:
+    dated = f" of {model.origin.date}" if model.origin.date else ""
+    return [f"machine {model.machine}, model {model.name}{dated}, written by hexapod_comp export", _box_text(box)]
+
+
+def _box_text(box: np.ndarray) -> str:
+    low, high = (", ".join(f"{v:g}" for v in corner.round(9) * 1e3) for corner in box)
+    return f"box of tool positions ({low})…({high}) mm, 20 °C"
+
+
+def _linuxcnc(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray) -> tuple[list[str], Result]:
+    """Write LinuxCNC's files, read them back and drive the machine through them."""
+    from ..export.linuxcnc import make_genhexkins, table_misfit
+    from ..export.linuxcnc_files import read_genhexkins, write_genhexkins
+
+    machine = trial.machine
+    told = make_genhexkins(machine, box)
+    misfit = table_misfit(machine, told, box)
+    files = write_genhexkins(told, args.linuxcnc, args.units, _titles(machine.model, box), misfit)
+    back = read_genhexkins(args.linuxcnc, args.units)
+    check = trial.check(back.commands)
+    rms, largest = table_misfit(machine, back, box).max(axis=0) * 1e6
+    points = max(len(table.nominal) for table in back.tables)
+    notes = [
+        f"what bends between the {points} points of a strut's .comp file: {rms:.3f} µm RMS, {largest:.3f} at most",
+        f"the error field: moves the tool by {_size(check.field)}",
+    ]
+    return [str(file) for file in files], ("LinuxCNC", check, notes)
+
+
+def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray) -> list[Result]:
+    """Write the table, read it back, and drive the machine through its strut and through its pose corrections."""
+    from ..export.table import commands_by_poses, commands_by_struts, make_table, read_table, write_table
+
+    geometry, model = trial.machine.geometry, trial.machine.model
+    table, left_out = make_table(geometry, model, box, args.step_mm * 1e-3)
+    left_out.append("tilt: the table holds for a level tool; above stands what a tilted one keeps")
+    write_table(table, args.table, _titles(model, box))
+    back = read_table(args.table)
+    by_struts = trial.check(lambda travel: commands_by_struts(back, geometry, travel))
+    by_poses = trial.check(lambda travel: commands_by_poses(back, geometry, travel))
+    lost = model.struts.backlash.max() * 1e6
+    backlash = [f"backlash of struts, up to {lost:.3f} µm: no pose correction fits six directions"] if lost else []
+    return [("table, struts", by_struts, left_out), ("table, poses", by_poses, [*left_out, *backlash])]
+
+
+def _size(size: Size, factor: float = 1e6, unit: str = "µm") -> str:
+    return f"{size.rms * factor:.3f} {unit} RMS, {size.largest * factor:.3f} at most"
+
+
+def _report(
+    args: argparse.Namespace, model: MachineModel, box: np.ndarray, written: list[str], checks: list[Result]
+) -> str:
+    """Return the report for people."""
+    lines = [f"machine {model.machine}, model {model.name}", _box_text(box), f"written: {', '.join(written)}", ""]
+    lines.append(
+        f"tool error of that machine at {args.poses} random poses, forward and backward, before → after "
+        "(files read back, the model taken for the truth):"
+    )
+    for name, check, notes in checks:
+        lines.append(f"  {name}, level tool: {_change(check.level)}")
+        if check.tilted is None:
+            lines.append(f"  {name}, tool tilted by {args.tilt_deg:g}°: no such pose is within the machine's limits")
+        else:
+            lines.append(f"  {name}, tool tilted by {args.tilt_deg:g}°: {_change(check.tilted)}")
+        lines += [f"    not carried: {note}" for note in [*notes, _thermal(check)]]
+    return "\n".join(lines)
+
+
+def _change(found: Comparison) -> str:
+    """Return a comparison as text."""
+    (a, b), (c, d) = [(s.rms * 1e6, s.largest * 1e6) for s in (found.before, found.after)]
+    text = f"{a:.3f} → {c:.3f} µm RMS"
+    if a > 0.0:
+        text += f" ({texts.number(100.0 * abs(1.0 - c / a), 1)} % {'more' if c > a + HARMLESS * 1e6 else 'less'})"
+    turned = f"{found.before_rotation.rms * 1e6:.2f} → {found.after_rotation.rms * 1e6:.2f} µrad RMS"
+    return f"{text}, {b:.3f} → {d:.3f} µm at most, {turned}"
+
+
+def _thermal(check: ExportCheck) -> str:
+    if check.per_kelvin is None:
+        return "thermal growth (the model has none)"
+    return f"thermal growth: 1 K on struts, base and platform moves the tool by {_size(check.per_kelvin)}"
+
+
+def _as_json(
+    args: argparse.Namespace, model: MachineModel, box: np.ndarray, written: list[str], checks: list[Result]
+) -> dict[str, Any]:
+    return {
+        "machine": model.machine,
+        "model": model.name,
+        "box_mm": box * 1e3,
+        "poses": args.poses,
+        "seed": args.seed,
+        "tilt_deg": args.tilt_deg,
+        "written": written,
+        "checks": [
+            {
+                "export": name,
+                "level": _numbers(check.level),
+                "tilted": None if check.tilted is None else _numbers(check.tilted),
+                "field_rms_um": check.field.rms * 1e6,
+                "field_max_um": check.field.largest * 1e6,
+                "per_kelvin_rms_um": None if check.per_kelvin is None else check.per_kelvin.rms * 1e6,
+                "per_kelvin_max_um": None if check.per_kelvin is None else check.per_kelvin.largest * 1e6,
+                "not_carried": notes,
+            }
+            for name, check, notes in checks
+        ],
+    }
+
+
+def _numbers(found: Comparison) -> dict[str, float]:
+    numbers: dict[str, float] = {"passes": found.passes}
+    for name in ("before", "after"):
+        moved, turned = getattr(found, name), getattr(found, f"{name}_rotation")
+        numbers |= {f"{name}_rms_um": moved.rms * 1e6, f"{name}_max_um": moved.largest * 1e6}
+        numbers |= {f"{name}_rms_urad": turned.rms * 1e6, f"{name}_max_urad": turned.largest * 1e6}
+    return numbers

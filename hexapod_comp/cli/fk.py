@@ -1,0 +1,191 @@
+"""``hexapod_comp fk``: tool poses from strut lengths."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from ..formats import texts
+from . import common
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ..formats.csv import Row
+    from ..machine.geometry import HexapodGeometry
+    from ..machine.model import MachineModel
+    from ..pose import Pose
+
+SUMMARY = "tool pose (mm, degrees) for six strut lengths (mm) or a CSV file of them"
+
+TEXT = """A file's columns are L1_mm … L6_mm (or _m, _um, _in), optionally sequence or name; CSV in gives CSV
+out, which ik and check read. With --model the lengths are commands, and the pose is where the real machine
+goes. Newton starts at home, or at --guess; --cold needs no guess: it finds every pose with these lengths
+and picks the one in which the machine can work (6-3 machines).
+
+example:
+  $ hexapod_comp fk --lengths 519.494,519.808,509.192,509.192,499.282,498.955
+  machine paper
+       x_mm      y_mm        z_mm  alpha_deg  beta_deg  gamma_deg
+  -0.000130  0.000034  400.000021   5.000127  0.000074   0.000011
+  $ hexapod_comp ik config/table1.csv | hexapod_comp fk -"""
+
+MODE_COLUMNS = ("mode", "x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg", "")
+
+
+def add_parser(subparsers: common.Subparsers) -> None:
+    """Add the verb."""
+    parser = common.add_verb(subparsers, "fk", run, SUMMARY, TEXT)
+    parser.add_argument("lengths_file", nargs="?", metavar="LENGTHS.csv", help="CSV file; - for standard input")
+    parser.add_argument("--lengths", type=common.lengths_argument, metavar="L1,…,L6", help="six lengths, mm")
+    start = parser.add_mutually_exclusive_group()
+    start.add_argument(
+        "--guess",
+        type=common.pose_argument,
+        metavar="X,Y,Z[,A,B,C]",
+        help=f"{common.POSE_HELP}; default home",
+    )
+    start.add_argument("--cold", action="store_true", help="no guess: pick the working assembly mode")
+    start.add_argument("--all-modes", action="store_true", help="list every assembly mode of the nominal machine")
+    common.add_machine_options(parser)
+    common.add_output_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the verb."""
+    from ..errors import CommandError
+
+    if (args.lengths_file is None) == (args.lengths is None):
+        raise CommandError("usage", "give either a CSV file of lengths or --lengths")
+    if args.all_modes and (args.lengths is None or args.model != "ideal"):
+        raise CommandError("usage", "--all-modes goes with --lengths and the nominal machine only")
+    rows, lengths = _read(args)
+    geometry, model = common.load_machine(args)
+    common.mention_compiling("kinematics.solve_pose_many")
+    if args.all_modes:
+        common.emit(_all_modes(args, geometry, lengths[0]), args.out)
+    else:
+        common.emit(_poses(args, geometry, model, rows, lengths), args.out)
+    return 0
+
+
+def _read(args: argparse.Namespace) -> tuple[list[Row], np.ndarray]:
+    import numpy as np
+
+    from ..formats.csv import Row, read_lengths
+
+    if args.lengths is None:
+        return read_lengths(common.input_file(args.lengths_file))
+    return [Row(0, "1")], np.array([args.lengths])
+
+
+def _poses(
+    args: argparse.Namespace,
+    geometry: HexapodGeometry,
+    model: MachineModel,
+    rows: list[Row],
+    lengths: np.ndarray,
+) -> str:
+    """Solve all rows and return the result as JSON, CSV or, for one set of lengths, as a table."""
+    from ..formats.csv import pose_values
+
+    poses = _solve(args, geometry, model, rows, lengths)
+    table: list[dict[str, Any]] = [
+        {"sequence": row.label, **pose_values(geometry.tool_pose(pose))} for row, pose in zip(rows, poses, strict=True)
+    ]
+    if args.json:
+        return common.json_text({"machine": geometry.name, "model": model.name, "rows": table})
+    if args.lengths is None or args.out:
+        return common.csv_text(table)
+    header = list(table[0])[1:]
+    title = f"machine {geometry.name}" + (f", model {model.name}" if args.model != "ideal" else "")
+    return f"{title}\n{texts.aligned(header, [[texts.number(table[0][name], 6) for name in header]])}\n"
+
+
+def _solve(
+    args: argparse.Namespace,
+    geometry: HexapodGeometry,
+    model: MachineModel,
+    rows: list[Row],
+    lengths: np.ndarray,
+) -> list[Pose]:
+    """Return the platform pose of every row; the first row without one is named."""
+    import numpy as np
+
+    from ..errors import KinematicsError
+    from ..machine.assembly import working_mode
+    from ..machine.kinematics import Structure, solve_pose, solve_poses
+    from ..machine.model import RealMachine
+    from ..pose import Pose
+
+    machine = RealMachine(geometry, model)
+    structure = machine.structure if args.model != "ideal" else Structure.of(geometry)
+    guess = _guess(args, geometry)
+    batch = None if args.cold else solve_poses(structure, lengths, guess)
+    poses = []
+    bar = common.progress_bar(len(rows), " rows")
+    for n, row in enumerate(rows):
+        bar.update()
+        try:
+            if batch is None:
+                pose = working_mode(geometry, structure, lengths[n])
+            elif batch.ok[n]:
+                pose = Pose(batch.positions[n], batch.rotations[n])
+            else:
+                pose = solve_pose(structure, lengths[n], guess)
+            if args.model != "ideal":  # struts and field come on top; directions of motion are not known
+                pose = machine.pose_for(lengths[n], np.zeros(9), pose)[0]
+        except KinematicsError as error:
+            problem = f"{common.where(row)}: {error}" if row.line else str(error)
+            raise KinematicsError(problem, error.value, error.limit) from error
+        poses.append(pose)
+    bar.close()
+    return poses
+
+
+def _guess(args: argparse.Namespace, geometry: HexapodGeometry) -> Pose:
+    from ..pose import Pose
+
+    if args.guess is None:
+        return geometry.home
+    return geometry.platform_pose(Pose.from_angles(*args.guess))
+
+
+def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.ndarray) -> str:
+    """List every assembly mode, and say for each why it is, or is not, the working one."""
+    from ..errors import KinematicsError, UnreachableError
+    from ..formats.csv import pose_values
+    from ..machine.assembly import assembly_modes, mode_objections, working_mode
+    from ..machine.kinematics import Structure
+
+    structure = Structure.of(geometry)
+    modes = assembly_modes(structure, lengths)
+    if not modes:
+        raise UnreachableError("no pose of the machine has these strut lengths", 0)
+    try:
+        working, reason = working_mode(geometry, structure, lengths), ""
+    except KinematicsError as error:
+        working, reason = None, str(error)
+    found: list[dict[str, Any]] = []
+    for index, mode in enumerate(modes, start=1):
+        objections = mode_objections(geometry, structure, mode)
+        is_working = working is not None and _same(mode, working)
+        values = pose_values(geometry.tool_pose(mode))
+        found.append({"mode": index, **values, "working": is_working, "objections": objections})
+    if args.json:
+        return common.json_text({"machine": geometry.name, "modes": found, "no_working_mode": reason})
+    body = [[str(m["mode"]), *(texts.number(m[name], 6) for name in MODE_COLUMNS[1:7]), _verdict(m)] for m in found]
+    lines = [f"machine {geometry.name}: {len(modes)} assembly modes", texts.aligned(MODE_COLUMNS, body)]
+    return "\n".join(lines + [f"no working mode: {reason}"] * bool(reason)) + "\n"
+
+
+def _same(one: Pose, other: Pose) -> bool:
+    import numpy as np
+
+    return np.array_equal(one.position, other.position) and np.array_equal(one.rotation, other.rotation)
+
+
+def _verdict(mode: dict[str, Any]) -> str:
+    if mode["working"]:
+        return "working mode"
+    return "; ".join(mode["objections"]) or "possible, further from home"

@@ -1,0 +1,406 @@
+"""Every limit of a machine checked along poses, before anything moves: all breaches, and what margin is left.
+
+The compensator refuses a command at the first limit that it breaks; here the same quantities are taken for
+all poses, all struts and both stages (nominal and compensated), and nothing stops at the first finding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..errors import GeometryError, HexapodError, LimitError, NotConvergedError, NotFiniteError, OutsideFieldError
+from ..kernels.checks import OUTSIDE, UNSOLVED, examine_many
+from ..kernels.limits import Quantities
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry
+from ..machine.limits import REASONS, STAGES
+from ..machine.model import MachineModel, RealMachine
+from ..machine.motion import MotionState
+from ..machine.trajectory import moves
+
+LIMITS = ("stroke", "base_cone", "platform_cone", "clearance", "condition", "correction", "step", "speed")
+"""Limits that have a margin, in the order in which they are shown."""
+
+OTHER_FINDINGS = ("assembly", "not_converged", "outside_field")
+"""What has no margin: it is so or it is not."""
+
+MODES = ("poses", "moves", "stream")
+"""What the rows of a list are to each other: nothing; targets joined by moves; consecutive commands."""
+
+RATES = (1.0, 10_000.0)
+"""Command rates that make sense, Hz."""
+
+CHUNK = 16_384
+"""Poses examined at a time: bounds the memory of long paths."""
+
+
+@dataclass(frozen=True)
+class Breach:
+    """One limit that one pose, or the move to it, breaks.
+
+    Attributes
+    ----------
+    row : int
+        Index of the pose.
+    share : float
+        How much of the move to it is done there: 1.0 at the pose itself.
+    error : HexapodError
+        What is wrong, in words; a :class:`~hexapod_comp.errors.LimitError` for limits, with value, allowed
+        value, strut and stage.
+    """
+
+    row: int
+    share: float
+    error: HexapodError
+
+    @property
+    def limit(self) -> str:
+        """Name of the limit."""
+        return self.error.reason
+
+
+@dataclass(frozen=True)
+class LimitSummary:
+    """What is left of one limit, pose by pose; SI units.
+
+    Attributes
+    ----------
+    margin, value : ndarray, shape (N, 2)
+        Smallest distance to the limit (negative: broken) and the value there, in the nominal and in the
+        compensated stage; margin ∞ and value NaN where there was nothing to compare.
+    strut : ndarray of int, shape (N, 2)
+        Index of the strut concerned; −1 for the condition number.
+    share : ndarray, shape (N, 2)
+        As in :class:`Breach`.
+    """
+
+    margin: np.ndarray
+    value: np.ndarray
+    strut: np.ndarray
+    share: np.ndarray
+
+    def smallest(self) -> tuple[int, int] | None:
+        """Return (row, stage) of the smallest margin, None when nothing was compared."""
+        index = int(self.margin.argmin())
+        return None if np.isposinf(self.margin.flat[index]) else divmod(index, 2)
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """What :func:`check` found.
+
+    Attributes
+    ----------
+    mode : str
+        One of :data:`MODES`.
+    rate : float
+        Commands per second, Hz.
+    examined : int
+        Poses looked at, those on the way included.
+    limits : dict of str to LimitSummary
+        By the names in :data:`LIMITS`; without ``clearance`` where the machine has no such limit.
+    breaches : list of Breach
+        Every limit broken, in order of rows; per row, limit and strut the worst.
+    lengths : ndarray, shape (N, 2, 6)
+        Strut lengths at the poses themselves, nominal and compensated, m.
+    unchecked_moves : ndarray of bool, shape (N,)
+        The move to this pose was left out, because one of its ends breaks a limit by itself.
+    outside_box : ndarray of bool, shape (N,)
+        The pose lies outside the box for which the model was measured.
+    outside_field : ndarray of bool, shape (N,)
+        There, or on the move to it, the error field's value is held at the boundary of its box.
+    """
+
+    mode: str
+    rate: float
+    examined: int
+    limits: dict[str, LimitSummary]
+    breaches: list[Breach]
+    lengths: np.ndarray
+    unchecked_moves: np.ndarray
+    outside_box: np.ndarray
+    outside_field: np.ndarray
+
+    @property
+    def ok(self) -> bool:
+        """Whether every limit is kept; then every move was checked."""
+        return not self.breaches
+
+
+def check(
+    geometry: HexapodGeometry,
+    model: MachineModel,
+    positions: np.ndarray,
+    rotations: np.ndarray,
+    mode: str = "moves",
+    rate: float = 250.0,
+    progress: Callable[[int], object] = lambda rows: None,
+) -> CheckResult:
+    """Check tool poses against all limits of a machine.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        Nominal machine and limits.
+    model : MachineModel
+        What the compensator would run.
+    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
+        ``pose_tool_in_work``, m.
+    mode : str
+        ``moves``: the poses are targets, joined by :func:`hexapod_comp.machine.trajectory.moves`, and the whole path
+        is checked. ``stream``: they are consecutive commands, checked for step and speed. ``poses``: each is
+        checked by itself, with directions of motion unknown.
+    rate : float
+        Commands per second, Hz.
+    progress : callable, optional
+        Called with the number of rows just done.
+
+    Raises
+    ------
+    GeometryError
+        Rate or mode that makes no sense.
+    ModelError
+        The model belongs to another machine.
+    """
+    if not RATES[0] <= rate <= RATES[1]:
+        raise GeometryError("--rate-hz", f"must lie in {RATES[0]:g}…{RATES[1]:g} Hz", rate)
+    if mode not in MODES:
+        raise GeometryError("mode", f"must be one of {', '.join(MODES)}", mode)
+    run = _Run(geometry, model, len(positions), rate)
+    if mode == "moves":
+        run.check_moves(positions, rotations, progress)
+    else:
+        run.check_rows(positions, rotations, mode == "stream", progress)
+    return run.result(mode, geometry.platform_poses(positions, rotations)[0])
+
+
+@dataclass
+class _Worst:
+    """The worst of one limit so far, per row and stage."""
+
+    margin: np.ndarray
+    value: np.ndarray
+    strut: np.ndarray
+    share: np.ndarray
+    broken: dict[tuple[int, int], tuple[float, float, int, float]] = field(default_factory=dict)
+    """(row, strut) → (margin, value, stage, share)."""
+
+    @staticmethod
+    def empty(count: int) -> _Worst:
+        shape = (count, 2)
+        return _Worst(np.full(shape, np.inf), np.full(shape, np.nan), np.full(shape, -1), np.ones(shape))
+
+    def take(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
+        """Take in margins and values, (n, 2, k), of n poses that belong to the rows `owner`, ascending."""
+        margin = np.where(np.isnan(margin), -np.inf, margin)
+        starts = np.flatnonzero(np.diff(owner, prepend=-1))
+        rows = owner[starts]
+        of_pose = margin.min(axis=2)
+        for stage in range(2):
+            first = np.lexsort((of_pose[:, stage], owner))[starts]  # the worst pose of each row
+            better = of_pose[first, stage] < self.margin[rows, stage]
+            first, into = first[better], rows[better]
+            strut = margin[first, stage].argmin(axis=1)
+            self.margin[into, stage] = of_pose[first, stage]
+            self.value[into, stage] = value[first, stage, strut]
+            self.strut[into, stage] = strut if margin.shape[2] == 6 else -1
+            self.share[into, stage] = share[first]
+        self._take_broken(margin, value, owner, share)
+
+    def _take_broken(self, margin: np.ndarray, value: np.ndarray, owner: np.ndarray, share: np.ndarray) -> None:
+        pose, stage, strut = np.nonzero(margin < 0.0)
+        # The worst of each row and strut first; of equals the nominal stage.
+        order = np.lexsort((stage, margin[pose, stage, strut], strut, owner[pose]))
+        pose, stage, strut = pose[order], stage[order], strut[order]
+        new = np.ones(len(pose), dtype=bool)
+        new[1:] = (np.diff(owner[pose]) != 0) | (np.diff(strut) != 0)
+        for p, s, k in zip(pose[new], stage[new], strut[new], strict=True):
+            key = int(owner[p]), int(k)
+            found = float(margin[p, s, k]), float(value[p, s, k]), int(s), float(share[p])
+            if key not in self.broken or found[0] < self.broken[key][0]:
+                self.broken[key] = found
+
+
+class _Run:
+    """One check under way: the machine, its state along the path, and the worst so far."""
+
+    def __init__(self, geometry: HexapodGeometry, model: MachineModel, count: int, rate: float) -> None:
+        self.geometry, self.rate, self.count = geometry, rate, count
+        self.machine = RealMachine(geometry, model)
+        self.limits = tuple(name for name in LIMITS if name != "clearance" or geometry.limits.clearance)
+        self.worst = {name: _Worst.empty(count) for name in (*self.limits, *OTHER_FINDINGS)}
+        self.lengths = np.full((count, 2, 6), np.nan)
+        self.unchecked = np.zeros(count, dtype=bool)
+        self.outside_field = np.zeros(count, dtype=bool)
+        self.examined = 0
+        self._start()
+
+    def _start(self) -> None:
+        """Forget where the machine comes from."""
+        self.motion = MotionState()
+        self.previous: np.ndarray = np.full((1, 2, 6), np.nan)
+
+    def check_rows(
+        self, positions: np.ndarray, rotations: np.ndarray, stream: bool, progress: Callable[[int], object]
+    ) -> None:
+        """Check the rows themselves, as consecutive commands or each for itself."""
+        for start in range(0, self.count, CHUNK):
+            owner = np.arange(start, min(start + CHUNK, self.count))
+            self.take(positions[owner], rotations[owner], owner, np.ones(len(owner)), stream)
+            progress(len(owner))
+
+    def check_moves(self, positions: np.ndarray, rotations: np.ndarray, progress: Callable[[int], object]) -> None:
+        """Check the rows, then the moves between those that are within their limits."""
+        self.check_rows(positions, rotations, False, lambda rows: None)
+        bad = np.zeros(self.count, dtype=bool)
+        bad[[row for worst in self.worst.values() for row, _ in worst.broken]] = True
+        self.unchecked[1:] = bad[1:] | bad[:-1]
+        legs_at_once = int(np.clip(CHUNK / self.rate, 1, 64))
+        for start in range(0, self.count - 1, legs_at_once):
+            rows = np.arange(start, min(start + legs_at_once, self.count - 1) + 1)
+            good = np.flatnonzero(~self.unchecked[rows[1:]])
+            for legs in np.split(good, np.flatnonzero(np.diff(good) > 1) + 1):
+                if len(legs):
+                    self._take_moves(positions, rotations, rows[legs[0] : legs[-1] + 2])
+            progress(len(rows) - 1)
+
+    def _take_moves(self, positions: np.ndarray, rotations: np.ndarray, rows: np.ndarray) -> None:
+        """Check the moves that join consecutive rows."""
+        if rows[0] == 0 or self.unchecked[rows[0]]:
+            self._start()
+            self.take(positions[rows[:1]], rotations[rows[:1]], rows[:1], np.ones(1), True)
+        path, counts = moves(self.geometry, positions[rows], rotations[rows], self.rate)
+        owner = np.repeat(rows[1:], counts)
+        done = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
+        share = done / np.repeat(counts, counts)
+        for start in range(0, len(owner), CHUNK):
+            part = slice(start, start + CHUNK)
+            self.take(path.positions[part], path.rotations[part], owner[part], share[part], True)
+
+    def take(
+        self,
+        positions: np.ndarray,
+        rotations: np.ndarray,
+        owner: np.ndarray,
+        share: np.ndarray,
+        in_sequence: bool,
+    ) -> None:
+        """Examine tool poses, (n, …), of the rows `owner`; `in_sequence`: after the ones before."""
+        found, flags = self._examine(*self.geometry.platform_poses(positions, rotations), in_sequence)
+        lengths = found.lengths
+        at_rows = share == 1.0
+        self.lengths[owner[at_rows]] = lengths[at_rows]
+        self.examined += len(owner)
+        self.outside_field[owner[flags == OUTSIDE]] = True
+        solved = flags != UNSOLVED
+        with np.errstate(invalid="ignore", over="ignore"):
+            measured = {**self._static(found, solved), **self._other(found.sign[:, :, None], flags)}
+            if in_sequence:
+                changes = np.diff(np.concatenate([self.previous, lengths]), axis=0)
+                measured |= self._changes(changes)
+                self.previous = lengths[-1:].copy()
+        for name, (margin, value) in measured.items():
+            self.worst[name].take(margin, value, owner, share)
+
+    def _examine(
+        self, positions: np.ndarray, rotations: np.ndarray, in_sequence: bool
+    ) -> tuple[Quantities, np.ndarray]:
+        machine, geometry = self.machine, self.geometry
+        found = Quantities.empty(len(positions), 2)
+        flags = np.empty(len(positions), np.int64)
+        examine_many(
+            np.ascontiguousarray(positions),
+            np.ascontiguousarray(rotations),
+            not in_sequence,
+            geometry.kernel_joints[0],
+            geometry.kernel_joints[1],
+            geometry.limit_numbers,
+            machine.thresholds,
+            self.motion.low,
+            self.motion.sense,
+            machine.body,
+            machine.strut_arrays,
+            machine.field_arrays,
+            found,
+            flags,
+        )
+        for quantity in found:
+            quantity[flags == UNSOLVED, 1] = np.nan
+        return found, flags
+
+    def _static(self, found: Quantities, solved: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Return margin and value, (n, 2, k), of the limits of single poses."""
+        limits, correction = self.geometry.limits, np.zeros_like(found.lengths)
+        correction[:, 1] = found.lengths[:, 1] - found.lengths[:, 0]
+        measured = {**limits.margins(found), "correction": (limits.correction - np.abs(correction), correction)}
+        for margin, _ in measured.values():
+            margin[~solved, 1] = np.inf  # said once, as not converged
+        measured["correction"][0][:, 0] = np.inf
+        return measured
+
+    def _changes(self, changes: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Return margin and value, (n, 2, 6), of step and speed from the changes of length, m."""
+        limits = self.geometry.limits
+        measured = {
+            "step": (limits.step - np.abs(changes), changes),
+            "speed": (limits.speed - np.abs(changes) * self.rate, changes * self.rate),
+        }
+        for margin, _ in measured.values():
+            margin[np.isnan(changes)] = np.inf  # nothing to compare with
+        return measured
+
+    def _other(self, sign: np.ndarray, flags: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Return what is so or not as margins of −1 or ∞, with the value that matters."""
+        refusing = self.machine.model.field.outside == "refuse"
+        never = np.zeros(len(flags), dtype=bool)
+        found = {
+            "not_converged": np.stack([never, flags == UNSOLVED], axis=1)[:, :, None],
+            "outside_field": np.stack([never, (flags == OUTSIDE) & refusing], axis=1)[:, :, None],
+            "assembly": (sign != self.geometry.home_sign) & ~np.isnan(sign),
+        }
+        return {name: (np.where(is_so, -1.0, np.inf), sign) for name, is_so in found.items()}
+
+    def result(self, mode: str, platform_positions: np.ndarray) -> CheckResult:
+        """Return what was found."""
+        breaches = [
+            Breach(row, share, self._error(name, strut, stage, value))
+            for name, worst in self.worst.items()
+            for (row, strut), (_, value, stage, share) in worst.broken.items()
+        ]
+        box = self.machine.model.valid_box
+        outside = np.zeros(self.count, dtype=bool)
+        if box is not None:
+            outside = ((platform_positions < box[0]) | (platform_positions > box[1])).any(axis=1)
+        summaries = {name: self.worst[name] for name in self.limits}
+        return CheckResult(
+            mode=mode,
+            rate=self.rate,
+            examined=self.examined,
+            limits={n: LimitSummary(w.margin, w.value, w.strut, w.share) for n, w in summaries.items()},
+            breaches=sorted(breaches, key=lambda breach: breach.row),
+            lengths=self.lengths,
+            unchecked_moves=self.unchecked,
+            outside_box=outside,
+            outside_field=self.outside_field,
+        )
+
+    def _error(self, name: str, strut: int, stage: int, value: float) -> HexapodError:
+        """Return the error that a finding deserves."""
+        if name == "not_converged":
+            return NotConvergedError("the error field is too steep to be undone at this pose")
+        if name == "outside_field":
+            return OutsideFieldError("the measured point is outside the field's box, and the model refuses that")
+        if not np.isfinite(value) and name != "condition":
+            return NotFiniteError(f"{STRUT_NAMES[strut]}: {name} cannot be computed, the pose is degenerate")
+        if name == "speed":
+            limit = self.geometry.limits.speed
+            problem = (
+                f"{STRUT_NAMES[strut]}: the {STAGES[stage]} length would change at "
+                f"{abs(value) * 1e3:.3f} mm/s, "
+                f"allowed {limit * 1e3:g} mm/s"
+            )
+            return LimitError("speed", problem, value, limit, strut, STAGES[stage])
+        without_strut = name in ("condition", "assembly")
+        return self.geometry.limits.error(REASONS.index(name), -1 if without_strut else strut, stage, value)

@@ -1,0 +1,528 @@
+"""From a commanded tool pose to six compensated strut commands, with every limit checked on what is sent.
+
+Data flow of one command: tool pose in the work frame → platform pose in ``base`` → nominal lengths; → model
+run backwards → corrections → ramp → commands → limits on nominal and on compensated values → `Correction`.
+A refused command leaves the compensator exactly as it was.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import HexapodError, ModelError, NotConvergedError, NotFiniteError, OutsideFieldError, PoseError
+from ..kernels import kinematics as kernels
+from ..kernels.compensation import (
+    NO_POSE,
+    OUTSIDE,
+    STATE_SIZE,
+    UNSOLVED,
+    State,
+    compensate_one,
+    compensate_quaternion,
+    estimate_one,
+    state_of,
+)
+from ..kernels.limits import WITHIN
+from ..kernels.pose import POSE_NOT_FINITE, QUATERNION_NORM_TOLERANCE
+from ..machine.geometry import HexapodGeometry
+from ..machine.kinematics import forward_error, strut_lengths
+from ..machine.model import MachineModel, RealMachine, Temperatures
+from ..machine.motion import MotionState
+from ..pose import Pose
+
+DEFAULT_RAMP_RATE = 1e-3
+"""How fast a change of model, temperature or enabling moves a strut, m/s."""
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Everything about one compensated command.
+
+    Attributes
+    ----------
+    tool_pose : Pose
+        Commanded ``pose_tool_in_work``.
+    platform_pose : Pose
+        The same as ``pose_platform_in_base``.
+    model_pose : Pose
+        Pose q with q ∘ E(q) = platform_pose, for which the real structure's lengths were taken.
+    sense : ndarray, shape (9,)
+        Directions of motion used: x, y, z of the measured point, six struts.
+    temperatures : dict of str to float
+        Readings used, °C; parts without one are at 20 °C.
+    nominal : ndarray, shape (6,)
+        Strut lengths of the nominal machine, m.
+    correction : ndarray, shape (6,)
+        command − nominal, m.
+    command : ndarray, shape (6,)
+        What the struts are told, m.
+    predicted_error : ndarray, shape (6,)
+        Displacement (m) and rotation (rad) of the tool along the axes of ``base`` that nominal lengths
+        would leave, to first order in the corrections: J⁻¹ times minus the model's correction.
+    condition : float
+        Condition number of the nominal pose.
+    enabled : bool
+        Compensation was on.
+    ramping : bool
+        A change of model, temperature or enabling has not been fully taken up yet.
+    outside_field : bool
+        The field's value was held at the boundary of its box.
+    outside_box : bool
+        The platform is outside the box for which the model was measured.
+    """
+
+    tool_pose: Pose
+    platform_pose: Pose
+    model_pose: Pose
+    sense: np.ndarray
+    temperatures: dict[str, float]
+    nominal: np.ndarray
+    correction: np.ndarray
+    command: np.ndarray
+    predicted_error: np.ndarray
+    condition: float
+    enabled: bool
+    ramping: bool
+    outside_field: bool
+    outside_box: bool
+
+
+def pack_machine(machine: RealMachine) -> np.ndarray:
+    """Return what :func:`~hexapod_comp.kernels.compensation.machine_views` takes apart."""
+    return _joined(*machine.body, machine.strut_arrays[0], machine.field_arrays[0], machine.thresholds, machine.solver)
+
+
+def pack_nominal(geometry: HexapodGeometry) -> np.ndarray:
+    """Return what :func:`~hexapod_comp.kernels.compensation.nominal_views` takes apart."""
+    tool = geometry.tool.inverse()
+    return _joined(*geometry.kernel_joints, tool.position, tool.rotation, *geometry.limit_numbers)
+
+
+def pack_pose(pose: Pose) -> np.ndarray:
+    """Return position, then rotation matrix by rows, shape (12,)."""
+    return _joined(pose.position, pose.rotation)
+
+
+def _joined(*parts: Any) -> np.ndarray:
+    return np.concatenate([np.ravel(part) for part in parts])
+
+
+class _Command:
+    """One command's state: its vector, and the parts that have names."""
+
+    __slots__ = ("motion", "numbers", "state")
+
+    def __init__(self, ramp_rate: float) -> None:
+        self.numbers = np.full(STATE_SIZE, math.nan)
+        self.state: State = state_of.py_func(self.numbers)
+        self.motion = MotionState(self.state.motion_low, self.state.motion_sense)
+        self.state.ramp[:], self.state.ramp_rate[:] = 0.0, ramp_rate
+        self.state.enabled[:], self.state.changed[:] = 1.0, 0.0
+        self.clear()
+
+    @property
+    def platform(self) -> Pose:
+        """Commanded ``pose_platform_in_base``."""
+        return Pose(self.state.platform_position, self.state.platform_rotation)
+
+    def clear(self) -> None:
+        """Forget lengths and motion; the correction stays, as what the struts stand at."""
+        state = self.state
+        state.motion_low[:], state.motion_sense[:] = math.nan, 0.0
+        state.nominal[:], state.command[:], state.time[:], state.resumes[:] = math.nan, math.nan, math.nan, 0.0
+        self.must_ramp()
+
+    def must_ramp(self) -> None:
+        """Let the next command start from the correction that the struts stand at, if there is one."""
+        self.state.changed[:] = float(not math.isnan(self.state.correction[0]))
+
+
+class Compensator:
+    """Turns commanded tool poses into compensated strut commands for one machine.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        Nominal machine and limits.
+    model : MachineModel
+        What the real machine does differently.
+    ramp_rate : float, optional
+        Largest strut speed at which a change of model, temperatures or enabling is taken up, m/s.
+
+    Raises
+    ------
+    ModelError
+        The model belongs to another machine.
+
+    Notes
+    -----
+    :meth:`step` is the loop's entry: it works on preallocated arrays and returns nothing but what must be
+    sent. :meth:`correct` does the same and gives the full record.
+
+    Attributes
+    ----------
+    on_change : callable
+        Called after each change from outside, with its name and value: ``temperature`` (name, °C), ``model``,
+        ``enable`` (bool), ``reset`` (measured struts or None). Together with the commands these decide all answers.
+    """
+
+    def __init__(self, geometry: HexapodGeometry, model: MachineModel, ramp_rate: float = DEFAULT_RAMP_RATE) -> None:
+        self.geometry = geometry
+        self.temperatures = Temperatures()
+        self.machine = RealMachine(geometry, model)
+        self.condition = math.nan
+        self.outside_field = False
+        self._nominal_numbers = pack_nominal(geometry)
+        self._work = pack_pose(geometry.work)
+        self._last, self._next = _Command(ramp_rate), _Command(ramp_rate)
+        self._take_machine(RealMachine(geometry, model))
+        self._model_pose, self._tool_pose = np.empty(12), np.empty(12)
+        self.on_change: Callable[[str, Any], None] = lambda what, value: None
+        self._forget()
+
+    @property
+    def command(self) -> np.ndarray:
+        """Strut commands last accepted, m; NaN before the first, the measured struts after a reset."""
+        return self._last.state.command
+
+    @property
+    def nominal(self) -> np.ndarray:
+        """Nominal strut lengths of the last command, m; NaN before the first."""
+        return self._last.state.nominal
+
+    @property
+    def correction(self) -> np.ndarray:
+        """Corrections of the last command, m; NaN before the first."""
+        return self._last.state.correction
+
+    @property
+    def motion(self) -> MotionState:
+        """Directions of motion after the last command."""
+        return self._last.motion
+
+    @property
+    def model(self) -> MachineModel:
+        """The model in use."""
+        return self.machine.model
+
+    @property
+    def ramping(self) -> bool:
+        """Whether a change has not been fully taken up yet."""
+        return bool(self._last.state.ramp.any() or self._last.state.changed[0])
+
+    @property
+    def enabled(self) -> bool:
+        """Whether it compensates."""
+        return bool(self._last.state.enabled[0])
+
+    def set_model(self, model: MachineModel) -> None:
+        """Replace the model; the corrections ramp from the old one's to the new one's."""
+        self._renew(model)
+        self.on_change("model", model)
+
+    def _renew(self, model: MachineModel) -> None:
+        """Take a model at the present temperatures."""
+        machine = RealMachine(self.geometry, model, self.temperatures)
+        before, after = self._followed(self.machine), self._followed(machine)
+        if before is not None and after is not None:
+            # The model's lengths jump, the struts do not: without this the jump would count as a motion,
+            # turn directions round, and a backlash would step when they turn back.
+            self.motion.low[:] += after - before
+        self._take_machine(machine)
+        self._last.state.changed[:] = 1.0
+
+    def _followed(self, machine: RealMachine) -> np.ndarray | None:
+        """Return the nine values whose directions are followed, at the last command, under a machine's model.
+
+        None before the first command, and where the model's field cannot be undone: it is refused there.
+        """
+        if not np.isfinite(self.nominal).all():
+            return None
+        platform, motion = self._last.platform, MotionState()
+        motion.copy_from(self.motion)
+        try:
+            _, model_pose, _ = machine.commands_for(platform, motion)
+        except NotConvergedError:
+            return None
+        point = platform.position + platform.rotation @ machine.model.field.probe
+        return np.concatenate([point, strut_lengths(machine.structure, model_pose)])
+
+    def _take_machine(self, machine: RealMachine) -> None:
+        self.machine = machine
+        varied = (*machine.strut_arrays[1:], *machine.field_arrays[1:])
+        self._fixed = (pack_machine(machine), self._nominal_numbers, varied)
+
+    def set_temperature(self, name: str, value: float) -> None:
+        """Take a temperature, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
+
+        A sensor's noise would move the struts: pass its readings through a
+        :class:`~hexapod_comp.compensation.thermal.TemperatureFilter`.
+
+        Raises
+        ------
+        ModelError
+            Unknown name or a value outside the allowed range.
+        """
+        self.temperatures.set(name, value)
+        self._renew(self.model)
+        self.on_change("temperature", (name, self.temperatures.values[name]))
+
+    def enable(self, enabled: bool) -> None:
+        """Switch compensation on or off; the corrections ramp."""
+        if enabled != self.enabled:
+            self._last.state.enabled[:] = float(enabled)
+            self._last.must_ramp()
+            self.on_change("enable", enabled)
+
+    def reset(self, measured: np.ndarray | None = None) -> None:
+        """Forget the last command and all directions of motion.
+
+        What was corrected last is not forgotten, since the struts still stand there: the next command
+        starts from it and ramps.
+
+        Parameters
+        ----------
+        measured : array_like, shape (6,), optional
+            Where the struts are, m. When the next command's nominal lengths lie within the allowed correction
+            of it, that command starts from there and ramps: the struts do not step. Elsewhere it may be at
+            most one allowed step away.
+        """
+        if measured is None:
+            self._forget()
+            self.on_change("reset", None)
+            return
+        measured = np.array(measured, dtype=float)
+        if measured.shape != (6,) or not np.isfinite(measured).all():
+            raise NotFiniteError("measured strut lengths must be six finite numbers, m", measured.tolist())
+        self._forget()
+        self._last.state.command[:], self._last.state.resumes[:] = measured, 1.0
+        self.on_change("reset", measured)
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return what, beside geometry and model, decides the next answer, by name.
+
+        ``temperatures``, °C by name, and each field of :class:`~hexapod_comp.kernels.compensation.State`: a list of
+        numbers, matrices by rows.
+        """
+        numbers = {name: part.ravel().tolist() for name, part in self._last.state._asdict().items()}
+        return {**numbers, "temperatures": dict(self.temperatures.values)}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Take over a :meth:`snapshot` of a compensator with this geometry and model.
+
+        Raises
+        ------
+        ModelError
+            It does not have the names that a snapshot has, or under one of them not as many numbers; or a
+            temperature is not allowed.
+        """
+        parts = self._last.state._asdict()
+        for name in sorted({*parts, "temperatures"} ^ {*snapshot}):
+            problem = "is missing" if name in parts or name == "temperatures" else "is nothing that this release knows"
+            raise ModelError(f"snapshot.{name}", problem)
+        values = {name: np.asarray(snapshot[name], dtype=float) for name in parts}
+        for name, part in parts.items():
+            if values[name].shape != (part.size,):
+                raise ModelError(f"snapshot.{name}", f"must be {part.size} numbers", values[name].size)
+        temperatures = Temperatures(snapshot["temperatures"])
+        self._take_machine(RealMachine(self.geometry, self.model, temperatures))
+        self.temperatures = temperatures
+        for name, part in parts.items():
+            part[...] = values[name].reshape(part.shape)
+
+    def _forget(self) -> None:
+        home = self.geometry.home
+        self._last.clear()
+        self._model_pose[:3], self._model_pose[3:] = home.position, home.rotation.ravel()
+
+    def step(self, numbers: tuple[float, ...], time: float, frame: np.ndarray | None = None) -> np.ndarray:
+        """Compensate one commanded tool pose: the loop's entry.
+
+        Parameters
+        ----------
+        numbers : tuple of seven float
+            Position x, y, z, m, and quaternion x, y, z, w of the tool in `frame`.
+        time : float
+            When the command was made, s: the node gives its stamp in nanoseconds × 1e-9. Only differences
+            matter, for ramps, and of them no more than 20 ms forwards; so the same commands with the same
+            stamps give the same answers bit for bit, and no jump of a clock can step.
+        frame : ndarray, shape (12,), optional
+            Frame of the commanded pose seen from ``base``, packed by
+            :func:`pack_pose`; the geometry's work frame by default.
+
+        Returns
+        -------
+        ndarray, shape (6,)
+            Strut commands, m; this compensator's own array, valid until the next call.
+
+        Raises
+        ------
+        PoseError, LimitError, KinematicsError, OutsideFieldError
+            The command is refused and nothing has changed.
+        """
+        if self._last.state.resumes[0]:
+            return self._resume(lambda: self._run_numbers(numbers, time, frame), numbers)
+        return self._finish(self._run_numbers(numbers, time, frame), numbers)
+
+    def _run_numbers(self, numbers: tuple[float, ...], time: float, frame: np.ndarray | None) -> tuple:
+        """Work out the next command from a message's numbers; what it is worth, :meth:`_finish` says."""
+        frame = self._work if frame is None else frame
+        return compensate_quaternion(*numbers, time, frame, self._fixed, self._last.numbers, self._next.numbers)
+
+    def _resume(self, run: Callable[[], tuple], numbers: tuple[float, ...] = ()) -> np.ndarray:
+        """Take the first command after a reset to measured struts, starting from where they stand.
+
+        What they differ from the command's nominal lengths counts as the correction that they stand at, if it
+        could be one; the first command is then the measured struts, and ramps. A trial run finds the nominal
+        lengths.
+        """
+        last = self._last.state
+        before = last.correction.copy(), last.changed.copy()
+        run()
+        standing = last.command - self._next.state.nominal
+        if (np.abs(standing) <= self.geometry.limits.correction).all():
+            last.correction[:], last.changed[:] = standing, 1.0
+        try:
+            return self._finish(run(), numbers)
+        except HexapodError:
+            last.correction[:], last.changed[:] = before
+            raise
+
+    def _finish(self, found: tuple, numbers: tuple[float, ...] = ()) -> np.ndarray:
+        """Accept the command under way, or raise what was found."""
+        status, finding, strut, stage, value, condition = found
+        if status == NO_POSE:
+            raise _pose_error(finding, numbers)
+        if status == UNSOLVED:
+            raise NotConvergedError("the error field is too steep to be undone at this pose")
+        if status == OUTSIDE and self.model.field.outside == "refuse":
+            raise self._outside_error(self._next)
+        if finding != WITHIN:
+            raise self.geometry.limits.error(finding, strut, stage, value)
+        self._last, self._next = self._next, self._last
+        self.condition, self.outside_field = condition, status == OUTSIDE
+        return self._last.state.command
+
+    def estimate(self, struts: np.ndarray) -> np.ndarray:
+        """Return where the tool is when the struts read `struts`, through the model.
+
+        Parameters
+        ----------
+        struts : ndarray, shape (6,)
+            Encoder readings, or commands, m.
+
+        Returns
+        -------
+        ndarray, shape (12,)
+            ``pose_tool_in_base``: position, m, then the rotation matrix by rows; this compensator's own
+            array, valid until the next call.
+
+        Raises
+        ------
+        KinematicsError
+            There is no such pose; the next estimate starts from the last good one.
+        """
+        tool = self.geometry.tool
+        outcome, condition = estimate_one(
+            struts,
+            self._last.numbers,
+            self._fixed,
+            tool.position,
+            tool.rotation,
+            self._model_pose,
+            self._tool_pose,
+        )
+        if outcome != kernels.OK:
+            raise forward_error(outcome, condition, self.geometry.limits.condition)
+        return self._tool_pose
+
+    @property
+    def platform_estimate(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position (3,) and rotation (3, 3) of the platform in ``base`` by the last estimate, field left out."""
+        return self._model_pose[:3], self._model_pose[3:].reshape((3, 3))
+
+    def _outside_error(self, command: _Command) -> HexapodError:
+        box = self.model.field.box * 1e3
+        platform = command.platform
+        point = (platform.position + platform.rotation @ self.model.field.probe) * 1e3
+        low, high = (", ".join(f"{v:g}" for v in corner) for corner in box)
+        problem = f"the measured point ({point[0]:.3f}, {point[1]:.3f}, {point[2]:.3f}) mm is outside the field's box"
+        return OutsideFieldError(f"{problem} ({low})…({high}) mm", point, box)
+
+    def correct(self, tool_pose: Pose, time: float = 0.0) -> Correction:
+        """Compensate one commanded tool pose and return the full record.
+
+        Parameters
+        ----------
+        tool_pose : Pose
+            ``pose_tool_in_work``.
+        time : float, optional
+            When the command was made, s, for ramps, as in :meth:`step`.
+
+        Raises
+        ------
+        LimitError, KinematicsError, OutsideFieldError
+            The command is refused and nothing has changed.
+        """
+        if self._last.state.resumes[0]:
+            self._resume(lambda: self._run_pose(tool_pose, time))
+        else:
+            self._finish(self._run_pose(tool_pose, time))
+        return self.record(tool_pose)
+
+    def _run_pose(self, tool_pose: Pose, time: float) -> tuple:
+        """Work out the next command from a pose."""
+        pose = tool_pose.position, tool_pose.rotation
+        return compensate_one(*pose, time, self._work, self._fixed, self._last.numbers, self._next.numbers)
+
+    def record(self, tool_pose: Pose) -> Correction:
+        """Return the record of the command just accepted for `tool_pose`."""
+        platform = self._last.platform
+        box = self.model.valid_box
+        outside_box = box is not None and bool((platform.position < box[0]).any() or (platform.position > box[1]).any())
+        return Correction(
+            tool_pose=tool_pose,
+            platform_pose=platform,
+            model_pose=Pose(self._last.state.model_position, self._last.state.model_rotation),
+            sense=self.motion.sense.copy(),
+            temperatures=dict(self.temperatures.values),
+            nominal=self.nominal.copy(),
+            correction=self.correction.copy(),
+            command=self.command.copy(),
+            predicted_error=self.predicted_error(),
+            condition=self.condition,
+            enabled=self.enabled,
+            ramping=self.ramping,
+            outside_field=self.outside_field,
+            outside_box=outside_box,
+        )
+
+    def predicted_error(self) -> np.ndarray:
+        """Return the tool error that nominal lengths would leave at the last command (see `Correction`)."""
+        matrix, twist = np.empty((6, 6)), self._model_correction() * -1.0
+        platform = self._last.platform
+        kernels.jacobian_one(*self.geometry.kernel_joints, platform.position, platform.rotation, matrix)
+        kernels.solve_six(matrix, twist)
+        lever = platform.rotation @ self.geometry.tool.position
+        twist[:3] += np.cross(twist[3:], lever)
+        return twist
+
+    def _model_correction(self) -> np.ndarray:
+        """Return what the model would correct at the last command, ramp and switch left aside."""
+        motion = MotionState()
+        motion.copy_from(self.motion)
+        commands, _, _ = self.machine.commands_for(self._last.platform, motion)
+        return commands - self.nominal
+
+
+def _pose_error(outcome: int, numbers: tuple[float, ...]) -> PoseError:
+    if outcome == POSE_NOT_FINITE:
+        return PoseError("pose must be finite", list(numbers), "not_finite")
+    norm = math.hypot(*numbers[3:])
+    problem = f"quaternion must have norm 1 within {QUATERNION_NORM_TOLERANCE:g}, not {norm:.6g}"
+    return PoseError(problem, list(numbers[3:]), "quaternion")

@@ -1,0 +1,446 @@
+"""The compensator's journal: what the compensator consumed, in its order, written so that it can be replayed.
+
+An answer follows from the commands before it and from what happened to the compensator in between: temperatures,
+models, switching, starts. A page holds all of them in the order in which they were taken, with the answers that were
+given; so a replay need not guess which answer belongs to which command. Pages are numbered: a lost one shows. Every
+:data:`SNAPSHOT_PERIOD` a page closes with a snapshot of everything that decides the next answer. From there a replay
+can go on, so a recording may begin in the middle of a motion.
+
+A page is JSON: people read it with ``ros2 topic echo``, and its numbers come back as the very same floats, as
+Python writes the shortest digits that do. NaN, for which JSON has no word, is null. Commands and answers come a
+thousand times a second: they are the bytes of an array of :data:`ANSWER`, in base64.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import json
+import math
+import platform
+import secrets
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ..errors import HexapodError, InputFileError
+from ..formats.yaml import read_text
+from ..machine.model import MachineModel
+from .compensator import Compensator
+
+FORMAT = 3
+"""Version of pages."""
+
+OLDER = {
+    1: "does not hold what the compensator consumed, in its order",
+    2: "holds the compensator's state as numbers without names, which another release may order differently",
+}
+"""Why older versions cannot be replayed."""
+
+SNAPSHOT_PERIOD = 0.4
+"""Longest time between two snapshots, s: what a lost message costs a replay. A late subscriber is given the ten
+newest pages; at one every 50 ms a snapshot is among them."""
+
+ROLES = ("base", "work")
+"""Frames of commanded poses; an answer names its frame by its place here."""
+
+ANSWER = np.dtype([("stamp", "<i8"), ("frame", "u1"), ("pose", "<f8", 7), ("lengths", "<f8", (2, 6))])
+"""One answered command: the time that the compensator was given, ns; frame; position, m, and quaternion x, y, z, w;
+strut commands and corrections that it answered, m."""
+
+_ASKED = struct.Struct("<qB7d")
+"""The first three fields of an ANSWER: packed so in a fifth of the time."""
+
+REFUSALS_PER_PAGE = 20
+"""A page names no more refused commands than this; it counts the others."""
+
+LARGEST_SOURCE = 250_000
+"""Longer files are named, not copied, characters: the message is made while commands wait."""
+
+CPU_INFO = Path("/proc/cpuinfo")
+
+Loaded = TypeVar("Loaded")
+
+
+class JournalError(HexapodError):
+    """A page that is none: what is wrong in it."""
+
+    reason = "bad_journal"
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file that decides commands: geometry or model.
+
+    Attributes
+    ----------
+    name : str
+        Where it was read from.
+    text : str or None
+        All of it; None where it was too long to be copied. Empty for the ideal model.
+    sha256 : str
+        Of the text as UTF-8, hexadecimal.
+    """
+
+    name: str
+    text: str | None
+    sha256: str
+
+    @classmethod
+    def of(cls, name: str, text: str) -> Source:
+        """Return the source with a text."""
+        return cls(name, text, hashlib.sha256(text.encode()).hexdigest())
+
+
+def load_with_source(path: str | Path, load: Callable[[str | Path], Loaded]) -> tuple[Loaded, Source]:
+    """Load a file and return also the text it was loaded from.
+
+    Raises
+    ------
+    InputFileError
+        As `load`; or the file changes while it is read.
+    """
+    before = read_text(path)
+    loaded = load(path)
+    if read_text(path) != before:
+        raise InputFileError(path, "", "is being written while it is read; try again")
+    return loaded, Source.of(str(path), before)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One change, or one refused command.
+
+    Attributes
+    ----------
+    after : int
+        Commands answered before it since the session began.
+    what : str
+        ``temperature``, ``model``, ``enable``, ``reset`` or ``refused``.
+    values : dict of str to object
+        ``name`` and ``value`` (°C) of a temperature; ``name`` and ``sha256`` of a model; ``on``;
+        ``measured`` (m, or None) of a reset; ``stamp`` (ns), ``reason`` and ``text`` of a refused command.
+    """
+
+    after: int
+    what: str
+    values: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Everything that decides the next answer.
+
+    Attributes
+    ----------
+    state : dict
+        As :meth:`Compensator.snapshot`, arrays in place of lists.
+    model, geometry : dict of str to str
+        ``name`` and ``sha256`` of what was in use.
+    frames : dict of str to str
+        frame_id of poses in the machine's ``base`` and in its ``work`` frame.
+    made_with : dict of str to str
+        Versions that the last bit may depend on.
+    """
+
+    state: dict[str, Any]
+    model: dict[str, str]
+    geometry: dict[str, str]
+    frames: dict[str, str]
+    made_with: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Page:
+    """One message of the journal.
+
+    Attributes
+    ----------
+    session : str
+        Differs from one configuration of a node to the next.
+    number : int
+        Of this page in its session, from 1.
+    begins : int
+        Commands answered before this page since the session began.
+    answers : ndarray of ANSWER
+        Commands answered since the page before, and the answers.
+    entries : tuple of Entry
+        What else happened since then.
+    refused_more : int
+        Refused commands that the page does not name.
+    snapshot : Snapshot or None
+        Taken after all of that.
+    """
+
+    session: str
+    number: int
+    begins: int
+    answers: np.ndarray
+    entries: tuple[Entry, ...]
+    refused_more: int
+    snapshot: Snapshot | None
+
+    def steps(self) -> Iterator[Entry | None]:
+        """Yield what happened, in its order: entries, and None for each answered command."""
+        entries = iter(self.entries)
+        upcoming = next(entries, None)
+        for number in range(len(self.answers) + 1):
+            while upcoming is not None and upcoming.after <= self.begins + number:
+                yield upcoming
+                upcoming = next(entries, None)
+            if number < len(self.answers):
+                yield None
+
+
+class Journal:
+    """Writes the pages of one compensator, whose ``on_change`` it takes.
+
+    Parameters
+    ----------
+    compensator : Compensator
+        Watched from now on.
+    sources : mapping of str to Source
+        ``geometry`` and ``model`` in use; looked up whenever they are named.
+    frames : dict of str to str
+        See :class:`Snapshot`.
+    """
+
+    def __init__(self, compensator: Compensator, sources: Mapping[str, Source], frames: dict[str, str]) -> None:
+        self._compensator, self._sources = compensator, sources
+        self._always = {"frames": frames, "made_with": made_with()}
+        self._places = {frames[role]: place for place, role in enumerate(ROLES)}
+        self._session, self._number, self._count = secrets.token_hex(4), 0, 0
+        self._answers, self._begins = bytearray(), 0
+        self._entries: list[dict[str, Any]] = []
+        self._refused = 0
+        self._last = -math.inf
+        compensator.on_change = self.note
+
+    def answered(self, stamp: int, frame_id: str, numbers: tuple[float, ...]) -> None:
+        """Write down a command just answered: its time, ns, frame, position, m, and quaternion."""
+        self._answers += _ASKED.pack(stamp, self._places[frame_id], *numbers)
+        self._answers += self._compensator.command.tobytes() + self._compensator.correction.tobytes()
+        self._count += 1
+
+    def note(self, what: str, value: Any) -> None:
+        """Write down a change that has just been made."""
+        entry = {"after": self._count, "what": what, **_values(what, value, self._sources)}
+        if self._entries and what == "reset":
+            last = self._entries[-1]
+            # Every refused first command resets anew; only the last reset counts, and a page stays short.
+            if (last["what"], last["after"]) == (what, entry["after"]):
+                self._entries.pop()
+        self._entries.append(entry)
+
+    def refused(self, stamp: int, reason: str, text: str) -> None:
+        """Write down a refused command with its stamp, ns."""
+        self._refused += 1
+        if self._refused <= REFUSALS_PER_PAGE:
+            entry = {"after": self._count, "what": "refused", "stamp": stamp, "reason": reason, "text": text}
+            self._entries.append(entry)
+
+    def due(self, now: float) -> bool:
+        """Return whether a page should be written at the monotonic time `now`, s."""
+        return bool(self._answers or self._entries) or self._snapshot_due(now)
+
+    def _snapshot_due(self, now: float) -> bool:
+        return now - self._last >= SNAPSHOT_PERIOD
+
+    def page(self, now: float) -> str:
+        """Return the next page and begin a new one."""
+        self._number += 1
+        content = {
+            "journal": FORMAT,
+            "session": self._session,
+            "number": self._number,
+            "begins": self._begins,
+            "entries": self._entries,
+            "refused_more": max(0, self._refused - REFUSALS_PER_PAGE),
+            "snapshot": self._snapshot(now) if self._snapshot_due(now) else None,
+        }
+        answers = base64.b64encode(self._answers).decode()
+        self._answers, self._begins = bytearray(), self._count
+        self._entries, self._refused = [], 0
+        # Put in by hand: looking for what must be escaped in so long a string takes longer than all the rest.
+        return f'{json.dumps(content, ensure_ascii=False)[:-1]}, "answers": "{answers}"}}'
+
+    def _snapshot(self, now: float) -> dict[str, Any]:
+        self._last = now
+        return {
+            "state": _nullified(self._compensator.snapshot()),
+            "model": _identity(self._compensator.model, self._sources["model"]),
+            "geometry": {"name": self._compensator.geometry.name, "sha256": self._sources["geometry"].sha256},
+            **self._always,
+        }
+
+
+def _values(what: str, value: Any, sources: Mapping[str, Source]) -> dict[str, Any]:
+    if what == "temperature":
+        return {"name": value[0], "value": value[1]}
+    if what == "model":
+        return _identity(value, sources["model"])
+    if what == "enable":
+        return {"on": bool(value)}
+    if what == "reset":
+        return {"measured": None if value is None else value.tolist()}
+    raise JournalError(f"the journal knows no change called {what!r}")
+
+
+def _identity(model: MachineModel, source: Source) -> dict[str, str]:
+    return {"name": model.name, "sha256": source.sha256}
+
+
+def _nullified(snapshot: dict[str, Any]) -> dict[str, Any]:
+    """Return a snapshot with null for NaN."""
+    return {
+        key: [None if v != v else v for v in value] if isinstance(value, list) else value
+        for key, value in snapshot.items()
+    }
+
+
+def made_with() -> dict[str, str]:
+    """Return the versions and the processor that a result's last bit may depend on."""
+    import numba
+
+    from ..kernels.compiling import cache_folder
+
+    return {
+        "kernels": cache_folder(numba.config.CACHE_DIR).name,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "numba": numba.__version__,
+        "processor": _processor(),
+    }
+
+
+def _processor() -> str:
+    """Return what Linux calls the processor, else its family."""
+    try:
+        text = CPU_INFO.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        text = ""
+    names = [line.partition(":")[2].strip() for line in text.splitlines() if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def sources_text(sources: Mapping[str, Source]) -> str:
+    """Return the message that carries the files in use."""
+    content = {
+        key: {
+            "name": source.name,
+            "sha256": source.sha256,
+            "text": source.text if len(source.text or "") <= LARGEST_SOURCE else None,
+        }
+        for key, source in sources.items()
+    }
+    return json.dumps({"journal": FORMAT, "files": content}, ensure_ascii=False)
+
+
+def read_sources(text: str) -> dict[str, Source]:
+    """Read what :func:`sources_text` has written.
+
+    Raises
+    ------
+    JournalError
+        It is something else, or a text does not have its hash.
+    """
+    sources = {}
+    try:
+        for key, entry in _content(text)["files"].items():
+            text_or_none = None if entry["text"] is None else str(entry["text"])
+            sources[key] = Source(str(entry["name"]), text_or_none, str(entry["sha256"]))
+    except (KeyError, TypeError, AttributeError) as error:
+        raise JournalError(f"not a message with files: {error!r}") from error
+    for key, source in sources.items():
+        if source.text is not None and Source.of("", source.text).sha256 != source.sha256:
+            raise JournalError(f"the {key}'s text does not have the hash that stands beside it")
+    return sources
+
+
+def read_page(text: str) -> Page:
+    """Read what :meth:`Journal.page` has written.
+
+    Raises
+    ------
+    JournalError
+        It is something else, or of another version.
+    """
+    content = _content(text)
+    try:
+        page = Page(
+            session=str(content["session"]),
+            number=int(content["number"]),
+            begins=int(content["begins"]),
+            answers=np.frombuffer(base64.b64decode(content["answers"], validate=True), ANSWER),
+            entries=tuple(_read_entry(entry) for entry in content["entries"]),
+            refused_more=int(content["refused_more"]),
+            snapshot=None if content["snapshot"] is None else _read_snapshot(content["snapshot"]),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, binascii.Error) as error:
+        raise JournalError(f"not a page of the journal: {error!r}") from error
+    places = [page.begins, *(entry.after for entry in page.entries), page.begins + len(page.answers)]
+    if places != sorted(places) or (page.answers["frame"] >= len(ROLES)).any():
+        raise JournalError("its entries and answers are not in an order that a journal can have")
+    return page
+
+
+def _content(text: str) -> dict[str, Any]:
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise JournalError(f"not JSON: {error}") from error
+    found = content.get("journal") if isinstance(content, dict) else content
+    if isinstance(found, int) and found in OLDER:
+        advice = f"this release reads version {FORMAT}. Replay the recording with the release that made it"
+        raise JournalError(f"is of version {int(found)}, which {OLDER[found]}; {advice}")
+    if not isinstance(content, dict) or found != FORMAT:
+        raise JournalError(f"must be of version {FORMAT}, not {str(found)[:40]}")
+    return content
+
+
+def _measured(content: Any) -> list[float] | None:
+    return None if content is None else [float(value) for value in content]
+
+
+ENTRIES: dict[str, dict[str, Callable[[Any], Any]]] = {
+    "temperature": {"name": str, "value": float},
+    "model": {"name": str, "sha256": str},
+    "enable": {"on": bool},
+    "reset": {"measured": _measured},
+    "refused": {"stamp": int, "reason": str, "text": str},
+}
+"""What each kind of entry says, and how it is read."""
+
+
+def _read_entry(content: Any) -> Entry:
+    what = content["what"]
+    return Entry(int(content["after"]), what, {key: read(content[key]) for key, read in ENTRIES[what].items()})
+
+
+def _read_snapshot(content: Any) -> Snapshot:
+    temperatures = {str(key): float(value) for key, value in content["state"]["temperatures"].items()}
+    arrays = {
+        str(name): np.array([math.nan if v is None else float(v) for v in numbers])
+        for name, numbers in content["state"].items()
+        if name != "temperatures"
+    }
+    return Snapshot(
+        state={**arrays, "temperatures": temperatures},
+        model=_words(content["model"], "name", "sha256"),
+        geometry=_words(content["geometry"], "name", "sha256"),
+        frames=_words(content["frames"], *ROLES),
+        made_with=_words(content["made_with"]),
+    )
+
+
+def _words(content: Any, *required: str) -> dict[str, str]:
+    words = {str(key): str(value) for key, value in content.items()}
+    missing = [key for key in required if key not in words]
+    if missing:
+        raise KeyError(missing[0])
+    return words

@@ -1,0 +1,238 @@
+"""A machine model for LinuxCNC without this package at run time: joints for genhexkins, screw tables for motion.
+
+Facts from LinuxCNC's sources, the same at 2.9.0~pre1 (f1270d6ed7, packaged by Debian 12) and at 5c41560ebb:
+
+- ``src/emc/kinematics/genhexkins.c``: a joint is |P + R·a − b| + lead·arcsin(n_b3·n_a2)/2π with
+  n_b3 = unit(u × (n_b × u)), n_a2 = unit(R·n_p × u), R = Rz(C)·Ry(B)·Rx(A), and one lead for all.
+- ``src/emc/motion/motion.h`` and ``command.c``: at most 256 points, increasing; trims and slopes are floats.
+- ``src/emc/motion/control.c``, compute_screw_comp and output_to_hal: motor command = joint command + trim,
+  linear between points of the *joint command*, held beyond the first and the last; BACKLASH is then not used.
+
+So genhexkins with the real joints turns a pose into real lengths, and the table turns a length into the command
+that gives it: the same inverse of the strut's errors that the compensator takes. What stands for LinuxCNC here,
+:class:`Genhexkins`, shares no arithmetic with the model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.interpolate import make_lsq_spline
+
+from ..errors import GeometryError
+from ..kernels.struts import LEAD, TWIST_HOME, command_for_length, screw_twist
+from ..machine.geometry import STRUT_NAMES
+from ..machine.model import RealMachine
+from ..machine.travel import Passes
+from .worth import Travel
+
+MOST_POINTS = 256
+"""EMCMOT_COMP_SIZE."""
+OUTER_POINTS = 12
+"""Most points spent on each end of a stroke that level poses of the box do not need."""
+MARGIN = 0.003
+"""Fine points go this far beyond the lengths needed, m: there the coarse part's misfit has died away."""
+FOLD = np.deg2rad(5.0)
+"""Cardan axes this near to a right angle, rad, are refused together with a screw lead."""
+SAMPLES = 16
+"""Samples of the strut's errors between two points of its table."""
+
+
+@dataclass(frozen=True)
+class ScrewTable:
+    """One joint's compensation table.
+
+    Attributes
+    ----------
+    nominal : ndarray, shape (n,)
+        Joint commands, m, increasing.
+    trims : ndarray, shape (2, n)
+        What is added to the command of a joint that moves up, and of one that moves down, m.
+    """
+
+    nominal: np.ndarray
+    trims: np.ndarray
+
+    def correction(self, joint: np.ndarray, up: np.ndarray) -> np.ndarray:
+        """Return what LinuxCNC adds to joint commands (N,), m, for boolean directions (N,)."""
+        trims = self.trims.astype(np.float32)  # as motion keeps them
+        slopes = np.append((np.diff(trims) / np.diff(self.nominal)).astype(np.float32), np.zeros((2, 1)), axis=1)
+        entry = np.searchsorted(self.nominal, joint, side="right") - 1
+        row, inside = np.where(up, 0, 1), np.maximum(entry, 0)
+        way = np.where(entry < 0, 0.0, joint - self.nominal[inside])
+        return trims[row, inside] + slopes[row, inside] * way
+
+
+@dataclass(frozen=True)
+class Genhexkins:
+    """What LinuxCNC has been told of a machine, in SI.
+
+    Attributes
+    ----------
+    base_joints, platform_joints : ndarray, shape (6, 3)
+        Joints in LinuxCNC's world (our ``work``) and in the moving frame (our ``tool``), m.
+    base_axes, platform_axes : ndarray, shape (6, 3)
+        Unit vectors of the cardan axes in the same frames; zeros without a lead.
+    lead : float
+        Screw lead, m.
+    tables : tuple of six ScrewTable
+        Compensation of the joints.
+    """
+
+    base_joints: np.ndarray
+    platform_joints: np.ndarray
+    base_axes: np.ndarray
+    platform_axes: np.ndarray
+    lead: float
+    tables: tuple[ScrewTable, ...]
+
+    def joints(self, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+        """Return genhexkins' joints, shape (N, 6), m, for poses (N, 3), m, and (N, 3, 3)."""
+        struts = positions[:, None] + np.einsum("nij,kj->nki", rotations, self.platform_joints) - self.base_joints
+        lengths = np.linalg.norm(struts, axis=2)
+        if self.lead == 0.0:
+            return lengths
+        along = struts / lengths[..., None]
+        across = np.cross(along, np.cross(self.base_axes, along))
+        moving = np.cross(np.einsum("nij,kj->nki", rotations, self.platform_axes), along)
+        sine = (across * moving).sum(axis=2) / (np.linalg.norm(across, axis=2) * np.linalg.norm(moving, axis=2))
+        return lengths + self.lead * np.arcsin(sine) / (2.0 * np.pi)
+
+    def commands(self, travel: Travel) -> np.ndarray:
+        """Return the motor commands, shape (N, 6), m, along a travel."""
+        joints = self.joints(travel.positions, travel.rotations)
+        ahead = self.joints(travel.positions + 1e-6 * travel.directions, travel.rotations)
+        corrections = [t.correction(joints[:, i], ahead[:, i] > joints[:, i]) for i, t in enumerate(self.tables)]
+        return joints + np.stack(corrections, axis=1)
+
+
+# Making
+
+
+def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
+    """Put a machine into LinuxCNC's terms.
+
+    Parameters
+    ----------
+    machine : RealMachine
+        At 20 °C.
+    box : ndarray, shape (2, 3)
+        Lowest and highest tool position in ``work``, m, for which the tables shall be fine.
+
+    Raises
+    ------
+    GeometryError
+        The struts' leads differ, or cardan axes come near a right angle: genhexkins cannot have that.
+    """
+    geometry, structure = machine.geometry, machine.structure
+    lead = float(geometry.screw_lead[0])
+    if (geometry.screw_lead != lead).any():
+        problem = "must be the same for all struts: genhexkins has one screw-lead"
+        raise GeometryError("screw.lead", problem, geometry.screw_lead.tolist())
+    base_axes, platform_axes = geometry.kernel_axes
+    # genhexkins' arcsine has the sign of a right-hand thread where the axis vectors point apart (theory, 8).
+    turned = -_side(machine, box)[:, None]
+    work, tool = geometry.work, geometry.tool
+    described = Genhexkins(
+        (structure.base_joints - work.position) @ work.rotation,
+        (structure.platform_joints - tool.position) @ tool.rotation,
+        base_axes @ work.rotation,
+        turned * platform_axes @ tool.rotation,
+        lead,
+        (),
+    )
+    ranges = _joint_ranges(described, box)
+    tables = tuple(_screw_table(machine, i, *ranges[i]) for i in range(6))
+    return replace(described, tables=tables)
+
+
+def _side(machine: RealMachine, box: np.ndarray) -> np.ndarray:
+    """Return +1 for each strut whose axis vectors are less than 90° apart, −1 where they are more, shape (6,).
+
+    Raises
+    ------
+    GeometryError
+        They come near 90°, at home or at level poses in the box: genhexkins' arcsine has a fold there.
+    """
+    geometry = machine.geometry
+    if not geometry.screw_lead.any():
+        return np.ones(6)
+    nodes = _box_nodes(box, 5)
+    level = Passes.of_tool(geometry, nodes, np.tile(np.eye(3), (len(nodes), 1, 1)), np.zeros_like(nodes))
+    cosines = np.empty((len(nodes), 6))
+    for row, pose in enumerate(zip(level.positions, level.rotations, strict=True)):
+        cosines[row] = np.cos([screw_twist(*machine.body, *pose, i) for i in range(6)])
+    side = np.where(np.cos(machine.strut_arrays[0][:, TWIST_HOME]) > 0.0, 1.0, -1.0)
+    nearest = (side * cosines).min(axis=0)
+    if nearest.min() < np.sin(FOLD):
+        strut = int(nearest.argmin())
+        problem = (
+            f"{STRUT_NAMES[strut]}: its cardan axes come within {np.degrees(FOLD):g}° of a right angle, seen along it; "
+            "genhexkins' screw-lead cannot follow its screw's rotation there"
+        )
+        raise GeometryError("screw.lead", problem, float(geometry.screw_lead[strut]))
+    return side
+
+
+def _box_nodes(box: np.ndarray, count: int) -> np.ndarray:
+    """Return count³ positions that fill a box, shape (count³, 3), m."""
+    return np.array(np.meshgrid(*np.linspace(box[0], box[1], count).T)).reshape(3, -1).T
+
+
+def _joint_ranges(described: Genhexkins, box: np.ndarray) -> np.ndarray:
+    """Return the shortest and longest joint command per strut, shape (6, 2), m, for level poses in the box."""
+    nodes = _box_nodes(box, 17)
+    joints = described.joints(nodes, np.tile(np.eye(3), (len(nodes), 1, 1)))
+    return np.stack([joints.min(axis=0), joints.max(axis=0)], axis=1)
+
+
+def _screw_table(machine: RealMachine, strut: int, shortest: float, longest: float) -> ScrewTable:
+    """Return the table of one strut: the best broken line through its errors, finest where they are needed."""
+    points = _points(machine.geometry.limits.stroke[strut], shortest - MARGIN, longest + MARGIN)
+    dense = np.concatenate([np.linspace(a, b, SAMPLES, endpoint=False) for a, b in pairwise(points)])
+    dense = np.append(dense, points[-1])
+    knots = np.concatenate([points[:1], points, points[-1:]])
+    trims = [make_lsq_spline(dense, exact_trims(machine, strut, dense, s), knots, k=1).c for s in (1.0, -1.0)]
+    return ScrewTable(points, np.array(trims))
+
+
+def _points(stroke: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Return increasing joint commands over a stroke, densest between `low` and `high`."""
+    low, high = max(low, stroke[0]), min(high, stroke[1])
+    even = MOST_POINTS / (stroke[1] - stroke[0])
+    below, above = (min(OUTER_POINTS, int(np.ceil(even * rest))) for rest in (low - stroke[0], stroke[1] - high))
+    before = np.linspace(stroke[0], low, below, endpoint=False)
+    inner = np.linspace(low, high, MOST_POINTS - below - above)
+    return np.concatenate([before, inner, np.linspace(high, stroke[1], above + 1)[1:]])
+
+
+def exact_trims(machine: RealMachine, strut: int, joints: np.ndarray, sense: float) -> np.ndarray:
+    """Return motor command minus joint command of a strut, m, at joint commands (n,), m, by the model.
+
+    genhexkins adds what the screw has turned since its axes were in line; the model counts from home. The
+    difference is a constant, and part of the table.
+    """
+    table, knots, pieces = machine.strut_arrays
+    twist = table[strut, TWIST_HOME]
+    since = twist - np.pi * np.round(twist / np.pi)  # what the arcsine makes of it
+    shift = table[strut, LEAD] * since / (2.0 * np.pi)
+    commands = [command_for_length(joint, sense, shift, table, knots, pieces, strut) for joint in joints]
+    return np.array(commands) - joints
+
+
+def table_misfit(machine: RealMachine, told: Genhexkins, box: np.ndarray) -> np.ndarray:
+    """Return RMS and largest difference between table and model, shape (6, 2), m, over the lengths of the box."""
+    misfits = []
+    for strut, (low, high) in enumerate(_joint_ranges(told, box)):
+        joints = np.linspace(low, high, SAMPLES * MOST_POINTS)
+        rest = np.concatenate(
+            [
+                told.tables[strut].correction(joints, np.full(len(joints), sense > 0.0))
+                - exact_trims(machine, strut, joints, sense)
+                for sense in (1.0, -1.0)
+            ]
+        )
+        misfits.append([np.sqrt((rest**2).mean()), np.abs(rest).max()])
+    return np.array(misfits)

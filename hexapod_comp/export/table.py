@@ -1,0 +1,336 @@
+"""A model as a plain table: corrections on a rectangular grid of tool positions, trilinear in between.
+
+For controllers that know no more than a volumetric table. Each row holds one commanded position of a level
+tool and one direction of travel (forward or backward along x, y and z), and gives the same correction in two
+forms: six strut corrections, and the change of the commanded tool pose that the nominal machine would need to
+send the same strut commands. Backlash depends on each strut's own direction, which no direction of the tool
+fixes, so it has columns of its own: half of it is added to the correction of a strut that grows, and half
+taken from that of one that shrinks. A pose correction cannot carry it.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import RegularGridInterpolator
+from scipy.spatial.transform import Rotation
+
+from ..errors import InputFileError, ModelError, OutsideFieldError
+from ..formats.csv import Table
+from ..formats.yaml import write_text_atomically
+from ..machine.geometry import HexapodGeometry
+from ..machine.kinematics import Structure, solve_pose
+from ..machine.model import MachineModel, RealMachine
+from ..machine.model_file import DIRECTIONS
+from ..machine.motion import MotionState
+from ..machine.travel import Passes, at, nominal_commands
+from ..pose import Pose
+from .worth import DIAGONAL, Travel, refuse_unreachable
+
+POSITION = ("x", "y", "z")
+CORRECTION = tuple(f"correction_L{i}" for i in range(1, 7))
+BACKLASH = tuple(f"backlash_L{i}" for i in range(1, 7))
+DISPLACEMENT = ("dx", "dy", "dz")
+ROTATION = ("rx", "ry", "rz")
+
+COLUMNS = (
+    *(f"{name}_mm" for name in POSITION),
+    "direction",
+    *(f"{name}_um" for name in (*CORRECTION, *BACKLASH, *DISPLACEMENT)),
+    *(f"{name}_urad" for name in ROTATION),
+)
+"""Header of the file."""
+
+MOST_ROWS = 200_000
+"""A finer grid is refused: it would not be a table for a controller."""
+
+WAVE_STEPS = 4.0
+"""A screw wave with fewer steps of the grid than this to its period is left out: the grid would see noise."""
+
+EDGE = 0.1e-3
+"""Nodes on the boundary of the field's box count as inside, though errors move the measured point out by µm."""
+
+SAME_NODE = 1e-9
+"""Coordinates of a file that differ by less than this, m, are one node."""
+
+
+@dataclass(frozen=True)
+class GridTable:
+    """Corrections on a grid, forward and backward.
+
+    Parameters
+    ----------
+    nodes : tuple of three ndarray
+        Increasing coordinates of the level tool in ``work``, m.
+    struts : ndarray, shape (2, nx, ny, nz, 6)
+        Strut correction = commanded − nominal strut length, m, forward and backward, backlash left out.
+    backlash : ndarray, shape (2, nx, ny, nz, 6)
+        Lost motion to be made up for on reversal of a strut, m.
+    poses : ndarray, shape (2, nx, ny, nz, 6)
+        Change of the commanded tool pose along the axes of ``work``: displacement, m, rotation vector, rad.
+    """
+
+    nodes: tuple[np.ndarray, np.ndarray, np.ndarray]
+    struts: np.ndarray
+    backlash: np.ndarray
+    poses: np.ndarray
+
+    def strut_corrections(self, positions: np.ndarray, backward: np.ndarray, senses: np.ndarray) -> np.ndarray:
+        """Return strut corrections, shape (N, 6), m.
+
+        Parameters
+        ----------
+        positions : ndarray, shape (N, 3)
+            Commanded tool positions in ``work``, m.
+        backward : ndarray of bool, shape (N,)
+            Direction of the tool.
+        senses : ndarray, shape (N, 6)
+            Direction of each strut, +1 growing, −1 shrinking, 0 unknown.
+
+        Raises
+        ------
+        ModelError
+            A position outside the grid.
+        """
+        lost = self._between(self.backlash, positions, backward)
+        return self._between(self.struts, positions, backward) + 0.5 * senses * lost
+
+    def pose_corrections(self, positions: np.ndarray, backward: np.ndarray) -> np.ndarray:
+        """Return displacement, m, and rotation vector, rad, of the commanded tool pose, shape (N, 6).
+
+        Raises
+        ------
+        ModelError
+            A position outside the grid.
+        """
+        return self._between(self.poses, positions, backward)
+
+    def _between(self, values: np.ndarray, positions: np.ndarray, backward: np.ndarray) -> np.ndarray:
+        """Interpolate trilinearly in the grid of each row's direction."""
+        corners = np.array([[n[0] for n in self.nodes], [n[-1] for n in self.nodes]])
+        outside = ((positions < corners[0]) | (positions > corners[1])).any(axis=1)
+        if outside.any():
+            problem = f"holds positions within {(corners * 1e3).tolist()} mm only"
+            raise ModelError("table", problem, (positions[outside][0] * 1e3).tolist())
+        grids = [RegularGridInterpolator(self.nodes, grid)(positions) for grid in values]
+        return np.where(np.asarray(backward)[:, None], grids[1], grids[0])
+
+
+# Making
+
+
+def make_table(
+    geometry: HexapodGeometry, model: MachineModel, box: np.ndarray, step: float
+) -> tuple[GridTable, list[str]]:
+    """Evaluate a model on a grid.
+
+    Parameters
+    ----------
+    geometry, model : HexapodGeometry, MachineModel
+        The machine, at 20 °C.
+    box : ndarray, shape (2, 3)
+        Lowest and highest tool position in ``work``, m.
+    step : float
+        Largest distance of neighbouring nodes along an axis, m; the cells are equal.
+
+    Returns
+    -------
+    table : GridTable
+    left_out : list of str
+        What of the model is not in it.
+
+    Raises
+    ------
+    ModelError
+        Too many nodes.
+    LimitError
+        A node is out of the machine's reach.
+    OutsideFieldError
+        A node is outside the field's box, and the field refuses that.
+    """
+    rows = 2.0 * float((np.ptp(box, axis=0) / step + 1.0).prod())  # before any node is made
+    if rows > 2.0 * MOST_ROWS:
+        raise ModelError("step", f"gives some {rows:.3g} rows, allowed {MOST_ROWS}; take a larger one, m", step)
+    nodes = tuple(_nodes(low, high, step) for low, high in box.T)
+    shape = tuple(len(n) for n in nodes)
+    if 2 * math.prod(shape) > MOST_ROWS:
+        raise ModelError("step", f"gives {2 * math.prod(shape)} rows, allowed {MOST_ROWS}; take a larger one, m", step)
+    places = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)
+    level = np.tile(np.eye(3), (2 * len(places), 1, 1))
+    travel = Travel(np.tile(places, (2, 1)), level, np.repeat([DIAGONAL, -DIAGONAL], len(places), axis=0))
+    refuse_unreachable(geometry, travel)
+    carried, left_out = _without_fine_waves(model, step)
+    machine = RealMachine(geometry, carried)
+    held = _outside_field(machine, travel)
+    if held:
+        left_out.append(f"{held} of {len(level)} rows are outside the field's box: its boundary value is held")
+    struts, backlash = _strut_corrections(machine, travel)
+    values = (struts, backlash, _pose_corrections(geometry, travel, struts))
+    return GridTable((nodes[0], nodes[1], nodes[2]), *(v.reshape(2, *shape, 6) for v in values)), left_out
+
+
+def _nodes(low: float, high: float, step: float) -> np.ndarray:
+    return np.linspace(low, high, max(1, math.ceil((high - low) / step - 1e-9)) + 1)
+
+
+def _without_fine_waves(model: MachineModel, step: float) -> tuple[MachineModel, list[str]]:
+    """Return the model without the screw waves that a grid cannot follow, and what was left out."""
+    s = model.struts
+    amplitude = np.hypot(s.cosine, s.sine)
+    fine = (amplitude > 0.0) & (s.period < WAVE_STEPS * step)
+    if not fine.any():
+        return model, []
+    smooth = replace(s, cosine=np.where(fine, 0.0, s.cosine), sine=np.where(fine, 0.0, s.sine))
+    text = (
+        f"screw waves of {s.period[fine].min() * 1e3:g} mm period and up to {amplitude.max() * 1e6:.2f} µm are finer "
+        f"than the grid's {step * 1e3:g} mm and left out"
+    )
+    return replace(model, struts=smooth), [text]
+
+
+def _outside_field(machine: RealMachine, travel: Travel) -> int:
+    """Return how many rows have their measured point outside the field's box.
+
+    Raises
+    ------
+    OutsideFieldError
+        There is one, and the field refuses that.
+    """
+    field = machine.model.field
+    low, high = field.box + np.array([[-EDGE], [EDGE]])
+    passes = travel.passes(machine.geometry)
+    points = passes.points(field.probe)
+    outside = ((points < low) | (points > high)).any(axis=1)
+    if outside.any() and field.outside == "refuse":
+        row, corners = int(outside.argmax()), (field.box * 1e3).tolist()
+        problem = f"{at(passes.positions[row])}: the measured point is outside the field's box {corners} mm"
+        raise OutsideFieldError(problem, points[row], field.box)
+    return int(outside.sum())
+
+
+def _strut_corrections(machine: RealMachine, travel: Travel) -> tuple[np.ndarray, np.ndarray]:
+    """Return corrections without backlash, shape (N, 6), and backlash, shape (N, 6), m."""
+    passes = travel.passes(machine.geometry)
+    nominal = nominal_commands(machine.geometry, passes)
+    found = np.empty((3, *nominal.shape))
+    for row in range(len(passes)):
+        target = Pose(passes.positions[row], passes.rotations[row])
+        along = np.sign(passes.directions[row])
+        for k, sense in enumerate((0.0, 1.0, -1.0)):
+            motion = MotionState()
+            motion.sense[:] = np.concatenate([along, np.full(6, sense)])
+            found[k, row] = machine.commands_for(target, motion)[0]
+    return found[0] - nominal, found[1] - found[2]
+
+
+def _pose_corrections(geometry: HexapodGeometry, travel: Travel, corrections: np.ndarray) -> np.ndarray:
+    """Return the changes of the commanded tool pose, shape (N, 6), that amount to strut corrections (N, 6)."""
+    structure = Structure.of(geometry)
+    passes = travel.passes(geometry)
+    lengths = nominal_commands(geometry, passes) + corrections
+    changes = np.empty((len(lengths), 6))
+    for row in range(len(passes)):
+        commanded = Pose(passes.positions[row], passes.rotations[row])
+        told = geometry.tool_pose(solve_pose(structure, lengths[row], commanded))
+        changes[row, :3] = told.position - travel.positions[row]
+        changes[row, 3:] = Rotation.from_matrix(told.rotation @ travel.rotations[row].T).as_rotvec()
+    return changes
+
+
+# Applying
+
+
+def commands_by_struts(table: GridTable, geometry: HexapodGeometry, travel: Travel) -> np.ndarray:
+    """Return strut commands, shape (N, 6), m: nominal lengths plus strut corrections, backlash by each strut."""
+    passes = travel.passes(geometry)
+    own = passes.senses(geometry)[:, 3:]
+    corrections = table.strut_corrections(travel.positions, travel.directions[:, 0] < 0.0, own)
+    return nominal_commands(geometry, passes) + corrections
+
+
+def commands_by_poses(table: GridTable, geometry: HexapodGeometry, travel: Travel) -> np.ndarray:
+    """Return strut commands, shape (N, 6), m: nominal lengths of the corrected tool poses."""
+    changes = table.pose_corrections(travel.positions, travel.directions[:, 0] < 0.0)
+    rotations = Rotation.from_rotvec(changes[:, 3:]).as_matrix() @ travel.rotations
+    told = Passes.of_tool(geometry, travel.positions + changes[:, :3], rotations, travel.directions)
+    return nominal_commands(geometry, told)
+
+
+# Files
+
+
+def write_table(table: GridTable, path: str | Path, titles: Sequence[str]) -> None:
+    """Write a table as CSV, whole or not at all; `titles` become comment lines."""
+    stream = io.StringIO()
+    for title in titles:
+        stream.write(f"# {' '.join(title.split())}\n")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for index in np.ndindex(*table.struts.shape[:4]):
+        way, i, j, k = index
+        x, y, z = (nodes[n] * 1e3 for nodes, n in zip(table.nodes, (i, j, k), strict=True))
+        changes = np.concatenate([table.struts[index], table.backlash[index], table.poses[index]]) * 1e6
+        place = [f"{value + 0.0:.9f}" for value in (x, y, z)]
+        writer.writerow([*place, DIRECTIONS[way], *(f"{value:.6f}" for value in np.round(changes, 6) + 0.0)])
+    write_text_atomically(path, stream.getvalue())
+
+
+def read_table(path: str | Path) -> GridTable:
+    """Read a table; its rows may stand in any order, its lengths and angles in any unit of theirs.
+
+    Raises
+    ------
+    InputFileError
+        Columns missing or unknown, numbers not finite, a direction that is none, positions that are no
+        complete grid, with file and line.
+    """
+    table = Table(path)
+    positions = table.numbers(table.required(POSITION, "length"))
+    struts = table.numbers(table.required(CORRECTION, "length"))
+    backlash = table.numbers(table.required(BACKLASH, "length"))
+    displacements = table.numbers(table.required(DISPLACEMENT, "length"))
+    rotations = table.numbers(table.required(ROTATION, "angle"))
+    ((column, _),) = table.required(("direction",), None)
+    table.refuse_unknown()
+    lines = [line for line, _ in table.rows]
+    ways = [_direction(path, line, row[column].strip()) for line, row in table.rows]
+    nodes, places = zip(*(_grid_axis(values) for values in positions.T), strict=True)
+    for axis, found in zip(POSITION, nodes, strict=True):
+        if len(found) < 2:
+            raise InputFileError(path, "", f"needs at least two positions along {axis}", found.tolist())
+    shape = (2, *(len(n) for n in nodes))
+    where = np.ravel_multi_index((np.array(ways), *places), shape)
+    _refuse_gaps(path, lines, where, math.prod(shape))
+    order = np.argsort(where)
+    grids = (struts, backlash, np.hstack([displacements, rotations]))
+    return GridTable(nodes, *(values[order].reshape(*shape, 6) for values in grids))
+
+
+def _direction(path: str | Path, line: int, text: str) -> int:
+    if text not in DIRECTIONS:
+        raise InputFileError(path, f"line {line}, column direction", f"must be one of {', '.join(DIRECTIONS)}", text)
+    return DIRECTIONS.index(text)
+
+
+def _grid_axis(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the nodes among coordinates (N,), and each coordinate's node."""
+    found = np.unique(values)
+    nodes = found[np.append(True, np.diff(found) > SAME_NODE)]
+    return nodes, np.searchsorted(nodes, values + SAME_NODE, side="right") - 1
+
+
+def _refuse_gaps(path: str | Path, lines: list[int], where: np.ndarray, count: int) -> None:
+    """Raise unless every node of the grid has exactly one row per direction."""
+    values, first, repeats = np.unique(where, return_index=True, return_counts=True)
+    if (repeats > 1).any():
+        again = np.flatnonzero(where == values[repeats > 1][0])[1]
+        raise InputFileError(path, f"line {lines[again]}", "position and direction are given twice")
+    if len(values) != count:
+        problem = f"has {len(values)} rows, its grid needs {count}: every position in both directions"
+        raise InputFileError(path, f"lines {lines[first.min()]}…{lines[-1]}", problem)

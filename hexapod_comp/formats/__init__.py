@@ -1,0 +1,1 @@
+"""How files and reports are read and written, whatever is in them."""

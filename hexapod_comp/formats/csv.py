@@ -1,0 +1,356 @@
+"""CSV files of poses and of strut lengths: units in the column names, errors that name row and column."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from decimal import Decimal
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..errors import InputFileError, PoseError
+from ..kernels.pose import QUATERNION_NORM_TOLERANCE
+from ..pose import Pose, angles_from_rotation, rotation_from_angles
+from .yaml import UNITS
+
+LABEL_COLUMNS = ("sequence", "name")
+POSITION_COLUMNS = ("x", "y", "z")
+ANGLE_COLUMNS = ("alpha", "beta", "gamma")
+QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
+LENGTH_COLUMNS = tuple(f"L{i}" for i in range(1, 7))
+NOMINAL_COLUMNS = tuple(f"nominal_L{i}" for i in range(1, 7))
+CORRECTION_COLUMNS = tuple(f"correction_L{i}" for i in range(1, 7))
+
+MAX_ROWS = 2_000_000
+"""Longer files are refused: an hour's path at 500 Hz fits, a device that never ends does not."""
+
+MAX_COLUMNS = 1000
+"""Wider files are refused: other laboratories' have some dozen columns."""
+
+MAX_LINE = 1_000_000
+"""Longer lines are refused, in characters: a file without line ends would be read into memory whole."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Where a value comes from.
+
+    Attributes
+    ----------
+    line : int
+        Line in the file, the header being line 1.
+    label : str
+        The row's ``sequence`` or ``name``, or its number.
+    """
+
+    line: int
+    label: str
+
+
+class Table:
+    """A CSV file with its header understood.
+
+    Attributes
+    ----------
+    path : str or Path
+        The file.
+    sha256 : str
+        Of the bytes that were read, hexadecimal.
+    header : list of str
+        Column names.
+    rows : list of (int, list of str)
+        Line and cells of each row; all as many as the header's.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = path
+        numbered, self.sha256 = _read_rows(path)
+        self.header = [name.strip() for name in numbered[0][1]] if numbered else []
+        if len(self.header) > MAX_COLUMNS:
+            problem = f"has {len(self.header)} columns, at most {MAX_COLUMNS} are allowed"
+            raise InputFileError(path, "header", problem)
+        twice = [name for name in self.header if self.header.count(name) > 1]
+        if twice:
+            raise InputFileError(path, "header", "column is given twice", twice[0])
+        self.rows = numbered[1:]
+        if not self.rows:
+            raise InputFileError(path, "", "has a header but no rows" if self.header else "has no header")
+        for line, row in self.rows:
+            if len(row) != len(self.header):
+                problem = f"has {len(row)} columns, the header has {len(self.header)}"
+                raise InputFileError(path, f"line {line}", problem)
+        self._known: set[str] = {name for name in LABEL_COLUMNS if name in self.header}
+
+    def column(self, name: str, dimension: str | None) -> tuple[int, float] | None:
+        """Return index and unit of a column, or None when there is none of that name."""
+        wanted = {name: 1.0} if dimension is None else {f"{name}_{u}": s for u, s in UNITS[dimension].items()}
+        found = [key for key in wanted if key in self.header]
+        if len(found) > 1:
+            raise InputFileError(self.path, "header", f"{name} is given twice", found)
+        if not found:
+            return None
+        self._known.add(found[0])
+        return self.header.index(found[0]), wanted[found[0]]
+
+    def columns(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]] | None:
+        """Return all columns of a group, None when the whole group is absent."""
+        found = [self.column(name, dimension) for name in names]
+        if all(entry is None for entry in found):
+            return None
+        for name, entry in zip(names, found, strict=True):
+            if entry is None:
+                raise InputFileError(self.path, "header", f"column {_column_names(name, dimension)} is missing")
+        return [entry for entry in found if entry is not None]
+
+    def required(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]]:
+        """Return all columns of a group that must be there."""
+        found = self.columns(names, dimension)
+        if found is None:
+            raise InputFileError(self.path, "header", f"column {_column_names(names[0], dimension)} is missing")
+        return found
+
+    def refuse_unknown(self) -> None:
+        """Raise on a column that nobody asked for."""
+        for name in self.header:
+            if name not in self._known:
+                raise InputFileError(self.path, "header", "is not a known column", name)
+
+    def numbers(self, columns: list[tuple[int, float]]) -> np.ndarray:
+        """Return the finite numbers of some columns in SI, shape (rows, columns)."""
+        values = np.empty((len(self.rows), len(columns)))
+        for n, (line, row) in enumerate(self.rows):
+            for k, (index, unit) in enumerate(columns):
+                values[n, k] = si_from_text(row[index], self.number(line, index, row[index]), unit)
+        return values
+
+    def texts(self, name: str) -> list[str]:
+        """Return the cells of a column that must be there, without spaces around them."""
+        index = self.required((name,), None)[0][0]
+        return [row[index].strip() for _, row in self.rows]
+
+    def poses(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the poses of the columns that :func:`read_poses` describes, shapes (N, 3), (N, 3, 3)."""
+        columns = self.required(POSITION_COLUMNS, "length")
+        angle_columns = self.columns(ANGLE_COLUMNS, "angle")
+        quaternion_columns = self.columns(QUATERNION_COLUMNS, None)
+        if angle_columns and quaternion_columns:
+            raise InputFileError(self.path, "header", "give either angles or a quaternion, not both")
+        positions = self.numbers(columns)
+        if quaternion_columns:
+            quaternions = self.numbers(quaternion_columns)
+            return positions, _rotations_from_quaternions(self.path, self.labels(), quaternions)
+        angles = self.numbers(angle_columns) if angle_columns else np.zeros((len(self.rows), 3))
+        return positions, self.rotations(angles)
+
+    def rotations(self, angles: np.ndarray) -> np.ndarray:
+        """Return the rotation matrices (N, 3, 3) of the rows' angles (N, 3), rad."""
+        try:
+            return rotation_from_angles(angles)
+        except PoseError as error:
+            row = int(np.abs(angles).max(axis=1).argmax())
+            raise InputFileError(self.path, f"line {self.rows[row][0]}", str(error)) from error
+
+    def number(self, line: int, index: int, text: str) -> float:
+        """Return the finite number in a cell."""
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value) or "_" in text or not text.isascii():  # Python reads 1_0 and １０ as ten
+            where = f"line {line}, column {self.header[index]}"
+            raise InputFileError(self.path, where, "must be a finite number", text)
+        return value
+
+    def labels(self) -> list[Row]:
+        """Return line and label of every row."""
+        columns = [self.header.index(name) for name in LABEL_COLUMNS if name in self.header]
+        return [
+            Row(line, row[columns[0]].strip() if columns else str(n + 1)) for n, (line, row) in enumerate(self.rows)
+        ]
+
+
+class _Hashed(io.RawIOBase):
+    """The bytes of a file, hashed as they pass: what was read is what is named, also from a pipe."""
+
+    def __init__(self, file: io.FileIO) -> None:
+        self._file = file
+        self.sha256 = hashlib.sha256()
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        count = self._file.readinto(buffer) or 0
+        self.sha256.update(memoryview(buffer)[:count])
+        return count
+
+
+def _read_rows(path: str | Path) -> tuple[list[tuple[int, list[str]]], str]:
+    """Return the rows of a CSV file that are neither empty nor comments, with their lines, and its SHA-256."""
+    numbered: list[tuple[int, list[str]]] = []
+    try:
+        with open(path, "rb", buffering=0) as file:
+            source = _Hashed(file)
+            stream = io.TextIOWrapper(io.BufferedReader(source), newline="", encoding="utf-8-sig")
+            lines = csv.reader(_bounded_lines(path, stream), skipinitialspace=True)
+            for row in lines:
+                if row and not row[0].startswith("#"):
+                    numbered.append((lines.line_num, row))
+                if len(numbered) > MAX_ROWS:
+                    raise InputFileError(path, "", f"has more than the allowed {MAX_ROWS} rows")
+    except csv.Error as error:
+        raise InputFileError(path, f"line {lines.line_num}", f"is not CSV: {error}") from error
+    except OSError as error:
+        raise InputFileError(path, "", f"cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InputFileError(path, f"line {len(numbered) + 1} or later", "is not UTF-8 text") from error
+    return numbered, source.sha256.hexdigest()
+
+
+def _bounded_lines(path: str | Path, stream: io.TextIOWrapper) -> Iterator[str]:
+    """Yield the lines of a stream; refuse one too long, and the zero bytes that spreadsheets never write."""
+    for number, line in enumerate(iter(partial(stream.readline, MAX_LINE + 1), ""), start=1):
+        if len(line) > MAX_LINE:
+            raise InputFileError(path, f"line {number}", f"is longer than the allowed {MAX_LINE} characters")
+        if "\0" in line:
+            raise InputFileError(path, f"line {number}", "is not text: it holds a zero byte")
+        yield line
+
+
+SHIFTS = {10.0**digits: digits for digits in range(-9, 10)}
+"""Digits by which a unit of such a size moves the decimal point."""
+
+
+def si_from_text(text: str, number: float, unit: float) -> float:
+    """Return a number in SI: where the unit moves the decimal point only, the float that is nearest to the text.
+
+    So 203.2 mm is the very 0.2032 of source code, and what was written with all its digits comes back.
+
+    Parameters
+    ----------
+    text : str
+        As it stands in the file.
+    number : float
+        What it is, finite.
+    unit : float
+        Size of its unit in SI.
+    """
+    digits = SHIFTS.get(unit)
+    if digits is None:
+        return unit * number
+    if digits == 0:
+        return number
+    return float(exact(text, number).scaleb(digits)) if "e" in text.lower() else float(f"{text.strip()}e{digits}")
+
+
+def exact(text: str, number: float) -> Decimal:
+    """Return a number that stands in a file as a decimal, without rounding it first."""
+    return Decimal(repr(number)) if "e" in text.lower() else Decimal(text)
+
+
+def _column_names(name: str, dimension: str | None) -> str:
+    if dimension is None:
+        return name
+    return " or ".join(f"{name}_{unit}" for unit in UNITS[dimension])
+
+
+def read_poses(path: str | Path) -> tuple[list[Row], list[Pose]]:
+    """Read poses from a CSV file.
+
+    Columns: ``x_mm``, ``y_mm``, ``z_mm`` (or ``_m``, ``_um``, ``_in``); optionally ``alpha_deg``,
+    ``beta_deg``, ``gamma_deg`` (the paper's angles; or ``_rad``, …) or ``qx``, ``qy``, ``qz``, ``qw``;
+    optionally ``sequence`` or ``name``. Lines that start with ``#`` are skipped.
+
+    Returns
+    -------
+    rows : list of Row
+        Where each pose stands.
+    poses : list of Pose
+        m and rotation matrices.
+
+    Raises
+    ------
+    InputFileError
+        Naming file, line and column.
+    """
+    rows, positions, rotations = read_pose_arrays(path)
+    return rows, [Pose(p, r) for p, r in zip(positions, rotations, strict=True)]
+
+
+def read_pose_arrays(path: str | Path) -> tuple[list[Row], np.ndarray, np.ndarray]:
+    """Read poses as :func:`read_poses` does, for files of many thousand rows.
+
+    Returns
+    -------
+    rows : list of Row
+        Where each pose stands.
+    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
+        m and rotation matrices.
+
+    Raises
+    ------
+    InputFileError
+        Naming file, line and column.
+    """
+    table = Table(path)
+    positions, rotations = table.poses()
+    table.refuse_unknown()
+    return table.labels(), positions, rotations
+
+
+def _rotations_from_quaternions(path: str | Path, rows: list[Row], quaternions: np.ndarray) -> np.ndarray:
+    """Return rotation matrices, (N, 3, 3); refuse the first row that is no unit quaternion."""
+    wrong = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > QUATERNION_NORM_TOLERANCE
+    if wrong.any():
+        row = int(wrong.argmax())
+        try:
+            Pose.from_quaternion(np.zeros(3), quaternions[row])
+        except PoseError as error:
+            raise InputFileError(path, f"line {rows[row].line}, columns qx…qw", str(error)) from error
+    return Rotation.from_quat(quaternions).as_matrix()
+
+
+def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
+    """Read strut lengths from a CSV file with the columns ``L1_mm`` … ``L6_mm`` (or ``_m``, …).
+
+    The columns ``nominal_L…`` and ``correction_L…`` that ``ik --model`` adds are known and passed over.
+
+    Returns
+    -------
+    rows : list of Row
+        Where each set stands.
+    lengths : ndarray, shape (N, 6)
+        m.
+
+    Raises
+    ------
+    InputFileError
+        Naming file, line and column.
+    """
+    table = Table(path)
+    lengths = table.numbers(table.required(LENGTH_COLUMNS, "length"))
+    for group in (NOMINAL_COLUMNS, CORRECTION_COLUMNS):
+        table.columns(group, "length")
+    table.refuse_unknown()
+    return table.labels(), lengths
+
+
+def pose_values(pose: Pose) -> dict[str, float]:
+    """Return a pose as the columns that :func:`read_poses` reads: mm and degrees."""
+    x, y, z = pose.position * 1e3
+    alpha, beta, gamma = np.degrees(angles_from_rotation(pose.rotation))
+    names = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
+    return {name: float(value) for name, value in zip(names, (x, y, z, alpha, beta, gamma), strict=True)}
+
+
+def length_values(lengths: np.ndarray) -> dict[str, float]:
+    """Return six lengths as the columns that :func:`read_lengths` reads, mm."""
+    return {f"{name}_mm": float(value) * 1e3 for name, value in zip(LENGTH_COLUMNS, lengths, strict=True)}

@@ -1,0 +1,120 @@
+"""Where the shipped configuration files are, in a source tree as in an installation."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from functools import cache
+from pathlib import Path
+
+from ..errors import InputFileError
+
+PACKAGE = "hexapod_comp"
+
+
+def config_file(name: str | os.PathLike[str]) -> Path:
+    """Find a configuration file: the user's own where `name` is a path to one, else a shipped one.
+
+    Parameters
+    ----------
+    name : str or path
+        Path of a file (``~`` is understood), or the name of a shipped file relative to its folder,
+        with or without ``.yaml``: ``paper``, ``paper.yaml``.
+
+    Returns
+    -------
+    Path
+        An existing file.
+
+    Raises
+    ------
+    InputFileError
+        There is no such file; the message lists the shipped names.
+    """
+    own = os.path.expanduser(name)
+    if os.path.isfile(own):
+        return Path(own)
+    shipped = shipped_names()
+    for candidate in (os.fspath(name), f"{os.fspath(name)}.yaml"):
+        if candidate in shipped:
+            return config_folder() / candidate
+    raise InputFileError(os.fspath(name) or "''", "", _not_found(os.fspath(name), shipped))
+
+
+def confined_file(name: str | os.PathLike[str], folder: Path | None) -> Path:
+    """Find a configuration file as :func:`config_file` does, but only in one folder or among the shipped ones.
+
+    Parameters
+    ----------
+    name : str or path
+        Path of a file, also relative to `folder`, or the name of a shipped one.
+    folder : Path or None
+        Folder, with all below it, from which files may be read; None: only shipped ones.
+
+    Returns
+    -------
+    Path
+        An existing regular file, without links: what is replaced later cannot lead elsewhere.
+
+    Raises
+    ------
+    InputFileError
+        There is no such file, it is not a regular one, or it lies elsewhere, be it by ``..`` or a link.
+    """
+    own = os.path.expanduser(os.fspath(name))
+    if own and folder is not None and os.path.exists(folder / own):
+        own = os.path.join(folder, own)
+    if os.path.exists(own) and not os.path.isfile(own):
+        raise InputFileError(own, "", "is not a regular file")
+    path = config_file(own).resolve()
+    folders = [place.resolve() for place in (folder, config_folder()) if place is not None]
+    if not any(path.is_relative_to(place) for place in folders):
+        places = " and ".join(str(place) for place in folders)
+        problem = f"leads to {path}, but files are only read from {places}; see model_folder"
+        raise InputFileError(os.fspath(name), "", problem)
+    return path
+
+
+def folder_of(name: str | os.PathLike[str]) -> Path | None:
+    """Return the folder of a file given by its path, without links; None for the name of a shipped one."""
+    own = os.path.expanduser(name)
+    if os.path.dirname(own) or os.path.isfile(own):
+        return Path(os.path.dirname(own) or ".").resolve()
+    return None
+
+
+def shipped_names() -> list[str]:
+    """Return the names of all shipped configuration files, relative to their folder, sorted."""
+    folder = config_folder()
+    files = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+    return sorted(path.as_posix() for path in files if not path.name.startswith("."))
+
+
+@cache
+def config_folder() -> Path:
+    """Return the folder of the shipped configuration files.
+
+    It is sought from this file upwards, so it always belongs to the code that runs: ``config`` beside
+    the package in a source tree (also with an editable or symlinked installation), else
+    ``share/hexapod_comp/config`` in the prefix into which pip or colcon installed both.
+
+    Raises
+    ------
+    InputFileError
+        The installation has lost its files.
+    """
+    package = Path(__file__).resolve().parents[1]
+    if (package.parent / "package.xml").is_file():
+        return package.parent / "config"
+    for prefix in package.parents:
+        folder = prefix / "share" / PACKAGE / "config"
+        if folder.is_dir():
+            return folder
+    raise InputFileError(package, "", f"no share/{PACKAGE}/config in any folder above it; install it anew")
+
+
+def _not_found(name: str, shipped: list[str]) -> str:
+    """Say that `name` is neither a file nor shipped, and what is."""
+    near = difflib.get_close_matches(name, shipped, 1)
+    hint = f"; did you mean {near[0]}?" if near else ""
+    return f"there is no such file, and the shipped ones are {', '.join(shipped)}{hint}"

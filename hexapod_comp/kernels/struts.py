@@ -1,0 +1,111 @@
+"""Compiled: what a strut makes of its command, and the command that gives it a length."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .compiling import compiled
+from .kinematics import strut_vector
+
+OFFSET, PITCH, REFERENCE, COSINE, SINE, WAVENUMBER, BACKLASH, LEAD, TWIST_HOME, GROWTH = range(10)
+"""Columns of the table of strut parameters that the kernels read."""
+
+
+PARAMETERS = 10
+
+
+@compiled
+def screw_twist(base, platform, base_axes, platform_axes, position, rotation, i):
+    """Return the angle about strut `i` from the base's cardan axis to the platform's, rad.
+
+    Both axes are seen along the strut, i.e. projected perpendicular to it. Where the angle stays within
+    ±90°, its sine is the one in LinuxCNC's genhexkins.
+    """
+    sx, sy, sz = strut_vector(base, platform, position, rotation, i)
+    length = math.sqrt(sx * sx + sy * sy + sz * sz)
+    ux, uy, uz = sx / length, sy / length, sz / length
+    bx, by, bz = base_axes[i, 0], base_axes[i, 1], base_axes[i, 2]
+    ax, ay, az = platform_axes[i, 0], platform_axes[i, 1], platform_axes[i, 2]
+    px = rotation[0, 0] * ax + rotation[0, 1] * ay + rotation[0, 2] * az
+    py = rotation[1, 0] * ax + rotation[1, 1] * ay + rotation[1, 2] * az
+    pz = rotation[2, 0] * ax + rotation[2, 1] * ay + rotation[2, 2] * az
+    sine = bx * (py * uz - pz * uy) + by * (pz * ux - px * uz) + bz * (px * uy - py * ux)
+    cosine = bx * px + by * py + bz * pz - (bx * ux + by * uy + bz * uz) * (px * ux + py * uy + pz * uz)
+    return math.atan2(sine, cosine)
+
+
+@compiled
+def screw_shift(base, platform, base_axes, platform_axes, position, rotation, table, i):
+    """Return −l·θ/2π: how much longer the command of strut `i` must be for its screw's rotation, m.
+
+    A platform that turns by θ about the strut turns the screw in its nut. A right-hand screw then advances
+    by l·θ/2π by itself, wherever its nut sits, and the command must be shorter by as much.
+    """
+    lead = table[i, LEAD]
+    if lead == 0.0:
+        return 0.0
+    twist = screw_twist(base, platform, base_axes, platform_axes, position, rotation, i)
+    turns = (twist - table[i, TWIST_HOME]) / (2.0 * math.pi)
+    return -lead * (turns - math.floor(turns + 0.5))
+
+
+@compiled
+def smooth_error(command, table, knots, pieces, i):
+    """Return (error, slope) of the part that depends on the command alone: offset, pitch, waves, map."""
+    k = table[i, WAVENUMBER]
+    error = table[i, OFFSET] + table[i, PITCH] * (command - table[i, REFERENCE])
+    slope = table[i, PITCH]
+    if table[i, COSINE] != 0.0 or table[i, SINE] != 0.0:
+        c, s = math.cos(k * command), math.sin(k * command)
+        error += table[i, COSINE] * c + table[i, SINE] * s
+        slope += k * (table[i, SINE] * c - table[i, COSINE] * s)
+    last = knots.shape[0] - 1
+    if last > 0:
+        held = min(knots[last], max(knots[0], command))
+        piece = min(np.searchsorted(knots, held, side="right") - 1, last - 1)
+        x = held - knots[piece]
+        a, b, c3, d = pieces[i, piece, 0], pieces[i, piece, 1], pieces[i, piece, 2], pieces[i, piece, 3]
+        error += ((a * x + b) * x + c3) * x + d
+        if held == command:
+            slope += (3.0 * a * x + 2.0 * b) * x + c3
+    return error, slope
+
+
+@compiled
+def actual_length(command, sense, shift, table, knots, pieces, i):
+    """Return the real length of strut `i` for a command, m; `sense` is its direction of motion, −1…1."""
+    error, _ = smooth_error(command, table, knots, pieces, i)
+    return (1.0 + table[i, GROWTH]) * (command + error - 0.5 * sense * table[i, BACKLASH] - shift)
+
+
+@compiled
+def command_for_length(length, sense, shift, table, knots, pieces, i):
+    """Return the command that gives strut `i` a real length, m: the inverse of :func:`actual_length`."""
+    wanted = length / (1.0 + table[i, GROWTH]) + 0.5 * sense * table[i, BACKLASH] + shift
+    command = wanted
+    for _ in range(8):
+        error, slope = smooth_error(command, table, knots, pieces, i)
+        step = (wanted - command - error) / (1.0 + slope)
+        command += step
+        if abs(step) < 1e-9:  # Newton squares it: the rest is below rounding
+            break
+    return command
+
+
+@compiled
+def write_lengths(lengths, period, position, velocity):
+    """Write six lengths and their speeds in place."""
+    for i in range(6):
+        velocity[i] = (lengths[i] - position[i]) / period if period > 0.0 else 0.0
+        position[i] = lengths[i]
+
+
+@compiled
+def within(values, others, limit):
+    """Return whether six values differ from six others by no more than a limit."""
+    worst = 0.0
+    for i in range(6):
+        worst = max(worst, abs(values[i] - others[i]))
+    return worst <= limit

@@ -1,0 +1,1 @@
+"""A hexapod in LinuxCNC: the bridge to the compensator, and the machine behind the simulated drives."""

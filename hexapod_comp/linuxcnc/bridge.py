@@ -1,0 +1,381 @@
+"""The LinuxCNC bridge: a HAL component on one side, a ROS node on the other.
+
+LinuxCNC's commanded axes go out as ``tool_pose_command``, its measured struts as ``strut_states``; the
+compensator's ``strut_corrections`` come back, pass a :class:`~hexapod_comp.linuxcnc.guard.CorrectionGuard`, and
+stand on pins that LinuxCNC adds to its strut commands. Load it from a HAL file with
+``loadusr -Wn hexapod_comp linuxcnc_bridge``; the README lists pins and parameters.
+
+The component lives as long as the process and beats as long as its loop runs; activating and deactivating the
+node only decides whether it takes part, so that deactivating ramps the corrections out like any other loss.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from rclpy.task import Future
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from ..errors import CommandError
+from ..nodes.command_source import CommandSource
+from ..nodes.health import ERROR, OK, WARN, Flow, Refusals, seconds
+from ..nodes.messages import StrutMessage, StrutReader
+from ..nodes.parameters import ParameterError, declare
+from ..nodes.running import keep_discovery_local, run
+from ..nodes.runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, STATE_QOS, MachineNode
+from ..nodes.stamps import nanoseconds_of, stamp_of
+from .guard import ON_LOSS, CorrectionGuard, GuardStatus
+from .hal import COUNTS, METRES, HalComponent, pose_from_axes
+from .parameters import AXES, CORRECTIONS, COUNTERS, FEEDBACK, FLAGS, PARAMETERS, PINS, PROGRAM, SWITCHES
+
+CHECK_PERIOD = 0.05
+"""How often the node looks whether its state has changed, s."""
+
+NEVER = 1e9
+"""What the pin ``age`` shows before the first correction, s."""
+
+STANDING = 2e-3
+"""Struts slower than this stand, m/s: no drive lags behind by more than some micrometres then."""
+
+RESET_AFTER = 0.15
+"""A compensator that has been lost for so long is asked to start anew, s: it has forgotten its feedback by then."""
+
+RESET_PERIOD = 0.5
+"""The compensator is asked to start anew no more often than this, s."""
+
+COMPLAINT_COUNTS_FOR = 1.2
+"""The compensator's last diagnostics tell how it is for so long, s: it sends some every second."""
+
+LARGEST_PIN = 1e6
+"""No axis stands beyond this, in LinuxCNC's units or degrees; and nothing made of such numbers overflows."""
+
+LONGEST_FAREWELL = 1.0
+"""Corrections that can be ramped out within this time are, before the process ends, s."""
+
+STATUS_TEXTS = {
+    GuardStatus.OFF: (OK, "off"),
+    GuardStatus.RAMPING: (OK, "running, corrections are ramping in"),
+    GuardStatus.COMPENSATING: (OK, "running"),
+    GuardStatus.HOLDING: (ERROR, "compensator lost, corrections hold"),
+    GuardStatus.RETURNING: (OK, "off, corrections are ramping out"),
+    GuardStatus.WAITING: (WARN, "waiting for the first correction"),
+}
+
+
+class LinuxcncBridgeNode(MachineNode):
+    """Lifecycle node around a HAL component and a :class:`CorrectionGuard`.
+
+    Parameters
+    ----------
+    hal : module, optional
+        LinuxCNC's module ``hal``; found where LinuxCNC is installed.
+    **options
+        Those of ``rclpy`` nodes.
+
+    Raises
+    ------
+    HalError, ParameterError
+        No LinuxCNC, or a parameter's value is not allowed.
+    """
+
+    def __init__(self, hal: Any = None, **options: Any) -> None:
+        super().__init__("linuxcnc_bridge", **options)
+        self._options = declare(self, PARAMETERS)
+        self.wants_autostart = self._options["autostart"]
+        self._metres = METRES[self._choice("units", tuple(METRES))]
+        self._choice("on_loss", ON_LOSS)
+        self._guard = CorrectionGuard(*(self._options[name] for name in ("limit", "ramp_rate", "timeout", "on_loss")))
+        self._refusals, self._bad_pins = Refusals(), Refusals()
+        self._cycles, self._sent, self._states, self._heard = Flow(), Flow(), Flow(), Flow()
+        # Half a cycle less, since cycles come a little early or late.
+        self._states_period = 1.0 / self._options["states_rate"] - 0.5 / self._options["rate"]
+        self._reader = StrutReader()
+        self._machine_on = self._enabled = self._beat = False
+        self._streaming_since = math.inf
+        self._asked_at = self._moved_at = self._complained_at = -math.inf
+        self._compensator = f"{self.get_namespace()}/compensator:".lstrip("/")
+        self._resets, self._latency, self._last_text = 0, 0.0, ""
+        self._question: Future | None = None
+        self._talks = False
+        self._hal: HalComponent | None = HalComponent(self._options["component"], PINS, hal)
+        self._open_pins(self._hal)
+        self._make_messages()
+        self._hal.ready()
+        self._loop = self.every(1.0 / self._options["rate"], self._cycle)
+
+    def _choice(self, name: str, allowed: Sequence[str]) -> str:
+        value = self._options[name]
+        if value not in allowed:
+            raise ParameterError(f"parameter {name}: must be {' or '.join(allowed)}, not {value!r}")
+        return value
+
+    def _open_pins(self, hal: HalComponent) -> None:
+        self._read_axes, self._read_feedback = hal.reader(*AXES), hal.reader(*FEEDBACK)
+        self._read_switches = hal.reader(*SWITCHES)
+        self._write_corrections = hal.writer(*CORRECTIONS)
+        self._write_state = hal.writer("status", "age", "largest", *FLAGS, *COUNTERS)
+        self._write_state((GuardStatus.OFF, NEVER, 0.0, False, False, 0, 0, 0))
+
+    def _make_messages(self) -> None:
+        self._pose_out, self._states_out = PoseStamped(), StrutMessage()
+        self._pose_out.header.frame_id = self._options["frame_id"]
+        self._states_out.write(np.zeros(6))
+
+    # ---- lifecycle ----
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Open topics."""
+        self._pose_pub = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS)
+        self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
+        self.open_diagnostics(self._options["component"])
+        self._talks = True
+        self._subscription = self.obey(JointState, "strut_corrections", self._on_correction, self._look_at_publishers)
+        topic, count = self._subscription.topic_name, self._subscription.get_publisher_count
+        self._source = CommandSource(self, topic, count, self._options["allow_several_publishers"])
+        self._complaints = self.listen_to(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
+        self._reset_client = self.create_client(Trigger, "compensator/reset")
+        self._check = self.every(CHECK_PERIOD, self._check_state)
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Start to take part."""
+        self._active = True
+        self.get_logger().info("ready")
+        return super().on_activate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close topics; the HAL component stays."""
+        self._active = self._talks = False
+        self.destroy_timer(self._check)
+        self.destroy_client(self._reset_client)
+        for subscription in (self._subscription, self._complaints):
+            self.destroy_subscription(subscription)
+        for publisher in (self._pose_pub, self._states_pub, self._diagnostics_pub):
+            self.destroy_publisher(publisher)
+        return super().on_cleanup(state)
+
+    def say_goodbye(self) -> None:
+        """Ramp the corrections out if that is quick, and publish a last status."""
+        self._active = False
+        period, end = 1.0 / self._options["rate"], time.monotonic() + LONGEST_FAREWELL
+        if max(map(abs, self._guard.output)) > self._options["ramp_rate"] * LONGEST_FAREWELL:
+            self.get_logger().warning("corrections stay as they are: ramping them out would take too long")
+            end = 0.0
+        while any(self._guard.output) and time.monotonic() < end:
+            self._cycle()
+            time.sleep(period)
+        if self._talks:
+            self._check_state()
+            self._diagnostics_pub.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+
+    def destroy_node(self) -> None:
+        """Leave HAL and ROS."""
+        if self._hal is not None:
+            self._hal.exit()
+            self._hal = None
+        super().destroy_node()
+
+    # ---- the loop ----
+
+    def _cycle(self) -> None:
+        now = time.monotonic()
+        self._machine_on, self._enabled = self._read_switches()
+        if self._active and self._machine_on:
+            self._send(now)
+            self._ask_for_reset(now)
+        output = self._guard.update(now, self._active and self._machine_on and self._enabled)
+        self._cycles.tick(now)
+        self._write_corrections([value / self._metres for value in output])
+        self._write_state(self._state_numbers(now, output))
+
+    def _state_numbers(self, now: float, output: list[float]) -> tuple[float, ...]:
+        guard = self._guard
+        self._beat = not self._beat
+        rejected = sum(self._refusals.counts.values())
+        return (
+            guard.status,
+            min(guard.age(now), NEVER),
+            max(map(abs, output)) / self._metres,
+            guard.status is GuardStatus.COMPENSATING,
+            self._beat,
+            guard.accepted % COUNTS,
+            rejected % COUNTS,
+            self._resets % COUNTS,
+        )
+
+    def _send(self, now: float) -> None:
+        """Publish measured struts and commanded pose, each only if all its pins are usable."""
+        stamp = stamp_of(time.time_ns())
+        if self._states.age(now) >= self._states_period:
+            feedback = self._read_feedback()
+            if self._usable(FEEDBACK, feedback, now):
+                self._send_states(feedback, stamp, now)
+        axes = self._read_axes()
+        if self._usable(AXES, axes, now):
+            if self._sent.age(now) > self._options["timeout"]:
+                self._streaming_since = now
+            self._write_pose(axes)
+            self._pose_out.header.stamp = stamp
+            self._pose_pub.publish(self._pose_out)
+            self._sent.tick(now)
+
+    def _send_states(self, feedback: Sequence[float], stamp: Time, now: float) -> None:
+        """Publish measured struts; while no corrections come, only when they stand.
+
+        A compensator starts from the measured struts, and takes their way to its commands for a correction to be
+        ramped out. Moving struts lag: one that starts while they move is better left without them.
+        """
+        out, since = self._states_out, self._states.age(now)
+        self._states.tick(now)
+        followed = since < self._options["timeout"]
+        out.write(np.array(feedback) * self._metres, since if followed else 0.0)
+        if not followed or max(map(abs, out.velocity.tolist())) > STANDING:
+            self._moved_at = now
+        if self._silent(now) and now - self._moved_at < self._options["timeout"]:
+            return
+        out.message.header.stamp = stamp
+        self._states_pub.publish(out.message)
+
+    def _silent(self, now: float) -> bool:
+        """Return whether the compensator has not been heard of late."""
+        return self._heard.age(now) > self._options["timeout"]
+
+    def _write_pose(self, axes: Sequence[float]) -> None:
+        p, q = self._pose_out.pose.position, self._pose_out.pose.orientation
+        x, y, z, q.x, q.y, q.z, q.w = pose_from_axes(*axes)
+        p.x, p.y, p.z = x * self._metres, y * self._metres, z * self._metres
+
+    def _usable(self, names: Sequence[str], values: Sequence[float], now: float) -> bool:
+        bad = {name: value for name, value in zip(names, values, strict=True) if not abs(value) <= LARGEST_PIN}
+        if not bad:
+            return True
+        which, said = ", ".join(bad), ", ".join(f"{name} = {value}" for name, value in bad.items())
+        text = f"pins that are no numbers within ±{LARGEST_PIN:g}: {said}"
+        self._bad_pins.add(which, text, now)
+        self.warn_of(which, text)
+        return False
+
+    def _look_at_publishers(self) -> None:
+        self._source.look(time.monotonic())
+
+    def _on_correction(self, message: JointState, number: int | None) -> None:
+        now = time.monotonic()
+        self._heard.tick(now)
+        self._source.hear(number, now)
+        try:
+            if self._source.problem:
+                raise CommandError(self._source.reason, self._source.problem)
+            self._check_stamp(message.header.stamp)
+            self._reader.read(message)
+            self._guard.offer(self._reader.lengths.tolist(), now)
+        except CommandError as error:
+            self._refusals.add(error.reason, str(error), now)
+            self.warn_of(error.reason, f"correction refused ({error.reason}): {error}")
+
+    def _check_stamp(self, stamp: Time) -> None:
+        """Refuse a correction of a command that is long past: its stamp is ours, and comes from this clock."""
+        age = (time.time_ns() - nanoseconds_of(stamp)) * 1e-9
+        if not abs(age) <= self._options["timeout"]:
+            raise CommandError("stamp", f"it answers a command of {age:.3f} s ago, or somebody else's")
+        self._latency = age
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.level == ERROR and status.name.startswith(self._compensator):
+                self._complained_at = time.monotonic()
+
+    def _ask_for_reset(self, now: float) -> None:
+        """Let a compensator that refuses every command start anew, as one does when the machine moved on unheard.
+
+        Only one that complains is asked: requests to one that is stopped get lost, and DDS then keeps back those
+        that follow for seconds.
+        """
+        waited = min(now - self._streaming_since, self._heard.age(now))
+        if waited < self._options["timeout"] + RESET_AFTER or now - self._asked_at < RESET_PERIOD:
+            return
+        if self._complained_at < self._heard.last or now - self._complained_at > COMPLAINT_COUNTS_FOR:
+            return
+        self._asked_at = now
+        if not self._reset_client.service_is_ready():
+            return
+        if self._question is not None:
+            self._reset_client.remove_pending_request(self._question)
+        self._question = self._reset_client.call_async(Trigger.Request())
+        self._resets += 1
+        self.warn_of("reset", "the compensator refuses every command; asked it to start anew")
+
+    # ---- state ----
+
+    def _state(self, now: float) -> tuple[bytes, str]:
+        """Return level and message of the diagnostics."""
+        status = self._guard.status
+        if not self._active:
+            return WARN, "not active"
+        if self._bad_pins.recent(now):
+            return ERROR, f"unusable pins: {self._bad_pins.last_reason}"
+        if self._refusals.recent(now):
+            return ERROR, f"refusing corrections: {self._refusals.last_reason}"
+        if not self._machine_on:
+            return OK, "machine off"
+        if self._enabled and self._guard.accepted and status is GuardStatus.WAITING:
+            return ERROR, "compensator lost, corrections are zero"
+        if self._enabled and status is GuardStatus.RETURNING:
+            return ERROR, "compensator lost, corrections are ramping out"
+        return STATUS_TEXTS[status]
+
+    def _check_state(self) -> None:
+        if not self._talks:
+            return
+        now = time.monotonic()
+        self._source.look(now)
+        level, text = self._state(now)
+        if text != self._last_text:
+            self._last_text = text
+            self._say(level, text)
+        self.tell(level, text, lambda: self._values(now))
+
+    def _say(self, level: bytes, text: str) -> None:
+        if level != OK:
+            self.warn_of(text, text)
+        elif self._throttle.passes(text) is not None:
+            self.get_logger().info(text)
+
+    def _values(self, now: float) -> dict[str, str]:
+        guard = self._guard
+        return {
+            "status": guard.status.name.lower(),
+            "machine_on": str(self._machine_on).lower(),
+            "enabled": str(self._enabled).lower(),
+            "cycle_rate_hz": f"{self._cycles.rate(now):.1f}",
+            "command_rate_hz": f"{self._sent.rate(now):.1f}",
+            "correction_rate_hz": f"{self._heard.rate(now):.1f}",
+            "correction_age_s": seconds(guard.age(now)),
+            "latency_s": f"{self._latency:.6f}",
+            "largest_correction_m": f"{max(map(abs, guard.output)):.9f}",
+            "accepted": str(guard.accepted),
+            "resets": str(self._resets),
+            "compensated_by": ", ".join(self._source.names),
+            "last_refusal": self._refusals.last_text,
+            "last_bad_pins": self._bad_pins.last_text,
+            **self._refusals.values(),
+        }
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node; the entry of the executable ``linuxcnc_bridge``."""
+    keep_discovery_local()
+    return run(LinuxcncBridgeNode, PROGRAM, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

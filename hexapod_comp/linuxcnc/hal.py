@@ -1,0 +1,230 @@
+"""Components of LinuxCNC's hardware abstraction layer (HAL) in this package's Python, whichever that is.
+
+Debian's LinuxCNC brings a module ``hal`` for Debian's Python 3. It loads into any CPython of the same version;
+where that is an environment of its own, the module is found in Debian's folder without letting the other
+packages there (an old NumPy) in.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from ..errors import HexapodError
+
+DEBIAN_PACKAGES = Path("/usr/lib/python3/dist-packages")
+"""Where Debian's LinuxCNC puts its Python modules."""
+
+METRES = {"mm": 1e-3, "inch": 0.0254}
+"""LinuxCNC's length units, m."""
+
+COUNTS = 2**32
+"""A u32 pin goes on from zero after this many."""
+
+
+class HalError(HexapodError):
+    """LinuxCNC's HAL is not there, or does not take what is asked of it."""
+
+    reason = "hal"
+
+
+def load_module(name: str = "hal") -> ModuleType:
+    """Import one of LinuxCNC's Python modules.
+
+    Parameters
+    ----------
+    name : str
+        ``hal`` or ``linuxcnc``.
+
+    Raises
+    ------
+    HalError
+        LinuxCNC is not installed, or its module is for another version of Python; names both.
+    """
+    with _own_signals():
+        return _import(name)
+
+
+@contextmanager
+def _own_signals() -> Iterator[None]:
+    """Keep this process's handling of SIGTERM: importing ``hal`` makes it a KeyboardInterrupt, anywhere."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+
+
+def _import(name: str) -> ModuleType:
+    with suppress(ImportError):
+        return importlib.import_module(name)
+    folder = str(DEBIAN_PACKAGES)
+    # At the end, and only for now: in front of the environment's own folders it would replace NumPy.
+    sys.path.append(folder)
+    importlib.invalidate_caches()
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise HalError(_absence(name)) from error
+    finally:
+        sys.path.remove(folder)
+
+
+def _absence(name: str) -> str:
+    """Return why a module cannot be imported, and what helps."""
+    here = f"CPython {sys.version_info.major}.{sys.version_info.minor}"
+    built = sorted(
+        file.name.split(".")[1]
+        for pattern in (f"_{name}.*.so", f"{name}.*.so")
+        for file in DEBIAN_PACKAGES.glob(pattern)
+    )
+    if not built:
+        return (
+            f"LinuxCNC's Python module {name!r} is neither on this Python's path nor in {DEBIAN_PACKAGES}: "
+            "install LinuxCNC (Debian: apt install linuxcnc-uspace), or set PYTHONPATH to its lib/python"
+        )
+    return f"LinuxCNC's Python module {name!r} in {DEBIAN_PACKAGES} is built for {', '.join(built)}, this is {here}"
+
+
+@dataclass(frozen=True)
+class Pin:
+    """One pin of a component.
+
+    Parameters
+    ----------
+    name : str
+        Name within the component.
+    kind : str
+        ``float``, ``bit``, ``s32`` or ``u32``.
+    direction : str
+        ``in`` or ``out``.
+    """
+
+    name: str
+    kind: str
+    direction: str
+
+
+def pins(direction: str, kind: str, *names: str) -> tuple[Pin, ...]:
+    """Return pins of one direction and kind."""
+    return tuple(Pin(name, kind, direction) for name in names)
+
+
+class HalComponent:
+    """A userspace HAL component; its pins exist from the start, :meth:`ready` lets ``loadusr -W`` go on.
+
+    Parameters
+    ----------
+    name : str
+        Of the component; pins are ``name.pin``.
+    wanted : iterable of Pin
+        Its pins.
+    hal : module, optional
+        LinuxCNC's ``hal``; :func:`load_module` finds it.
+
+    Raises
+    ------
+    HalError
+        There is no HAL, or it refuses the component, e.g. because one of that name exists.
+    """
+
+    def __init__(self, name: str, wanted: Iterable[Pin], hal: Any = None) -> None:
+        hal = load_module() if hal is None else hal
+        self.name = name
+        self._error = hal.error
+        try:
+            self._component = hal.component(name)
+            self._pins = {pin.name: self._add(hal, pin) for pin in wanted}
+        except (hal.error, ValueError, RuntimeError) as error:
+            raise HalError(f"HAL refuses the component {name!r}: {error}") from error
+
+    def _add(self, hal: Any, pin: Pin) -> Any:
+        return self._component.newpin(
+            pin.name, getattr(hal, f"HAL_{pin.kind.upper()}"), getattr(hal, f"HAL_{pin.direction.upper()}")
+        )
+
+    def reader(self, *names: str) -> Callable[[], list[Any]]:
+        """Return a fast function that reads some pins."""
+        gets = [self._pins[name].get for name in names]
+        return lambda: [get() for get in gets]
+
+    def writer(self, *names: str) -> Callable[[Sequence[Any]], None]:
+        """Return a fast function that writes some pins; counters must be below :data:`COUNTS`."""
+        sets = [self._pins[name].set for name in names]
+
+        def write(values: Sequence[Any]) -> None:
+            for put, value in zip(sets, values, strict=True):
+                put(value)
+
+        return write
+
+    def ready(self) -> None:
+        """Tell LinuxCNC that the component works."""
+        self._component.ready()
+
+    def exit(self) -> None:
+        """Leave the HAL; the pins are gone, signals keep their last values."""
+        self._component.exit()
+
+
+def quaternion_from_axes(a: float, b: float, c: float) -> tuple[float, float, float, float]:
+    """Return the unit quaternion (x, y, z, w) of LinuxCNC's rotary axes: R = Rz(C)·Ry(B)·Rx(A) (genhexkins).
+
+    Parameters
+    ----------
+    a, b, c : float
+        Roll, pitch, yaw, degrees.
+    """
+    cr, sr = _half(a)
+    cp, sp = _half(b)
+    cy, sy = _half(c)
+    return (
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    )
+
+
+def pose_from_axes(
+    x: float, y: float, z: float, a: float, b: float, c: float, tool_offset: float = 0.0
+) -> tuple[float, float, float, float, float, float, float]:
+    """Return position and unit quaternion (x, y, z, w) of the platform that LinuxCNC's genhexkins commands.
+
+    Parameters
+    ----------
+    x, y, z : float
+        Commanded axes; the position is in their unit.
+    a, b, c : float
+        Roll, pitch, yaw, degrees.
+    tool_offset : float
+        Its tool length T, in the same unit. The axes tell where the point (0, 0, −T) of the platform is, shifted by
+        T so that a level platform has the same axes with any tool: the platform is at axes − T·ẑ + R·T·ẑ.
+    """
+    i, j, k, w = quaternion_from_axes(a, b, c)
+    return (
+        x + tool_offset * 2.0 * (i * k + w * j),
+        y + tool_offset * 2.0 * (j * k - w * i),
+        z - tool_offset * 2.0 * (i * i + j * j),
+        i,
+        j,
+        k,
+        w,
+    )
+
+
+def _half(degrees: float) -> tuple[float, float]:
+    half = math.radians(0.5 * degrees)
+    return math.cos(half), math.sin(half)

@@ -1,0 +1,215 @@
+"""The real machine behind LinuxCNC's simulated drives, as HAL pins: where the tool is, and how far off.
+
+A HAL component without ROS, for people who watch a simulation with halscope, halshow or AXIS. It takes the
+drives' strut lengths, runs them forwards through a hidden truth, and compares with LinuxCNC's commanded axes.
+Load it from a HAL file with ``loadusr -Wn hexapod_machine linuxcnc_machine --truth mine.yaml``.
+
+A moving tool trails its command by what motion's interpolator and the drives take, 3 ms in the shipped configuration:
+15 µm at 5 mm/s. That is in the error, too, until the tool rests.
+
+LinuxCNC's frames (genhexkins): with no tool length, XYZ and R = Rz(C)·Ry(B)·Rx(A) are the pose of the geometry
+file's tool frame in its work frame. A tool length T puts the tip T further along the tool's −z and moves the
+origin of LinuxCNC's axes up by T, so that a level tool does not move when a length comes into force.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..errors import HexapodError, KinematicsError
+from ..formats.paths import config_file
+from ..kernels.drives import follow_point
+from ..kernels.motion import follow
+from ..machine.geometry import HexapodGeometry, load_geometry
+from ..machine.model import MachineModel, RealMachine
+from ..machine.model_file import load_model
+from ..machine.motion import MotionState
+from ..pose import Pose
+from .hal import METRES, HalComponent, pins
+
+AXES = ("x", "y", "z", "a", "b", "c")
+STRUTS = tuple(f"strut.{n}" for n in range(6))
+TRUE = tuple(f"true-{axis}" for axis in AXES)
+ERRORS = ("error", "error-x", "error-y", "error-z")
+
+PINS = (
+    *pins("in", "float", *STRUTS, *AXES, "tool-offset"),
+    *pins("out", "float", *TRUE, *ERRORS),
+    *pins("out", "bit", "valid"),
+)
+
+
+def pose_from_axes(position: np.ndarray, degrees: np.ndarray) -> Pose:
+    """Return the pose that LinuxCNC's axes stand for: R = Rz(C)·Ry(B)·Rx(A).
+
+    Parameters
+    ----------
+    position : ndarray, shape (3,)
+        X, Y, Z, m.
+    degrees : ndarray, shape (3,)
+        A, B, C.
+    """
+    return Pose(position, Rotation.from_euler("xyz", degrees, degrees=True).as_matrix())
+
+
+class WatchedMachine:
+    """A machine whose struts are told, and whose tool is seen.
+
+    Parameters
+    ----------
+    machine : RealMachine
+        The truth.
+    """
+
+    def __init__(self, machine: RealMachine) -> None:
+        self.machine = machine
+        geometry = machine.geometry
+        self._motion = MotionState()
+        self._guess = geometry.home
+        self._tool_in_platform, self._base_in_work = geometry.tool, geometry.work.inverse()
+        self._work, self._platform_in_tool = geometry.work, geometry.tool.inverse()
+
+    def look(self, struts: np.ndarray, command: Pose, tool_length: float = 0.0) -> tuple[Pose, np.ndarray]:
+        """Return where the tool is, as LinuxCNC's axes would put it, and its tip's error.
+
+        Parameters
+        ----------
+        struts : ndarray, shape (6,)
+            Lengths that the drives have gone to, m.
+        command : Pose
+            LinuxCNC's commanded axes, m.
+        tool_length : float
+            In force in LinuxCNC, m.
+
+        Returns
+        -------
+        true : Pose
+            Comparable with `command`.
+        error : ndarray, shape (3,)
+            True minus commanded tip, along the axes of ``work``, m.
+
+        Raises
+        ------
+        KinematicsError
+            The machine has no pose for these lengths.
+        """
+        up = np.array([0.0, 0.0, tool_length])
+        commanded = Pose(command.position - up + command.rotation @ up, command.rotation)
+        self._follow(struts, self._work @ commanded @ self._platform_in_tool)
+        platform, self._guess = self.machine.pose_for(struts, self._motion.sense, self._guess)
+        tool = self._base_in_work @ platform @ self._tool_in_platform
+        true = Pose(tool.position - tool.rotation @ up + up, tool.rotation)
+        return true, true.position - command.position
+
+    def _follow(self, struts: np.ndarray, platform: Pose) -> None:
+        """Update the directions of motion that the truth's backlash and field depend on."""
+        probe, (axis_threshold, strut_threshold) = self.machine.model.field.probe, self.machine.thresholds
+        low, sense = self._motion.low, self._motion.sense
+        follow_point(platform.position, platform.rotation, probe, axis_threshold, low, sense)
+        for i, length in enumerate(struts):
+            follow(length, strut_threshold, low, sense, 3 + i)
+
+
+class MachineComponent:
+    """The HAL side: pins in, a :class:`WatchedMachine`, pins out.
+
+    Parameters
+    ----------
+    machine : RealMachine
+        The truth.
+    units : str
+        LinuxCNC's length unit, ``mm`` or ``inch``.
+    name : str
+        Name of the component.
+    hal : module, optional
+        LinuxCNC's ``hal``.
+
+    Raises
+    ------
+    HalError
+        There is no HAL, or it refuses the component.
+    """
+
+    def __init__(self, machine: RealMachine, units: str = "mm", name: str = "hexapod_machine", hal: Any = None):
+        self._watched, self._metres = WatchedMachine(machine), METRES[units]
+        self.component = HalComponent(name, PINS, hal)
+        self._read_struts, self._read_axes = self.component.reader(*STRUTS), self.component.reader(*AXES)
+        self._read_tool = self.component.reader("tool-offset")
+        self._write_true, self._write_errors = self.component.writer(*TRUE), self.component.writer(*ERRORS)
+        self._write_valid = self.component.writer("valid")
+
+    def cycle(self) -> None:
+        """Read, look, write; lengths without a pose, as before homing, only take ``valid`` away."""
+        axes = np.array(self._read_axes())
+        struts = np.array(self._read_struts()) * self._metres
+        command = pose_from_axes(axes[:3] * self._metres, axes[3:])
+        try:
+            true, error = self._watched.look(struts, command, self._read_tool()[0] * self._metres)
+        except KinematicsError:
+            self._write_valid([False])
+            return
+        degrees = Rotation.from_matrix(true.rotation).as_euler("xyz", degrees=True)
+        self._write_true([*(true.position / self._metres), *degrees])
+        self._write_errors([value / self._metres for value in (np.linalg.norm(error), *error)])
+        self._write_valid([True])
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the component until SIGINT or SIGTERM; the entry of the executable ``linuxcnc_machine``."""
+    options = _parser().parse_args(argv)
+    stop = threading.Event()
+    try:
+        geometry = load_geometry(config_file(options.geometry))
+        shown = MachineComponent(RealMachine(geometry, _truth(options.truth, geometry)), options.units, options.name)
+    except HexapodError as error:
+        print(f"cannot start: {error}", file=sys.stderr)
+        return 1
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    shown.cycle()  # compiles the kernels before LinuxCNC goes on
+    shown.component.ready()
+    period, due = 1.0 / options.rate, time.monotonic()
+    while not stop.wait(max(0.0, due - time.monotonic())):
+        shown.cycle()
+        due = max(due + period, time.monotonic())
+    shown.component.exit()
+    return 0
+
+
+def _truth(name: str, geometry: HexapodGeometry) -> MachineModel:
+    return MachineModel(geometry.name) if name == "ideal" else load_model(config_file(name), geometry)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="linuxcnc_machine", description="HAL component: the tool's true pose.")
+    parser.add_argument("--geometry", default="paper.yaml", metavar="FILE", help="geometry file (default: paper.yaml)")
+    parser.add_argument(
+        "--truth", default="paper_machine.yaml", metavar="FILE", help="model file of the hidden truth, or ideal"
+    )
+    parser.add_argument("--units", choices=tuple(METRES), default="mm", help="LinuxCNC's length unit (default: mm)")
+    parser.add_argument("--rate", type=_rate, default=50.0, metavar="HZ", help="looks per second (default: 50)")
+    parser.add_argument("--name", default="hexapod_machine", help="of the HAL component (default: hexapod_machine)")
+    return parser
+
+
+def _rate(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.1 <= value <= 1000.0:
+        raise argparse.ArgumentTypeError(f"must be a number from 0.1 to 1000, not {text}")
+    return value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

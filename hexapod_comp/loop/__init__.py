@@ -1,0 +1,1 @@
+"""The compensator and the virtual machine run together: what ``demo`` and ``run`` do."""

@@ -1,0 +1,180 @@
+"""Starting the two nodes as processes of their own, in a ROS domain where nobody else is."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+
+from ..nodes.middleware import avoid_shared_memory
+
+# DDS derives its UDP ports from the domain: 7400 + 250 · domain + offset. Offsets 0 and 1 are multicast,
+# participants take 10, 11, 12, …; nobody uses 2 to 9, and domains above 101 reach into the ephemeral ports.
+DOMAINS = range(1, 102)
+RESERVED_OFFSET = 5
+FIRST_PARTICIPANT_OFFSET = 10
+
+LIBC = ctypes.CDLL(None)
+
+PR_SET_PDEATHSIG = 1
+"""From Linux's <sys/prctl.h>."""
+
+STOP_TIMEOUT = 5.0
+"""A process that has not ended this long after SIGTERM is killed, s."""
+
+
+def reserve_domain() -> tuple[int, socket.socket]:
+    """Return a free ROS domain id and the socket that keeps it reserved while it is open.
+
+    The socket takes a port that belongs to the domain and that DDS leaves unused, so a second session
+    on this machine goes elsewhere, and the system frees it even after a crash.
+
+    Raises
+    ------
+    RuntimeError
+        All domains are taken.
+    """
+    start = os.getpid() % len(DOMAINS)
+    for domain in (*DOMAINS[start:], *DOMAINS[:start]):
+        base = 7400 + 250 * domain
+        reservation = _bind(base + RESERVED_OFFSET)
+        if reservation is None:
+            continue
+        probe = _bind(base + FIRST_PARTICIPANT_OFFSET)
+        if probe is not None:
+            probe.close()
+            return domain, reservation
+        reservation.close()
+    raise RuntimeError(f"all ROS domains from {DOMAINS[0]} to {DOMAINS[-1]} are in use on this machine")
+
+
+def _bind(port: int) -> socket.socket | None:
+    """Return a socket bound to the UDP port, or None when somebody else has it."""
+    udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        udp.bind(("0.0.0.0", port))
+    except OSError:
+        udp.close()
+        return None
+    return udp
+
+
+class PrivateDomain:
+    """Context manager: this process and its children see no other ROS domain, and nobody sees theirs.
+
+    A demonstration that spoke in the user's own domain could move a real machine.
+    """
+
+    def __enter__(self) -> int:
+        self._before = dict(os.environ)
+        domain, self._reservation = reserve_domain()
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        for name in ("ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER", "ROS_LOCALHOST_ONLY"):
+            os.environ.pop(name, None)
+        avoid_shared_memory()
+        return domain
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        os.environ.clear()
+        os.environ.update(self._before)
+        self._reservation.close()
+
+
+def _end_with_parent() -> None:
+    """Ask the system to end this process when its parent dies, however it dies.
+
+    A session of its own keeps a terminal's Ctrl-C away from the nodes; nobody but the parent ends them.
+    """
+    LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+class NodeProcess:
+    """One node as an operating-system process; its output goes to a log file, and it ends with its parent.
+
+    Parameters
+    ----------
+    module : str
+        ``compensator`` or ``strut_drive``.
+    parameters : dict of str to object
+        ROS parameters.
+    remaps : mapping of str to str, optional
+        Topics under other names.
+    wrapper : sequence of str, optional
+        Command that runs the node and becomes it, such as ``nsenter``.
+    """
+
+    def __init__(
+        self,
+        module: str,
+        parameters: dict[str, object],
+        remaps: Mapping[str, str] | None = None,
+        wrapper: Sequence[str] = (),
+    ) -> None:
+        self.name = module
+        handle, path = tempfile.mkstemp(prefix=f"hexapod_comp_{module}_", suffix=".log")
+        self.log = Path(path)
+        arguments = ros_arguments(parameters, remaps)
+        command = [*wrapper, sys.executable, "-m", f"hexapod_comp.nodes.{module}", *arguments]
+        with os.fdopen(handle, "wb") as log:
+            self._process = subprocess.Popen(
+                command,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+                preexec_fn=_end_with_parent,
+            )
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    def exit_code(self) -> int | None:
+        """Return the exit code, None while it runs."""
+        return self._process.poll()
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal."""
+        self._process.send_signal(number)
+
+    def output(self) -> str:
+        """Return what it has printed so far."""
+        return self.log.read_text(encoding="utf-8", errors="replace") if self.log.exists() else ""
+
+    def stop(self) -> tuple[int, str]:
+        """End the process with SIGTERM; return its exit code and all it printed. Kill it when it does not listen.
+
+        Not SIGINT: a shell's background jobs ignore that until the node has set its own handler.
+        """
+        if self._process.poll() is None:
+            self.send(signal.SIGTERM)
+        try:
+            code = self._process.wait(STOP_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            code = self._process.wait()
+        said = self.output()
+        self.log.unlink(missing_ok=True)
+        return code, said
+
+
+def ros_arguments(parameters: Mapping[str, object], remaps: Mapping[str, str] | None = None) -> Sequence[str]:
+    """Return the command-line arguments that set ROS parameters and rename topics."""
+    arguments = []
+    for name, value in parameters.items():
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        arguments += ["-p", f"{name}:={text}"]
+    for name, other in (remaps or {}).items():
+        arguments += ["-r", f"{name}:={other}"]
+    return ["--ros-args", *arguments] if arguments else []

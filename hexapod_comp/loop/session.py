@@ -1,0 +1,229 @@
+"""A witnessed run: poses and a path through the running loop, without and with compensation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+
+from ..compensation.compensator import Compensator
+from ..errors import HexapodError
+from ..machine.geometry import HexapodGeometry
+from ..machine.model import MachineModel, RealMachine
+from ..machine.trajectory import Path, commanded_in_base, move
+from ..nodes.client import LoopClient, NoAnswerError, Sent
+from ..pose import Pose
+from ..virtual.machine import StrutDrive
+from .processes import NodeProcess, PrivateDomain
+from .records import PathRecord, PoseRecord, SessionResult, Track, track_along
+
+CONNECT_TIMEOUT = 120.0
+"""A first start compiles in both processes; after that it is under three seconds."""
+
+SETTLE_TIMEOUT = 5.0
+
+MOVE_FEED = 0.1
+"""Tool speed between poses, m/s."""
+
+
+def prepare(geometry: HexapodGeometry) -> None:
+    """Compile, or load from the cache, what the nodes need, so that they do not both compile at once."""
+    Compensator(geometry, MachineModel(geometry.name)).correct(geometry.tool_pose(geometry.home))
+    StrutDrive(RealMachine(geometry, MachineModel(geometry.name))).advance(0.01)
+
+
+@contextmanager
+def simulated_machine(
+    compensator: dict[str, object], drive: dict[str, object]
+) -> Iterator[tuple[NodeProcess, NodeProcess]]:
+    """Run compensator and strut drive as processes in a ROS domain of their own.
+
+    Raises
+    ------
+    HexapodError
+        On leaving, when one of them did not end by itself with exit code 0; carries its output.
+    """
+    with PrivateDomain():
+        nodes = NodeProcess("compensator", compensator), NodeProcess("strut_drive", drive)
+        try:
+            yield nodes
+        except BaseException as error:
+            said = "\n".join(f"{node.name}:\n{node.stop()[1]}" for node in nodes)
+            if isinstance(error, NoAnswerError):
+                raise NoAnswerError(f"{error}; the nodes said:").with_lines(said) from error
+            raise
+        for node in nodes:
+            code, said = node.stop()
+            if code != 0:
+                raise HexapodError(f"{node.name} ended with code {code}:").with_lines(said)
+
+
+class Session:
+    """Drives a machine through poses and a path while watching it.
+
+    Parameters
+    ----------
+    client : LoopClient
+        Connected client.
+    geometry : HexapodGeometry
+        For moves that keep the limits.
+    rate : float
+        Commands per second, Hz.
+    progress : callable, optional
+        Called with a number of commands just sent.
+    """
+
+    def __init__(
+        self,
+        client: LoopClient,
+        geometry: HexapodGeometry,
+        rate: float,
+        progress: Callable[[int], None] | None = None,
+    ) -> None:
+        self._client, self._geometry, self._rate = client, geometry, rate
+        self._progress = progress
+        self._base = commanded_in_base(geometry)
+        self._at = client.estimate
+        self._answers: list[Sent] = []
+
+    def go(self, target: Pose) -> None:
+        """Move smoothly to a tool pose in ``base``."""
+        self._stream(move(self._base, self._at, target, self._rate, MOVE_FEED))
+        self._at = target
+
+    def rest(self) -> Sent:
+        """Hold the pose until the true tool rests; return the last command."""
+        client = self._client
+        quiet = client.settled() if client.has_true_pose else (lambda: True)
+        return client.hold(self._at, self._rate, quiet, SETTLE_TIMEOUT, "the machine to come to rest")
+
+    def enable(self, enabled: bool) -> None:
+        """Switch compensation and wait until the change has ramped through."""
+        self._client.enable(enabled)
+        client = self._client
+        before = dict(client.diagnostics)
+
+        def through() -> bool:
+            seen = client.diagnostics
+            wanted = "on" if enabled else "off"
+            return seen != before and seen["compensation"] == wanted and seen["ramping"] == "false"
+
+        client.hold(self._at, self._rate, through, 10.0, "compensation to ramp")
+
+    def visit(self, records: list[PoseRecord], compensated: bool) -> None:
+        """Go to every pose, rest, and write down what is seen there."""
+        for record in records:
+            self.go(record.target)
+            answer = self.rest()
+            true = self._client.true_pose if self._client.has_true_pose else None
+            if compensated:
+                record.command, record.correction = answer.command, answer.correction
+                record.estimate, record.true_with = self._client.estimate, true
+            else:
+                record.true_without = true
+
+    def mill(self, path: Path) -> tuple[Track | None, np.ndarray]:
+        """Run a path; return the true track and the corrections sent, shape (N, 6)."""
+        self.go(path.pose(0))
+        self.rest()
+        answers = self._stream(path)
+        self._at = path.pose(len(path) - 1)
+        positions = np.array([position for position, _ in self._client.track])
+        sent = np.array([count for _, count in self._client.track])
+        track = track_along(path, positions, sent)
+        return track, np.array([answer.correction for answer in answers])
+
+    def _stream(self, path: Path) -> list[Sent]:
+        progress = self._progress
+        answers = self._client.stream(path, None if progress is None else (lambda _: progress(1)))
+        self._answers += answers
+        return answers
+
+    def latencies(self) -> np.ndarray:
+        """Return and forget the latencies of the streamed commands, s."""
+        values = np.array([answer.answered_at - answer.sent_at for answer in self._answers])
+        self._answers = []
+        return values[np.isfinite(values)]
+
+
+def connect(client: LoopClient, nodes: Sequence[NodeProcess] = (), timeout: float = CONNECT_TIMEOUT) -> None:
+    """Wait until the loop answers.
+
+    Raises
+    ------
+    HexapodError
+        A process has ended, with its output, or nobody answers in time.
+    """
+
+    def ready() -> bool:
+        for node in nodes:
+            if node.exit_code() is not None:
+                said = node.output()
+                raise HexapodError(f"{node.name} ended with code {node.exit_code()}:").with_lines(said)
+        return client.connected() and (client.has_true_pose or not nodes)
+
+    client.spin_until(ready, timeout, "compensator and strut drive to answer")
+
+
+def run_session(
+    client: LoopClient,
+    geometry: HexapodGeometry,
+    targets: Sequence[Pose],
+    path: Path | None,
+    rate: float,
+    compare: bool,
+    progress: Callable[[int], None] | None = None,
+    announce: Callable[[str], None] = lambda _: None,
+) -> SessionResult:
+    """Visit poses, then mill a path; first without compensation when `compare`, then with it.
+
+    Parameters
+    ----------
+    client : LoopClient
+        Connected.
+    geometry : HexapodGeometry
+        The machine commanded.
+    targets : sequence of Pose
+        ``pose_tool_in_base``.
+    path : Path or None
+        In ``base``.
+    rate : float
+        Commands per second, Hz.
+    compare : bool
+        Make the uncompensated pass.
+    progress : callable, optional
+        Called with a number of commands just sent.
+    announce : callable, optional
+        Called with a line about what happens now.
+    """
+    session = Session(client, geometry, rate, progress)
+    records = [PoseRecord(target) for target in targets]
+    track_without = None
+    if compare:
+        announce("pass without compensation …")
+        session.enable(False)
+        session.visit(records, compensated=False)
+        if path is not None:
+            track_without, _ = session.mill(path)
+        session.enable(True)
+        session.latencies()
+    announce("pass with compensation …")
+    session.visit(records, compensated=True)
+    result = SessionResult(records)
+    if path is not None:
+        track_with, corrections = session.mill(path)
+        result.path = PathRecord(path, track_without, track_with, corrections)
+    result.latencies = session.latencies()
+    _count(client, result)
+    return result
+
+
+def _count(client: LoopClient, result: SessionResult) -> None:
+    accepted, result.refused = client.counted()
+    result.sent = len(client.sent)
+    result.lost = max(0, result.sent - accepted - result.refused)
+    result.model = client.diagnostics["model"]
+    for key, value in client.diagnostics.items():
+        if key.startswith("refused."):
+            result.refusals[key.removeprefix("refused.")] = int(value)

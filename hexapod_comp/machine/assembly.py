@@ -1,0 +1,348 @@
+"""Forward kinematics without a guess: every assembly mode of a 6-3 machine, and the pick of the working one.
+
+:mod:`hexapod_comp.machine.elimination` finds where to look, :mod:`hexapod_comp.kernels.assembly` closes the
+loops from there; this module makes poses of the triangles, continues them to real structures, and picks.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..errors import KinematicsError, OtherAssemblyModeError, SingularError, UnreachableError
+from ..kernels import kinematics as kernels
+from ..kernels.assembly import closed_triangles
+from ..kernels.limits import Quantities, examine
+from ..pose import Pose, rotation_angle
+from .elimination import joint_circles, start_angles
+from .geometry import HexapodGeometry
+from .kinematics import Structure, jacobian, six_lengths, solve_pose
+
+CLOSURE = 1e-12
+"""Largest error of a strut length or of a platform side in a mode, relative to the longest strut."""
+
+DISTINCT = 1e-6
+"""Modes whose platform joints all lie closer than this, relative to the longest strut, are one double mode:
+rounding moves the two of a pair by about √1e-16 = 1e-8."""
+
+PAIR_GAP = 0.02
+"""Largest distance of two platform joints that count as one, relative to the characteristic length; enough
+for deviations of 1 mm on a machine with a 300 mm platform."""
+
+EXACT_GAP = 1e-13
+"""Pairs closer than this, relative to the characteristic length, coincide to rounding."""
+
+NEARLY_CLOSED = 20.0
+"""Modes of the pairs' midpoints that fail to close by up to this many gaps are tried on a real structure."""
+
+MOST_MODES = 16
+"""A 6-3 machine has at most sixteen modes unless it can move with all struts locked."""
+
+AMBIGUITY = 1.2
+"""A cold start is refused when the second-nearest candidate is within this factor of the nearest."""
+
+
+def assembly_modes(structure: Structure, lengths: np.ndarray) -> list[Pose]:
+    """Return every real pose of a 6-3 machine that has these strut lengths; no guess is needed.
+
+    Parameters
+    ----------
+    structure : Structure
+        Machine whose platform joints coincide in the pairs (1, 2), (3, 4), (5, 6), exactly or, on a real
+        structure, within :data:`PAIR_GAP`; base joints anywhere. Its home sign and largest condition number
+        are not used: all modes are returned.
+    lengths : array_like, shape (6,)
+        Strut lengths, m.
+
+    Returns
+    -------
+    list of Pose
+        ``pose_platform_in_base``, highest platform first; empty when no pose has these lengths. A singular
+        pose (double root) is listed once.
+
+    Raises
+    ------
+    NotFiniteError
+        A length is NaN, infinite or not positive.
+    SingularError
+        The machine moves with its struts locked: its poses are not countable.
+    KinematicsError
+        Not a 6-3 machine; or joints that define no circle or no triangle.
+
+    Notes
+    -----
+    For pairs that coincide the list is complete. For a real structure the modes of the machine with the
+    pairs' midpoints are continued by Newton. With deviations of a few tenths of a per cent of the platform's
+    size, modes within a hair of a singular pose (condition numbers above 100) can be missed there.
+    """
+    lengths = six_lengths(lengths)
+    _refuse_degenerate(structure)
+    if platform_pair_gap(structure) <= EXACT_GAP * structure.characteristic_length:
+        poses = _exact_poses(structure, lengths)
+    else:
+        poses = _continued_poses(structure, lengths)
+    return sorted(poses, key=lambda pose: -pose.position[2])
+
+
+def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.ndarray) -> Pose:
+    """Return the pose in which the machine must be standing, for cold starts: no guess but its home.
+
+    Of the modes to which :func:`mode_objections` has none the nearest to home is taken, by |Δposition| +
+    characteristic length · angle, unless the next is nearly as near. On a machine that is not 6-3 the one
+    candidate is what Newton finds from home.
+    A machine that stands outside its own limits, which lengths alone cannot show, is refused or, where another
+    mode keeps the limits, taken to be in that one.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        Home, joint cones and limits.
+    structure : Structure
+        Ideal or real joints.
+    lengths : array_like, shape (6,)
+        Strut lengths, m.
+
+    Returns
+    -------
+    Pose
+        ``pose_platform_in_base``.
+
+    Raises
+    ------
+    UnreachableError
+        No pose has these lengths.
+    OtherAssemblyModeError
+        No mode can be the working one (says how many there are and what rules each out), or two can.
+    NotFiniteError, SingularError, NotConvergedError, KinematicsError
+        As :func:`assembly_modes` or, where the machine is not 6-3, as :func:`solve_pose`.
+    """
+    if platform_pair_gap(structure) > PAIR_GAP * structure.characteristic_length:
+        modes = [solve_pose(structure, lengths, geometry.home)]
+    else:
+        modes = assembly_modes(structure, lengths)
+    if not modes:
+        raise UnreachableError("no pose of the machine has these strut lengths", 0)
+    objections = [mode_objections(geometry, structure, mode) for mode in modes]
+    fit = [mode for mode, found in zip(modes, objections, strict=True) if not found]
+    if not fit:
+        listed = "; ".join(f"mode {i}: {', '.join(found)}" for i, found in enumerate(objections, start=1))
+        problem = f"none of the {len(modes)} poses with these strut lengths can be the working one: {listed}"
+        raise OtherAssemblyModeError(problem, len(modes))
+    return _nearest_to_home(geometry, structure, fit)
+
+
+def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose) -> list[str]:
+    """Return what keeps a pose from being the working mode; empty when nothing does.
+
+    The machine can work only with det J of home's sign, the platform on home's side of the base, condition
+    number and joint cones within their limits.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        Home, joint cones and limits.
+    structure : Structure
+        Ideal or real joints.
+    pose : Pose
+        ``pose_platform_in_base``.
+
+    Returns
+    -------
+    list of str
+        One short phrase per objection, with found and allowed values.
+    """
+    at = structure.base_joints, structure.platform_joints, pose.position, pose.rotation
+    measured, limits = Quantities.empty(1), geometry.limits
+    kernels.strut_lengths_one(*at, measured.lengths[0, 0])
+    examine(*at, geometry.limit_numbers, measured, 0, 0)
+    broken = {
+        name: (int(margin.argmin()), value.ravel()[margin.argmin()])
+        for name, (margin, value) in limits.margins(measured).items()
+        if not (margin >= 0.0).all()
+    }
+    found = ["det J of the other sign"] if measured.sign[0, 0] != structure.home_sign else []
+    if "condition" in broken:
+        found.append(f"condition number {broken['condition'][1]:.4g} above {limits.condition:.4g}")
+    centre, homewards = _home_side(geometry, structure)
+    if homewards @ (pose.position + pose.rotation @ structure.platform_joints.mean(axis=0) - centre) < 0.0:
+        found.append("platform on the other side of the base")
+    for body, allowed in (("base", limits.base_cone), ("platform", limits.platform_cone)):
+        if f"{body}_cone" in broken:
+            joint, angle = broken[f"{body}_cone"]
+            degrees = f"{np.rad2deg(angle):.1f}°, allowed {np.rad2deg(allowed[joint]):.1f}°"
+            found.append(f"{body} joint {joint + 1} at {degrees}")
+    if "clearance" in broken:
+        strut, distance = broken["clearance"]
+        one, other = sorted((strut + 1, int(measured.nearest[0, 0, strut]) + 1))
+        millimetres = f"{distance * 1e3:.1f} mm apart, allowed {limits.clearance * 1e3:.1f} mm"
+        found.append(f"struts {one} and {other} {millimetres}")
+    return found
+
+
+def platform_pair_gap(structure: Structure) -> float:
+    """Return the largest distance within the platform joint pairs (1, 2), (3, 4), (5, 6), m; 0 on a 6-3."""
+    joints = structure.platform_joints
+    return float(np.linalg.norm(joints[0::2] - joints[1::2], axis=1).max())
+
+
+def _nearest_to_home(geometry: HexapodGeometry, structure: Structure, modes: list[Pose]) -> Pose:
+    """Return the mode nearest to home; refuse where the next is nearly as near."""
+
+    def distance(pose: Pose) -> float:
+        turn = rotation_angle(geometry.home.rotation.T @ pose.rotation)
+        shift = float(np.linalg.norm(pose.position - geometry.home.position))
+        return shift + structure.characteristic_length * turn
+
+    nearest, *others = sorted(modes, key=distance)
+    least = distance(nearest)
+    if others and distance(others[0]) <= AMBIGUITY * least:
+        next_least = distance(others[0])
+        problem = (
+            f"{len(modes)} poses with these strut lengths could be the working one and two are about as near "
+            f"to home ({least * 1e3:.4g} and {next_least * 1e3:.4g} mm): give a guess"
+        )
+        raise OtherAssemblyModeError(problem, next_least, AMBIGUITY * least)
+    return nearest
+
+
+def _home_side(geometry: HexapodGeometry, structure: Structure) -> tuple[np.ndarray, np.ndarray]:
+    """Return the base joints' centroid, m, and their mean plane's normal towards home; each (3,), ``base``.
+
+    The normal is zero where home lies in that plane: then there is no side to be on.
+    """
+    centre = structure.base_joints.mean(axis=0)
+    normal = np.linalg.svd(structure.base_joints - centre)[2][2]
+    home = geometry.home.position + geometry.home.rotation @ structure.platform_joints.mean(axis=0)
+    height = float(normal @ (home - centre))
+    if abs(height) < 1e-6 * structure.characteristic_length:
+        return centre, np.zeros(3)
+    return centre, math.copysign(1.0, height) * normal
+
+
+def _refuse_degenerate(structure: Structure) -> None:
+    """Refuse joints that make no 6-3 machine, or define no circles or no triangle."""
+    gap, allowed = platform_pair_gap(structure), PAIR_GAP * structure.characteristic_length
+    if gap > allowed:
+        raise KinematicsError(
+            "platform joints of struts (1, 2), (3, 4), (5, 6) must coincide to find poses without a guess, "
+            f"but are up to {gap * 1e3:.4g} mm apart ({allowed * 1e3:.4g} mm allowed): use solve_pose",
+            gap,
+            allowed,
+        )
+    tiny = 1e-6 * structure.characteristic_length
+    for i in (0, 2, 4):
+        apart = float(np.linalg.norm(structure.base_joints[i] - structure.base_joints[i + 1]))
+        if apart < tiny:
+            raise KinematicsError(f"base joints {i + 1} and {i + 2} coincide", apart, tiny)
+    corners = _corners(structure)
+    area = float(np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])))
+    if area < tiny * structure.characteristic_length:
+        raise KinematicsError("platform joints lie on one line: the platform can turn about it", area)
+
+
+def _corners(structure: Structure) -> np.ndarray:
+    """Return the midpoints of the platform joint pairs, shape (3, 3), m, in ``platform``."""
+    return 0.5 * (structure.platform_joints[0::2] + structure.platform_joints[1::2])
+
+
+def _closed_triangles(structure: Structure, lengths: np.ndarray, allowed: float, distinct: float) -> np.ndarray:
+    """Return the platform corners T1..T3, (M, 3, 3), m, of all modes of the machine with its pairs' midpoints.
+
+    A platform side may be wrong by `allowed`, m: more than rounding keeps modes that only just fail to close.
+    Triangles whose corners all lie closer than `distinct`, m, are one.
+    """
+    circles = joint_circles(structure.base_joints, lengths, allowed)
+    if circles is None:
+        return np.empty((0, 3, 3))
+    corners = _corners(structure)
+    sides = np.linalg.norm(corners - corners[[1, 2, 0]], axis=1)
+    return closed_triangles(circles, sides, start_angles(circles, sides), allowed, distinct)
+
+
+def _exact_poses(structure: Structure, lengths: np.ndarray) -> list[Pose]:
+    """Return the modes of a machine whose platform joints coincide in pairs."""
+    longest = float(lengths.max())
+    triangles = _closed_triangles(structure, lengths, CLOSURE * longest, DISTINCT * longest)
+    if len(triangles) > MOST_MODES:
+        raise SingularError("the machine moves with its struts locked at these lengths: its pose is open")
+    poses = _poses_at(structure, triangles)
+    polished = [_newton(structure, lengths, pose) for pose in poses]
+    # Near a singular pose Newton may be thrown to another mode: then the triangle stands as it is.
+    return [
+        fine if fine is not None and _same(structure, fine, pose, lengths) else pose
+        for pose, fine in zip(poses, polished, strict=True)
+    ]
+
+
+def _continued_poses(structure: Structure, lengths: np.ndarray) -> list[Pose]:
+    """Return the real structure's modes near those of the machine with its pairs' midpoints."""
+    gap = platform_pair_gap(structure)
+    # The wide tolerance takes in pairs of modes that the deviations have parted or joined.
+    triangles = _closed_triangles(structure, lengths, NEARLY_CLOSED * gap, gap)
+    found: list[Pose] = []
+    for pose_of_pairs in _poses_at(structure, triangles):
+        for start in _starts_near(structure, pose_of_pairs, gap):
+            pose = _newton(structure, lengths, start)
+            if pose is not None and not any(_same(structure, pose, other, lengths) for other in found):
+                found.append(pose)
+    return found
+
+
+def _poses_at(structure: Structure, triangles: np.ndarray) -> list[Pose]:
+    """Return the poses whose platform corners stand at triangles, (M, 3, 3), m; centroid on centroid."""
+    corners = _corners(structure)
+    rotations = _frames(triangles) @ _frames(corners).T
+    positions = triangles.mean(axis=1) - rotations @ corners.mean(axis=0)
+    return [Pose(*pose) for pose in zip(positions, rotations, strict=True)]
+
+
+def _frames(triangles: np.ndarray) -> np.ndarray:
+    """Return right-handed orthonormal frames attached to triangles, (..., 3, 3); axes are the columns."""
+    x = triangles[..., 1, :] - triangles[..., 0, :]
+    z = np.cross(x, triangles[..., 2, :] - triangles[..., 0, :])
+    axes = np.stack([x, np.cross(z, x), z], axis=-1)
+    return axes / np.linalg.norm(axes, axis=-2, keepdims=True)
+
+
+def _starts_near(structure: Structure, pose: Pose, gap: float) -> list[Pose]:
+    """Return guesses at a pose and, where it is nearly singular, to both sides along the weakest motion.
+
+    Near a singular pose a deviation ε of the joints moves modes by √ε, and parts or joins them in pairs.
+    """
+    size = structure.characteristic_length
+    matrix = jacobian(structure, pose)
+    matrix[:, 3:] /= size
+    _, singular_values, directions = np.linalg.svd(matrix)
+    reach = math.sqrt(gap * size)
+    if singular_values[-1] > 4.0 * reach / size:
+        return [pose]
+    shift, turn = directions[-1][:3], directions[-1][3:] / size
+    starts = [pose]
+    for step in reach * np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0]):
+        turned = Rotation.from_rotvec(step * turn).as_matrix() @ pose.rotation
+        starts.append(Pose(pose.position + step * shift, turned))
+    return starts
+
+
+def _same(structure: Structure, one: Pose, other: Pose, lengths: np.ndarray) -> bool:
+    """Return whether two poses hold all platform joints at the same places."""
+    apart = one.position - other.position + structure.platform_joints @ (one.rotation - other.rotation).T
+    return bool(np.abs(apart).max() < DISTINCT * lengths.max())
+
+
+def _newton(structure: Structure, lengths: np.ndarray, start: Pose) -> Pose | None:
+    """Return the pose that Newton on the six loop closures finds, whatever its sign and condition number."""
+    position, rotation = start.position.copy(), start.rotation.copy()
+    outcome, _, _ = kernels.solve_pose_one(
+        structure.base_joints,
+        structure.platform_joints,
+        lengths,
+        position,
+        rotation,
+        structure.characteristic_length,
+        0.0,
+        math.inf,
+    )
+    return Pose(position, rotation) if outcome == kernels.OK else None

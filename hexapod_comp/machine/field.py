@@ -1,0 +1,117 @@
+"""The error field of paper 001: polynomials along grid lines, four lines weighted bilinearly.
+
+A field gives the error of the measured point (the reflector) as six components along and about the axes of
+``base``: dx, dy, dz in metres, rx, ry, rz in radians. Three families of lines, one along each axis, run
+through the nodes of a rectangular grid; every line carries one polynomial per component and direction of
+motion. The paper's 1-D field is the case where lines along x carry only dx, along y only dy, along z only
+dz; a field whose lines carry all six is evaluated by the same code. Families add up.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..errors import ModelError
+from ..kernels.field import field_one
+
+COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")
+"""Order of the six error components."""
+
+CROSS_AXES = ((1, 2), (0, 2), (0, 1))
+"""The two axes across which the lines along x, y, z are arranged; also the order of their node indices."""
+
+OUTSIDE_POLICIES = ("hold", "refuse")
+
+
+@dataclass(frozen=True)
+class GridField:
+    """Error of the measured point over a box, forward and backward.
+
+    Parameters
+    ----------
+    grid : tuple of three ndarray
+        Increasing node coordinates along x, y, z in ``base``, m; at least two each. The box between the
+        outermost nodes is the measured one.
+    lines : tuple of three ndarray
+        Coefficients of the lines along x, y, z, shape (2, n, m, 6, K): direction (forward, backward), node
+        index along each of the two cross axes, component, power of u, where u runs from −1 to 1 over the
+        box along the line. Shape (2, n, m, 6, 0) when a family was not measured. m and rad.
+    probe : ndarray, shape (3,)
+        The measured point in ``platform``, m.
+    reversal_threshold : float
+        How far the measured point must come back along an axis before its direction counts as reversed, m:
+        above what the struts' backlash moves it along an axis that is told to stand still.
+    outside : str
+        ``hold`` keeps the value at the boundary of the box, ``refuse`` makes the compensator refuse.
+
+    Raises
+    ------
+    ModelError
+        Nodes not increasing, shapes that do not fit the grid, or values that are not finite.
+    """
+
+    grid: tuple[np.ndarray, np.ndarray, np.ndarray]
+    lines: tuple[np.ndarray, np.ndarray, np.ndarray]
+    probe: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    outside: str = "hold"
+    reversal_threshold: float = 10e-6
+
+    def __post_init__(self) -> None:
+        grid = tuple(np.array(nodes, dtype=float) for nodes in self.grid)
+        lines = tuple(np.array(family, dtype=float, order="C") for family in self.lines)
+        for axis, nodes in zip("xyz", grid, strict=True):
+            if nodes.ndim != 1 or len(nodes) < 2 or not (np.isfinite(nodes).all() and (np.diff(nodes) > 0).all()):
+                raise ModelError(f"field.grid_{axis}", "needs at least two increasing nodes", nodes.tolist())
+        for axis, family, cross in zip("xyz", lines, CROSS_AXES, strict=True):
+            wanted = (2, len(grid[cross[0]]), len(grid[cross[1]]), 6)
+            if family.ndim != 5 or family.shape[:4] != wanted:
+                raise ModelError(f"field.lines_{axis}", f"must have shape {wanted} × powers, not {family.shape}")
+            if not np.isfinite(family).all():
+                raise ModelError(f"field.lines_{axis}", "must be finite")
+        probe = np.array(self.probe, dtype=float)
+        if probe.shape != (3,) or not np.isfinite(probe).all():
+            raise ModelError("field.probe", "must be three finite numbers, m", probe.tolist())
+        if self.outside not in OUTSIDE_POLICIES:
+            raise ModelError("field.outside", f"must be one of {', '.join(OUTSIDE_POLICIES)}", self.outside)
+        if not (math.isfinite(self.reversal_threshold) and self.reversal_threshold >= 0.0):
+            raise ModelError("field.reversal_threshold", "must be finite and not negative, m", self.reversal_threshold)
+        object.__setattr__(self, "grid", grid)
+        object.__setattr__(self, "lines", lines)
+        object.__setattr__(self, "probe", probe)
+
+    @property
+    def box(self) -> np.ndarray:
+        """Corners of the measured box, shape (2, 3), m in ``base``."""
+        return np.array([[nodes[0] for nodes in self.grid], [nodes[-1] for nodes in self.grid]])
+
+    def evaluate(self, position: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Return the error at a point of ``base``.
+
+        Parameters
+        ----------
+        position : array_like, shape (3,)
+            The measured point, m.
+        sense : array_like, shape (3,)
+            Direction of motion along each axis: +1 forward, −1 backward, 0 unknown (mean of both).
+
+        Returns
+        -------
+        error : ndarray, shape (6,)
+            dx, dy, dz (m), rx, ry, rz (rad).
+        outside : bool
+            True when the point lies outside the box and the boundary's value was held.
+        """
+        error = np.empty(6)
+        position = np.array(position, dtype=float)
+        outside = field_one(position, np.array(sense, dtype=float), *self.grid, *self.lines, error)
+        return error, bool(outside)
+
+
+def no_field() -> GridField:
+    """Return a field that is zero everywhere."""
+    nodes = np.array([-1e3, 1e3])
+    empty = np.zeros((2, 2, 2, 6, 0))
+    return GridField((nodes, nodes, nodes), (empty, empty, empty))

@@ -1,0 +1,314 @@
+"""The nominal machine: where the twelve joints should be, how far everything may go, and its file.
+
+Frames: ``base`` is fixed, ``platform`` moves; joints are given each in the frame of the body that carries
+them. Struts are numbered 1..6 in the file's order and named ``strut_1`` … ``strut_6``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import GeometryError, InputFileError, KinematicsError, LimitError, PoseError
+from ..formats.yaml import Section, read_yaml
+from ..kernels import kinematics as kernels
+from ..kernels.limits import WITHIN, LimitNumbers, check_stage
+from ..pose import Pose
+from .limits import STRUT_NAMES as STRUT_NAMES
+from .limits import Limits, frozen_array
+
+GEOMETRY_FORMAT = "hexapod_comp/geometry"
+GEOMETRY_VERSION = 1
+
+COINCIDENT = 1e-6
+"""Joints closer than this, m, are one."""
+
+LONGEST_AXIS = 1e9
+"""Largest component of an axis: only its direction counts, and the square of a huge one overflows."""
+
+
+@dataclass(frozen=True)
+class HexapodGeometry:
+    """A general 6-6 hexapod as designed.
+
+    Parameters
+    ----------
+    name : str
+        Machine name; a model file must carry the same.
+    base_joints : ndarray, shape (6, 3)
+        Joint centres in ``base``, m.
+    platform_joints : ndarray, shape (6, 3)
+        Joint centres in ``platform``, m.
+    home : Pose
+        ``pose_platform_in_base`` at which the machine is known to work; it picks the assembly mode.
+    limits : Limits
+        What the machine may do.
+    base_axes, platform_axes : ndarray, shape (6, 3), optional
+        Unit vectors of the cardan axis fixed to each body, in that body's frame; needed when a lead is given.
+    base_cone_axes, platform_cone_axes : ndarray, shape (6, 3), optional
+        Neutral direction of each joint, from base to platform, in its body's frame; the default is the
+        strut's direction at home.
+    screw_lead : ndarray, shape (6,), optional
+        Advance of each screw per turn, m; positive for a right-hand thread, zero for struts whose screw
+        cannot turn with the joints.
+    tool : Pose, optional
+        ``pose_tool_in_platform``.
+    work : Pose, optional
+        ``pose_work_in_base``.
+
+    Raises
+    ------
+    GeometryError
+        With key, value and what is allowed.
+    """
+
+    name: str
+    base_joints: np.ndarray
+    platform_joints: np.ndarray
+    home: Pose
+    limits: Limits
+    base_axes: np.ndarray | None = None
+    platform_axes: np.ndarray | None = None
+    base_cone_axes: np.ndarray | None = None
+    platform_cone_axes: np.ndarray | None = None
+    screw_lead: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    tool: Pose = field(default_factory=Pose.identity)
+    work: Pose = field(default_factory=Pose.identity)
+    home_sign: float = field(init=False)
+    """Sign of det J at home: the other sign is another assembly mode."""
+    kernel_joints: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False)
+    """Private writable copies of the joints for compiled kernels, which would compile twice for read-only ones."""
+    characteristic_length: float = field(init=False)
+    """RMS radius of the platform joints about their centroid, m; makes the condition number unit-free."""
+    limit_numbers: LimitNumbers = field(init=False, repr=False)
+    """The limits for compiled kernels."""
+
+    def __post_init__(self) -> None:
+        def put(name: str, value: object) -> None:
+            object.__setattr__(self, name, value)
+
+        put("base_joints", frozen_array(self.base_joints, (6, 3), "base.joints"))
+        put("platform_joints", frozen_array(self.platform_joints, (6, 3), "platform.joints"))
+        put("kernel_joints", (self.base_joints.copy(), self.platform_joints.copy()))
+        put("screw_lead", frozen_array(self.screw_lead, (6,), "screw.lead"))
+        _refuse_coincident(self.base_joints)
+        spread = self.platform_joints - self.platform_joints.mean(axis=0)
+        put("characteristic_length", float(np.sqrt((spread**2).sum(axis=1).mean())))
+        if self.characteristic_length < COINCIDENT:
+            raise GeometryError("platform.joints", "must not all coincide", self.platform_joints.tolist())
+        self._fill_axes(put)
+        self._check_home(put)
+
+    def _fill_axes(self, put: Callable[[str, object], None]) -> None:
+        """Normalise the joint axes and take the missing cone axes from the struts at home."""
+        at_home = self.home.position + self.platform_joints @ self.home.rotation.T - self.base_joints
+        cones = {"base_cone_axes": at_home, "platform_cone_axes": at_home @ self.home.rotation}
+        for name in ("base_axes", "platform_axes", *cones):
+            body, _, kind = name.partition("_")
+            key = f"{body}.{'joint_axes' if kind == 'axes' else 'cone_axes'}"
+            vectors = getattr(self, name)
+            if vectors is None:
+                vectors = cones.get(name)
+            if vectors is not None:
+                put(name, _unit_vectors(vectors, key))
+            elif self.screw_lead.any():
+                raise GeometryError(key, "are needed when a screw lead is given")
+
+    @property
+    def kernel_axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Writable copies of the cardan axes for compiled kernels, zeros where the machine gives none."""
+        missing = np.zeros((6, 3))
+        base, platform = self.base_axes, self.platform_axes
+        return np.array(missing if base is None else base), np.array(missing if platform is None else platform)
+
+    def _check_home(self, put: Callable[[str, object], None]) -> None:
+        """Refuse a home pose that breaks a limit of single poses."""
+        pose = (self.home.position, self.home.rotation)
+        lengths = np.empty(6)
+        kernels.strut_lengths_one(*self.kernel_joints, *pose, lengths)
+        put("home_sign", float(kernels.condition_one(*self.kernel_joints, *pose, self.characteristic_length)[1]))
+        cone_axes, joints = np.array([self.base_cone_axes, self.platform_cone_axes]), self.platform_joints
+        # The distance of struts that share a joint cannot be limited.
+        apart = (np.linalg.norm(joints[:, None] - joints, axis=2) > COINCIDENT).astype(float)
+        put("limit_numbers", self.limits.numbers(cone_axes, apart, self.characteristic_length, self.home_sign))
+        refusal = self.refusal(*pose, lengths)
+        if refusal is not None:
+            raise GeometryError("home", f"breaks a limit: {refusal}")
+
+    def refusal(
+        self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray
+    ) -> LimitError | KinematicsError | None:
+        """Return why the nominal machine may not stand in a platform pose with its strut lengths, None if it may."""
+        found = check_stage(*self.kernel_joints, position, rotation, lengths, self.limit_numbers)
+        finding, strut, value, _, _ = found
+        return None if finding == WITHIN else self.limits.error(finding, strut, 0, value)
+
+    def platform_pose(self, tool_pose: Pose) -> Pose:
+        """Return the ``pose_platform_in_base`` that belongs to a ``pose_tool_in_work``."""
+        return self.work @ tool_pose @ self.tool.inverse()
+
+    def tool_pose(self, platform_pose: Pose) -> Pose:
+        """Return the ``pose_tool_in_work`` that belongs to a ``pose_platform_in_base``."""
+        return self.work.inverse() @ platform_pose @ self.tool
+
+    def platform_poses(self, positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions (N, 3), m, and rotations (N, 3, 3) of :meth:`platform_pose` for many tool poses."""
+        turned = self.work.rotation @ rotations @ self.tool.rotation.T
+        tips = self.work.position + positions @ self.work.rotation.T
+        return tips - turned @ self.tool.position, turned
+
+    def tool_poses(self, positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions (N, 3), m, and rotations (N, 3, 3) of :meth:`tool_pose` for many platform poses."""
+        tips = positions + rotations @ self.tool.position - self.work.position
+        return tips @ self.work.rotation, self.work.rotation.T @ rotations @ self.tool.rotation
+
+
+def paper_joints(a: float, b: float, d: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the joints of the paper's 6-3 machine from its three dimensions.
+
+    Parameters
+    ----------
+    a : float
+        Side of the platform triangle, m.
+    b, d : float
+        Long and short side of the semi-regular base hexagon, m.
+
+    Returns
+    -------
+    base_joints, platform_joints : ndarray, shape (6, 3)
+        000, Figure 3, with its misprint in X_B5 mended (see doc/theory.md).
+    """
+    for key, value in (("a", a), ("b", b), ("d", d)):
+        if not (np.isfinite(value) and value > 0.0):
+            raise GeometryError(key, "must be finite and positive, m", value)
+    third = np.sqrt(3.0) / 6.0
+    half = np.array(
+        [
+            [third * (2 * b + d), d / 2, 0.0],
+            [-third * (b - d), (b + d) / 2, 0.0],
+            [-third * (b + 2 * d), b / 2, 0.0],
+        ]
+    )
+    mirror = np.array([1.0, -1.0, 1.0])
+    base = np.vstack([half, half[::-1] * mirror])
+    angles = np.deg2rad([60.0, 180.0, -60.0])
+    triangle = a / np.sqrt(3.0) * np.stack([np.cos(angles), np.sin(angles), np.zeros(3)], axis=1)
+    return base, np.repeat(triangle, 2, axis=0)
+
+
+def load_geometry(path: str | Path) -> HexapodGeometry:
+    """Read a geometry file (format ``hexapod_comp/geometry``, described in the README).
+
+    Parameters
+    ----------
+    path : str or Path
+        YAML file.
+
+    Returns
+    -------
+    HexapodGeometry
+
+    Raises
+    ------
+    InputFileError
+        Naming file, key and value.
+    """
+    top = read_yaml(path, GEOMETRY_FORMAT, GEOMETRY_VERSION)
+    name = top.text("machine")
+    base, platform, axes = _read_joints(top)
+    home = read_pose(top, "home")
+    limits = _read_limits(top.section("limits"), path)
+    lead = np.zeros(6)
+    if "screw" in top:
+        screw = top.section("screw")
+        lead = screw.per_strut("lead", "length")
+        screw.finish()
+    tool = read_pose(top, "tool") if "tool" in top else Pose.identity()
+    work = read_pose(top, "work") if "work" in top else Pose.identity()
+    top.finish()
+    try:
+        return HexapodGeometry(name, base, platform, home, limits, screw_lead=lead, tool=tool, work=work, **axes)
+    except GeometryError as error:
+        raise InputFileError(path, error.key, error.problem, error.value) from error
+
+
+def read_pose(parent: Section, key: str) -> Pose:
+    """Read a pose section: ``position_*`` and the paper's angles ``rotation_*`` (default zero)."""
+    section = parent.section(key)
+    position = section.quantity("position", "length", (3,))
+    angles = section.quantity("rotation", "angle", (3,), np.zeros(3))
+    section.finish()
+    try:
+        return Pose.from_angles(position, angles)
+    except PoseError as error:
+        raise parent.error(key, str(error)) from error
+
+
+def _read_joints(top: Section) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Return base joints, platform joints and the axes that the file gives."""
+    axes: dict[str, np.ndarray] = {}
+    joints = {}
+    if "paper_dimensions" in top:
+        section = top.section("paper_dimensions")
+        a, b, d = (float(section.quantity(key, "length")) for key in "abd")
+        section.finish()
+        try:
+            joints["base"], joints["platform"] = paper_joints(a, b, d)
+        except GeometryError as error:
+            raise section.error(error.key, error.problem, error.value) from error
+    for body in ("base", "platform"):
+        if body not in top and body in joints:
+            continue
+        section = top.section(body)
+        if body not in joints:
+            joints[body] = section.quantity("joints", "length", (6, 3))
+        for key, name in (("joint_axes", f"{body}_axes"), ("cone_axes", f"{body}_cone_axes")):
+            if key in section:
+                axes[name] = section.array(key, (6, 3))
+        section.finish()
+    return joints["base"], joints["platform"], axes
+
+
+def _read_limits(section: Section, path: str | Path) -> Limits:
+    stroke = section.pairs_per_strut("stroke", "length")
+    values = {
+        "stroke": stroke,
+        "base_cone": section.per_strut("base_cone", "angle"),
+        "platform_cone": section.per_strut("platform_cone", "angle"),
+        "condition": float(section.array("condition_number")),
+        "correction": float(section.quantity("correction", "length")),
+        "step": float(section.quantity("step", "length")),
+        "speed": float(section.quantity("speed", "speed")),
+        "clearance": float(section.quantity("clearance", "length", default=0.0)),
+    }
+    section.finish()
+    try:
+        return Limits(**values)  # type: ignore[arg-type]
+    except GeometryError as error:
+        raise InputFileError(path, error.key, error.problem, error.value) from error
+
+
+def _refuse_coincident(base_joints: np.ndarray) -> None:
+    for i in range(6):
+        for j in range(i):
+            if np.linalg.norm(base_joints[i] - base_joints[j]) < COINCIDENT:
+                problem = f"coincides with base joint {j + 1}; every strut needs a base joint of its own"
+                raise GeometryError(f"base.joints[{i}]", problem, base_joints[i].tolist())
+
+
+def _unit_vectors(values: object, key: str) -> np.ndarray:
+    vectors = frozen_array(values, (6, 3), key)
+    largest = np.abs(vectors).max(axis=1, keepdims=True)
+    if largest.max() > LONGEST_AXIS:
+        index = int(largest.argmax())
+        raise GeometryError(f"{key}[{index}]", f"components must be at most {LONGEST_AXIS:g}", vectors[index].tolist())
+    norms = np.linalg.norm(vectors, axis=1)
+    if norms.min() < COINCIDENT:
+        index = int(norms.argmin())
+        raise GeometryError(f"{key}[{index}]", "must not be the zero vector", vectors[index].tolist())
+    unit = vectors / norms[:, None]
+    unit.flags.writeable = False
+    return unit

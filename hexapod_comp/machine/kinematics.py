@@ -1,0 +1,421 @@
+"""Kinematics of the ideal and of the imperfect structure: strut lengths, Jacobian, forward solution.
+
+Checked entry points to :mod:`hexapod_comp.kernels.kinematics`. They take joints, so the same call serves the nominal
+structure and the real one.
+"""
+
+from __future__ import annotations
+
+import collections
+import os
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from ..errors import (
+    KinematicsError,
+    NotConvergedError,
+    NotFiniteError,
+    OtherAssemblyModeError,
+    SingularError,
+    UnreachableError,
+)
+from ..kernels import kinematics as kernels
+from ..pose import Pose
+from .geometry import STRUT_NAMES, HexapodGeometry
+
+ALONE = 0.01
+"""Work of the calling thread, s, before others help: they take 0.1 ms to start, and some ms to end on busy cores."""
+
+SLICE = 1e-3
+"""Work on a slice of a batch, s: long beside taking the next one, short beside waiting for somebody's last one."""
+
+FIRST_SLICE = 256
+"""Poses in a batch's first slice; each of the next has twice as many until one takes its time."""
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Where the twelve joints are: the nominal machine's, or the real one's.
+
+    Parameters
+    ----------
+    base_joints, platform_joints : ndarray, shape (6, 3)
+        Joint centres in ``base`` and in ``platform``, m.
+    characteristic_length : float
+        Length that makes the condition number unit-free, m.
+    home_sign : float
+        Sign of det J in the working assembly mode.
+    max_condition : float
+        Largest condition number accepted as a solution.
+    """
+
+    base_joints: np.ndarray
+    platform_joints: np.ndarray
+    characteristic_length: float
+    home_sign: float
+    max_condition: float
+
+    @staticmethod
+    def of(geometry: HexapodGeometry) -> Structure:
+        """Return the nominal structure of a machine."""
+        return Structure(
+            *geometry.kernel_joints,
+            geometry.characteristic_length,
+            geometry.home_sign,
+            geometry.limits.condition,
+        )
+
+    def moved(self, base_deviation: np.ndarray, platform_deviation: np.ndarray) -> Structure:
+        """Return the structure with its joints displaced by (6, 3) deviations, m, in their bodies' frames."""
+        return Structure(
+            np.ascontiguousarray(self.base_joints + base_deviation),
+            np.ascontiguousarray(self.platform_joints + platform_deviation),
+            self.characteristic_length,
+            self.home_sign,
+            self.max_condition,
+        )
+
+
+@dataclass(frozen=True)
+class ForwardBatch:
+    """Result of :func:`solve_poses`; rows that failed hold NaN.
+
+    Attributes
+    ----------
+    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
+        Platform poses in ``base``, m.
+    outcomes : ndarray of int, shape (N,)
+        ``kernels.OK`` or the reason of failure.
+    iterations : ndarray of int, shape (N,)
+        Newton steps.
+    conditions : ndarray, shape (N,)
+        Condition numbers.
+    """
+
+    positions: np.ndarray
+    rotations: np.ndarray
+    outcomes: np.ndarray
+    iterations: np.ndarray
+    conditions: np.ndarray
+
+    @property
+    def ok(self) -> np.ndarray:
+        """Boolean mask of the rows that have a solution."""
+        return self.outcomes == kernels.OK
+
+
+def strut_lengths(structure: Structure, pose: Pose) -> np.ndarray:
+    """Return the six strut lengths at a pose (000, inverse kinematic model).
+
+    Parameters
+    ----------
+    structure : Structure
+        Ideal or real joints.
+    pose : Pose
+        ``pose_platform_in_base``.
+
+    Returns
+    -------
+    ndarray, shape (6,)
+        |P + R·t_i − b_i|, m.
+    """
+    lengths = np.empty(6)
+    kernels.strut_lengths_one(structure.base_joints, structure.platform_joints, pose.position, pose.rotation, lengths)
+    return lengths
+
+
+def strut_lengths_batch(
+    structure: Structure, positions: np.ndarray, rotations: np.ndarray, threads: int | None = None
+) -> np.ndarray:
+    """Return the strut lengths at N poses, shape (N, 6), m, using all cores.
+
+    Parameters
+    ----------
+    structure : Structure
+        Ideal or real joints.
+    positions, rotations : array_like, shape (N, 3), (N, 3, 3)
+        Platform poses in ``base``, m.
+    threads : int, optional
+        Most threads to use; all cores by default. A batch of some milliseconds stays on the calling thread.
+
+    Raises
+    ------
+    NotFiniteError
+        A pose is not finite; names its row.
+    """
+    positions, rotations = _batch_poses(positions, rotations)
+    lengths = np.empty((len(positions), 6))
+
+    def run(rows: slice) -> None:
+        kernels.strut_lengths_many(
+            structure.base_joints,
+            structure.platform_joints,
+            positions[rows],
+            rotations[rows],
+            lengths[rows],
+        )
+
+    over_chunks(run, len(positions), threads)
+    if not np.isfinite(lengths).all():
+        _refuse_not_finite(positions, rotations)
+    return lengths
+
+
+def jacobian(structure: Structure, pose: Pose) -> np.ndarray:
+    """Return ∂L/∂(v, ω) at a pose: strut speeds per platform twist expressed in ``base``.
+
+    Returns
+    -------
+    ndarray, shape (6, 6)
+        Columns 0–2 per metre, 3–5 per radian; row i is (u_i, R·t_i × u_i).
+    """
+    matrix = np.empty((6, 6))
+    kernels.jacobian_one(structure.base_joints, structure.platform_joints, pose.position, pose.rotation, matrix)
+    return matrix
+
+
+def condition_number(structure: Structure, pose: Pose) -> tuple[float, float]:
+    """Return (condition number, sign of det J) at a pose.
+
+    The condition number is ‖J‖·‖J⁻¹‖/6 in Frobenius norms with rotations scaled by the characteristic
+    length: 1 for an isotropic machine, ∞ at a singular pose.
+    """
+    return kernels.condition_one(
+        structure.base_joints,
+        structure.platform_joints,
+        pose.position,
+        pose.rotation,
+        structure.characteristic_length,
+    )
+
+
+def solve_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> Pose:
+    """Return the pose at which the machine has these strut lengths (forward kinematics).
+
+    Newton on the six loop closures with the analytic Jacobian and a multiplicative rotation update. The
+    answer is certified: loops closed to rounding, condition number within the limit, det J of the working
+    assembly mode's sign.
+
+    Parameters
+    ----------
+    structure : Structure
+        Ideal or real joints.
+    lengths : array_like, shape (6,)
+        Strut lengths, m.
+    guess : Pose
+        ``pose_platform_in_base`` to start from, usually the last pose.
+
+    Returns
+    -------
+    Pose
+        ``pose_platform_in_base``.
+
+    Raises
+    ------
+    NotFiniteError, UnreachableError, SingularError, NotConvergedError, OtherAssemblyModeError
+        Each says what was found and what is allowed.
+    """
+    lengths = six_lengths(lengths)
+    position, rotation = guess.position.copy(), guess.rotation.copy()
+    outcome, _, condition = _solve_one(structure, lengths, position, rotation)
+    if outcome == kernels.NOT_CONVERGED or (outcome == kernels.SINGULAR and not np.isfinite(condition)):
+        position, rotation = _closest_pose(structure, lengths, guess)
+        outcome, _, condition = _solve_one(structure, lengths, position, rotation)
+    if outcome != kernels.OK:
+        raise forward_error(outcome, condition, structure.max_condition)
+    return Pose(position, rotation)
+
+
+def solve_poses(structure: Structure, lengths: np.ndarray, guess: Pose, threads: int | None = None) -> ForwardBatch:
+    """Solve the forward kinematics of N sets of lengths from one guess, on all cores.
+
+    Parameters
+    ----------
+    structure : Structure
+        Ideal or real joints.
+    lengths : array_like, shape (N, 6)
+        m.
+    guess : Pose
+        Start for every row.
+    threads : int, optional
+        Most threads to use; all cores by default. A batch of some milliseconds stays on the calling thread.
+
+    Returns
+    -------
+    ForwardBatch
+        Rows without a solution are NaN and carry their outcome; nothing is raised for them.
+    """
+    lengths = np.ascontiguousarray(lengths, dtype=float)
+    if lengths.ndim != 2 or lengths.shape[1] != 6:
+        raise KinematicsError(f"lengths must have shape (N, 6), not {lengths.shape}", lengths.shape)
+    count = len(lengths)
+    positions, rotations = np.empty((count, 3)), np.empty((count, 3, 3))
+    outcomes, iterations = np.empty(count, np.int64), np.empty(count, np.int64)
+    conditions = np.empty(count)
+
+    def run(rows: slice) -> None:
+        positions[rows], rotations[rows] = guess.position, guess.rotation
+        kernels.solve_pose_many(
+            structure.base_joints,
+            structure.platform_joints,
+            lengths[rows],
+            positions[rows],
+            rotations[rows],
+            structure.characteristic_length,
+            structure.home_sign,
+            structure.max_condition,
+            outcomes[rows],
+            iterations[rows],
+            conditions[rows],
+        )
+
+    over_chunks(run, count, threads)
+    failed = outcomes != kernels.OK
+    positions[failed] = np.nan
+    rotations[failed] = np.nan
+    return ForwardBatch(positions, rotations, outcomes, iterations, conditions)
+
+
+def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = None) -> None:
+    """Call `run` on slices that cover ``range(count)``; for kernels without the GIL.
+
+    The calling thread begins alone. Others help only when it has worked for :data:`ALONE` of processor time and what
+    is left would take it as long again, so that no batch is slower for the help, whatever its kernel costs. It goes on
+    to take slices as they do, and waits only for those that others have begun.
+
+    Parameters
+    ----------
+    run : callable
+        Gets each slice once, from any thread, in any order.
+    count : int
+        Rows in the batch.
+    threads : int, optional
+        Most threads to use, the calling one included; all cores that this process may use by default.
+    """
+    workers = threads or len(os.sched_getaffinity(0))
+    size, done, took, began = FIRST_SLICE, 0, 0.0, time.thread_time()
+    while done < count:
+        if workers > 1 and took > ALONE and took * (count - done) > ALONE * done:
+            _share([slice(k, min(k + size, count)) for k in range(done, count, size)], run, workers)
+            return
+        stop = min(done + size, count)
+        run(slice(done, stop))
+        before, took = took, time.thread_time() - began
+        done, size = stop, size * 2 if took - before < 0.5 * SLICE else size
+
+
+def _share(slices: list[slice], run: Callable[[slice], None], workers: int) -> None:
+    """Work on slices together with other threads; the first error ends the work and is raised."""
+    left = iter(slices)
+
+    def work() -> None:
+        try:
+            for rows in left:
+                run(rows)
+        except BaseException:
+            collections.deque(left, maxlen=0)  # nobody begins with what is left
+            raise
+
+    with ThreadPoolExecutor(workers - 1) as pool:
+        helpers = [pool.submit(work) for _ in range(min(workers, len(slices)) - 1)]
+        work()
+    for helper in helpers:
+        helper.result()
+
+
+def forward_error(outcome: int, condition: float, max_condition: float) -> KinematicsError:
+    """Return the error that belongs to a kernel's outcome other than OK."""
+    if outcome == kernels.NOT_FINITE:
+        return NotFiniteError("strut lengths and guess must be finite, lengths above 0")
+    if outcome == kernels.UNREACHABLE:
+        return UnreachableError("no pose has these strut lengths: two struts cannot meet their joints")
+    if outcome == kernels.SINGULAR:
+        problem = f"the machine is singular there: condition number {condition:.4g}, allowed {max_condition:.4g}"
+        return SingularError(problem, condition, max_condition)
+    if outcome == kernels.OTHER_ASSEMBLY:
+        return OtherAssemblyModeError("the pose found from this guess belongs to another assembly mode")
+    problem = f"Newton did not settle within {kernels.MAX_ITERATIONS} steps; give a guess nearer to the pose"
+    return NotConvergedError(problem, limit=kernels.MAX_ITERATIONS)
+
+
+def _solve_one(
+    structure: Structure, lengths: np.ndarray, position: np.ndarray, rotation: np.ndarray
+) -> tuple[int, int, float]:
+    return kernels.solve_pose_one(
+        structure.base_joints,
+        structure.platform_joints,
+        lengths,
+        position,
+        rotation,
+        structure.characteristic_length,
+        structure.home_sign,
+        structure.max_condition,
+    )
+
+
+def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pose near `guess` whose lengths are closest to those asked for.
+
+    Where Newton wandered off, a trust-region minimiser tells the two causes apart: it either finds the
+    closure, or stops where no further approach is possible.
+
+    Raises
+    ------
+    UnreachableError
+        The minimum is not a closure; carries the remaining length error.
+    NotConvergedError
+        The guess is so far away that numbers overflow.
+    """
+
+    def pose_at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rotation = Rotation.from_rotvec(x[3:] / structure.characteristic_length).as_matrix() @ guess.rotation
+        return guess.position + x[:3], rotation
+
+    def misfit(x: np.ndarray) -> np.ndarray:
+        found = np.empty(6)
+        kernels.strut_lengths_one(structure.base_joints, structure.platform_joints, *pose_at(x), found)
+        return found - lengths
+
+    first = misfit(np.zeros(6))
+    if not np.isfinite(first @ first):
+        raise NotConvergedError(f"the guess {guess.position.tolist()} m is too far away to start from")
+    fit = least_squares(misfit, np.zeros(6), xtol=1e-12, ftol=1e-12, gtol=1e-12, max_nfev=200)
+    rest = float(np.abs(fit.fun).max())
+    if rest > 1e-6:
+        raise UnreachableError(
+            f"no pose near the guess has these strut lengths: the closest one leaves {rest * 1e3:.4g} mm", rest
+        )
+    return pose_at(fit.x)
+
+
+def six_lengths(lengths: np.ndarray) -> np.ndarray:
+    lengths = np.ascontiguousarray(lengths, dtype=float)
+    if lengths.shape != (6,):
+        raise KinematicsError(f"six strut lengths are needed, not shape {lengths.shape}", lengths.shape)
+    for name, length in zip(STRUT_NAMES, lengths, strict=True):
+        if not (np.isfinite(length) and length > 0.0):
+            raise NotFiniteError(f"{name}: length must be finite and above 0, not {length} m", float(length))
+    return lengths
+
+
+def _batch_poses(positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    positions = np.ascontiguousarray(positions, dtype=float)
+    rotations = np.ascontiguousarray(rotations, dtype=float)
+    if positions.ndim != 2 or positions.shape[1] != 3 or rotations.shape != (len(positions), 3, 3):
+        problem = f"poses must have shapes (N, 3) and (N, 3, 3), not {positions.shape} and {rotations.shape}"
+        raise KinematicsError(problem)
+    return positions, rotations
+
+
+def _refuse_not_finite(positions: np.ndarray, rotations: np.ndarray) -> None:
+    """Raise for the first pose that is not finite; lengths can also overflow."""
+    finite = np.isfinite(positions).all(axis=1) & np.isfinite(rotations).all(axis=(1, 2))
+    if not finite.all():
+        row = int(np.argmin(finite))
+        raise NotFiniteError(f"pose {row} is not finite", positions[row].tolist())

@@ -1,0 +1,203 @@
+"""The machine's limits, checked on nominal and on compensated values; a breach refuses, nothing is clamped."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..errors import GeometryError, KinematicsError, LimitError, NotFiniteError
+from ..kernels.limits import (
+    ASSEMBLY,
+    BASE_CONE,
+    CLEARANCE,
+    CONDITION,
+    CORRECTION,
+    NOT_FINITE,
+    PLATFORM_CONE,
+    STEP,
+    STROKE_LONG,
+    STROKE_SHORT,
+    LimitNumbers,
+    Quantities,
+)
+
+STRUT_NAMES = tuple(f"strut_{i}" for i in range(1, 7))
+"""Names of the six struts, in order, as they stand in messages."""
+
+REASONS = (
+    "",
+    "stroke",
+    "stroke",
+    "base_cone",
+    "platform_cone",
+    "clearance",
+    "condition",
+    "assembly",
+    "not_finite",
+    "correction",
+    "step",
+)
+"""Names of the findings, as counted in diagnostics."""
+
+STAGES = ("nominal", "compensated")
+
+TINY = np.finfo(float).tiny
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the machine may do; every check refuses, none clamps.
+
+    Parameters
+    ----------
+    stroke : ndarray, shape (6, 2)
+        Shortest and longest strut length, m.
+    base_cone, platform_cone : ndarray, shape (6,)
+        Largest angle of each strut to the joint's neutral direction, rad.
+    condition : float
+        Largest condition number of the Jacobian (see :func:`hexapod_comp.machine.kinematics.condition_number`).
+    correction : float
+        Largest magnitude of a strut correction, m.
+    step : float
+        Largest change of a strut command between two commands, m.
+    speed : float
+        Largest strut speed, m/s; used by ``check`` and by the trajectories that this package makes.
+    clearance : float, optional
+        Smallest distance between the axes of two struts, m; 0: not limited. Struts that share a joint do not count.
+    """
+
+    stroke: np.ndarray
+    base_cone: np.ndarray
+    platform_cone: np.ndarray
+    condition: float
+    correction: float
+    step: float
+    speed: float
+    clearance: float = 0.0
+    cone_cosines: np.ndarray = field(init=False, repr=False)
+    """Of the cones' angles, at the base and at the platform, shape (2, 6): what the angles themselves are judged by."""
+
+    def __post_init__(self) -> None:
+        for name, shape in (("stroke", (6, 2)), ("base_cone", (6,)), ("platform_cone", (6,))):
+            object.__setattr__(self, name, frozen_array(getattr(self, name), shape, f"limits.{name}"))
+        for index, (shortest, longest) in enumerate(self.stroke):
+            if not 0.0 < shortest < longest:
+                problem = "shortest length must be positive and below the longest"
+                raise GeometryError(f"limits.stroke[{index}]", problem, [float(shortest), float(longest)])
+        for name in ("base_cone", "platform_cone"):
+            for index, angle in enumerate(getattr(self, name)):
+                if not 0.0 < angle <= np.pi:
+                    raise GeometryError(f"limits.{name}[{index}]", "must lie in (0, π] rad", float(angle))
+        for name, least in (("condition", 1.0), ("correction", 0.0), ("step", 0.0), ("speed", 0.0)):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > least):
+                raise GeometryError(f"limits.{name}", f"must be finite and above {least:g}", value)
+        if not 0.0 <= self.clearance < np.inf:
+            raise GeometryError("limits.clearance", "must be finite and not negative, m", self.clearance)
+        object.__setattr__(self, "cone_cosines", np.cos(np.array([self.base_cone, self.platform_cone])))
+
+    def numbers(
+        self, cone_axes: np.ndarray, apart: np.ndarray, characteristic_length: float, home_sign: float
+    ) -> LimitNumbers:
+        """Return the limits as compiled code takes them; the arguments are the machine's, see there."""
+        return LimitNumbers(
+            stroke=self.stroke.copy(),
+            cone_axes=cone_axes,
+            cone_cosines=self.cone_cosines,
+            apart=apart,
+            condition=float(self.condition),
+            correction=float(self.correction),
+            step=float(self.step),
+            clearance=float(self.clearance),
+            characteristic_length=characteristic_length,
+            home_sign=home_sign,
+        )
+
+    def margins(self, found: Quantities) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Return what is left of each limit of single poses, and the values, by the limit's name.
+
+        Parameters
+        ----------
+        found : Quantities
+            Of N poses in S stages.
+
+        Returns
+        -------
+        dict of str to (ndarray, ndarray)
+            Margins and values, shape (N, S, 6), (N, S, 1) for the condition number: m, rad. A margin is negative,
+            or NaN, exactly where :func:`~hexapod_comp.kernels.limits.check_stage` refuses. Without ``clearance``
+            where it is not limited.
+        """
+        angles, condition = np.arccos(np.clip(found.cosines, -1.0, 1.0)), found.condition[..., None]
+        cones = np.array([self.base_cone, self.platform_cone]) - angles
+        # An angle rounds where its cosine does not: the cosine says on which side of its limit it is.
+        cones = np.where(found.cosines >= self.cone_cosines, np.maximum(cones, 0.0), np.minimum(cones, -TINY))
+        stroke = np.minimum(found.lengths - self.stroke[:, 0], self.stroke[:, 1] - found.lengths)
+        margins = {
+            "stroke": (stroke, found.lengths),
+            "base_cone": (cones[..., 0, :], angles[..., 0, :]),
+            "platform_cone": (cones[..., 1, :], angles[..., 1, :]),
+            "condition": (self.condition - condition, condition),
+        }
+        if self.clearance:
+            margins["clearance"] = (found.distances - self.clearance, found.distances)
+        return margins
+
+    def error(self, code: int, strut: int, stage: int, value: float) -> LimitError | KinematicsError:
+        """Return the error for a finding: which limit, which strut, found and allowed value with units."""
+        which = STAGES[stage]
+        if code == NOT_FINITE:
+            return NotFiniteError(f"the {which} values at this pose are not finite")
+        name = STRUT_NAMES[strut] if strut >= 0 else ""
+        low, high = self.stroke[strut]
+        cone = (self.base_cone if code == BASE_CONE else self.platform_cone)[strut]
+        stroke = (
+            low if value < low else high,
+            f"{name}: {which} length {value * 1e3:.4f} mm is outside the stroke {low * 1e3:.3f}…{high * 1e3:.3f} mm",
+        )
+        allowed, text = {
+            STROKE_SHORT: stroke,
+            STROKE_LONG: stroke,
+            BASE_CONE: (cone, _cone_text(name, which, "base", value, cone)),
+            PLATFORM_CONE: (cone, _cone_text(name, which, "platform", value, cone)),
+            CLEARANCE: (
+                self.clearance,
+                f"{name}: {value * 1e3:.3f} mm from the nearest other strut ({which}), "
+                f"allowed {self.clearance * 1e3:g} mm",
+            ),
+            CONDITION: (
+                self.condition,
+                f"condition number {value:.4g} of the {which} pose is above {self.condition:g}: near a singularity",
+            ),
+            ASSEMBLY: (0.0, f"the {which} pose belongs to another assembly mode than home"),
+            CORRECTION: (
+                self.correction,
+                f"{name}: correction {value * 1e6:.3f} µm is larger than ±{self.correction * 1e6:g} µm",
+            ),
+            STEP: (
+                self.step,
+                f"{name}: the {which} length would change by {value * 1e3:.4f} mm in one command, "
+                f"allowed {self.step * 1e3:g} mm",
+            ),
+        }[code]
+        return LimitError(REASONS[code], text, value, float(allowed), strut if strut >= 0 else None, which)
+
+
+def _cone_text(name: str, which: str, body: str, value: float, limit: float) -> str:
+    return (
+        f"{name}: {body} joint at {math.degrees(value):.3f}° ({which}), allowed {math.degrees(limit):g}° "
+        "from its neutral direction"
+    )
+
+
+def frozen_array(values: object, shape: tuple[int, ...], key: str) -> np.ndarray:
+    """Return a private read-only float copy of the given shape."""
+    array = np.array(values, dtype=float, order="C")
+    if array.shape != shape:
+        raise GeometryError(key, f"must have shape {shape}, not {array.shape}")
+    if not np.isfinite(array).all():
+        raise GeometryError(key, "must be finite", array.tolist())
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,352 @@
+"""The model of the real machine, run forwards (what will the tool do?) and backwards (what to command?).
+
+Three blocks, each optional: structure (where the joints really are), struts (their own errors), field (the
+rest, interpolated on a grid). One sign rule: actual = commanded ∘ error; strut correction = commanded strut
+length − nominal strut length.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..errors import ModelError, NotConvergedError, UnreachableError
+from ..kernels import kinematics as kernels
+from ..kernels.model import actual_pose_one, command_one
+from ..pose import Pose
+from .field import GridField, no_field
+from .geometry import STRUT_NAMES, HexapodGeometry
+from .kinematics import Structure, forward_error
+from .motion import MotionState
+from .struts import StrutErrors
+
+REFERENCE_TEMPERATURE = 20.0
+"""Temperature at which geometry and model hold, °C (ISO 1)."""
+
+LARGEST_DEVIATION = 0.05
+"""Joint deviations above this, m, are a unit error, not a machine."""
+
+TEMPERATURE_RANGE = (-40.0, 120.0)
+"""Sensor readings outside this, °C, are not a machine shop's."""
+
+
+@dataclass(frozen=True)
+class ModelOrigin:
+    """Where a model comes from; carried by the file, not used in the arithmetic.
+
+    Parameters
+    ----------
+    date : str
+        ISO 8601 date of the fit.
+    sources : tuple of (str, str)
+        Name and SHA-256 of each data file that the model was fitted to.
+    held_out_residual : float or None
+        RMS tool error that the model left on data it was not fitted to, m; None when nobody measured it.
+    note : str
+        One line for people.
+    """
+
+    date: str = ""
+    sources: tuple[tuple[str, str], ...] = ()
+    held_out_residual: float | None = None
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class MachineModel:
+    """What the real machine does differently from its geometry file.
+
+    Parameters
+    ----------
+    machine : str
+        Name of the geometry that it belongs to.
+    name : str
+        Name of the model, shown in diagnostics.
+    base_deviation, platform_deviation : ndarray, shape (6, 3)
+        Real minus nominal joint position, m, in each body's frame.
+    struts : StrutErrors
+        Errors of the six struts.
+    field : GridField
+        Interpolated rest.
+    base_expansion, platform_expansion : float
+        Thermal expansion of the two bodies about their origins, 1/K.
+    reversal_threshold : float
+        How far a strut must come back before its direction counts as reversed, m: above the noise of the
+        commands, and as far below the backlash as that allows. The field has a threshold of its own.
+    valid_box : ndarray, shape (2, 3) or None
+        Lowest and highest platform position for which the model was measured, m in ``base``; None: anywhere.
+    origin : ModelOrigin
+        Provenance.
+
+    Raises
+    ------
+    ModelError
+        With key, value and what is allowed.
+    """
+
+    machine: str
+    name: str = "ideal"
+    base_deviation: np.ndarray = field(default_factory=lambda: np.zeros((6, 3)))
+    platform_deviation: np.ndarray = field(default_factory=lambda: np.zeros((6, 3)))
+    struts: StrutErrors = field(default_factory=StrutErrors)
+    field: GridField = field(default_factory=no_field)
+    base_expansion: float = 0.0
+    platform_expansion: float = 0.0
+    reversal_threshold: float = 0.2e-6
+    valid_box: np.ndarray | None = None
+    origin: ModelOrigin = ModelOrigin()
+
+    def __post_init__(self) -> None:
+        for name in ("base_deviation", "platform_deviation"):
+            array = np.array(getattr(self, name), dtype=float)
+            key = f"structure.{name}"
+            if array.shape != (6, 3) or not np.isfinite(array).all():
+                raise ModelError(key, "must be six finite triples, m", array.tolist())
+            if np.abs(array).max() > LARGEST_DEVIATION:
+                problem = f"must stay within ±{LARGEST_DEVIATION * 1e3:g} mm; is the unit right?"
+                raise ModelError(key, problem, float(np.abs(array).max()))
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        for name in ("base_expansion", "platform_expansion"):
+            if not math.isfinite(getattr(self, name)):
+                raise ModelError(f"thermal.{name}", "must be finite, 1/K", getattr(self, name))
+        if self.valid_box is not None:
+            object.__setattr__(self, "valid_box", _checked_box(self.valid_box))
+        if not (math.isfinite(self.reversal_threshold) and self.reversal_threshold >= 0.0):
+            raise ModelError("reversal_threshold", "must be finite and not negative, m", self.reversal_threshold)
+
+
+def _checked_box(valid_box: np.ndarray) -> np.ndarray:
+    """Return a private read-only copy of a box that has an inside."""
+    box = np.array(valid_box, dtype=float)
+    if box.shape != (2, 3) or not (np.isfinite(box).all() and (box[0] < box[1]).all()):
+        raise ModelError("valid_box", "must be its lowest and its highest corner, m", box.tolist())
+    box.flags.writeable = False
+    return box
+
+
+class Temperatures:
+    """Temperatures of struts, base and platform, °C; whatever has not been heard of is at 20 °C.
+
+    Attributes
+    ----------
+    values : dict of str to float
+        Readings by ``strut_1`` … ``strut_6``, ``base``, ``platform``.
+    """
+
+    NAMES = (*STRUT_NAMES, "base", "platform")
+
+    def __init__(self, readings: Mapping[str, float] | None = None) -> None:
+        self.values: dict[str, float] = {}
+        for name, value in (readings or {}).items():
+            self.set(name, value)
+
+    def set(self, name: str, value: float) -> None:
+        """Take a reading.
+
+        Raises
+        ------
+        ModelError
+            Unknown name, not finite, or outside :data:`TEMPERATURE_RANGE`.
+        """
+        if name not in self.NAMES:
+            raise ModelError("temperature", f"must be of one of {', '.join(self.NAMES)}", name)
+        if not TEMPERATURE_RANGE[0] <= value <= TEMPERATURE_RANGE[1]:
+            low, high = TEMPERATURE_RANGE
+            raise ModelError(f"temperature of {name}", f"must lie within {low:g}…{high:g} °C", value)
+        self.values[name] = float(value)
+
+    def above_reference(self, name: str) -> float:
+        """Return the difference to 20 °C, K."""
+        return self.values.get(name, REFERENCE_TEMPERATURE) - REFERENCE_TEMPERATURE
+
+
+class RealMachine:
+    """A geometry with its model at given temperatures, ready to be run both ways.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        The nominal machine.
+    model : MachineModel
+        Its errors.
+    temperatures : Temperatures, optional
+        Readings; 20 °C everywhere by default.
+
+    Raises
+    ------
+    ModelError
+        The model belongs to another machine.
+    """
+
+    def __init__(
+        self, geometry: HexapodGeometry, model: MachineModel, temperatures: Temperatures | None = None
+    ) -> None:
+        if model.machine != geometry.name:
+            problem = f"the model is for machine {model.machine!r}, the geometry is {geometry.name!r}"
+            raise ModelError("machine", problem)
+        self.geometry, self.model = geometry, model
+        self.temperatures = temperatures or Temperatures()
+        base, platform = geometry.kernel_joints
+        self.structure = Structure.of(geometry).moved(
+            self._displacement("base", base, model.base_deviation, model.base_expansion),
+            self._displacement("platform", platform, model.platform_deviation, model.platform_expansion),
+        )
+        growth = np.array([self._growth(n, a) for n, a in zip(STRUT_NAMES, model.struts.expansion, strict=True)])
+        structure = self.structure
+        self.body = (structure.base_joints, structure.platform_joints, *geometry.kernel_axes)
+        self.solver = (structure.characteristic_length, structure.home_sign, structure.max_condition)
+        self.strut_arrays = (
+            model.struts.parameter_table(geometry, growth),
+            model.struts.map_knots.copy(),
+            model.struts.spline_coefficients(),
+        )
+        self.thresholds = np.array([model.field.reversal_threshold, model.reversal_threshold])
+        self.field_arrays = (model.field.probe, *model.field.grid, *model.field.lines)
+
+    def _displacement(self, body: str, nominal: np.ndarray, deviation: np.ndarray, expansion: float) -> np.ndarray:
+        """Return real minus nominal joints of a body that grows about its origin, shape (6, 3), m."""
+        return deviation + self._growth(body, expansion) * (nominal + deviation)
+
+    def _growth(self, name: str, expansion: float) -> float:
+        return float(expansion) * self.temperatures.above_reference(name)
+
+    def commands_for(self, target: Pose, motion: MotionState) -> tuple[np.ndarray, Pose, bool]:
+        """Return the strut commands that really bring the platform to a pose (backward run).
+
+        Parameters
+        ----------
+        target : Pose
+            ``pose_platform_in_base`` wanted.
+        motion : MotionState
+            Directions of motion; updated.
+
+        Returns
+        -------
+        commands : ndarray, shape (6,)
+            m.
+        model_pose : Pose
+            q with q ∘ E(q) = target: the pose for which the structure's lengths were taken.
+        outside : bool
+            The measured point lies outside the field's box.
+
+        Raises
+        ------
+        NotConvergedError
+            q ∘ E(q) = target could not be solved: the field is no small correction.
+        """
+        commands = np.empty(6)
+        position, rotation = np.empty(3), np.empty((3, 3))
+        solved, outside = command_one(
+            target.position,
+            target.rotation,
+            self.thresholds,
+            motion.low,
+            motion.sense,
+            self.body,
+            self.strut_arrays,
+            self.field_arrays,
+            position,
+            rotation,
+            commands,
+        )
+        if not solved:
+            raise NotConvergedError("the error field is too steep to be undone at this pose")
+        return commands, Pose(position, rotation), bool(outside)
+
+    def pose_for(self, commands: np.ndarray, sense: np.ndarray, guess: Pose) -> tuple[Pose, Pose]:
+        """Return where the platform really goes under given strut commands (forward run).
+
+        Parameters
+        ----------
+        commands : array_like, shape (6,)
+            Strut commands, or encoder readings, m.
+        sense : ndarray, shape (9,)
+            Directions of motion, as in :class:`MotionState`.
+        guess : Pose
+            Model pose to start from, usually the last one.
+
+        Returns
+        -------
+        actual, model_pose : Pose
+            ``pose_platform_in_base`` with and without the field's error.
+
+        Raises
+        ------
+        KinematicsError
+            As :func:`hexapod_comp.machine.kinematics.solve_pose`.
+        """
+        position, rotation = guess.position.copy(), guess.rotation.copy()
+        actual_position, actual_rotation = np.empty(3), np.empty((3, 3))
+        outcome, _, condition, _ = self.forward(
+            np.ascontiguousarray(commands, dtype=float),
+            np.ascontiguousarray(sense, dtype=float),
+            position,
+            rotation,
+            actual_position,
+            actual_rotation,
+        )
+        if outcome != kernels.OK:
+            raise forward_error(outcome, condition, self.structure.max_condition)
+        return Pose(actual_position, actual_rotation), Pose(position, rotation)
+
+    def forward(self, commands, sense, position, rotation, actual_position, actual_rotation):
+        """Run :func:`actual_pose_one` on preallocated arrays: the loop's entry, without checks."""
+        return actual_pose_one(
+            commands,
+            sense,
+            self.body,
+            self.strut_arrays,
+            self.field_arrays,
+            self.solver,
+            position,
+            rotation,
+            actual_position,
+            actual_rotation,
+        )
+
+    def nominal_error(self, target: Pose, sense: np.ndarray) -> Pose:
+        """Return the platform pose that the machine takes when nominal lengths are commanded.
+
+        Parameters
+        ----------
+        target : Pose
+            Commanded ``pose_platform_in_base``.
+        sense : ndarray, shape (9,)
+            Directions of motion.
+
+        Raises
+        ------
+        UnreachableError
+            Nominal lengths cannot be computed at a pose where a strut has no length.
+        """
+        lengths = np.empty(6)
+        kernels.strut_lengths_one(*self.geometry.kernel_joints, target.position, target.rotation, lengths)
+        if not (lengths > 0.0).all():
+            raise UnreachableError("a strut would have no length at this pose")
+        return self.pose_for(lengths, sense, target)[0]
+
+
+class MachinesByTemperature:
+    """Real machines at temperatures that come again and again, each made once.
+
+    Parameters
+    ----------
+    geometry, model : HexapodGeometry, MachineModel
+        As for :class:`RealMachine`.
+    """
+
+    def __init__(self, geometry: HexapodGeometry, model: MachineModel) -> None:
+        self._geometry, self._model = geometry, model
+        self._known: dict[tuple[float, ...], RealMachine] = {}
+
+    def at(self, values: np.ndarray) -> RealMachine:
+        """Return the machine at the temperatures of struts 1–6, base and platform, °C, shape (8,)."""
+        key = tuple(values.tolist())
+        if key not in self._known:
+            temperatures = Temperatures(dict(zip(Temperatures.NAMES, key, strict=True)))
+            self._known[key] = RealMachine(self._geometry, self._model, temperatures)
+        return self._known[key]

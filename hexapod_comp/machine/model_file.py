@@ -1,0 +1,486 @@
+"""Model files: the machine model as YAML, readable by people, refused when anything in it is in doubt.
+
+Keys end in their unit, as in geometry files (:data:`hexapod_comp.formats.yaml.UNITS`); below stand the units that
+:func:`save_model` writes, reading takes any unit of the same kind. A value *per strut* is one number for
+all six or a list of six. Everything marked optional may be left out and is then zero or as stated::
+
+    format: hexapod_comp/model
+    version: 1
+    closed: true                      # optional: the last key is `end`; without it the file is refused as cut off
+    machine: paper                    # must be the geometry file's `machine`
+    name: after the crash             # shown in diagnostics
+    date: '2026-01-31'                # ISO 8601, date or date and time
+    sources:                          # every file that it was fitted to; [] for none
+    - file: laser_x.csv
+      sha256: 64 lower-case hexadecimal digits
+    valid_box_mm: [[-200, -200, 350], [200, 200, 550]]  # optional: lowest, highest platform position, base
+    held_out_residual_um: 4.2         # optional: RMS tool error left on data not used for the fit
+    note: one line for people         # optional
+    reversal_threshold_um: 0.2        # optional (0.2): way back until a strut's direction counts as reversed
+
+    structure:                        # optional: real − nominal joint position
+      base_deviation_um:              # optional, 6×3, in base
+      platform_deviation_um:          # optional, 6×3, in platform
+
+    struts:                           # optional; L = (1 + g)(c + errors), see hexapod_comp.machine.struts
+      offset_um: 0.0                  # each of these optional and per strut
+      pitch_ppm: 0.0
+      reference_length_mm: 0.0        # command at which the pitch error is zero
+      backlash_um: 0.0                # lost motion on reversal
+      expansion_ppm_per_K: 0.0
+      wave:                           # optional: cosine·cos(2πc/period) + sine·sin(2πc/period), per strut
+        cosine_um: 0.0
+        sine_um: 0.0
+        period_mm: 5.0                # required in this block
+      map:                            # optional: natural cubic spline, end values held outside
+        knots_mm: [330, 600, 880]     # commands, increasing
+        values_um:                    # 6×n, one row per strut
+
+    thermal:                          # optional: bodies about their origins
+      base_expansion_ppm_per_K: 0.0
+      platform_expansion_ppm_per_K: 0.0
+
+    field:                            # optional: interpolated error of the measured point, in base
+      grid_x_mm: [-200, 0, 200]       # increasing nodes; the outermost bound the measured box
+      grid_y_mm: [-200, 0, 200]
+      grid_z_mm: [350, 450, 550]
+      probe_mm: [0, 0, 0]             # optional: the measured point in platform
+      reversal_threshold_um: 10.0     # optional (10): way back until an axis' direction counts as reversed
+      outside: hold                   # optional: hold or refuse
+      lines:                          # [] for none
+      - axis: x                       # the line runs along this axis …
+        at: [0, 2]                    # … through these nodes of the other two (in the order x, y, z), from 0
+        direction: forward            # of motion along the axis: forward, backward or both
+        dx_um: [0.1, -3.0, 0.4]       # polynomial: constant, u, u², … with u from −1 to 1 over the box
+        rz_urad: [5.0]                # dx dy dz (lengths), rx ry rz (angles); one left out is zero
+
+    end: true                         # of a closed file: everything above has arrived
+
+A family of lines (all along one axis) is whole or absent: every pair of nodes in both directions.
+
+Numbers are written with as many digits as bring back the very same float where the unit's factor allows
+it, and to one rounding (relative 2e-16) elsewhere; what was read from a file is written back unchanged.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator
+from datetime import date, datetime
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from ..errors import InputFileError, ModelError
+from ..formats.yaml import UNITS, Section, in_si, read_yaml, write_text_atomically
+from .field import COMPONENTS, CROSS_AXES, OUTSIDE_POLICIES, GridField, no_field
+from .geometry import HexapodGeometry
+from .model import MachineModel, ModelOrigin
+from .struts import StrutErrors
+
+MODEL_FORMAT = "hexapod_comp/model"
+MODEL_VERSION = 1
+
+DIRECTIONS = ("forward", "backward")
+"""Order of the directions of motion in a field's arrays."""
+
+STRUT_TERMS = {
+    "offset": ("length", "um"),
+    "pitch": ("ratio", "ppm"),
+    "reference_length": ("length", "mm"),
+    "backlash": ("length", "um"),
+    "expansion": ("expansion", "ppm_per_K"),
+}
+"""Per-strut terms: kind of quantity, and the unit in which they are written."""
+
+COMPONENT_UNITS = {name: ("length", "um") if name[0] == "d" else ("angle", "urad") for name in COMPONENTS}
+
+ISO_8601 = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d(\.\d{3}(\d{3})?)?)?(Z|[+-]\d\d:\d\d)?)?")
+"""The extended forms that every supported Python reads alike."""
+
+SHA_256 = re.compile(r"[0-9a-f]{64}")
+
+Line = tuple[int, int, int]
+"""Key of a field line inside its family: direction, node index along each of the two cross axes."""
+
+
+def load_model(path: str | Path, geometry: HexapodGeometry) -> MachineModel:
+    """Read a model file; the module's docstring describes the format.
+
+    Parameters
+    ----------
+    path : str or Path
+        YAML file.
+    geometry : HexapodGeometry
+        The machine that it must belong to.
+
+    Returns
+    -------
+    MachineModel
+
+    Raises
+    ------
+    InputFileError
+        Naming file, key, value and what is allowed.
+    """
+    top = read_yaml(path, MODEL_FORMAT, MODEL_VERSION)
+    _refuse_cut_off(top)
+    machine = top.text("machine")
+    if machine != geometry.name:
+        raise top.error("machine", f"the model is for another machine, must be {geometry.name!r}", machine)
+    try:
+        values = {
+            "name": top.text("name"),
+            "origin": _read_origin(top),
+            **_read_scalars(top),
+            **_read_structure(top),
+            **_read_thermal(top),
+        }
+        if "struts" in top:
+            values["struts"] = _read_struts(top.section("struts"))
+        if "field" in top:
+            values["field"] = _read_field(top.section("field"))
+        top.finish()
+        return MachineModel(machine, **values)
+    except ModelError as error:
+        raise InputFileError(path, error.key, error.problem, error.value) from error
+
+
+def save_model(model: MachineModel, path: str | Path) -> None:
+    """Write a model file, whole or not at all; equal models give equal files.
+
+    Parameters
+    ----------
+    model : MachineModel
+        Its origin must carry a date.
+    path : str or Path
+        File to make or to replace.
+
+    Raises
+    ------
+    ModelError
+        Date or hashes of the origin are not what they should be.
+    InputFileError
+        The file cannot be written.
+    """
+    _check_origin(model.origin)
+    content: dict[str, Any] = {"format": MODEL_FORMAT, "version": MODEL_VERSION, "closed": True}
+    content |= {"machine": model.machine, "name": model.name, "date": model.origin.date}
+    content["sources"] = [{"file": name, "sha256": digest} for name, digest in model.origin.sources]
+    if model.valid_box is not None:
+        content["valid_box_mm"] = _written(model.valid_box, "length", "mm")
+    if model.origin.held_out_residual is not None:
+        content["held_out_residual_um"] = _written(model.origin.held_out_residual, "length", "um")
+    if model.origin.note:
+        content["note"] = model.origin.note
+    content["reversal_threshold_um"] = _written(model.reversal_threshold, "length", "um")
+    blocks = {
+        "structure": _structure_block(model),
+        "struts": _struts_block(model.struts),
+        "thermal": _thermal_block(model),
+        "field": _field_block(model.field),
+    }
+    content |= {name: block for name, block in blocks.items() if block} | {"end": True}
+    text = yaml.dump(content, Dumper=_ModelDumper, sort_keys=False, allow_unicode=True, width=math.inf)
+    write_text_atomically(path, text)
+
+
+# Reading
+
+
+def _refuse_cut_off(top: Section) -> None:
+    """Raise when a closed file has lost its end: every block is optional, so what is left may read well."""
+    marks = [key for key in ("closed", "end") if key in top]
+    for key in marks:
+        value = top.take(key)
+        if value is not True:
+            raise top.error(key, "must be true, or be left out together with its fellow", value)
+    if marks == ["closed"]:
+        raise top.error("end", "is missing: the file is cut off, or still being written")
+    if marks == ["end"]:
+        raise top.error("closed", "is missing at the file's beginning")
+
+
+def _read_origin(top: Section) -> ModelOrigin:
+    given = top.take("date")
+    if isinstance(given, date):  # YAML makes one of an unquoted date
+        given = given.isoformat()
+    residual = None
+    if top.quantity_key("held_out_residual", "length"):
+        residual = float(top.quantity("held_out_residual", "length"))
+    sources = []
+    for entry in top.sections("sources"):
+        sources.append((entry.text("file"), entry.take("sha256")))
+        entry.finish()
+    note = top.text("note") if "note" in top else ""
+    origin = ModelOrigin(given, tuple(sources), residual, note)
+    _check_origin(origin)
+    return origin
+
+
+def _check_origin(origin: ModelOrigin) -> None:
+    """Raise ModelError on a date, hash or residual that is none."""
+    try:
+        if not ISO_8601.fullmatch(origin.date):
+            raise ValueError
+        datetime.fromisoformat(origin.date.replace("Z", "+00:00"))
+    except (TypeError, ValueError) as error:
+        raise ModelError("date", "must be ISO 8601, like 2026-01-31", origin.date) from error
+    for index, (name, digest) in enumerate(origin.sources):
+        if not (isinstance(digest, str) and SHA_256.fullmatch(digest)):
+            problem = f"must be the 64 lower-case hexadecimal digits of the SHA-256 of {name!r}"
+            raise ModelError(f"sources[{index}].sha256", problem, digest)
+    residual = origin.held_out_residual
+    if residual is not None and not (math.isfinite(residual) and residual >= 0.0):
+        raise ModelError("held_out_residual", "must be finite and not negative, m", residual)
+
+
+def _read_scalars(top: Section) -> dict[str, Any]:
+    """Return valid box and reversal threshold, where given."""
+    values: dict[str, Any] = {}
+    if top.quantity_key("valid_box", "length"):
+        values["valid_box"] = top.quantity("valid_box", "length", (2, 3))
+    if top.quantity_key("reversal_threshold", "length"):
+        values["reversal_threshold"] = float(top.quantity("reversal_threshold", "length"))
+    return values
+
+
+def _read_structure(top: Section) -> dict[str, Any]:
+    if "structure" not in top:
+        return {}
+    section = top.section("structure")
+    names = ("base_deviation", "platform_deviation")
+    values = {name: section.quantity(name, "length", (6, 3), np.zeros((6, 3))) for name in names}
+    section.finish()
+    return values
+
+
+def _read_thermal(top: Section) -> dict[str, Any]:
+    if "thermal" not in top:
+        return {}
+    section = top.section("thermal")
+    names = ("base_expansion", "platform_expansion")
+    values = {name: float(section.quantity(name, "expansion", (), 0.0)) for name in names}
+    section.finish()
+    return values
+
+
+def _read_struts(section: Section) -> StrutErrors:
+    values = {name: section.per_strut(name, kind, 0.0) for name, (kind, _) in STRUT_TERMS.items()}
+    if "wave" in section:
+        wave = section.section("wave")
+        values |= {name: wave.per_strut(name, "length", 0.0) for name in ("cosine", "sine")}
+        values["period"] = wave.per_strut("period", "length")
+        wave.finish()
+    if "map" in section:
+        length_map = section.section("map")
+        values["map_knots"] = length_map.quantity("knots", "length", (None,))
+        values["map_values"] = length_map.quantity("values", "length", (6, None))
+        length_map.finish()
+    section.finish()
+    return StrutErrors(**values)
+
+
+def _read_field(section: Section) -> GridField:
+    grid = tuple(section.quantity(f"grid_{axis}", "length", (None,)) for axis in "xyz")
+    probe = section.quantity("probe", "length", (3,), np.zeros(3))
+    threshold = float(section.quantity("reversal_threshold", "length", (), no_field().reversal_threshold))
+    outside = section.choice("outside", OUTSIDE_POLICIES, "hold")
+    families: dict[str, dict[Line, np.ndarray]] = {axis: {} for axis in "xyz"}
+    for entry in section.sections("lines"):
+        _read_line(entry, grid, families)
+    lines = [
+        _family_array(section, axis, families[axis], len(grid[first]), len(grid[second]))
+        for axis, (first, second) in zip("xyz", CROSS_AXES, strict=True)
+    ]
+    section.finish()
+    families_in_order = (lines[0], lines[1], lines[2])
+    return GridField((grid[0], grid[1], grid[2]), families_in_order, probe, outside, threshold)
+
+
+def _read_line(entry: Section, grid: tuple[np.ndarray, ...], families: dict[str, dict[Line, np.ndarray]]) -> None:
+    """Read one line of the field into its family, for one direction or both."""
+    axis = entry.choice("axis", ("x", "y", "z"))
+    cross = CROSS_AXES["xyz".index(axis)]
+    first, second = _node_indices(entry, [len(grid[other]) for other in cross])
+    direction = entry.choice("direction", (*DIRECTIONS, "both"))
+    rows = [entry.quantity(name, kind, (None,), ()) for name, (kind, _) in COMPONENT_UNITS.items()]
+    entry.finish()
+    coefficients = np.zeros((6, max(len(row) for row in rows)))
+    for component, row in enumerate(rows):
+        coefficients[component, : len(row)] = row
+    for index, name in enumerate(DIRECTIONS):
+        if direction not in (name, "both"):
+            continue
+        if (index, first, second) in families[axis]:
+            problem = f"the {name} line along {axis} through these nodes is given twice"
+            raise entry.error("at", problem, [first, second])
+        families[axis][index, first, second] = coefficients
+
+
+def _node_indices(entry: Section, counts: list[int]) -> tuple[int, int]:
+    found = entry.take("at")
+    inside = (
+        isinstance(found, list)
+        and len(found) == 2
+        and all(type(index) is int and 0 <= index < count for index, count in zip(found, counts, strict=True))
+    )
+    if not inside:
+        problem = f"must be two node indices within 0…{counts[0] - 1} and 0…{counts[1] - 1}"
+        raise entry.error("at", problem, found)
+    return found[0], found[1]
+
+
+def _family_array(
+    section: Section, axis: str, family: dict[Line, np.ndarray], first_count: int, second_count: int
+) -> np.ndarray:
+    """Return the family's coefficients, shape (2, n, m, 6, K); K = 0 for one that was not measured."""
+    if not family:
+        return np.zeros((2, first_count, second_count, 6, 0))
+    every = product(range(2), range(first_count), range(second_count))
+    missing = next((line for line in every if line not in family), None)
+    if missing is not None:  # looked for before anything is allocated: node counts are the file's
+        direction, *nodes = missing
+        raise section.error("lines", f"the {DIRECTIONS[direction]} line along {axis} at {nodes} is missing")
+    powers = max(coefficients.shape[1] for coefficients in family.values())
+    array = np.zeros((2, first_count, second_count, 6, powers))
+    for line, coefficients in family.items():
+        array[line][:, : coefficients.shape[1]] = coefficients
+    return array
+
+
+# Writing
+
+
+class _ModelDumper(yaml.SafeDumper):
+    """Rows of numbers on one line, everything else in blocks, nothing by reference."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _represent_list(dumper: yaml.SafeDumper, data: list) -> yaml.Node:
+    row = not any(isinstance(item, list | dict) for item in data)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=row)
+
+
+_ModelDumper.add_representer(list, _represent_list)
+
+
+def _written(values: Any, kind: str, unit: str) -> Any:
+    """Return SI values in a unit, as nested lists of floats that read back to the same values."""
+    factor = UNITS[kind][unit]
+    return _map_numbers(lambda value: _in_unit(value, factor), np.asarray(values, dtype=float).tolist())
+
+
+def _map_numbers(function: Callable[[float], float], values: Any) -> Any:
+    return [_map_numbers(function, item) for item in values] if isinstance(values, list) else function(values)
+
+
+def _in_unit(value: float, factor: float) -> float:
+    """Return the shortest number that reads back as `value`, or as its neighbour where no number does."""
+    exact = _exact_in_unit(value, factor)
+    if exact is None:
+        nearest = value / factor
+        exact = _exact_in_unit(float(in_si(nearest, factor)), factor)  # what will be read is written alike
+        return nearest if exact is None else exact
+    return exact
+
+
+def _exact_in_unit(value: float, factor: float) -> float | None:
+    quotient = value / factor
+    candidates = [float(f"{quotient:.{digits}g}") for digits in (15, 16, 17)]
+    candidates += [math.nextafter(quotient, math.inf), math.nextafter(quotient, -math.inf)]
+    return next((number + 0.0 for number in candidates if in_si(number, factor) == value), None)
+
+
+def _per_strut(values: np.ndarray, kind: str, unit: str) -> Any:
+    """Return one number where all six are equal, else the six."""
+    return _written(values[0] if (values == values[0]).all() else values, kind, unit)
+
+
+def _structure_block(model: MachineModel) -> dict[str, Any]:
+    given = {"base_deviation": model.base_deviation, "platform_deviation": model.platform_deviation}
+    return {f"{name}_um": _written(values, "length", "um") for name, values in given.items() if values.any()}
+
+
+def _thermal_block(model: MachineModel) -> dict[str, Any]:
+    given = {"base_expansion": model.base_expansion, "platform_expansion": model.platform_expansion}
+    unit = "ppm_per_K"
+    return {f"{name}_{unit}": _written(value, "expansion", unit) for name, value in given.items() if value}
+
+
+def _struts_block(struts: StrutErrors) -> dict[str, Any]:
+    block = {}
+    for name, (kind, unit) in STRUT_TERMS.items():
+        if getattr(struts, name).any():
+            block[f"{name}_{unit}"] = _per_strut(getattr(struts, name), kind, unit)
+    if struts.cosine.any() or struts.sine.any() or (struts.period != StrutErrors().period).any():
+        block["wave"] = {
+            f"{name}_{unit}": _per_strut(getattr(struts, name), "length", unit)
+            for name, unit in (("cosine", "um"), ("sine", "um"), ("period", "mm"))
+        }
+    if len(struts.map_knots):
+        knots = _written(struts.map_knots, "length", "mm")
+        block["map"] = {"knots_mm": knots, "values_um": _written(struts.map_values, "length", "um")}
+    return block
+
+
+def _field_block(field: GridField) -> dict[str, Any]:
+    if _is_no_field(field):
+        return {}
+    block: dict[str, Any] = {}
+    for axis, nodes in zip("xyz", field.grid, strict=True):
+        block[f"grid_{axis}_mm"] = _written(nodes, "length", "mm")
+    block["probe_mm"] = _written(field.probe, "length", "mm")
+    block["reversal_threshold_um"] = _written(field.reversal_threshold, "length", "um")
+    block["outside"] = field.outside
+    block["lines"] = [
+        line for axis, family in zip("xyz", field.lines, strict=True) for line in _family_lines(axis, family)
+    ]
+    return block
+
+
+def _is_no_field(field: GridField) -> bool:
+    """Return whether leaving the block out brings the same field back."""
+    nothing = no_field()
+    return (
+        not any(family.shape[4] for family in field.lines)
+        and all(np.array_equal(mine, its) for mine, its in zip(field.grid, nothing.grid, strict=True))
+        and not field.probe.any()
+        and field.outside == nothing.outside
+        and field.reversal_threshold == nothing.reversal_threshold
+    )
+
+
+def _family_lines(axis: str, family: np.ndarray) -> Iterator[dict[str, Any]]:
+    """Yield the family's lines, each with the components that any line of the family has.
+
+    Rows keep their full number of powers, and a family of zeros keeps one component, so that reading
+    brings back the same shape.
+    """
+    if not family.shape[4]:
+        return
+    used = np.flatnonzero(family.any(axis=(0, 1, 2, 4)))
+    components = used.tolist() or ["xyz".index(axis)]
+    for first, second in np.ndindex(family.shape[1:3]):
+        forward, backward = family[:, first, second]
+        given = {"both": forward}
+        if not np.array_equal(forward, backward):
+            given = dict(zip(DIRECTIONS, (forward, backward), strict=True))
+        for direction, line in given.items():
+            rows = _component_rows(line, components)
+            yield {"axis": axis, "at": [first, second], "direction": direction, **rows}
+
+
+def _component_rows(line: np.ndarray, components: list[int]) -> dict[str, Any]:
+    rows = {}
+    for component in components:
+        name = COMPONENTS[component]
+        kind, unit = COMPONENT_UNITS[name]
+        rows[f"{name}_{unit}"] = _written(line[component], kind, unit)
+    return rows

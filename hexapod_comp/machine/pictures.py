@@ -1,0 +1,113 @@
+"""Pictures of a machine and of its conventions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from ..formats.figures import WITH, WITHOUT
+from ..kernels.motion import follow
+from ..pose import Pose
+from .geometry import HexapodGeometry
+
+
+def machine_figure(geometry: HexapodGeometry) -> Figure:
+    """Draw a machine at home: joints, struts and frames in space, joints and struts from above.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        Its tool and work frames are drawn where they differ from those that carry them.
+    """
+    figure = Figure(figsize=(12, 6), layout="constrained")
+    space = figure.add_subplot(1, 2, 1, projection="3d")
+    above = figure.add_subplot(1, 2, 2)
+    base = geometry.base_joints * 1e3
+    platform = (geometry.home.position + geometry.platform_joints @ geometry.home.rotation.T) * 1e3
+    for axes, shown in ((space, 3), (above, 2)):
+        _bodies(axes, base[:, :shown], platform[:, :shown])
+    for name, pose in _frames(geometry).items():
+        _frame(space, name, pose)
+    space.set_box_aspect(None, zoom=1.15)  # type: ignore[attr-defined]
+    space.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm", aspect="equal")  # type: ignore[call-arg]
+    space.view_init(elev=22.0, azim=-62.0)  # type: ignore[attr-defined]
+    above.set(xlabel="x, mm", ylabel="y, mm", aspect="equal", title="from above")
+    above.margins(0.12)
+    return figure
+
+
+def _bodies(axes: Any, base: np.ndarray, platform: np.ndarray) -> None:
+    """Draw both bodies and the six struts on flat or 3-D axes; joints (6, 2) or (6, 3), mm."""
+    for joints, colour in ((base, "black"), (platform, WITH)):
+        axes.plot(*np.vstack([joints, joints[:1]]).T, color=colour, lw=2.0, marker="o", ms=4)
+    for index, (start, end) in enumerate(zip(base, platform, strict=True)):
+        axes.plot(*np.stack([start, end]).T, color=WITHOUT, lw=1.2)
+        axes.text(*(0.5 * (start + end)), str(index + 1), color=WITHOUT, weight="bold")
+        axes.text(*(start * 1.08), f"$b_{index + 1}$", ha="center", va="center")
+    for joint in np.unique(platform.round(6), axis=0):
+        here = np.flatnonzero(np.abs(platform - joint).max(axis=1) < 1e-3) + 1
+        axes.text(*joint, " = ".join(f"$t_{i}$" for i in here), color=WITH, va="bottom")
+
+
+def _frames(geometry: HexapodGeometry) -> dict[str, Pose]:
+    """Return the frames worth drawing, by name, seen from ``base``."""
+    frames = {"base": Pose.identity(), "platform": geometry.home}
+    offsets = ("tool", geometry.home, geometry.tool), ("work", frames["base"], geometry.work)
+    for name, outer, inner in offsets:
+        if inner.position.any() or not np.array_equal(inner.rotation, np.eye(3)):
+            frames[name] = outer @ inner
+    return frames
+
+
+def _frame(axes: Any, name: str, pose: Pose) -> None:
+    """Draw the axes of a frame, 70 mm long, and its name on 3-D axes."""
+    origin = pose.position * 1e3
+    for axis, colour, letter in zip(pose.rotation.T, ("#b22222", "#2e8b57", "#4169e1"), "xyz", strict=True):
+        tip = origin + 70.0 * axis
+        axes.plot(*np.stack([origin, tip]).T, color=colour, lw=1.5)
+        axes.text(*tip, letter, color=colour, fontsize=7)
+    axes.text(*(origin - 12.0), name, style="italic", ha="right", va="top")
+
+
+def weights_figure() -> Figure:
+    """Draw the weights of the four lines around a tool: each the area of the rectangle opposite to it."""
+    figure = Figure(figsize=(4.8, 4.2), layout="constrained")
+    axes = figure.subplots()
+    y, z = 0.3, 0.4
+    corners = ((0.0, 0.0), (0.0, 1.0), (1.0, 1.0), (1.0, 0.0))
+    for index, (at_y, at_z) in enumerate(corners):
+        far_y, far_z = 1.0 - at_y, 1.0 - at_z
+        width, height, colour = abs(far_y - y), abs(far_z - z), f"C{index}"
+        corner = min(y, far_y), min(z, far_z)
+        axes.add_patch(Rectangle(corner, width, height, color=colour, alpha=0.3, lw=0.0))
+        weight = f"$W_{index + 1}$ = {width * height:.2f}"
+        axes.text(0.5 * (y + far_y), 0.5 * (z + far_z), weight, ha="center", va="center")
+        axes.plot(at_y, at_z, "o", color=colour, ms=9, clip_on=False)
+        axes.annotate(f"line {index + 1}", (at_y, at_z), (6, 6), textcoords="offset points", color=colour)
+    axes.plot(y, z, "k+", ms=14)
+    axes.annotate("tool", (y, z), (6, 4), textcoords="offset points")
+    axes.set(xlim=(-0.06, 1.2), ylim=(-0.06, 1.12), aspect="equal")
+    axes.set(xlabel="s, across in y", ylabel="t, across in z")
+    return figure
+
+
+def direction_figure() -> Figure:
+    """Show the direction of motion that the code gives a noisy axis: there, at rest, and back."""
+    threshold = 2.0
+    there = np.concatenate([np.linspace(0.0, 12.0, 60), np.full(60, 12.0), np.linspace(12.0, 3.0, 60)])
+    values = there + 0.3 * np.random.default_rng(1).standard_normal(len(there))
+    low, sense = np.full(1, np.nan), np.zeros(1)
+    followed = np.array([(follow(value, threshold, low, sense, 0), low[0]) for value in values])
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
+    number, window = np.arange(len(values)), followed[:, 1]
+    upper.fill_between(number, window, window + threshold, color=WITH, alpha=0.25, label="window")
+    upper.plot(values, color="black", lw=0.8, label="value, with noise")
+    upper.set(ylabel="µm")
+    upper.legend()
+    lower.step(number, followed[:, 0], where="post", color=WITHOUT)
+    lower.set(xlabel="command", ylabel="direction", yticks=[-1, 0, 1])
+    return figure

@@ -1,0 +1,190 @@
+"""Streams of poses for a machine: smooth moves between poses that keep its limits, and milling paths."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..pose import Pose
+from .geometry import HexapodGeometry
+from .kinematics import Structure, strut_lengths_batch
+
+SHARE_OF_LIMIT = 0.8
+"""Moves use this much of the allowed strut speed and step, leaving room for the corrections."""
+
+PEAK_OF_QUINTIC = 1.875
+"""Largest slope of the quintic 10t³ − 15t⁴ + 6t⁵."""
+
+COARSE = 20
+"""Sections of a move over which the struts' slopes are taken."""
+
+
+@dataclass(frozen=True)
+class Path:
+    """Poses to be sent one after the other at a constant rate.
+
+    Attributes
+    ----------
+    positions : ndarray, shape (N, 3)
+        m, in the commanded frame.
+    rotations : ndarray, shape (N, 3, 3)
+        Rotation matrices.
+    rate : float
+        Poses per second, Hz.
+    """
+
+    positions: np.ndarray
+    rotations: np.ndarray
+    rate: float
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def pose(self, index: int) -> Pose:
+        """Return one pose."""
+        return Pose(self.positions[index], self.rotations[index])
+
+
+def move(geometry: HexapodGeometry, start: Pose, end: Pose, rate: float, feed: float | None = None) -> Path:
+    """Return a smooth straight move between two tool poses that keeps strut speeds and steps.
+
+    Position runs straight, rotation along the shortest arc, both with the quintic 10t³ − 15t⁴ + 6t⁵, which
+    starts and ends at rest.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        Its limits of step and speed set the duration.
+    start, end : Pose
+        ``pose_tool_in_work``; the start is not part of the path, the end is.
+    rate : float
+        Poses per second, Hz.
+    feed : float, optional
+        Largest tool speed, m/s.
+    """
+    positions = np.array([start.position, end.position])
+    return moves(geometry, positions, np.array([start.rotation, end.rotation]), rate, feed)[0]
+
+
+def moves(
+    geometry: HexapodGeometry,
+    positions: np.ndarray,
+    rotations: np.ndarray,
+    rate: float,
+    feed: float | None = None,
+) -> tuple[Path, np.ndarray]:
+    """Return the moves (see :func:`move`) that join N tool poses, with a rest at each.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        Its limits of step and speed set each move's duration.
+    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
+        Tool poses in the work frame, m; the first is not part of the path.
+    rate : float
+        Poses per second, Hz.
+    feed : float, optional
+        Largest tool speed, m/s.
+
+    Returns
+    -------
+    path : Path
+        All moves, one after the other.
+    counts : ndarray of int, shape (N − 1,)
+        Poses of each move.
+    """
+    legs = np.arange(len(positions) - 1)
+    share = np.tile(np.linspace(0.0, 1.0, COARSE + 1), len(legs))
+    coarse = _interpolate(positions, rotations, np.repeat(legs, COARSE + 1), share)
+    lengths = strut_lengths_batch(Structure.of(geometry), *geometry.platform_poses(*coarse), threads=1)
+    changes = np.abs(np.diff(lengths.reshape(len(legs), COARSE + 1, 6), axis=1))
+    allowed = SHARE_OF_LIMIT * min(geometry.limits.speed, geometry.limits.step * rate)
+    duration = PEAK_OF_QUINTIC * COARSE * changes.max(axis=(1, 2)) / allowed
+    if feed is not None:
+        travel = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        duration = np.maximum(duration, PEAK_OF_QUINTIC * travel / feed)
+    counts = np.maximum(1, np.ceil(duration * rate).astype(int))
+    leg = np.repeat(legs, counts)
+    t = (np.arange(len(leg)) - (np.cumsum(counts) - counts)[leg] + 1) / counts[leg]
+    return Path(*_interpolate(positions, rotations, leg, quintic(t)), rate), counts
+
+
+def circle(centre: Pose, radius: float, feed: float, rate: float) -> Path:
+    """Return one full circle in the centre pose's xy plane, from rest to rest at its +x side.
+
+    Parameters
+    ----------
+    centre : Pose
+        Centre and orientation of the tool.
+    radius : float
+        m.
+    feed : float
+        Largest tool speed, m/s.
+    rate : float
+        Poses per second, Hz.
+    """
+    count = max(8, int(np.ceil(PEAK_OF_QUINTIC * 2.0 * np.pi * radius / feed * rate)))
+    angle = 2.0 * np.pi * quintic(np.arange(count + 1) / count)
+    offsets = radius * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
+    positions = centre.position + offsets @ centre.rotation.T
+    return Path(positions, np.tile(centre.rotation, (count + 1, 1, 1)), rate)
+
+
+def quintic(t: np.ndarray) -> np.ndarray:
+    """Return 10t³ − 15t⁴ + 6t⁵: from 0 to 1 with speed and acceleration zero at both ends."""
+    return t**3 * (10.0 - 15.0 * t + 6.0 * t * t)
+
+
+def pocket(
+    geometry: HexapodGeometry, corner: Pose, size: tuple[float, float], pitch: float, feed: float, rate: float
+) -> Path:
+    """Return a rectangular pocket milled in a zigzag: every row reverses x, so that backlash shows.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        Its limits bound the speed of each stroke.
+    corner : Pose
+        Pose at the pocket's lowest x and y.
+    size : tuple of float
+        Length along x and y, m.
+    pitch : float
+        Distance of the rows, m.
+    feed : float
+        Largest tool speed, m/s.
+    rate : float
+        Poses per second, Hz.
+    """
+    rows = round(size[1] / pitch) + 1
+    corners = []
+    for row in range(rows):
+        ends = (0.0, size[0]) if row % 2 == 0 else (size[0], 0.0)
+        corners += [corner @ Pose(np.array([x, row * pitch, 0.0]), np.eye(3)) for x in ends]
+    return join([move(geometry, a, b, rate, feed) for a, b in pairwise(corners)])
+
+
+def commanded_in_base(geometry: HexapodGeometry) -> HexapodGeometry:
+    """Return the machine with its work frame in the base, for poses that are given in ``base``."""
+    return replace(geometry, work=Pose.identity())
+
+
+def join(paths: list[Path]) -> Path:
+    """Return several paths of one rate as one."""
+    return Path(
+        np.concatenate([path.positions for path in paths]),
+        np.concatenate([path.rotations for path in paths]),
+        paths[0].rate,
+    )
+
+
+def _interpolate(
+    positions: np.ndarray, rotations: np.ndarray, leg: np.ndarray, share: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the poses at the given shares, (K,), of the given legs, (K,): straight, shortest arc."""
+    travel = np.diff(positions, axis=0)
+    turn = Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1)).as_rotvec()
+    turned = Rotation.from_rotvec(share[:, None] * turn[leg]).as_matrix() @ rotations[leg]
+    return positions[leg] + share[:, None] * travel[leg], turned

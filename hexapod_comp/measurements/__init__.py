@@ -1,0 +1,1 @@
+"""Readings of every instrument, and every reader of measured files."""

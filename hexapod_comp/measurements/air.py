@@ -1,0 +1,284 @@
+"""What the air does to a laser's length, and what temperature does to steel.
+
+An interferometer counts wavelengths, and the wavelength in air is the one in vacuum divided by the refractive
+index n: about 1.00027, falling by 0.95·10⁻⁶ per K, rising by 2.7·10⁻⁶ per kPa. Readings are corrected here
+once, and only when the instrument has not done so itself. Humidity bends the laser, not the steel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from ..errors import ModelError
+from ..machine.model import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE
+
+Values: TypeAlias = "float | np.ndarray"
+"""One number, or one a reading."""
+
+VACUUM_WAVELENGTH = 632.9908e-9
+"""Vacuum wavelength of a helium-neon laser, m. The index moves by 1·10⁻¹² per 0.1 pm: any He-Ne will do."""
+
+USUAL_CO2_PPM = 450.0
+"""CO₂ in the air of a workshop, 10⁻⁶; 100 more raise n by 1.5·10⁻⁸."""
+
+ZERO_CELSIUS = 273.15
+"""0 °C in K."""
+
+AIR_RANGES = {
+    "temperature": (0.0, 60.0, "0…60 °C"),
+    "pressure": (50e3, 120e3, "50…120 kPa, given in Pa"),
+    "humidity": (0.0, 1.0, "0…1, as a fraction"),
+}
+"""Lowest and highest of what is taken for the air of a workshop: where Ciddor's equation holds, above ice."""
+
+WAVELENGTH_RANGE = (300e-9, 1700e-9)
+"""Vacuum wavelengths for which Ciddor's equation holds, m."""
+
+CO2_RANGE = (0.0, 2000.0)
+"""CO₂ for which Ciddor's equation holds, 10⁻⁶."""
+
+LARGEST_INDEX = 1.001
+"""No air of :data:`AIR_RANGES` comes near it: an index above is a mistake."""
+
+LARGEST_EXPANSION = 100e-6
+"""Steel has 12·10⁻⁶, aluminium 23·10⁻⁶ per K: above is a unit error."""
+
+
+@dataclass(frozen=True, eq=False)
+class Air:
+    """State of the air along a laser's beam, for one reading or for many.
+
+    Parameters
+    ----------
+    temperature : float or ndarray
+        °C.
+    pressure : float or ndarray
+        As the barometer on the spot shows it, not reduced to sea level, Pa.
+    humidity : float or ndarray
+        Relative, as a fraction 0…1.
+
+    Raises
+    ------
+    ModelError
+        Not finite, outside :data:`AIR_RANGES`, or shapes that do not go together; says which reading.
+    """
+
+    temperature: Values
+    pressure: Values
+    humidity: Values
+
+    def __post_init__(self) -> None:
+        for name, (low, high, allowed) in AIR_RANGES.items():
+            values = np.array(getattr(self, name), dtype=float)
+            _check_range(f"air {name}", values, low, high, allowed)
+            values.flags.writeable = False
+            object.__setattr__(self, name, values)
+        shapes = [np.shape(getattr(self, name)) for name in AIR_RANGES]
+        try:
+            np.broadcast_shapes(*shapes)
+        except ValueError as error:
+            problem = "temperature, pressure and humidity must each be one number or one a reading"
+            raise ModelError("air", problem, shapes) from error
+
+
+def _check_range(key: str, values: Values, low: float, high: float, allowed: str) -> None:
+    """Raise on the first value outside its range, NaN included."""
+    array = np.asarray(values, dtype=float)
+    wrong = ~((array >= low) & (array <= high))
+    if wrong.any():
+        index = int(wrong.argmax())
+        where = f"{key}, reading {index + 1}" if array.ndim else key
+        raise ModelError(where, f"must lie within {allowed}; is the unit right?", float(array.flat[index]))
+
+
+STANDARD_AIR = Air(20.0, 101_325.0, 0.5)
+"""What instruments take for the air when nobody has told them otherwise; n = 1.00027137."""
+
+
+def ciddor_index(air: Air, vacuum_wavelength: float = VACUUM_WAVELENGTH, co2_ppm: float = USUAL_CO2_PPM) -> np.ndarray:
+    """Return the phase refractive index of air after Ciddor.
+
+    Ciddor, *Refractive index of air: new equations for the visible and near infrared*, Applied Optics 35,
+    1566 (1996), eqs. 1–5: standard refractivities of dry air and of water vapour, each in proportion to its
+    density by the BIPM 1981/91 equation. Gas constant and molar masses cancel. Its own uncertainty is 2 to
+    5·10⁻⁸; 0.1 K of air temperature is twice that.
+
+    Parameters
+    ----------
+    air : Air
+        State of the air.
+    vacuum_wavelength : float
+        m.
+    co2_ppm : float
+        CO₂, 10⁻⁶ of the molecules.
+
+    Returns
+    -------
+    ndarray
+        n, in the shape of the air's readings.
+
+    Raises
+    ------
+    ModelError
+        Wavelength or CO₂ outside the equation's range.
+    """
+    low, high = WAVELENGTH_RANGE
+    _check_range("vacuum wavelength", vacuum_wavelength, low, high, f"{low:g}…{high:g} m")
+    _check_range("CO2", co2_ppm, *CO2_RANGE, f"{CO2_RANGE[0]:g}…{CO2_RANGE[1]:g} ppm")
+    vapour = _vapour_fraction(air)
+    density = _molar_density(air.pressure, air.temperature, vapour)
+    of_dry_air = density * (1.0 - vapour) / _molar_density(101_325.0, 15.0, 0.0)
+    of_vapour = density * vapour / _molar_density(1333.0, 20.0, 1.0)
+    wavenumber_squared = (1e-6 / vacuum_wavelength) ** 2
+    dry_refractivity = _dry_air_refractivity(wavenumber_squared, co2_ppm)
+    vapour_refractivity = _vapour_refractivity(wavenumber_squared)
+    return np.asarray(1.0 + of_dry_air * dry_refractivity + of_vapour * vapour_refractivity)
+
+
+def _dry_air_refractivity(wavenumber_squared: float, co2_ppm: float) -> float:
+    """Return n − 1 of dry air at 15 °C and 101 325 Pa (Ciddor, eqs. 1 and 2); wavenumber in 1/µm."""
+    of_450_ppm = 5_792_105.0 / (238.0185 - wavenumber_squared) + 167_917.0 / (57.362 - wavenumber_squared)
+    return 1e-8 * of_450_ppm * (1.0 + 0.534e-6 * (co2_ppm - 450.0))
+
+
+def _vapour_refractivity(wavenumber_squared: float) -> float:
+    """Return n − 1 of water vapour at 20 °C and 1333 Pa (Ciddor, eq. 3); wavenumber in 1/µm."""
+    return 1.022e-8 * float(np.polyval([0.004028, -0.032380, 2.6422, 295.235], wavenumber_squared))
+
+
+def _vapour_fraction(air: Air) -> Values:
+    """Return the share of water among the molecules (Ciddor, appendix A)."""
+    kelvin = air.temperature + ZERO_CELSIUS
+    saturation = np.exp(1.2378847e-5 * kelvin**2 - 1.9121316e-2 * kelvin + 33.93711047 - 6343.1645 / kelvin)
+    enhancement = 1.00062 + 3.14e-8 * air.pressure + 5.6e-7 * air.temperature**2
+    return enhancement * air.humidity * saturation / air.pressure
+
+
+def _molar_density(pressure: Values, temperature: Values, vapour: Values) -> Values:
+    """Return p/(Z·T), the molar density times the gas constant, Pa/K (Ciddor, eq. 4 and appendix A)."""
+    t, ratio = temperature, pressure / (temperature + ZERO_CELSIUS)
+    first = 1.58123e-6 - 2.9331e-8 * t + 1.1043e-10 * t**2
+    first = first + (5.707e-6 - 2.051e-8 * t) * vapour + (1.9898e-4 - 2.376e-6 * t) * vapour**2
+    compressibility = 1.0 - ratio * first + ratio**2 * (1.83e-11 - 0.765e-8 * vapour**2)
+    return ratio / compressibility
+
+
+def shop_index(air: Air) -> np.ndarray:
+    """Return the refractive index of air for a helium-neon laser by the formula of the shop floor.
+
+    NIST, *Engineering Metrology Toolbox*, refractive index of air, appendix B (Stone and Zimmerman). For
+    checks by hand: at 0…40 °C and 50…120 kPa, any humidity, it stays within 0.12·10⁻⁶ of
+    :func:`ciddor_index` (measured, see the tests); beyond 40 °C it does not.
+
+    Parameters
+    ----------
+    air : Air
+        State of the air.
+
+    Returns
+    -------
+    ndarray
+        n, in the shape of the air's readings.
+    """
+    dry = 7.86e-4 * (air.pressure / 1e3) / (273.0 + air.temperature)
+    return np.asarray(1.0 + dry - 1.5e-11 * (100.0 * air.humidity) * (air.temperature**2 + 160.0))
+
+
+def correct_displacement(
+    raw: Values,
+    air: Air,
+    assumed_index: Values = 1.0,
+    dead_path: Values = 0.0,
+    air_at_zero: Air | None = None,
+    index: Callable[[Air], np.ndarray] = ciddor_index,
+) -> np.ndarray:
+    """Return the displacement that an interferometer measured, from what it showed.
+
+    It counts what the optical path n·(D + L) has changed since the zero, n₀·D, and shows the count divided by
+    the index that it assumes. So L = (raw·n_assumed + n₀·D)/n − D. For straightness and angles, which are
+    differences of two such paths, leave the dead path out.
+
+    Parameters
+    ----------
+    raw : float or ndarray
+        Displacement shown, from the run's zero, m: the whole way, not its deviation from the target.
+    air : Air
+        Air when each reading was taken.
+    assumed_index : float or ndarray
+        Index that the instrument divided by: 1 when it counts vacuum wavelengths, its setting otherwise,
+        as ``ciddor_index(STANDARD_AIR)``. With ``ciddor_index(air)`` only the dead path is left to correct.
+    dead_path : float or ndarray
+        D, m: from interferometer to reflector where the counter was zeroed; negative when readings grow
+        towards the interferometer. What the air does to it during the run looks like a displacement.
+    air_at_zero : Air, optional
+        Air when the counter was zeroed; needed with a dead path.
+    index : callable
+        Air to n; ``functools.partial(ciddor_index, …)`` for another laser.
+
+    Returns
+    -------
+    ndarray
+        Displacement, m.
+
+    Raises
+    ------
+    ModelError
+        An index that no air has, or a dead path without the air at the zero.
+    """
+    _check_range("assumed index", assumed_index, 1.0, LARGEST_INDEX, f"1…{LARGEST_INDEX:g}")
+    n = index(air)
+    displacement = np.asarray(raw) * (assumed_index / n)
+    if not np.any(dead_path):
+        return displacement
+    if air_at_zero is None:
+        raise ModelError("air at zero", "is needed to correct a dead path", float(np.max(np.abs(dead_path))))
+    return displacement - dead_path * (n - index(air_at_zero)) / n
+
+
+def to_reference(length: Values, expansion: float, temperature: Values) -> np.ndarray:
+    """Return at 20 °C a length measured at another temperature.
+
+    For ISO 230-2 figures and for artefacts. Calibration does not need it: there the model's own growth
+    (:class:`~hexapod_comp.machine.model.RealMachine`) takes struts, base and platform to 20 °C.
+
+    Parameters
+    ----------
+    length : float or ndarray
+        As measured, m.
+    expansion : float
+        Of the material, 1/K.
+    temperature : float or ndarray
+        Of the material, °C.
+
+    Returns
+    -------
+    ndarray
+        m.
+
+    Raises
+    ------
+    ModelError
+        Temperature or expansion that no machine has.
+    """
+    return np.asarray(length) / _stretch(expansion, temperature)
+
+
+def from_reference(length: Values, expansion: float, temperature: Values) -> np.ndarray:
+    """Return as measured a length that an instrument with a material sensor has taken to 20 °C.
+
+    The inverse of :func:`to_reference`: the growth that the instrument took out would otherwise be taken out
+    again by the model. Parameters, units and errors are the same; `expansion` is the instrument's setting.
+    """
+    return np.asarray(length) * _stretch(expansion, temperature)
+
+
+def _stretch(expansion: float, temperature: Values) -> Values:
+    """Return 1 + a·(T − 20 °C)."""
+    _check_range("expansion", expansion, -LARGEST_EXPANSION, LARGEST_EXPANSION, "±100 ppm/K, given in 1/K")
+    low, high = TEMPERATURE_RANGE
+    _check_range("material temperature", temperature, low, high, f"{low:g}…{high:g} °C")
+    return 1.0 + expansion * (np.asarray(temperature) - REFERENCE_TEMPERATURE)

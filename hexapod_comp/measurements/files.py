@@ -1,0 +1,60 @@
+"""One door for measured files of every kind."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputFileError
+from ..machine.geometry import HexapodGeometry
+from .carto import read_carto
+from .readings import MeasurementSet
+from .runs import joined
+from .tidy_csv import read_measurements
+from .wide_csv import read_wide
+
+LASER_SUFFIXES = (".rtl", ".rtx")
+"""Files of the laser software; each needs its line file beside it."""
+
+
+def read_files(
+    paths: Sequence[str | Path],
+    geometry: HexapodGeometry,
+    columns: str | Path | None = None,
+    probe: np.ndarray | None = None,
+) -> MeasurementSet:
+    """Read measured files, whatever wrote them, as one set.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        ``.rtl`` and ``.rtx`` files, each with a line file of the same name and ``.yaml`` beside it; all others
+        are CSV.
+    geometry : HexapodGeometry
+        The machine that was measured.
+    columns : path, optional
+        Columns file that explains the CSV files; without it they are tidy CSV, one reading a row.
+    probe : array_like, shape (3,), optional
+        The measured point in ``platform``, m; the tool's tip by default.
+
+    Raises
+    ------
+    InputFileError
+        Naming file and place.
+    """
+    if not paths:
+        raise InputFileError("measurements", "", "no file is given")
+    laser = [path for path in paths if Path(path).suffix.lower() in LASER_SUFFIXES]
+    tables = [path for path in paths if path not in laser]
+    sets = []
+    if laser:
+        sets.append(read_carto([(path, f"{path}.yaml") for path in laser], geometry, probe))
+    if tables and columns is None:
+        sets.append(read_measurements(tables, geometry, probe))
+    if tables and columns is not None:
+        if probe is not None:
+            raise InputFileError(tables[0], "", "a wide file is of the tool's tip; leave the probe out")
+        sets += [read_wide(path, columns, geometry) for path in tables]
+    return joined(sets)

@@ -1,0 +1,373 @@
+"""Measured data of a machine, whatever instrument they come from, in one form.
+
+Every reading is one number that the error of the measured point gives: its displacement along a direction,
+or its rotation about one. With e = (dx, dy, dz, rx, ry, rz) = actual minus commanded, along and about the
+axes of ``base``,
+
+    value = w · e + what the instrument does not know (each run's own zero, the slope of its beam)
+
+so a laser line, a straightness, an angle, a body diagonal and a tracker's pose differ only in w and in what
+is unknown. Readings of one *run* share these unknowns; readings taken at the same command, from the same
+direction, under the same temperatures share a *station*.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..errors import CalibrationError
+from ..machine.geometry import HexapodGeometry
+from ..machine.model import REFERENCE_TEMPERATURE, Temperatures
+from ..pose import Pose
+
+AXES = ("x", "y", "z")
+CHANNELS = (
+    "linear",
+    *(f"straightness_{a}" for a in AXES),
+    *(f"rotation_{a}" for a in AXES),
+    *(f"position_{a}" for a in AXES),
+    *(f"attitude_{a}" for a in AXES),
+)
+"""What a reading is of. ``linear`` is along the run's line; the others are along or about an axis of the work
+frame. Straightness and rotation belong to lines and have unknown zeros; position and attitude are absolute."""
+
+KINDS = ("linear", "straightness", "rotation", "position", "attitude")
+"""Kinds of channel: those of one kind share an instrument and its noise."""
+
+KIND_OF = np.array([KINDS.index(channel.partition("_")[0]) for channel in CHANNELS])
+"""Kind of each channel, as an index."""
+
+DEFAULT_UNCERTAINTY = dict(zip(KINDS, (1e-6, 1e-6, 1e-6, 10e-6, 10e-6), strict=True))
+"""Standard deviation of a reading where neither the file nor repeated readings tell, m or rad."""
+
+ANGULAR_KINDS = ("rotation", "attitude")
+
+FORWARD, BACKWARD, UNKNOWN, FROM_PREVIOUS = 1, -1, 0, 2
+"""How a station was approached; FROM_PREVIOUS: from the command in the row before."""
+
+SAME_ATTITUDE = 1e-6
+"""Attitudes that differ by less, rad, are one."""
+
+LEAST_SIDE = 1e-6
+"""A box of which a side is shorter, m, is a line or a plane."""
+
+LEAST_NOISE = 1e-9
+"""No instrument reads better, m or rad; also keeps readings without noise from having infinite weight."""
+
+LEAST_TRAVEL = 1e-6
+"""Components of a line shorter than this, m, are no travel along that axis."""
+
+
+class Source(NamedTuple):
+    """Where a reading stands.
+
+    Attributes
+    ----------
+    file : str
+        Name of the file, or of what made the reading.
+    line : int
+        Line in it; 0 when it has none.
+    """
+
+    file: str
+    line: int
+
+    def __str__(self) -> str:
+        return f"{self.file}: line {self.line}" if self.line else self.file
+
+
+class Reading(NamedTuple):
+    """One reading as an instrument or a file gives it, in SI; the unit in which files become sets.
+
+    Attributes
+    ----------
+    run : str
+        Readings of one run share the unknown zeros.
+    cycle : int
+        Which of several passes of the run, from 1.
+    direction : int
+        ``FORWARD``, ``BACKWARD``, ``UNKNOWN`` or ``FROM_PREVIOUS``.
+    pose : Pose
+        Commanded ``pose_tool_in_work``.
+    channel : str
+        One of :data:`CHANNELS`.
+    value : float
+        Error read, actual minus commanded, m or rad.
+    uncertainty : float
+        Its standard deviation; NaN when not known.
+    temperatures : tuple of float
+        struts 1–6, base, platform, °C.
+    commands : tuple of float or None
+        Strut readings, m, when the file has them; otherwise the machine was told nominal lengths.
+    source : Source
+        For messages.
+    """
+
+    run: str
+    cycle: int
+    direction: int
+    pose: Pose
+    channel: str
+    value: float
+    uncertainty: float = np.nan
+    temperatures: tuple[float, ...] = (REFERENCE_TEMPERATURE,) * 8
+    commands: tuple[float, ...] | None = None
+    source: Source = Source("", 0)
+
+
+@dataclass(frozen=True)
+class Run:
+    """What the readings of one run share.
+
+    Attributes
+    ----------
+    name : str
+        As in the file.
+    axis : ndarray, shape (3,)
+        Unit vector of the run's line in ``base``, zero for scattered poses. It points along the first of x,
+        y, z along which the line travels: that is forward.
+    origin : ndarray, shape (3,)
+        First commanded point of the line, m in ``base``.
+    """
+
+    name: str
+    axis: np.ndarray
+    origin: np.ndarray
+
+    @property
+    def is_line(self) -> bool:
+        """Whether its points lie on a line."""
+        return bool(self.axis.any())
+
+    @property
+    def base_axis(self) -> int | None:
+        """0, 1 or 2 for a line parallel to x, y or z of ``base``, None for any other."""
+        parallel = np.flatnonzero(np.abs(self.axis) > 1.0 - 1e-9)
+        return int(parallel[0]) if len(parallel) else None
+
+
+@dataclass(frozen=True)
+class Stations:
+    """Where the machine stood: commands and what it felt.
+
+    Attributes
+    ----------
+    positions, rotations : ndarray, shape (M, 3), (M, 3, 3)
+        Commanded ``pose_platform_in_base``, m.
+    commands : ndarray, shape (M, 6)
+        Strut commands, or encoder readings, m.
+    sense : ndarray, shape (M, 9)
+        Directions of motion as in :class:`hexapod_comp.machine.motion.MotionState`.
+    temperatures : ndarray, shape (M, 8)
+        Struts 1–6, base, platform, °C.
+    """
+
+    positions: np.ndarray
+    rotations: np.ndarray
+    commands: np.ndarray
+    sense: np.ndarray
+    temperatures: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def pose(self, index: int) -> Pose:
+        """Return a commanded ``pose_platform_in_base``."""
+        return Pose(self.positions[index], self.rotations[index])
+
+    def temperature(self, index: int) -> Temperatures:
+        """Return the temperatures of a station."""
+        return Temperatures(dict(zip(Temperatures.NAMES, self.temperatures[index].tolist(), strict=True)))
+
+
+@dataclass(frozen=True)
+class MeasurementSet:
+    """Readings of one machine; arrays have one entry a reading.
+
+    Attributes
+    ----------
+    geometry : HexapodGeometry
+        The machine as designed.
+    probe : ndarray, shape (3,)
+        The measured point (reflector, target) in ``platform``, m.
+    runs : tuple of Run
+        Runs in order of appearance.
+    stations : Stations
+        Distinct places.
+    station, run, cycle, direction, channel : ndarray of int, shape (N,)
+        Indices of station, run and channel; number of the pass; direction.
+    value, uncertainty : ndarray, shape (N,)
+        m or rad; NaN where the uncertainty is not known.
+    sources : tuple of Source
+        Where each reading stands.
+    files : tuple of (str, str)
+        Name and SHA-256 of each file read.
+    notes : tuple of str
+        What the reader found odd, for the report.
+    """
+
+    geometry: HexapodGeometry
+    probe: np.ndarray
+    runs: tuple[Run, ...]
+    stations: Stations
+    station: np.ndarray
+    run: np.ndarray
+    cycle: np.ndarray
+    direction: np.ndarray
+    channel: np.ndarray
+    value: np.ndarray
+    uncertainty: np.ndarray
+    sources: tuple[Source, ...]
+    files: tuple[tuple[str, str], ...] = ()
+    notes: tuple[str, ...] = field(default=())
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+    @property
+    def kind(self) -> np.ndarray:
+        """Index into :data:`KINDS` of each reading."""
+        return KIND_OF[self.channel]
+
+    @property
+    def stated(self) -> np.ndarray:
+        """Standard deviation of each reading, shape (N,), m or rad: its file's, else :data:`DEFAULT_UNCERTAINTY`."""
+        defaults = np.array([DEFAULT_UNCERTAINTY[kind] for kind in KINDS])[self.kind]
+        return np.where(np.isfinite(self.uncertainty), self.uncertainty, defaults)
+
+    def stated_of(self, kind: int) -> float:
+        """Return the root mean square of :attr:`stated` over a kind's readings, m or rad; 1 where there are none."""
+        mine = self.stated[self.kind == kind]
+        return float(np.sqrt((mine**2).mean())) if len(mine) else 1.0
+
+    def misfit(self, found: Mapping[int, float], times: float) -> str:
+        """Return what is wrong when kinds of reading are further off than they may be; empty when none is.
+
+        Parameters
+        ----------
+        found : mapping of int to float
+            What is left of each kind (its index), standard deviation, m or rad.
+        times : float
+            How many times the stated one it may be.
+        """
+        far = []
+        for kind, value in found.items():
+            stated = self.stated_of(kind)
+            if value > times * stated:
+                unit = "µrad" if KINDS[kind] in ANGULAR_KINDS else "µm"
+                given = np.isfinite(self.uncertainty[self.kind == kind]).any()
+                source = "stated" if given else "assumed, since the file states none"
+                ratio = f"{value / stated:.3g} times the {stated * 1e6:.3g} {unit} {source}"
+                far.append(f"{KINDS[kind]} by {value * 1e6:.3g} {unit}, {ratio}")
+        problem = f"readings are off by more than {times:g} times their noise"
+        return f"{problem}: {'; '.join(far)}" if far else ""
+
+    def directions(self) -> np.ndarray:
+        """Return w of each reading, shape (N, 6): value = w · (dx, dy, dz, rx, ry, rz) in ``base``."""
+        axes = self.geometry.work.rotation.T  # row a: the work frame's axis a, in base
+        fixed = np.zeros((len(CHANNELS), 6))
+        for index, channel in enumerate(CHANNELS[1:], start=1):
+            kind, _, axis = channel.partition("_")
+            part = slice(3, 6) if kind in ANGULAR_KINDS else slice(0, 3)
+            fixed[index, part] = axes[AXES.index(axis)]
+        weights = fixed[self.channel]
+        linear = self.channel == 0
+        weights[linear, :3] = np.array([run.axis for run in self.runs]).reshape(-1, 3)[self.run[linear]]
+        return weights
+
+    def points(self) -> np.ndarray:
+        """Return the commanded place of the measured point at each station, shape (M, 3), m in ``base``."""
+        return self.stations.positions + self.stations.rotations @ self.probe
+
+    def level(self) -> np.ndarray:
+        """Return the platform's attitude that reports call level, shape (3, 3), in ``base``.
+
+        The tool parallel to the work frame, where the stations surround such an attitude or have it. Otherwise
+        the machine was measured turned, and the station nearest to the mean of all attitudes stands for them.
+        """
+        rotations = self.stations.rotations
+        parallel = self.geometry.work.rotation @ self.geometry.tool.rotation.T
+        mean = Rotation.from_matrix(rotations).mean().as_matrix()
+        away = np.linalg.norm(attitude_error(rotations, mean), axis=1)
+        if np.linalg.norm(attitude_error(parallel, mean)) <= away.max() + SAME_ATTITUDE:
+            return parallel
+        return rotations[away.argmin()]
+
+    def tool_box(self) -> np.ndarray:
+        """Return the lowest and highest commanded tool position, shape (2, 3), m in ``work``."""
+        positions, _ = self.geometry.tool_poses(self.stations.positions, self.stations.rotations)
+        return np.array([positions.min(axis=0), positions.max(axis=0)])
+
+    def platform_box(self) -> np.ndarray:
+        """Return the lowest and highest commanded platform position, shape (2, 3), m in ``base``.
+
+        Of the stations that are level, where these span a box: with a long tool, tilted ones reach further, but
+        not with a level tool. Otherwise of all stations.
+        """
+        positions = self.stations.positions
+        turned = np.linalg.norm(attitude_error(self.stations.rotations, self.level()), axis=1)
+        of_level = positions[turned <= SAME_ATTITUDE]
+        if len(of_level) and spans(of_level):
+            positions = of_level
+        return np.array([positions.min(axis=0), positions.max(axis=0)])
+
+    def along(self) -> np.ndarray:
+        """Return each reading's commanded coordinate along its line, from the run's first point, m, (N,)."""
+        origins = np.array([run.origin for run in self.runs]).reshape(-1, 3)
+        axes = np.array([run.axis for run in self.runs]).reshape(-1, 3)
+        return ((self.points()[self.station] - origins[self.run]) * axes[self.run]).sum(axis=1)
+
+    def select(self, mask: np.ndarray) -> MeasurementSet:
+        """Return the set of the readings in a boolean mask (N,); runs and stations keep their numbers."""
+        arrays = ("station", "run", "cycle", "direction", "channel", "value", "uncertainty")
+        chosen = {name: getattr(self, name)[mask] for name in arrays}
+        return replace(self, sources=tuple(s for s, m in zip(self.sources, mask, strict=True) if m), **chosen)
+
+    def with_values(self, value: np.ndarray) -> MeasurementSet:
+        """Return the same stations with other readings, shape (N,), m or rad."""
+        return replace(self, value=value)
+
+
+def refuse_unmoved(measurements: MeasurementSet, left: np.ndarray) -> None:
+    """Refuse a kind of reading that shows nothing: an instrument without any noise would have infinite weight.
+
+    Parameters
+    ----------
+    measurements : MeasurementSet
+        The readings.
+    left : ndarray, shape (N,)
+        What the nominal machine and the instruments' unknown zeros leave of them, m or rad.
+
+    Raises
+    ------
+    CalibrationError
+        Of a kind nothing is left, to :data:`LEAST_NOISE`.
+    """
+    for k in np.unique(measurements.kind):
+        mine = measurements.kind == k
+        if np.abs(left[mine]).max() <= LEAST_NOISE:
+            zero = not measurements.value[mine].any()
+            problem = "are all zero" if zero else "never change within a run, or are just what the machine was told"
+            hint = "was the instrument connected? Such readings tell nothing; leave them out"
+            raise CalibrationError(f"{KINDS[k]}", f"the {mine.sum()} readings {problem}: {hint}")
+
+
+def spans(points: np.ndarray) -> bool:
+    """Return whether points (n, 3), m, span a box."""
+    return bool((np.ptp(points, axis=0) >= LEAST_SIDE).all())
+
+
+def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:
+    """Return the rotation vector(s) that turn commanded into actual rotations, rad in their common frame.
+
+    Parameters
+    ----------
+    actual, commanded : ndarray, shape (..., 3, 3)
+        Rotation matrices.
+    """
+    return Rotation.from_matrix(actual @ np.swapaxes(commanded, -1, -2)).as_rotvec()

@@ -1,0 +1,279 @@
+"""Readings in whatever order they come, gathered into one :class:`~.measurement.MeasurementSet`.
+
+Runs are recognised as lines, equal commands become one station, poses out of reach are refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from ..errors import InputFileError
+from ..machine.geometry import HexapodGeometry
+from ..machine.kinematics import Structure, strut_lengths
+from ..machine.travel import Passes
+from ..pose import Pose
+from .readings import (
+    ANGULAR_KINDS,
+    BACKWARD,
+    CHANNELS,
+    FORWARD,
+    FROM_PREVIOUS,
+    KIND_OF,
+    KINDS,
+    LEAST_TRAVEL,
+    MeasurementSet,
+    Reading,
+    Run,
+    Stations,
+)
+
+SAME = 1e-9
+"""Commands nearer to each other than this, m, are the same command."""
+
+
+LARGEST_READING = 10.0
+"""No machine errs by more, and no instrument's zero lies further off, m or rad."""
+
+SMALLEST_UNCERTAINTY = 1e-12
+"""No instrument reads better, m or rad; and the square of its inverse is still a number."""
+
+
+def assemble(
+    geometry: HexapodGeometry,
+    readings: Sequence[Reading],
+    probe: np.ndarray | None = None,
+    files: Iterable[tuple[str, str]] = (),
+    notes: Iterable[str] = (),
+) -> MeasurementSet:
+    """Return the set of some readings: runs recognised as lines, stations made unique, reach checked.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        The machine as designed.
+    readings : sequence of Reading
+        In the order in which they were taken, as far as ``FROM_PREVIOUS`` needs it.
+    probe : array_like, shape (3,), optional
+        Measured point in ``platform``, m; the tool's tip by default.
+    files : iterable of (str, str)
+        Name and SHA-256 of each file.
+    notes : iterable of str
+        Remarks so far.
+
+    Raises
+    ------
+    InputFileError
+        No readings, an unknown channel, values that are not finite, poses out of the machine's reach, line
+        channels in a run that is no line. Names file and line.
+    """
+    if not readings:
+        raise InputFileError("measurements", "", "hold no reading")
+    probe = np.array(geometry.tool.position if probe is None else probe, dtype=float)
+    _check_readings(readings)
+    poses = _platform_poses(geometry, readings)
+    points = np.array([pose.position + pose.rotation @ probe for pose in poses])
+    members: dict[str, list[int]] = {}
+    for index, reading in enumerate(readings):
+        members.setdefault(reading.run, []).append(index)
+    along = geometry.work.rotation.T
+    runs = tuple(_recognise([readings[i] for i in rows], points[rows], along) for rows in members.values())
+    number = {run.name: index for index, run in enumerate(runs)}
+    run_of = np.array([number[r.run] for r in readings])
+    stations, station = _collect_stations(geometry, readings, poses, [runs[i] for i in run_of])
+    swapped = [_swapped_note(run, [readings[i] for i in rows], points[rows])
+               for run, rows in zip(runs, members.values(), strict=True)]  # fmt: skip
+    return MeasurementSet(
+        geometry=geometry,
+        probe=probe,
+        runs=runs,
+        stations=stations,
+        station=station,
+        run=run_of,
+        cycle=np.array([r.cycle for r in readings]),
+        direction=np.array([r.direction for r in readings]),
+        channel=np.array([CHANNELS.index(r.channel) for r in readings]),
+        value=np.array([r.value for r in readings], dtype=float),
+        uncertainty=np.array([r.uncertainty for r in readings], dtype=float),
+        sources=tuple(r.source for r in readings),
+        files=tuple(files),
+        notes=(*notes, *filter(None, swapped)),
+    )
+
+
+def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> list[Pose]:
+    """Return the commanded ``pose_platform_in_base`` of each reading; equal poses are one object."""
+    known: dict[bytes, Pose] = {}
+    poses = []
+    for reading in readings:
+        key = reading.pose.position.tobytes() + reading.pose.rotation.tobytes()
+        if key not in known:
+            known[key] = geometry.platform_pose(reading.pose)
+        poses.append(known[key])
+    return poses
+
+
+def _check_readings(readings: Sequence[Reading]) -> None:
+    """Refuse what no instrument reads."""
+    for r in readings:
+        if r.channel not in CHANNELS:
+            raise InputFileError(r.source.file, _line(r), f"channel must be one of {', '.join(CHANNELS)}", r.channel)
+        unit = "rad" if KINDS[KIND_OF[CHANNELS.index(r.channel)]] in ANGULAR_KINDS else "m"
+        if not np.isfinite(r.value):
+            raise InputFileError(r.source.file, _line(r), "value must be finite", r.value)
+        if abs(r.value) > LARGEST_READING:
+            problem = f"value must be within ±{LARGEST_READING:g} {unit}: it is the error, actual minus commanded"
+            raise InputFileError(r.source.file, _line(r), problem, r.value)
+        if r.uncertainty <= 0.0 or np.isinf(r.uncertainty):
+            raise InputFileError(r.source.file, _line(r), "uncertainty must be finite and above zero", r.uncertainty)
+        if not (np.isnan(r.uncertainty) or SMALLEST_UNCERTAINTY <= r.uncertainty <= LARGEST_READING):
+            problem = f"uncertainty must be {SMALLEST_UNCERTAINTY:g}…{LARGEST_READING:g} {unit}"
+            raise InputFileError(r.source.file, _line(r), problem, r.uncertainty)
+
+
+def _line(reading: Reading) -> str:
+    return f"line {reading.source.line}" if reading.source.line else f"run {reading.run}"
+
+
+def _recognise(readings: list[Reading], points: np.ndarray, work_axes: np.ndarray) -> Run:
+    """Return a run from its readings and their commanded points (n, 3), with its line if it has line channels.
+
+    Which way along the line is forward is a matter of the work frame, whose axes are the rows of `work_axes`.
+
+    Raises
+    ------
+    InputFileError
+        Line channels whose commanded points do not lie on a line, or at one place only; line and absolute
+        channels mixed.
+    """
+    first, name = readings[0], readings[0].run
+    of_lines = {KIND_OF[CHANNELS.index(r.channel)] < KINDS.index("position") for r in readings}
+    if len(of_lines) == 2:
+        raise InputFileError(first.source.file, f"run {name}", "mixes channels of a line with absolute ones")
+    if of_lines == {False}:
+        return Run(name, np.zeros(3), points[0])
+    spread = points - points[0]
+    far = spread[np.linalg.norm(spread, axis=1).argmax()]
+    if np.linalg.norm(far) < LEAST_TRAVEL:
+        raise InputFileError(first.source.file, f"run {name}", "has one commanded point only; a line needs two")
+    axis = far / np.linalg.norm(far)
+    off = np.linalg.norm(spread - np.outer(spread @ axis, axis), axis=1)
+    if off.max() > LEAST_TRAVEL:
+        where = readings[int(off.argmax())]
+        problem = f"run {name}: the commanded point is {off.max() * 1e3:.4f} mm off the run's line"
+        raise InputFileError(where.source.file, _line(where), problem)
+    in_work = work_axes @ far
+    leading = in_work[np.abs(in_work) > LEAST_TRAVEL][0]
+    return Run(name, axis * np.sign(leading), points[0])
+
+
+def _collect_stations(
+    geometry: HexapodGeometry, readings: Sequence[Reading], poses: list[Pose], runs: list[Run]
+) -> tuple[Stations, np.ndarray]:
+    """Return the distinct stations and each reading's index among them; poses and runs per reading."""
+    known: dict[tuple, int] = {}
+    rows: list[tuple] = []
+    index = np.empty(len(readings), dtype=int)
+    nominal = Structure.of(geometry)
+    here: tuple | None = None
+    before: int | None = None
+    for n, (r, pose, run) in enumerate(zip(readings, poses, runs, strict=True)):
+        place = (r.run, id(pose), r.commands)
+        if here is not None and place != here:
+            before = int(index[n - 1]) if readings[n - 1].run == r.run else None
+        here = place
+        # A station belongs to a run: lines that cross at a point pass it in different ways.
+        came_from = rows[before] if before is not None and r.direction == FROM_PREVIOUS else None
+        key = (place, r.direction, None if came_from is None else before, r.temperatures)
+        if key not in known:
+            lengths = strut_lengths(nominal, pose)
+            _check_reach(geometry, pose, lengths, r)
+            commands = np.array(lengths if r.commands is None else r.commands, dtype=float)
+            sense = _sense(geometry, r.direction, run, pose, commands, came_from)
+            known[key] = len(rows)
+            rows.append((pose.position, pose.rotation, commands, sense, r.temperatures))
+        index[n] = known[key]
+    columns = [np.array(column, dtype=float) for column in zip(*rows, strict=True)]
+    return Stations(*columns), index
+
+
+def _check_reach(geometry: HexapodGeometry, pose: Pose, lengths: np.ndarray, reading: Reading) -> None:
+    """Refuse a commanded pose that the machine cannot have taken."""
+    refusal = geometry.refusal(pose.position, pose.rotation, lengths)
+    if refusal is not None:
+        problem = f"the commanded pose is out of the machine's reach: {refusal}"
+        raise InputFileError(reading.source.file, _line(reading), problem)
+
+
+def _sense(
+    geometry: HexapodGeometry, direction: int, run: Run, pose: Pose, commands: np.ndarray, came_from: tuple | None
+) -> np.ndarray:
+    """Return the directions of motion at a station, shape (9,); `came_from` is the station before."""
+    if direction in (FORWARD, BACKWARD):
+        return Passes(pose.position[None], pose.rotation[None], direction * run.axis[None]).senses(geometry)[0]
+    if came_from is not None:
+        change = np.concatenate([pose.position - came_from[0], commands - came_from[2]])
+        return np.sign(change) * (np.abs(change) > SAME)
+    return np.zeros(9)
+
+
+def _swapped_note(run: Run, readings: list[Reading], points: np.ndarray) -> str:
+    """Return a remark on a line whose rows run against both their directions, else nothing."""
+    if not run.is_line:
+        return ""
+    along = points @ run.axis
+    way = {direction: _way(readings, along, direction) for direction in (FORWARD, BACKWARD)}
+    if not way[FORWARD] < 0.0 < way[BACKWARD]:
+        return ""
+    return f"{readings[0].source}: run {run.name}: rows called forward run backward and vice versa; swapped?"
+
+
+def _way(readings: list[Reading], along: np.ndarray, direction: int) -> float:
+    """Return the way from the first to the last row of the first pass in a direction, m."""
+    chosen = [(r.cycle, r.channel, a) for r, a in zip(readings, along, strict=True) if r.direction == direction]
+    first_pass = [a for cycle, channel, a in chosen if (cycle, channel) == chosen[0][:2]]
+    return float(first_pass[-1] - first_pass[0]) if first_pass else 0.0
+
+
+def joined(sets: Sequence[MeasurementSet]) -> MeasurementSet:
+    """Return several sets of one machine as one; runs of equal names stay apart.
+
+    Raises
+    ------
+    InputFileError
+        Sets of different measured points, or a file twice.
+    """
+    first = sets[0]
+    hashes = [sha for s in sets for _, sha in s.files]
+    for s in sets:
+        for name, sha in s.files:
+            if hashes.count(sha) > 1:
+                raise InputFileError(name, "", "is given twice: its readings would count twice")
+    if len(sets) == 1:
+        return first
+    if any(np.abs(other.probe - first.probe).max() > SAME for other in sets[1:]):
+        raise InputFileError("measurements", "", "files with different measured points cannot be fitted together")
+    stations_before = np.cumsum([0, *(len(s.stations) for s in sets)])[:-1]
+    runs_before = np.cumsum([0, *(len(s.runs) for s in sets)])[:-1]
+
+    def together(name: str) -> np.ndarray:
+        return np.concatenate([getattr(s, name) for s in sets])
+
+    columns = ("positions", "rotations", "commands", "sense", "temperatures")
+    return MeasurementSet(
+        geometry=first.geometry,
+        probe=first.probe,
+        runs=tuple(run for s in sets for run in s.runs),
+        stations=Stations(*(np.concatenate([getattr(s.stations, c) for s in sets]) for c in columns)),
+        station=np.concatenate([s.station + n for s, n in zip(sets, stations_before, strict=True)]),
+        run=np.concatenate([s.run + n for s, n in zip(sets, runs_before, strict=True)]),
+        cycle=together("cycle"),
+        direction=together("direction"),
+        channel=together("channel"),
+        value=together("value"),
+        uncertainty=together("uncertainty"),
+        sources=tuple(source for s in sets for source in s.sources),
+        files=tuple(file for s in sets for file in s.files),
+        notes=tuple(note for s in sets for note in s.notes),
+    )

@@ -1,0 +1,492 @@
+"""Tidy CSV files of measurements, one reading a row: the door through which every instrument's data come in.
+
+Columns
+-------
+``run``
+    Name. Readings of one run share the instrument's set-up: one unknown zero per channel. The same name in
+    two files means two runs; they are then called ``name [file]``.
+``direction``
+    ``forward``: travelling along the first of x, y, z of the work frame that moves; ``backward``; ``sequence``:
+    from the row before to this one (rows in the order of measuring); empty: not known.
+``x_mm``, ``y_mm``, ``z_mm``; ``alpha_deg``, ``beta_deg``, ``gamma_deg`` or ``qx``, ``qy``, ``qz``, ``qw``
+    Commanded pose of the tool in the work frame, as in every pose file (:func:`hexapod_comp.formats.csv.read_poses`).
+``channel``, ``value``, ``unit``
+    What was read (below), how much, and in what: m, mm, um, in; rad, mrad, urad, deg, arcsec; empty for quaternions.
+``cycle`` (optional)
+    Which of several passes, from 1. The same reading twice in a pass is refused.
+``uncertainty`` (optional)
+    Standard deviation, in the value's unit; may be empty.
+``temperature_degC`` (optional)
+    Of the air, and of the whole machine unless ``strut_1_degC`` … ``strut_6_degC``, ``base_degC``,
+    ``platform_degC`` say otherwise. Without any, 20 °C.
+``instrument_index``, ``pressure_kPa``, ``humidity_percent`` (optional)
+    The refractive index with which the instrument turned its counts into lengths; 1 when it counts vacuum
+    wavelengths. A row that has one is corrected to the air of that row (Ciddor), which needs its temperature,
+    pressure and humidity. Empty: the instrument has corrected itself, nothing is done.
+
+Channels
+--------
+``linear``
+    Displacement read minus commanded displacement, along the line, positive as ``forward``.
+``straightness_x`` … ``_z``, ``rotation_x`` … ``_z``
+    Displacement along, rotation about an axis of the work frame (right-hand), minus that commanded.
+``roll``, ``pitch``, ``yaw``
+    Of lines parallel to an axis of the work frame. Roll is about the line. On x lines pitch is about y, yaw about
+    z; on y lines about x and z; on z lines about x and y. All are positive as a right hand turns about the
+    positive axis: an instrument that counts otherwise needs its sign changed first.
+``position_x`` … ``_z``
+    Measured coordinates of the point in the work frame, not their errors: what a tracker reads.
+``quaternion_x`` … ``_w``
+    Measured orientation of the tool in the work frame, four rows for one pose.
+``attitude_x`` … ``_z``
+    Or its error: the rotation vector from the commanded to the measured orientation, along the work frame's axes.
+``strut_1`` … ``strut_6``
+    Strut lengths that the machine was told, or that its encoders show, six rows for one pose: they then hold for
+    all readings of that run, cycle, direction and pose. Without them the machine was told nominal lengths.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from decimal import Decimal
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import InputFileError, PoseError
+from ..formats.csv import Table, exact, si_from_text
+from ..formats.yaml import UNITS
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry
+from ..machine.model import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
+from ..pose import Pose
+from .air import AIR_RANGES, LARGEST_INDEX, Air, correct_displacement
+from .readings import (
+    ANGULAR_KINDS,
+    AXES,
+    BACKWARD,
+    CHANNELS,
+    FORWARD,
+    FROM_PREVIOUS,
+    LEAST_TRAVEL,
+    UNKNOWN,
+    MeasurementSet,
+    Reading,
+    Source,
+    attitude_error,
+)
+from .runs import assemble
+
+DIRECTIONS = {"forward": FORWARD, "backward": BACKWARD, "sequence": FROM_PREVIOUS, "": UNKNOWN}
+"""Words of the column ``direction``."""
+
+TURNS = ("roll", "pitch", "yaw")
+"""Rotations named after the line on which they are read."""
+
+TURN_AXES = ((0, 1, 2), (1, 0, 2), (2, 0, 1))
+"""Axes of roll, pitch and yaw on a line along x, y, z."""
+
+QUATERNION_CHANNELS = tuple(f"quaternion_{c}" for c in "xyzw")
+
+DIMENSIONS = {
+    **{channel: "angle" if channel.partition("_")[0] in ANGULAR_KINDS else "length" for channel in CHANNELS},
+    **dict.fromkeys(TURNS, "angle"),
+    **dict.fromkeys(QUATERNION_CHANNELS, ""),
+    **dict.fromkeys(STRUT_NAMES, "length"),
+}
+"""What each channel of a file is measured in."""
+
+LINE_KINDS = ("linear", "straightness", "rotation", *TURNS)
+"""Channels that light reads along a line, and that the air therefore bends."""
+
+PARALLEL = 1e-9
+"""Largest cross component of a unit vector that still is parallel to an axis."""
+
+
+class _Row(NamedTuple):
+    """A row of a file; value and uncertainty in SI, `decimal` is the value as it stands there, in `unit`."""
+
+    run: str
+    cycle: int
+    direction: int
+    pose: Pose
+    channel: str
+    value: float
+    decimal: Decimal
+    unit: float
+    uncertainty: float
+    temperatures: tuple[float, ...]
+    air: tuple[float, ...] | None
+    line: int
+
+
+def read_measurements(
+    paths: str | Path | Sequence[str | Path], geometry: HexapodGeometry, probe: np.ndarray | None = None
+) -> MeasurementSet:
+    """Read tidy CSV files (described above) as one set.
+
+    Parameters
+    ----------
+    paths : path or sequence of paths
+        Files.
+    geometry : HexapodGeometry
+        The machine that was measured.
+    probe : array_like, shape (3,), optional
+        The measured point in ``platform``, m; the tool's tip by default.
+
+    Raises
+    ------
+    InputFileError
+        Naming file, line, column, value and what is allowed.
+    """
+    paths = [paths] if isinstance(paths, str | Path) else list(paths)
+    readings: list[Reading] = []
+    files: list[tuple[str, str]] = []
+    notes: list[str] = []
+    tables = [Table(path) for path in paths]
+    _refuse_twice(tables)
+    of_files = [_read_rows(table) for table in tables]
+    for table, rows, names in zip(tables, of_files, _run_names(tables, of_files), strict=True):
+        found, corrected = _file_readings(table, rows, names, geometry, probe)
+        readings += found
+        files.append((Path(table.path).name, table.sha256))
+        if corrected:
+            notes.append(f"{table.path}: {corrected} readings corrected to the air of their rows (Ciddor)")
+    return assemble(geometry, readings, probe, files, notes)
+
+
+def _refuse_twice(tables: Sequence[Table]) -> None:
+    """Raise on a file given twice: its readings would count twice."""
+    seen: dict[str, Table] = {}
+    for table in tables:
+        if table.sha256 in seen:
+            raise InputFileError(table.path, "", f"is the same file as {seen[table.sha256].path}")
+        seen[table.sha256] = table
+
+
+def _run_names(tables: Sequence[Table], of_files: Sequence[Sequence[_Row]]) -> list[dict[str, str]]:
+    """Return the names that the runs of each file get: their own where no other file has the same."""
+    names = [{row.run for row in rows} for rows in of_files]
+    short = [Path(table.path).name for table in tables]
+    label = short if len(set(short)) == len(short) else [str(table.path) for table in tables]
+    return [
+        {name: f"{name} [{label[n]}]" if sum(name in other for other in names) > 1 else name for name in own}
+        for n, own in enumerate(names)
+    ]
+
+
+def _read_rows(table: Table) -> list[_Row]:
+    """Return the rows of a file, every cell checked by itself."""
+    runs, channels, units = table.texts("run"), table.texts("channel"), table.texts("unit")
+    directions, cycles, poses = _directions(table), _cycles(table), _poses(table)
+    value_column = table.required(("value",), None)[0][0]
+    uncertainty_column = table.column("uncertainty", None)
+    temperatures, air = _temperatures(table), _air(table)
+    table.refuse_unknown()
+    sizes: dict[tuple[str, str], float] = {}
+    rows = []
+    for n, (line, cells) in enumerate(table.rows):
+        if not runs[n]:
+            raise InputFileError(table.path, f"line {line}, column run", "must be a name")
+        key = (channels[n], units[n])
+        if key not in sizes:
+            sizes[key] = _unit_size(table, line, *key)
+        text = cells[value_column]
+        number = table.number(line, value_column, text)
+        value = (si_from_text(text, number, sizes[key]), exact(text, number), sizes[key])
+        uncertainty = _uncertainty(table, line, cells, uncertainty_column, sizes[key])
+        place = (runs[n], cycles[n], directions[n], poses[n], channels[n])
+        rows.append(_Row(*place, *value, uncertainty, temperatures[n], air[n], line))
+    return rows
+
+
+def _uncertainty(table: Table, line: int, cells: Sequence[str], column: tuple[int, float] | None, unit: float) -> float:
+    """Return a standard deviation in SI, NaN where there is none."""
+    if column is None or not cells[column[0]].strip():
+        return math.nan
+    text = cells[column[0]]
+    value = si_from_text(text, table.number(line, column[0], text), unit)
+    if value <= 0.0:
+        raise InputFileError(table.path, f"line {line}, column uncertainty", "must be above zero, or empty", text)
+    return value
+
+
+def _directions(table: Table) -> list[int]:
+    """Return the directions as numbers."""
+    texts = table.texts("direction")
+    for (line, _), text in zip(table.rows, texts, strict=True):
+        if text not in DIRECTIONS:
+            allowed = "must be forward, backward, sequence or empty"
+            raise InputFileError(table.path, f"line {line}, column direction", allowed, text)
+    return [DIRECTIONS[text] for text in texts]
+
+
+def _poses(table: Table) -> list[Pose]:
+    """Return the commanded poses; rows with the same one share the object."""
+    positions, rotations = table.poses()
+    known: dict[bytes, Pose] = {}
+    poses = []
+    for position, rotation in zip(positions, rotations, strict=True):
+        key = position.tobytes() + rotation.tobytes()
+        if key not in known:
+            known[key] = Pose(position, rotation)
+        poses.append(known[key])
+    return poses
+
+
+def _cycles(table: Table) -> list[int]:
+    """Return the numbers of the passes, 1 without a column."""
+    if table.column("cycle", None) is None:
+        return [1] * len(table.rows)
+    cycles = []
+    for (line, _), text in zip(table.rows, table.texts("cycle"), strict=True):
+        if not (text.isascii() and text.isdigit() and int(text[:9]) >= 1 and len(text) < 10):
+            raise InputFileError(table.path, f"line {line}, column cycle", "must be a whole number from 1", text)
+        cycles.append(int(text))
+    return cycles
+
+
+def _optional(
+    table: Table, name: str, dimension: str | None, fits: Callable[[float], bool], allowed: str, blank: bool
+) -> list[float]:
+    """Return a column's numbers in SI; NaN where it is missing, or a cell `blank` where that may be."""
+    column = table.column(name, dimension)
+    if column is None:
+        return [math.nan] * len(table.rows)
+    index, unit = column
+    numbers = []
+    for line, cells in table.rows:
+        text = cells[index]
+        if blank and not text.strip():
+            numbers.append(math.nan)
+            continue
+        numbers.append(si_from_text(text, table.number(line, index, text), unit))
+        if not fits(numbers[-1]):
+            where = f"line {line}, column {table.header[index]}"
+            raise InputFileError(table.path, where, f"must be within {allowed}", text)
+    return numbers
+
+
+def _temperatures(table: Table) -> list[tuple[float, ...]]:
+    """Return the temperatures of struts, base and platform of each row, °C."""
+    low, high = TEMPERATURE_RANGE
+
+    def read(name: str) -> np.ndarray:
+        return np.array(
+            _optional(table, name, "temperature", lambda v: low <= v <= high, f"{low:g}…{high:g} °C", blank=False)
+        )
+
+    everywhere = np.nan_to_num(read("temperature"), nan=REFERENCE_TEMPERATURE)
+    columns = [np.where(np.isnan(own := read(name)), everywhere, own) for name in Temperatures.NAMES]
+    return list(map(tuple, np.stack(columns, axis=1).tolist()))
+
+
+def _air(table: Table) -> list[tuple[float, ...] | None]:
+    """Return instrument index, temperature, pressure and humidity of the rows that have the first."""
+    up_to = LARGEST_INDEX
+    index = _optional(table, "instrument_index", None, lambda v: 1.0 <= v <= up_to, f"1…{up_to:g}", blank=True)
+    wanted = not np.isnan(index).all()
+    columns = [index]
+    for name, dimension in (("temperature", "temperature"), ("pressure", "pressure"), ("humidity", "ratio")):
+        low, high, allowed = AIR_RANGES[name]
+        columns.append(
+            _optional(
+                table,
+                name,
+                dimension,
+                lambda v, low=low, high=high: not wanted or low <= v <= high,  # type: ignore[misc]
+                allowed,
+                blank=True,
+            )
+        )
+    air: list[tuple[float, ...] | None] = []
+    for (line, _), *row in zip(table.rows, *columns, strict=True):
+        if math.isnan(row[0]):
+            air.append(None)
+            continue
+        if any(map(math.isnan, row)):
+            problem = "has an instrument_index, so it needs temperature_degC, pressure_kPa and humidity_percent too"
+            raise InputFileError(table.path, f"line {line}", problem)
+        air.append(tuple(row))
+    return air
+
+
+def _unit_size(table: Table, line: int, channel: str, unit: str) -> float:
+    """Return the size of a unit in SI; refuse unknown channels and units that do not fit them."""
+    if channel not in DIMENSIONS:
+        allowed = f"must be one of {', '.join(DIMENSIONS)}"
+        raise InputFileError(table.path, f"line {line}, column channel", allowed, channel)
+    units = UNITS[DIMENSIONS[channel]] if DIMENSIONS[channel] else {"": 1.0}
+    if unit not in units:
+        allowed = f"must be {' or '.join(units)}" if units != {"": 1.0} else "must be empty"
+        raise InputFileError(table.path, f"line {line}, column unit", f"{allowed} for {channel}", unit)
+    return units[unit]
+
+
+def _file_readings(
+    table: Table, rows: Sequence[_Row], names: dict[str, str], geometry: HexapodGeometry, probe: np.ndarray | None
+) -> tuple[list[Reading], int]:
+    """Return a file's readings, and how many of them were corrected for the air."""
+    file = str(table.path)
+    visits = _visits(rows)
+    _refuse_duplicates(file, rows, visits)
+    points = _points(rows, geometry, probe)
+    lines = _lines(rows, points)
+    commands = _commands(file, rows, visits)
+    attitudes = _attitudes(file, rows, visits)
+    corrected = _corrected(file, rows, lines, points)
+    readings = []
+    for n, row in enumerate(rows):
+        if row.channel in STRUT_NAMES:
+            continue
+        if row.channel in QUATERNION_CHANNELS:
+            pairs = attitudes.pop(visits[n], [])
+        elif row.channel.startswith("position_"):
+            pairs = [(row.channel, _minus(row, float(points[n, AXES.index(row.channel[-1])])))]
+        else:
+            pairs = [(_channel(file, row, lines), corrected.get(n, row.value))]
+        for channel, value in pairs:
+            reading = (names[row.run], row.cycle, row.direction, row.pose, channel, value, row.uncertainty)
+            source = Source(file, row.line)
+            readings.append(Reading(*reading, row.temperatures, commands.get(visits[n]), source))
+    if not readings:
+        raise InputFileError(file, "", "holds strut readings only: nothing that was measured")
+    return readings, len(corrected)
+
+
+def _visits(rows: Sequence[_Row]) -> list[tuple]:
+    """Return for each row what readings taken together share; a sequence may come back to a place."""
+    visits: list[tuple] = []
+    count, before = 0, None
+    for row in rows:
+        place = (row.run, row.cycle, row.direction, id(row.pose))
+        if row.direction == FROM_PREVIOUS and place != before:
+            count += 1
+        before = place
+        visits.append((*place, count if row.direction == FROM_PREVIOUS else 0))
+    return visits
+
+
+def _refuse_duplicates(file: str, rows: Sequence[_Row], visits: Sequence[tuple]) -> None:
+    """Raise on a channel read twice in one pass at one place."""
+    seen: dict[tuple, int] = {}
+    for row, visit in zip(rows, visits, strict=True):
+        first = seen.setdefault((visit, row.channel), row.line)
+        if first != row.line:
+            problem = f"reads {row.channel} again at the place of line {first}; number repeated passes in column cycle"
+            raise InputFileError(file, f"line {row.line}", problem)
+
+
+def _points(rows: Sequence[_Row], geometry: HexapodGeometry, probe: np.ndarray | None) -> np.ndarray:
+    """Return the commanded place of the measured point in the work frame, shape (N, 3), m."""
+    offset = np.zeros(3)
+    if probe is not None:
+        offset = geometry.tool.rotation.T @ (np.asarray(probe, dtype=float) - geometry.tool.position)
+    if not offset.any():
+        return np.array([row.pose.position for row in rows])
+    return np.array([row.pose.position + row.pose.rotation @ offset for row in rows])
+
+
+class _Line(NamedTuple):
+    """A run's first point and its direction forward, in the work frame; no direction when it does not travel."""
+
+    origin: np.ndarray
+    axis: np.ndarray
+
+
+def _lines(rows: Sequence[_Row], points: np.ndarray) -> dict[str, _Line]:
+    """Return the lines of the runs that have channels of lines."""
+    members: dict[str, list[int]] = {}
+    for n, row in enumerate(rows):
+        if row.channel.partition("_")[0] in LINE_KINDS:
+            members.setdefault(row.run, []).append(n)
+    lines = {}
+    for run, indices in members.items():
+        spread = points[indices] - points[indices[0]]
+        far = spread[np.linalg.norm(spread, axis=1).argmax()]
+        moving = np.flatnonzero(np.abs(far) > LEAST_TRAVEL)
+        axis = far / np.linalg.norm(far) * np.sign(far[moving[0]]) if len(moving) else np.zeros(3)
+        lines[run] = _Line(points[indices[0]], axis)
+    return lines
+
+
+def _commands(file: str, rows: Sequence[_Row], visits: Sequence[tuple]) -> dict[tuple, tuple[float, ...]]:
+    """Return the strut commands of the visits that have them, m."""
+    found: dict[tuple, dict[str, _Row]] = {}
+    for row, visit in zip(rows, visits, strict=True):
+        if row.channel in STRUT_NAMES:
+            if not math.isnan(row.uncertainty):
+                raise InputFileError(file, f"line {row.line}, column uncertainty", "must be empty for a strut")
+            found.setdefault(visit, {})[row.channel] = row
+    return {visit: _whole(file, group, STRUT_NAMES) for visit, group in found.items()}
+
+
+def _whole(file: str, group: dict[str, _Row], channels: Sequence[str]) -> tuple[float, ...]:
+    """Return the values of channels that only make sense together."""
+    for channel in channels:
+        if channel not in group:
+            line = next(iter(group.values())).line
+            together = f"{channels[0]} … {channels[-1]} belong together"
+            raise InputFileError(file, f"line {line}", f"{together}; {channel} is missing at this pose")
+    return tuple(group[channel].value for channel in channels)
+
+
+def _attitudes(file: str, rows: Sequence[_Row], visits: Sequence[tuple]) -> dict[tuple, list[tuple[str, float]]]:
+    """Return attitude errors from measured quaternions, rad along the work frame's axes."""
+    found: dict[tuple, dict[str, _Row]] = {}
+    for row, visit in zip(rows, visits, strict=True):
+        if row.channel in QUATERNION_CHANNELS:
+            if not math.isnan(row.uncertainty):
+                wrong = "must be empty for a quaternion; give attitude_x, attitude_y, attitude_z instead"
+                raise InputFileError(file, f"line {row.line}, column uncertainty", wrong)
+            found.setdefault(visit, {})[row.channel] = row
+    errors = {}
+    for visit, group in found.items():
+        first = next(iter(group.values()))
+        try:
+            measured = Pose.from_quaternion(np.zeros(3), np.array(_whole(file, group, QUATERNION_CHANNELS)))
+        except PoseError as problem:
+            where = f"line {first.line}, channels {QUATERNION_CHANNELS[0]} …"
+            raise InputFileError(file, where, str(problem)) from problem
+        error = attitude_error(measured.rotation, first.pose.rotation)
+        errors[visit] = [(f"attitude_{axis}", float(value)) for axis, value in zip(AXES, error, strict=True)]
+    return errors
+
+
+def _channel(file: str, row: _Row, lines: dict[str, _Line]) -> str:
+    """Return the channel of a set for a channel of a file."""
+    if row.channel not in TURNS:
+        return row.channel
+    along = np.flatnonzero(np.abs(lines[row.run].axis) > 1.0 - PARALLEL)
+    if not len(along):
+        problem = f"{row.channel} is for lines parallel to an axis of the work frame; use rotation_x, _y or _z"
+        raise InputFileError(file, f"line {row.line}, column channel", problem)
+    return f"rotation_{AXES[TURN_AXES[along[0]][TURNS.index(row.channel)]]}"
+
+
+def _corrected(file: str, rows: Sequence[_Row], lines: dict[str, _Line], points: np.ndarray) -> dict[int, float]:
+    """Return the values of the rows that are to be corrected for the air, by the rows' number."""
+    chosen = [n for n, row in enumerate(rows) if row.air is not None]
+    if not chosen:
+        return {}
+    commanded = np.zeros(len(chosen))
+    for k, n in enumerate(chosen):
+        row = rows[n]
+        if row.channel.partition("_")[0] not in LINE_KINDS:
+            problem = f"is for what a laser reads along a line; a {row.channel} must come corrected"
+            raise InputFileError(file, f"line {row.line}, column instrument_index", problem)
+        if row.channel == "linear":
+            commanded[k] = lines[row.run].axis @ (points[n] - lines[row.run].origin)
+    index, *air = np.array([rows[n].air for n in chosen]).T
+    shown = np.array([rows[n].value for n in chosen]) + commanded
+    true = correct_displacement(shown, Air(*air), index) - commanded
+    return dict(zip(chosen, true.tolist(), strict=True))
+
+
+def _minus(row: _Row, commanded: float) -> float:
+    """Return a coordinate minus the commanded one, without losing the digits that both share."""
+    power = round(math.log10(row.unit))
+    if 10.0**power != row.unit:
+        return row.value - commanded
+    return float(row.decimal.scaleb(power) - Decimal(repr(commanded)))

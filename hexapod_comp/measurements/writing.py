@@ -1,0 +1,128 @@
+"""Sets of measurements as tidy CSV files, to the last bit of every value."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterator
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+
+from ..formats.csv import ANGLE_COLUMNS, POSITION_COLUMNS
+from ..formats.yaml import write_text_atomically
+from ..machine.geometry import STRUT_NAMES
+from ..machine.kinematics import Structure, strut_lengths
+from ..machine.model import REFERENCE_TEMPERATURE, Temperatures
+from ..pose import angles_from_rotation
+from .readings import ANGULAR_KINDS, AXES, CHANNELS, FROM_PREVIOUS, MeasurementSet
+from .tidy_csv import DIRECTIONS
+
+
+def write_measurements(measurements: MeasurementSet, path: str | Path) -> None:
+    """Write a set as the file that :func:`~.tidy_csv.read_measurements` reads back, to the last bit.
+
+    Commanded poses are written to 10⁻¹³ m and 10⁻¹² degrees. The measured point is not a column: where it is not
+    the tool's tip, a comment in the file says where it is, and it has to be given again for reading.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be written.
+    """
+    stream = io.StringIO()
+    if not np.array_equal(measurements.probe, measurements.geometry.tool.position):
+        point = ", ".join(_scaled(float(value), 3) for value in measurements.probe)
+        stream.write(f"# measured point in the platform frame, mm: {point}\n")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerows(_csv_rows(measurements))
+    write_text_atomically(path, stream.getvalue())
+
+
+def _csv_rows(measurements: MeasurementSet) -> Iterator[list[str]]:
+    """Yield the header and the rows of a set."""
+    words = {number: word for word, number in DIRECTIONS.items()}
+    positions, rotations = _tool_poses(measurements)
+    offset = measurements.geometry.tool.rotation.T @ (measurements.probe - measurements.geometry.tool.position)
+    commanded = positions + rotations @ offset if offset.any() else positions
+    pose_names, poses = _pose_cells(positions, rotations)
+    temperature_names, temperatures = _temperature_cells(measurements)
+    with_uncertainty = bool(np.isfinite(measurements.uncertainty).any())
+    tail = ["uncertainty"] * with_uncertainty + temperature_names
+    yield ["run", "direction", "cycle", *pose_names, "channel", "value", "unit", *tail]
+    struts = _strut_cells(measurements)
+    told: set[tuple] = set()
+    before: tuple | None = None
+    for n, station in enumerate(measurements.station.tolist()):
+        direction, cycle = int(measurements.direction[n]), int(measurements.cycle[n])
+        head = [measurements.runs[measurements.run[n]].name, words[direction], str(cycle), *poses[station]]
+        visit = (direction, cycle, station)
+        if station in struts and (visit not in told or (direction == FROM_PREVIOUS and visit != before)):
+            for name, length in zip(STRUT_NAMES, struts[station], strict=True):
+                yield [*head, name, length, "mm", *[""] * with_uncertainty, *temperatures[station]]
+        told.add(visit)
+        before = visit
+        channel, value = CHANNELS[measurements.channel[n]], float(measurements.value[n])
+        cells = _value_cells(channel, value, float(measurements.uncertainty[n]), commanded[station])
+        yield [*head, channel, *(cells if with_uncertainty else cells[:2]), *temperatures[station]]
+
+
+def _value_cells(channel: str, value: float, uncertainty: float, commanded: np.ndarray) -> list[str]:
+    """Return value, unit and uncertainty as text, with every digit."""
+    kind, _, axis = channel.partition("_")
+    unit, digits = ("urad", 6) if kind in ANGULAR_KINDS else ("mm", 3) if kind == "position" else ("um", 6)
+    number = Decimal(repr(value))
+    if kind == "position":
+        number += Decimal(repr(float(commanded[AXES.index(axis)])))
+    return [_moved(number, digits), unit, "" if math.isnan(uncertainty) else _scaled(uncertainty, digits)]
+
+
+def _scaled(value: float, digits: int) -> str:
+    """Return a float as decimal text with its point moved: nothing is rounded."""
+    return _moved(Decimal(repr(value)), digits)
+
+
+def _moved(number: Decimal, digits: int) -> str:
+    text = format(number.scaleb(digits), "f")
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def _tool_poses(measurements: MeasurementSet) -> tuple[np.ndarray, np.ndarray]:
+    """Return the commanded poses of the tool in the work frame as a file says them, (M, 3) m and (M, 3, 3)."""
+    stations, work, tool = measurements.stations, measurements.geometry.work, measurements.geometry.tool
+    tips = stations.positions + stations.rotations @ tool.position
+    return ((tips - work.position) @ work.rotation).round(13), work.rotation.T @ stations.rotations @ tool.rotation
+
+
+def _pose_cells(positions: np.ndarray, rotations: np.ndarray) -> tuple[list[str], list[list[str]]]:
+    """Return pose columns and their cells per station; angles only where there are any."""
+    names = [f"{name}_mm" for name in POSITION_COLUMNS]
+    cells = [[_scaled(float(value), 3) for value in position + 0.0] for position in positions]
+    if np.array_equal(rotations, np.broadcast_to(np.eye(3), rotations.shape)):
+        return names, cells
+    angles = np.degrees(angles_from_rotation(rotations)).round(12) + 0.0
+    tilted = [[*cell, *(_scaled(float(angle), 0) for angle in row)] for cell, row in zip(cells, angles, strict=True)]
+    return names + [f"{name}_deg" for name in ANGLE_COLUMNS], tilted
+
+
+def _temperature_cells(measurements: MeasurementSet) -> tuple[list[str], list[list[str]]]:
+    """Return temperature columns and their cells per station: none, one, or eight."""
+    values = measurements.stations.temperatures
+    if (values == REFERENCE_TEMPERATURE).all():
+        return [], [[] for _ in values]
+    if (values == values[:, :1]).all():
+        return ["temperature_degC"], [[repr(row[0])] for row in values.tolist()]
+    return [f"{name}_degC" for name in Temperatures.NAMES], [list(map(repr, row)) for row in values.tolist()]
+
+
+def _strut_cells(measurements: MeasurementSet) -> dict[int, list[str]]:
+    """Return the strut commands, mm, of the stations where they are not the nominal lengths."""
+    nominal = Structure.of(measurements.geometry)
+    stations = measurements.stations
+    cells = {}
+    for n, commands in enumerate(stations.commands):
+        if not np.array_equal(commands, strut_lengths(nominal, stations.pose(n))):
+            cells[n] = [_scaled(float(length), 3) for length in commands]
+    return cells

@@ -1,0 +1,129 @@
+"""ROS messages to core types and back; the only module beside ``nodes`` that knows ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import JointState
+
+from ..errors import CommandError
+from ..kernels.pose import quaternion_of
+from ..kernels.struts import write_lengths
+from ..machine.geometry import STRUT_NAMES
+from ..pose import Pose
+
+
+def pose_numbers(message: PoseStamped) -> tuple[float, float, float, float, float, float, float]:
+    """Return x, y, z (m) and the quaternion x, y, z, w of a message."""
+    p, q = message.pose.position, message.pose.orientation
+    return p.x, p.y, p.z, q.x, q.y, q.z, q.w
+
+
+def write_pose(message: PoseStamped, position: np.ndarray, rotation: np.ndarray) -> None:
+    """Fill a message's pose from position (m) and rotation matrix."""
+    p, q = message.pose.position, message.pose.orientation
+    p.x, p.y, p.z = position.tolist()
+    q.x, q.y, q.z, q.w = quaternion_of(rotation)
+
+
+def pose_message(pose: Pose, frame_id: str) -> PoseStamped:
+    """Return a new message with a zero stamp."""
+    message = PoseStamped()
+    message.header.frame_id = frame_id
+    write_pose(message, pose.position, pose.rotation)
+    return message
+
+
+def message_pose(message: PoseStamped) -> Pose:
+    """Return a message's pose.
+
+    Raises
+    ------
+    PoseError
+        Not finite, or the quaternion's norm is not 1.
+    """
+    numbers = pose_numbers(message)
+    return Pose.from_quaternion(np.array(numbers[:3]), np.array(numbers[3:]))
+
+
+class StrutMessage:
+    """A JointState of the six struts whose numbers are written in place, to be published again and again.
+
+    The velocity field is filled too: an empty one makes bags that some readers refuse.
+
+    Attributes
+    ----------
+    message : JointState
+        The message.
+    position, velocity : ndarray, shape (6,)
+        Views of the message's numbers, m and m/s.
+    """
+
+    def __init__(self, frame_id: str = "") -> None:
+        self.message = JointState(name=list(STRUT_NAMES), position=[0.0] * 6, velocity=[0.0] * 6)
+        self.message.header.frame_id = frame_id
+        self.position = np.frombuffer(self.message.position, dtype=float)
+        self.velocity = np.frombuffer(self.message.velocity, dtype=float)
+
+    def write(self, lengths: np.ndarray, period: float = 0.0) -> None:
+        """Write lengths, m, and as velocities their change since the last ones over `period` s; 0: at rest."""
+        write_lengths(lengths, period, self.position, self.velocity)
+
+
+LARGEST_LENGTH = 1e150
+"""The squares of larger numbers, m, overflow; whether a strut can be so long is a question for limits."""
+
+
+class StrutReader:
+    """Picks the six struts out of JointState messages by name; other joints beside them do not matter.
+
+    Attributes
+    ----------
+    lengths : ndarray, shape (6,)
+        Lengths last read, in strut order, m.
+    """
+
+    def __init__(self) -> None:
+        self.lengths = np.zeros(6)
+        self._names: list[str] | None = None
+        self._order = np.arange(6)
+
+    def read(self, message: JointState) -> None:
+        """Read a message.
+
+        Raises
+        ------
+        CommandError
+            ``strut_names``, ``strut_count`` or ``not_finite``; the lengths last read stay.
+        """
+        if message.name != self._names:
+            self._order = strut_order(message.name)
+            self._names = list(message.name)
+        joints, positions = len(message.name), len(message.position)
+        if joints != positions:
+            raise CommandError("strut_count", f"each of {joints} names needs a position, there are {positions}")
+        lengths = np.frombuffer(message.position, dtype=float)[self._order]
+        if not all(abs(length) < LARGEST_LENGTH for length in lengths.tolist()):
+            allowed = f"finite and below {LARGEST_LENGTH:g} m"
+            raise CommandError("not_finite", f"strut lengths must be {allowed}, not {lengths.tolist()}")
+        self.lengths[:] = lengths
+
+
+def strut_order(names: Sequence[str]) -> np.ndarray:
+    """Return where each of the six struts stands in a list of names.
+
+    Raises
+    ------
+    CommandError
+        ``strut_names``: one is missing, or there twice.
+    """
+    found: dict[str, list[int]] = {name: [] for name in STRUT_NAMES}
+    for place, name in enumerate(names):
+        if name in found:
+            found[name].append(place)
+    wrong = [f"{name} {'twice' if places else 'missing'}" for name, places in found.items() if len(places) != 1]
+    if wrong:
+        raise CommandError("strut_names", f"each strut must be named once: {', '.join(wrong)}")
+    return np.array([places[0] for places in found.values()])

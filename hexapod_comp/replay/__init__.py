@@ -1,0 +1,1 @@
+"""A recorded run put through the compensator again."""

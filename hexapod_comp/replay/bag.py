@@ -1,0 +1,462 @@
+"""Reading a recorded run: one machine's topics out of a bag, as plain arrays. Only this module knows ``rosbags``.
+
+A bag is a folder with ``metadata.yaml`` as ``ros2 bag record`` writes it, or a bare ``.mcap`` or ``.db3`` file. Of
+its topics a replay needs the compensator's journal alone; ``compensator/files`` spares the user the search for geometry
+and model; ``strut_states`` and ``tool_pose_estimate`` are shown where there are any. All others are left alone,
+whatever their types.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..compensation.journal import JournalError, Page, Snapshot, Source, read_page, read_sources
+from ..errors import HexapodError, InputFileError, printable
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry, load_geometry
+from ..machine.model import MachineModel
+from ..machine.model_file import load_model
+from .unpacking import Allowance, UnpackingError, bounded, refuse_overlapping_chunks, refuse_too_much_at_once
+
+POSE, STRUTS, TEXT = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState", "std_msgs/msg/String"
+
+TOPICS = {
+    "strut_states": STRUTS,
+    "tool_pose_estimate": POSE,
+}
+"""A machine's topics in its namespace that are shown, and their types."""
+
+COMMANDS = "tool_pose_command"
+"""Topic of commands: counted, not read. What the compensator took, its journal says."""
+
+JOURNAL, FILES = "/journal", "/files"
+"""How the topics of a compensator's journal end, after the node's name."""
+
+STORAGE = (".mcap", ".db3")
+
+MCAP_END = b"\x89MCAP0\r\n"
+"""Last bytes of an MCAP file that was closed."""
+
+CUT_OFF = (
+    "it has no end, as when the recorder is killed; `mcap recover FILE --output NEW.mcap` makes a whole file of it"
+)
+
+SPARE = 4
+"""Bytes that some writers leave behind a message."""
+
+RECORD = "record at least compensator/journal and compensator/files"
+
+IDEAL = Source.of("", "").sha256
+"""Hash of the model that is none."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """Messages of one topic, oldest first.
+
+    Attributes
+    ----------
+    stamps : ndarray of int64, shape (n,)
+        Their headers' stamps, ns.
+    times : ndarray of int64, shape (n,)
+        When the recorder got them, ns.
+    values : ndarray, shape (n, k)
+        Six struts, m; or position x, y, z, m.
+    """
+
+    stamps: np.ndarray
+    times: np.ndarray
+    values: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+
+@dataclass
+class Recording:
+    """What a bag tells about one machine.
+
+    Attributes
+    ----------
+    path : str
+        The bag.
+    node : str
+        Full name of the compensator.
+    topics : dict of str to Series
+        By the names in :data:`TOPICS`; empty where the bag has none.
+    pages : list of (int, Page)
+        The journal with the recorder's times, ns; session by session, in the pages' own order.
+    answers : ndarray of ANSWER
+        Those of all pages, one after the other.
+    sources : dict of str to Source
+        Geometries and models by their hash.
+    heard : int
+        Commands that the recorder heard; the compensator may have taken fewer.
+    notes : list of str
+        What was odd.
+    """
+
+    path: str
+    node: str
+    topics: dict[str, Series]
+    pages: list[tuple[int, Page]]
+    answers: np.ndarray
+    sources: dict[str, Source]
+    heard: int
+    notes: list[str]
+
+    @property
+    def first(self) -> Snapshot:
+        """The first snapshot."""
+        return next(page.snapshot for _, page in self.pages if page.snapshot is not None)
+
+
+def read_recording(
+    path: str | Path, namespace: str | None = None, progress: Callable[[int], object] = lambda messages: None
+) -> Recording:
+    """Read one machine's topics.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder, ``.mcap`` or ``.db3``.
+    namespace : str, optional
+        Needed when the bag holds several machines; ``/`` for none.
+    progress : callable, optional
+        Called with the number of messages just read.
+
+    Raises
+    ------
+    HexapodError
+        ``rosbags`` is not installed.
+    InputFileError
+        No bag, damaged, of an earlier version, without journal, several machines or no such one; or it
+        unpacks to more than its size makes believable.
+    """
+    _rosbags()
+    with ExitStack() as stack:
+        files, notes = _files(Path(path))
+        size = _size(files)
+        stack.enter_context(bounded(Allowance(size)))
+        readers = _open(Path(path), files, stack)
+        connections = [c for reader in readers for c in reader.connections]
+        node = _choose(path, connections, namespace)
+        wanted = _wanted(path, connections, node)
+        collected = _Collected(path, node, Allowance(size))
+        for reader in readers:
+            chosen = [c for c in reader.connections if c.topic in wanted]
+            for topic, time, message, length in _messages(path, reader, chosen):
+                collected.take(wanted[topic], time, message, length)
+                progress(1)
+    heard = sum(c.msgcount for c in connections if c.topic == f"{_namespace(node)}/{COMMANDS}")
+    return collected.recording(notes, heard)
+
+
+def _rosbags() -> Any:
+    """Return the modules of rosbags, with a clear word where it is missing."""
+    try:
+        from rosbags import rosbag2, typesys
+    except ImportError as error:
+        raise HexapodError(
+            f"reading bags needs rosbags ({error}): pip install hexapod_comp[bags], "
+            "or on a ROS machine the rosdep key python3-rosbags-pip"
+        ) from error
+    return rosbag2, typesys
+
+
+def _open(path: Path, files: list[Path], stack: ExitStack) -> list[Any]:
+    """Open all files of a bag; return their readers."""
+    rosbag2, _ = _rosbags()
+    readers = []
+    for file in files:
+        try:
+            readers.append(stack.enter_context(rosbag2.Reader(file)))
+            refuse_overlapping_chunks(readers[-1])
+        except Exception as error:
+            raise _unreadable(path, file, "", error) from error
+    if not any(reader.message_count for reader in readers):
+        raise InputFileError(path, "", "is a bag without messages")
+    return readers
+
+
+def _size(files: list[Path]) -> int:
+    """Return the bytes of a bag's files."""
+    inside = [one for file in files for one in (file.iterdir() if file.is_dir() else [file])]
+    return sum(file.stat().st_size for file in inside if file.is_file())
+
+
+def _files(path: Path) -> tuple[list[Path], list[str]]:
+    """Return what is to be opened: the folder, or its single files where ``metadata.yaml`` is missing."""
+    if path.name == "metadata.yaml":
+        path = path.parent
+    if not path.exists():
+        raise InputFileError(path, "", "there is no such file or folder")
+    if path.is_file():
+        if path.suffix not in STORAGE:
+            raise InputFileError(path, "", "must be a bag: a folder with metadata.yaml, a .mcap or a .db3 file")
+        return [path], []
+    if (path / "metadata.yaml").is_file():
+        return [path], []
+    found = sorted(file for file in path.iterdir() if file.suffix in STORAGE)
+    if not found:
+        raise InputFileError(path, "", "is no bag: it has neither metadata.yaml nor a .mcap or .db3 file")
+    return found, ["metadata.yaml is missing, as when the recorder is killed; all files of the folder were read"]
+
+
+def _unreadable(path: str | Path, file: Path, key: str, error: Exception) -> InputFileError:
+    """Return the error for what the library raises on damaged bytes.
+
+    That is whatever its parts happen to raise: struct.error, KeyError, AssertionError, errors of three
+    decompressors and of two databases; hence ``except Exception`` where it is called.
+    """
+    if isinstance(error, UnpackingError):
+        return InputFileError(path, key, str(error))
+    said = " ".join(str(part) for part in error.args) or type(error).__name__
+    problem = f"cannot be read as a bag: {printable(said)}"
+    if any(_cut_off(one) for one in (file, *file.glob("*.mcap"))):
+        problem += f"; {CUT_OFF}"
+    return InputFileError(path, key, problem)
+
+
+def _cut_off(file: Path) -> bool:
+    """Return whether a file is an MCAP file that was never closed."""
+    if file.suffix != ".mcap" or not file.is_file():
+        return False
+    with open(file, "rb") as stream:
+        stream.seek(max(0, file.stat().st_size - len(MCAP_END)))
+        return stream.read() != MCAP_END
+
+
+def _choose(path: str | Path, connections: Iterable[Any], namespace: str | None) -> str:
+    """Return the full name of the compensator meant."""
+    connections = list(connections)
+    journals = [c for c in connections if c.topic.endswith(JOURNAL)]
+    journals = [c for c in journals if c.msgtype == TEXT] or journals  # others have journals too
+    nodes = sorted({c.topic.removesuffix(JOURNAL) for c in journals})
+    if namespace is not None:
+        wanted = "/" + namespace.strip("/")
+        here = [node for node in nodes if _namespace(node) == wanted.rstrip("/")]
+    else:
+        here = nodes
+    if len(here) == 1:
+        return here[0]
+    if not nodes:
+        found = ", ".join(sorted({c.topic for c in connections})) or "none"
+        problem = f"holds no journal of a compensator, without which nothing can be replayed; {RECORD}"
+        raise InputFileError(path, "", f"{problem}. Its topics: {printable(found, 500)}")
+    names = ", ".join(_namespace(node) or "/" for node in nodes)
+    problem = "holds several machines; choose one with --namespace" if here else f"has no machine in {namespace}"
+    raise InputFileError(path, "", f"{problem}: {names}")
+
+
+def _namespace(node: str) -> str:
+    return node.rpartition("/")[0]
+
+
+def _wanted(path: str | Path, connections: Iterable[Any], node: str) -> dict[str, str]:
+    """Return what the topics to be read are called here; refuse wrong types."""
+    names = {f"{_namespace(node)}/{name}": (name, kind) for name, kind in TOPICS.items()}
+    names |= {node + JOURNAL: (JOURNAL, TEXT), node + FILES: (FILES, TEXT)}
+    for connection in connections:
+        kind = names.get(connection.topic, ("", connection.msgtype))[1]
+        if connection.msgtype != kind:
+            raise InputFileError(path, connection.topic, f"must be of type {kind}", connection.msgtype)
+    return {topic: name for topic, (name, _) in names.items()}
+
+
+def _messages(path: str | Path, reader: Any, connections: list[Any]) -> Iterator[tuple[str, int, Any, int]]:
+    """Yield topic, the recorder's time (ns), message and its length (bytes) of some connections."""
+    if not connections:
+        return
+    _, typesys = _rosbags()
+    # These types have been the same since they exist: the definitions in the bag, if any, are not needed.
+    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+    messages = reader.messages(connections)
+    while True:
+        key = ""
+        try:
+            connection, time, raw = next(messages)
+            key = f"{connection.topic} at {time} ns"
+            refuse_too_much_at_once(len(raw), "a message")
+            message = _deserialized(store, raw, connection.msgtype)
+        except StopIteration:
+            return
+        except Exception as error:
+            raise _unreadable(path, reader.path, key, error) from error
+        yield connection.topic, time, message, len(raw)
+
+
+def _deserialized(store: Any, raw: bytes, kind: str) -> Any:
+    """Return a message; rclpy's serialize_message leaves four bytes behind some, which the library refuses."""
+    try:
+        return store.deserialize_cdr(raw, kind)
+    except Exception:
+        try:
+            return store.deserialize_cdr(raw[:-SPARE], kind)
+        except Exception:
+            pass
+        raise
+
+
+class _Columns:
+    """One topic's messages on their way into a Series: plain numbers, a fifth of the memory of tuples."""
+
+    def __init__(self) -> None:
+        self.times, self.stamps, self.values = array("q"), array("q"), array("d")
+
+    def series(self, width: int) -> Series:
+        """Return them, oldest first."""
+        times = np.array(self.times, dtype=np.int64)
+        order = np.argsort(times, kind="stable")
+        values = np.array(self.values, dtype=float).reshape((-1, width))[order]
+        return Series(stamps=np.array(self.stamps, dtype=np.int64)[order], times=times[order], values=values)
+
+
+class _Collected:
+    """Messages on their way into a Recording."""
+
+    def __init__(self, path: str | Path, node: str, allowance: Allowance) -> None:
+        self._path, self._node, self._allowance = path, node, allowance
+        self._columns = {name: _Columns() for name in TOPICS}
+        self._pages: list[tuple[int, Page]] = []
+        self._sources: dict[str, Source] = {}
+        self._odd: dict[str, int] = {}
+
+    def take(self, name: str, time: int, message: Any, length: int) -> None:
+        """Take one message of some length, bytes: pages of a database may hold many of one piece of file."""
+        try:
+            self._allowance.take(length)
+        except UnpackingError as error:
+            raise InputFileError(self._path, f"{name} at {time} ns", str(error)) from error
+        if name in (JOURNAL, FILES):
+            self._take_text(name, time, message.data)
+            return
+        columns, point = self._columns[name], getattr(message, "pose", None)
+        numbers = _lengths(message) if point is None else (point.position.x, point.position.y, point.position.z)
+        if numbers is None:
+            self._odd[name] = self._odd.get(name, 0) + 1
+            return
+        columns.times.append(time)
+        columns.stamps.append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
+        columns.values.extend(numbers)
+
+    def _take_text(self, name: str, time: int, text: str) -> None:
+        try:
+            if name == JOURNAL:
+                self._pages.append((time, read_page(text)))
+            else:
+                self._sources |= {source.sha256: source for source in read_sources(text).values()}
+        except JournalError as error:
+            raise InputFileError(self._path, f"{self._node}{name} at {time} ns", str(error)) from error
+
+    def recording(self, notes: list[str], heard: int) -> Recording:
+        """Return what was collected."""
+        pages = _in_order(self._pages)
+        if not any(page.snapshot for _, page in pages):
+            problem = "holds no snapshot of the compensator's state: record for longer than half a second"
+            raise InputFileError(self._path, self._node + JOURNAL, problem)
+        answers, pages = _gathered(pages)
+        if not len(answers):
+            raise InputFileError(self._path, self._node + JOURNAL, "holds not a single answer of the compensator")
+        topics = {name: columns.series(3 if TOPICS[name] == POSE else 6) for name, columns in self._columns.items()}
+        notes = notes + [
+            f"{count} messages of {name} left out: not a position for each of {', '.join(STRUT_NAMES)}"
+            for name, count in self._odd.items()
+        ]
+        return Recording(str(self._path), self._node, topics, pages, answers, self._sources, heard, notes)
+
+
+def _in_order(pages: list[tuple[int, Page]]) -> list[tuple[int, Page]]:
+    """Return pages session by session; each once, if a recorder that joined twice has it twice."""
+    pages = sorted(pages, key=lambda entry: entry[0])
+    sessions = {session: n for n, session in enumerate(dict.fromkeys(page.session for _, page in pages))}
+    once = {(sessions[page.session], page.number): (time, page) for time, page in reversed(pages)}
+    return [once[key] for key in sorted(once)]
+
+
+def _gathered(pages: list[tuple[int, Page]]) -> tuple[np.ndarray, list[tuple[int, Page]]]:
+    """Return all answers in one array, and the pages with views of it."""
+    answers = np.concatenate([page.answers for _, page in pages])
+    ends = np.cumsum([len(page.answers) for _, page in pages])
+    views = np.split(answers, ends[:-1])
+    return answers, [(time, replace(page, answers=view)) for (time, page), view in zip(pages, views, strict=True)]
+
+
+def _lengths(message: Any) -> tuple[float, ...] | None:
+    """Return the six struts' positions in strut order, m; None when they are not what the message holds."""
+    names, positions = list(message.name), message.position.tolist()
+    if len(names) != len(positions) or any(names.count(name) != 1 for name in STRUT_NAMES):
+        return None
+    return tuple(positions[names.index(name)] for name in STRUT_NAMES)
+
+
+class Files:
+    """Finds geometries and models by their hash: in the recording, and among files that the user names.
+
+    Parameters
+    ----------
+    recording : Recording
+        Carries its own, unless they were not recorded.
+    given : mapping of str to Source
+        More, by hash.
+    """
+
+    def __init__(self, recording: Recording, given: Mapping[str, Source]) -> None:
+        self._path = recording.path
+        self._sources = {**recording.sources, **given}
+        self._loaded: dict[tuple[str, str], Any] = {}
+        pages = [page for _, page in recording.pages]
+        snapshots = [page.snapshot for page in pages if page.snapshot is not None]
+        self.used = {one["sha256"] for snapshot in snapshots for one in (snapshot.geometry, snapshot.model)}
+        self.used |= {str(entry.values["sha256"]) for page in pages for entry in page.entries if entry.what == "model"}
+
+    @property
+    def used_ideal(self) -> bool:
+        """Whether there was a time without a model."""
+        return IDEAL in self.used
+
+    def missing(self) -> str | None:
+        """Return the hash of a file that was in use and is not at hand, None when all are."""
+        absent = (s for s in sorted(self.used) if s != IDEAL and not getattr(self._sources.get(s), "text", None))
+        return next(absent, None)
+
+    def geometry(self, identity: Mapping[str, str]) -> HexapodGeometry:
+        """Return a geometry by its name and hash."""
+        key = identity["sha256"], ""
+        if key not in self._loaded:
+            self._loaded[key] = self._load("machine", identity, load_geometry)
+        return self._loaded[key]
+
+    def model(self, identity: Mapping[str, str], geometry: HexapodGeometry) -> MachineModel:
+        """Return a model by its name and hash."""
+        key = identity["sha256"], geometry.name
+        if key not in self._loaded:
+            if identity["sha256"] == IDEAL:
+                self._loaded[key] = MachineModel(geometry.name)
+            else:
+                self._loaded[key] = self._load("model", identity, lambda path: load_model(path, geometry))
+        return self._loaded[key]
+
+    def _load(self, what: str, identity: Mapping[str, str], load: Callable[[Path], Any]) -> Any:
+        source = self._sources.get(identity["sha256"])
+        if source is None or source.text is None:
+            problem = (
+                f"does not carry the {what} {identity.get('name', '')!r} that was in use; "
+                f"give its file with --{what} (sha256 {identity['sha256']})"
+            )
+            raise InputFileError(self._path, "", problem)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "text.yaml"
+            path.write_text(source.text, encoding="utf-8")
+            try:
+                return load(path)
+            except InputFileError as error:
+                # A file of another version of this package, most likely: name the bag, not our copy.
+                raise InputFileError(self._path, f"{source.name}: {error.key}", error.problem, error.value) from error

@@ -1,0 +1,198 @@
+"""Pictures of a replayed run: corrections, commands, following error, tool, refused commands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..compensation.journal import Entry
+from ..errors import printable
+from ..formats.figures import WITH, WITHOUT, save
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry
+from .replay import BEFORE, DIFFERENT, LOST
+from .report import LONGEST_GAP, Report, following_error, since, tool_positions
+
+EVENT_COLOURS = {"temperature": "#8a6d3b", "model": "#7b3294", "enable": "#2e8b57", "reset": "#555555"}
+
+MOST_LABELS = 12
+"""More changes than this are drawn without their names."""
+
+
+def write_pictures(report: Report, geometry: HexapodGeometry | None, folder: str | Path) -> list[Path]:
+    """Write every picture that there is something for; return the files.
+
+    Parameters
+    ----------
+    report : Report
+        The replay.
+    geometry : HexapodGeometry or None
+        For the work frame; without it the tool is not drawn.
+    folder : str or Path
+        Made when it is missing.
+
+    Raises
+    ------
+    InputFileError
+        It cannot be written.
+    """
+    figures = {"corrections": corrections_figure(report), "commands": commands_figure(report)}
+    if len(report.recording.topics["strut_states"]):
+        figures["following_error"] = following_figure(report)
+    if geometry is not None:
+        figures["tool"] = tool_figure(report, geometry)
+    if report.refused:
+        figures["refused"] = refused_figure(report)
+    if report.other is not None or not report.same:
+        figures["difference"] = difference_figure(report)
+    paths = []
+    for name, figure in figures.items():
+        paths.append(Path(folder) / f"{name}.png")
+        save(figure, paths[-1])
+    return paths
+
+
+def _figure(report: Report, what: str, height: float = 4.5) -> Figure:
+    figure = Figure(figsize=(11, height), layout="constrained")
+    figure.suptitle(f"{what} · {report.recording.node} · {Path(report.recording.path).name}")
+    return figure
+
+
+def _broken(seconds: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a line with a hole wherever the recording pauses."""
+    holes = np.flatnonzero(np.diff(seconds) > LONGEST_GAP) + 1
+    return np.insert(seconds, holes, np.nan), np.insert(values, holes, np.nan, axis=0)
+
+
+def _struts(axes: Axes, seconds: np.ndarray, values: np.ndarray) -> None:
+    """Draw six columns over time."""
+    for name, column in zip(STRUT_NAMES, values.T, strict=True):
+        axes.plot(*_broken(seconds, column), lw=0.8, label=name)
+    axes.set(xlabel="time, s")
+    axes.legend(ncols=6, fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.12))
+
+
+def _mark_events(report: Report, axes: Axes) -> None:
+    """Draw a line where something was changed, and shade what could not be replayed."""
+    replayed = report.replayed
+    if replayed is None:
+        return
+    seconds = report.seconds
+    for event in replayed.changes:
+        at, entry = seconds[min(event.row, len(seconds) - 1)], event.entry
+        axes.axvline(at, color=EVENT_COLOURS.get(entry.what, "black"), lw=0.8, ls="--")
+        if len(replayed.changes) <= MOST_LABELS:
+            axes.annotate(
+                _label(entry), (at, 1.0), (2, -3), xycoords=("data", "axes fraction"), textcoords="offset points",
+                rotation=90, va="top", fontsize=6,
+            )  # fmt: skip
+    lost = np.isin(replayed.outcome, (LOST, BEFORE))
+    if lost.any():
+        low, high = axes.get_ylim()
+        axes.fill_between(seconds, low, high, where=lost.tolist(), color="grey", alpha=0.2, lw=0.0, step="mid")
+        axes.set_ylim(low, high)
+
+
+def _label(entry: Entry) -> str:
+    if entry.what == "enable":
+        return "enable" if entry.values["on"] else "disable"
+    return f"{entry.what} {printable(str(entry.values.get('name', '')), 20)}".rstrip()
+
+
+def corrections_figure(report: Report) -> Figure:
+    """Show the recorded corrections over time; changes are marked, what was not replayed is grey."""
+    figure = _figure(report, "Strut corrections: command − nominal")
+    axes = figure.subplots()
+    _struts(axes, report.seconds, report.corrections * 1e6)
+    axes.set(ylabel="µm")
+    _mark_events(report, axes)
+    return figure
+
+
+def commands_figure(report: Report) -> Figure:
+    """Show the commanded lengths, strut by strut, and the measured ones where there are any."""
+    figure = _figure(report, "Strut lengths", 6.5)
+    panels = figure.subplots(2, 3, sharex=True)
+    commands, states = report.commands * 1e3, report.recording.topics["strut_states"]
+    for n, axes in enumerate(panels.ravel()):
+        if len(states) and states.stamps.all():
+            measured = since(states.stamps, report.recording.answers["stamp"])
+            axes.plot(*_broken(measured, states.values[:, n] * 1e3), color=WITHOUT, lw=1.6, label="measured")
+        axes.plot(*_broken(report.seconds, commands[:, n]), color=WITH, lw=0.8, label="command")
+        axes.set(title=STRUT_NAMES[n])
+    for axes in panels[1]:
+        axes.set(xlabel="time, s")
+    for axes in panels[:, 0]:
+        axes.set(ylabel="mm")
+    panels[0, 0].legend(fontsize=7)
+    return figure
+
+
+def following_figure(report: Report) -> Figure:
+    """Show by how much the measured struts were off their commands."""
+    figure = _figure(report, "Following error: measured − commanded, the drives' lag included")
+    axes = figure.subplots()
+    seconds, error = following_error(report)
+    _struts(axes, seconds, error * 1e6)
+    axes.set(ylabel="µm")
+    return figure
+
+
+def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
+    """Show the commanded tool path from above and from the side, and where the compensator thought the tool was."""
+    figure = _figure(report, "Tool in base", 5.0)
+    positions = tool_positions(report.recording, geometry.work)
+    estimates = report.recording.topics["tool_pose_estimate"]
+    both = len(estimates) > 1 and len(positions) > 1
+    panels = figure.subplots(1, 3 if both else 2)
+    for axes, (first, second) in zip(panels, ((0, 1), (0, 2)), strict=False):
+        if len(estimates):
+            points = estimates.values[:, :3] * 1e3
+            axes.plot(points[:, first], points[:, second], color=WITHOUT, lw=1.6, label="estimated")
+        axes.plot(positions[:, first] * 1e3, positions[:, second] * 1e3, color=WITH, lw=0.8, label="commanded")
+        axes.set(xlabel=f"{'xyz'[first]}, mm", ylabel=f"{'xyz'[second]}, mm")
+        axes.axis("equal")
+    panels[0].legend(fontsize=7)
+    if both:
+        at = since(estimates.stamps, report.recording.answers["stamp"])
+        _off(panels[2], report.seconds, positions, at, estimates.values[:, :3])
+    return figure
+
+
+def _off(axes: Axes, seconds: np.ndarray, wanted: np.ndarray, at: np.ndarray, points: np.ndarray) -> None:
+    """Draw by how much estimated points are off the commanded ones at the same time, x, y, z."""
+    inside = (at >= seconds[0]) & (at <= seconds[-1])
+    for name, column, point in zip("xyz", wanted.T, points.T, strict=True):
+        off = point[inside] - np.interp(at[inside], seconds, column)
+        axes.plot(*_broken(at[inside], off * 1e6), lw=0.8, label=name)
+    axes.set(title="estimated − commanded, lag included", xlabel="time, s", ylabel="µm")
+    axes.legend(fontsize=7)
+
+
+def refused_figure(report: Report) -> Figure:
+    """Show when commands were refused, by reason."""
+    figure = _figure(report, "Refused commands", 3.5)
+    axes = figure.subplots()
+    reasons = sorted({event.entry.values["reason"] for event in report.refused})
+    for height, reason in enumerate(reasons):
+        times = [report.since_first_page(e.time) for e in report.refused if e.entry.values["reason"] == reason]
+        axes.plot(times, np.full(len(times), height), "|", ms=14)
+    axes.set_yticks(range(len(reasons)), [printable(reason, 30) for reason in reasons])
+    axes.set(xlabel="time, s")
+    axes.margins(y=0.3)
+    return figure
+
+
+def difference_figure(report: Report) -> Figure:
+    """Show replayed minus recorded corrections, and the other model's minus the recorded ones."""
+    shown = [(report.other, f"{report.other_name} − recorded")] if report.other is not None else []
+    replayed = report.replayed
+    if replayed is not None and (replayed.outcome == DIFFERENT).any():
+        shown.append((replayed, "replayed − recorded"))
+    figure = _figure(report, "Corrections compared", 4.5 * max(1, len(shown)))
+    for axes, (run, title) in zip(figure.subplots(max(1, len(shown)), 1, squeeze=False)[:, 0], shown, strict=False):
+        _struts(axes, report.seconds, run.difference * 1e6)
+        axes.set(title=printable(title), ylabel="µm")
+    return figure

@@ -1,0 +1,252 @@
+"""Running a recorded run through the compensator again: the same answers, bit for bit, or where they part.
+
+Everything that decides an answer is in the journal, in its order. What a recorder has lost cannot be run again; the
+next snapshot, at most half a second later, gives the state to go on from, and what lies between is counted, not judged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..compensation.compensator import Compensator, pack_pose
+from ..compensation.journal import Entry, Page, Snapshot
+from ..errors import HexapodError
+from ..machine.geometry import HexapodGeometry
+from ..machine.model import MachineModel
+from ..pose import Pose
+from .bag import Files, Recording
+
+IDENTICAL, DIFFERENT, LOST, BEFORE = range(4)
+"""What came of an answer: the same bits; others; not replayed because the recorder has lost a page before it; not
+replayed because no snapshot lies before it."""
+
+Progress = Callable[[int], object]
+"""Called with the number of answers just compared."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """An entry of the journal in its place.
+
+    Attributes
+    ----------
+    row : int
+        Number of the answer that it precedes.
+    time : int
+        When the recorder heard of it, ns: up to 50 ms later.
+    entry : Entry
+        What happened.
+    """
+
+    row: int
+    time: int
+    entry: Entry
+
+
+@dataclass
+class Replay:
+    """What came of a replay.
+
+    Attributes
+    ----------
+    answers : ndarray of ANSWER
+        The recorded ones, n of them.
+    outcome : ndarray of int, shape (n,)
+        One of the module's four constants.
+    lengths : ndarray, shape (n, 2, 6)
+        Replayed strut commands and corrections, m; NaN where there is none.
+    refused_now : dict of int to str
+        Answers whose commands the replay refuses, with its reason.
+    changes, refused : list of Event
+        What happened between the answered commands.
+    states_differ : list of int
+        Answers before which the journal's snapshot was another than the replay's.
+    lost : int
+        Answers that the journal counts, and whose pages the recorder has lost.
+    """
+
+    answers: np.ndarray
+    outcome: np.ndarray
+    lengths: np.ndarray
+    refused_now: dict[int, str] = field(default_factory=dict)
+    changes: list[Event] = field(default_factory=list)
+    refused: list[Event] = field(default_factory=list)
+    states_differ: list[int] = field(default_factory=list)
+    lost: int = 0
+
+    @property
+    def compared(self) -> int:
+        """How many answers could be compared."""
+        return int(np.isin(self.outcome, (IDENTICAL, DIFFERENT)).sum())
+
+    @property
+    def identical(self) -> bool:
+        """Whether whatever could be compared is the same, and something could."""
+        return bool((self.outcome == IDENTICAL).any()) and not (self.outcome == DIFFERENT).any()
+
+    @property
+    def difference(self) -> np.ndarray:
+        """Replayed minus recorded corrections, shape (n, 6), m."""
+        return self.lengths[:, 1] - self.answers["lengths"][:, 1]
+
+
+def replay(recording: Recording, files: Files, progress: Progress = lambda answers: None) -> Replay:
+    """Run a recording through the compensator again.
+
+    Parameters
+    ----------
+    recording : Recording
+        What was read.
+    files : Files
+        Geometry and model in use.
+    progress : callable, optional
+        Called with the number of answers just compared.
+
+    Raises
+    ------
+    InputFileError
+        Geometry or model in use are not at hand.
+    """
+    return _AsItWas(recording, progress, files).run()
+
+
+def what_if(
+    recording: Recording, geometry: HexapodGeometry, model: MachineModel, progress: Progress = lambda answers: None
+) -> Replay:
+    """Run the recorded commands through another model, or another geometry.
+
+    Temperatures, switching and starts are those of the recording; its own models are not. The corrections
+    begin at the other model's: nothing ramps. All answers are run; nothing is left out after lost pages.
+    """
+    run = _Run(recording, progress)
+    compensator = Compensator(geometry, model)
+    compensator.restore(_begin(compensator, recording.first))
+    run.take(compensator)
+    return run.run()
+
+
+def _begin(compensator: Compensator, snapshot: Snapshot) -> dict[str, Any]:
+    """Return a snapshot with no more than what another machine can take over: directions and switches."""
+    kept = ("temperatures", "motion_sense", "enabled", "resumes", "ramp_rate")
+    fresh = compensator.snapshot() | {name: value for name, value in snapshot.state.items() if name in kept}
+    return fresh | {"motion_sense": np.nan_to_num(fresh["motion_sense"])}
+
+
+class _Run:
+    """A replay under way: all pages, step by step."""
+
+    compensator: Compensator
+
+    def __init__(self, recording: Recording, progress: Progress) -> None:
+        self._recording, self._progress = recording, progress
+        self._answers, count = recording.answers, len(recording.answers)
+        self.result = Replay(self._answers, np.full(count, BEFORE), np.full((count, 2, 6), np.nan))
+
+    def take(self, compensator: Compensator) -> None:
+        """Give the commands from now on to a compensator."""
+        self.compensator = compensator
+        self._frames = pack_pose(Pose.identity()), pack_pose(compensator.geometry.work)  # as journal.ROLES
+
+    def run(self) -> Replay:
+        """Return what comes of it."""
+        row, result = 0, self.result
+        for time, page in self._recording.pages:
+            self.begin(page)
+            for entry in page.steps():
+                if entry is None:
+                    result.outcome[row] = self.answer(row)
+                    row += 1
+                    self._progress(1)
+                elif entry.what == "refused":
+                    result.refused.append(Event(row, time, entry))
+                else:
+                    result.changes.append(Event(row, time, entry))
+                    self.change(entry)
+            if page.snapshot is not None:
+                self.check(page.snapshot, row)
+        return result
+
+    def begin(self, page: Page) -> None:
+        """Begin a page."""
+
+    def check(self, snapshot: Snapshot, row: int) -> None:
+        """Compare states before answer `row`."""
+
+    def change(self, entry: Entry) -> None:
+        """Make a change that the journal tells of."""
+        values = entry.values
+        if entry.what == "temperature":
+            self.compensator.set_temperature(values["name"], float(values["value"]))
+        elif entry.what == "enable":
+            self.compensator.enable(bool(values["on"]))
+        elif entry.what == "reset":
+            measured = values["measured"]
+            self.compensator.reset(None if measured is None else np.array(measured, dtype=float))
+
+    def answer(self, row: int) -> int:
+        """Give the command that was answered, as the node did; return what comes of it."""
+        asked, given = self._answers[row], self.result.lengths[row]
+        try:
+            frame = self._frames[asked["frame"]]
+            self.compensator.step(tuple(asked["pose"].tolist()), int(asked["stamp"]) * 1e-9, frame)
+        except HexapodError as error:
+            self.result.refused_now[row] = f"{error.reason}: {error}"
+            return DIFFERENT
+        given[0], given[1] = self.compensator.command, self.compensator.correction
+        return IDENTICAL if given.tobytes() == asked["lengths"].tobytes() else DIFFERENT
+
+
+class _AsItWas(_Run):
+    """A replay with what was in use."""
+
+    def __init__(self, recording: Recording, progress: Progress, files: Files) -> None:
+        super().__init__(recording, progress)
+        self._files = files
+        self._known, self._otherwise = False, BEFORE
+        self._in_use = "", ""
+        self._next = "", 0, 0
+
+    def begin(self, page: Page) -> None:
+        """Notice lost pages: from there on nothing is known until the next snapshot."""
+        session, _, begins = self._next
+        self._known &= self._next == (page.session, page.number, page.begins)
+        if session == page.session:
+            self.result.lost += max(0, page.begins - begins)
+        self._next = page.session, page.number + 1, page.begins + len(page.answers)
+
+    def change(self, entry: Entry) -> None:
+        """Make a change that the journal tells of."""
+        if not self._known:
+            return
+        if entry.what == "model":
+            self.compensator.set_model(self._files.model(entry.values, self.compensator.geometry))
+            self._in_use = self._in_use[0], entry.values["sha256"]
+        super().change(entry)
+
+    def answer(self, row: int) -> int:
+        """Compare an answer, if the state before it is known."""
+        return super().answer(row) if self._known else self._otherwise
+
+    def check(self, snapshot: Snapshot, row: int) -> None:
+        """Compare states, and go on from the recorded one."""
+        in_use = snapshot.geometry["sha256"], snapshot.model["sha256"]
+        same = in_use == self._in_use
+        if not same:
+            geometry = self._files.geometry(snapshot.geometry)
+            self.take(Compensator(geometry, self._files.model(snapshot.model, geometry)))
+        if not same or not _same_state(self.compensator.snapshot(), snapshot.state):
+            self.compensator.restore(snapshot.state)
+            if self._known:
+                self.result.states_differ.append(row)
+        self._in_use, self._known, self._otherwise = in_use, True, LOST
+
+
+def _same_state(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Return whether two snapshots are the same, all NaN being one number."""
+    if one.keys() != other.keys() or one["temperatures"] != other["temperatures"]:
+        return False
+    return all(np.array_equal(one[name], other[name], equal_nan=True) for name in one if name != "temperatures")

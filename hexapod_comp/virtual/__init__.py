@@ -1,0 +1,1 @@
+"""Machines that do not exist: imperfections drawn at random, drives, instruments."""

@@ -1,0 +1,195 @@
+"""Random imperfections within bounds: the hidden truth of a virtual machine.
+
+Every quantity is drawn whether its bound is zero or not, so that widening one bound leaves the others'
+draws alone, and a seed names one machine.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from ..errors import ModelError
+from ..machine.field import CROSS_AXES, GridField, no_field
+from ..machine.geometry import COINCIDENT, HexapodGeometry
+from ..machine.kinematics import Structure, strut_lengths
+from ..machine.model import MachineModel, ModelOrigin
+from ..machine.struts import StrutErrors
+
+FIELD_NODES = 3
+"""Nodes of a drawn field along each axis."""
+
+FIELD_POWERS = 4
+"""Coefficients of a drawn field's polynomials: cubic along each line."""
+
+
+@dataclass(frozen=True)
+class ImperfectionBounds:
+    """How imperfect a machine may be; all draws are uniform.
+
+    The defaults are paper 000's assessment: ±10 µm on every joint coordinate and on every strut, nothing
+    else.
+
+    Parameters
+    ----------
+    joint : float
+        Bound of every joint coordinate's deviation, m (±).
+    strut_offset : float
+        Bound of every strut's length offset, m (±).
+    pitch : float
+        Bound of every screw's relative pitch error, m per m (±); zero error at the home length.
+    wave : (float, float)
+        Lowest and highest amplitude of the periodic screw error, m; its phase is drawn too.
+    wave_period : float
+        Period of that error, m: the screw's lead.
+    backlash : (float, float)
+        Lowest and highest lost motion of a strut, m.
+    field_displacement, field_rotation : float
+        Largest displacement (m) and rotation (rad) of each component of a smooth six-component field; the
+        drawn field reaches it somewhere in its box.
+    field_reversal : float
+        Share of the field by which forward and backward may differ, 0…1.
+    field_box : ndarray, shape (2, 3) or None
+        Corners of the field's box, m in ``base``; needed when there is a field.
+    shared_platform_joints : bool
+        True: platform joints that coincide nominally are one ball joint and move together. False: each
+        strut has a joint of its own.
+
+    Raises
+    ------
+    ModelError
+        Bounds that are not finite, negative or the wrong way round.
+    """
+
+    joint: float = 10e-6
+    strut_offset: float = 10e-6
+    pitch: float = 0.0
+    wave: tuple[float, float] = (0.0, 0.0)
+    wave_period: float = 0.01
+    backlash: tuple[float, float] = (0.0, 0.0)
+    field_displacement: float = 0.0
+    field_rotation: float = 0.0
+    field_reversal: float = 0.1
+    field_box: np.ndarray | None = None
+    shared_platform_joints: bool = True
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if entry.name in ("wave", "backlash"):
+                low, high = value
+                if not 0.0 <= low <= high < math.inf:
+                    problem = "must be two lengths, 0 ≤ lowest ≤ highest, m"
+                    raise ModelError(f"bounds.{entry.name}", problem, value)
+            elif entry.name not in ("field_box", "shared_platform_joints") and not 0.0 <= value < math.inf:
+                raise ModelError(f"bounds.{entry.name}", "must be finite and not negative", value)
+        if self.wave_period <= 0.0:
+            raise ModelError("bounds.wave_period", "must be above zero, m", self.wave_period)
+        if self.field_reversal > 1.0:
+            raise ModelError("bounds.field_reversal", "must be at most 1", self.field_reversal)
+        if self.field_displacement or self.field_rotation:
+            self._check_box()
+
+    def _check_box(self) -> None:
+        box = np.array(self.field_box if self.field_box is not None else np.nan, dtype=float)
+        if box.shape != (2, 3) or not np.isfinite(box).all() or (box[1] <= box[0]).any():
+            problem = "must be two finite corners, the lower first, m, when there is a field"
+            raise ModelError("bounds.field_box", problem, self.field_box)
+
+
+def draw_model(geometry: HexapodGeometry, bounds: ImperfectionBounds, seed: int, name: str = "") -> MachineModel:
+    """Draw the hidden truth of one virtual machine.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        The nominal machine.
+    bounds : ImperfectionBounds
+        How imperfect it may be.
+    seed : int
+        Not negative; the same seed gives the same machine.
+    name : str, optional
+        Name of the model; ``virtual-<seed>`` by default.
+
+    Returns
+    -------
+    MachineModel
+
+    Raises
+    ------
+    ModelError
+        A seed that is not one, or draws that cannot describe a machine.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise ModelError("seed", "must be a whole number, 0 or above", seed)
+    rng = np.random.default_rng(int(seed))
+    base = bounds.joint * rng.uniform(-1.0, 1.0, (6, 3))
+    platform = bounds.joint * rng.uniform(-1.0, 1.0, (6, 3))
+    if bounds.shared_platform_joints:
+        platform = platform[_first_of_same(geometry.platform_joints)]
+    return MachineModel(
+        machine=geometry.name,
+        name=name or f"virtual-{seed}",
+        base_deviation=base,
+        platform_deviation=platform,
+        struts=_draw_struts(geometry, bounds, rng),
+        field=_draw_field(bounds, rng),
+        origin=ModelOrigin(note=f"virtual machine drawn with seed {seed}"),
+    )
+
+
+def _first_of_same(joints: np.ndarray) -> np.ndarray:
+    """Return, for each joint, the index of the first one at the same place."""
+    distances = np.linalg.norm(joints[:, None] - joints[None], axis=2)
+    return (distances < COINCIDENT).argmax(axis=1)
+
+
+def _draw_struts(geometry: HexapodGeometry, bounds: ImperfectionBounds, rng: np.random.Generator) -> StrutErrors:
+    offset, pitch = rng.uniform(-1.0, 1.0, (2, 6))
+    amplitude = rng.uniform(*bounds.wave, 6)
+    phase = rng.uniform(0.0, 2.0 * np.pi, 6)
+    return StrutErrors(
+        offset=bounds.strut_offset * offset,
+        pitch=bounds.pitch * pitch,
+        reference_length=strut_lengths(Structure.of(geometry), geometry.home),
+        cosine=amplitude * np.cos(phase),
+        sine=amplitude * np.sin(phase),
+        period=np.full(6, bounds.wave_period),
+        backlash=rng.uniform(*bounds.backlash, 6),
+    )
+
+
+def _draw_field(bounds: ImperfectionBounds, rng: np.random.Generator) -> GridField:
+    """Draw low-order polynomials along the lines whose coefficients vary bilinearly from line to line."""
+    common = _draw_lines(rng, 1)
+    difference = _draw_lines(rng, 2)
+    if not (bounds.field_displacement or bounds.field_rotation):
+        return no_field()
+    box = np.array(bounds.field_box, dtype=float)
+    x, y, z = (np.linspace(box[0, axis], box[1, axis], FIELD_NODES) for axis in range(3))
+    lines = [
+        (1.0 - bounds.field_reversal) * whole + bounds.field_reversal * part
+        for whole, part in zip(common, difference, strict=True)
+    ]
+    raw = GridField((x, y, z), (lines[0], lines[1], lines[2]))
+    wanted = np.repeat([bounds.field_displacement, bounds.field_rotation], 3)
+    scale = (wanted / _largest(raw))[:, None]
+    return replace(raw, lines=tuple(family * scale for family in raw.lines))
+
+
+def _draw_lines(rng: np.random.Generator, directions: int) -> list[np.ndarray]:
+    """Return coefficients of the three families, shape (directions, n, m, 6, powers), of order 1."""
+    across = np.linspace(-1.0, 1.0, FIELD_NODES)
+    terms = np.array([[(1.0, s, t, s * t) for t in across] for s in across])
+    weights = rng.uniform(-1.0, 1.0, (len(CROSS_AXES), directions, 4, 6, FIELD_POWERS))
+    return [np.einsum("nmk,dkcp->dnmcp", terms, family) for family in weights]
+
+
+def _largest(grid_field: GridField) -> np.ndarray:
+    """Return the largest magnitude of each component over the box and both directions, shape (6,)."""
+    samples = [np.linspace(nodes[0], nodes[-1], 9) for nodes in grid_field.grid]
+    points = np.stack(np.meshgrid(*samples), axis=-1).reshape(-1, 3)
+    values = [grid_field.evaluate(point, np.full(3, direction))[0] for point in points for direction in (1.0, -1.0)]
+    return np.abs(values).max(axis=0)

@@ -1,0 +1,152 @@
+"""Virtual instruments: what lasers and trackers would read on a machine whose errors are known.
+
+The other side of calibration: a campaign's template is filled in from the truth, so that the whole way from
+measuring to compensating can be tried, and judged, without a laser.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from ..errors import HexapodError, KinematicsError
+from ..machine.model import MachineModel, MachinesByTemperature, RealMachine
+from ..machine.motion import MotionState
+from ..measurements.campaign import Campaign
+from ..measurements.readings import AXES, CHANNELS, KINDS, MeasurementSet, attitude_error
+
+VISITS, SLOPES, NOISE = range(3)
+"""Streams of random numbers, one per cause: changing one leaves the others' draws alone."""
+
+
+def measure(
+    template: MeasurementSet,
+    campaign: Campaign,
+    truth: RealMachine,
+    seed: int,
+    advance: Callable[[int], object] | None = None,
+) -> MeasurementSet:
+    """Return a template's readings as instruments would take them on the real machine.
+
+    value = w · (e + where the machine happened to stop) − the same at the run's first reading of that channel
+    + slope of the straightness beam × way along the line + noise of the instrument. Positions and attitudes are
+    absolute: nothing is subtracted.
+
+    Parameters
+    ----------
+    template : MeasurementSet
+        Stations with the commands that the machine is given; its values are not used.
+    campaign : Campaign
+        Noise, beam slope and repeatability.
+    truth : RealMachine
+        The real machine; its own temperatures give way to the stations'.
+    seed : int
+        0 or above; the same seed gives the same readings.
+    advance : callable, optional
+        Called with the number of stations done since the last call.
+
+    Raises
+    ------
+    HexapodError
+        The machine cannot take one of the poses; names the reading.
+    """
+    errors = station_errors(template, truth, advance)[template.station]
+    errors[:, :3] += _stopping(template, campaign.repeatability, np.random.default_rng([seed, VISITS]))
+    value = (template.directions() * errors).sum(axis=1)
+    value -= _zeros(template, value)
+    value += _slopes(template, campaign.beam_slope, np.random.default_rng([seed, SLOPES])) * template.along()
+    sigma = np.array(campaign.noise)[template.kind]
+    value += sigma * np.random.default_rng([seed, NOISE]).standard_normal(len(value))
+    return template.with_values(value)
+
+
+def station_errors(
+    measurements: MeasurementSet, truth: RealMachine, advance: Callable[[int], object] | None = None
+) -> np.ndarray:
+    """Return the real error of the measured point at each station, shape (M, 6), m and rad along ``base``.
+
+    Displacement of the point and rotation of the platform, actual minus commanded, under the stations'
+    commands, directions of motion and temperatures.
+    """
+    machines = MachinesByTemperature(truth.geometry, truth.model)
+    stations, probe = measurements.stations, measurements.probe
+    errors = np.empty((len(stations), 6))
+    for n in range(len(stations)):
+        commanded = stations.pose(n)
+        try:
+            machine = machines.at(stations.temperatures[n])
+            actual, _ = machine.pose_for(stations.commands[n], stations.sense[n], commanded)
+        except KinematicsError as error:
+            raise _at_station(measurements, n, error) from error
+        errors[n, :3] = actual.position - commanded.position + (actual.rotation - commanded.rotation) @ probe
+        errors[n, 3:] = attitude_error(actual.rotation, commanded.rotation)
+        if advance is not None:
+            advance(1)
+    return errors
+
+
+def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet:
+    """Return a template whose machine is told what a model's compensation tells it.
+
+    Parameters
+    ----------
+    template : MeasurementSet
+        Stations with nominal commands.
+    model : MachineModel
+        Its own errors are undone at every station, at the station's temperatures and directions of motion.
+
+    Raises
+    ------
+    HexapodError
+        A pose at which the model cannot be undone; names the reading.
+    """
+    machines, stations = MachinesByTemperature(template.geometry, model), template.stations
+    commands = np.empty_like(stations.commands)
+    for n in range(len(stations)):
+        motion = MotionState(sense=stations.sense[n].copy())
+        try:
+            machine = machines.at(stations.temperatures[n])
+            commands[n] = machine.commands_for(stations.pose(n), motion)[0]
+        except KinematicsError as error:
+            raise _at_station(template, n, error) from error
+    return replace(template, stations=replace(stations, commands=commands))
+
+
+def _at_station(measurements: MeasurementSet, station: int, error: KinematicsError) -> HexapodError:
+    """Return an error that says at which reading it happened."""
+    reading = int((measurements.station == station).argmax())
+    position = (measurements.stations.positions[station] * 1e3).round(3).tolist()
+    run = measurements.runs[measurements.run[reading]].name
+    where = f"run {run}, reading {reading + 1}, platform at {position} mm"
+    return KinematicsError(f"{where}: {error}", error.value, error.limit)
+
+
+def _stopping(template: MeasurementSet, repeatability: float, rng: np.random.Generator) -> np.ndarray:
+    """Return where the machine stopped beside its usual place, shape (N, 3), m; one draw per visit."""
+    visits = np.stack([template.station, template.cycle], axis=1)
+    _, visit = np.unique(visits, axis=0, return_inverse=True)
+    visit = visit.ravel()  # NumPy 2.0 gave it another shape
+    return repeatability * rng.standard_normal((visit.max() + 1, 3))[visit]
+
+
+def _groups(template: MeasurementSet) -> np.ndarray:
+    """Return a number for each run and channel, shape (N,)."""
+    return template.run * len(CHANNELS) + template.channel
+
+
+def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
+    """Return what each reading's instrument showed when it was zeroed, at the first reading, shape (N,)."""
+    _, first, group = np.unique(_groups(template), return_index=True, return_inverse=True)
+    of_line = template.kind < KINDS.index("position")
+    return np.where(of_line, value[first][group.ravel()], 0.0)
+
+
+def _slopes(template: MeasurementSet, slope: float, rng: np.random.Generator) -> np.ndarray:
+    """Return the slope of the beam of each straightness reading, rad, zero for the others, shape (N,)."""
+    drawn = slope * rng.standard_normal(len(template.runs) * len(AXES))
+    straightness = template.kind == KINDS.index("straightness")
+    axis = template.channel - CHANNELS.index("straightness_x")
+    index = np.where(straightness, template.run * len(AXES) + axis, 0)
+    return np.where(straightness, drawn[index], 0.0)

@@ -1,0 +1,295 @@
+"""The virtual machine: six stepper-driven struts with hidden errors, their encoders, and a tracker.
+
+Commands go through the drives (:mod:`hexapod_comp.virtual.drives`) into motor positions and nut plays;
+:class:`hexapod_comp.machine.model.RealMachine`, the hidden truth, turns those into the pose that the platform
+really takes. Faults can be set while it runs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from ..errors import CommandError, ModelError
+from ..kernels import kinematics as kernels
+from ..kernels.drives import follow_point, run_struts
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry
+from ..machine.kinematics import forward_error
+from ..machine.model import RealMachine
+from ..machine.motion import MotionState
+from ..pose import Pose
+from .drives import DriveParameters, Faults, to_step
+
+__all__ = ["DriveParameters", "Faults", "StrutDrive"]
+
+LONGEST_ADVANCE = 60.0
+"""Longest time advanced in one call, s; more is a unit error."""
+
+LONGEST_TICK = 0.25e-3
+"""Integration step of the drives, s; shorter for a shorter lag."""
+
+
+class StrutDrive:
+    """A machine that moves: commands in, encoder readings and the true pose out.
+
+    Time passes only in :meth:`advance`. The same seed and the same calls give the same readings.
+
+    Parameters
+    ----------
+    machine : RealMachine
+        The hidden truth.
+    parameters : DriveParameters, optional
+        Drives and instruments.
+    seed : int
+        Of the noise and of the dropped readings.
+
+    Raises
+    ------
+    ModelError
+        Parameters that do not fit the machine.
+    """
+
+    def __init__(self, machine: RealMachine, parameters: DriveParameters | None = None, seed: int = 0) -> None:
+        self.machine = machine
+        self.parameters = (parameters or DriveParameters()).completed(machine)
+        self._rng = np.random.default_rng(seed)
+        self._tick = min(LONGEST_TICK, self.parameters.lag / 40.0) or LONGEST_TICK
+        self._left_over, self._time = 0.0, 0.0
+        self._set_up_struts()
+        self._set_up_pose(machine.geometry)
+        self._under_way: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
+        self._last_reading = np.full(6, np.nan)
+        self.feedback_arrived = True
+        self.faults = Faults()
+        self._follow_commanded_point()
+        self._run(0)
+        self._read_encoders(0.0)
+
+    def _set_up_struts(self) -> None:
+        p = self.parameters
+        self._commands = np.array(p.initial_lengths)
+        self._stops = np.array(p.stops)
+        self._position = self._commands.copy()
+        self._speed = np.zeros(6)
+        self._motor = to_step(self._commands, p.step)
+        self._half_play = 0.5 * self.machine.model.struts.backlash
+        self._play = np.zeros(6)
+        self._stuck, self._stopped = np.zeros(6, bool), np.zeros(6, bool)
+
+    def _set_up_pose(self, geometry: HexapodGeometry) -> None:
+        self._motion = MotionState()
+        self._model_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
+        self._true_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
+        self._commanded_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
+        self._outcome, self._condition = kernels.OK, math.nan
+        work = geometry.work.inverse()
+        self._work = work.position, work.rotation
+        self._tool = geometry.tool.position, geometry.tool.rotation
+
+    @property
+    def faults(self) -> Faults:
+        """What goes wrong at present; a jump happens when it is set."""
+        return self._faults
+
+    @faults.setter
+    def faults(self, faults: Faults) -> None:
+        self._faults = faults
+        self._stuck[:] = False
+        if faults.stuck is not None:
+            self._stuck[faults.stuck] = True
+            self._speed[faults.stuck] = 0.0
+        if faults.jump is not None:
+            index, distance = faults.jump
+            self._position[index] += distance
+
+    @property
+    def time(self) -> float:
+        """Time advanced since the start, s."""
+        return self._time
+
+    @property
+    def commands(self) -> np.ndarray:
+        """The commands in force, m, shape (6,)."""
+        return self._commands.copy()
+
+    @property
+    def stopped(self) -> np.ndarray:
+        """Which motors the last advance found at a stop, asked or knocked to go on; bool, shape (6,)."""
+        return self._stopped.copy()
+
+    def set_command(self, lengths: np.ndarray) -> None:
+        """Take six strut commands; lengths beyond a stop are taken, and reported by :attr:`stopped`.
+
+        Parameters
+        ----------
+        lengths : array_like, shape (6,)
+            m.
+
+        Raises
+        ------
+        CommandError
+            Not six finite lengths; the last command stays in force.
+        """
+        lengths = np.asarray(lengths, dtype=float)
+        if lengths.shape != (6,):
+            raise CommandError("strut_count", f"six strut lengths are needed, not shape {lengths.shape}")
+        if not np.isfinite(lengths).all():
+            index = int(np.argmin(np.isfinite(lengths)))
+            problem = f"{STRUT_NAMES[index]}: length must be finite, not {lengths[index]} m"
+            raise CommandError("not_finite", problem)
+        self._commands[:] = lengths
+        self._follow_commanded_point()
+
+    def advance(self, dt: float) -> None:
+        """Let time pass and read the encoders once at its end.
+
+        Parameters
+        ----------
+        dt : float
+            s. The drives run in ticks of at most 0.25 ms; what is left over is kept for the next call, so
+            where the motors go does not depend on how the time is cut.
+
+        Raises
+        ------
+        ModelError
+            Negative, not finite, or longer than :data:`LONGEST_ADVANCE`.
+        """
+        if not 0.0 <= dt <= LONGEST_ADVANCE:
+            raise ModelError("dt", f"must lie within 0…{LONGEST_ADVANCE:g} s", dt)
+        self._left_over += dt
+        ticks = int(self._left_over / self._tick + 1e-6)
+        self._left_over -= ticks * self._tick
+        if self.parameters.lag == 0.0:
+            ticks = 1
+        if ticks > 0:
+            self._stopped[:] = False
+            self._run(ticks)
+        self._time += dt
+        self._read_encoders(dt)
+
+    def _run(self, ticks: int) -> None:
+        """Run the drives for some ticks, then find where that puts the platform."""
+        p = self.parameters
+        run_struts(
+            ticks,
+            self._tick,
+            p.lag,
+            p.max_speed,
+            p.max_acceleration,
+            p.step,
+            self._commands,
+            self._stops,
+            self._stuck,
+            self._half_play,
+            self._position,
+            self._speed,
+            self._motor,
+            self._play,
+            self._stopped,
+            self._motion.sense,
+        )
+        self._locate(self._motor, self._model_pose)
+
+    def _locate(self, lengths: np.ndarray, model_pose: tuple[np.ndarray, np.ndarray]) -> None:
+        """Find the true pose for motor positions, starting from, and updating, a model pose."""
+        self._outcome, _, self._condition, _ = self.machine.forward(
+            lengths, self._motion.sense, *model_pose, *self._true_pose
+        )
+
+    def _follow_commanded_point(self) -> None:
+        """Take the field's directions from where the commands lead.
+
+        A reversal value belongs to the side from which a target is approached. Following errors and
+        backlash being taken up also move the tool along axes that are told to stand still; they have no
+        direction.
+        """
+        self._locate(self._commands, self._commanded_pose)
+        if self._outcome == kernels.OK:
+            model, motion = self.machine.model, self._motion
+            threshold, probe = model.field.reversal_threshold, model.field.probe
+            follow_point(*self._commanded_pose, probe, threshold, motion.low, motion.sense)
+
+    def _read_encoders(self, dt: float) -> None:
+        """Take a reading and deliver what has arrived by now."""
+        p, faults = self.parameters, self._faults
+        reading = self._motor
+        if p.encoder_noise:
+            reading = reading + p.encoder_noise * self._rng.standard_normal(6)
+        reading = to_step(reading, p.encoder_resolution)
+        speeds = (reading - self._last_reading) / dt if dt > 0.0 else np.zeros(6)
+        self._last_reading = reading
+        if faults.feedback_drop == 0.0 or self._rng.uniform() >= faults.feedback_drop:
+            self._under_way.append((self._time, reading, speeds))
+        self.feedback_arrived = False
+        due = self._time - faults.feedback_delay + 1e-9
+        while self._under_way and self._under_way[0][0] <= due:
+            _, self._lengths, self._speeds = self._under_way.popleft()
+            self.feedback_arrived = True
+
+    def _blanked(self, values: np.ndarray) -> np.ndarray:
+        values = values.copy()
+        if self._faults.encoder_lost is not None:
+            values[self._faults.encoder_lost] = np.nan
+        return values
+
+    def encoder_lengths(self) -> np.ndarray:
+        """Return the newest encoder readings that have arrived, m, shape (6,); NaN where one is lost.
+
+        :attr:`feedback_arrived` says whether the last :meth:`advance` brought a new one.
+        """
+        return self._blanked(self._lengths)
+
+    def encoder_speeds(self) -> np.ndarray:
+        """Return the difference quotient of the last two readings, m/s, shape (6,), as old as they are."""
+        return self._blanked(self._speeds)
+
+    def motor_lengths(self) -> np.ndarray:
+        """Return where the motors really stand, as a perfect encoder would read it, m, shape (6,)."""
+        return self._motor.copy()
+
+    def play(self) -> np.ndarray:
+        """Return motor minus nut position, m, shape (6,), within ± half the backlash."""
+        return self._play.copy()
+
+    def true_pose(self) -> Pose:
+        """Return the true ``pose_platform_in_base``.
+
+        Raises
+        ------
+        KinematicsError
+            The machine cannot stand where its motors are, e.g. after a jump.
+        """
+        self._refuse_impossible()
+        return Pose(*self._true_pose)
+
+    def true_tool_pose(self) -> Pose:
+        """Return the true ``pose_tool_in_work``.
+
+        Raises
+        ------
+        KinematicsError
+            As :meth:`true_pose`.
+        """
+        return self._tool_pose(np.zeros(3))
+
+    def tracker_pose(self) -> Pose:
+        """Return ``pose_tool_in_work`` as a laser tracker reads it: the truth, its position with noise.
+
+        Raises
+        ------
+        KinematicsError
+            As :meth:`true_pose`.
+        """
+        return self._tool_pose(self.parameters.tracker_noise * self._rng.standard_normal(3))
+
+    def _tool_pose(self, noise: np.ndarray) -> Pose:
+        self._refuse_impossible()
+        (position, rotation), (offset, turn) = self._true_pose, self._tool
+        origin, axes = self._work
+        return Pose(origin + axes @ (position + rotation @ offset) + noise, axes @ rotation @ turn)
+
+    def _refuse_impossible(self) -> None:
+        if self._outcome != kernels.OK:
+            raise forward_error(self._outcome, self._condition, self.machine.structure.max_condition)

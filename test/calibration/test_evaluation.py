@@ -1,0 +1,178 @@
+"""What a model is worth: figures that are known beforehand, for machines simple enough to know them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hexapod_comp.calibration.evaluation import INCH, held_out, paper_metric, run, worth
+from hexapod_comp.errors import ModelError
+from hexapod_comp.formats.paths import config_file
+from hexapod_comp.machine.field import GridField
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.kinematics import Structure, jacobian
+from hexapod_comp.machine.model import MachineModel, RealMachine, Temperatures
+from hexapod_comp.machine.motion import MotionState
+from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.machine.travel import Passes, random_passes
+from hexapod_comp.pose import Pose
+from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
+
+BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])
+BOUNDS = ImperfectionBounds(joint=1e-4, strut_offset=1e-4, pitch=1e-4, wave=(4e-6, 4e-6), backlash=(3e-6, 5e-6))
+
+
+@pytest.fixture(scope="module")
+def geometry() -> HexapodGeometry:
+    return load_geometry(config_file("paper.yaml"))
+
+
+@pytest.fixture(scope="module")
+def framed(geometry) -> HexapodGeometry:
+    """The same machine with a tool and a work frame, both turned and shifted."""
+    tool = Pose.from_angles([0.01, -0.02, 0.08], np.deg2rad([10.0, -5.0, 30.0]))
+    return replace(geometry, tool=tool, work=Pose.from_angles([0.02, 0.01, 0.05], np.deg2rad([1.0, 2.0, 40.0])))
+
+
+@pytest.fixture(scope="module")
+def truth(geometry) -> RealMachine:
+    return RealMachine(geometry, draw_model(geometry, BOUNDS, 1))
+
+
+def moved(geometry: HexapodGeometry, turn: np.ndarray, shift: np.ndarray) -> RealMachine:
+    """Return a machine whose base stands elsewhere: every pose is turned and shifted, nothing else."""
+    joints = geometry.base_joints.copy()
+    deviation = Rotation.from_rotvec(turn).apply(joints) + shift - joints
+    return RealMachine(geometry, MachineModel(geometry.name, base_deviation=deviation))
+
+
+def field_machine(geometry: HexapodGeometry, forward: list[float], backward: list[float]) -> MachineModel:
+    """Return a machine whose only error is dx along x, the same polynomials of u on every line."""
+    nodes = tuple(BOX[:, axis] for axis in range(3))
+    family = np.zeros((2, 2, 2, 6, len(forward)))
+    family[0, :, :, 0], family[1, :, :, 0] = forward, backward
+    empty = np.zeros((2, 2, 2, 6, 0))
+    return MachineModel(geometry.name, field=GridField(nodes, (family, empty, empty)))
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.1])
+def test_the_true_model_leaves_nothing(truth, tilt):
+    """Backward and forward run of one model: rounding, 1e-12 m as in test_machine."""
+    found = held_out(truth, truth.model, BOX, 200, seed=3, tilt=tilt)
+    assert found.raw_rms < 1e-12
+    assert found.rotation_rms < 1e-11
+
+
+def test_a_shifted_machine_errs_by_the_shift_and_aligned_not_at_all(geometry, framed):
+    """Closed form: every point is off by the same vector, 50 µm long, whatever tool and work frame."""
+    for machine in (geometry, framed):
+        found = held_out(moved(machine, np.zeros(3), np.array([30e-6, 0.0, -40e-6])), None, BOX * 0.5, 100)
+        assert found.raw_rms == pytest.approx(50e-6, abs=1e-11)
+        assert found.aligned_rms < 1e-11
+        assert found.aligned_max < 1e-11
+        assert found.rotation_rms < 1e-9
+
+
+def test_a_turned_machine_has_no_error_once_aligned(geometry, framed):
+    """A rigid motion of everything: alignment takes out all of it, and the rotation its whole angle."""
+    turn = np.array([1e-4, -2e-4, 3e-4])
+    for machine in (geometry, framed):
+        found = held_out(moved(machine, turn, np.array([1e-4, 0.0, 0.0])), None, BOX * 0.5, 100, tilt=0.1)
+        assert found.raw_rms > 5e-5
+        assert found.aligned_rms < 1e-11
+        assert found.rotation_rms < 1e-9
+
+
+def test_repeatability_alone(geometry):
+    """√3 times the figure per axis; 6000 draws scatter by 1/√12000 ≈ 1 %, four times that is allowed."""
+    perfect = RealMachine(geometry, MachineModel(geometry.name))
+    found = held_out(perfect, None, BOX, 1000, repeatability=1e-6)
+    assert found.raw_rms == pytest.approx(np.sqrt(3.0) * 1e-6, rel=0.04)
+    assert found.rotation_rms < 1e-9
+
+
+def test_temperatures_seen_and_not_seen(geometry):
+    """A machine 1 K warm, by its own model: nothing is left when the sensors say so, much when they do not."""
+    model = MachineModel(geometry.name, struts=StrutErrors(expansion=np.full(6, 11e-6)))
+    warm = Temperatures(dict.fromkeys(Temperatures.NAMES, 21.0))
+    truth = RealMachine(geometry, model, warm)
+    assert held_out(truth, model, BOX, 50, sensed=warm).raw_rms < 1e-12
+    assert held_out(truth, model, BOX, 50).raw_rms > 4e-6
+    assert paper_metric(truth, model, BOX, lines=2, sensed=warm).after < 1e-12
+
+
+def test_all_passes_at_once_are_the_machine_one_by_one(framed):
+    """The objects' way, pose by pose; a strut's direction is the sign of its speed, from the Jacobian."""
+    truth = RealMachine(framed, draw_model(framed, BOUNDS, 5))
+    model = draw_model(framed, BOUNDS, 6)
+    passes = random_passes(framed, BOX * 0.5 + np.array([0.0, 0.0, 0.1]), 20, 0.1, np.random.default_rng(0))
+    positions, rotations = run(truth, passes, model)
+    believed, found = RealMachine(framed, model), passes.senses(framed)
+    for n in range(len(passes)):
+        pose = Pose(passes.positions[n], passes.rotations[n])
+        motion = MotionState()
+        speeds = jacobian(Structure.of(framed), pose)[:, :3] @ passes.directions[n]
+        motion.sense[:] = np.sign(np.concatenate([passes.directions[n], speeds]))
+        assert (found[n] == motion.sense).all()
+        commands = believed.commands_for(pose, motion)[0]
+        actual = truth.pose_for(commands, motion.sense, pose)[0]
+        assert (positions[n] == actual.position).all()
+        assert (rotations[n] == actual.rotation).all()
+
+
+def test_tool_passes_bring_the_tool_there(framed):
+    """Pose algebra of Pose: work @ tool pose = platform pose @ tool."""
+    wanted = Pose.from_angles([0.05, -0.03, 0.4], np.deg2rad([5.0, -3.0, 8.0]))
+    passes = Passes.of_tool(framed, wanted.position[None], wanted.rotation[None], np.array([[1.0, 0.0, 0.0]]))
+    found = framed.work.inverse() @ Pose(passes.positions[0], passes.rotations[0]) @ framed.tool
+    assert found.position == pytest.approx(wanted.position, abs=1e-15)
+    assert found.rotation == pytest.approx(wanted.rotation, abs=1e-15)
+    assert passes.directions[0] == pytest.approx(framed.work.rotation[:, 0], abs=1e-15)
+
+
+def test_paper_metric_of_a_scale_error(geometry):
+    """dx = a·u grows from 0 at a line's start to 2a at its end: a in the mean, on 16 of 16 + 16 + 8 readings."""
+    truth = RealMachine(geometry, field_machine(geometry, [0.0, 10e-6], [0.0, 10e-6]))
+    found = paper_metric(truth, truth.model, BOX)
+    assert found.before == pytest.approx(10e-6 * 16 / 40, rel=1e-6)
+    assert found.after < 1e-12
+    assert found.reduction == pytest.approx(1.0, abs=1e-6)
+    assert (found.lines, found.readings) == (60, 20 * 2 * 40)
+
+
+def test_paper_metric_of_backlash(geometry):
+    """∓b/2 forward and backward: an interferometer zeroed on the way out reads 0 there and b on the way back."""
+    truth = RealMachine(geometry, field_machine(geometry, [-4e-6], [4e-6]))
+    found = paper_metric(truth, MachineModel(geometry.name), BOX)
+    assert found.before == pytest.approx(8e-6 / 2 * 16 / 40, rel=1e-6)
+    assert found.after == pytest.approx(found.before, rel=1e-9)  # an ideal model changes nothing
+
+
+def test_paper_metric_is_blind_to_a_shift(geometry):
+    """All that the lines' zeros hide: 100 µm everywhere."""
+    found = paper_metric(moved(geometry, np.zeros(3), np.full(3, 1e-4)), MachineModel(geometry.name), BOX)
+    assert found.before < 1e-11
+
+
+def test_equal_seeds_equal_figures(truth):
+    first, again, other = (held_out(truth, None, BOX, 50, seed=seed) for seed in (1, 1, 2))
+    assert first == again
+    assert first != other
+
+
+def test_worth_collects_all_three(truth):
+    found = worth(truth, truth.model, BOX, 50)
+    assert found.before == held_out(truth, None, BOX, 50)
+    assert found.paper == paper_metric(truth, truth.model, BOX)
+    for reduction in (found.raw_reduction, found.aligned_reduction, found.rotation_reduction):
+        assert reduction == pytest.approx(1.0, abs=1e-6)
+
+
+def test_what_is_refused(truth, geometry):
+    with pytest.raises(ModelError, match="points: must be at least three"):
+        held_out(truth, None, BOX, 2)
+    with pytest.raises(ModelError, match="step: leaves no reading"):
+        paper_metric(truth, truth.model, BOX, step=40 * INCH)
+    with pytest.raises(ModelError, match="another"):
+        held_out(truth, MachineModel("another"), BOX)

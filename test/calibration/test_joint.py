@@ -1,0 +1,484 @@
+"""Scheme `joint`: cells, nuisances, the linear solver against textbook least squares, whole fits against the truth."""
+
+from dataclasses import replace
+from functools import cache
+
+import calibration_helpers as small
+import numpy as np
+import pytest
+from scipy.stats import chi2, multivariate_normal
+
+from hexapod_comp.calibration.estimation import HYPER, JointProblem, LinearProblem, held_out, physical_covariance, solve
+from hexapod_comp.calibration.fit import JointFit, fit_joint
+from hexapod_comp.calibration.parameters import BLOCKS, ParameterSpace, Settings
+from hexapod_comp.errors import CalibrationError
+from hexapod_comp.machine.model import RealMachine
+from hexapod_comp.measurements.campaign import template
+from hexapod_comp.measurements.readings import CHANNELS, KINDS, MeasurementSet, Source
+from hexapod_comp.pose import Pose
+from hexapod_comp.virtual.imperfections import ImperfectionBounds
+from hexapod_comp.virtual.instruments import station_errors
+
+FEW = small.FEW
+SOME = replace(FEW, blocks=(*FEW.blocks, "field displacement", "field rotation"), field_degree=2)
+LINEAR, STRAIGHTNESS, ROTATION, POSITION, ATTITUDE = range(len(KINDS))
+ONES = np.ones(len(KINDS))
+
+
+@cache
+def readings(seed: int = 1, instrument: str = "5-D", diagonals: int = 4, cycles: int = 1) -> MeasurementSet:
+    plan = small.campaign(instrument, diagonals, cycles=cycles)
+    return small.measured(small.virtual_machine(seed), plan, seed)
+
+
+@cache
+def fitted(seed: int, instrument: str) -> JointFit:
+    return fit_joint(readings(seed, instrument), SOME)
+
+
+def linearised(measurements: MeasurementSet, settings: Settings = FEW) -> tuple[ParameterSpace, LinearProblem]:
+    space = ParameterSpace(measurements, settings)
+    joint = JointProblem(measurements, space)
+    return space, joint.linearise(np.zeros(space.size), np.ones(len(measurements)))[0]
+
+
+# ---------------------------------------------------------------- cells, zeros and slopes
+
+
+def test_what_instruments_do_not_know_changes_nothing():
+    """Zeros of ±1 mm and beam slopes of ±1 mrad on every channel of every run: 1e-16 · 1 mm / 1 µm is left."""
+    ours, rng = readings(), np.random.default_rng(1)
+    group = ours.run * len(CHANNELS) + ours.channel
+    zeros, slopes = rng.uniform(-1e-3, 1e-3, (2, group.max() + 1))
+    beams = np.where(ours.kind == STRAIGHTNESS, slopes[group] * ours.along(), 0.0)
+    theirs = ours.with_values(ours.value + zeros[group] + beams)
+    space, problem = linearised(ours)
+    _, other = linearised(theirs)
+    np.testing.assert_allclose(other.target, problem.target, atol=1e-10 * 1e3)
+    noise = np.array([1.0, 1.2, 0.8, 1.0, 1.0])
+    answers = [solve(space, p, space.start_tolerances(), noise, 0) for p in (problem, other)]
+    deviations = np.sqrt(np.diag(answers[0].covariance))
+    np.testing.assert_allclose((answers[1].y - answers[0].y) / deviations, 0.0, atol=1e-6)
+
+
+def test_a_slope_of_a_linear_reading_is_not_forgotten():
+    """A laser's wavelength is known: only straightness beams may lie askew."""
+    ours = readings()
+    tilted = ours.with_values(ours.value + np.where(ours.kind == LINEAR, 1e-4 * ours.along(), 0.0))
+    assert np.abs(linearised(tilted)[1].target - linearised(ours)[1].target).max() > 1.0
+
+
+def test_absolute_poses_keep_their_zero():
+    poses = [Pose([x, y, 0.45], np.eye(3)) for x in np.linspace(-0.1, 0.1, 4) for y in np.linspace(-0.1, 0.1, 4)]
+    absolute = small.scattered(small.paper(), poses)
+    space = ParameterSpace(absolute, Settings(blocks=()))
+    shifted = JointProblem(absolute.with_values(absolute.value + 1e-5), space)
+    problem, residuals = shifted.linearise(np.zeros(space.size), np.ones(len(absolute)))
+    np.testing.assert_allclose(residuals, 1e-5, atol=1e-12)
+    assert problem.freedom.sum() == len(absolute)
+
+
+def test_repeated_readings_count_as_their_weighted_mean():
+    """Three passes of unlike uncertainty, against one pass of their mean x̄ = Σx/σ² / Σ1/σ² with 1/σ̄² = Σ1/σ².
+
+    Covariances are compared as correlations: one that is near zero has no digits of its own. The normal equations'
+    condition is 1e7, so that rounding, which differs between versions of NumPy, leaves 2e-9.
+    """
+    thrice, rng = readings(cycles=3), np.random.default_rng(2)
+    thrice = replace(thrice, uncertainty=rng.uniform(0.5e-6, 3e-6, len(thrice)))
+    key = thrice.station * len(CHANNELS) + thrice.channel
+    once = thrice.select(thrice.cycle == 1)
+    cells = [key == k for k in once.station * len(CHANNELS) + once.channel]
+    weights = [thrice.uncertainty[cell] ** -2 for cell in cells]
+    means = [np.average(thrice.value[cell], weights=w) for cell, w in zip(cells, weights, strict=True)]
+    once = replace(once, value=np.array(means), uncertainty=np.array([w.sum() ** -0.5 for w in weights]))
+    space, problem = linearised(thrice)
+    _, mean = linearised(once)
+    answers = [solve(space, p, space.start_tolerances(), ONES, 0) for p in (problem, mean)]
+    deviations = np.sqrt(np.diag(answers[0].covariance))
+    difference = (answers[0].covariance - answers[1].covariance) / np.outer(deviations, deviations)
+    np.testing.assert_allclose(difference, 0.0, atol=1e-8)
+    np.testing.assert_allclose((answers[0].y - answers[1].y) / deviations, 0.0, atol=1e-6)
+    assert problem.freedom.sum() - mean.freedom.sum() == 2 * len(once)
+
+
+def test_cells_are_left_out_by_line_and_by_pose():
+    lines = JointProblem(readings(), ParameterSpace(readings(), FEW)).cells
+    of_cell = readings().run[[int(np.flatnonzero(lines.of_reading == c)[0]) for c in range(len(lines.fold))]]
+    pairs = np.unique(np.stack([lines.fold, of_cell]), axis=1)
+    assert pairs.shape[1] == len(readings().runs) == lines.fold.max() + 1
+    poses = [Pose([x, 0.02 * x, 0.45], np.eye(3)) for x in np.linspace(-0.1, 0.1, 9)]
+    absolute = small.scattered(small.paper(), poses)
+    folds = JointProblem(absolute, ParameterSpace(absolute, Settings(blocks=()))).cells.fold
+    assert np.bincount(folds).tolist() == [6] * 9
+
+
+# ---------------------------------------------------------------- the linear solver
+
+
+@cache
+def random_problem(seed: int = 3, count: int = 240) -> tuple[ParameterSpace, LinearProblem, np.ndarray]:
+    """Return a problem with random rows and three kinds of readings, and the noise factors that it was made with."""
+    space, rng = ParameterSpace(readings(), FEW), np.random.default_rng(seed)
+    spread = space.spread(space.start_tolerances())
+    rows = rng.standard_normal((count, space.size)) / spread * rng.uniform(0.02, 3.0, space.size)
+    kind = np.repeat([LINEAR, STRAIGHTNESS, ROTATION], count // 3)
+    factors = np.array([2.0, 3.0, 0.5, 1.0, 1.0])
+    target = rows @ (spread * rng.standard_normal(space.size)) + factors[kind] * rng.standard_normal(count)
+    return space, problem_of(space, rows, target, kind, rng.integers(0, 20, count)), factors
+
+
+def problem_of(
+    space: ParameterSpace, rows: np.ndarray, target: np.ndarray, kind: np.ndarray, fold: np.ndarray
+) -> LinearProblem:
+    """Return a linear problem in which every cell is one reading and nothing is projected out."""
+    parts = [np.flatnonzero(kind == k) for k in range(len(KINDS))]
+    return LinearProblem(
+        target=target,
+        rows=rows,
+        kind=kind,
+        fold=fold,
+        normal=np.array([rows[p].T @ rows[p] for p in parts]),
+        moment=np.array([rows[p].T @ target[p] for p in parts]),
+        square=np.array([target[p] @ target[p] for p in parts]),
+        freedom=np.array([float(len(p)) for p in parts]),
+        least_noise=np.zeros(len(KINDS)),
+    )
+
+
+def dense(
+    space: ParameterSpace, problem: LinearProblem, tolerances: np.ndarray, noise: np.ndarray, keep: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the textbook's answer and covariance: least squares with the priors as further rows."""
+    spread = space.spread(tolerances)
+    scale = 1.0 / noise[problem.kind[keep]]
+    rows = np.vstack([scale[:, None] * problem.rows[keep], np.diag(1.0 / spread)])
+    target = np.concatenate([scale * problem.target[keep], np.zeros(space.size)])
+    z = np.linalg.lstsq(rows * spread, target, rcond=None)[0]
+    inverse = np.linalg.pinv(rows * spread)
+    return spread * z, spread[:, None] * (inverse @ inverse.T) * spread
+
+
+def test_solver_is_least_squares_with_prior_rows():
+    space, problem, noise = random_problem()
+    tolerances = space.start_tolerances() * [1.0, 0.3, 2.0, 1.5]
+    answer = solve(space, problem, tolerances, noise, 0)
+    y, covariance = dense(space, problem, tolerances, noise, np.arange(len(problem.target)))
+    deviations = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose((answer.y - y) / deviations, 0.0, atol=1e-9)
+    np.testing.assert_allclose(answer.covariance / np.outer(deviations, deviations),
+                               covariance / np.outer(deviations, deviations), atol=1e-9)  # fmt: skip
+    hat = 1.0 - np.diag(covariance) / space.spread(tolerances) ** 2
+    np.testing.assert_allclose(answer.determined, hat, atol=1e-9)
+
+
+def test_a_block_without_tolerance_is_out():
+    space, problem, noise = random_problem()
+    answer = solve(space, problem, space.start_tolerances() * [1.0, 0.0, 1.0, 0.0], noise, 3)
+    names = [block.name for block in space.blocks if block.part.start in answer.used]
+    assert names == ["structure", "wave"]
+    assert answer.tolerances[[1, 3]].tolist() == [0.0, 0.0]
+
+
+def test_held_out_errors_are_those_of_fits_that_left_a_fold_out():
+    """Twenty folds of some twelve cells, each really left out and fitted again."""
+    space, problem, noise = random_problem()
+    tolerances = space.start_tolerances()
+    errors = held_out(problem, solve(space, problem, tolerances, noise, 0))
+    for fold in range(20):
+        out = problem.fold == fold
+        y, _ = dense(space, problem, tolerances, noise, np.flatnonzero(~out))
+        wanted = (problem.target[out] - problem.rows[out] @ y) / noise[problem.kind[out]]
+        np.testing.assert_allclose(errors[out], wanted, atol=1e-8)
+
+
+def test_held_out_lines_are_those_of_fits_without_the_line():
+    """The same on a campaign, whose zeros and slopes are projected out: a run goes with all its unknowns."""
+    ours = readings()
+    space, problem = linearised(ours)
+    errors = held_out(problem, solve(space, problem, space.start_tolerances(), ONES, 0))
+    joint = JointProblem(ours, space)
+    for fold in (0, 7, 20):
+        out = joint.cells.fold == fold
+        rest = JointProblem(ours.select(~out[joint.cells.of_reading]), space)
+        less, _ = rest.linearise(np.zeros(space.size), np.ones(len(rest.measurements)))
+        answer = solve(space, less, space.start_tolerances(), ONES, 0)
+        np.testing.assert_allclose(errors[out], problem.target[out] - problem.rows[out] @ answer.y, atol=1e-6)
+
+
+def log_evidence(space: ParameterSpace, problem: LinearProblem, tolerances: np.ndarray, noise: np.ndarray) -> float:
+    """Return the logarithm of the readings' probability with all parameters integrated out."""
+    spread = space.spread(tolerances)
+    covariance = (problem.rows * spread**2) @ problem.rows.T + np.diag(noise[problem.kind] ** 2)
+    return float(multivariate_normal.logpdf(problem.target, cov=covariance))
+
+
+def test_tolerances_and_noise_are_the_most_probable_ones():
+    """At the fixed point the evidence has no slope along any log tolerance or log noise factor.
+
+    Each tolerance t has the prior t^−h · exp(−h·(t₀/t)²/2), h = HYPER, written from the rule that the first guess
+    counts as h of a parameter. Slopes by central differences; the largest one away from the optimum is about 60.
+    """
+    space, problem, _ = random_problem()
+    answer = solve(space, problem, space.start_tolerances(), ONES, 400)
+    start, kinds = space.start_tolerances(), np.array([LINEAR, STRAIGHTNESS, ROTATION])
+
+    def probability(log_scales: np.ndarray) -> float:
+        tolerances, noise = answer.tolerances.copy(), answer.noise.copy()
+        tolerances *= np.exp(log_scales[: len(tolerances)])
+        noise[kinds] *= np.exp(log_scales[len(tolerances) :])
+        prior = -HYPER * (np.log(tolerances) + 0.5 * (start / tolerances) ** 2).sum()
+        return log_evidence(space, problem, tolerances, noise) + prior
+
+    count = len(start) + len(kinds)
+    slopes = [(probability(h) - probability(-h)) / 2e-3 for h in 1e-3 * np.eye(count)]
+    np.testing.assert_allclose(slopes, 0.0, atol=0.01)
+
+
+def test_noise_is_found_with_the_right_freedom():
+    """Noise² is χ² over readings less parameters; the hat matrix comes from the textbook's answer."""
+    space, problem, made_with = random_problem()
+    answer = solve(space, problem, space.start_tolerances(), ONES, 400)
+    y, covariance = dense(space, problem, answer.tolerances, answer.noise, np.arange(len(problem.target)))
+    for k in (LINEAR, STRAIGHTNESS, ROTATION):
+        rows, residual = problem.rows[problem.kind == k], (problem.target - problem.rows @ y)[problem.kind == k]
+        freedom = len(rows) - np.trace(rows @ covariance @ rows.T) / answer.noise[k] ** 2
+        assert answer.noise[k] ** 2 == pytest.approx(residual @ residual / freedom, rel=1e-6)
+        # A standard deviation from n free numbers is known to 1/√(2n); three of these.
+        assert answer.noise[k] == pytest.approx(made_with[k], rel=3.0 / np.sqrt(2.0 * freedom))
+
+
+# ---------------------------------------------------------------- whole fits
+
+
+def machine_directions(fit: JointFit, truth: RealMachine) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors of the parameters along the covariance's axes in standard deviations, and what is data.
+
+    The axes are those of the covariance in units of the priors; a share near 1 means that the data fixed it.
+    """
+    spread = fit.space.spread(fit.solution.posterior.tolerances)
+    covariance = physical_covariance(fit.space, fit.solution.posterior) / np.outer(spread, spread)
+    variances, axes = np.linalg.eigh(covariance)
+    wrong = fit.solution.x - small.true_parameters(fit.space, truth.model)
+    return axes.T @ (wrong / spread) / np.sqrt(variances), 1.0 - variances
+
+
+@pytest.mark.parametrize("instrument", ["5-D", "6-D"])
+def test_parameters_are_as_wrong_as_the_fit_says(instrument: str):
+    """Σz² over what the data determine, of two machines, is χ² distributed: within its middle 99.8 %."""
+    squares, count = 0.0, 0
+    for seed in (1, 3):
+        z, share = machine_directions(fitted(seed, instrument), small.virtual_machine(seed))
+        squares, count = squares + (z[share > 0.9] ** 2).sum(), count + int((share > 0.9).sum())
+    assert count > 60
+    assert chi2.ppf(0.001, count) < squares < chi2.ppf(0.999, count)
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_strut_errors_come_back(seed: int):
+    """Backlash and waves within four standard errors each, and these below half a micrometre."""
+    fit, truth = fitted(seed, "5-D"), small.virtual_machine(seed)
+    wrong = fit.solution.x - small.true_parameters(fit.space, truth.model)
+    errors = np.sqrt(np.diag(physical_covariance(fit.space, fit.solution.posterior)))
+    for name in ("wave", "backlash"):
+        part = fit.space.block(name).part
+        assert (np.abs(wrong[part]) < 4.0 * errors[part]).all()
+        assert errors[part].max() < 0.5e-6
+
+
+@pytest.mark.parametrize(("seed", "instrument"), [(1, "5-D"), (3, "5-D"), (1, "6-D"), (3, "6-D")])
+def test_tool_error_falls_as_predicted(seed: int, instrument: str):
+    """The bound is 95 %; four cases were looked at, eight of eight machines lay within it."""
+    fit, truth = fitted(seed, instrument), small.virtual_machine(seed)
+    before, _ = small.tool_error(truth, None)
+    after, turned = small.tool_error(truth, fit.model)
+    assert after < 0.02 * before
+    assert fit.level.low < after < fit.level.high
+    assert fit.level.before == pytest.approx(before, rel=0.15)
+    if instrument == "6-D":
+        assert turned == pytest.approx(fit.level.rotation_after, rel=0.5)
+
+
+def test_blocks_that_the_machine_has_are_kept_and_no_others():
+    """All blocks on offer; then a machine of joints alone."""
+    fit = fit_joint(readings(), replace(small.SETTINGS, field_degree=1))
+    assert [d.block for d in fit.decisions] == list(BLOCKS[1:])
+    assert {d.block for d in fit.decisions if d.kept} == {"pitch", "wave", "backlash"}
+    assert [block.name for block in fit.space.blocks] == ["structure", "pitch", "wave", "backlash"]
+    bare = replace(small.BOUNDS, pitch=0.0, wave=(0.0, 0.0), backlash=(0.0, 0.0))
+    fit = fit_joint(small.measured(small.virtual_machine(1, bare), small.campaign(), 1), SOME)
+    assert not any(d.kept for d in fit.decisions)
+
+
+def test_a_field_is_found():
+    """A field of 30 µm and 60 µrad, with terms up to degree six, is kept and takes a good part of it away."""
+    bounds = replace(small.BOUNDS, field_displacement=30e-6, field_rotation=60e-6, field_box=small.BOX,
+                     field_reversal=0.0)  # fmt: skip
+    truth = small.virtual_machine(2, bounds)
+    ours = small.measured(truth, small.campaign("6-D", 16), 2)
+    fit = fit_joint(ours, replace(SOME, field_degree=3))
+    assert {"field displacement", "field rotation"} <= {d.block for d in fit.decisions if d.kept}
+    without = fit_joint(ours, FEW)
+    assert small.tool_error(truth, fit.model)[0] < 0.7 * small.tool_error(truth, without.model)[0]
+
+
+def test_noise_twice_and_three_times_as_stated_is_found():
+    """2 µm and 3 µrad under a stated 1: known from some 360 to 600 free readings, 4 % each; four of these."""
+    plan = small.campaign(noise=(2e-6, 1e-6, 3e-6, 1e-5, 1e-5))
+    ours = small.measured(small.virtual_machine(1), plan, 1)
+    fit = fit_joint(replace(ours, uncertainty=np.full(len(ours), 1e-6)), FEW)
+    found = {channel.kind: channel.found / channel.stated for channel in fit.channels}
+    assert found == {kind: pytest.approx(n, rel=0.16) for kind, n in zip(KINDS[:3], (2.0, 1.0, 3.0), strict=True)}
+    assert all(c.chi_square == pytest.approx((c.found / c.stated) ** 2) for c in fit.channels)
+    assert sum(c.readings for c in fit.channels) == len(ours)
+
+
+SMALL_ERRORS = replace(small.BOUNDS, joint=1e-5, strut_offset=1e-5, pitch=5e-5)
+"""Machine A: so good that Gauss–Newton settles in two steps, before any reading has been doubted."""
+
+
+@pytest.mark.parametrize(
+    ("bounds", "gross"), [(small.BOUNDS, 1e-3), (SMALL_ERRORS, 2e-5), (SMALL_ERRORS, 1e-3)], ids=["B", "A", "A, worse"]
+)
+def test_gross_errors_are_named_and_do_no_harm(bounds: ImperfectionBounds, gross: float):
+    """Three readings that are 20 standard deviations off, or a millimetre: listed, and the tool error stays.
+
+    Dropping them outright would be best; downweighted readings pull with 2.5 standard deviations each, which
+    moves 57 parameters from 1,600 readings by a fraction of their standard error.
+    """
+    truth, where = small.virtual_machine(2, bounds), [100, 700, 1300]
+    ours = small.measured(truth, small.campaign(), 2)
+    ours = replace(ours, sources=tuple(Source("shop.csv", n + 2) for n in range(len(ours))))
+    value = ours.value.copy()
+    value[where] += [gross, -gross, gross]
+    clean, fit = fit_joint(ours, FEW), fit_joint(ours.with_values(value), FEW)
+    assert {o.source.line for o in fit.outliers} == {n + 2 for n in where}
+    assert all(abs(o.residual) == pytest.approx(gross, abs=6e-6) for o in fit.outliers)
+    assert [d.kept for d in fit.decisions] == [d.kept for d in clean.decisions]
+    deviations = np.sqrt(np.diag(physical_covariance(clean.space, clean.solution.posterior)))
+    assert (np.abs(fit.solution.x - clean.solution.x) < 1.0 * deviations).all()
+    assert small.tool_error(truth, fit.model)[0] < 1.2 * small.tool_error(truth, clean.model)[0]
+    assert not clean.outliers
+
+
+def test_struts_without_backlash_do_not_upset_the_fit():
+    """Three nuts have play, three have none: the estimate of zero goes below zero half of the time, and settles."""
+    truth = small.virtual_machine(0)
+    backlash = truth.model.struts.backlash * [0.0, 1.0, 0.0, 1.0, 0.0, 1.0]
+    model = replace(truth.model, struts=replace(truth.model.struts, backlash=backlash))
+    fit = fit_joint(small.measured(RealMachine(small.paper(), model), small.campaign(), 0), FEW)
+    part = fit.space.block("backlash").part
+    errors = np.sqrt(np.diag(physical_covariance(fit.space, fit.solution.posterior)))[part]
+    assert (np.abs(fit.solution.x[part] - backlash) < 4.0 * errors).all()
+    assert (fit.model.struts.backlash >= 0.0).all()
+
+
+# ---------------------------------------------------------------- what must be refused
+
+
+def swapped(ours: MeasurementSet) -> MeasurementSet:
+    """Return the readings with forward called backward: the stations' directions turn round."""
+    stations = replace(ours.stations, sense=-ours.stations.sense)
+    return replace(ours, stations=stations, direction=-ours.direction)
+
+
+def test_swapped_directions_are_named():
+    with pytest.raises(CalibrationError, match="swapped"):
+        fit_joint(swapped(readings()), FEW)
+
+
+def test_too_few_readings_are_refused_with_their_numbers():
+    ours = readings()
+    few = ours.select((ours.run < 3) & (ours.channel == 0) & (ours.direction == 1))
+    with pytest.raises(CalibrationError, match=r"27 readings .* 33 parameters"):
+        fit_joint(few, FEW)
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e6], ids=["millimetres", "micrometres"])
+def test_wrong_units_are_a_calibration_error(factor: float):
+    """38 µm read as 38 mm or 38 m: no machine is like that."""
+    ours = readings()
+    with pytest.raises(CalibrationError, match="units"):
+        fit_joint(ours.with_values(factor * ours.value), FEW)
+
+
+def test_commands_in_wrong_units_are_a_calibration_error():
+    """Strut readings in centimetres: refused before anything is computed from them."""
+    poses = [Pose([x, y, 0.45], np.eye(3)) for x in np.linspace(-0.1, 0.1, 4) for y in np.linspace(-0.1, 0.1, 4)]
+    ours = small.scattered(small.paper(), poses)
+    ours = replace(ours, stations=replace(ours.stations, commands=1e2 * ours.stations.commands))
+    with pytest.raises(CalibrationError, match="units"):
+        fit_joint(ours, Settings(blocks=("pitch",)))
+
+
+# ---------------------------------------------------------------- the edge of what can be asked
+
+
+def tilted_poses(count: int, seed: int = 4) -> list[Pose]:
+    rng = np.random.default_rng(seed)
+    positions = rng.uniform([-0.15, -0.15, 0.4], [0.15, 0.15, 0.5], (count, 3))
+    return [Pose.from_angles(p, a) for p, a in zip(positions, rng.uniform(-0.1, 0.1, (count, 3)), strict=True)]
+
+
+def test_a_tracker_at_tilted_poses_is_enough():
+    """Eighty absolute poses of 10 µm and 10 µrad: no line, no zero; the error falls as predicted."""
+    truth, rng = small.virtual_machine(1), np.random.default_rng(5)
+    template_of_poses = small.scattered(small.paper(), tilted_poses(80))
+    errors = station_errors(template_of_poses, truth)[template_of_poses.station]
+    value = (template_of_poses.directions() * errors).sum(axis=1) + 1e-5 * rng.standard_normal(len(errors))
+    fit = fit_joint(template_of_poses.with_values(value), FEW)
+    assert "pitch" in {d.block for d in fit.decisions if d.kept}
+    after, _ = small.tool_error(truth, fit.model, fit.space.box)
+    assert after < 0.3 * small.tool_error(truth, None, fit.space.box)[0]
+    assert fit.level.low < after < fit.level.high
+
+
+def test_readings_that_are_all_zero_are_refused():
+    """A disconnected instrument, not a perfect machine: without noise it would have infinite weight."""
+    with pytest.raises(CalibrationError, match=r"^linear: the 410 readings are all zero"):
+        fit_joint(template(small.campaign(), small.paper()), FEW)
+
+
+def test_readings_without_noise_are_welcome():
+    """What a virtual campaign with perfect lasers gives: nanometres are left, of which rounding makes none."""
+    plan = small.campaign("6-D", noise=(0.0,) * len(KINDS))
+    truth = small.virtual_machine(1)
+    fit = fit_joint(small.measured(truth, plan, 1), FEW)
+    assert small.tool_error(truth, fit.model)[0] < 10e-9
+
+
+def test_a_channel_that_never_changes_is_refused():
+    """A constant is an unknown zero, so nothing is left: one dead channel among others that live is enough."""
+    ours = readings()
+    straightness = ours.kind == KINDS.index("straightness")
+    stuck = ours.with_values(np.where(straightness, 3e-6, ours.value))
+    with pytest.raises(CalibrationError, match=r"^straightness: the \d+ readings never change within a run"):
+        fit_joint(stuck, FEW)
+
+
+def test_uncertainties_below_any_instrument_are_refused():
+    """1e-15 m against a prior of 100 µm: 22 decimal places, six more than numbers have."""
+    ours = readings()
+    with pytest.raises(CalibrationError, match="uncertainty"):
+        fit_joint(replace(ours, uncertainty=np.full(len(ours), 1e-15)), FEW)
+
+
+@pytest.mark.parametrize("kinds", [(ROTATION,), (LINEAR,)], ids=["rotations only", "lengths only"])
+def test_one_kind_of_reading_is_enough_to_go_on(kinds: tuple[int, ...]):
+    ours = readings().select(np.isin(readings().kind, kinds))
+    fit = fit_joint(ours, FEW)
+    assert [c.kind for c in fit.channels] == [KINDS[k] for k in kinds]
+    assert np.isfinite(fit.solution.x).all()
+    assert fit.observability.structure_rank < 33
+
+
+@pytest.mark.parametrize("run", [0, 1, 2, 8])
+def test_one_line_can_not_choose_blocks(run: int):
+    """A single run leaves nothing to hold out: the structure alone answers, and says how little it knows.
+
+    Whatever the blocks, such a fit would predict nothing: the gain is exactly zero, where rounding made 1e-5 of it,
+    with a standard error of zero, and of either sign.
+    """
+    fit = fit_joint(readings().select(readings().run == run), FEW)
+    assert [(d.kept, d.gain, d.uncertainty) for d in fit.decisions] == [(False, 0.0, 0.0)] * 3
+    assert fit.observability.structure_rank < 12

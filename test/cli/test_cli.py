@@ -1,0 +1,559 @@
+"""The command line in-process: what it prints, what it refuses and how, and what ``check`` finds."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import table_lengths, table_poses
+from scipy.spatial.transform import Rotation
+from strategies import paper_geometry, random_field, random_model
+
+from hexapod_comp import cli
+from hexapod_comp.cli import assess, fk, ik
+from hexapod_comp.cli import check as check_verb
+from hexapod_comp.compensation.checks import LIMITS, check
+from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.errors import GeometryError, HexapodError
+from hexapod_comp.formats.csv import read_lengths, read_poses
+from hexapod_comp.machine.field import GridField
+from hexapod_comp.machine.model import MachineModel
+from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.pose import Pose
+
+ROOT = Path(__file__).resolve().parents[2]
+TABLE_1 = str(ROOT / "config" / "table1.csv")
+PAPER = paper_geometry()
+IDEAL = MachineModel("paper")
+POSE_HEADER = "name,x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg"
+
+Run = tuple[int, str, str]
+
+
+@pytest.fixture
+def hexapod(capsys: pytest.CaptureFixture[str]):
+    """Give a function that runs the command and returns exit code, output and error output."""
+
+    def run(*arguments: str) -> Run:
+        code = cli.main(arguments)
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def parsed(text: str) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+def file_of(folder: Path, rows: Sequence[Sequence[object]], header: str = POSE_HEADER) -> str:
+    path = folder / "poses.csv"
+    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
+    return str(path)
+
+
+# The program itself.
+
+
+def test_help_is_fast_and_needs_no_compiler() -> None:
+    """In a process of its own; 0.3 s is the bar on an idle machine, what it may not import says why it holds."""
+    code = (
+        "import sys, hexapod_comp.cli as cli; assert cli.main(['--help']) == 0; "
+        "heavy = {'numpy', 'numba', 'scipy', 'matplotlib', 'rclpy', 'tqdm'} & set(sys.modules); "
+        "assert not heavy, heavy"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=20)
+    assert done.returncode == 0, done.stderr
+    for verb in ("ik", "fk", "check", "assess", "run", "demo"):
+        assert re.search(rf"^    {verb} ", done.stdout, re.MULTILINE)
+
+
+def test_version_is_the_packages(hexapod) -> None:
+    version = re.search(r"<version>(.*)</version>", (ROOT / "package.xml").read_text())
+    assert version
+    assert hexapod("--version") == (0, f"hexapod_comp {version.group(1)}\n", "")
+
+
+@pytest.mark.parametrize("arguments", [(), ("nonsense",), ("ik", "--pose", "1,2"), ("check",), ("fk", "--guess", "x")])
+def test_usage_errors_exit_2(hexapod, arguments: tuple[str, ...]) -> None:
+    code, out, err = hexapod(*arguments)
+    assert (code, out) == (2, "")
+    assert "usage: hexapod_comp" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("ik",), "give a CSV file of poses, or --pose"),
+        (("ik", TABLE_1, "--pose", "0,0,400"), "exactly one of the three"),
+        (("ik", "--x-mm", "1", "--z-mm", "400"), "--y-mm is missing"),
+        (("ik", "nowhere.csv"), "nowhere.csv: there is no such file"),
+        (("ik", TABLE_1, "--model", "paper"), "format: must be 'hexapod_comp/model'"),
+        (("ik", TABLE_1, "--machine", "paper_machine"), "format: must be 'hexapod_comp/geometry'"),
+        (("ik", TABLE_1, "--out", "/nowhere/lengths.csv"), "/nowhere/lengths.csv: cannot be written"),
+        (("fk",), "give either a CSV file of lengths or --lengths"),
+        (("fk", TABLE_1), "header: column L1_m or L1_mm"),
+        (("fk", "--lengths", "1,2,3,4,5,6"), "no pose has these strut lengths"),
+        (("fk", "--lengths", "500,500,500,500,500,900"), "the closest one leaves"),
+        (("fk", "--lengths", "500,500,500,500,500,900", "--cold"), "no pose"),
+        (("fk", TABLE_1, "--all-modes"), "--all-modes goes with --lengths"),
+        (("check", TABLE_1, "--rate-hz", "0"), "--rate-hz: must lie in 1…10000 Hz"),
+    ],
+)
+def test_bad_input_is_one_line_on_stderr_and_exit_2(hexapod, arguments: tuple[str, ...], complaint: str) -> None:
+    code, out, err = hexapod(*arguments)
+    assert (code, out) == (2, "")
+    assert err.startswith("hexapod_comp: error: ")
+    assert complaint in err
+    assert err.count("\n") == 1
+
+
+def test_errors_name_row_and_column(hexapod, tmp_path: Path) -> None:
+    path = file_of(tmp_path, [("a", 0, 0, 400, 0, 0, 0), ("b", 0, 0, "four", 0, 0, 0)])
+    for verb in ("ik", "check", "assess"):
+        assert hexapod(verb, path) == (
+            2,
+            "",
+            f"hexapod_comp: error: {path}: line 3, column z_mm: must be a finite number (found 'four')\n",
+        )
+
+
+def test_control_c_and_a_closed_pipe(hexapod, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(args: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ik, "run", interrupted)
+    assert hexapod("ik", "--pose", "0,0,400") == (130, "", "")
+
+
+def test_a_closed_pipe_is_quiet(tmp_path: Path) -> None:
+    """``hexapod_comp ik long.csv | head -1`` in two real processes."""
+    path = file_of(tmp_path, [(n, 0, 0, 400, 0, 0, 0) for n in range(5000)])
+    command = f"{sys.executable} -m hexapod_comp ik {path} | head -1"
+    done = subprocess.run(["sh", "-c", command], cwd=ROOT, capture_output=True, text=True, timeout=100)
+    assert done.stdout == "sequence,L1_mm,L2_mm,L3_mm,L4_mm,L5_mm,L6_mm\n"
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize("verb", [ik, fk, check_verb, assess], ids=lambda verb: verb.__name__.rpartition(".")[2])
+def test_the_example_in_the_help_is_real(hexapod, monkeypatch: pytest.MonkeyPatch, verb) -> None:
+    """Every line of output shown under the first command of a help text comes out of that command."""
+    monkeypatch.chdir(ROOT)
+    lines = verb.TEXT.partition("example:\n")[2].splitlines()
+    first = lines[0].split()
+    assert first[:2] == ["$", "hexapod_comp"]
+    code, out, err = hexapod(*first[2:])
+    assert (code, err) == (0, "")
+    shown = [line[2:] for line in lines[1:] if line.strip(" …") and not line.startswith("  $")]
+    assert shown
+    produced = out.splitlines()
+    for line in shown:
+        assert line in produced
+
+
+# ik and fk.
+
+
+def test_table_1_gives_table_2_at_the_printed_digits(hexapod) -> None:
+    """000, Tables 1 and 2."""
+    code, out, err = hexapod("ik", TABLE_1)
+    assert (code, err) == (0, "")
+    rows = parsed(out)
+    assert [row["sequence"] for row in rows] == [str(n) for n in range(1, 11)]
+    ours = [[f"{float(row[f'L{i}_mm']):.3f}" for i in range(1, 7)] for row in rows]
+    assert ours == [[f"{length * 1e3:.3f}" for length in row] for row in table_lengths()]
+
+
+@pytest.mark.parametrize("model", ["ideal", "paper_machine", "paper_lines_model"])
+@pytest.mark.parametrize("start", [(), ("--guess", "-5,3,390,2,-2,1"), ("--cold",)], ids=["home", "guess", "cold"])
+def test_ik_then_fk_is_where_it_started(hexapod, tmp_path: Path, model: str, start: tuple[str, ...]) -> None:
+    """CSV carries 1e-9 mm and degrees; the pose moves by less than ten times the lengths' rounding."""
+    lengths, poses = str(tmp_path / "lengths.csv"), str(tmp_path / "poses.csv")
+    assert hexapod("ik", TABLE_1, "--model", model, "--out", lengths) == (0, "", "")
+    assert hexapod("fk", lengths, "--model", model, *start, "--out", poses) == (0, "", "")
+    rows, found = read_poses(poses)
+    assert [row.label for row in rows] == [str(n) for n in range(1, 11)]
+    for pose, wanted in zip(found, table_poses(), strict=True):
+        np.testing.assert_allclose(pose.position, wanted.position, atol=1e-11)
+        np.testing.assert_allclose(pose.rotation, wanted.rotation, atol=1e-10)
+    assert len(read_lengths(lengths)[1]) == 10
+
+
+def test_poses_and_lengths_from_a_pipe() -> None:
+    command = f"{sys.executable} -m hexapod_comp ik {TABLE_1} | {sys.executable} -m hexapod_comp fk -"
+    done = subprocess.run(["sh", "-c", command], cwd=ROOT, capture_output=True, text=True, timeout=100)
+    assert done.stderr == ""
+    assert parsed(done.stdout)[4]["beta_deg"] == "10.000000000"
+
+
+def test_one_pose_by_options_by_list_and_by_json(hexapod) -> None:
+    """The same pose three ways; Table 2, row 2."""
+    by_list = hexapod("ik", "--pose", "0,0,400,5,0,0")
+    assert by_list == hexapod("ik", "--x-mm", "0", "--y-mm", "0", "--z-mm", "400", "--alpha-deg", "5")
+    printed = re.findall(r"strut_\d +([\d.]+)", by_list[1])
+    assert [f"{float(value):.3f}" for value in printed] == [f"{length * 1e3:.3f}" for length in table_lengths()[1]]
+    content = json.loads(hexapod("ik", "--pose", "0,0,400,5,0,0", "--json")[1])
+    assert content["rows"][0]["L1_mm"] == pytest.approx(519.494, abs=5e-4)
+
+
+def test_negative_numbers_need_no_equals_sign(hexapod) -> None:
+    spaced = hexapod("ik", "--pose", "-5,0,400,-1,0,0")
+    assert spaced == hexapod("ik", "--pose=-5,0,400,-1,0,0")
+    assert spaced == hexapod("ik", "--x-mm", "-5", "--y-mm", "0", "--z-mm", "400", "--alpha-deg", "-1e0")
+    assert spaced[0] == 0
+
+
+def test_ik_with_a_model_prints_commands_and_corrections(hexapod) -> None:
+    """command = nominal + correction, in mm and µm; the correction is the compensator's first one."""
+    code, out, _ = hexapod("ik", "--pose", "1,2,410,3,4,5", "--model", "paper_machine", "--json")
+    row = json.loads(out)["rows"][0]
+    for i in range(1, 7):
+        command, nominal = row[f"L{i}_mm"], row[f"nominal_L{i}_mm"]
+        assert command - nominal == pytest.approx(row[f"correction_L{i}_um"] * 1e-3, abs=1e-10)
+    table = hexapod("ik", "--pose", "1,2,410,3,4,5", "--model", "paper_machine")[1]
+    assert table.splitlines()[1].split() == ["strut", "nominal_mm", "command_mm", "correction_um"]
+    assert code == 0
+
+
+def test_ik_out_of_limits_answers_and_says_so(hexapod) -> None:
+    code, out, err = hexapod("ik", "--pose", "0,0,950")
+    assert code == 0
+    assert "strut_1  1000.887773" in out
+    assert "note: the pose: strut_1: nominal length 1000.8878 mm is outside the stroke" in err
+
+
+def test_fk_with_a_model_is_the_real_machine(hexapod) -> None:
+    """Nominal lengths on the real machine: not at the commanded pose, but within a millimetre of it."""
+    lengths = ",".join(repr(float(v) * 1e3) for v in table_lengths()[4])
+    ideal, real = (
+        json.loads(hexapod("fk", "--lengths", lengths, "--json", "--model", model)[1])["rows"][0]
+        for model in ("ideal", "paper_machine")
+    )
+    assert ideal["z_mm"] == pytest.approx(405.0, abs=2e-3)
+    assert 0.05 < abs(real["x_mm"] - ideal["x_mm"]) + abs(real["y_mm"] - ideal["y_mm"]) < 1.0
+
+
+def test_fk_names_the_row_without_a_pose(hexapod, tmp_path: Path) -> None:
+    rows = [(500,) * 6, (500, 500, 500, 500, 500, 2000), (500,) * 6]
+    path = file_of(tmp_path, rows, "L1_mm,L2_mm,L3_mm,L4_mm,L5_mm,L6_mm")
+    code, out, err = hexapod("fk", path)
+    assert (code, out) == (2, "")
+    assert err.startswith("hexapod_comp: error: line 3 (row 2): no pose has these strut lengths")
+
+
+def test_all_modes_lists_each_once_and_marks_the_working_one(hexapod) -> None:
+    """Every mode's pose has the lengths asked for, by NumPy; the working one is Table 1, row 2."""
+    values = table_lengths()[1]
+    lengths = ",".join(repr(float(v) * 1e3) for v in values)
+    modes = json.loads(hexapod("fk", "--lengths", lengths, "--all-modes", "--json")[1])["modes"]
+    assert sum(mode["working"] for mode in modes) == 1
+    for mode in modes:
+        alpha, beta, gamma = (mode[f"{name}_deg"] for name in ("alpha", "beta", "gamma"))
+        rotation = Rotation.from_euler("YXZ", [beta, alpha, gamma], degrees=True).as_matrix()
+        position = np.array([mode["x_mm"], mode["y_mm"], mode["z_mm"]]) * 1e-3
+        found = np.linalg.norm(position + PAPER.platform_joints @ rotation.T - PAPER.base_joints, axis=1)
+        np.testing.assert_allclose(found, values, atol=1e-12)
+        assert mode["working"] or mode["objections"]
+    working = next(mode for mode in modes if mode["working"])
+    assert working["alpha_deg"] == pytest.approx(5.0, abs=1e-3)
+    text = hexapod("fk", "--lengths", lengths, "--all-modes")[1]
+    assert text.splitlines()[0] == f"machine paper: {len(modes)} assembly modes"
+    assert text.count("working mode") == 1
+
+
+# check.
+
+
+def stream_pose(z: float) -> tuple[object, ...]:
+    return ("", 0, 0, z, 0, 0, 0)
+
+
+LINES = {
+    # limit: options, rows, row that breaks it first, text of its line
+    "stroke": ((), [stream_pose(400), stream_pose(900), stream_pose(400)], 3, "strut_1: nominal length 953."),
+    "base_cone": ((), [stream_pose(400), ("", 430, 0, 250, 0, 0, 0)], 3, "base joint at"),
+    "platform_cone": ((), [stream_pose(400), ("", 0, 0, 500, 0, 0, 85)], 3, "platform joint at"),
+    "clearance": ((), [stream_pose(400), ("", 0, 0, 400, 0, 0, 60)], 3, "mm from the nearest other strut"),
+    "condition": ((), [stream_pose(400), ("", 0, 0, 400, 0, 0, 89)], 3, "condition number"),
+    "step": (("--stream", "--rate-hz", "50"), [stream_pose(400), stream_pose(403)], 3, "would change by 2.3"),
+    "speed": (("--stream",), [stream_pose(400), stream_pose(401.5)], 3, "length would change at 29"),
+}
+
+
+@pytest.mark.parametrize("limit", LINES)
+def test_check_names_row_and_limit(hexapod, tmp_path: Path, limit: str) -> None:
+    """Poses made to break one limit each; the machine is the paper's, opened wide but for the limit meant."""
+    options, rows, line, text = LINES[limit]
+    wide = {"stroke": "[200, 2000]", "base_cone": "89", "platform_cone": "120", "condition": "1000"}
+    kept = {"stroke": "[330, 880]", "base_cone": "50", "platform_cone": "30", "condition": "10"}
+    values = {name: kept[name] if name == limit else wide[name] for name in wide}
+    machine = (ROOT / "config" / "paper.yaml").read_text()
+    for key, name in (
+        ("stroke_mm", "stroke"),
+        ("base_cone_deg", "base_cone"),
+        ("platform_cone_deg", "platform_cone"),
+        ("condition_number", "condition"),
+    ):
+        machine = re.sub(rf"{key}: \S+( \S+\])?", f"{key}: {values[name]}", machine)
+    machine = machine.replace("  step_mm", f"  clearance_mm: {220 if limit == 'clearance' else 0}\n  step_mm")
+    geometry = tmp_path / "machine.yaml"
+    geometry.write_text(machine)
+    path = file_of(tmp_path, rows)
+    code, out, err = hexapod("check", path, "--machine", str(geometry), *options)
+    assert (code, err) == (1, "")
+    broken = [entry for entry in out.splitlines() if entry.startswith("line ")]
+    assert broken
+    assert all(entry.startswith(f"line {line} (row ") for entry in broken)
+    assert any(text in entry for entry in broken)
+    report = json.loads(hexapod("check", path, "--machine", str(geometry), *options, "--json")[1])
+    assert not report["within_limits"]
+    assert {entry["limit"] for entry in report["broken"]} == {limit}
+    assert all(entry["line"] == line for entry in report["broken"])
+    smallest = next(entry for entry in report["smallest_margins"] if entry["limit"] == limit)
+    assert smallest["margin"] < 0.0
+    assert smallest["line"] == line
+
+
+def test_check_names_a_correction_that_is_too_large() -> None:
+    """A strut 2.5 mm short needs 2.5 mm of correction, 2 mm are allowed: at every pose, for that strut alone."""
+    model = MachineModel("paper", struts=StrutErrors(offset=np.array([0.0, 0.0, 0.0, -2.5e-3, 0.0, 0.0])))
+    poses = table_poses()
+    result = check(PAPER, model, *stacked(poses), mode="poses")
+    assert {(b.limit, b.error.strut) for b in result.breaches} == {("correction", 3)}  # type: ignore[attr-defined]
+    assert [b.row for b in result.breaches] == list(range(10))
+    assert result.limits["correction"].margin[:, 1] == pytest.approx(-0.5e-3, abs=1e-12)
+
+
+def stacked(poses: Sequence[Pose]) -> tuple[np.ndarray, np.ndarray]:
+    return np.array([pose.position for pose in poses]), np.array([pose.rotation for pose in poses])
+
+
+def test_check_lists_every_breach_not_the_first(hexapod, tmp_path: Path) -> None:
+    """At z = 950 mm all six struts are too long: six lines for each of the two rows, none for the good ones."""
+    rows = [(n, 0, 0, z, 0, 0, 0) for n, z in zip("abcde", (400, 950, 420, 950, 400), strict=True)]
+    code, out, _ = hexapod("check", file_of(tmp_path, rows))
+    assert code == 1
+    lines = [line for line in out.splitlines() if line.startswith("line ")]
+    assert [line.partition(":")[0] for line in lines] == ["line 3 (row b)"] * 6 + ["line 5 (row d)"] * 6
+    assert "LIMITS BROKEN: 12, on 2 of 5 poses" in out
+    assert "not checked: 4 moves" in out
+
+
+def test_check_finds_what_happens_on_the_way() -> None:
+    """Both ends within the stroke of strut 1, the middle not: a straight line past its base joint's foot."""
+    joint = PAPER.base_joints[0]
+    there = PAPER.platform_joints[0]
+    middle = np.array([joint[0] - there[0], joint[1] - there[1], 0.4])
+    ends = [Pose(middle + np.array([0.0, y, 0.0]), np.eye(3)) for y in (-0.1, 0.1)]
+    lengths = [np.linalg.norm(p.position + there - joint) for p in (*ends, Pose(middle, np.eye(3)))]
+    assert min(lengths[:2]) > lengths[2]
+    limits = replace(
+        PAPER.limits,
+        stroke=np.vstack([[0.5 * (lengths[0] + lengths[2]), 2.0], np.tile([0.2, 2.0], (5, 1))]),
+        base_cone=np.full(6, 2.0),
+        platform_cone=np.full(6, 2.0),
+        condition=100.0,
+    )
+    geometry = replace(PAPER, limits=limits)
+    assert check(geometry, IDEAL, *stacked(ends), mode="poses").ok
+    result = check(geometry, IDEAL, *stacked(ends), mode="moves")
+    assert [(b.row, b.limit, b.error.strut) for b in result.breaches] == [(1, "stroke", 0)]  # type: ignore[attr-defined]
+    assert result.breaches[0].share == pytest.approx(0.5, abs=0.01)
+    assert result.limits["stroke"].margin[1, 0] == pytest.approx(lengths[2] - limits.stroke[0, 0], abs=1e-6)
+    assert result.examined > 100
+
+
+def test_check_agrees_with_the_compensator_on_a_random_stream() -> None:
+    """The compensator refuses a fresh pose exactly where check finds a limit broken, and for one of its reasons."""
+    rng = np.random.default_rng(21)
+    limits = replace(
+        PAPER.limits,
+        stroke=np.tile([0.38, 0.66], (6, 1)),
+        base_cone=np.full(6, 0.4),
+        platform_cone=np.full(6, 0.5),
+        condition=1.3,
+        correction=1.0e-3,
+        step=10.0,
+    )
+    geometry = replace(PAPER, limits=limits)
+    model = replace(random_model(rng, "paper"), field=random_field(rng, outside="refuse"))
+    positions = PAPER.home.position + rng.uniform(-0.12, 0.12, (400, 3))
+    rotations = Rotation.from_rotvec(rng.uniform(-0.3, 0.3, (400, 3))).as_matrix()
+    result = check(geometry, model, positions, rotations, mode="poses")
+    reasons = [{b.limit for b in result.breaches if b.row == n} for n in range(400)]
+    for n in range(400):
+        compensator = Compensator(geometry, model)
+        if reasons[n]:
+            with pytest.raises(HexapodError) as caught:
+                compensator.correct(Pose(positions[n], rotations[n]))
+            assert caught.value.reason in reasons[n]
+        else:
+            record = compensator.correct(Pose(positions[n], rotations[n]))
+            np.testing.assert_allclose(result.lengths[n], [record.nominal, record.command], atol=1e-15)
+    found = set().union(*reasons)
+    assert {"stroke", "base_cone", "platform_cone", "condition", "correction", "outside_field"} <= found
+    assert 100 < sum(not r for r in reasons) < 300
+
+
+def test_check_follows_a_stream_like_the_compensator() -> None:
+    """Directions, backlash and steps along a stream: largest steps and corrections as the compensator makes them."""
+    model = random_model(np.random.default_rng(22), "paper")
+    geometry = replace(PAPER, limits=replace(PAPER.limits, correction=0.02))
+    angle = np.linspace(0.0, 4.0 * np.pi, 700)
+    positions = PAPER.home.position + 0.02 * np.stack([np.cos(angle), np.sin(2 * angle), 0.2 * np.sin(angle)], axis=1)
+    rotations = Rotation.from_rotvec(0.05 * np.stack([np.sin(angle)] * 3, axis=1)).as_matrix()
+    result = check(geometry, model, positions, rotations, mode="stream")
+    compensator = Compensator(geometry, model)
+    records = [
+        compensator.correct(Pose(p, r), n / 250) for n, (p, r) in enumerate(zip(positions, rotations, strict=True))
+    ]
+    commands = np.array([record.command for record in records])
+    np.testing.assert_allclose(result.lengths[:, 1], commands, atol=1e-15)
+    steps = np.abs(np.diff(commands, axis=0)).max(axis=1)
+    np.testing.assert_allclose(np.abs(result.limits["step"].value[1:, 1]), steps, atol=1e-15)
+    np.testing.assert_allclose(np.abs(result.limits["speed"].value[1:, 1]), steps * 250.0, atol=1e-12)
+    corrections = np.array([record.correction for record in records])
+    np.testing.assert_allclose(
+        np.abs(result.limits["correction"].value[:, 1]), np.abs(corrections).max(axis=1), atol=1e-15
+    )
+    assert np.isnan(result.limits["step"].value[0]).all()
+
+
+def test_check_says_where_a_field_cannot_be_undone() -> None:
+    """A field whose displacement grows by 1.5 m per m has no inverse by iteration: named, once, per pose."""
+    grid = tuple(np.array(axis) for axis in ([-0.2, 0.2], [-0.2, 0.2], [0.3, 0.5]))
+    lines = [np.zeros((2, 2, 2, 6, 2)) for _ in range(3)]
+    lines[0][:, :, :, 0, 1] = 0.3  # u runs from −1 to 1 over 0.4 m
+    model = MachineModel("paper", field=GridField(grid, tuple(lines)))  # type: ignore[arg-type]
+    poses = [Pose([0.03, 0.0, 0.4], np.eye(3)), Pose([0.05, 0.0, 0.4], np.eye(3))]
+    result = check(PAPER, model, *stacked(poses), mode="stream")
+    assert [(b.row, b.limit) for b in result.breaches if b.limit == "not_converged"] == [
+        (0, "not_converged"),
+        (1, "not_converged"),
+    ]
+
+
+def test_check_long_streams_in_pieces() -> None:
+    """40,000 poses take three pieces; margins are those of the same poses checked all by themselves."""
+    angle = np.linspace(0.0, 200.0 * np.pi, 40_000)
+    positions = np.stack([0.02 * np.cos(angle), 0.02 * np.sin(angle), np.full_like(angle, 0.4)], axis=1)
+    rotations = np.tile(np.eye(3), (len(angle), 1, 1))
+    done: list[int] = []
+    result = check(PAPER, IDEAL, positions, rotations, "stream", 250.0, done.append)
+    assert result.ok
+    assert (result.examined, sum(done)) == (40_000, 40_000)
+    lengths = np.linalg.norm(positions[:, None] + PAPER.platform_joints - PAPER.base_joints, axis=2)
+    np.testing.assert_allclose(result.lengths[:, 0], lengths, atol=1e-15)
+    margins = np.minimum(lengths - PAPER.limits.stroke[:, 0], PAPER.limits.stroke[:, 1] - lengths).min(axis=1)
+    np.testing.assert_allclose(result.limits["stroke"].margin[:, 0], margins, atol=1e-15)
+    steps = np.abs(np.diff(lengths, axis=0)).max(axis=1)
+    np.testing.assert_allclose(np.abs(result.limits["step"].value[1:, 0]), steps, atol=1e-15)
+
+
+def test_check_writes_all_margins(hexapod, tmp_path: Path) -> None:
+    out = tmp_path / "margins.csv"
+    code, text, err = hexapod("check", TABLE_1, "--model", "paper_machine", "--out", str(out))
+    assert (code, err) == (0, "")
+    assert text.endswith("all within limits\n")
+    rows = parsed(out.read_text())
+    assert len(rows) == 10
+    assert rows[0]["step_nominal_mm"] == ""  # nothing to compare with
+    assert float(rows[0]["stroke_margin_nominal_mm"]) == pytest.approx(509.192 - 330.0, abs=5e-4)
+    assert {"base_cone_margin_compensated_deg", "condition_nominal", "correction_um", "speed_nominal_mm_s"} <= set(
+        rows[0]
+    )
+
+
+def test_check_json_has_every_limit(hexapod) -> None:
+    code, out, _ = hexapod("check", TABLE_1, "--json")
+    report = json.loads(out)
+    assert code == 0
+    assert report["within_limits"] is True
+    limited = [name for name in LIMITS if name != "clearance"]  # which the paper's machine does not limit
+    assert [entry["limit"] for entry in report["smallest_margins"]] == limited
+    assert report["rows"][0]["step_nominal_mm"] is None
+
+
+def test_check_cuts_long_tables(hexapod, tmp_path: Path) -> None:
+    path = file_of(tmp_path, [(n, 0, 0, 400 + 0.01 * n, 0, 0, 0) for n in range(150)])
+    code, out, _ = hexapod("check", path, "--stream")
+    assert code == 0
+    assert "… and 50 more rows; --out FILE writes all" in out
+
+
+def test_check_says_when_poses_leave_the_measured_box(hexapod, tmp_path: Path) -> None:
+    """The shipped field reaches to z = 553 mm; the model of lines was measured in the same box."""
+    path = file_of(tmp_path, [("in", 0, 0, 400, 0, 0, 0), ("out", 0, 0, 600, 0, 0, 0)])
+    _, out, _ = hexapod("check", path, "--model", "paper_machine")
+    assert "boundary is held there: 1 of 2, first line 3 (row out)\n" in out
+    _, out, _ = hexapod("check", path, "--model", "paper_lines_model")
+    assert "outside the box in which the model was measured: 1 of 2, first line 3 (row out)\n" in out
+
+
+@pytest.mark.parametrize(("mode", "rate"), [("moves", 0.5), ("moves", np.nan), ("jumps", 250.0)])
+def test_check_refuses_what_makes_no_sense(mode: str, rate: float) -> None:
+    with pytest.raises(GeometryError):
+        check(PAPER, IDEAL, *stacked(table_poses()), mode=mode, rate=rate)
+
+
+# assess.
+
+
+def test_assess_prints_the_papers_tables(hexapod) -> None:
+    """Table 2 to the printed digits; Table 4 − Table 2 is what it says."""
+    code, out, err = hexapod("assess", "--seed", "3")
+    assert (code, err) == (0, "")
+    blocks = out.split("\n\n")
+    titles = [block.splitlines()[0] for block in blocks]
+    assert titles[0] == "machine paper, joints ±10 µm, struts ±10 µm; seed 3"
+    assert [title.rpartition("(")[2] for title in titles[1:4]] == ["as Table 1):", "as Table 2):", "as Table 4):"]
+    ideal, real, change = (
+        np.array([[float(cell) for cell in line.split()[1:]] for line in block.splitlines()[2:]])
+        for block in blocks[2:5]
+    )
+    np.testing.assert_allclose(ideal * 1e-3, table_lengths(), atol=0.5001e-6)
+    np.testing.assert_allclose((real - ideal) * 1e3, change, atol=1.6e-3)  # three roundings: 0.5 nm, 0.5 nm, 0.5 nm
+    assert "round trip of the real structure" in blocks[-1]
+
+
+def test_assess_statistics_follow_the_seed(hexapod) -> None:
+    first, again, other = (
+        json.loads(hexapod("assess", "--machines", "20", "--seed", seed, "--json")[1]) for seed in ("5", "5", "6")
+    )
+    assert first == again
+    assert first["statistics"] != other["statistics"]
+    assert first["seeds"] == list(range(5, 25))
+    assert first["round_trip_m"] <= 1e-13
+    assert len(first["records"]) == 200
+    largest = max(row["displacement_um"][2] for row in first["statistics"])
+    found = max(np.linalg.norm([r[f"error_{axis}_um"] for axis in "xyz"]) for r in first["records"])
+    assert largest == pytest.approx(found, rel=1e-9)
+
+
+def test_assess_writes_every_machine(hexapod, tmp_path: Path) -> None:
+    out = tmp_path / "assessment.csv"
+    code, text, _ = hexapod("assess", TABLE_1, "--machines", "3", "--out", str(out))
+    assert code == 0
+    assert "over 3 machines" in text
+    rows = parsed(out.read_text())
+    assert [(row["seed"], row["sequence"]) for row in rows[::10]] == [("0", "1"), ("1", "1"), ("2", "1")]
+    assert float(rows[0]["real_L1_mm"]) - float(rows[0]["ideal_L1_mm"]) == pytest.approx(
+        float(rows[0]["change_L1_um"]) * 1e-3, abs=3e-9
+    )
+
+
+@pytest.mark.parametrize(
+    "arguments", [("--joint-um", "-1"), ("--machines", "0"), ("--seed", "-1"), ("--strut-um", "nan")]
+)
+def test_assess_refuses_bounds_that_are_none(hexapod, arguments: tuple[str, ...]) -> None:
+    code, out, err = hexapod("assess", *arguments)
+    assert (code, out) == (2, "")
+    assert f"argument {arguments[0]}" in err

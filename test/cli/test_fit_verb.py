@@ -1,0 +1,715 @@
+"""``measure``, ``fit``, ``plan`` and ``iso230`` in-process, from file to file: what they print, write and refuse.
+
+One campaign of a 1-D laser is measured and fitted once for the whole module; tests of options that only change
+what is written get that fit again instead of a new one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hexapod_comp import cli
+from hexapod_comp.calibration import fit as joint_fit
+from hexapod_comp.calibration.fit import JointFit
+from hexapod_comp.calibration.parameters import Settings
+from hexapod_comp.formats.paths import config_file
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.measurements.files import read_files
+
+CAMPAIGN = """format: hexapod_comp/campaign
+version: 1
+box_mm: [[-203.2, -203.2, 350], [203.2, 203.2, 553.2]]
+cell_in: 8
+step_in: 1.6
+instrument: 1-D
+diagonals: 4
+cycles: 2
+"""
+"""Six readings on the shortest lines, the fewest that scheme lines takes; two cycles, the fewest for ISO 230-2."""
+
+BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])
+"""The same box, m."""
+
+JOINT = ("--lead-mm", "10", "--blocks", "pitch,wave,backlash")
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+Run = tuple[int, str, str]
+Program = Callable[..., Run]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The measured file, the fit, and what the two verbs said."""
+
+    folder: Path
+    campaign: Path
+    measured: Path
+    fit: JointFit
+    measure_said: str
+    fit_said: str
+
+    def file(self, name: str) -> Path:
+        return self.folder / name
+
+
+@pytest.fixture
+def hexapod(capsys: pytest.CaptureFixture[str]) -> Program:
+    """Give a function that runs the command and returns exit code, output and error output."""
+
+    def run(*arguments: object) -> Run:
+        code = cli.main([str(argument) for argument in arguments])
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def said_by(*arguments: object) -> str:
+    """Run the command in a fixture of the module, where capsys does not reach, and return what it prints."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        assert cli.main([str(argument) for argument in arguments]) == 0
+    return out.getvalue()
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
+    """Measure the shipped machine and fit it, with every file that fit can write."""
+    folder = tmp_path_factory.mktemp("calibration")
+    campaign, measured = folder / "campaign.yaml", folder / "measured.csv"
+    campaign.write_text(CAMPAIGN)
+    fits: list[JointFit] = []
+    real = joint_fit.fit_joint
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(joint_fit, "fit_joint", lambda *arguments: fits.append(real(*arguments)) or fits[-1])  # type: ignore[func-returns-value]
+        measure_said = said_by("measure", "--campaign", campaign, "--seed", 1, "--out", measured)
+        files = {"--out": "model.yaml", "--json": "fit.json", "--covariance": "fit.npz", "--report": "report.txt"}
+        written = [word for option, name in files.items() for word in (option, folder / name)]
+        shown = ("--pictures", folder / "pictures", "--truth", "paper_machine", "--name", "Tuesday's")
+        fit_said = said_by("fit", measured, *JOINT, *written, *shown)
+    return Calibration(folder, campaign, measured, fits[0], measure_said, fit_said)
+
+
+@pytest.fixture
+def fitted(done: Calibration, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calibration:
+    """Give the fit to whoever asks for one, and an empty folder to write into."""
+    monkeypatch.setattr(joint_fit, "fit_joint", lambda *arguments: done.fit)
+    monkeypatch.chdir(tmp_path)
+    return done
+
+
+def assert_refused(outcome: Run, complaint: str) -> None:
+    """Exit code 2, one line on stderr that holds the complaint."""
+    code, out, err = outcome
+    assert (code, out) == (2, "")
+    assert err.startswith("hexapod_comp: error: ")
+    assert err.count("\n") == 1
+    assert re.search(complaint, err), err
+
+
+# measure, then fit.
+
+
+def test_measure_says_what_it_wrote(done: Calibration) -> None:
+    """12 lines along x and y of 11 readings, 9 along z of 6, 4 diagonals of 16; two ways, two cycles."""
+    readings = 2 * 2 * (12 * 11 + 9 * 6 + 4 * 16)
+    assert f"{readings} readings of 25 runs at {readings // 2} stations: {done.measured}" in done.measure_said
+    assert len(done.measured.read_text().splitlines()) == readings + 1
+
+
+def test_fit_reports_all_its_sections(done: Calibration) -> None:
+    for part in (
+        "machine paper: 1000 readings of 25 runs at 500 stations",
+        "scheme joint: ",
+        "expected tool error at random points of the measured box",
+        "level tool: ",
+        "tilted 10°: ",
+        "do not trust this model with a tilted tool",
+        "residuals; held out",
+        "blocks; gain",
+        "structure parameters are observable",
+        "observability indices: O1 ",
+        "not seen (left near nominal): base 1",
+        "ISO 230-2:2014, both directions",
+        "On the virtual machine, without → with the model",
+        "001's metric, mean |displacement error|",
+        f"model: {done.file('model.yaml')}",
+        f"picture: {done.file('pictures')}/fit.png",
+        f"picture: {done.file('pictures')}/left.png",
+        f"picture: {done.file('pictures')}/strut_errors.png",
+    ):
+        assert part in done.fit_said, part
+
+
+def test_report_file_is_what_was_printed(done: Calibration) -> None:
+    report = done.file("report.txt").read_text()
+    assert done.fit_said.startswith(report)
+    assert done.fit_said.removeprefix(report).strip().splitlines()[0].startswith("model: ")
+
+
+def test_what_is_printed_was_fitted(done: Calibration) -> None:
+    """The two figures that decide whether anyone uses the model, from the text and from the fit."""
+    level = done.fit.level
+    assert level is not None
+    found = re.search(r"level tool: +([\d.]+) → ([\d.]+) µm RMS \(([\d.]+)…([\d.]+) with 95 %\)", done.fit_said)
+    assert found
+    wanted = [1e6 * value for value in (level.before, level.after, level.low, level.high)]
+    np.testing.assert_allclose([float(v) for v in found.groups()], wanted, atol=0.006)
+    removed = re.search(r"error vector in space, RMS, datum aligned: .*\(([\d.]+) % less\)", done.fit_said)
+    assert removed
+    assert float(removed.group(1)) > 90.0  # the shipped machine has a field of 3 µm, which no block here can be
+
+
+def test_model_file_says_where_it_comes_from(done: Calibration) -> None:
+    model = load_model(done.file("model.yaml"), load_geometry(config_file("paper")))
+    assert model.name == "Tuesday's"
+    assert model.origin.sources == (("measured.csv", hashlib.sha256(done.measured.read_bytes()).hexdigest()),)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", model.origin.date)
+    assert "scheme joint, 1000 readings" in model.origin.note
+    assert model.valid_box is not None
+    np.testing.assert_allclose(model.valid_box, BOX, atol=1e-12)
+    residual = model.origin.held_out_residual
+    assert residual is not None
+    assert 0.5e-6 < residual < 5e-6  # cells of two readings of 1 µm, and the shipped machine's field of 3 µm
+
+
+def test_model_file_holds_the_fit(done: Calibration) -> None:
+    """To the last digit of the file: what the nodes load is what was judged."""
+    model = load_model(done.file("model.yaml"), load_geometry(config_file("paper")))
+    np.testing.assert_allclose(model.base_deviation, done.fit.model.base_deviation, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(model.struts.backlash, done.fit.model.struts.backlash, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(model.struts.period, 0.01, rtol=1e-12)
+
+
+def test_json_holds_every_parameter_with_its_error(done: Calibration) -> None:
+    content = json.loads(done.file("fit.json").read_text())
+    assert content["machine"] == "paper"
+    assert content["scheme"] == "joint"
+    assert len(content["parameters"]) == done.fit.space.size
+    assert all(entry["standard_error"] > 0.0 and np.isfinite(entry["value"]) for entry in content["parameters"])
+    assert {entry["unit"] for entry in content["parameters"]} <= {"m", "m/m", "rad"}
+    assert {entry["block"] for entry in content["blocks"]} == {"pitch", "wave", "backlash"}
+    assert content["channels"][0]["kind"] == "linear"
+    error = content["expected_tool_error"]
+    assert error["low"] < error["after"] < error["high"] < error["before"]
+    assert content["observability"]["structure_size"] == 33
+
+
+def test_covariance_is_one(done: Calibration) -> None:
+    """Symmetric, positive semidefinite to rounding, its diagonal the squared standard errors of the JSON file."""
+    with np.load(done.file("fit.npz"), allow_pickle=False) as stored:
+        labels, values, covariance = stored["labels"], stored["values"], stored["covariance"]
+    assert covariance.shape == (len(labels), len(labels)) == (len(values),) * 2
+    np.testing.assert_allclose(covariance, covariance.T, rtol=0.0, atol=1e-12 * np.abs(covariance).max())
+    eigenvalues = np.linalg.eigvalsh(covariance)
+    assert eigenvalues.min() > -1e-12 * eigenvalues.max()
+    parameters = json.loads(done.file("fit.json").read_text())["parameters"]
+    assert [entry["name"] for entry in parameters] == labels.tolist()
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [p["standard_error"] for p in parameters], rtol=1e-9)
+    np.testing.assert_allclose(values, [p["value"] for p in parameters], rtol=1e-12)
+
+
+def test_pictures_are_pictures(done: Calibration) -> None:
+    pictures = sorted(done.file("pictures").iterdir())
+    assert [path.name for path in pictures] == ["fit.png", "left.png", "strut_errors.png"]
+    for path in pictures:
+        content = path.read_bytes()
+        assert content.startswith(PNG)
+        assert len(content) > 10_000
+
+
+def test_nothing_else_is_written(done: Calibration) -> None:
+    """No half-written or temporary file beside the ones that were asked for."""
+    names = {"campaign.yaml", "measured.csv", "model.yaml", "fit.json", "fit.npz", "report.txt", "pictures"}
+    assert {path.name for path in done.folder.iterdir()} - {"five.yaml", "noisy"} == names
+
+
+def test_without_options_only_the_model_is_written(hexapod: Program, fitted: Calibration) -> None:
+    code, out, err = hexapod("fit", fitted.measured, "--out", "model.yaml")
+    assert (code, err) == (0, "")
+    assert [path.name for path in Path.cwd().iterdir()] == ["model.yaml"]
+    assert "On the virtual machine" not in out
+    assert load_model("model.yaml", load_geometry(config_file("paper"))).name == "joint calibration"
+
+
+def test_options_reach_the_fit(
+    hexapod: Program, done: Calibration, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """In SI, and the field's three blocks under one word."""
+    given: list[Settings] = []
+
+    def spy(measured: object, settings: Settings, say: object) -> JointFit:
+        given.append(settings)
+        return done.fit
+
+    monkeypatch.setattr(joint_fit, "fit_joint", spy)
+    options = "--lead-mm 5 --blocks map,field --separate-joints --tolerance-um 20 --field-degree 3 --not-robust"
+    expansion = ("--expansion-ppm", "11.7,11,23")
+    code, _, err = hexapod("fit", done.measured, *options.split(), *expansion, "--out", tmp_path / "m.yaml")
+    assert (code, err) == (0, "")
+    (settings,) = given
+    assert settings.lead == pytest.approx(0.005)
+    assert settings.blocks == ("map", "field displacement", "field rotation", "field reversal")
+    assert (settings.shared_platform_joints, settings.robust, settings.field_degree) == (False, False, 3)
+    assert dict(settings.tolerances)["structure"] == pytest.approx(20e-6)
+    expansions = (settings.strut_expansion, settings.base_expansion, settings.platform_expansion)
+    assert expansions == pytest.approx((11.7e-6, 11e-6, 23e-6))
+
+
+# Scheme lines.
+
+
+def test_scheme_lines(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
+    """Polynomials, the paper's metric beside the honest one, a model whose field is the measured box."""
+    options = ("--scheme", "lines", "--truth", "paper_machine", "--pictures", tmp_path / "pictures")
+    code, out, err = hexapod("fit", done.measured, *options, "--order", "aicc", "--out", tmp_path / "lines.yaml")
+    assert (code, err) == (0, "")
+    assert "42 polynomials on a grid of 3 × 3 × 2 nodes" in out  # 21 lines, both directions
+    assert "R² least" in out
+    assert "4 runs are not parallel to an axis" in out
+    assert "ISO 230-2:2014" in out
+    assert "001's metric" in out
+    assert "error vector in space, RMS, datum aligned" in out
+    model = load_model(tmp_path / "lines.yaml", load_geometry(config_file("paper")))
+    np.testing.assert_allclose(model.field.box, BOX, atol=1e-12)
+    assert model.origin.sources[0][0] == "measured.csv"
+    names = [path.name for path in sorted((tmp_path / "pictures").iterdir())]
+    assert names == ["lines.png", "strut_errors.png"]
+    assert (tmp_path / "pictures" / "lines.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.parametrize("option", ["--json", "--covariance"])
+def test_scheme_lines_has_no_covariance(hexapod: Program, done: Calibration, tmp_path: Path, option: str) -> None:
+    written = ("--out", tmp_path / "m.yaml", option, tmp_path / "other")
+    outcome = hexapod("fit", done.measured, "--scheme", "lines", *written)
+    assert_refused(outcome, f"{option}: has no meaning for scheme lines")
+    assert not list(tmp_path.iterdir())
+
+
+# Readings that do not bear the model out.
+
+ALL = ("--out", "m.yaml", "--json", "j.json", "--covariance", "c.npz", "--report", "r.txt", "--pictures", "p")
+
+
+@pytest.fixture(scope="module")
+def noisy(done: Calibration) -> Path:
+    """Measure with a laser thirty times as noisy as is assumed of one."""
+    (done.folder / "noisy").mkdir()
+    campaign, measured = done.folder / "noisy" / "campaign.yaml", done.folder / "noisy" / "noisy.csv"
+    campaign.write_text(CAMPAIGN + "noise: {linear_um: 30}\n")
+    said_by("measure", "--campaign", campaign, "--seed", 1, "--out", measured)
+    return measured
+
+
+def test_noise_far_above_the_stated_writes_nothing(
+    hexapod: Program, noisy: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Exit code 1, what is wrong at the top of the report, no file of any kind."""
+    monkeypatch.chdir(tmp_path)
+    code, out, err = hexapod("fit", noisy, "--lead-mm", 10, "--blocks", "pitch", *ALL)
+    assert code == 1
+    said = r"NOT WRITTEN: .*linear by (\S+) µm, (\S+) times the 1 µm assumed, since the file states none"
+    found = re.match(said, out)
+    assert found, out
+    assert [float(v) for v in found.groups()] == pytest.approx([30.0, 30.0], rel=0.1)
+    assert "residuals; held out" in out, "the report says the rest"
+    assert err == "hexapod_comp: error: nothing was written; the report says why, --force writes it\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_forced_model_says_so(hexapod: Program, noisy: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """At the top of the report, in its file, and in the model for whoever runs it."""
+    monkeypatch.chdir(tmp_path)
+    code, out, err = hexapod("fit", noisy, "--lead-mm", 10, "--blocks", "pitch", "--force", *ALL[:-2])
+    assert (code, err) == (0, "")
+    assert out.startswith("WRITTEN BY FORCE: this model is not to be trusted: readings are off by more than 10 times")
+    assert out.startswith(Path("r.txt").read_text())
+    model = load_model("m.yaml", load_geometry(config_file("paper")))
+    assert model.origin.note.startswith("FORCED: readings are off by more than 10 times their noise: linear by ")
+    assert {path.name for path in tmp_path.iterdir()} == {"m.yaml", "j.json", "c.npz", "r.txt"}
+
+
+def test_noise_that_is_stated_is_welcome(hexapod: Program, noisy: Path, tmp_path: Path) -> None:
+    """The same readings with the uncertainty that they have."""
+    header, *rows = noisy.read_text().splitlines()
+    stated = tmp_path / "stated.csv"
+    stated.write_text("\n".join([header + ",uncertainty", *(row + ",30" for row in rows)]) + "\n")
+    code, out, err = hexapod("fit", stated, "--blocks", "pitch", "--out", tmp_path / "m.yaml")
+    assert (code, err) == (0, "")
+    assert out.startswith("machine paper")
+
+
+def test_micrometres_called_millimetres_write_nothing(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
+    """By either scheme: that of lines leaves the screws' waves, a few micrometres, which now are millimetres."""
+    wrong = tmp_path / "mm.csv"
+    wrong.write_text(done.measured.read_text().replace(",um\n", ",mm\n"))
+    code, out, _ = hexapod("fit", wrong, "--scheme", "lines", "--out", tmp_path / "m.yaml")
+    assert code == 1
+    assert re.match(r"NOT WRITTEN: .*readings are off by more than 10 times their noise: linear by .* assumed", out)
+    code, _, err = hexapod("fit", wrong, "--lead-mm", 10, "--blocks", "pitch", "--out", tmp_path / "m.yaml")
+    assert code == 1 or "do units" in err
+    assert list(tmp_path.iterdir()) == [wrong]
+
+
+@pytest.mark.parametrize("scheme", ["joint", "lines"])
+def test_a_dead_instrument_is_refused(hexapod: Program, done: Calibration, tmp_path: Path, scheme: str) -> None:
+    header, *rows = done.measured.read_text().splitlines()
+    dead = tmp_path / "dead.csv"
+    column = header.split(",").index("value") - len(header.split(","))  # the run's name may hold commas
+    cells = [row.split(",") for row in rows]
+    for row in cells:
+        row[column] = "0"
+    dead.write_text("\n".join([header, *(",".join(row) for row in cells)]) + "\n")
+    outcome = hexapod("fit", dead, "--scheme", scheme, "--out", tmp_path / "m.yaml")
+    assert_refused(outcome, "linear: the 1000 readings are all zero")
+    assert list(tmp_path.iterdir()) == [dead]
+
+
+# What is refused: nothing is written, one line says what and where.
+
+
+@dataclass(frozen=True)
+class Wrong:
+    """A usage that is wrong, with the file that it needs, if any."""
+
+    arguments: str
+    complaint: str
+    name: str = ""
+    content: str = ""
+
+
+LINE = "x line,forward,{x},0,400,linear,0,um\n"
+TIDY = "run,direction,x_mm,y_mm,z_mm,channel,value,unit\n"
+WIDE = "cx,cy,cz,mx,my,mz\n0,0,400,0.1,0,400\n"
+
+WRONG = {
+    "no such file": Wrong("gone.csv", r"gone\.csv: cannot be read: No such file"),
+    "a folder": Wrong(".", r"\.: cannot be read: Is a directory"),
+    "empty": Wrong("e.csv", r"e\.csv: has no header", "e.csv"),
+    "header only": Wrong("h.csv", r"h\.csv: has a header but no rows", "h.csv", TIDY),
+    "not text": Wrong("b.csv", r"b\.csv: line 1 or later: is not UTF-8 text", "b.csv", "\xff\xfe"),
+    "nan": Wrong("n.csv", r"n\.csv: line 2, column value: .*'nan'", "n.csv",
+                 TIDY + "l,forward,0,0,400,linear,nan,um\n"),
+    "unit": Wrong("u.csv", r"u\.csv: line 2, column unit: .*'furlong'", "u.csv",
+                  TIDY + "l,forward,0,0,400,linear,1,furlong\n"),
+    "out of reach": Wrong("r.csv", r"r\.csv: line 3: the commanded pose is out of .*outside the stroke", "r.csv",
+                          TIDY + LINE.format(x=0) + LINE.format(x=900)),
+    "too few": Wrong("f.csv", r"11 readings .* leave 10 numbers for the structure's 33", "f.csv",
+                     TIDY + "".join(LINE.format(x=10 * n) for n in range(11))),
+    "endless": Wrong("v.csv", r"v\.csv: line 2: value must be within ±10 m: .*\(found 1e\+302\)", "v.csv",
+                     TIDY + "l,forward,0,0,400,linear,1e308,um\n" + LINE.format(x=9)),
+    "turns": Wrong("v.csv", r"v\.csv: line 2: value must be within ±10 rad", "v.csv",
+                   TIDY + "l,forward,0,0,400,rotation_x,11,rad\n" + LINE.format(x=9)),
+    "below any instrument": Wrong("v.csv", r"v\.csv: line 2: uncertainty must be 1e-12…10 m", "v.csv",
+                                  TIDY.replace("unit", "unit,uncertainty") + "l,forward,0,0,400,linear,1,um,1e-300\n"),
+    "no certainty": Wrong("v.csv", r"v\.csv: line 2: uncertainty must be 1e-12…10 m", "v.csv",
+                          TIDY.replace("unit", "unit,uncertainty") + "l,forward,0,0,400,linear,1,um,1e300\n"),
+    "the same file twice": Wrong("{measured} {measured}", "is the same file as"),
+    "unknown block": Wrong("{measured} --blocks pitch,colour", r"blocks: must be of structure, .*'colour'"),
+    "no lead": Wrong("{measured} --lead-mm 0", r"lead: must be 0\.1 mm to 1000 mm \(found 0\.0\)"),
+    "endless lead": Wrong("{measured} --lead-mm 5000", r"lead: .*\(found 5000\.0\)"),
+    "lead of a clockwork": Wrong("{measured} --lead-mm 1e-300", r"lead: must be 0\.1 mm to"),
+    "degree": Wrong("{measured} --field-degree 9", r"field_degree: must be 1…8 \(found 9\)"),
+    "wide without columns": Wrong("w.csv", r"w\.csv: header: column run is missing", "w.csv", WIDE),
+    "tidy with columns": Wrong("{measured} --columns jugglebot_columns", r"measured\.csv: header: column position_x"),
+    "no columns file": Wrong("w.csv --columns gone.yaml", r"gone\.yaml: there is no such file", "w.csv", WIDE),
+    "columns of another kind": Wrong("w.csv --columns paper", r"format: must be 'hexapod_comp/columns'", "w.csv", WIDE),
+    "probe of a wide file": Wrong("w.csv --columns jugglebot_columns --probe-mm 0,0,1", "leave the probe out",
+                                  "w.csv", WIDE),
+    "no line file": Wrong("x.rtl", r"x\.rtl\.yaml: cannot be read", "x.rtl", "HEADER::\n"),
+    "another machine": Wrong("{measured} --machine jugglebot", r"measured\.csv: line 2: the commanded pose is out of"),
+    "no machine": Wrong("{measured} --machine gone", r"gone: there is no such file"),
+    "a model for a machine": Wrong("{measured} --machine paper_machine", "format: must be 'hexapod_comp/geometry'"),
+    "no truth": Wrong("{measured} --truth gone.yaml", r"gone\.yaml: there is no such file"),
+    "a machine for a truth": Wrong("{measured} --truth paper", "format: must be 'hexapod_comp/model'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_wrong_fit_is_one_line_and_writes_nothing(
+    hexapod: Program, done: Calibration, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, case: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    wrong = WRONG[case]
+    if wrong.name:
+        Path(wrong.name).write_bytes(wrong.content.encode("latin-1"))
+    arguments = wrong.arguments.format(measured=done.measured).split()
+    written = ("--out", "m.yaml", "--json", "j.json", "--report", "r.txt", "--pictures", "p")
+    assert_refused(hexapod("fit", *arguments, *written), wrong.complaint)
+    assert [path.name for path in tmp_path.iterdir()] == [wrong.name] * bool(wrong.name)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ("", "arguments are required: FILE, --out"),
+        ("x.csv", "arguments are required: --out"),
+        ("--out m.yaml", "arguments are required: FILE"),
+        ("x.csv --out m.yaml --lead-mm -1", "argument --lead-mm: must not be negative"),
+        ("x.csv --out m.yaml --lead-mm nan", "argument --lead-mm: is not finite"),
+        ("x.csv --out m.yaml --lead-mm ten", "argument --lead-mm: is not finite numbers: 'ten'"),
+        ("x.csv --out m.yaml --tolerance-um -3", "argument --tolerance-um: must not be negative"),
+        ("x.csv --out m.yaml --field-degree 0", "argument --field-degree: must be a whole number from 1 to 10000000"),
+        ("x.csv --out m.yaml --field-degree 2.5", "argument --field-degree: must be a whole number from 1 to 10000000"),
+        ("x.csv --out m.yaml --expansion-ppm 1,2", "argument --expansion-ppm: needs one or three numbers"),
+        ("x.csv --out m.yaml --probe-mm 1,2", "argument --probe-mm: needs three"),
+        ("x.csv --out m.yaml --probe-mm 1,2,3,4,5,6", "argument --probe-mm: needs three numbers, mm"),
+        ("x.csv --out m.yaml --scheme cubic", "argument --scheme: invalid choice: 'cubic'"),
+        ("x.csv --out m.yaml --order bic", "argument --order: invalid choice: 'bic'"),
+    ],
+)
+def test_a_wrong_option_shows_the_usage(hexapod: Program, arguments: str, complaint: str) -> None:
+    code, out, err = hexapod("fit", *arguments.split())
+    assert (code, out) == (2, "")
+    assert err.startswith("usage: hexapod_comp fit")
+    assert complaint in err
+
+
+@pytest.mark.parametrize(
+    ("option", "path"),
+    [
+        ("--out", "nowhere/m.yaml"),
+        ("--json", "nowhere/j.json"),
+        ("--covariance", "nowhere/c.npz"),
+        ("--report", "nowhere/r.txt"),
+        ("--out", "."),
+    ],
+)
+def test_what_cannot_be_written_is_named(hexapod: Program, fitted: Calibration, option: str, path: str) -> None:
+    options = {"--out": "m.yaml", option: path}
+    words = [word for pair in options.items() for word in pair]
+    assert_refused(hexapod("fit", fitted.measured, *words), rf"{re.escape(path)}: cannot be written")
+
+
+def test_a_file_where_the_pictures_should_go_is_named(hexapod: Program, fitted: Calibration) -> None:
+    Path("p").write_text("here already")
+    code, _, err = hexapod("fit", fitted.measured, "--out", "m.yaml", "--pictures", "p")
+    assert code == 2
+    assert re.fullmatch(r"hexapod_comp: error: p.*: cannot be written: .*\n", err)
+
+
+def test_no_output_without_its_model(hexapod: Program, fitted: Calibration) -> None:
+    words = ("--out", "nowhere/m.yaml", "--json", "j.json", "--covariance", "c.npz", "--report", "r.txt")
+    assert_refused(hexapod("fit", fitted.measured, *words), "nowhere/m.yaml: cannot be written")
+    assert not list(Path.cwd().iterdir())
+
+
+def test_a_tolerance_of_zero_is_refused(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
+    options = ("--tolerance-um", 0, "--blocks", "pitch", "--out", tmp_path / "m.yaml")
+    assert_refused(hexapod("fit", done.measured, *options), "tolerance")
+
+
+def test_scheme_lines_refuses_what_it_would_ignore(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
+    options = ("--scheme", "lines", "--blocks", "pitch", "--out", tmp_path / "m.yaml")
+    assert_refused(hexapod("fit", done.measured, *options), "--blocks")
+
+
+def test_fit_of_too_short_lines_says_which_and_what_is_needed(hexapod: Program, tmp_path: Path) -> None:
+    """Five readings on a line of 8 inches, every two inches: the paper's third of the points is no polynomial."""
+    (tmp_path / "c.yaml").write_text(CAMPAIGN.replace("1.6", "2").replace("cycles: 2", "cycles: 1"))
+    measured = tmp_path / "m.csv"
+    assert hexapod("measure", "--campaign", tmp_path / "c.yaml", "--out", measured)[0] == 0
+    outcome = hexapod("fit", measured, "--scheme", "lines", "--out", tmp_path / "m.yaml")
+    assert_refused(outcome, r"z line at x -203\.2, y -203\.2 .*has 5 points in a direction; 6 are needed")
+
+
+# measure, wrongly.
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ("--campaign gone.yaml", r"gone\.yaml: there is no such file"),
+        ("--campaign high.yaml", r"run x line at .*: the commanded pose is out of the machine's reach: strut_1"),
+        ("--campaign laser.yaml", r"laser\.yaml: instrument: must be one of 1-D, 5-D, 6-D, none \(found '7-D'\)"),
+        ("--campaign key.yaml", r"key\.yaml: colour: is not a known key here \(found 'blue'\)"),
+        ("--campaign paper", "format: must be 'hexapod_comp/campaign'"),
+        ("--campaign small.yaml --truth gone.yaml", r"gone\.yaml: there is no such file"),
+        ("--campaign small.yaml --machine jugglebot", r"machine: the model is for another machine"),
+        ("--campaign small.yaml --out nowhere/m.csv", r"nowhere/m\.csv: cannot be written"),
+    ],
+)
+def test_wrong_campaigns(
+    hexapod: Program, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, arguments: str, complaint: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    files = {
+        "small.yaml": CAMPAIGN,
+        "high.yaml": CAMPAIGN.replace("553.2", "1553.2"),
+        "laser.yaml": CAMPAIGN.replace("1-D", "7-D"),
+        "key.yaml": CAMPAIGN + "colour: blue\n",
+    }
+    for name, content in files.items():
+        Path(name).write_text(content)
+    out = () if "--out" in arguments else ("--out", "m.csv")
+    assert_refused(hexapod("measure", *arguments.split(), *out), complaint)
+    assert {path.name for path in tmp_path.iterdir()} == set(files)
+
+
+# plan.
+
+
+@pytest.fixture(scope="module")
+def five(done: Calibration) -> Path:
+    """Give the same campaign with a 5-D laser."""
+    path = done.file("campaign.yaml").with_name("five.yaml")
+    path.write_text(CAMPAIGN.replace("1-D", "5-D"))
+    return path
+
+
+def test_plan_says_what_will_be_determined(hexapod: Program, five: Path) -> None:
+    """Before anything is measured. Level 5-D lines show 14 of 33 structure parameters, says issue 3, and no roll."""
+    code, out, err = hexapod("plan", five, *JOINT)
+    assert (code, err) == (0, "")
+    assert "machine paper: 3976 readings of 25 runs at 500 stations, 57 parameters" in out
+    assert "14 of 33 structure parameters are observable; of all 57 parameters " in out
+    assert re.search(r"level tool: +[\d.]+ → [\d.]+ µm RMS", out)
+    assert "do not trust this model with a tilted tool" in out
+    assert "machine errors that leave no trace in these readings: roll of x, roll of y, roll of z\n" in out
+
+
+def test_plan_as_json(hexapod: Program, done: Calibration) -> None:
+    """A 1-D laser on the same lines shows less than the 5-D laser's 14 directions."""
+    code, out, err = hexapod("plan", done.campaign, *JOINT, "--json")
+    assert (code, err) == (0, "")
+    content = json.loads(out)
+    assert (content["readings"], content["parameters"]) == (1000, 57)
+    seen = content["observability"]
+    assert 0 < seen["structure_rank"] < 14
+    assert seen["structure_size"] == 33
+    assert seen["structure_rank"] < seen["rank"] < seen["size"] == 57
+    assert set(content["unseen_errors"]) >= {"roll of x", "roll of y", "roll of z"}
+    error = content["expected_tool_error"]
+    assert error["low"] < error["after"] < error["high"] < error["before"]
+
+
+def test_fit_names_the_machine_errors_that_plan_names(hexapod: Program, done: Calibration) -> None:
+    """The readings are the same, so what they cannot show is."""
+    planned = json.loads(hexapod("plan", done.campaign, *JOINT, "--json")[1])["unseen_errors"]
+    assert json.loads(done.file("fit.json").read_text())["unseen_errors"] == planned
+
+
+def test_plan_and_fit_agree(done: Calibration, hexapod: Program) -> None:
+    """The plan's readings are the file's, and its expectation is that of the fit with the same blocks: the noise is
+    the campaign's, the machine within the same tolerances; a factor of two covers one machine's luck."""
+    planned = json.loads(hexapod("plan", done.campaign, *JOINT, "--json")[1])["expected_tool_error"]["after"]
+    assert done.fit.level is not None
+    assert 0.5 < planned / done.fit.level.after < 2.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ("gone.yaml", r"gone\.yaml: there is no such file"),
+        ("paper", "format: must be 'hexapod_comp/campaign'"),
+        ("{measured}", r"measured\.csv: must hold keys and values"),
+        ("{campaign} --lead-mm 0", r"lead: must be 0\.1 mm to"),
+        ("{campaign} --blocks colour", r"blocks: must be of .*'colour'"),
+        ("{campaign} --machine jugglebot", "the commanded pose is out of the machine's reach"),
+        ("laser.yaml", r"laser\.yaml: instrument: must be one of .*'7-D'"),
+    ],
+)
+def test_wrong_plans(
+    hexapod: Program,
+    done: Calibration,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    arguments: str,
+    complaint: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("laser.yaml").write_text(CAMPAIGN.replace("1-D", "7-D"))
+    words = arguments.format(measured=done.measured, campaign=done.campaign).split()
+    assert_refused(hexapod("plan", *words), complaint)
+
+
+@pytest.mark.parametrize("verb", ["plan", "measure"])
+def test_a_campaign_out_of_reach_names_its_file(hexapod: Program, tmp_path: Path, verb: str) -> None:
+    high = tmp_path / "high.yaml"
+    high.write_text(CAMPAIGN.replace("553.2", "1553.2"))
+    words = ("plan", high) if verb == "plan" else ("measure", "--campaign", high, "--out", tmp_path / "m.csv")
+    assert_refused(hexapod(*words), "high.yaml")
+
+
+# iso230.
+
+
+def test_iso230_judges_every_line(hexapod: Program, done: Calibration) -> None:
+    code, out, err = hexapod("iso230", done.measured)
+    assert (code, err) == (0, "")
+    rows = out.splitlines()
+    assert rows[0] == "ISO 230-2:2014, both directions"
+    assert rows[1].split()[:5] == ["run", "targets", "cycles", "A", "E"]
+    assert len(rows) == 2 + 25
+    assert out.strip() in done.fit_said, "the same table is part of the fit's report"
+
+
+def test_iso230_figures_follow_from_the_readings(hexapod: Program, done: Calibration) -> None:
+    """The standard's M and B of one line by hand, from the readings themselves: M is the range of the means of both
+    directions, B the largest difference of the two means of a target. Numbers in the table have 1 nm."""
+    measured = read_files([done.measured], load_geometry(config_file("paper")))
+    name = "x line at y 0.0, z 350.0"
+    number = [run.name for run in measured.runs].index(name)
+    along = measured.along().round(9)
+    means = np.array(
+        [
+            [measured.value[(measured.run == number) & (measured.direction == way) & (along == place)].mean()
+             for place in np.unique(along[measured.run == number])]
+            for way in (1, -1)
+        ]
+    )  # fmt: skip
+    assert means.shape == (2, 11)
+    figures = json.loads(hexapod("iso230", done.measured, "--json")[1])[name]
+    assert figures["M"] == pytest.approx(np.ptp(means.mean(axis=0)), abs=1e-12)
+    assert figures["B"] == pytest.approx(np.abs(means[0] - means[1]).max(), abs=1e-12)
+    assert figures["E"] == pytest.approx(np.ptp(means), abs=1e-12)
+    assert figures["A"] > figures["E"] > figures["M"]
+
+
+def test_iso230_target_by_target(hexapod: Program, done: Calibration) -> None:
+    code, out, _ = hexapod("iso230", done.measured, "--targets")
+    assert code == 0
+    assert out.count("accuracy A") == 25
+    assert "x line at y 0.0, z 350.0" in out
+
+
+def test_iso230_of_single_passes_says_what_is_missing(hexapod: Program, tmp_path: Path) -> None:
+    rows = [f"l,{way},{x},0,400,linear,{x},um\n" for way in ("forward", "backward") for x in (0, 10, 20)]
+    (tmp_path / "once.csv").write_text(TIDY + "".join(rows))
+    assert_refused(hexapod("iso230", tmp_path / "once.csv"), "no linear run has two cycles or more")
+    assert_refused(hexapod("iso230", "gone.csv"), r"gone\.csv: cannot be read")
+
+
+# Help.
+
+
+@pytest.mark.parametrize("verb", ["fit", "plan", "measure", "iso230", "export"])
+def test_each_verb_explains_itself_without_a_compiler(verb: str) -> None:
+    """In a process of its own, as test_cli does it for the whole program."""
+    code = (
+        f"import sys, hexapod_comp.cli as cli; assert cli.main(['{verb}', '--help']) == 0; "
+        "heavy = {'numpy', 'numba', 'scipy', 'matplotlib', 'rclpy', 'tqdm'} & set(sys.modules); assert not heavy, heavy"
+    )
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert f"usage: hexapod_comp {verb}" in done.stdout
+    assert "example:" in done.stdout
+
+
+def test_the_program_lists_them(hexapod: Program) -> None:
+    out = hexapod("--help")[1]
+    for verb in ("fit", "plan", "measure", "iso230", "export"):
+        assert re.search(rf"^    {verb} +\w", out, re.MULTILINE), verb

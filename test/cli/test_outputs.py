@@ -1,0 +1,123 @@
+"""No verb replaces what it reads: every option that names a file is either read or written, and the two never meet."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from hexapod_comp import cli
+from hexapod_comp.errors import InputFileError
+from hexapod_comp.formats import outputs
+
+ROOT = Path(__file__).resolve().parents[2]
+WORDS = {"name", "namespace", "blocks", "order", "scheme", "method", "scheduler"}
+"""Options whose text is no file's name."""
+
+
+def options() -> dict[str, set[str]]:
+    """Return the options and arguments of each verb whose values are text."""
+    (subparsers,) = (a for a in cli.make_parser()._actions if isinstance(a, argparse._SubParsersAction))
+    return {
+        verb: {a.dest for a in parser._actions if a.nargs != 0 and a.type is None and a.choices is None}
+        for verb, parser in subparsers.choices.items()
+    }
+
+
+def test_every_option_that_names_a_file_is_known_as_read_or_written():
+    known = set(outputs.READ) | set(outputs.WRITTEN) | WORDS
+    assert not set(outputs.READ) & set(outputs.WRITTEN)
+    assert {verb: found - known for verb, found in options().items() if found - known} == {}
+    assert set(outputs.READ) | set(outputs.WRITTEN) <= set().union(*options().values())
+
+
+COMMANDS = [
+    ("ik {in}/table1.csv --out {in}/table1.csv", "table1.csv"),
+    ("ik {in}/table1.csv --json --out {in}/table1.csv", "table1.csv"),
+    ("ik --pose 0,0,400 --machine {in}/paper.yaml --out {in}/paper.yaml", "paper.yaml"),
+    ("fk {in}/table1.csv --out {in}/table1.csv", "table1.csv"),
+    ("check {in}/table1.csv --out {in}/table1.csv", "table1.csv"),
+    ("assess {in}/table1.csv --out {in}/table1.csv", "table1.csv"),
+    ("run {in}/table1.csv --plot {in}/table1.csv", "table1.csv"),
+    ("demo --truth {in}/paper_machine.yaml --plot {in}/paper_machine.yaml", "paper_machine.yaml"),
+    ("measure --campaign {in}/campaign_5d.yaml --out {in}/campaign_5d.yaml", "campaign_5d.yaml"),
+    ("fit {in}/m.csv --out {in}/m.csv", "m.csv"),
+    ("fit {in}/other.csv {in}/m.csv --out {in}/new --report {in}/m.csv", "m.csv"),
+    ("fit {in}/m.csv --out {in}/new --json {in}/m.csv", "m.csv"),
+    ("fit {in}/m.csv --out {in}/new --covariance {in}/m.csv", "m.csv"),
+    ("fit {in}/m.csv --out {in}/new --columns {in}/c.yaml --report {in}/c.yaml", "c.yaml"),
+    ("fit {in}/m.csv --truth {in}/paper_machine.yaml --out {in}/paper_machine.yaml", "paper_machine.yaml"),
+    ("export --model {in}/paper_machine.yaml --table {in}/paper_machine.yaml", "paper_machine.yaml"),
+    ("replay {in}/bag --out {in}/bag/metadata.yaml", "metadata.yaml"),
+]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name in ("table1.csv", "paper.yaml", "paper_machine.yaml", "campaign_5d.yaml"):
+        shutil.copy(ROOT / "config" / name, tmp_path)
+    for name in ("m.csv", "other.csv", "c.yaml"):
+        (tmp_path / name).write_text("read me\n")
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "metadata.yaml").write_text("read me\n")
+    return tmp_path
+
+
+@pytest.mark.parametrize(("command", "name"), COMMANDS)
+def test_output_that_is_an_input_is_refused_at_once(command: str, name: str, folder: Path, capsys):
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert cli.main([word.replace("{in}", str(folder)) for word in command.split()]) == 2
+    told = capsys.readouterr().err
+    assert f"{name}: is read by this command" in told
+    assert told.count("\n") == 1
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("way", ["link", "hard link", "other spelling", "folder", "standard input"])
+def test_other_names_of_an_input_are_refused_too(way: str, folder: Path, capsys):
+    given, out = str(folder / "table1.csv"), folder / "out.csv"
+    if way == "link":
+        out.symlink_to(given)
+    elif way == "hard link":
+        os.link(given, out)
+    elif way == "other spelling":
+        out = folder / "bag" / ".." / "table1.csv"
+    elif way == "folder":
+        (folder / "linked").symlink_to(folder)
+        out = folder / "linked" / "table1.csv"
+    else:
+        out, given = Path(given), "-"
+        with open(out, encoding="utf-8") as stream:
+            own = os.dup(0)
+            os.dup2(stream.fileno(), 0)
+            try:
+                assert cli.main(["ik", "-", "--out", str(out)]) == 2
+            finally:
+                os.dup2(own, 0)
+                os.close(own)
+        assert "is read by this command, as -" in capsys.readouterr().err
+        return
+    assert cli.main(["ik", given, "--out", str(out)]) == 2
+    assert "is read by this command" in capsys.readouterr().err
+    assert Path(given).read_bytes() == (ROOT / "config" / "table1.csv").read_bytes()
+
+
+def test_a_file_in_an_output_folder_that_is_read_is_not_replaced(folder: Path):
+    """Which files a folder will get only their writers know: they ask too."""
+    from hexapod_comp.formats.yaml import write_text_atomically
+
+    with outputs.inputs_protected(argparse.Namespace(budget=str(folder / "c.yaml"), out=str(folder))):
+        with pytest.raises(InputFileError, match="is read by this command"):
+            write_text_atomically(folder / "c.yaml", "new")
+        write_text_atomically(folder / "other.csv", "new")
+    write_text_atomically(folder / "c.yaml", "new")  # a program that uses the package may
+    assert (folder / "c.yaml").read_text() == (folder / "other.csv").read_text() == "new"
+
+
+def test_existing_files_that_are_no_inputs_are_replaced_as_before(folder: Path):
+    out = folder / "m.csv"
+    assert cli.main(["ik", str(folder / "table1.csv"), "--out", str(out)]) == 0
+    assert out.read_text().startswith("sequence,L1_mm")

@@ -1,0 +1,550 @@
+"""The compensator: commands that close the loop, refusals that leave no trace, changes that ramp."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from strategies import (
+    UNEVEN_GRID,
+    paper_geometry,
+    random_field,
+    random_model,
+    random_pose,
+    random_struts,
+    skewed_geometry,
+)
+
+from hexapod_comp.compensation.compensator import Compensator, Correction, pack_pose
+from hexapod_comp.errors import HexapodError, LimitError, ModelError, NotFiniteError, OutsideFieldError
+from hexapod_comp.kernels.compensation import LONGEST_RAMP_STEP
+from hexapod_comp.machine.field import GridField
+from hexapod_comp.machine.geometry import HexapodGeometry, Limits
+from hexapod_comp.machine.model import MachineModel
+from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.pose import Pose
+
+PAPER = paper_geometry()
+WIDE = Limits(np.tile([0.1, 2.0], (6, 1)), np.full(6, np.pi), np.full(6, np.pi), 100.0, 0.02, 1.0, 1.0)
+TOOL = Pose.from_angles([0.02, -0.01, -0.15], np.deg2rad([4.0, -7.0, 25.0]))
+WORK = Pose.from_angles([0.05, 0.04, 0.1], np.deg2rad([2.0, 3.0, 40.0]))
+FREE = replace(PAPER, limits=WIDE)
+OFFSET = replace(FREE, tool=TOOL, work=WORK)
+SKEWED = replace(skewed_geometry(lead=0.005), limits=WIDE)
+IDEAL = MachineModel("paper")
+RATE = 250.0
+RAMP = 1e-3
+
+
+def model_of(geometry: HexapodGeometry, seed: int) -> MachineModel:
+    """Return a model with every block on."""
+    return random_model(np.random.default_rng(seed), geometry.name)
+
+
+def tool_poses(geometry: HexapodGeometry, count: int, seed: int) -> list[Pose]:
+    """Return tool poses in the work frame whose platform poses lie about home."""
+    rng = np.random.default_rng(seed)
+    return [geometry.work.inverse() @ random_pose(rng, geometry.home) @ geometry.tool for _ in range(count)]
+
+
+def shifted(pose: Pose, *by: float) -> Pose:
+    return Pose(pose.position + np.array(by), pose.rotation)
+
+
+def nominal_lengths(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
+    """Return the nominal lengths by NumPy alone."""
+    joints = platform.position + geometry.platform_joints @ platform.rotation.T
+    return np.linalg.norm(joints - geometry.base_joints, axis=1)
+
+
+def numbers_of(pose: Pose) -> tuple[float, ...]:
+    """Return a pose as the loop's entry takes it: position, then quaternion x, y, z, w by scipy."""
+    return (*pose.position.tolist(), *Rotation.from_matrix(pose.rotation).as_quat().tolist())
+
+
+def composed(*poses: Pose) -> tuple[Rotation, np.ndarray]:
+    """Return rotation and position of a product of poses, by scipy's rotations."""
+    rotation, position = Rotation.identity(), np.zeros(3)
+    for pose in poses:
+        position = position + rotation.apply(pose.position)
+        rotation = rotation * Rotation.from_matrix(pose.rotation)
+    return rotation, position
+
+
+def assert_same_records(one: Correction, other: Correction) -> None:
+    """Compare every field bit by bit."""
+    for entry in fields(Correction):
+        a, b = getattr(one, entry.name), getattr(other, entry.name)
+        if isinstance(a, Pose):
+            assert np.array_equal(a.position, b.position), entry.name
+            assert np.array_equal(a.rotation, b.rotation), entry.name
+        elif isinstance(a, np.ndarray):
+            assert np.array_equal(a, b, equal_nan=True), entry.name
+        else:
+            assert a == b, entry.name
+
+
+# The command is right.
+
+
+@pytest.mark.parametrize("geometry", [FREE, OFFSET, SKEWED], ids=["paper", "tool and work", "6-6 with lead"])
+def test_the_commands_bring_the_real_machine_to_the_pose(geometry: HexapodGeometry) -> None:
+    """Closure: the forward model, by Newton from home, finds the commanded pose again: 1e-13 m, 1e-12 rad."""
+    compensator = Compensator(geometry, model_of(geometry, 1))
+    for n, pose in enumerate(tool_poses(geometry, 50, 2)):
+        record = compensator.correct(pose, n / RATE)
+        actual, model_pose = compensator.machine.pose_for(record.command, record.sense, geometry.home)
+        tool = geometry.work.inverse() @ actual @ geometry.tool
+        assert np.abs(tool.position - pose.position).max() <= 1e-13
+        assert Rotation.from_matrix(tool.rotation @ pose.rotation.T).magnitude() <= 1e-12
+        np.testing.assert_allclose(model_pose.position, record.model_pose.position, atol=1e-13)
+        np.testing.assert_allclose(record.command, record.nominal + record.correction, atol=1e-16)
+        assert np.abs(record.correction).max() > 50e-6  # there was something to correct
+        assert not record.ramping
+
+
+@pytest.mark.parametrize("geometry", [FREE, OFFSET, SKEWED], ids=["paper", "tool and work", "6-6 with lead"])
+def test_the_estimate_from_the_commands_is_the_commanded_pose(geometry: HexapodGeometry) -> None:
+    """What is sent, read back from the encoders, is where the tool was wanted, seen from ``base``."""
+    compensator = Compensator(geometry, model_of(geometry, 3))
+    for n, pose in enumerate(tool_poses(geometry, 20, 4)):
+        record = compensator.correct(pose, n / RATE)
+        estimate = compensator.estimate(record.command)
+        rotation, position = composed(geometry.work, pose)
+        np.testing.assert_allclose(estimate[:3], position, atol=2e-13)
+        np.testing.assert_allclose(estimate[3:].reshape(3, 3), rotation.as_matrix(), atol=1e-12)
+
+
+def test_an_impossible_reading_gives_no_estimate_and_spoils_nothing() -> None:
+    compensator = Compensator(FREE, model_of(FREE, 3))
+    record = compensator.correct(FREE.home)
+    before = compensator.estimate(record.command).copy()
+    for reading in (np.array([0.5, 0.5, 0.5, 0.5, 0.5, 3.0]), np.full(6, np.nan)):
+        with pytest.raises(HexapodError):
+            compensator.estimate(reading)
+    np.testing.assert_allclose(compensator.estimate(record.command), before, atol=1e-14)
+
+
+def test_tool_and_work_offsets_against_scipy() -> None:
+    """platform = work · commanded · tool⁻¹, composed by scipy; the nominal lengths by NumPy."""
+    compensator = Compensator(OFFSET, IDEAL)
+    for pose in tool_poses(OFFSET, 20, 5):
+        record = compensator.correct(pose)
+        rotation, position = composed(WORK, pose)
+        rotation = rotation * Rotation.from_matrix(TOOL.rotation).inv()
+        position = position - rotation.apply(TOOL.position)
+        np.testing.assert_allclose(record.platform_pose.position, position, atol=1e-15)
+        np.testing.assert_allclose(record.platform_pose.rotation, rotation.as_matrix(), atol=1e-14)
+        platform = Pose(position, rotation.as_matrix())
+        np.testing.assert_allclose(record.nominal, nominal_lengths(OFFSET, platform), atol=1e-14)
+        np.testing.assert_allclose(OFFSET.platform_pose(pose).position, position, atol=1e-15)
+        back = OFFSET.tool_pose(record.platform_pose)
+        np.testing.assert_allclose(back.position, pose.position, atol=1e-15)
+
+
+def test_a_frame_given_with_the_command_replaces_the_work_frame() -> None:
+    pose = tool_poses(OFFSET, 1, 6)[0]
+    in_base = WORK @ pose
+    by_work = Compensator(OFFSET, IDEAL).step(numbers_of(pose), 0.0)
+    by_frame = Compensator(OFFSET, IDEAL).step(numbers_of(in_base), 0.0, pack_pose(Pose.identity()))
+    np.testing.assert_allclose(by_frame, by_work, atol=1e-15)
+
+
+def test_both_entries_give_the_same_commands() -> None:
+    """Quaternion in, rotation matrix in: the same to rounding, also with a norm that is off by what is allowed."""
+    model = model_of(OFFSET, 6)
+    by_pose, by_numbers, unnormalised = (Compensator(OFFSET, model) for _ in range(3))
+    for n, pose in enumerate(tool_poses(OFFSET, 20, 6)):
+        command = by_pose.correct(pose, n / RATE).command
+        numbers = numbers_of(pose)
+        np.testing.assert_allclose(by_numbers.step(numbers, n / RATE), command, atol=2e-15)
+        longer = (*numbers[:3], *(1.0009 * q for q in numbers[3:]))
+        np.testing.assert_allclose(unnormalised.step(longer, n / RATE), command, atol=2e-15)
+
+
+def test_an_ideal_model_commands_the_nominal_lengths() -> None:
+    compensator = Compensator(FREE, IDEAL)
+    for pose in tool_poses(FREE, 20, 7):
+        record = compensator.correct(pose)
+        np.testing.assert_allclose(record.command, record.nominal, atol=1e-15)
+        np.testing.assert_allclose(record.predicted_error, 0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("geometry", [FREE, OFFSET], ids=["paper", "tool and work"])
+def test_the_predicted_error_is_right_to_first_order(geometry: HexapodGeometry) -> None:
+    """Against the exact forward run under nominal lengths: the difference falls by four when errors halve."""
+    rng = np.random.default_rng(8)
+    deviations, offsets = rng.uniform(-1.0, 1.0, (2, 6, 3)), rng.uniform(-1.0, 1.0, 6)
+    whole = random_field(np.random.default_rng(9), size=0.2)
+
+    def difference(size: float) -> tuple[float, float]:
+        lines = tuple(size * family for family in whole.lines)
+        model = MachineModel(
+            geometry.name,
+            base_deviation=size * deviations[0],
+            platform_deviation=size * deviations[1],
+            struts=StrutErrors(offset=size * offsets),
+            field=GridField(UNEVEN_GRID, lines),  # type: ignore[arg-type]
+        )
+        compensator = Compensator(geometry, model)
+        record = compensator.correct(tool_poses(geometry, 1, 10)[0])
+        taken = compensator.machine.nominal_error(record.platform_pose, record.sense) @ geometry.tool
+        wanted = record.platform_pose @ geometry.tool
+        turn = Rotation.from_matrix(taken.rotation @ wanted.rotation.T).as_rotvec()
+        exact = np.concatenate([taken.position - wanted.position, turn])
+        return float(np.abs(record.predicted_error - exact).max()), float(np.abs(exact).max())
+
+    full, error = difference(1e-3)
+    half, _ = difference(5e-4)
+    assert error > 5e-4  # a large error on purpose, so that its square stands clear of rounding
+    assert 3.6 < full / half < 4.4
+    assert full < 0.05 * error
+
+
+def test_the_first_command_takes_the_mean_of_both_directions() -> None:
+    """Backlash alone: told L, a strut is L − s·b/2 long, so it must be told L + s·b/2; s is 0 at first."""
+    backlash = np.linspace(10e-6, 60e-6, 6)
+    compensator = Compensator(FREE, MachineModel("paper", struts=StrutErrors(backlash=backlash)))
+    first = compensator.correct(FREE.home)
+    np.testing.assert_array_equal(first.sense, 0.0)
+    np.testing.assert_allclose(first.correction, 0.0, atol=1e-16)
+    for z, sign in ((1e-3, 1.0), (2e-3, 1.0), (1e-3, -1.0), (0.0, -1.0), (1e-3, 1.0)):
+        record = compensator.correct(shifted(FREE.home, 0.0, 0.0, z))
+        np.testing.assert_array_equal(record.sense[[2, 3, 4, 5, 6, 7, 8]], sign)
+        np.testing.assert_allclose(record.correction, sign * backlash / 2.0, atol=1e-15)
+
+
+def test_temperatures_in_closed_form() -> None:
+    """Struts told c are (1 + a·ΔT)·c long; joints move away from their body's origin by a·ΔT of their distance."""
+    expansion = np.linspace(5e-6, 20e-6, 6)
+    struts = StrutErrors(expansion=expansion)
+    model = MachineModel("paper", struts=struts, base_expansion=11e-6, platform_expansion=23e-6)
+    compensator = Compensator(FREE, model)
+    readings = {"strut_1": 25.0, "strut_3": 12.0, "base": 22.0, "platform": 31.0}
+    for name, value in readings.items():
+        compensator.set_temperature(name, value)
+    pose = tool_poses(FREE, 1, 11)[0]
+    record = compensator.correct(pose)
+    assert record.temperatures == readings
+    joints = pose.position + (1.0 + 23e-6 * 11.0) * FREE.platform_joints @ pose.rotation.T
+    lengths = np.linalg.norm(joints - (1.0 + 11e-6 * 2.0) * FREE.base_joints, axis=1)
+    warmer = np.array([5.0, 0.0, -8.0, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(record.command, lengths / (1.0 + expansion * warmer), atol=1e-15)
+
+
+# What is outside.
+
+
+def boxed(outside: str) -> MachineModel:
+    field = random_field(np.random.default_rng(12), outside=outside)
+    return MachineModel("paper", field=field, valid_box=np.array([[-0.1, -0.1, 0.35], [0.1, 0.1, 0.5]]))
+
+
+def test_outside_the_field_is_held_and_said_or_refused() -> None:
+    low, high = (np.array([axis[k] for axis in UNEVEN_GRID]) for k in (0, -1))
+    beyond = Pose([0.0, 0.0, high[2] + 0.02], np.eye(3))
+    record = Compensator(FREE, boxed("hold")).correct(beyond)
+    assert record.outside_field
+    assert not Compensator(FREE, boxed("hold")).correct(Pose((low + high) / 2.0, np.eye(3))).outside_field
+    refusing = Compensator(FREE, boxed("refuse"))
+    with pytest.raises(OutsideFieldError, match=r"\(0\.000, 0\.000, 570\.000\) mm is outside"):
+        refusing.correct(beyond)
+
+
+def test_outside_the_measured_box_is_said() -> None:
+    compensator = Compensator(FREE, boxed("hold"))
+    assert not compensator.correct(FREE.home).outside_box
+    assert compensator.correct(shifted(FREE.home, 0.11, 0.0, 0.0)).outside_box
+
+
+def test_another_machines_model_is_refused() -> None:
+    with pytest.raises(ModelError, match="is for machine 'other'"):
+        Compensator(FREE, MachineModel("other"))
+    compensator = Compensator(FREE, IDEAL)
+    with pytest.raises(ModelError, match="is for machine 'other'"):
+        compensator.set_model(MachineModel("other"))
+    assert compensator.model is IDEAL
+    assert not compensator.ramping
+
+
+@pytest.mark.parametrize(("name", "value"), [("strut_7", 20.0), ("base", np.nan), ("strut_1", 500.0)])
+def test_readings_that_are_none_are_refused(name: str, value: float) -> None:
+    compensator = Compensator(FREE, IDEAL)
+    with pytest.raises(ModelError):
+        compensator.set_temperature(name, value)
+    assert compensator.temperatures.values == {}
+
+
+# A refusal leaves no trace.
+
+
+def standing(limits: Limits = PAPER.limits, outside: str = "hold") -> Compensator:
+    """Return a compensator in motion, with a model of everything and a ramp under way."""
+    rng = np.random.default_rng(13)
+    model = replace(
+        random_model(rng, "paper"),
+        struts=replace(random_struts(rng), offset=rng.uniform(-1e-4, 1e-4, 6), pitch=np.zeros(6)),
+        field=random_field(rng, outside=outside),
+    )
+    compensator = Compensator(replace(PAPER, limits=limits), model, RAMP)
+    for n in range(5):
+        compensator.correct(shifted(PAPER.home, 0.0, 2e-4 * n, -1e-4 * n), n / RATE)
+    compensator.enable(False)
+    compensator.correct(shifted(PAPER.home, 0.0, 1e-3, -5e-4), 5.0 / RATE)
+    return compensator
+
+
+LARGE_STEPS = replace(PAPER.limits, step=1.0)
+STANDING_STILL = (0.0, 0.0, 0.4, 0.0, 0.0, 0.0)
+
+REFUSED: dict[str, tuple[Limits, Pose | tuple[float, ...]]] = {
+    "stroke": (LARGE_STEPS, Pose([0.0, 0.0, 0.9], np.eye(3))),
+    "base_cone": (replace(LARGE_STEPS, base_cone=np.full(6, 0.1)), Pose([0.1, 0.0, 0.4], np.eye(3))),
+    "platform_cone": (
+        replace(LARGE_STEPS, platform_cone=np.full(6, 0.2)),
+        Pose.from_angles([0.0, 0.0, 0.4], [0.3, 0.0, 0.0]),
+    ),
+    "condition": (replace(LARGE_STEPS, condition=1.3), Pose([0.0, 0.0, 0.65], np.eye(3))),
+    "step": (PAPER.limits, shifted(PAPER.home, 0.0, 0.0, 0.01)),
+    "not_finite": (PAPER.limits, (*STANDING_STILL, np.nan)),
+    "quaternion": (PAPER.limits, (*STANDING_STILL, 1.01)),
+}
+
+
+def assert_no_trace(make: Callable[[], Compensator], refuse: Callable[[Compensator], None]) -> None:
+    """Compare with a twin that never saw the refused command, over the ramp that follows."""
+    tried, twin = make(), make()
+    refuse(tried)
+    np.testing.assert_array_equal(tried.command, twin.command)
+    np.testing.assert_array_equal(tried.predicted_error(), twin.predicted_error())
+    for n in range(6, 40):
+        pose = shifted(PAPER.home, 1e-4 * (n - 6), 1e-3, -5e-4)
+        assert_same_records(tried.correct(pose, n / RATE), twin.correct(pose, n / RATE))
+
+
+@pytest.mark.parametrize("reason", REFUSED)
+def test_a_refused_command_leaves_no_trace(reason: str) -> None:
+    limits, pose = REFUSED[reason]
+
+    def refuse(compensator: Compensator) -> None:
+        for _ in range(3):
+            with pytest.raises(HexapodError) as caught:
+                compensator.step(numbers_of(pose) if isinstance(pose, Pose) else pose, 5.5 / RATE)
+            assert caught.value.reason == reason
+
+    assert_no_trace(lambda: standing(limits), refuse)
+
+
+def test_a_command_outside_the_field_leaves_no_trace() -> None:
+    def refuse(compensator: Compensator) -> None:
+        with pytest.raises(OutsideFieldError):
+            compensator.correct(Pose([0.0, 0.0, 0.6], np.eye(3)), 5.5 / RATE)
+
+    assert_no_trace(lambda: standing(LARGE_STEPS, "refuse"), refuse)
+
+
+def test_too_large_a_correction_leaves_no_trace() -> None:
+    """A model that corrects more than is allowed is refused when its ramp gets there, and every time again."""
+    bad = MachineModel("paper", struts=StrutErrors(offset=np.full(6, -2.5e-3)))
+    compensator = Compensator(PAPER, bad, RAMP)
+    for _ in range(3):
+        with pytest.raises(LimitError, match=r"correction 2500\.000 µm is larger than ±2000 µm") as caught:
+            compensator.correct(PAPER.home)
+        assert caught.value.reason == "correction"
+    assert np.isnan(compensator.command).all()
+    compensator.set_model(IDEAL)
+    compensator.correct(PAPER.home)
+
+
+@pytest.mark.parametrize("index", range(7))
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e200])
+def test_no_number_of_a_pose_may_be_absurd(index: int, value: float) -> None:
+    compensator = standing()
+    before = compensator.command.copy()
+    numbers = [*STANDING_STILL, 1.0]
+    numbers[index] = value
+    with pytest.raises(HexapodError):
+        compensator.step(tuple(numbers), 6.0 / RATE)
+    np.testing.assert_array_equal(compensator.command, before)
+
+
+# The first command after a reset.
+
+
+def test_the_first_command_is_at_most_a_step_from_the_measured_struts() -> None:
+    lengths = nominal_lengths(PAPER, PAPER.home)
+    compensator = Compensator(PAPER, IDEAL)
+    compensator.reset(lengths + 2.001e-3)
+    with pytest.raises(LimitError, match=r"compensated length would change by -2\.0010 mm") as caught:
+        compensator.correct(PAPER.home)
+    assert (caught.value.reason, caught.value.stage) == ("step", "compensated")
+    compensator.reset(lengths + 1.999e-3)
+    compensator.correct(PAPER.home)
+    compensator.reset()
+    compensator.correct(shifted(PAPER.home, 0.0, 0.0, 0.1))  # nothing known, nothing to compare with
+
+
+@pytest.mark.parametrize("measured", [np.full(6, np.nan), np.zeros(5), np.full(6, np.inf)], ids=["NaN", "five", "∞"])
+def test_measured_lengths_that_are_none_are_refused(measured: np.ndarray) -> None:
+    compensator = Compensator(PAPER, IDEAL)
+    compensator.correct(PAPER.home)
+    before = compensator.command.copy()
+    with pytest.raises(NotFiniteError, match="six finite numbers"):
+        compensator.reset(measured)
+    np.testing.assert_array_equal(compensator.command, before)
+
+
+def test_after_a_reset_the_correction_ramps_to_that_of_a_fresh_start() -> None:
+    """Truth: a compensator that never knew anything else, once the ramp is through; before it, no step."""
+    compensator = standing()
+    assert compensator.ramping
+    compensator.reset()
+    compensator.enable(True)
+    stands_at = compensator.correction.copy()
+    first = compensator.correct(PAPER.home, 99.0)
+    np.testing.assert_allclose(first.correction, stands_at, atol=1e-15)
+    for n in range(200):
+        record = compensator.correct(PAPER.home, 99.0 + 0.02 * (n + 1))
+    fresh = Compensator(PAPER, compensator.model, RAMP).correct(PAPER.home, 99.0)
+    assert_same_records(record, fresh)
+
+
+@pytest.mark.parametrize("backlash", [0.0, 20e-6], ids=["none", "backlash"])
+def test_a_restarted_compensator_starts_from_the_measured_struts(backlash: float) -> None:
+    """Its first command is what was measured, the way from there no faster than the ramp, its end a fresh start's.
+
+    At rest, after a motion that has left every strut at the forward side of its backlash.
+    """
+    model = MachineModel("paper", struts=StrutErrors(offset=np.full(6, 70e-6), backlash=np.full(6, backlash)))
+    before = Compensator(PAPER, model, RAMP)
+    for n in range(10):
+        measured = before.correct(shifted(PAPER.home, 0.0, 0.0, 1e-4 * n), n / RATE).command + 0.3e-6
+    pose = shifted(PAPER.home, 0.0, 0.0, 9e-4)
+    again = Compensator(PAPER, model, RAMP)
+    again.reset(measured)
+    sent = [again.correct(pose, 7.0 + n / RATE).command for n in range(500)]
+    np.testing.assert_allclose(sent[0], measured, rtol=0.0, atol=1e-15)
+    assert (np.abs(np.diff(sent, axis=0)) <= RAMP / RATE + 1e-15).all()
+    assert not again.ramping
+    np.testing.assert_allclose(sent[-1], Compensator(PAPER, model).correct(pose).command, rtol=0.0, atol=1e-15)
+
+
+def test_a_refused_first_command_leaves_the_start_from_the_measured_struts() -> None:
+    """Struts on their commands, an impossible command, then a good one: that starts from the struts all the same."""
+    compensator = standing()
+    measured = compensator.command + 5e-6
+    compensator.reset(measured)
+    state = compensator.snapshot()
+    for bad in (shifted(PAPER.home, 0.0, 0.0, 0.05), shifted(PAPER.home, 0.0, 0.0, 5.0)):
+        with pytest.raises(LimitError):
+            compensator.correct(bad, 1.0)
+    assert repr(compensator.snapshot()) == repr(state), "NaN differs from itself"
+    np.testing.assert_allclose(compensator.correct(PAPER.home, 1.0).command, measured, rtol=0.0, atol=1e-15)
+
+
+# Changes ramp.
+
+
+def changed_model(compensator: Compensator) -> None:
+    compensator.set_model(replace(compensator.model, base_deviation=np.full((6, 3), 80e-6)))
+
+
+CHANGES = {
+    "disable": lambda c: c.enable(False),
+    "model": changed_model,
+    "warmer": lambda c: c.set_temperature("base", 45.0),
+    "colder": lambda c: c.set_temperature("base", 5.0),
+}
+"""The new model and the cold base make the model's struts shorter at once while they really lengthen: a
+jump that must not pass for a reversal."""
+changes = pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
+
+
+def running(seed: int = 14) -> Compensator:
+    compensator = Compensator(FREE, model_of(FREE, seed), RAMP)
+    compensator.correct(shifted(FREE.home, 0.0, 0.0, -1e-3), -1.0)
+    compensator.correct(FREE.home, 0.0)
+    return compensator
+
+
+@changes
+def test_a_change_at_rest_ramps_at_its_rate_and_arrives(change: Callable[[Compensator], None]) -> None:
+    """No command moves a strut by more than rate · time; the largest change takes just as long as that says."""
+    compensator = running()
+    start = compensator.command.copy()
+    change(compensator)
+    assert compensator.ramping
+    commands = [start]
+    for n in range(1, 2000):
+        record = compensator.correct(FREE.home, n / RATE)
+        commands.append(record.command)
+        if not record.ramping:
+            break
+    moved = np.abs(np.diff(commands, axis=0))
+    assert moved.max() <= RAMP / RATE * (1.0 + 1e-9)
+    largest = np.abs(commands[-1] - start).max()
+    assert largest > 20e-6
+    assert len(moved) == pytest.approx(largest / (RAMP / RATE), abs=1.5)
+    settled = compensator.correct(FREE.home, n / RATE + 1.0)
+    np.testing.assert_array_equal(settled.command, commands[-1])
+    expected = settled.nominal
+    if compensator.enabled:
+        motion_free = compensator.machine.pose_for(settled.command, settled.sense, FREE.home)[0]
+        np.testing.assert_allclose(motion_free.position, FREE.home.position, atol=1e-13)
+    else:
+        np.testing.assert_allclose(settled.command, expected, atol=1e-16)
+
+
+@changes
+def test_a_change_in_motion_adds_no_step(change: Callable[[Compensator], None]) -> None:
+    """While the pose moves, a command moves by no more than pose and ramp together ask for.
+
+    The pose's own part is what a compensator without the change does, ± 1 % for the slope of the models'
+    corrections (their pitch errors are below 0.1 %, their fields below that).
+    """
+    compensator, undisturbed = running(), running()
+    last, plain_last = compensator.command.copy(), undisturbed.command.copy()
+    for n in range(1, 1200):
+        pose = shifted(FREE.home, 2e-5 * n, 1e-5 * n, 3e-5 * n)
+        if n == 5:
+            change(compensator)
+        plain = undisturbed.correct(pose, n / RATE).command
+        command = compensator.correct(pose, n / RATE).command
+        pose_part = np.abs(plain - plain_last).max()
+        assert np.abs(command - last).max() <= 1.01 * pose_part + RAMP / RATE
+        last, plain_last = command, plain
+    assert not compensator.ramping
+
+
+def test_switching_off_and_on_again_within_a_ramp_never_steps() -> None:
+    compensator = running()
+    rng = np.random.default_rng(15)
+    last = compensator.command.copy()
+    for n in range(1, 400):
+        if rng.uniform() < 0.05:
+            compensator.enable(not compensator.enabled)
+        if rng.uniform() < 0.05:
+            compensator.set_temperature("platform", float(rng.uniform(15.0, 25.0)))
+        command = compensator.correct(FREE.home, n / RATE).command
+        assert np.abs(command - last).max() <= RAMP / RATE * (1.0 + 1e-9)
+        last = command.copy()
+
+
+@pytest.mark.parametrize("late", [100.0, -5.0], ids=["a long pause", "the clock runs backwards"])
+def test_a_late_command_does_not_step(late: float) -> None:
+    compensator = running()
+    last = compensator.command.copy()
+    compensator.enable(False)
+    command = compensator.correct(FREE.home, late).command
+    assert np.abs(command - last).max() <= RAMP * LONGEST_RAMP_STEP * (1.0 + 1e-9)
+
+
+def test_a_change_before_the_first_command_needs_no_ramp() -> None:
+    compensator = Compensator(FREE, model_of(FREE, 16), RAMP)
+    compensator.enable(False)
+    record = compensator.correct(FREE.home)
+    assert not record.ramping
+    np.testing.assert_array_equal(record.command, record.nominal)

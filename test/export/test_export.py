@@ -1,0 +1,479 @@
+"""Exports: LinuxCNC's own numbers, closed forms, read back against the model, and what files are refused."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from strategies import PAPER_FILE, paper_geometry, random_model, skewed_geometry
+
+from hexapod_comp.cli import export
+from hexapod_comp.errors import GeometryError, HexapodError, InputFileError, LimitError, ModelError, OutsideFieldError
+from hexapod_comp.export.linuxcnc import Genhexkins, make_genhexkins, table_misfit
+from hexapod_comp.export.linuxcnc_files import COMP_FILES, HAL_FILE, INI_FILE, read_genhexkins, write_genhexkins
+from hexapod_comp.export.table import (
+    COLUMNS,
+    GridTable,
+    commands_by_poses,
+    commands_by_struts,
+    make_table,
+    read_table,
+    write_table,
+)
+from hexapod_comp.export.worth import ExportTrial, Travel, draw_travel
+from hexapod_comp.machine.field import GridField, no_field
+from hexapod_comp.machine.geometry import HexapodGeometry
+from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.machine.motion import MotionState
+from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.machine.travel import commanded_box, nominal_commands
+from hexapod_comp.pose import Pose
+
+MACHINE_FILE = PAPER_FILE.with_name("paper_machine.yaml")
+PAPER_BOX = np.array([[-0.2032, -0.2032, 0.350], [0.2032, 0.2032, 0.5532]])
+SMALL_BOX = np.array([[-0.04, -0.06, 0.38], [0.06, 0.03, 0.46]])
+
+LINUXCNC = (
+    (
+        (-10.6, 19.0, 407.3, 4.6, 5.9, -1.7),
+        (537.934488419, 480.957401283, 518.589834097, 522.207111764, 534.034280197, 502.626817841),
+        (0.01206551, 0.01992898, 0.02577668, 0.01849114, -0.00004507, 0.03951313),
+        (0.02322415, -0.01744676, -0.00972082, -0.00499009, 0.01004514, -0.03046647),
+    ),
+    (
+        (-23.4, -44.5, 442.0, -1.2, -3.9, 1.5),
+        (577.550392426, 533.282392607, 555.514623917, 490.145566998, 557.688759474, 560.246170118),
+        (-0.01000000, 0.01250364, -0.01766425, 0.03753735, -0.03116939, -0.03971348),
+        (0.06000000, 0.01356625, 0.04458034, -0.02753744, 0.04116945, 0.04155772),
+    ),
+)
+"""LinuxCNC 2.9.0~pre1 (Debian 12), its genhexkins and motmod, given the files of ``cardanic_machine`` with the
+tables of ``hand_made_table``: XYZ (mm) and ABC (degrees) reached in G-code, joint.N.pos-cmd (mm), and
+motor-pos-cmd − motor-offset − pos-cmd (mm), come to along +X+Y+Z and along −X−Y−Z."""
+
+
+def cardanic_machine(lead: float = 0.008) -> HexapodGeometry:
+    """Return a general 6-6 machine whose cardan axes are parallel at home on all struts."""
+    geometry = skewed_geometry(lead)
+    assert geometry.base_axes is not None
+    return replace(geometry, platform_axes=geometry.base_axes @ geometry.home.rotation)
+
+
+def hand_made_table(i: int) -> list[str]:
+    """Return the table of strut `i` that LinuxCNC was given, mm."""
+    n = i + 1
+    return [
+        f"{400 + 2 * i} 0.0{n} -0.02",
+        f"{450 + i} -0.03 0.0{n}",
+        f"{500 - i} 0.05 -0.04",
+        f"{560 + 3 * i} -0.0{n} 0.06",
+    ]
+
+
+def paper_machine() -> MachineModel:
+    return load_model(MACHINE_FILE, paper_geometry())
+
+
+def written(
+    folder: Path, geometry: HexapodGeometry, model: MachineModel, box: np.ndarray, unit: str = "mm"
+) -> tuple[Genhexkins, Genhexkins]:
+    """Write an export; return what was told and what is read back."""
+    machine = RealMachine(geometry, model)
+    told = make_genhexkins(machine, box)
+    write_genhexkins(told, folder, unit, ["a test"], table_misfit(machine, told, box))
+    return told, read_genhexkins(folder, unit)
+
+
+def edited(path: Path, change: Callable[[str], str]) -> None:
+    """Change a file, and make sure that the change was one."""
+    before = path.read_text()
+    path.write_text(change(before))
+    assert path.read_text() != before
+
+
+# LinuxCNC
+
+
+def test_reader_agrees_with_linuxcnc(tmp_path: Path) -> None:
+    """Truth: LinuxCNC itself. Its joints were noted to 1e-9 mm.
+
+    A joint at rest keeps the correction of the last cycle in which it moved, here some 1e-5 mm away on a
+    slope of 1e-3, and corrections are floats: 1e-7 mm.
+    """
+    written(tmp_path, cardanic_machine(), MachineModel("skewed"), SMALL_BOX)
+    for i, name in enumerate(COMP_FILES):
+        table = "\n".join(hand_made_table(i))
+        edited(tmp_path / name, lambda text, table=table: table + "\n" + text[text.index("# set") :])
+    told = read_genhexkins(tmp_path, "mm")
+    for pose, joints, *corrections in LINUXCNC:
+        rotation = Rotation.from_euler("xyz", pose[3:], degrees=True).as_matrix()  # roll, pitch, yaw: Rz·Ry·Rx
+        position = np.array(pose[:3]) * 1e-3
+        found = told.joints(position[None], rotation[None])[0]
+        np.testing.assert_allclose(found * 1e3, joints, atol=1e-9, rtol=0.0)
+        for sign, noted in zip((1.0, -1.0), corrections, strict=True):
+            travel = Travel(position[None], rotation[None], np.full((1, 3), sign))
+            np.testing.assert_allclose((told.commands(travel)[0] - found) * 1e3, noted, atol=1e-7, rtol=0.0)
+
+
+@pytest.mark.parametrize("turned", [1.0, -1.0])
+def test_screw_rotation_goes_through_genhexkins(tmp_path: Path, turned: float) -> None:
+    """Truth: the model, with axis vectors either way. Left: nothing but the length map's curvature.
+
+    Its five knots ask for a bend of ≤ 0.06 per m, which a broken line of 0.5 mm steps leaves 2 nm of; the tool
+    moves by a few times that.
+    """
+    geometry = cardanic_machine()
+    assert geometry.platform_axes is not None
+    geometry = replace(geometry, platform_axes=turned * geometry.platform_axes)
+    model = random_model(np.random.default_rng(4), "skewed")
+    struts = replace(model.struts, cosine=np.zeros(6), sine=np.zeros(6))
+    model = replace(model, field=no_field(), struts=struts)
+    _, back = written(tmp_path, geometry, model, SMALL_BOX)
+    check = ExportTrial(geometry, model, SMALL_BOX, 100).check(back.commands)
+    assert check.level.before.rms > 0.5e-3
+    assert check.level.after.largest < 20e-9
+    assert check.tilted is not None
+    assert check.tilted.after.largest < 0.5e-6  # struts longer than a level tool needs: coarse points
+
+
+def test_export_follows_work_and_tool_frames(tmp_path: Path) -> None:
+    """Truth: the model. Only the field's absence may be left, and there is none."""
+    geometry = replace(
+        paper_geometry(),
+        tool=Pose.from_angles([0.01, -0.02, -0.08], np.deg2rad([3.0, -2.0, 20.0])),
+        work=Pose.from_angles([0.03, 0.02, 0.35], np.deg2rad([0.5, 1.0, -30.0])),
+    )
+    struts = StrutErrors(offset=np.linspace(-1e-4, 1e-4, 6), backlash=np.full(6, 4e-6))
+    model = MachineModel("paper", base_deviation=np.full((6, 3), 5e-5), struts=struts)
+    box = np.array([[-0.05, -0.05, -0.08], [0.05, 0.05, 0.02]])
+    _, back = written(tmp_path, geometry, model, box)
+    check = ExportTrial(geometry, model, box, 100).check(back.commands)
+    assert check.level.before.rms > 40e-6
+    assert check.level.after.largest < 1e-9  # ten digits of a float32 correction of 0.1 mm
+
+
+def test_table_of_offset_pitch_and_backlash_is_exact(tmp_path: Path) -> None:
+    """Truth: L = c + o + p(c − c₀) ∓ b/2 solved for c by hand; a straight line, so no misfit but float32's."""
+    o, p, c0, b = 120e-6, 80e-6, 0.5, 6e-6
+    struts = StrutErrors(
+        offset=np.full(6, o), pitch=np.full(6, p), reference_length=np.full(6, c0), backlash=np.full(6, b)
+    )
+    _, back = written(tmp_path, paper_geometry(), MachineModel("paper", struts=struts), PAPER_BOX)
+    lengths = np.random.default_rng(1).uniform(0.33, 0.88, 500)
+    for up, half in ((True, 0.5 * b), (False, -0.5 * b)):
+        wanted = (lengths - o + p * c0 + half) / (1.0 + p) - lengths
+        for table in back.tables:
+            np.testing.assert_allclose(table.correction(lengths, np.full(500, up)), wanted, atol=2e-11, rtol=0.0)
+
+
+def test_waves_are_followed_as_well_as_256_points_can() -> None:
+    """Truth: a straight line through points h apart leaves at most h²/8·A·k² of a wave A of wavenumber k."""
+    geometry, model = paper_geometry(), paper_machine()
+    machine = RealMachine(geometry, model)
+    told = make_genhexkins(machine, PAPER_BOX)
+    for i, (rms, largest) in enumerate(table_misfit(machine, told, PAPER_BOX)):
+        nominal = told.tables[i].nominal
+        assert len(nominal) == 256
+        assert (nominal[0], nominal[-1]) == pytest.approx((0.33, 0.88), abs=1e-12)
+        bound = np.median(np.diff(nominal)) ** 2 / 8.0 * 4e-6 * (2.0 * math.pi / 0.01) ** 2
+        assert largest < bound
+        assert rms < 0.5 * bound
+
+
+def test_paper_machine_keeps_its_field_only(tmp_path: Path) -> None:
+    """Truth: the model. What is left is the field (1.4 µm) and the tables' 0.2 µm a strut."""
+    geometry, model = paper_geometry(), paper_machine()
+    _, back = written(tmp_path, geometry, model, PAPER_BOX)
+    check = ExportTrial(geometry, model, PAPER_BOX, 300).check(back.commands)
+    assert check.level.after.rms < 0.015 * check.level.before.rms
+    assert check.level.after.rms == pytest.approx(check.field.rms, rel=0.1)
+    without = replace(model, field=no_field())
+    assert ExportTrial(geometry, without, PAPER_BOX, 300).check(back.commands).level.after.rms < 0.5e-6
+
+
+def test_tilt_out_of_reach_is_not_driven() -> None:
+    geometry = paper_geometry()
+    trial = ExportTrial(geometry, paper_machine(), PAPER_BOX, 20, tilt=1.5)
+    check = trial.check(lambda travel: nominal_commands(geometry, travel.passes(geometry)))
+    assert check.tilted is None
+    assert check.level.after == check.level.before
+
+
+def test_inches_and_millimetres_say_the_same(tmp_path: Path) -> None:
+    """Numbers have 12 digits after the point (trims, joints) or 9 (nominal): below a tenth of a nanometre."""
+    geometry, model = paper_geometry(), paper_machine()
+    travel = draw_travel(PAPER_BOX, 50, 3)
+    for unit in ("mm", "inch"):
+        told, back = written(tmp_path / unit, geometry, model, PAPER_BOX, unit)
+        np.testing.assert_allclose(back.commands(travel), told.commands(travel), atol=1e-10, rtol=0.0)
+
+
+def test_files_are_what_linuxcnc_reads(tmp_path: Path) -> None:
+    """Pin names are those in genhexkins.so; a comment before the points would end a table unread."""
+    model = replace(paper_machine(), name="evil\nsetp motion.feed-hold 1")
+    machine = RealMachine(paper_geometry(), model)
+    told = make_genhexkins(machine, PAPER_BOX)
+    write_genhexkins(told, tmp_path, "mm", [model.name], table_misfit(machine, told, PAPER_BOX))
+    pins = [line.split()[1] for line in (tmp_path / HAL_FILE).read_text().splitlines() if line.startswith("setp")]
+    joints = {f"genhexkins.{body}.{n}.{x}" for body in ("base", "platform") for n in range(6) for x in "xyz"}
+    assert sorted(pins) == sorted([*joints, "genhexkins.screw-lead"])
+    for name in COMP_FILES:
+        rows = (tmp_path / name).read_text().splitlines()
+        points = [list(map(float, row.split())) for row in rows if not row.startswith("#")]
+        assert len(points) <= 256
+        assert rows[len(points)].startswith("#")  # points first, comments after them
+        assert all(len(point) == 3 for point in points)
+        assert max(map(len, rows)) < 255
+    ini = (tmp_path / INI_FILE).read_text()
+    assert re.findall(r"^COMP_FILE = (.*)$", ini, re.MULTILINE) == list(COMP_FILES)
+
+
+@pytest.mark.parametrize(
+    ("file", "pattern", "replacement", "message"),
+    [
+        (HAL_FILE, r"setp genhexkins.base.3.y .*\n", "", "base.3.y: is not set"),
+        (HAL_FILE, r"(setp genhexkins.base.3.y) .*", r"\1 nan", "finite number"),
+        (HAL_FILE, r"setp genhexkins.base.3.y", "setp motion.base.3.y", "is not setp of a genhexkins pin"),
+        (HAL_FILE, r"# set ....", "# set 0000", "files of two exports"),
+        (INI_FILE, r"COMP_FILE_TYPE = 1", "COMP_FILE_TYPE = 0", "must be 1"),
+        (INI_FILE, r"\[JOINT_5\]", "[JOINT_6]", "is not the lines"),
+        ("strut_2.comp", r"\A", "# a comment\n", "has no points"),
+        ("strut_2.comp", r"\A(.*\n)", r"\1\1", "must increase"),
+        ("strut_2.comp", r"\A(.*\n)", r"1 0 0\n2 0 0\n\1", "at most 256"),
+        ("strut_2.comp", r"\A\S+", "inf", "finite number"),
+    ],
+)
+def test_files_that_linuxcnc_would_misread_are_refused(
+    tmp_path: Path, file: str, pattern: str, replacement: str, message: str
+) -> None:
+    written(tmp_path, paper_geometry(), paper_machine(), PAPER_BOX)
+    edited(tmp_path / file, lambda text: re.sub(pattern, replacement, text, count=1))
+    with pytest.raises(InputFileError, match=message) as caught:
+        read_genhexkins(tmp_path, "mm")
+    assert file in str(caught.value)
+
+
+def test_what_genhexkins_cannot_have_is_refused() -> None:
+    machine = RealMachine(skewed_geometry(0.008), MachineModel("skewed"))
+    with pytest.raises(GeometryError, match=r"strut_.*right angle"):  # struts 4–6 stand at 90° at home
+        make_genhexkins(machine, SMALL_BOX)
+    uneven = replace(cardanic_machine(), screw_lead=np.array([8e-3] * 5 + [-8e-3]))
+    with pytest.raises(GeometryError, match="same for all struts"):
+        make_genhexkins(RealMachine(uneven, MachineModel("skewed")), SMALL_BOX)
+
+
+# The table
+
+
+def trilinear_table() -> tuple[GridTable, Callable[[np.ndarray], np.ndarray]]:
+    """Return a table whose values are a trilinear function of position, and that function."""
+    nodes = (np.array([-0.1, 0.0, 0.1]), np.array([-0.2, 0.1]), np.array([0.3, 0.35, 0.5]))
+
+    def function(p: np.ndarray) -> np.ndarray:
+        return 1e-4 * (1.0 + p[..., 0] - 2.0 * p[..., 1] + 3.0 * p[..., 2] + 7.0 * p.prod(axis=-1))
+
+    places = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1)
+    values = function(places)[None, ..., None] * np.array([1.0, -2.0])[:, None, None, None, None] * np.arange(1.0, 7.0)
+    return GridTable(nodes, values, np.abs(values), 10.0 * values), function
+
+
+def test_table_file_brings_trilinear_functions_back(tmp_path: Path) -> None:
+    """Truth: trilinear interpolation of a trilinear function is the function; the file keeps 1e-12 m and rad."""
+    table, function = trilinear_table()
+    write_table(table, tmp_path / "t.csv", ["a test"])
+    back = read_table(tmp_path / "t.csv")
+    positions = np.random.default_rng(2).uniform([-0.1, -0.2, 0.3], [0.1, 0.1, 0.5], (200, 3))
+    backward = np.arange(200) % 2 == 1
+    wanted = np.where(backward, -2.0, 1.0)[:, None] * function(positions)[:, None] * np.arange(1.0, 7.0)
+    np.testing.assert_allclose(back.pose_corrections(positions, backward), 10.0 * wanted, atol=2e-12, rtol=0.0)
+    senses = np.tile([1.0, -1.0, 0.0, 1.0, -1.0, 0.0], (200, 1))
+    corrections = back.strut_corrections(positions, backward, senses)
+    np.testing.assert_allclose(corrections, wanted + 0.5 * senses * np.abs(wanted), atol=2e-12, rtol=0.0)
+    with pytest.raises(ModelError, match="holds positions within"):
+        back.pose_corrections(np.array([[0.0, 0.0, 0.51]]), np.array([False]))
+
+
+def test_table_rows_may_stand_in_any_order_and_unit(tmp_path: Path) -> None:
+    table, _ = trilinear_table()
+    write_table(table, tmp_path / "t.csv", [])
+    header, *rows = (tmp_path / "t.csv").read_text().splitlines()
+    in_metres = [",".join([f"{float(c) * 1e-3:.15f}" for c in row.split(",")[:3]] + row.split(",")[3:]) for row in rows]
+    shuffled = np.random.default_rng(3).permutation(in_metres)
+    (tmp_path / "t.csv").write_text("\n".join([header.replace("_mm", "_m"), *shuffled]) + "\n")
+    np.testing.assert_allclose(read_table(tmp_path / "t.csv").struts, table.struts, atol=1e-12, rtol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda rows: rows[:-1], "has 35 rows, its grid needs 36"),
+        (lambda rows: [rows[0], *(row for row in rows if row.startswith("0.0"))], "at least two positions along x"),
+        (lambda rows: [*rows, rows[4]], "line 38: position and direction are given twice"),
+        (lambda rows: [rows[0], rows[1].replace("forward", "left"), *rows[2:]], "column direction: must be one of"),
+        (lambda rows: [rows[0].replace("dx_um", "dx"), *rows[1:]], "column dx_m or .* is missing"),
+        (lambda rows: [rows[0], rows[1].replace("forward,", "forward,nan,", 1), *rows[2:]], "columns, the header has"),
+        (lambda rows: [f"{rows[0]},colour", *(f"{row},1" for row in rows[1:])], "not a known column"),
+    ],
+)
+def test_tables_that_are_none_are_refused(
+    tmp_path: Path, change: Callable[[list[str]], list[str]], message: str
+) -> None:
+    write_table(trilinear_table()[0], tmp_path / "t.csv", [])
+    rows = (tmp_path / "t.csv").read_text().splitlines()
+    assert rows[0] == ",".join(COLUMNS)
+    (tmp_path / "t.csv").write_text("\n".join(change(rows)) + "\n")
+    with pytest.raises(InputFileError, match=message):
+        read_table(tmp_path / "t.csv")
+
+
+def test_nodes_hold_the_models_own_corrections() -> None:
+    """Truth: the model's commands at a node with every strut growing; half the backlash column is then added."""
+    geometry, model = paper_geometry(), paper_machine()
+    table, left_out = make_table(geometry, model, PAPER_BOX, 0.12)
+    assert "10 mm period" in left_out[0]
+    smooth = replace(model.struts, cosine=np.zeros(6), sine=np.zeros(6))
+    machine = RealMachine(geometry, replace(model, struts=smooth))
+    for way, sign in enumerate((1.0, -1.0)):
+        for index in ((0, 0, 0), (1, 2, 1), (4, 4, 2)):
+            target = Pose([nodes[n] for nodes, n in zip(table.nodes, index, strict=True)], np.eye(3))
+            motion = MotionState()
+            motion.sense[:] = [sign] * 3 + [1.0] * 6
+            commands, _, _ = machine.commands_for(target, motion)
+            ends = target.position + geometry.platform_joints
+            nominal = np.linalg.norm(ends - geometry.base_joints, axis=1)
+            at_node = (way, *index)
+            found = table.struts[at_node] + 0.5 * table.backlash[at_node]
+            np.testing.assert_allclose(found, commands - nominal, atol=1e-13, rtol=0.0)
+            change = table.poses[at_node]  # told to the nominal machine, it must send the same commands
+            turned = Rotation.from_rotvec(change[3:]).apply(np.array(geometry.platform_joints))
+            told = np.linalg.norm(target.position + change[:3] + turned - geometry.base_joints, axis=1)
+            np.testing.assert_allclose(told - nominal, table.struts[at_node], atol=1e-13, rtol=0.0)
+
+
+@pytest.mark.parametrize(("step", "left"), [(0.0508, 0.25e-6), (0.0254, 0.06e-6)])
+def test_table_leaves_what_its_step_leaves(tmp_path: Path, step: float, left: float) -> None:
+    """Truth: the model, without waves. A cell of half the size leaves a quarter: quadratic interpolation error."""
+    geometry, model = paper_geometry(), paper_machine()
+    model = replace(model, struts=replace(model.struts, cosine=np.zeros(6), sine=np.zeros(6)))
+    table, left_out = make_table(geometry, model, PAPER_BOX, step)
+    assert left_out == []
+    write_table(table, tmp_path / "t.csv", [])
+    back = read_table(tmp_path / "t.csv")
+    trial = ExportTrial(geometry, model, PAPER_BOX, 200)
+    by_struts = trial.check(lambda travel: commands_by_struts(back, geometry, travel))
+    assert by_struts.level.after.rms < left
+    by_poses = trial.check(lambda travel: commands_by_poses(back, geometry, travel))
+    assert by_struts.level.after.rms < by_poses.level.after.rms < left + 5e-6  # backlash, 3–5 µm, stays
+
+
+def test_what_no_table_can_hold_is_refused() -> None:
+    geometry, model = paper_geometry(), paper_machine()
+    with pytest.raises(ModelError, match="rows, allowed 200000"):
+        make_table(geometry, model, PAPER_BOX, 0.002)
+    with pytest.raises(LimitError, match=r"platform at \(.*stroke"):
+        make_table(geometry, model, np.array([[-0.2, -0.2, 0.35], [0.2, 0.2, 0.9]]), 0.1)
+    field = GridField(model.field.grid, model.field.lines, outside="refuse")
+    wide = np.array([[-0.25, -0.2, 0.35], [0.2, 0.2, 0.55]])
+    with pytest.raises(OutsideFieldError, match="outside the field's box"):
+        make_table(geometry, replace(model, field=field), wide, 0.1)
+    assert "outside the field's box" in make_table(geometry, model, wide, 0.1)[1][-1]
+    table, left_out = make_table(geometry, replace(model, field=field), model.field.box, 0.2)  # its own corners are in
+    assert len(left_out) == 1
+    assert np.isfinite(table.struts).all()
+
+
+# The verb
+
+
+def run_verb(*arguments: str) -> int:
+    parser = argparse.ArgumentParser()
+    export.add_parser(parser.add_subparsers())
+    args = parser.parse_args(["export", "--machine", str(PAPER_FILE), *arguments])
+    return int(args.run(args))
+
+
+def test_verb_writes_reads_back_and_reports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, file = tmp_path / "cnc", tmp_path / "t.csv"
+    arguments = ("--model", str(MACHINE_FILE), "--linuxcnc", str(folder), "--table", str(file), "--step-mm", "51")
+    assert run_verb(*arguments) == 0
+    text = capsys.readouterr().out
+    assert sorted(path.name for path in folder.iterdir()) == sorted([HAL_FILE, INI_FILE, *COMP_FILES])
+    found = re.search(r"LinuxCNC, level tool: ([\d.]+) → ([\d.]+) µm RMS", text)
+    assert found is not None
+    assert 140.0 < float(found[1]) < 150.0  # 145.4 µm in paper_lines_model.yaml, at other points
+    assert float(found[2]) < 2.0
+    for part in ("the error field: moves the tool by", "screw waves of 10 mm", "(the model has none)", "tilted by 5°"):
+        assert part in text
+    assert run_verb(*arguments, "--json", "--units", "inch", "--seed", "1", "--tilt-deg", "3") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert [check["export"] for check in report["checks"]] == ["LinuxCNC", "table, struts", "table, poses"]
+    assert report["checks"][0]["level"]["passes"] == 2000
+    assert report["checks"][0]["level"]["after_rms_um"] < 2.0
+
+
+def test_verb_says_what_thermal_growth_costs(tmp_path: Path) -> None:
+    """Truth: a machine whose every part grows alike only gets larger: 11 ppm of a position's distance to base."""
+    struts = StrutErrors(expansion=np.full(6, 11e-6))
+    model = MachineModel("paper", struts=struts, base_expansion=11e-6, platform_expansion=11e-6)
+    _, back = written(tmp_path, paper_geometry(), model, PAPER_BOX)
+    check = ExportTrial(paper_geometry(), model, PAPER_BOX, 200).check(back.commands)
+    far = np.linalg.norm(draw_travel(PAPER_BOX, 200, 0).positions, axis=1)
+    assert check.per_kelvin is not None
+    assert check.per_kelvin.largest == pytest.approx(11e-6 * far.max(), rel=1e-4)
+    assert check.per_kelvin.rms == pytest.approx(11e-6 * np.sqrt((far**2).mean()), rel=1e-4)
+
+
+def test_verb_tells_when_an_export_makes_it_worse(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine without errors can only lose; one read back wrongly must not pass."""
+    box = ("--box=-100,-100,350,100,100,500", "--linuxcnc", str(tmp_path / "cnc"))
+    assert run_verb(*box) == 0
+    read = read_genhexkins
+
+    def wrong(folder: str | Path, unit: str) -> Genhexkins:
+        found = read(folder, unit)
+        return replace(found, base_joints=found.base_joints + 1e-6 * np.eye(6)[:, :3])
+
+    monkeypatch.setattr("hexapod_comp.export.linuxcnc_files.read_genhexkins", wrong)
+    assert run_verb(*box) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        ((), "at least one is needed"),
+        (("--linuxcnc", "x"), "neither a valid box nor a field"),
+        (("--linuxcnc", "/nonexistent/folder/x", "--box=-9,-9,390,9,9,410"), "cannot be made"),
+        (("--table", "/nonexistent/x.csv", "--box=-9,-9,390,9,9,410"), "cannot be written"),
+        (("--linuxcnc", "x", "--box=-900,-9,390,9,9,410"), "outside the stroke"),
+    ],
+)
+def test_verb_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], error: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(HexapodError, match=error):
+        run_verb(*arguments)
+
+
+@pytest.mark.parametrize(
+    "argument", ["--box=0,0,400,9,9,399", "--step-mm=0", "--poses=999", "--units=cm", "--tilt-deg=-1"]
+)
+def test_verb_refuses_options(argument: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        run_verb("--linuxcnc", "x", argument)
+    assert argument.split("=")[0] in capsys.readouterr().err
+
+
+def test_box_comes_from_the_model_and_follows_the_frames() -> None:
+    geometry, model = paper_geometry(), paper_machine()
+    np.testing.assert_allclose(commanded_box(geometry, model), PAPER_BOX, atol=1e-12)
+    valid = replace(model, valid_box=SMALL_BOX)
+    shifted = replace(geometry, work=Pose([0.1, 0.0, 0.3], np.eye(3)), tool=Pose([0.0, 0.0, -0.05], np.eye(3)))
+    np.testing.assert_allclose(commanded_box(shifted, valid), SMALL_BOX - [0.1, 0.0, 0.35], atol=1e-12)

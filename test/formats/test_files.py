@@ -1,0 +1,276 @@
+"""Strict YAML: units in key names, and files that no sane reader should take."""
+
+from __future__ import annotations
+
+import os
+import stat
+
+import numpy as np
+import pytest
+
+from hexapod_comp.errors import InputFileError
+from hexapod_comp.formats.yaml import (
+    MAX_FILE_BYTES,
+    MOST_NEIGHBOURS,
+    UNITS,
+    Section,
+    read_text,
+    read_yaml,
+    write_text_atomically,
+)
+
+HEAD = "format: test\nversion: 1\n"
+
+
+def load(folder, text):
+    path = folder / "some.yaml"
+    path.write_text(text, encoding="utf-8")
+    return read_yaml(path, "test", 1)
+
+
+def section(**content):
+    return Section("some.yaml", "", content)
+
+
+# Whole files.
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(InputFileError, match=r"nothing\.yaml: cannot be read: No such file"):
+        read_text(tmp_path / "nothing.yaml")
+
+
+def test_folder(tmp_path):
+    with pytest.raises(InputFileError, match="cannot be read: Is a directory"):
+        read_text(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", " \n\t\n", "\ufeff"])
+def test_empty_file(tmp_path, text):
+    with pytest.raises(InputFileError, match=r"some\.yaml: is empty"):
+        load(tmp_path, text)
+
+
+def test_binary_file(tmp_path):
+    path = tmp_path / "image.yaml"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)))
+    with pytest.raises(InputFileError, match=r"image\.yaml: is not UTF-8 text \(byte 0\)"):
+        read_text(path)
+
+
+def test_zeros_are_no_yaml(tmp_path):
+    path = tmp_path / "zeros.yaml"
+    path.write_bytes(bytes(100))
+    with pytest.raises(InputFileError, match=r"zeros\.yaml: is not valid YAML"):
+        read_yaml(path, "test", 1)
+
+
+def test_huge_file(tmp_path):
+    path = tmp_path / "huge.yaml"
+    with open(path, "wb") as stream:
+        stream.truncate(MAX_FILE_BYTES + 1)  # sparse: takes no room
+    with pytest.raises(InputFileError, match=r"huge\.yaml: larger than the allowed 8 MB"):
+        read_text(path)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/zero"), reason="needs a device without an end")
+def test_endless_file():
+    with pytest.raises(InputFileError, match="larger than the allowed"):
+        read_text("/dev/zero")
+
+
+def test_byte_order_mark_and_windows_line_ends(tmp_path):
+    path = tmp_path / "windows.yaml"
+    path.write_bytes(b"\xef\xbb\xbf" + (HEAD + "name: x\n").replace("\n", "\r\n").encode())
+    assert read_yaml(path, "test", 1).text("name") == "x"
+
+
+@pytest.mark.parametrize("text", ["just a sentence", "- 1\n- 2", "42"])
+def test_no_mapping(tmp_path, text):
+    with pytest.raises(InputFileError, match="must hold keys and values"):
+        load(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a: [1, 2\nb: 3", "line 4: is not valid YAML: did not find expected"),
+        ("a: 1\na: 2", "'a' is given twice"),
+        ("a: {b: 1, b: 2}", "'b' is given twice"),
+        ("1: 2", "key 1 is not text"),
+        ("[1, 2]: 3", "is not text"),
+        ("a: !!python/object/apply:os.system ['true']", r"line 3: is not valid YAML: tag .*os\.system' is not under"),
+        ("a: !!bool maybe", r"tag 'tag:yaml\.org,2002:bool' is not understood"),
+        ("a: !!float ''", "write the plain value"),
+        ("a: 2026-13-45", "line 3: is not valid YAML: '2026-13-45' is no date"),
+        ("a: " + "1" * 5000, r"line 3: is not valid YAML: '1+… is too long for a number"),
+        ("a: &x [1]\nb: *x", r"reference \*x is not understood"),
+        ("[" * 5000, "is not valid YAML"),
+        ("a: " + "[" * 33, "nested more than 32 deep"),
+        ("a: " + "{a: " * 33, "nested more than 32 deep"),
+        ("a:\n " + "- " * 100_000 + "1", "nested more than 32 deep"),
+    ],
+)
+def test_yaml_that_is_refused(tmp_path, text, said):
+    with pytest.raises(InputFileError, match=said):
+        load(tmp_path, HEAD + text)
+
+
+def test_a_short_file_cannot_stand_for_billions_of_values(tmp_path):
+    """The "billion laughs": without a refusal, checking or even printing the value would never end."""
+    text = "a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]\n"
+    for level in range(1, 12):
+        text += f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 9)}]\n"
+    with pytest.raises(InputFileError, match="reference"):
+        load(tmp_path, HEAD + text)
+
+
+@pytest.mark.parametrize("number", ["0400", "-010", "0x10", "0b11", "1:30", "1:30.5", "1_000", "1_0.5"])
+def test_numbers_that_yaml_would_misread(tmp_path, number):
+    """Truth: the YAML 1.1 types: 0400 is octal (256), 1:30 is to base 60 (90), 1_000 is 1000."""
+    with pytest.raises(InputFileError, match=r"line 3.*not a plain decimal number"):
+        load(tmp_path, HEAD + f"a_mm: {number}")
+
+
+@pytest.mark.parametrize(
+    ("number", "value"),
+    [("0", 0), ("-0.5", -0.5), ("+400", 400), ("400.", 400), (".5", 0.5), ("1.5e-3", 0.0015), ("0.05", 0.05)],
+)
+def test_numbers_that_mean_what_they_say(tmp_path, number, value):
+    assert load(tmp_path, HEAD + f"a_m: {number}").quantity("a", "length") == value
+
+
+@pytest.mark.parametrize("number", ["1e-3", "400mm", "4,5", "1" * 400])
+def test_what_yaml_does_not_take_for_a_number(tmp_path, number):
+    """YAML 1.1 reads 1e-3 (no point) as text, and 400 digits overflow: refused by name, never guessed."""
+    with pytest.raises(InputFileError, match="a_mm: must be"):
+        load(tmp_path, HEAD + f"a_mm: {number}").quantity("a", "length")
+
+
+def test_deep_nesting_does_not_end_the_process(tmp_path):
+    """The parser builds its tree by recursion in C: four million brackets overflowed its stack (SIGSEGV)."""
+    with pytest.raises(InputFileError, match="nested more than 32 deep"):
+        load(tmp_path, HEAD + "a: " + "[" * 4_000_000)
+
+
+def test_a_missing_key_among_very_many(tmp_path):
+    """Looking for the nearest of half a million names took 17 s: only the first of them are looked through."""
+    others = "".join(f"n{number}: 1\n" for number in range(MOST_NEIGHBOURS))
+    with pytest.raises(InputFileError, match=r"format: is missing; did you mean it by 'formt'\?$"):
+        load(tmp_path, "formt: test\n" + others)
+    with pytest.raises(InputFileError, match=r"format: is missing$"):
+        load(tmp_path, others + "formt: test\n")
+
+
+def test_messages_are_one_line_without_control_codes(tmp_path):
+    with pytest.raises(InputFileError) as caught:
+        load(tmp_path, HEAD + '"a\\n\\e[2J": 1').finish()
+    assert str(caught.value).endswith(r"a\n\x1b[2J: is not a known key here (found 1)")
+
+
+# Values.
+
+
+@pytest.mark.parametrize(
+    ("dimension", "unit", "number", "si"),
+    [
+        ("length", "mm", 350, 0.35),
+        ("length", "um", 12.3, 12.3e-6),
+        ("length", "in", 8, 0.2032),
+        ("length", "m", 1.5, 1.5),
+        ("angle", "deg", 180, np.pi),
+        ("angle", "urad", 5, 5e-6),
+        ("angle", "mrad", 5, 5e-3),
+        ("ratio", "ppm", 7, 7e-6),
+        ("ratio", "percent", 2, 0.02),
+        ("expansion", "ppm_per_K", 11.7, 11.7e-6),
+        ("speed", "m_min", 15, 0.25),
+        ("time", "ms", 20, 0.02),
+    ],
+)
+def test_units(dimension, unit, number, si):
+    """Truth: the definitions of the units; exact, since 350 mm in a file must be the 0.35 of source code."""
+    assert section(**{f"a_{unit}": number}).quantity("a", dimension) == si
+
+
+def test_every_unit_ends_its_key_in_one_way():
+    """A key must not fit two units of one kind: a_m_min is not the length a_m in min."""
+    for units in UNITS.values():
+        assert all(not one.endswith(f"_{other}") for one in units for other in units)
+
+
+def test_missing_key_suggests_its_neighbour():
+    with pytest.raises(InputFileError, match=r"machine: is missing; did you mean it by 'machin'\?"):
+        section(machin="x").text("machine")
+
+
+def test_quantity_without_unit_names_the_choices():
+    said = r"a: has no unit; write one of a_m, a_mm, a_um, a_in \(found 3\)"
+    with pytest.raises(InputFileError, match=said):
+        section(a=3).quantity("a", "length")
+
+
+def test_default_is_si_and_only_for_a_missing_key():
+    assert section().quantity("a", "length", (), 0.5) == 0.5
+    with pytest.raises(InputFileError, match="a_mm: must be a number"):
+        section(a_mm=None).quantity("a", "length", (), 0.5)
+
+
+def test_per_strut_takes_one_or_six():
+    np.testing.assert_array_equal(section(a_m=2).per_strut("a", "length"), np.full(6, 2.0))
+    np.testing.assert_array_equal(section(a_m=[1, 2, 3, 4, 5, 6]).per_strut("a", "length"), np.arange(1, 7))
+    with pytest.raises(InputFileError, match="a_m: must be numbers of shape 6, not 5"):
+        section(a_m=[1, 2, 3, 4, 5]).per_strut("a", "length")
+
+
+def test_ragged_lists_are_refused():
+    with pytest.raises(InputFileError, match="a: must be numbers of shape 2×2"):
+        section(a=[[1, 2], [3]]).array("a", (2, 2))
+
+
+def test_choice():
+    assert section(a="hold").choice("a", ("hold", "refuse")) == "hold"
+    with pytest.raises(InputFileError, match=r"a: must be one of hold, refuse \(found 'held'\)"):
+        section(a="held").choice("a", ("hold", "refuse"))
+    with pytest.raises(InputFileError, match="must be one of"):
+        section(a=["hold"]).choice("a", ("hold", "refuse"))
+
+
+def test_key_paths_of_nested_lists():
+    first, second = section(lines=[{"at": 1}, {}]).sections("lines")
+    assert first.take("at") == 1
+    with pytest.raises(InputFileError, match=r"some\.yaml: lines\[1\]\.at: is missing"):
+        second.take("at")
+
+
+def test_what_nobody_asked_for_is_an_error():
+    left = section(known=1, unknwon=2)
+    left.take("known")
+    with pytest.raises(InputFileError, match=r"unknwon: is not a known key here \(found 2\)"):
+        left.finish()
+
+
+# Writing.
+
+
+def test_write_replaces_the_whole_file(tmp_path):
+    path = tmp_path / "out.yaml"
+    path.write_text("old and longer")
+    write_text_atomically(path, "né\n")
+    assert path.read_bytes() == "né\n".encode()
+    assert stat.S_IMODE(path.stat().st_mode) == 0o644
+    assert os.listdir(tmp_path) == ["out.yaml"]
+
+
+def test_write_into_nowhere(tmp_path):
+    with pytest.raises(InputFileError, match=r"no/out\.yaml: cannot be written: No such file"):
+        write_text_atomically(tmp_path / "no" / "out.yaml", "x")
+
+
+def test_failed_write_leaves_the_old_file_and_no_litter(tmp_path):
+    folder = tmp_path / "out.yaml"
+    folder.mkdir()
+    (folder / "content").touch()
+    with pytest.raises(InputFileError, match="cannot be written"):
+        write_text_atomically(folder, "x")
+    assert os.listdir(tmp_path) == ["out.yaml"]

@@ -1,0 +1,155 @@
+"""CSV files of poses and lengths: what comes in is what stood there, and every complaint says where."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hexapod_comp.errors import InputFileError
+from hexapod_comp.formats import csv as tables
+from hexapod_comp.formats.csv import length_values, pose_values, read_lengths, read_pose_arrays, read_poses
+from hexapod_comp.pose import Pose
+
+HEADER = "name,x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg\n"
+LENGTHS = "L1_mm,L2_mm,L3_mm,L4_mm,L5_mm,L6_mm\n"
+
+
+def written(folder: Path, text: str | bytes) -> Path:
+    path = folder / "poses.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def test_mm_and_degrees_become_m_and_rotations(tmp_path: Path) -> None:
+    """Rotation by scipy from the paper's definition R = Ry(β)·Rx(α)·Rz(γ)."""
+    rows, poses = read_poses(written(tmp_path, HEADER + "a,1,-2,400,10,20,30\n"))
+    assert (rows[0].line, rows[0].label) == (2, "a")
+    np.testing.assert_allclose(poses[0].position, [1e-3, -2e-3, 0.4], rtol=1e-15)
+    turns = [Rotation.from_euler(axis, angle, degrees=True) for axis, angle in (("y", 20), ("x", 10), ("z", 30))]
+    expected = turns[0] * turns[1] * turns[2]
+    np.testing.assert_allclose(poses[0].rotation, expected.as_matrix(), atol=1e-15)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("m", 1.0), ("mm", 1e-3), ("um", 1e-6), ("in", 0.0254)])
+def test_every_length_unit(tmp_path: Path, unit: str, factor: float) -> None:
+    rows, poses = read_poses(written(tmp_path, f"x_{unit},y_{unit},z_{unit}\n2,3,4\n"))
+    np.testing.assert_allclose(poses[0].position, np.array([2.0, 3.0, 4.0]) * factor, rtol=1e-15)
+    np.testing.assert_array_equal(poses[0].rotation, np.eye(3))
+    assert rows[0].label == "1"
+
+
+def test_quaternions(tmp_path: Path) -> None:
+    """Half a turn about z."""
+    _, poses = read_poses(written(tmp_path, "x_m,y_m,z_m,qx,qy,qz,qw\n0,0,0.4,0,0,1,0\n"))
+    np.testing.assert_allclose(poses[0].rotation, np.diag([-1.0, -1.0, 1.0]), atol=1e-15)
+
+
+def test_comments_blank_lines_spaces_bom_and_windows_line_ends(tmp_path: Path) -> None:
+    """Lines are counted as an editor counts them."""
+    text = "\ufeff# a comment\r\nx_mm, y_mm, z_mm\r\n\r\n# more\r\n1, 2, 3\r\n"
+    rows, poses = read_poses(written(tmp_path, text))
+    assert rows[0].line == 5
+    np.testing.assert_allclose(poses[0].position, [1e-3, 2e-3, 3e-3], rtol=1e-15)
+
+
+MALFORMED = {
+    "empty": ("", "has no header"),
+    "header only": (HEADER, "has a header but no rows"),
+    "no z": ("x_mm,y_mm\n1,2\n", "header: column z_m or z_mm or z_um or z_in is missing"),
+    "no unit": ("x,y_mm,z_mm\n1,2,3\n", "header: column x_m or"),
+    "two units": ("x_mm,x_in,y_mm,z_mm\n1,1,2,3\n", "header: x is given twice"),
+    "column twice": ("x_mm,x_mm,y_mm,z_mm\n1,1,2,3\n", "header: column is given twice (found 'x_mm')"),
+    "unknown column": ("x_mm,y_mm,z_mm,feed\n1,2,3,4\n", "header: is not a known column (found 'feed')"),
+    "two angles": ("x_mm,y_mm,z_mm,alpha_deg,beta_deg\n1,2,3,4,5\n", "header: column gamma_rad or"),
+    "three quaternion parts": ("x_mm,y_mm,z_mm,qx,qy,qz\n1,2,3,0,0,0\n", "header: column qw is missing"),
+    "angles and quaternion": (
+        "x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg,qx,qy,qz,qw\n1,2,3,0,0,0,0,0,0,1\n",
+        "header: give either angles or a quaternion",
+    ),
+    "text": (HEADER + "a,1,2,3,0,0,0\nb,1,two,3,0,0,0\n", "line 3, column y_mm: must be a finite number (found 'two')"),
+    "empty cell": (HEADER + "a,1,,3,0,0,0\n", "line 2, column y_mm: must be a finite number (found '')"),
+    "NaN": (HEADER + "a,1,2,nan,0,0,0\n", "line 2, column z_mm: must be a finite number"),
+    "infinite": (HEADER + "a,1,2,3,0,-inf,0\n", "line 2, column beta_deg: must be a finite number"),
+    "digits with underscore": (HEADER + "a,1_0,2,3,0,0,0\n", "line 2, column x_mm: must be a finite number"),
+    "decimal comma": (HEADER + "a,1,5,2,3,0,0,0\n", "line 2: has 8 columns, the header has 7"),
+    "short row": (HEADER + "a,1,2,3,0,0,0\n\nb,1,2\n", "line 4: has 3 columns, the header has 7"),
+    "quaternion too long": (
+        "x_mm,y_mm,z_mm,qx,qy,qz,qw\n1,2,3,0,0,0,1\n1,2,3,0,0,0,1.1\n",
+        "line 3, columns qx…qw: quaternion must have norm 1, not 1.1",
+    ),
+    "zero quaternion": ("x_mm,y_mm,z_mm,qx,qy,qz,qw\n1,2,3,0,0,0,0\n", "line 2, columns qx…qw: quaternion"),
+    "open quote": (HEADER + '"a,1,2,3\n', "line 2: has 1 columns"),
+    "not UTF-8": (HEADER.encode() + b"\xff\xfe,1,2,3,0,0,0\n", "is not UTF-8 text"),
+    "huge field": (HEADER + "a" * 200_000, "is not CSV: field larger than field limit"),
+}
+
+
+@pytest.mark.parametrize(("text", "complaint"), MALFORMED.values(), ids=MALFORMED.keys())
+def test_malformed_poses_are_refused_with_file_line_and_column(
+    tmp_path: Path, text: str | bytes, complaint: str
+) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(InputFileError) as caught:
+        read_poses(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert complaint in str(caught.value)
+
+
+def test_a_missing_file_and_a_folder_are_named(tmp_path: Path) -> None:
+    for path in (tmp_path / "nowhere.csv", tmp_path):
+        with pytest.raises(InputFileError, match="cannot be read") as caught:
+            read_poses(path)
+        assert caught.value.path == str(path)
+
+
+def test_endless_input_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "MAX_ROWS", 10)
+    path = written(tmp_path, "x_mm,y_mm,z_mm\n" + "1,2,3\n" * 11)
+    with pytest.raises(InputFileError, match="more than the allowed 10 rows"):
+        read_poses(path)
+
+
+def test_lengths(tmp_path: Path) -> None:
+    rows, lengths = read_lengths(written(tmp_path, "sequence," + LENGTHS + "7,500,501,502,503,504,505\n"))
+    assert rows[0].label == "7"
+    np.testing.assert_allclose(lengths, [np.arange(500, 506) * 1e-3], rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("L1_mm,L2_mm,L3_mm,L4_mm,L5_mm\n1,2,3,4,5\n", "header: column L6_m or"),
+        (LENGTHS + "1,2,3,x,5,6\n", "line 2, column L4_mm: must be a finite number (found 'x')"),
+        ("L1_mm,L2_mm,L3_mm,L4_mm,L5_mm,L6_in\n1,2,3,4,5,6\n", None),
+        (LENGTHS[:-1] + ",correction_L1_um\n1,2,3,4,5,6,7\n", "header: column correction_L2_m or"),
+    ],
+    ids=["five", "text", "mixed units are fine", "half of what ik adds"],
+)
+def test_malformed_lengths(tmp_path: Path, text: str, complaint: str | None) -> None:
+    path = written(tmp_path, text)
+    if complaint is None:
+        assert read_lengths(path)[1][0, 5] == pytest.approx(6 * 0.0254)
+        return
+    with pytest.raises(InputFileError) as caught:
+        read_lengths(path)
+    assert complaint in str(caught.value)
+
+
+def test_what_is_written_reads_back(tmp_path: Path) -> None:
+    """Full digits: one rounding each of mm, degrees and the trigonometry in between, 1e-15 of a metre or radian."""
+    rng = np.random.default_rng(3)
+    poses = [
+        Pose(p, Rotation.from_rotvec(w).as_matrix())
+        for p, w in zip(rng.uniform(-1, 1, (50, 3)), rng.uniform(-1, 1, (50, 3)), strict=True)
+    ]
+    lines = [",".join(pose_values(poses[0])), *(",".join(map(repr, pose_values(p).values())) for p in poses)]
+    rows, positions, rotations = read_pose_arrays(written(tmp_path, "\n".join(lines)))
+    assert [row.line for row in rows] == list(range(2, 52))
+    np.testing.assert_allclose(positions, [p.position for p in poses], atol=1e-15)
+    np.testing.assert_allclose(rotations, [p.rotation for p in poses], atol=2e-15)
+    lengths = rng.uniform(0.3, 0.9, 6)
+    text = ",".join(length_values(lengths)) + "\n" + ",".join(map(repr, length_values(lengths).values()))
+    np.testing.assert_allclose(read_lengths(written(tmp_path, text))[1][0], lengths, rtol=1e-15)

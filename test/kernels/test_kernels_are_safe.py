@@ -1,0 +1,209 @@
+"""Forward kinematics is never wrong silently: whatever it is given, its answer holds or it raises.
+
+Every answer is judged by NumPy's linear algebra on the joints, not by the kernels. Hypothesis runs
+derandomised, so that a red test is red for everybody.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from helpers import general_machine, poses_about, three_two_one_machine, twist_between
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import fixed, paper_geometry, seeds
+
+from hexapod_comp.errors import KinematicsError, NotFiniteError, OtherAssemblyModeError
+from hexapod_comp.kernels import kinematics as kernels
+from hexapod_comp.machine.geometry import HexapodGeometry
+from hexapod_comp.machine.kinematics import Structure, solve_pose, solve_poses, strut_lengths, strut_lengths_batch
+from hexapod_comp.pose import Pose
+
+MACHINES = [paper_geometry(), general_machine(), three_two_one_machine()]
+fewer = settings(fixed, max_examples=40)
+"""For those that mostly end in the slow search for the closest pose."""
+
+machines = st.sampled_from(MACHINES)
+any_float = st.floats(allow_nan=True, allow_infinity=True)
+far = st.floats(-2.0, 2.0) | st.floats(-1e6, 1e6)
+"""Coordinates of poses, m."""
+
+quaternions = st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: math.hypot(*q) > 1e-3)
+
+
+@st.composite
+def any_poses(draw) -> Pose:
+    """Give poses within 1000 km, turned anyhow."""
+    quaternion = np.array(draw(quaternions))
+    return Pose.from_quaternion(draw(st.tuples(far, far, far)), quaternion / np.linalg.norm(quaternion))
+
+
+def judge(machine: HexapodGeometry, structure: Structure, lengths: np.ndarray, pose: Pose) -> None:
+    """Fail unless a pose closes the loops, is regular and belongs to the working assembly mode.
+
+    Loops: the solver promises 1e-13 m on such machines and this sum rounds once more. Condition and sign:
+    NumPy's inverse and determinant of (u_i, R·t_i × u_i), the sign being that at home.
+    """
+    matrix, found = jacobian_by_numpy(structure, pose)
+    np.testing.assert_allclose(found, lengths, rtol=1e-15, atol=3e-13)
+    np.testing.assert_allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-13)
+    assert np.linalg.det(pose.rotation) > 0.0
+    condition = np.linalg.norm(matrix) * np.linalg.norm(np.linalg.inv(matrix)) / 6.0
+    assert condition <= machine.limits.condition * (1.0 + 1e-9)
+    at_home, _ = jacobian_by_numpy(structure, machine.home)
+    assert np.linalg.det(matrix) * np.linalg.det(at_home) > 0.0
+
+
+def jacobian_by_numpy(structure: Structure, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
+    """Return the Jacobian, its rotation part per characteristic length, and the lengths."""
+    arms = structure.platform_joints @ pose.rotation.T
+    struts = pose.position + arms - structure.base_joints
+    lengths = np.linalg.norm(struts, axis=1)
+    units = struts / lengths[:, None]
+    return np.hstack([units, np.cross(arms, units) / structure.characteristic_length]), lengths
+
+
+def solve_and_judge(machine: HexapodGeometry, lengths: np.ndarray, guess: Pose) -> Pose | None:
+    """Return the solver's answer once it is found right, None when it raised one of its errors."""
+    structure = Structure.of(machine)
+    try:
+        pose = solve_pose(structure, lengths, guess)
+    except KinematicsError:
+        return None
+    judge(machine, structure, lengths, pose)
+    return pose
+
+
+@fixed
+@given(machines, st.lists(any_float, min_size=6, max_size=6))
+def test_any_six_floats(machine: HexapodGeometry, lengths: list[float]) -> None:
+    """Also denormal, huge, negative and not numbers; what is not a length must be called that."""
+    lengths = np.array(lengths)
+    if not (np.isfinite(lengths) & (lengths > 0.0)).all():
+        with pytest.raises(NotFiniteError):
+            solve_pose(Structure.of(machine), lengths, machine.home)
+    else:
+        solve_and_judge(machine, lengths, machine.home)
+
+
+@fixed
+@given(machines, st.lists(st.floats(0.01, 2.0), min_size=6, max_size=6))
+def test_any_lengths_of_a_machine_s_size(machine: HexapodGeometry, lengths: list[float]) -> None:
+    """Mostly unreachable, which must be found out and said."""
+    solve_and_judge(machine, np.array(lengths), machine.home)
+
+
+@fixed
+@given(machines, st.lists(st.floats(-0.1, 0.1), min_size=6, max_size=6))
+def test_lengths_about_home(machine: HexapodGeometry, changes: list[float]) -> None:
+    """Near the border of what can be reached, where answers are singular."""
+    lengths = strut_lengths(Structure.of(machine), machine.home) + changes
+    solve_and_judge(machine, lengths, machine.home)
+
+
+@fewer
+@given(machines, any_poses())
+def test_any_guess(machine: HexapodGeometry, guess: Pose) -> None:
+    """Reachable lengths, but the start is anywhere in space and turned anyhow."""
+    lengths = strut_lengths(Structure.of(machine), machine.home)
+    solve_and_judge(machine, lengths, guess)
+
+
+@fixed
+@given(machines, st.lists(any_float, min_size=18, max_size=18))
+def test_anything_at_all_in_the_kernel(machine: HexapodGeometry, numbers: list[float]) -> None:
+    """No check stands before the kernel here: lengths, position and rotation are any 18 floats."""
+    structure = Structure.of(machine)
+    lengths, position, rotation = np.split(np.array(numbers), [6, 9])
+    rotation = rotation.reshape(3, 3)
+    before = position.copy(), rotation.copy()
+    outcome, _, _ = kernels.solve_pose_one(
+        structure.base_joints,
+        structure.platform_joints,
+        lengths,
+        position,
+        rotation,
+        structure.characteristic_length,
+        structure.home_sign,
+        structure.max_condition,
+    )
+    if outcome == kernels.OK:
+        judge(machine, structure, lengths, Pose(position, rotation))
+    else:
+        np.testing.assert_array_equal(position, before[0])
+        np.testing.assert_array_equal(rotation, before[1])
+
+
+@fewer
+@given(machines, any_poses())
+def test_any_target(machine: HexapodGeometry, target: Pose) -> None:
+    """The lengths of some pose, possibly a singular one or of another mode, from itself and from home."""
+    lengths = strut_lengths(Structure.of(machine), target)
+    if np.isfinite(lengths).all():
+        solve_and_judge(machine, lengths, machine.home)
+        solve_and_judge(machine, lengths, target)
+
+
+@fixed
+@given(seeds)
+def test_the_target_itself_inside_the_box_from_home(seed: int) -> None:
+    """±50 mm, ±30°: no error and no other solution, to the round trip's tolerance (1e-13 m, 1e-12 rad)."""
+    machine = MACHINES[0]
+    target = pose_in_box(machine, seed)
+    found = solve_and_judge(machine, strut_lengths(Structure.of(machine), target), machine.home)
+    assert found is not None
+    assert np.abs(twist_between(target, found)).max() <= 1e-12
+
+
+@fixed
+@given(seeds, seeds)
+def test_the_target_itself_or_an_error_between_any_two_in_the_box(first: int, second: int) -> None:
+    """From opposite corners Newton may land in another mode (once in 10⁴), and then it must say so."""
+    machine = MACHINES[0]
+    structure = Structure.of(machine)
+    target, guess = pose_in_box(machine, first), pose_in_box(machine, second)
+    try:
+        found = solve_pose(structure, strut_lengths(structure, target), guess)
+    except OtherAssemblyModeError:
+        return
+    assert np.abs(twist_between(target, found)).max() <= 1e-12
+
+
+def pose_in_box(machine: HexapodGeometry, seed: int) -> Pose:
+    positions, rotations = poses_about(machine.home, 1, seed)
+    return Pose(positions[0], rotations[0])
+
+
+def test_the_target_itself_between_100000_pairs_in_the_box() -> None:
+    """The same in the compiled batch, which hypothesis is too slow for; guesses are grouped by hundreds."""
+    machine = MACHINES[0]
+    structure = Structure.of(machine)
+    answers = 0
+    for group in range(100):
+        positions, rotations = poses_about(machine.home, 1000, seed=group)
+        lengths = strut_lengths_batch(structure, positions, rotations, threads=1)
+        found = solve_poses(structure, lengths, pose_in_box(machine, 10_000 + group), threads=1)
+        assert np.abs(found.positions - positions)[found.ok].max() <= 1e-12
+        assert np.abs(found.rotations - rotations)[found.ok].max() <= 1e-12
+        assert np.isin(found.outcomes, (kernels.OK, kernels.OTHER_ASSEMBLY)).all()
+        answers += int(found.ok.sum())
+    assert answers >= 99_900
+
+
+def test_batch_of_anything_holds_or_is_nan() -> None:
+    """20,000 sets of lengths from reachable to absurd; every row without an outcome OK is NaN throughout."""
+    rng = np.random.default_rng(20)
+    for machine in MACHINES:
+        structure = Structure.of(machine)
+        home = strut_lengths(structure, machine.home)
+        spread = 10.0 ** rng.uniform(-4.0, 1.0, (20_000, 1))
+        found = solve_poses(structure, home + spread * rng.normal(size=(20_000, 6)), machine.home, threads=1)
+        assert 0 < found.ok.sum() < len(found.ok)
+        assert np.isnan(found.positions[~found.ok]).all()
+        assert (found.conditions[found.ok] <= machine.limits.condition).all()
+        for n in np.flatnonzero(found.ok)[::200]:
+            pose = Pose(found.positions[n], found.rotations[n])
+            _, lengths = jacobian_by_numpy(structure, pose)
+            judge(machine, structure, lengths, pose)

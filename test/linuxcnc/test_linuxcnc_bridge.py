@@ -1,0 +1,578 @@
+"""The LinuxCNC bridge over real DDS, with a stand-in for LinuxCNC's ``hal`` module and a real compensator.
+
+The stand-in does what the component API of ``hal`` does: typed pins, an error for a name taken twice. What the
+real one does is tested with LinuxCNC itself. Poses are compared with SciPy's rotations, struts with a closed form of
+the paper's machine, pins with what the compensator is seen to publish.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from hal_stand_in import StandInHal
+from node_helpers import CONFIG, HOME, RELIABLE, Bench, closed_form_lengths, near
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import JointState
+
+from hexapod_comp.linuxcnc import hal as hal_component
+from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
+from hexapod_comp.linuxcnc.guard import LONGEST_STEP, GuardStatus
+from hexapod_comp.linuxcnc.hal import HalComponent, HalError, load_module, pins, quaternion_from_axes
+from hexapod_comp.machine.geometry import STRUT_NAMES
+from hexapod_comp.nodes.health import ERROR, OK, WARN
+from hexapod_comp.nodes.parameters import ParameterError
+from hexapod_comp.nodes.running import autostart
+from hexapod_comp.pose import Pose
+
+NODE = "linuxcnc_bridge"
+
+RATE = 250.0
+"""Cycles per second, Hz: a test shares one Python with the compensator and the witness."""
+
+SLOW = {"rate": RATE, "timeout": 1.0}
+"""A busy machine's test may pause for more than the 0.1 s after which a compensator counts as lost."""
+
+
+class Machine:
+    """LinuxCNC's side: where the axes are, and drives that are where they were sent."""
+
+    def __init__(self, bench: Bench, metres: float = 1e-3, **parameters: object) -> None:
+        self.bench, self.hal, self._metres = bench, StandInHal(), metres
+        self.node = bench.add(LinuxcncBridgeNode, False, {**SLOW, **parameters}, hal=self.hal)
+        # The witness does not command here: the compensator obeys no two publishers.
+        bench.witness.destroy_publisher(bench._publishers.pop("tool_pose_command"))
+        self.poses: list[PoseStamped] = []
+        bench.witness.create_subscription(PoseStamped, "tool_pose_command", self.poses.append, RELIABLE)
+        self.place(HOME)
+
+    def start(self, on: bool = True) -> Machine:
+        """Activate the bridge with LinuxCNC on and compensation enabled."""
+        assert autostart(self.node)
+        self.hal["machine-on"] = self.hal["enable"] = on
+        return self
+
+    def place(self, pose: Pose, angles: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+        """Put axes and struts to a pose; `angles` are its A, B, C."""
+        for name, value in zip("xyz", pose.position, strict=True):
+            self.hal[name] = float(value) / self._metres
+        for name, value in zip("abc", angles, strict=True):
+            self.hal[name] = value
+        for n, length in enumerate(closed_form_lengths(pose)):
+            self.hal[f"joint-fb.{n}"] = float(length) / self._metres
+
+    def until_status(self, status: GuardStatus) -> None:
+        """Wait until the pin ``status`` shows a status."""
+        self.bench.until(lambda: self.hal["status"] == status, f"status {status.name}, not {self.hal['status']}")
+
+    def until_sent(self, count: int = 1) -> PoseStamped:
+        """Wait for poses sent from now on and return the last one."""
+        seen = len(self.poses)
+        self.bench.until(lambda: len(self.poses) >= seen + count, "poses")
+        return self.poses[-1]
+
+
+@pytest.fixture
+def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
+    with Bench(ros_context, spin_until, capfd) as made:
+        yield made
+
+
+@pytest.fixture
+def speak(bench):
+    """Give a function that publishes corrections as a compensator would: stamped now unless told otherwise.
+
+    ``speak.steadily`` does so at 100 Hz at most, however often it is called.
+    """
+    publisher = bench.witness.create_publisher(JointState, "strut_corrections", RELIABLE)
+
+    def send(values: list[float], stamp: Any = None, names: tuple[str, ...] = STRUT_NAMES) -> None:
+        bench.until(publisher.get_subscription_count, "the bridge's subscription")
+        message = JointState(name=list(names), position=[float(v) for v in values], velocity=[0.0] * len(values))
+        message.header.stamp = bench.now() if stamp is None else stamp
+        publisher.publish(message)
+
+    def steadily(values: list[float]) -> None:
+        if time.monotonic() - spoken[-1] > 0.01:
+            spoken.append(time.monotonic())
+            send(values)
+
+    spoken, send.steadily = [0.0], steadily
+    return send
+
+
+def stamped(message: JointState | PoseStamped) -> float:
+    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+
+
+def assert_never_steps(hal: StandInHal, metres: float = 1e-3, ramp_rate: float = 1e-3) -> None:
+    """No two values written one after the other differ by more than the ramp allows within one cycle at most."""
+    for n in range(6):
+        steps = [abs(b - a) * metres for a, b in pairwise(hal.history(f"correction.{n}"))]
+        assert max(steps) <= ramp_rate * LONGEST_STEP + 1e-15
+        assert all(map(math.isfinite, hal.history(f"correction.{n}")))
+
+
+# ---- out to ROS ----
+
+
+@pytest.mark.parametrize(("units", "metres"), [("mm", 1e-3), ("inch", 0.0254)])
+@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (5.0, -7.0, 30.0), (-170.0, 12.0, 260.0)])
+def test_pose_is_the_axes_in_metres_and_a_quaternion(bench, units, metres, angles):
+    """R = Rz(C)·Ry(B)·Rx(A), as genhexkins turns; SciPy makes it from the three rotations. Rounding: 1e-15."""
+    machine = Machine(bench, units=units)
+    for name, value in zip("xyzabc", (10.0, -20.0, 15.0, *angles), strict=True):
+        machine.hal[name] = value
+    before = time.time()
+    message = machine.start().until_sent()
+    p, q = message.pose.position, message.pose.orientation
+    np.testing.assert_allclose([p.x, p.y, p.z], np.array([10.0, -20.0, 15.0]) * metres, rtol=1e-15)
+    rx, ry, rz = (Rotation.from_euler(axis, turn, degrees=True) for axis, turn in zip("xyz", angles, strict=True))
+    turned = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+    np.testing.assert_allclose(turned, (rz * ry * rx).as_matrix(), rtol=0.0, atol=1e-15)
+    assert message.header.frame_id == "work"
+    assert before <= stamped(message) <= time.time()
+
+
+def test_quaternions_have_norm_one():
+    """Any angles, also many turns; the compensator refuses a norm that is off by 1e-3."""
+    for angles in np.random.default_rng(5).uniform(-1e4, 1e4, (200, 3)):
+        assert np.linalg.norm(quaternion_from_axes(*angles)) == pytest.approx(1.0, abs=1e-15)
+
+
+def test_tool_length_is_taken_off(bench):
+    """genhexkins with a tool T: struts |P − T·ẑ + R·(a + T·ẑ) − b|, so the platform is at P − T·ẑ + R·T·ẑ."""
+    machine = Machine(bench)
+    for name, value in zip("xyzabc", (1.0, 2.0, 400.0, 20.0, -10.0, 5.0), strict=True):
+        machine.hal[name] = value
+    machine.hal["tool-offset"] = 50.0
+    p = machine.start().until_sent().pose.position
+    turn = Rotation.from_euler("ZYX", [5.0, -10.0, 20.0], degrees=True)
+    expected = np.array([1.0, 2.0, 350.0]) + turn.apply([0.0, 0.0, 50.0])
+    np.testing.assert_allclose([p.x, p.y, p.z], expected * 1e-3, rtol=0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize(("units", "metres"), [("mm", 1e-3), ("inch", 0.0254)])
+def test_measured_struts_are_named_and_in_metres(bench, units, metres):
+    Machine(bench, metres, units=units).start()
+    bench.until(lambda: len(bench.seen["strut_states"]) > 2, "strut_states")
+    states = bench.seen["strut_states"][-1]
+    assert states.name == [f"strut_{n}" for n in range(1, 7)]
+    np.testing.assert_allclose(states.position, closed_form_lengths(HOME), rtol=1e-15)
+    assert list(states.velocity) == [0.0] * 6
+
+
+def test_struts_that_move_are_told_only_to_a_compensator_that_follows(bench, speak):
+    """One that starts would take their lag for a correction; once they stand, or it speaks, it is told."""
+    machine = Machine(bench)
+    hal, states = machine.start().hal, bench.seen["strut_states"]
+
+    def move() -> None:
+        hal["joint-fb.0"] = 500.0 + 10.0 * math.sin(20.0 * time.monotonic())
+
+    def moved(poses: int) -> bool:
+        move()
+        return len(machine.poses) > poses
+
+    bench.until(lambda: moved(round(RATE)), "a second of motion")
+    assert states == []
+    bench.until(lambda: states, "struts that stand")
+
+    def told() -> bool:
+        move()
+        speak.steadily([0.0] * 6)
+        return len(states) > seen + 50
+
+    seen = len(states)
+    bench.until(told, "struts that move, with a compensator")
+    # Speeds are the change since the last message, over the time between their stamps.
+    pairs = [(one, other) for one, other in pairwise(states) if other.velocity[0]]
+    ratios = [(b.position[0] - a.position[0]) / (b.velocity[0] * (stamped(b) - stamped(a))) for a, b in pairs]
+    assert np.median(ratios) == pytest.approx(1.0, abs=0.02)
+
+
+def test_another_frame(bench):
+    assert Machine(bench, frame_id="base").start().until_sent().header.frame_id == "base"
+
+
+def test_nothing_is_said_while_the_machine_is_off(bench):
+    """Its axes mean nothing before homing; the loop runs all the same."""
+    machine = Machine(bench).start(on=False)
+    bench.until_status(OK, "machine off", NODE)
+    beats = len(machine.hal.history("heartbeat"))
+    bench.until(lambda: len(machine.hal.history("heartbeat")) > beats + 50, "50 cycles")
+    bench.barrier()
+    assert (machine.poses, bench.seen["strut_states"]) == ([], [])
+    machine.hal["machine-on"] = True
+    machine.until_sent()
+    bench.until(lambda: bench.seen["strut_states"], "measured struts")
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e308])
+def test_an_axis_that_is_no_number_is_not_sent(bench, value):
+    """The struts still are, diagnostics name the pin, and it goes on when the pin is well again."""
+    machine = Machine(bench).start()
+    machine.until_sent()
+    machine.hal["b"] = value
+    bench.barrier()
+    sent, states = len(machine.poses), len(bench.seen["strut_states"])
+    values = bench.until_status(ERROR, "unusable pins: b", NODE)
+    bench.until(lambda: len(bench.seen["strut_states"]) > states + 20, "measured struts")
+    assert len(machine.poses) <= sent + 1
+    assert values["last_bad_pins"] == f"pins that are no numbers within ±1e+06: b = {value}"
+    machine.hal["b"] = 0.0
+    machine.until_sent()
+    assert all(math.isfinite(m.pose.orientation.w) for m in machine.poses)
+
+
+def test_a_strut_that_is_no_number_is_not_sent(bench):
+    machine = Machine(bench)
+    machine.hal["joint-fb.3"] = math.nan
+    machine.start().until_sent(20)
+    bench.until_status(ERROR, "unusable pins: joint-fb.3", NODE)
+    assert bench.seen["strut_states"] == []
+
+
+# ---- back from a compensator ----
+
+
+@pytest.mark.parametrize(("units", "metres"), [("mm", 1e-3), ("inch", 0.0254)])
+def test_corrections_of_a_real_compensator_arrive(bench, units, metres):
+    """At standstill, ramped in, the pins are what the compensator publishes, in machine units."""
+    machine = Machine(bench, metres, units=units)
+    bench.compensator()
+    hal = machine.start().hal
+    machine.until_status(GuardStatus.COMPENSATING)
+    seen = bench.seen["strut_corrections"]
+    bench.until(lambda: len(seen) > 5 and seen[-1].position == seen[-5].position, "the compensator's own ramp to end")
+    published = np.array(seen[-1].position)
+    assert np.abs(published).max() > 10e-6
+    bench.until(lambda: np.allclose(hal.corrections * metres, published, rtol=0.0, atol=1e-15), "the correction")
+    assert hal["largest"] == pytest.approx(np.abs(published).max() / metres, abs=1e-12)
+    assert hal["compensating"] is True
+    assert 0.0 <= hal["age"] < SLOW["timeout"]
+    assert 0 < hal["updates"] <= len(machine.poses) + 100
+    assert (hal["rejected"], hal["resets"]) == (0, 0)
+    assert_never_steps(hal, metres)
+    said = f"{np.abs(published).max():.9f}"
+    bench.until(lambda: bench.values(NODE).get("largest_correction_m") == said, f"{said} in the diagnostics")
+
+
+def test_enable_ramps_in_and_out(bench, speak):
+    """100 µm at 1 mm/s take 0.1 s each way, less at most the 20 ms that the first update may stand for."""
+    hal = Machine(bench).start().hal
+    hal["enable"] = False
+
+    def run(enable: bool, status: GuardStatus) -> float:
+        hal["enable"], began = enable, time.monotonic()
+
+        def reached() -> bool:
+            speak.steadily([100e-6] * 6)
+            return hal["status"] == status and bool(hal.corrections.any()) == enable
+
+        bench.until(reached, status.name)
+        return time.monotonic() - began
+
+    assert run(True, GuardStatus.COMPENSATING) >= 0.1 - LONGEST_STEP
+    np.testing.assert_allclose(hal.corrections, 0.1, rtol=1e-12)
+    assert run(False, GuardStatus.OFF) >= 0.1 - LONGEST_STEP
+    assert_never_steps(hal)
+
+
+@pytest.mark.parametrize(
+    ("on_loss", "status", "text"),
+    [
+        ("zero", GuardStatus.WAITING, "compensator lost, corrections are zero"),
+        ("hold", GuardStatus.HOLDING, "compensator lost, corrections hold"),
+    ],
+)
+def test_a_compensator_that_falls_silent(bench, on_loss, status, text):
+    """Corrections return to zero or hold, never stepping, and come back when it speaks again."""
+    machine = Machine(bench, on_loss=on_loss)
+    bench.compensator()
+    hal = machine.start().hal
+    machine.until_status(GuardStatus.COMPENSATING)
+    assert bench.change("deactivate")
+    machine.until_status(status)
+    bench.until_status(ERROR, text, NODE)
+    assert hal["age"] > SLOW["timeout"]
+    assert hal["compensating"] is False
+    assert bool(hal.corrections.any()) is (on_loss == "hold")
+    assert bench.change("activate")
+    machine.until_status(GuardStatus.COMPENSATING)
+    assert hal.corrections.any()
+    assert_never_steps(hal)
+
+
+def test_bad_corrections_are_never_applied(bench, speak):
+    """Not finite, too large, too few, misnamed, or the answer to a command of long ago: counted, named, forgotten."""
+    machine = Machine(bench).start()
+    hal = machine.hal
+    bad = [
+        (([1e-6, math.nan, 0.0, 0.0, 0.0, 0.0],), "not_finite"),
+        (([1e-6] * 5 + [math.inf],), "not_finite"),
+        (([501e-6] + [0.0] * 5,), "correction"),
+        (([1e-6] * 5, None, STRUT_NAMES[:5]), "strut_names"),
+        (([1e-6] * 6, None, ("a", *STRUT_NAMES[1:])), "strut_names"),
+        (([1e-6] * 6, bench.stamp(-5.0)), "stamp"),
+        (([1e-6] * 6, bench.stamp(100.0)), "stamp"),
+    ]
+    for count, (arguments, reason) in enumerate(bad, start=1):
+        speak(*arguments)  # those of stamps of their own are five seconds off and more, however long this takes
+        bench.until(lambda count=count: hal["rejected"] == count, f"refusal of {reason}")
+        bench.until_status(ERROR, f"refusing corrections: {reason}", NODE)
+    assert (hal["updates"], hal["age"], hal["status"]) == (0, 1e9, GuardStatus.WAITING)
+    for n in range(6):
+        assert set(hal.history(f"correction.{n}")) == {0.0}
+    bench.until(lambda: bench.values(NODE)["refused"] == "7", "the sum in the diagnostics")
+    assert bench.values(NODE)["refused.stamp"] == "2"
+
+
+def test_two_that_correct_are_refused(bench):
+    """Whoever is the second: corrections return to zero, and both are named."""
+    machine = Machine(bench)
+    bench.compensator()
+    machine.start().until_status(GuardStatus.COMPENSATING)
+    other = rclpy.create_node("other", context=bench.context)
+    bench.nodes.append(other)
+    other.create_publisher(JointState, "strut_corrections", RELIABLE)
+    bench.until_status(ERROR, "refusing corrections: several_publishers", NODE)
+    machine.until_status(GuardStatus.WAITING)
+    bench.until(lambda: "/other" in bench.values(NODE)["last_refusal"], "the name of the second")
+    assert not machine.hal.corrections.any()
+    assert_never_steps(machine.hal)
+
+
+def test_names_in_any_order(bench, speak):
+    hal = Machine(bench).start().hal
+    order = [5, 3, 1, 0, 2, 4]
+    speak([1e-6 * n for n in order], None, tuple(STRUT_NAMES[n] for n in order))
+    bench.until(lambda: hal["status"] == GuardStatus.COMPENSATING, "compensation")
+    np.testing.assert_allclose(hal.corrections, 1e-3 * np.arange(6), rtol=1e-12)
+
+
+def test_asks_a_compensator_that_refuses_to_start_anew(bench):
+    """Off, moved by hand by 20 mm and on again: more than the compensator lets a command jump (2 mm)."""
+    machine = Machine(bench)
+    bench.compensator()
+    machine.start().until_status(GuardStatus.COMPENSATING)
+    machine.hal["machine-on"] = False
+    machine.until_status(GuardStatus.OFF)
+    machine.place(near(HOME, (0.0, 0.0, 0.02)))
+    machine.hal["machine-on"] = True
+    # As a step, or as struts that are not where they were told to be: whichever message comes first.
+    bench.until(lambda: bench.values().get("refused", "0") != "0", "a refused command")
+    bench.until(lambda: machine.hal["resets"] >= 1, "a reset")
+    updates = machine.hal["updates"]
+    bench.until(lambda: machine.hal["updates"] > updates + 10, "corrections")
+    machine.until_status(GuardStatus.COMPENSATING)
+    assert bench.logged("asked it to start anew")
+    assert_never_steps(machine.hal)
+
+
+def test_asks_nobody_while_there_is_no_compensator(bench):
+    machine = Machine(bench).start()
+    machine.until_sent(round(RATE))
+    assert (machine.hal["resets"], machine.hal["status"]) == (0, GuardStatus.WAITING)
+    bench.until_status(WARN, "waiting for the first correction", NODE)
+
+
+# ---- life ----
+
+
+def test_pins_are_those_of_the_agreement(bench):
+    hal = Machine(bench).hal
+    inputs = {name for name, direction in hal.directions.items() if direction == "IN"}
+    feedback = {f"joint-fb.{n}" for n in range(6)}
+    assert inputs == {"x", "y", "z", "a", "b", "c", "tool-offset", "machine-on", "enable"} | feedback
+    assert set(hal.pins) - inputs == {f"correction.{n}" for n in range(6)} | {
+        *("status", "compensating", "age", "heartbeat", "updates", "rejected", "resets", "largest")
+    }
+    assert hal.is_ready
+
+
+def test_heart_beats_every_cycle(bench):
+    """At 100 Hz: alternating, and 50 beats last half a second, give or take a busy machine."""
+    machine = Machine(bench, rate=100.0).start(on=False)
+    beats = machine.hal.pins["heartbeat"].written
+    bench.until(lambda: len(beats) > 60, "60 beats")
+    assert all(one[1] != other[1] for one, other in pairwise(beats))
+    assert 0.4 < beats[55][0] - beats[5][0] < 2.0
+
+
+def test_deactivating_ramps_out_and_the_heart_goes_on(bench, speak):
+    machine = Machine(bench).start()
+
+    def compensating() -> bool:
+        speak.steadily([50e-6] * 6)
+        return machine.hal["status"] == GuardStatus.COMPENSATING
+
+    bench.until(compensating, "compensation")
+    assert bench.change("deactivate", NODE)
+    machine.until_status(GuardStatus.OFF)
+    assert not machine.hal.corrections.any()
+    beats = len(machine.hal.history("heartbeat"))
+    bench.until(lambda: len(machine.hal.history("heartbeat")) > beats + 10, "more beats")
+    assert bench.change("cleanup", NODE)
+    assert bench.change("configure", NODE)
+    assert bench.change("activate", NODE)
+    bench.until(compensating, "compensation again")
+
+
+@pytest.mark.parametrize(("ramp_rate", "left"), [(1e-3, 0.0), (10e-6, 0.05)])
+def test_end_ramps_out_what_is_quick(bench, speak, ramp_rate, left):
+    """50 µm: 0.05 s at 1 mm/s; at 10 µm/s they would take 5 s, so they stay (LinuxCNC's watchdog sees to them)."""
+    machine = Machine(bench, ramp_rate=1e-3, timeout=30.0).start()
+
+    def compensating() -> bool:
+        speak.steadily([50e-6] * 6)
+        return machine.hal["status"] == GuardStatus.COMPENSATING
+
+    bench.until(compensating, "compensation")
+    machine.node._options["ramp_rate"] = ramp_rate
+    machine.node._guard._ramp_rate = ramp_rate
+    machine.node.say_goodbye()
+    np.testing.assert_allclose(machine.hal.corrections, left, rtol=1e-9)
+    assert bool(bench.logged("corrections stay as they are")) is bool(left)
+    assert_never_steps(machine.hal)
+
+
+def test_ends_without_ever_having_been_configured(bench):
+    machine = Machine(bench)
+    machine.node.say_goodbye()
+    assert not machine.hal.corrections.any()
+
+
+def test_leaves_hal_with_the_node(ros_context):
+    hal = StandInHal()
+    LinuxcncBridgeNode(hal=hal, context=ros_context).destroy_node()
+    assert hal.has_left
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("units", "cm", "parameter units: must be mm or inch, not 'cm'"),
+        ("on_loss", "jump", "parameter on_loss: must be zero or hold, not 'jump'"),
+        ("limit", -1.0, "limit"),
+    ],
+)
+def test_bad_parameters_are_refused(bench, name, value, text):
+    with pytest.raises(ParameterError, match=text):
+        bench.add(LinuxcncBridgeNode, False, {name: value}, hal=StandInHal())
+
+
+PROCESS_HAL = """
+import signal
+signal.signal(signal.SIGTERM, signal.default_int_handler)  # as the real one does
+HAL_FLOAT, HAL_BIT, HAL_S32, HAL_U32, HAL_IN, HAL_OUT = range(6)
+class error(Exception): pass
+class component:
+    value = 0
+    def __init__(self, name): pass
+    def newpin(self, name, kind, direction): return self
+    def get(self): return 0.0
+    def set(self, value): pass
+    def ready(self): print("ready", flush=True)
+    def exit(self): print("left", flush=True)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_process_in_order(isolated_ros, tmp_path, number):
+    """Exit code 0, HAL left: LinuxCNC ends its components by SIGTERM, and ``hal`` would make that an exception."""
+    (tmp_path / "hal.py").write_text(PROCESS_HAL)
+    path = os.pathsep.join([str(tmp_path), str(CONFIG.parent), os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, "-m", "hexapod_comp.linuxcnc.bridge"]
+    with subprocess.Popen(
+        command, env={**os.environ, "PYTHONPATH": path}, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline() == "ready\n"
+        while "machine off" not in (line := process.stderr.readline()):
+            assert line, "it ended by itself"
+        process.send_signal(number)
+        said, complaints = process.communicate(timeout=30.0)
+    assert (process.returncode, said) == (0, "left\n"), complaints
+
+
+# ---- the module hal ----
+
+
+@pytest.fixture
+def packages(tmp_path, monkeypatch):
+    """Give a folder that stands for Debian's packages, and a Python that has no ``hal`` of its own."""
+    monkeypatch.setattr(hal_component, "DEBIAN_PACKAGES", tmp_path)
+    for name in ("hal", "_hal"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setattr(sys, "path", [folder for folder in sys.path if "dist-packages" not in folder])
+    yield tmp_path
+    for name in ("hal", "_hal"):
+        sys.modules.pop(name, None)
+
+
+def test_without_linuxcnc_it_says_so(packages):
+    with pytest.raises(HalError, match=r"neither on this Python's path nor in .*apt install linuxcnc-uspace"):
+        load_module()
+
+
+def test_another_pythons_module_is_named(packages):
+    """What Debian's package for one Python looks like to another: hal.py finds no _hal for it."""
+    (packages / "hal.py").write_text("import _hal\n")
+    (packages / "_hal.cpython-27-x86_64-linux-gnu.so").touch()
+    here = f"{sys.version_info.major}.{sys.version_info.minor}"
+    with pytest.raises(HalError, match=f"is built for cpython-27-x86_64-linux-gnu, this is CPython {here}"):
+        load_module()
+
+
+def test_found_in_debians_folder_without_leaving_a_trace(packages):
+    """Neither the folder on the path, where an old NumPy lies, nor hal's own handling of SIGTERM."""
+    (packages / "hal.py").write_text("import signal\nsignal.signal(signal.SIGTERM, signal.default_int_handler)\n")
+    path, handler = list(sys.path), signal.getsignal(signal.SIGTERM)
+    assert load_module().__file__ == str(packages / "hal.py")
+    assert sys.path == path
+    assert signal.getsignal(signal.SIGTERM) is handler
+
+
+LOADS_IT = """
+import signal, sys, numpy
+from hexapod_comp.hal_component import DEBIAN_PACKAGES, load_module
+before = list(sys.path), signal.getsignal(signal.SIGTERM), numpy.__file__
+print(load_module("hal").HAL_FLOAT, load_module("linuxcnc").MODE_MDI)
+import scipy.spatial
+assert before == (list(sys.path), signal.getsignal(signal.SIGTERM), sys.modules["numpy"].__file__)
+"""
+
+
+@pytest.mark.skipif(
+    not list(hal_component.DEBIAN_PACKAGES.glob(f"_hal.{sys.implementation.cache_tag}-*.so")),
+    reason="no LinuxCNC for this Python",
+)
+def test_the_real_modules_load_beside_this_numpy():
+    """In a process of its own; HAL_FLOAT is 2 in hal.h, EMC_TASK_MODE_MDI 3 in emc.hh."""
+    done = subprocess.run([sys.executable, "-c", LOADS_IT], cwd=CONFIG.parent, text=True, capture_output=True)
+    assert (done.returncode, done.stdout.split()) == (0, ["2", "3"]), done.stderr
+
+
+def test_a_refused_component_is_named():
+    hal = StandInHal()
+    HalComponent("twice", pins("in", "float", "x"), hal)
+    with pytest.raises(HalError, match="HAL refuses the component 'twice': Invalid component name twice"):
+        HalComponent("twice", (), hal)
+
+
+def test_bridge_without_linuxcnc_ends_with_a_message(packages, ros_context):
+    with pytest.raises(HalError, match="install LinuxCNC"):
+        LinuxcncBridgeNode(context=ros_context)

@@ -1,0 +1,360 @@
+"""The two nodes as operating-system processes: start, the loop between them, every way to end."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from node_helpers import HOME, closed_form_lengths, near
+from sensor_msgs.msg import JointState
+
+from hexapod_comp.errors import printable
+from hexapod_comp.loop.processes import NodeProcess
+from hexapod_comp.loop.session import connect
+from hexapod_comp.nodes.arguments import outside_ros
+from hexapod_comp.nodes.client import LISTENER_QOS, LoopClient, Sent
+from hexapod_comp.nodes.middleware import PROFILE_VARIABLES, avoid_shared_memory
+from hexapod_comp.pose import Pose
+
+STOP_WITHIN = 2.0
+"""From the signal to the end of the process, s."""
+
+
+@pytest.fixture
+def client(isolated_ros) -> Iterator[LoopClient]:
+    made = LoopClient()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def pair(client) -> Iterator[tuple[NodeProcess, NodeProcess]]:
+    """Compensator and strut drive, connected with each other and with the client."""
+    # The struts start from where they are measured; at this rate the correction is in with the second command.
+    parameters = {"model_file": "paper_machine.yaml", "ramp_rate": 1.0}
+    nodes = NodeProcess("compensator", parameters), NodeProcess("strut_drive", {})
+    try:
+        connect(client, nodes)
+        yield nodes
+    finally:
+        for node in nodes:
+            node.stop()
+
+
+def ask(client: LoopClient, pose: Pose) -> Sent:
+    """Send one command and wait for its answer."""
+    entry = client.send(pose)
+    client.spin_until(lambda: answered(entry), 5.0, "the answer to a command")
+    return entry
+
+
+def answered(entry: Sent) -> bool:
+    return bool(np.isfinite(entry.command[0]) and np.isfinite(entry.correction[0]))
+
+
+def said(client: LoopClient) -> list[str]:
+    """Return the list to which the messages of the compensator's statuses are appended from now on."""
+    messages: list[str] = []
+
+    def listen(array: DiagnosticArray) -> None:
+        messages.extend(status.message for status in array.status if status.name.startswith("compensator:"))
+
+    client.node.create_subscription(DiagnosticArray, "/diagnostics", listen, 10)
+    return messages
+
+
+def assert_ends_well(node: NodeProcess, *signals: signal.Signals) -> None:
+    """Send signals one after the other; the process ends in time, with 0 and without a traceback."""
+    began = time.monotonic()
+    for number in signals:
+        node.send(number)
+    while node.exit_code() is None and time.monotonic() - began < 30.0:
+        time.sleep(0.01)
+    assert node.exit_code() == 0, node.output()
+    assert time.monotonic() - began < STOP_WITHIN
+    assert "Traceback" not in node.output()
+
+
+def run_both(*arguments: str) -> list[tuple[int, str]]:
+    """Run both nodes at once, as a user would, and return exit code and stderr of each when they have ended."""
+    modules = [f"hexapod_comp.nodes.{name}" for name in ("compensator", "strut_drive")]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    started = [subprocess.Popen([sys.executable, "-m", module, *arguments], **pipes) for module in modules]
+    try:
+        return [(process.returncode, said) for process in started for _, said in [process.communicate(timeout=60.0)]]
+    finally:
+        for process in started:
+            process.kill()
+
+
+def test_loop_between_processes(client, pair):
+    """A command comes back as struts near the closed form, the tool goes there, the estimate says so.
+
+    In three commands, so that every strut has a direction of motion: the first alone has none to go by.
+    """
+    pose = near(HOME, (0.0005, -0.0003, 0.0008))
+    for share in (0.2, 0.6, 1.0):
+        entry = ask(client, near(HOME, (0.0005 * share, -0.0003 * share, 0.0008 * share)))
+    np.testing.assert_allclose(entry.command - entry.correction, closed_form_lengths(pose), rtol=0.0, atol=1e-12)
+    client.spin_until(client.settled(), 5.0, "the tool to rest")
+    # 0.1 µm steps, 0.05 µm noise of the encoders, J⁻¹ below 3: a fraction of a micrometre; uncorrected 100 µm.
+    assert np.abs(client.true_pose.position - pose.position).max() < 0.5e-6
+    assert np.abs(client.estimate.position - pose.position).max() < 2e-6
+    assert client.counted() == (3, 0)
+    for node in pair:
+        assert "ready" in node.output()
+        assert_ends_well(node, signal.SIGINT)
+
+
+@pytest.mark.parametrize(
+    ("to_compensator", "to_drive"),
+    [
+        ((signal.SIGINT, signal.SIGINT), (signal.SIGTERM,)),
+        ((signal.SIGTERM, signal.SIGINT), (signal.SIGINT, signal.SIGINT)),
+    ],
+    ids=["double SIGINT, SIGTERM", "SIGTERM and SIGINT, double SIGINT"],
+)
+def test_signals_end_both_with_0(client, pair, to_compensator, to_drive):
+    """A double SIGINT is what ``ros2 launch`` sends. The last thing said arrives."""
+    ask(client, HOME)
+    states = said(client)
+    client.spin_until(lambda: bool(states), 5.0, "a status")
+    for node, signals in zip(pair, (to_compensator, to_drive), strict=True):
+        assert_ends_well(node, *signals)
+    client.spin_until(lambda: states[-1] == "not active", 2.0, "the compensator's last status")
+
+
+def test_compensator_survives_the_end_of_the_drive(client, pair):
+    """kill -9 leaves no good-bye: the compensator goes on, says so, takes a new drive, and ends when told."""
+    compensator, drive = pair
+    states = said(client)
+
+    def goes_on(state: str) -> bool:
+        entry = client.send(HOME)
+        client.spin_until(lambda: answered(entry) or time.monotonic() > entry.sent_at + 0.2, 5.0, "an answer")
+        return answered(entry) and states[-1:] == [state]
+
+    client.spin_until(lambda: goes_on("running"), 10.0, "feedback")
+    drive.send(signal.SIGKILL)
+    client.spin_until(lambda: goes_on("feedback lost, pose estimated from own commands"), 10.0, "the loss to be said")
+    again = NodeProcess("strut_drive", {})
+    try:
+        client.spin_until(lambda: goes_on("running"), 20.0, "the new drive to be heard")
+        again.send(signal.SIGKILL)
+        assert_ends_well(compensator, signal.SIGINT)  # without waiting for the dead to acknowledge
+    finally:
+        again.stop()
+
+
+def test_a_compensator_restarted_under_a_stream_waits_for_the_struts(client, pair):
+    """kill -9, and the controller streams on by 120 mm: the successor never commands more than a step from the struts.
+
+    It hears the controller before it hears the drive: by itself now and then, here always, since the drive is stopped
+    until its first answer or refusal. The step allowed is 2 mm.
+    """
+    compensator, drive = pair
+    published, came = [], []
+
+    def listen(message: JointState) -> None:
+        published.append(np.array(message.position))
+        came.append(time.monotonic())
+
+    client.node.create_subscription(JointState, "strut_commands", listen, LISTENER_QOS)
+    heights = iter(np.clip(np.arange(0.0, 60.0, 4e-4), 0.0, 0.12))  # 100 mm/s at 250 Hz; then it stays up there
+
+    def higher() -> Pose:
+        return near(HOME, (0.0, 0.0, next(heights)))
+
+    def stream(until: Callable[[], object], pose: Callable[[], Pose] = higher) -> None:
+        end = time.monotonic() + 60.0
+        while not until():
+            assert time.monotonic() < end, client.diagnostics
+            rest = client.send(pose()).sent_at + 0.004
+            client.spin_until(lambda rest=rest: time.monotonic() >= rest, 1.0, "the next command to be due")
+
+    stream(lambda: len(published) > 50)
+    compensator.send(signal.SIGKILL)
+    stream(lambda: compensator.exit_code() is not None and time.monotonic() > came[-1] + 0.2)  # its last answers are in
+    drive.send(signal.SIGSTOP)
+    before, last = len(published), published[-1]
+    client.diagnostics = {}
+    again = NodeProcess("compensator", {"model_file": "paper_machine.yaml", "ramp_rate": 1.0})
+    try:
+        stream(lambda: "refused.no_feedback" in client.diagnostics or len(published) > before)
+        drive.send(signal.SIGCONT)
+        stream(lambda: "refused.step" in client.diagnostics or len(published) > before)
+        steps = np.abs(np.diff(published, axis=0)).max(axis=1)
+        assert steps.max() <= 2e-3 + 1e-9, f"it stepped by {steps.max() * 1e3:.1f} mm"
+        client.spin_until(client.settled(), 5.0, "the tool to rest")
+        here = client.estimate
+        stream(lambda: len(published) > before, lambda: here)
+        assert np.abs(published[-1] - last).max() <= 2e-3 + 1e-9
+    finally:
+        drive.send(signal.SIGCONT)
+        again.stop()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "texts"),
+    [
+        (["-p", "geometry_file:=nowhere.yaml"], ["cannot configure", "nowhere.yaml", "paper.yaml"]),
+        (["-p", "autostart:=maybe"], ["cannot start", "parameter autostart", "must be bool", "'maybe'"]),
+        (["-p", "compensator:ramp_rate:=-1.0", "-p", "strut_drive:lag:=-1.0"], ["cannot start: parameter", "-1.0"]),
+        (["-p", "compensator:ramp_rate:=50", "-p", "strut_drive:lag:=50"], ["cannot start: parameter", "…1, not 50"]),
+    ],
+    ids=["no such file", "wrong type", "below its range", "an int above its range"],
+)
+def test_bad_start_ends_with_1_and_a_clear_word(isolated_ros, arguments, texts):
+    for code, said in run_both("--ros-args", *arguments):
+        assert code == 1, said
+        assert "Traceback" not in said
+        for text in texts:
+            assert text in said
+
+
+PROGRAMS = {
+    "compensator": ("model_file  [ideal]", "tool_pose_command"),
+    "strut_drive": ("truth_file  [paper_machine.yaml]", "strut_commands"),
+    "linuxcnc_bridge": ("units  [mm]", "strut_corrections"),
+}
+
+
+def run_program(name: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", f"hexapod_comp.nodes.{name}", *arguments]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=60.0, check=False, env={**os.environ, **environment}
+    )
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_help_lists_every_parameter_and_the_topics(name):
+    done = run_program(name, "--help")
+    assert done.returncode == 0
+    assert done.stderr == ""
+    assert done.stdout.startswith(f"usage: {name} ")
+    assert all(text in done.stdout for text in PROGRAMS[name])
+    module = importlib.import_module(f"hexapod_comp.nodes.{name}")
+    declared = [*module.PARAMETERS, *getattr(module, "FAULT_PARAMETERS", ())]
+    assert all(f"  {parameter.name}  [" in done.stdout for parameter in declared)
+    assert max(map(len, done.stdout.splitlines())) <= 120
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["-p", "model_file:=mine.yaml"],
+        ["model_file:=mine.yaml"],
+        ["--model", "mine.yaml"],
+        ["--hel"],
+        ["mine\n\x1b[2J"],
+        ["--ros-args", "-p", "autostart:=false", "--", "late"],
+        ["--ros-args", "-p", "no_assignment"],
+        ["--ros-args", "--parms-file", "x.yaml"],
+    ],
+    ids=["-p without --ros-args", "ROS 1", "option", "shortened", "forged", "behind --", "no value", "unknown to ROS"],
+)
+def test_an_argument_that_nobody_reads_ends_with_2_and_is_named(arguments):
+    """Before, all but the last two started the node with its defaults."""
+    done = run_program("compensator", *arguments)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    said = done.stderr.splitlines()[-1]
+    assert said.startswith("compensator: error: ")
+    assert said.isprintable()
+    assert printable(arguments[-1]) in said
+
+
+def test_all_programs_refuse_what_they_do_not_know_on_any_terminal():
+    for name in PROGRAMS:
+        done = run_program(name, "-p", "x:=µ", PYTHONIOENCODING="ascii")
+        assert done.returncode == 2
+        assert f"{name} --ros-args" in done.stderr
+        assert "Traceback" not in done.stderr
+        assert run_program(name, "--help", PYTHONIOENCODING="ascii").returncode == 0
+
+
+def test_arguments_of_ros_stand_between_its_two_marks():
+    given = ["a", "--ros-args", "-r", "__node:=x", "--", "b", "--ros-args", "-p", "c:=1"]
+    assert outside_ros(given) == ["a", "b"]
+
+
+def test_nodes_end_when_their_parent_is_killed(isolated_ros):
+    """kill -9 of a demo must not leave a machine running that nobody sees."""
+    script = (
+        "from hexapod_comp.loop.processes import NodeProcess\n"
+        "import time\n"
+        "print(NodeProcess('strut_drive', {}).pid, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    pid = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    end = time.monotonic() + 20.0
+    while runs(pid) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not runs(pid)
+
+
+def runs(pid: int) -> bool:
+    """Return whether a process is alive; one that has ended but that nobody has waited for is not."""
+    try:
+        with open(f"/proc/{pid}/stat") as stat:
+            return stat.read().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def test_nodes_receive_by_udp_only(client, pair):
+    """A process that is killed in another's shared-memory port stalls it for seconds; nobody opens one here.
+
+    Fast DDS keeps each port of its shared-memory transport in /dev/shm/fastrtps_port….
+    """
+    ask(client, HOME)
+    for node in pair:
+        maps = Path(f"/proc/{node.pid}/maps").read_text(encoding="ascii")
+        assert "libfastrtps" in maps
+        assert "/dev/shm/fastrtps_port" not in maps
+
+
+def dropped(pid: int) -> int:
+    """Return how many datagrams found a process's UDP sockets full: the last column of /proc/net/udp."""
+    links = [os.readlink(link) for link in Path(f"/proc/{pid}/fd").iterdir() if link.is_symlink()]
+    own = {link[len("socket:[") : -1] for link in links if link.startswith("socket:[")}
+    rows = [line.split() for line in Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]]
+    return sum(int(row[12]) for row in rows if row[9] in own)
+
+
+def test_a_command_for_which_a_socket_had_no_room_is_repeated_at_once(client, pair):
+    """A stopped process's socket is full of readings after a second; it goes on when the next command has been lost.
+
+    Fast DDS repeats what was lost when the writer's heartbeat tells of it: by itself every 3 s, when a command
+    would be too old to be obeyed. No later command brings one earlier here.
+    """
+    compensator, _ = pair
+    ask(client, HOME)
+    compensator.send(signal.SIGSTOP)
+    try:
+        client.spin_until(lambda: dropped(compensator.pid), 10.0, "the socket to be full")
+        entry = client.send(HOME)
+    finally:
+        compensator.send(signal.SIGCONT)
+    client.spin_until(lambda: answered(entry), 5.0, "the answer to a command that was lost")
+
+
+@pytest.mark.parametrize("variable", PROFILE_VARIABLES)
+def test_the_users_own_fast_dds_profile_stays(monkeypatch, variable):
+    for name in PROFILE_VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv(variable, "/own.xml")
+    avoid_shared_memory()
+    assert {name: os.environ[name] for name in PROFILE_VARIABLES if name in os.environ} == {variable: "/own.xml"}

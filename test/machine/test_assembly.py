@@ -1,0 +1,302 @@
+"""Assembly modes: all poses without a guess, and the pick of the working one.
+
+Truth comes from the pose that made the lengths, from distances computed here, from symmetry, from poses
+whose multiplicity is known, and from a multi-start of Newton on the loop closures, which shares neither
+unknowns nor elimination with the code under test. Samples are small; benchmarks/assembly.py runs large ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hexapod_comp.errors import KinematicsError, NotFiniteError, OtherAssemblyModeError, SingularError, UnreachableError
+from hexapod_comp.kernels import kinematics as kernels
+from hexapod_comp.machine.assembly import assembly_modes, mode_objections, platform_pair_gap, working_mode
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.kinematics import Structure
+from hexapod_comp.pose import Pose
+
+CLOSED = 2e-15
+"""m; the loops close to a few roundings of a 1 m strut."""
+
+REGULAR = 1e-10
+"""m and rad; a pose of condition number up to 1e4 comes back to 1e4 roundings of the lengths, with margin."""
+
+
+@pytest.fixture(scope="module")
+def geometry() -> HexapodGeometry:
+    return load_geometry(Path(__file__).parents[2] / "config" / "paper.yaml")
+
+
+@pytest.fixture(scope="module")
+def structure(geometry) -> Structure:
+    return Structure.of(geometry)
+
+
+def distances(structure: Structure, pose: Pose) -> np.ndarray:
+    """Strut lengths from scratch: where the joints are, and how far apart."""
+    joints = np.array([pose.position + pose.rotation @ joint for joint in structure.platform_joints])
+    return np.linalg.norm(joints - structure.base_joints, axis=1)
+
+
+def numbers(pose: Pose) -> np.ndarray:
+    return np.concatenate([pose.position, pose.rotation.ravel()])
+
+
+def miss(pose: Pose, modes: list[Pose]) -> float:
+    """Distance of the nearest mode, largest of its differences in m and in rotation matrix elements."""
+    return min((float(np.abs(numbers(pose) - numbers(mode)).max()) for mode in modes), default=np.inf)
+
+
+def pose_mm_deg(position_mm, angles_deg) -> Pose:
+    return Pose.from_angles(1e-3 * np.array(position_mm, float), np.deg2rad(angles_deg))
+
+
+def workspace_poses(geometry: HexapodGeometry, count: int, seed: int) -> list[Pose]:
+    rng = np.random.default_rng(seed)
+    return [
+        Pose.from_angles(geometry.home.position + rng.uniform(-0.05, 0.05, 3), np.deg2rad(rng.uniform(-30.0, 30.0, 3)))
+        for _ in range(count)
+    ]
+
+
+def random_machine(seed: int, planar: bool) -> tuple[Structure, np.ndarray]:
+    """A 6-3 machine with joints anywhere, and lengths that it can have."""
+    rng = np.random.default_rng(seed)
+    base = rng.normal(0.0, 0.3, (6, 3)) * [1.0, 1.0, 0.0 if planar else 1.0]
+    platform = np.repeat(rng.normal(0.0, 0.2, (3, 3)), 2, axis=0)
+    structure = Structure(base, platform, 0.2, 1.0, 1e9)
+    pose = Pose(rng.normal(0.0, 0.4, 3), Rotation.from_rotvec(rng.normal(0.0, 1.0, 3)).as_matrix())
+    return structure, distances(structure, pose)
+
+
+def multi_start(structure: Structure, lengths: np.ndarray, seed: int, count: int = 4000) -> list[Pose]:
+    """All poses that Newton reaches from thousands of random ones."""
+    positions = np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 3)) * lengths.max()
+    rotations = Rotation.random(count, random_state=seed).as_matrix()
+    outcomes, iterations = np.empty(count, np.int64), np.empty(count, np.int64)
+    joints = structure.base_joints, structure.platform_joints
+    state = (np.tile(lengths, (count, 1)), positions, rotations, 0.2, 0.0, np.inf)
+    kernels.solve_pose_many(*joints, *state, outcomes, iterations, np.empty(count))
+    found: list[Pose] = []
+    rows = np.hstack([positions, rotations.reshape(-1, 9)])[outcomes == kernels.OK]
+    while len(rows):
+        found.append(Pose(rows[0, :3], rows[0, 3:].reshape(3, 3)))
+        rows = rows[np.abs(rows - rows[0]).max(axis=1) > 1e-6]
+    return found
+
+
+@pytest.mark.parametrize("planar", [True, False])
+@pytest.mark.parametrize("seed", range(6))
+def test_modes_are_those_a_multi_start_finds(seed, planar):
+    structure, lengths = random_machine(seed, planar)
+    modes, truth = assembly_modes(structure, lengths), multi_start(structure, lengths, seed)
+    assert len(modes) == len(truth)
+    assert max(miss(pose, modes) for pose in truth) < 1e-8
+    for mode in modes:
+        np.testing.assert_allclose(distances(structure, mode), lengths, rtol=0, atol=CLOSED)
+
+
+def test_planar_base_gives_mirror_images(geometry, structure):
+    # Mirroring in the base plane keeps every length; to stay a rotation, the platform is mirrored in its own
+    # plane as well, which its joints do not notice.
+    mirror = np.diag([1.0, 1.0, -1.0])
+    for pose in workspace_poses(geometry, 20, seed=1):
+        modes = assembly_modes(structure, distances(structure, pose))
+        assert len(modes) % 2 == 0
+        for mode in modes:
+            assert miss(Pose(mirror @ mode.position, mirror @ mode.rotation @ mirror), modes) < REGULAR
+
+
+def test_every_workspace_pose_is_found_and_picked(geometry, structure):
+    for pose in workspace_poses(geometry, 40, seed=2):
+        lengths = distances(structure, pose)
+        modes = assembly_modes(structure, lengths)
+        assert miss(pose, modes) < REGULAR
+        assert miss(pose, [working_mode(geometry, structure, lengths)]) < REGULAR
+        for mode in modes:
+            np.testing.assert_allclose(distances(structure, mode), lengths, rtol=0, atol=CLOSED)
+
+
+@pytest.mark.parametrize("deviation", [1e-5, 5e-4])
+def test_real_structure_is_continued_from_the_pairs(geometry, structure, deviation):
+    rng = np.random.default_rng(3)
+    for pose in workspace_poses(geometry, 20, seed=4):
+        real = structure.moved(*rng.uniform(-deviation, deviation, (2, 6, 3)))
+        lengths = distances(real, pose)
+        modes = assembly_modes(real, lengths)
+        assert miss(pose, modes) < REGULAR
+        assert miss(pose, [working_mode(geometry, real, lengths)]) < REGULAR
+        for mode in modes:
+            np.testing.assert_allclose(distances(real, mode), lengths, rtol=0, atol=5e-13)  # kernels' closure
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_real_structure_has_the_modes_a_multi_start_finds(seed):
+    nominal, _ = random_machine(20 + seed, planar=False)
+    rng = np.random.default_rng(seed)
+    real = nominal.moved(*rng.uniform(-1e-4, 1e-4, (2, 6, 3)))
+    lengths = distances(real, Pose(rng.normal(0.0, 0.4, 3), Rotation.random(random_state=seed).as_matrix()))
+    modes, truth = assembly_modes(real, lengths), multi_start(real, lengths, seed)
+    assert len(modes) == len(truth)
+    assert max(miss(pose, modes) for pose in truth) < 1e-8
+
+
+def test_sixteen_real_modes(structure):
+    # The most that a 6-3 machine can have; the paper's machine reaches it half a turn from home.
+    lengths = distances(structure, pose_mm_deg([0, 0, 400], [0, 0, 180]))
+    modes = assembly_modes(structure, lengths)
+    assert len(modes) == 16
+    for mode in modes:
+        np.testing.assert_allclose(distances(structure, mode), lengths, rtol=0, atol=CLOSED)
+
+
+def test_home_keeps_the_machines_symmetry(geometry, structure):
+    # Equal lengths: turning a mode by 120° gives a mode; home and its mirror image are their own turns.
+    modes = assembly_modes(structure, distances(structure, geometry.home))
+    turn = Pose.from_angles(np.zeros(3), np.deg2rad([0.0, 0.0, 120.0]))
+    assert max(miss(turn @ mode @ turn.inverse(), modes) for mode in modes) < REGULAR
+    assert len(modes) == len(multi_start(structure, distances(structure, geometry.home), 0))
+    assert miss(geometry.home, modes) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("position_mm", "angles_deg", "multiplicity"),
+    [
+        ([0, 0, 400], [0, 0, 90], 2),  # Fichter's singular poses: turned by 90°
+        ([20, 10, 400], [0, 0, 90], 2),
+        ([50, 20, 0], [0, 0, 20], 2),  # platform in the base plane: every mode is its own mirror image
+        ([0, 0, 400], [180, 0, 0], 3),  # upside down: a cusp
+    ],
+)
+def test_singular_pose_survives_once(structure, position_mm, angles_deg, multiplicity):
+    # A root of multiplicity m is known only to the m-th root of rounding (1e-16), here with a factor of 100.
+    pose = pose_mm_deg(position_mm, angles_deg)
+    lengths = distances(structure, pose)
+    modes = assembly_modes(structure, lengths)
+    uncertain = 100.0 * 1e-16 ** (1.0 / multiplicity)
+    assert miss(pose, modes) < uncertain
+    for number, mode in enumerate(modes):
+        assert miss(mode, modes[:number]) > 10.0 * uncertain
+        np.testing.assert_allclose(distances(structure, mode), lengths, rtol=0, atol=CLOSED)
+
+
+@pytest.mark.parametrize(
+    ("position_mm", "excess_deg"),
+    [([-34.66264384, -41.81081438, 400], 1.2904560e-4), ([10.75332473, -4.04670329, 400], 1.1619490e-4)],
+)
+def test_pair_of_modes_that_all_but_meet_is_not_counted_double(structure, position_mm, excess_deg):
+    # Turned by 90° and a trace (Fichter) two modes are about 1e-6 of a strut apart: the limit of being one.
+    pose = pose_mm_deg(position_mm, [0, 0, 90 + excess_deg])
+    modes = assembly_modes(structure, distances(structure, pose))
+    assert miss(pose, modes) < 1e-5
+    for number, mode in enumerate(modes):
+        assert miss(mode, modes[:number]) > 1e-7
+
+
+@pytest.mark.parametrize(("change", "count"), [(-1e-3, 0), (-1e-9, 0), (0.0, 1), (1e-15, 1), (1e-9, 8), (1e-3, 8)])
+def test_edge_of_reach(structure, change, count):
+    # The platform flat in the base plane, centred, is where equal struts are shortest; 8 modes meet there.
+    shortest = distances(structure, Pose.identity())
+    assert len(assembly_modes(structure, shortest * (1.0 + change))) == count
+
+
+def test_joint_on_the_line_of_its_base_joints(structure):
+    # Struts 1 and 2 in line hold platform joint 1 on a circle of radius 0, whose angle means nothing.
+    base, rotation = structure.base_joints, Rotation.from_rotvec([0.3, 0.5, 0.2]).as_matrix()
+    for share in (0.4, -0.7):
+        joint = base[0] + share * (base[1] - base[0])
+        pose = Pose(joint - rotation @ structure.platform_joints[0], rotation)
+        modes = assembly_modes(structure, distances(structure, pose))
+        assert miss(pose, modes) < 1e-7
+        assert len(modes) == 2  # itself and its mirror image
+
+
+def test_joint_on_the_axis_of_another_circle(structure):
+    # Platform joint 1 on the line of base joints 3 and 4 is equally far from all of circle 2.
+    base, rotation = structure.base_joints, Rotation.from_rotvec([0.3, 0.5, 0.2]).as_matrix()
+    joint = base[2] + 1.7 * (base[3] - base[2])
+    pose = Pose(joint - rotation @ structure.platform_joints[0], rotation)
+    assert miss(pose, assembly_modes(structure, distances(structure, pose))) < REGULAR
+
+
+def test_machine_that_moves_with_struts_locked_is_refused(structure):
+    # All base joints on one line: everything can turn about it.
+    base = np.zeros((6, 3))
+    base[:, 0] = [-0.5, -0.3, -0.1, 0.1, 0.3, 0.5]
+    swinging = replace(structure, base_joints=base)
+    lengths = distances(swinging, pose_mm_deg([20, 30, 400], [5, 10, 15]))
+    with pytest.raises(SingularError, match="struts locked"):
+        assembly_modes(swinging, lengths)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, -0.4])
+def test_length_that_is_none(structure, value):
+    lengths = np.full(6, 0.45)
+    lengths[3] = value
+    with pytest.raises(NotFiniteError, match="strut_4"):
+        assembly_modes(structure, lengths)
+
+
+def test_unreachable_lengths(geometry, structure):
+    for lengths in (np.full(6, 0.05), np.array([0.3, 0.9, 0.3, 0.9, 0.3, 0.9])):
+        assert assembly_modes(structure, lengths) == []
+        with pytest.raises(UnreachableError):
+            working_mode(geometry, structure, lengths)
+
+
+def test_other_machines_need_a_guess(geometry, structure):
+    split = structure.platform_joints.copy()
+    split[::2, 0] += 0.03
+    general = replace(structure, platform_joints=split)
+    pose = pose_mm_deg([10, -5, 410], [3, -4, 5])
+    lengths = distances(general, pose)
+    assert platform_pair_gap(general) == pytest.approx(0.03)
+    with pytest.raises(KinematicsError, match=r"30 mm apart.*solve_pose"):
+        assembly_modes(general, lengths)
+    assert miss(pose, [working_mode(geometry, general, lengths)]) < REGULAR
+
+
+def test_joints_that_define_nothing(structure):
+    base = structure.base_joints.copy()
+    base[1] = base[0]
+    with pytest.raises(KinematicsError, match="base joints 1 and 2"):
+        assembly_modes(replace(structure, base_joints=base), np.full(6, 0.45))
+    line = np.zeros((6, 3))
+    line[:, 0] = [0.0, 0.0, 0.1, 0.1, 0.3, 0.3]
+    with pytest.raises(KinematicsError, match="one line"):
+        assembly_modes(replace(structure, platform_joints=line), np.full(6, 0.45))
+
+
+def test_no_mode_within_the_limits(geometry, structure):
+    # Two degrees from Fichter's singular pose the condition number is 17, above the machine's limit of 10.
+    lengths = distances(structure, pose_mm_deg([0, 0, 400], [0, 0, 88]))
+    count = len(assembly_modes(structure, lengths))
+    expected = f"none of the {count} poses.*condition number 16.7"
+    with pytest.raises(OtherAssemblyModeError, match=expected) as caught:
+        working_mode(geometry, structure, lengths)
+    assert caught.value.value == count
+
+
+def test_each_objection_names_what_it_found(geometry, structure):
+    below = geometry.home.position * [1, 1, -1]
+    assert mode_objections(geometry, structure, geometry.home) == []
+    found = " ".join(mode_objections(geometry, structure, Pose(below, np.eye(3))))
+    assert "other sign" in found
+    assert "other side" in found
+    assert "base joint" in found
+
+
+def test_two_candidates_as_near_are_refused(geometry, structure):
+    # Tilted by 80° about its axis of symmetry the paper's machine has two more modes, mirror images of each
+    # other and so equally near to home; with the cones open nothing tells them apart.
+    limits = replace(geometry.limits, base_cone=np.full(6, np.pi), platform_cone=np.full(6, np.pi))
+    open_cones = replace(geometry, limits=limits)
+    lengths = distances(structure, pose_mm_deg([0, 0, 400], [0, 80, 0]))
+    with pytest.raises(OtherAssemblyModeError, match="about as near"):
+        working_mode(open_cones, structure, lengths)

@@ -1,0 +1,296 @@
+"""The error field of 001: weights, polynomials, directions, and what happens outside the measured box."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given
+from strategies import UNEVEN_GRID, fixed, random_field, seeds
+
+from hexapod_comp.errors import ModelError
+from hexapod_comp.machine.field import COMPONENTS, CROSS_AXES, GridField, no_field
+
+BOTH_UNKNOWN = np.zeros(3)
+FORWARD = np.ones(3)
+
+
+def empty_lines(grid):
+    """Return three families that were not measured."""
+    return [np.zeros((2, len(grid[a]), len(grid[b]), 6, 0)) for a, b in CROSS_AXES]
+
+
+def inside(rng):
+    """Return a point of the uneven grid's box."""
+    return np.array([rng.uniform(nodes[0], nodes[-1]) for nodes in UNEVEN_GRID])
+
+
+# One cell, x from −100 to 100 mm, y from 0 to 100 mm, z from 0 to 200 mm, in micrometres.
+CELL = (np.array([-0.1, 0.1]), np.array([0.0, 0.1]), np.array([0.0, 0.2]))
+ALONG_X = {(0, 0): [1, 2, 0], (0, 1): [3, 0, 0], (1, 0): [5, -4, 8], (1, 1): [7, 1, 0]}
+ALONG_Y = {(0, 0): [2, 0, 0], (0, 1): [4, 10, 0], (1, 0): [0, 0, 0], (1, 1): [8, 0, 0]}
+ALONG_Z = {(0, 0): [1, 0, 4], (0, 1): [0, 0, 0], (1, 0): [6, 2, 0], (1, 1): [10, 0, 0]}
+
+
+def test_hand_worked_cell():
+    """At (25, 30, 50) mm. Truth: worked by hand from 001, W_xi and Δx; every number is below.
+
+    u = 25/100 = 0.25, v = 2·30/100 − 1 = −0.4, w = 2·50/200 − 1 = −0.5; shares of the way through the cell:
+    x 125/200 = 0.625, y 0.3, z 0.25.
+
+    dx: lines at (y, z) low-low, low-high, high-low, high-high are worth 1.5, 3, 5 − 1 + 0.5 = 4.5, 7.25 and
+        weigh 0.7·0.75 = 0.525, 0.7·0.25 = 0.175, 0.3·0.75 = 0.225, 0.3·0.25 = 0.075:
+        0.7875 + 0.525 + 1.0125 + 0.54375 = 2.86875.
+    dy: (x, z): 2, 4 − 4 = 0, 0, 8 weigh 0.375·0.75 = 0.28125, 0.09375, 0.46875, 0.625·0.25 = 0.15625:
+        0.5625 + 0 + 0 + 1.25 = 1.8125.
+    dz: (x, y): 1 + 4·0.25 = 2, 0, 6 − 1 = 5, 10 weigh 0.375·0.7 = 0.2625, 0.1125, 0.4375, 0.1875:
+        0.525 + 0 + 2.1875 + 1.875 = 4.5875.
+    Tolerance: a few roundings of 1e-16 relative.
+    """
+    lines = [np.zeros((2, 2, 2, 6, 3)) for _ in range(3)]
+    for component, worked in enumerate((ALONG_X, ALONG_Y, ALONG_Z)):
+        for (first, second), coefficients in worked.items():
+            lines[component][:, first, second, component] = np.array(coefficients) * 1e-6
+    error, outside = GridField(CELL, tuple(lines)).evaluate([0.025, 0.030, 0.050], FORWARD)
+    np.testing.assert_allclose(error[:3], [2.86875e-6, 1.8125e-6, 4.5875e-6], rtol=1e-14)
+    assert not error[3:].any()
+    assert outside is False
+
+
+@fixed
+@given(seeds)
+def test_weights_sum_to_one(seed):
+    """Truth: if every line says 1, so must the field; three families of six components say 3.
+
+    Tolerance: twelve products and sums of numbers below 1, so a few 1e-16.
+    """
+    lines = [np.ones((2, len(UNEVEN_GRID[a]), len(UNEVEN_GRID[b]), 6, 1)) for a, b in CROSS_AXES]
+    rng = np.random.default_rng(seed)
+    error, _ = GridField(UNEVEN_GRID, tuple(lines)).evaluate(inside(rng), rng.choice([-1.0, 0.0, 1.0], 3))
+    np.testing.assert_allclose(error, 3.0, rtol=2e-15)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_equals_the_polynomial_on_every_grid_line(axis):
+    """Truth: numpy.polynomial on the line's own coefficients; the other three lines weigh nothing there."""
+    field = random_field(np.random.default_rng(1))
+    lines = empty_lines(UNEVEN_GRID)
+    lines[axis] = field.lines[axis]
+    alone = GridField(UNEVEN_GRID, tuple(lines))
+    first_axis, second_axis = CROSS_AXES[axis]
+    nodes = UNEVEN_GRID[axis]
+    for first, second in product(range(len(UNEVEN_GRID[first_axis])), range(len(UNEVEN_GRID[second_axis]))):
+        for u in (-1.0, -0.3, 0.0, 0.77, 1.0):
+            point = np.empty(3)
+            point[first_axis] = UNEVEN_GRID[first_axis][first]
+            point[second_axis] = UNEVEN_GRID[second_axis][second]
+            point[axis] = nodes[0] + (u + 1.0) / 2.0 * (nodes[-1] - nodes[0])
+            for direction, sense in enumerate((FORWARD, -FORWARD)):
+                error, _ = alone.evaluate(point, sense)
+                truth = np.polynomial.polynomial.polyval(u, lines[axis][direction, first, second].T)
+                np.testing.assert_allclose(error, truth, atol=1e-19)  # 1e-14 of the coefficients
+
+
+def trilinear(c, x, y, z):
+    return c @ [1.0, x, y, z, x * y, x * z, y * z, x * y * z]
+
+
+@fixed
+@given(seeds)
+def test_exact_on_trilinear_fields(seed):
+    """Truth: the closed form. Any family of straight lines reproduces a trilinear function between its nodes.
+
+    Tolerance: 1e-14 of the field's size of some 1e-5.
+    """
+    rng = np.random.default_rng(seed)
+    c = rng.uniform(-1e-5, 1e-5, (3, 8))
+    lines = [np.zeros((2, len(UNEVEN_GRID[a]), len(UNEVEN_GRID[b]), 6, 2)) for a, b in CROSS_AXES]
+    for axis, (a, b) in enumerate(CROSS_AXES):
+        for first, second in product(range(len(UNEVEN_GRID[a])), range(len(UNEVEN_GRID[b]))):
+            ends = []
+            for end in (0, -1):
+                point = np.empty(3)
+                point[axis], point[a], point[b] = (
+                    UNEVEN_GRID[axis][end],
+                    UNEVEN_GRID[a][first],
+                    UNEVEN_GRID[b][second],
+                )
+                ends.append(trilinear(c[axis], *point))
+            # A straight line from f(−1) to f(1): constant and slope in u.
+            lines[axis][:, first, second, axis] = [(ends[0] + ends[1]) / 2, (ends[1] - ends[0]) / 2]
+    point = inside(rng)
+    error, _ = GridField(UNEVEN_GRID, tuple(lines)).evaluate(point, BOTH_UNKNOWN)
+    np.testing.assert_allclose(error[:3], [trilinear(c[i], *point) for i in range(3)], atol=1e-19)
+
+
+def paper_weights(p, q, corners):
+    """Return W_1 … W_4 of 001 for the point (p, q): the corner opposite to i is k = Mod(i + 2).
+
+    The denominators |P_1 − P_4| and |P_1 − P_2| say how the corners are numbered: 1 → 2 along the second
+    axis, 1 → 4 along the first.
+    """
+    area = abs(corners[1][0] - corners[4][0]) * abs(corners[1][1] - corners[2][1])
+    opposite = {1: 3, 2: 4, 3: 1, 4: 2}
+    return {i: abs(p - corners[k][0]) * abs(q - corners[k][1]) / area for i, k in opposite.items()}
+
+
+@fixed
+@given(seeds)
+def test_equals_the_papers_formula(seed):
+    """Truth: 001, W_xi, W_yi, W_zi and Δx, Δy, Δz, written out here over the four corners; np.polyval.
+
+    The paper's 1-D field: lines along x know dx only, and so on. Tolerance: 1e-14 of some 1e-4.
+    """
+    rng = np.random.default_rng(seed)
+    full = random_field(rng)
+    lines = [np.zeros_like(family) for family in full.lines]
+    for axis in range(3):
+        lines[axis][:, :, :, axis] = full.lines[axis][:, :, :, axis]
+    point, sense = inside(rng), rng.choice([-1.0, 1.0], 3)
+    truth = []
+    for axis, (a, b) in enumerate(CROSS_AXES):
+        i = int(np.searchsorted(UNEVEN_GRID[a], point[a])) - 1
+        j = int(np.searchsorted(UNEVEN_GRID[b], point[b])) - 1
+        at = {1: (i, j), 2: (i, j + 1), 3: (i + 1, j + 1), 4: (i + 1, j)}
+        corners = {n: (UNEVEN_GRID[a][m], UNEVEN_GRID[b][k]) for n, (m, k) in at.items()}
+        middle = (UNEVEN_GRID[axis][0] + UNEVEN_GRID[axis][-1]) / 2
+        u = (point[axis] - middle) / (UNEVEN_GRID[axis][-1] - middle)
+        direction = 0 if sense[axis] > 0 else 1
+        values = {n: np.polyval(lines[axis][direction, m, k, axis, ::-1], u) for n, (m, k) in at.items()}
+        truth.append(sum(w * values[n] for n, w in paper_weights(point[a], point[b], corners).items()))
+    error, outside = GridField(UNEVEN_GRID, tuple(lines)).evaluate(point, sense)
+    np.testing.assert_allclose(error[:3], truth, atol=1e-18)
+    assert not error[3:].any()
+    assert not outside
+
+
+def test_directions():
+    """Truth: constants. Forward 1, 2, 4 µm along x, y, z, backward ten times that; unknown is the mean.
+
+    Every axis goes by its own direction of motion.
+    """
+    lines = [np.zeros((2, len(UNEVEN_GRID[a]), len(UNEVEN_GRID[b]), 6, 1)) for a, b in CROSS_AXES]
+    for axis, size in enumerate((1e-6, 2e-6, 4e-6)):
+        lines[axis][0, :, :, axis], lines[axis][1, :, :, axis] = size, 10 * size
+    field = GridField(UNEVEN_GRID, tuple(lines))
+    for sense, truth in {
+        (1, 1, 1): (1, 2, 4),
+        (-1, -1, -1): (10, 20, 40),
+        (0, 0, 0): (5.5, 11, 22),
+        (1, -1, 0): (1, 20, 22),
+    }.items():
+        error, _ = field.evaluate([0.0, 0.0, 0.4], sense)
+        np.testing.assert_allclose(error[:3] * 1e6, truth, rtol=1e-14)
+
+
+def test_six_components_of_every_family_add_up():
+    """Truth: constants, 1 … 6 µm on lines along x, ten times that along y, a hundred times along z."""
+    lines = [np.zeros((2, len(UNEVEN_GRID[a]), len(UNEVEN_GRID[b]), 6, 2)) for a, b in CROSS_AXES]
+    for axis in range(3):
+        lines[axis][..., 0] = np.arange(1, 7) * 1e-6 * 10**axis
+    error, _ = GridField(UNEVEN_GRID, tuple(lines)).evaluate([0.1, 0.1, 0.5], FORWARD)
+    np.testing.assert_allclose(error, 111e-6 * np.arange(1, 7), rtol=1e-14)
+    assert len(COMPONENTS) == 6
+
+
+@fixed
+@given(seeds)
+def test_outside_holds_the_boundary_value_and_says_so(seed):
+    """Truth: the value at the nearest point of the box, bit for bit."""
+    rng = np.random.default_rng(seed)
+    field = random_field(rng)
+    low, high = field.box
+    beyond = inside(rng)
+    axis, upwards = rng.integers(3), rng.integers(2)
+    beyond[axis] = (low, high)[upwards][axis] + (2 * upwards - 1) * rng.uniform(1e-9, 10.0)
+    held, outside = field.evaluate(beyond, FORWARD)
+    on_boundary, still_inside = field.evaluate(np.clip(beyond, low, high), FORWARD)
+    assert outside is True
+    assert still_inside is False
+    np.testing.assert_array_equal(held, on_boundary)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_continuous_across_the_boundary_and_the_nodes(axis):
+    """Truth: the step over 1 nm may be no more than the field's slope allows.
+
+    A line is worth at most 4·20 µm, so two neighbours differ by at most 160 µm over the narrowest cell of
+    30 mm, and three families add up: 1 nm · 3 · 160 µm/30 mm = 2e-11. A jump to wrong lines would be 1e-5.
+    """
+    rng = np.random.default_rng(4)
+    field = random_field(rng)
+    for node in UNEVEN_GRID[axis]:
+        for _ in range(20):
+            point = inside(rng)
+            before, after = point.copy(), point.copy()
+            before[axis], after[axis] = node - 5e-10, node + 5e-10
+            step = field.evaluate(after, FORWARD)[0] - field.evaluate(before, FORWARD)[0]
+            assert np.abs(step).max() < 1e-10
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_no_number_comes_from_a_position_that_is_none(bad, axis):
+    point = np.array([0.0, 0.0, 0.4])
+    point[axis] = bad
+    error, outside = random_field(np.random.default_rng(5)).evaluate(point, FORWARD)
+    assert np.isnan(error).all()
+    assert outside is True
+
+
+def test_no_field_is_zero_everywhere():
+    error, outside = no_field().evaluate([0.3, -0.2, 0.5], FORWARD)
+    assert not error.any()
+    assert not outside
+
+
+def _nan_in_lines(grid, lines):
+    lines[1] = np.full((2, len(grid[0]), len(grid[2]), 6, 1), np.nan)
+
+
+def _lines_for_another_grid(grid, lines):
+    lines[0] = np.zeros((2, len(grid[1]) + 1, len(grid[2]), 6, 1))
+
+
+def _one_node(grid, lines):
+    grid[0] = grid[0][:1]
+
+
+def _falling_nodes(grid, lines):
+    grid[2] = grid[2][::-1]
+
+
+def _node_twice(grid, lines):
+    grid[1] = grid[1][[0, 1, 1]]
+
+
+def _endless_node(grid, lines):
+    grid[0] = np.array([-np.inf, 0.0, 0.1, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "key"),
+    [
+        (_nan_in_lines, "field.lines_y"),
+        (_lines_for_another_grid, "field.lines_x"),
+        (_one_node, "field.grid_x"),
+        (_falling_nodes, "field.grid_z"),
+        (_node_twice, "field.grid_y"),
+        (_endless_node, "field.grid_x"),
+    ],
+)
+def test_refuses_what_is_no_field(spoil, key):
+    grid, lines = list(UNEVEN_GRID), empty_lines(UNEVEN_GRID)
+    spoil(grid, lines)
+    with pytest.raises(ModelError, match=key):
+        GridField(tuple(grid), tuple(lines))
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [({"probe": [0, 0]}, "probe"), ({"probe": [0, np.nan, 0]}, "probe"), ({"outside": "guess"}, "outside")],
+)
+def test_refuses_bad_probe_and_policy(change, key):
+    with pytest.raises(ModelError, match=f"field.{key}"):
+        GridField(UNEVEN_GRID, tuple(empty_lines(UNEVEN_GRID)), **change)

@@ -1,0 +1,428 @@
+"""Every limit at its edge: a hair inside passes, a hair outside is refused and says what, where and how much.
+
+Limits are asked in two ways, by what stops at the first breach and by what measures everything: both say the same.
+
+The limited quantities come from NumPy alone (distances between joints, angles by arctan2, condition number
+by the inverse matrix); limits are set a relative 1e-9 above and below them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from helpers import segment_distance
+from hypothesis import given
+from scipy.spatial.transform import Rotation
+from strategies import fixed, paper_geometry, random_model, random_pose, seeds, skewed_geometry
+
+from hexapod_comp.compensation.checks import check
+from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.errors import HexapodError, LimitError
+from hexapod_comp.kernels import limits as codes
+from hexapod_comp.machine.assembly import mode_objections
+from hexapod_comp.machine.geometry import HexapodGeometry
+from hexapod_comp.machine.kinematics import Structure, strut_lengths
+from hexapod_comp.machine.limits import REASONS, Limits
+from hexapod_comp.machine.model import MachineModel
+from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.pose import Pose
+from hexapod_comp.workspace.reach import Examiner
+
+PAPER = paper_geometry()
+HOME = PAPER.home
+HAIR = 1e-9
+WIDE = Limits(np.tile([0.1, 2.0], (6, 1)), np.full(6, np.pi), np.full(6, np.pi), 100.0, 0.01, 1.0, 1.0)
+CROSSED = Pose.from_angles([0.01, -0.02, 0.42], np.deg2rad([3.0, -2.0, 60.0]))
+TILTED = Pose.from_angles([0.02, -0.03, 0.52], np.deg2rad([12.0, -9.0, 15.0]))
+
+
+def struts(pose: Pose) -> np.ndarray:
+    """Return the strut vectors in ``base``, shape (6, 3), m."""
+    return pose.position + PAPER.platform_joints @ pose.rotation.T - PAPER.base_joints
+
+
+def angles_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the angles of rows, by arctan2, which is exact where arccos is not."""
+    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1))
+
+
+def condition_by_inverse(pose: Pose) -> float:
+    """Return ‖J‖·‖J⁻¹‖/6 (Frobenius), rotations in units of the RMS radius of the platform joints."""
+    s = struts(pose)
+    unit = s / np.linalg.norm(s, axis=1)[:, None]
+    arms = PAPER.platform_joints @ pose.rotation.T
+    spread = PAPER.platform_joints - PAPER.platform_joints.mean(axis=0)
+    radius = np.sqrt((spread**2).sum(axis=1).mean())
+    matrix = np.hstack([unit, np.cross(arms, unit) / radius])
+    return float(np.linalg.norm(matrix) * np.linalg.norm(np.linalg.inv(matrix)) / 6.0)
+
+
+def with_limits(**changes: object) -> HexapodGeometry:
+    return replace(PAPER, limits=replace(WIDE, **changes))
+
+
+def one_strut(value: float, strut: int, wide: float) -> np.ndarray:
+    values = np.full(6, wide)
+    values[strut] = value
+    return values
+
+
+def refusal(geometry: HexapodGeometry, pose: Pose, model: MachineModel | None = None) -> LimitError:
+    """Return the error with which a fresh compensator refuses the pose."""
+    compensator = Compensator(geometry, model or MachineModel(PAPER.name))
+    with pytest.raises(LimitError) as caught:
+        compensator.correct(pose)
+    assert np.isnan(compensator.command).all()
+    return caught.value
+
+
+def accepted(geometry: HexapodGeometry, pose: Pose, model: MachineModel | None = None) -> None:
+    Compensator(geometry, model or MachineModel(PAPER.name)).correct(pose)
+
+
+@pytest.mark.parametrize("strut", range(6))
+def test_longest_stroke(strut: int) -> None:
+    length = np.linalg.norm(struts(TILTED), axis=1)[strut]
+    bounds = WIDE.stroke.copy()
+    bounds[strut, 1] = length * (1.0 + HAIR)
+    accepted(with_limits(stroke=bounds), TILTED)
+    bounds[strut, 1] = length * (1.0 - HAIR)
+    error = refusal(with_limits(stroke=bounds), TILTED)
+    assert (error.reason, error.strut, error.stage) == ("stroke", strut, "nominal")
+    assert error.value == pytest.approx(length, rel=1e-14)
+    assert error.limit == bounds[strut, 1]
+    assert f"strut_{strut + 1}" in str(error)
+    assert f"{length * 1e3:.4f} mm" in str(error)
+
+
+@pytest.mark.parametrize("strut", range(6))
+def test_shortest_stroke(strut: int) -> None:
+    low = Pose(HOME.position - np.array([0.0, 0.0, 0.05]), HOME.rotation)
+    length = np.linalg.norm(struts(low), axis=1)[strut]
+    bounds = WIDE.stroke.copy()
+    bounds[strut, 0] = length * (1.0 - HAIR)
+    accepted(with_limits(stroke=bounds), low)
+    bounds[strut, 0] = length * (1.0 + HAIR)
+    error = refusal(with_limits(stroke=bounds), low)
+    assert (error.reason, error.strut, error.limit) == ("stroke", strut, bounds[strut, 0])
+
+
+@pytest.mark.parametrize("strut", range(6))
+@pytest.mark.parametrize("body", ["base", "platform"])
+def test_joint_cones(body: str, strut: int) -> None:
+    """Neutral directions are the struts' at home, each seen from the body that carries the joint."""
+    now, home = struts(TILTED), struts(HOME)
+    if body == "platform":
+        now, home = now @ TILTED.rotation, home @ HOME.rotation
+    angle = angles_between(now, home)[strut]
+    accepted(with_limits(**{f"{body}_cone": one_strut(angle * (1.0 + HAIR), strut, np.pi)}), TILTED)
+    error = refusal(with_limits(**{f"{body}_cone": one_strut(angle * (1.0 - HAIR), strut, np.pi)}), TILTED)
+    assert (error.reason, error.strut, error.stage) == (f"{body}_cone", strut, "nominal")
+    assert error.value == pytest.approx(angle, rel=1e-12)
+    assert f"{np.degrees(angle):.3f}°" in str(error)
+
+
+def least_distance(pose: Pose, base: np.ndarray) -> tuple[float, int]:
+    """Return the smallest distance of two struts that share no joint, m, and the first of the two."""
+    ends = pose.position + PAPER.platform_joints @ pose.rotation.T
+    pairs = [(i, j) for i, j in combinations(range(6), 2) if i // 2 != j // 2]
+    return min((segment_distance(base[i], ends[i], base[j], ends[j]), i) for i, j in pairs)
+
+
+def test_clearance() -> None:
+    """Turned by 60° about its axis the machine's struts cross, nearer to each other than at home."""
+    distance, strut = least_distance(CROSSED, PAPER.base_joints)
+    accepted(with_limits(clearance=distance * (1.0 - HAIR)), CROSSED)
+    error = refusal(with_limits(clearance=distance * (1.0 + HAIR)), CROSSED)
+    assert (error.reason, error.strut, error.stage) == ("clearance", strut, "nominal")
+    assert error.value == pytest.approx(distance, rel=1e-9)
+    assert f"strut_{strut + 1}: {distance * 1e3:.3f} mm from the nearest other strut" in str(error)
+
+
+def test_condition_number() -> None:
+    condition = condition_by_inverse(TILTED)
+    accepted(with_limits(condition=condition * (1.0 + HAIR)), TILTED)
+    error = refusal(with_limits(condition=condition * (1.0 - HAIR)), TILTED)
+    assert (error.reason, error.strut, error.stage) == ("condition", None, "nominal")
+    assert error.value == pytest.approx(condition, rel=1e-12)
+
+
+def test_other_assembly_mode() -> None:
+    """The machine mirrored in the base plane: same lengths, det J of the other sign (six rows, z negated)."""
+    flip = np.diag([1.0, 1.0, -1.0])
+    mirrored = Pose(flip @ HOME.position, flip @ HOME.rotation @ flip)
+    error = refusal(with_limits(), mirrored)
+    assert error.reason == "assembly"
+
+
+@pytest.mark.parametrize("strut", range(6))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_largest_correction(strut: int, sign: float) -> None:
+    """A strut that is 40 µm long is told 40 µm less: the correction is minus the offset, by definition."""
+    offset = np.zeros(6)
+    offset[strut] = sign * 40e-6
+    model = MachineModel(PAPER.name, struts=StrutErrors(offset=offset))
+    accepted(with_limits(correction=40e-6 * (1.0 + HAIR)), TILTED, model)
+    error = refusal(with_limits(correction=40e-6 * (1.0 - HAIR)), TILTED, model)
+    assert (error.reason, error.strut, error.stage) == ("correction", strut, "compensated")
+    assert error.value == pytest.approx(-offset[strut], rel=1e-9)
+    assert "40.000 µm" in str(error)
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_largest_step(way: float) -> None:
+    """At home all six struts lengthen alike along z; the first is named."""
+    z = HOME.position[2]
+    flat = np.linalg.norm(struts(HOME)[0, :2])
+    length = np.hypot(flat, z)
+    for step, allowed in ((2e-3 * (1.0 - HAIR), True), (2e-3 * (1.0 + HAIR), False)):
+        compensator = Compensator(with_limits(step=2e-3), MachineModel(PAPER.name))
+        compensator.correct(HOME)
+        next_z = np.sqrt((length + way * step) ** 2 - flat**2)
+        there = Pose([0.0, 0.0, next_z], HOME.rotation)
+        if allowed:
+            compensator.correct(there)
+            continue
+        with pytest.raises(LimitError, match=r"would change by -?2\.0000 mm") as caught:
+            compensator.correct(there)
+        assert (caught.value.reason, caught.value.stage) == ("step", "nominal")
+        assert caught.value.value == pytest.approx(way * step, rel=1e-9)
+
+
+def test_compensated_lengths_are_checked_too() -> None:
+    """Nominally 30 µm inside; the correction of +50 µm leads 20 µm outside."""
+    length = np.linalg.norm(struts(TILTED), axis=1)[2]
+    bounds = WIDE.stroke.copy()
+    bounds[2, 1] = length + 30e-6
+    model = MachineModel(PAPER.name, struts=StrutErrors(offset=np.array([0, 0, -50e-6, 0, 0, 0])))
+    accepted(with_limits(stroke=bounds), TILTED)
+    error = refusal(with_limits(stroke=bounds), TILTED, model)
+    assert (error.reason, error.strut, error.stage) == ("stroke", 2, "compensated")
+    assert error.value == pytest.approx(length + 50e-6, rel=1e-12)
+
+
+def test_compensated_cones_are_checked_too() -> None:
+    """The real base joint 4 stands 1 mm aside, which turns its strut past a cone that nominally fits."""
+    home = struts(HOME)
+    sideways = np.cross(home[3], [0.0, 0.0, 1.0])
+    deviation = np.zeros((6, 3))
+    deviation[3] = -1e-3 * sideways / np.linalg.norm(sideways)
+    there = Pose(HOME.position + 0.02 * sideways / np.linalg.norm(sideways), HOME.rotation)
+    angle = angles_between(struts(there), home)[3]
+    real = angles_between(struts(there) - deviation, home)[3]
+    geometry = with_limits(base_cone=one_strut(0.5 * (angle + real), 3, np.pi))
+    accepted(geometry, there)
+    error = refusal(geometry, there, MachineModel(PAPER.name, base_deviation=deviation))
+    assert (error.reason, error.strut, error.stage) == ("base_cone", 3, "compensated")
+    assert error.value == pytest.approx(real, rel=1e-9)
+
+
+def test_compensated_clearances_are_checked_too() -> None:
+    """The real base joint of the nearest strut stands 2 mm aside, towards or away from the other."""
+    nominal, strut = least_distance(CROSSED, PAPER.base_joints)
+    deviations = np.zeros((2, 6, 3))
+    deviations[:, strut, 0] = 2e-3, -2e-3
+    real, deviation = min(
+        ((least_distance(CROSSED, PAPER.base_joints + one)[0], one) for one in deviations), key=lambda found: found[0]
+    )
+    geometry = with_limits(clearance=0.5 * (nominal + real))
+    accepted(geometry, CROSSED)
+    error = refusal(geometry, CROSSED, MachineModel(PAPER.name, base_deviation=deviation))
+    assert (error.reason, error.strut, error.stage) == ("clearance", strut, "compensated")
+    assert error.value == pytest.approx(real, rel=1e-9)
+
+
+def test_compensated_steps_are_checked_too() -> None:
+    """A pitch error of 2 % makes the compensated step 2 % longer than the nominal one."""
+    model = MachineModel(
+        PAPER.name,
+        struts=StrutErrors(pitch=np.full(6, -0.02), reference_length=np.full(6, np.linalg.norm(struts(HOME)[0]))),
+    )
+    there = Pose(HOME.position + np.array([0.0, 0.0, 2.5e-3]), HOME.rotation)
+    step = np.linalg.norm(struts(there)[0]) - np.linalg.norm(struts(HOME)[0])
+    compensator = Compensator(with_limits(step=1.01 * step), model)
+    compensator.correct(HOME)
+    with pytest.raises(LimitError) as caught:
+        compensator.correct(there)
+    assert (caught.value.reason, caught.value.stage) == ("step", "compensated")
+    assert caught.value.value == pytest.approx(step / 0.98, rel=1e-9)
+
+
+def test_nothing_is_refused_just_inside_all_limits_at_random_poses() -> None:
+    """200 poses: limits that just hold what NumPy says of the pose let it through."""
+    rng = np.random.default_rng(4)
+    for _ in range(200):
+        turn = Rotation.from_rotvec(rng.uniform(-0.25, 0.25, 3)).as_matrix()
+        pose = Pose(HOME.position + rng.uniform(-0.05, 0.05, 3), turn)
+        now, home = struts(pose), struts(HOME)
+        lengths = np.linalg.norm(now, axis=1)
+        at_home = np.linalg.norm(home, axis=1)
+        stroke = np.stack([np.minimum(lengths, at_home), np.maximum(lengths, at_home)], axis=1)
+        limits = replace(
+            WIDE,
+            stroke=stroke * [1.0 - HAIR, 1.0 + HAIR],
+            base_cone=angles_between(now, home) * (1.0 + HAIR),
+            platform_cone=angles_between(now @ turn, home) * (1.0 + HAIR),
+            condition=max(condition_by_inverse(pose), condition_by_inverse(HOME)) * (1.0 + HAIR),
+        )
+        accepted(replace(PAPER, limits=limits), pose)
+
+
+# --- both ways of asking -----------------------------------------------------------------------------------
+
+TOOL = Pose.from_angles([0.01, -0.02, 0.08], np.deg2rad([20.0, -10.0, 40.0]))
+WORK = Pose.from_angles([0.1, 0.05, 0.2], np.deg2rad([3.0, 5.0, -70.0]))
+OVER = np.diag([1.0, -1.0, -1.0])
+"""Turns a machine upside down."""
+
+
+def tight(geometry: HexapodGeometry, clearance: float, **frames: object) -> HexapodGeometry:
+    """Return a machine whose every limit some poses about home break, and no few keep."""
+    lengths = strut_lengths(Structure.of(geometry), geometry.home)
+    stroke = np.stack([lengths - 0.05, lengths + 0.05], axis=1)
+    limits = Limits(stroke, np.full(6, 0.11), np.full(6, 0.26), 3.2, 80e-6, 1.0, 1.0, clearance)
+    return replace(geometry, limits=limits, **frames)
+
+
+def hanging() -> HexapodGeometry:
+    home = Pose(OVER @ HOME.position, OVER @ HOME.rotation @ OVER)
+    return HexapodGeometry(
+        "hanging", PAPER.base_joints @ OVER, PAPER.platform_joints @ OVER, home, WIDE, work=WORK, tool=TOOL
+    )
+
+
+MACHINES = {
+    "paper": tight(PAPER, 0.0),
+    "paper with a clearance": tight(PAPER, 0.23),
+    "6-6 in turned frames": tight(skewed_geometry(), 0.01, tool=TOOL, work=WORK),
+    "hanging": tight(hanging(), 0.23),
+}
+
+
+def first_broken(limits: Limits, numbers: codes.LimitNumbers, found: codes.Quantities) -> set[tuple[str, int]]:
+    """Return, of all limits that the full examination finds broken, what a check in the documented order meets first.
+
+    Reason and strut; two struts for a clearance, which concerns both; nothing for a pose within the limits.
+    """
+    margins = {name: (margin[0, 0], value[0, 0]) for name, (margin, value) in limits.margins(found).items()}
+    broken = {name: ~(margin >= 0.0) for name, (margin, _) in margins.items()}
+    for i in np.flatnonzero(broken["stroke"]):
+        return {("stroke" if np.isfinite(margins["stroke"][1][i]) else "not_finite", int(i))}
+    for i in range(6):
+        for cone in ("base_cone", "platform_cone"):
+            if broken[cone][i]:
+                return {(cone, i)}
+    if "clearance" in broken and broken["clearance"].any():
+        return {("clearance", int(i)) for i in np.flatnonzero(broken["clearance"])}
+    if broken["condition"][0]:
+        return {("condition", -1)}
+    return {("assembly", -1)} if found.sign[0, 0] != numbers.home_sign else set()
+
+
+def hold_together(machine: HexapodGeometry, limits: Limits, pose: Pose, lengths: np.ndarray) -> str:
+    """Fail unless both ways of asking say the same of a pose of the nominal machine; return what they say."""
+    given = machine.limit_numbers
+    numbers = limits.numbers(given.cone_axes, given.apart, given.characteristic_length, given.home_sign)
+    at = *machine.kernel_joints, pose.position, pose.rotation
+    found = codes.Quantities.empty(1)
+    found.lengths[0, 0] = lengths
+    codes.examine(*at, numbers, found, 0, 0)
+    finding, strut, _, other, _ = codes.check_stage(*at, lengths, numbers)
+    expected = first_broken(limits, numbers, found)
+    if finding == codes.WITHIN:
+        assert expected == set()
+    else:
+        assert (REASONS[finding], strut) in expected
+        assert other < 0 or (REASONS[finding], other) in expected
+    return REASONS[finding]
+
+
+def at_the_edge(limits: Limits, lengths: np.ndarray, found: codes.Quantities) -> list[Limits]:
+    """Return limits at the very quantities of a pose, and some steps of floating point beside them."""
+    angles = np.arccos(np.clip(found.cosines[0, 0], -1.0, 1.0))
+    values: list[tuple[str, tuple, float]] = []
+    for i in range(6):
+        values += [("stroke", (i, side), lengths[i]) for side in range(2)]
+        values += [(f"{body}_cone", (i,), angles[side, i]) for side, body in enumerate(("base", "platform"))]
+    values += [("condition", (), found.condition[0, 0])]
+    values += [("clearance", (), least) for least in found.distances[0, 0] if limits.clearance and np.isfinite(least)]
+    every = []
+    for name, place, value in values:
+        for steps in (-1000, -30, -1, 0, 1, 30, 1000):  # a cosine near 1 resolves some 100 steps of its angle
+            changed = np.array(getattr(limits, name))
+            changed[place] = value + steps * np.spacing(value)
+            every.append(replace(limits, **{name: changed if place else float(changed)}))
+    return every
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_both_ways_of_asking_agree_to_the_last_bit(name: str) -> None:
+    """At random poses, and with every limit at the pose's own quantity: an angle rounds where its cosine does not."""
+    machine, rng = MACHINES[name], np.random.default_rng(13)
+    said = set()
+    for _ in range(150):
+        pose = random_pose(rng, machine.home, 0.06, 25.0)
+        said.add(hold_together(machine, machine.limits, pose, strut_lengths(Structure.of(machine), pose)))
+    assert said >= {"", "stroke", "base_cone", "platform_cone"}
+    wide = replace(WIDE, clearance=1e-6 if machine.limits.clearance else 0.0)
+    for _ in range(5):
+        pose = random_pose(rng, machine.home, 0.06, 25.0)
+        lengths, found = strut_lengths(Structure.of(machine), pose), codes.Quantities.empty(1)
+        given = machine.limit_numbers._replace(clearance=wide.clearance)
+        codes.examine(*machine.kernel_joints, pose.position, pose.rotation, given, found, 0, 0)
+        verdicts = [hold_together(machine, limits, pose, lengths) for limits in at_the_edge(wide, lengths, found)]
+        assert set(verdicts) >= {"", "stroke", "base_cone", "platform_cone", "condition"}
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 0.0])
+@pytest.mark.parametrize("name", MACHINES)
+def test_both_ways_of_asking_refuse_what_is_no_number(name: str, bad: float) -> None:
+    """Lengths, positions and rotations that are none; a platform joint in its base joint: a strut without direction."""
+    machine = MACHINES[name]
+    for strut in range(6):
+        lengths = strut_lengths(Structure.of(machine), machine.home)
+        lengths[strut] = bad
+        assert hold_together(machine, machine.limits, machine.home, lengths) in ("not_finite", "stroke")
+    lengths = strut_lengths(Structure.of(machine), machine.home)
+    if not np.isfinite(bad):
+        for part in ("position", "rotation"):
+            pose = Pose(machine.home.position.copy(), machine.home.rotation.copy())
+            getattr(pose, part).flags.writeable = True
+            getattr(pose, part)[...] = bad
+            assert hold_together(machine, machine.limits, pose, lengths) != ""
+    joints = machine.home.rotation @ machine.platform_joints[2]
+    assert hold_together(machine, machine.limits, Pose(machine.base_joints[2] - joints, machine.home.rotation), lengths)
+
+
+def compensators_refusal(machine: HexapodGeometry, model: MachineModel, tool: Pose) -> tuple[str, int | None] | None:
+    """Return reason and strut with which a fresh compensator refuses a tool pose, None where it does not."""
+    try:
+        Compensator(machine, model).correct(tool)
+    except HexapodError as error:
+        return error.reason, getattr(error, "strut", None)
+    return None
+
+
+@pytest.mark.parametrize("name", MACHINES)
+@fixed
+@given(seed=seeds)
+def test_check_reach_cold_start_and_compensator_agree(name: str, seed: int) -> None:
+    """A model with all errors, random tool poses: who refuses, refuses for a reason that the others know."""
+    machine, rng = MACHINES[name], np.random.default_rng(seed)
+    structure, model = Structure.of(machine), random_model(rng, machine.name)
+    poses = [random_pose(rng, machine.home, 0.04, 12.0) for _ in range(4)]
+    told = [machine.tool_pose(pose) for pose in poses]
+    positions, rotations = np.array([p.position for p in told]), np.array([p.rotation for p in told])
+    result = check(machine, model, positions, rotations, "poses")
+    reach, _ = Examiner(machine).findings(positions, rotations)
+    for row, (pose, tool) in enumerate(zip(poses, told, strict=True)):
+        breaches = {(b.limit, getattr(b.error, "strut", None)) for b in result.breaches if b.row == row}
+        assert compensators_refusal(machine, model, tool) in (breaches or {None})
+        # Tool poses round on their way through the frames; the poses are random, none is at an edge.
+        nominal = machine.refusal(pose.position, pose.rotation, strut_lengths(structure, pose))
+        assert REASONS[reach[row]] == ("" if nominal is None else nominal.reason)
+        if nominal is None or nominal.reason != "stroke":
+            assert bool(mode_objections(machine, structure, pose)) == (nominal is not None)

@@ -1,0 +1,479 @@
+"""Model files: what is written comes back, what is read means what it says, what is in doubt is refused."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from dataclasses import fields, is_dataclass, replace
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import UNEVEN_GRID, fixed, paper_geometry, random_field, random_model, seeds, skewed_geometry
+
+from hexapod_comp.errors import InputFileError, ModelError
+from hexapod_comp.machine.field import CROSS_AXES, GridField
+from hexapod_comp.machine.model import MachineModel, ModelOrigin
+from hexapod_comp.machine.model_file import load_model, save_model
+from hexapod_comp.machine.struts import StrutErrors
+
+PAPER, SKEWED = paper_geometry(), skewed_geometry()
+DIGEST = "0123456789abcdef" * 4
+ORIGIN = ModelOrigin("2026-01-31", (("laser x.csv", DIGEST), ("ballbar.csv", "f" * 64)), 4.2e-6, "Größe: 4 µm")
+
+# Written by hand; every number is checked below.
+BY_HAND = f"""
+format: hexapod_comp/model
+version: 1
+machine: paper
+name: by hand
+date: 2026-01-31
+sources:
+- {{file: laser.csv, sha256: {DIGEST}}}
+valid_box_mm: [[-200, -200, 350], [200, 200, 550]]
+held_out_residual_um: 4.2
+reversal_threshold_um: 3
+structure:
+  base_deviation_um: [[1, 2, 3], [0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0], [-4, 5.5, 0]]
+struts:
+  offset_um: [10, 20, 30, 40, 50, 60]
+  pitch_ppm: 12
+  reference_length_in: 20
+  wave:
+    sine_um: 2
+    period_mm: [5, 5, 5, 5, 5, 4]
+  backlash_mm: 0.01
+  expansion_ppm_per_K: 11.7
+  map:
+    knots_mm: [330, 880]
+    values_um: [[0, 1], [0, 2], [0, 3], [0, 4], [0, 5], [0, 6]]
+thermal:
+  platform_expansion_ppm_per_K: 23.1
+field:
+  grid_x_mm: [-200, 200]
+  grid_y_in: [-8, 8]
+  grid_z_mm: [350, 400, 550]
+  probe_mm: [0, 0, -100]
+  lines:
+  - {{axis: z, at: [0, 0], direction: both, dz_um: [1, 2, 3], rx_urad: [7]}}
+  - {{axis: z, at: [0, 1], direction: forward}}
+  - {{axis: z, at: [0, 1], direction: backward, dz_mm: [0.001]}}
+  - {{axis: z, at: [1, 0], direction: both}}
+  - {{axis: z, at: [1, 1], direction: both, dx_um: []}}
+"""
+
+
+def load(folder, text, geometry=PAPER):
+    path = folder / "model.yaml"
+    path.write_text(text, encoding="utf-8")
+    return load_model(path, geometry)
+
+
+def assert_equal(one, other, relative=0.0):
+    """Compare two models, or any parts of them, field by field."""
+    assert type(one) is type(other)
+    if is_dataclass(one):
+        for entry in fields(one):
+            assert_equal(getattr(one, entry.name), getattr(other, entry.name), relative)
+    elif isinstance(one, tuple):
+        assert len(one) == len(other)
+        for mine, its in zip(one, other, strict=True):
+            assert_equal(mine, its, relative)
+    elif isinstance(one, np.ndarray):
+        assert one.shape == other.shape
+        np.testing.assert_allclose(one, other, rtol=relative)
+    elif isinstance(one, float):
+        assert one == pytest.approx(other, rel=relative, abs=0.0)
+    else:
+        assert one == other
+
+
+def there_and_back(model, folder, geometry):
+    save_model(model, folder / "there.yaml")
+    return load_model(folder / "there.yaml", geometry)
+
+
+# There and back.
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_model_comes_back(tmp_path, seed):
+    """Truth: the model saved. One rounding per number, 2.2e-16, where no decimal in the unit hits it."""
+    rng = np.random.default_rng(seed)
+    model = replace(
+        random_model(rng, "skewed"),
+        valid_box=np.sort(rng.uniform(-1.0, 1.0, (2, 3)), axis=0),
+        reversal_threshold=rng.uniform(0.0, 1e-5),
+        origin=ORIGIN,
+    )
+    assert_equal(there_and_back(model, tmp_path, SKEWED), model, relative=2.3e-16)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_what_was_read_is_written_unchanged(tmp_path, seed):
+    """Truth: from the first reading on everything is exact, and a second file equals the first."""
+    model = replace(random_model(np.random.default_rng(seed), "skewed"), origin=ORIGIN)
+    once = there_and_back(model, tmp_path, SKEWED)
+    first = (tmp_path / "there.yaml").read_bytes()
+    twice = there_and_back(once, tmp_path, SKEWED)
+    assert (tmp_path / "there.yaml").read_bytes() == first
+    assert_equal(twice, once)
+
+
+def test_an_ideal_model_comes_back_from_a_short_file(tmp_path):
+    model = MachineModel("paper", origin=ModelOrigin("2026-01-31"))
+    assert_equal(there_and_back(model, tmp_path, PAPER), model)
+    assert (tmp_path / "there.yaml").read_text() == (
+        "format: hexapod_comp/model\nversion: 1\nclosed: true\nmachine: paper\nname: ideal\ndate: '2026-01-31'\n"
+        "sources: []\nreversal_threshold_um: 0.2\nend: true\n"
+    )
+
+
+def _families(*powers):
+    return tuple(
+        np.zeros((2, len(UNEVEN_GRID[a]), len(UNEVEN_GRID[b]), 6, k))
+        for (a, b), k in zip(CROSS_AXES, powers, strict=True)
+    )
+
+
+def _only_dx_along_x():
+    lines = _families(3, 0, 0)
+    lines[0][:, :, :, 0] = np.random.default_rng(1).normal(size=lines[0][:, :, :, 0].shape) * 1e-5
+    return lines
+
+
+@pytest.mark.parametrize(
+    "field",
+    [
+        pytest.param(GridField(UNEVEN_GRID, _families(0, 0, 0), outside="refuse"), id="a box without lines"),
+        pytest.param(GridField(UNEVEN_GRID, _families(0, 2, 0)), id="a family of zeros"),
+        pytest.param(GridField(UNEVEN_GRID, _only_dx_along_x()), id="one component of one family"),
+        pytest.param(random_field(np.random.default_rng(2), powers=1), id="constants"),
+        pytest.param(random_field(np.random.default_rng(3), powers=9, probe=[0, 0, -0.15]), id="nine powers"),
+    ],
+)
+def test_fields_come_back(tmp_path, field):
+    model = MachineModel("paper", field=field, origin=ORIGIN)
+    assert_equal(there_and_back(model, tmp_path, PAPER), model, relative=2.3e-16)
+
+
+def test_the_papers_field_is_sparse_and_equal_directions_are_said_once(tmp_path):
+    """A 1-D laser's lines carry one component each; where forward is backward, one line says both."""
+    lines = _only_dx_along_x()
+    lines[0][1, 0, 0] = lines[0][0, 0, 0]
+    there_and_back(MachineModel("paper", field=GridField(UNEVEN_GRID, lines), origin=ORIGIN), tmp_path, PAPER)
+    written = yaml.safe_load((tmp_path / "there.yaml").read_text())["field"]["lines"]
+    assert all(set(line) == {"axis", "at", "direction", "dx_um"} for line in written)
+    assert [line["direction"] for line in written] == ["both"] + ["forward", "backward"] * 8
+
+
+def test_round_numbers_stay_round(tmp_path):
+    """Truth: what a person would write. 0.35 m are 350 mm, not 349.99999999999994."""
+    struts = StrutErrors(
+        offset=np.full(6, 12.3e-6), pitch=np.arange(6) / 1e6, sine=np.full(6, 1e-7), period=np.full(6, 0.005)
+    )
+    grid = (np.array([-0.2, 0.1]), np.array([-0.15, 0.3]), np.array([0.35, 0.55]))
+    lines = tuple(np.zeros((2, 2, 2, 6, 0)) for _ in range(3))
+    model = MachineModel("paper", struts=struts, field=GridField(grid, lines), origin=ORIGIN)
+    assert_equal(there_and_back(model, tmp_path, PAPER), model)
+    text = (tmp_path / "there.yaml").read_text()
+    for line in (
+        "  offset_um: 12.3\n",
+        "  pitch_ppm: [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]\n",
+        "    sine_um: 0.1\n",
+        "    period_mm: 5.0\n",
+        "  grid_y_mm: [-150.0, 300.0]\n",
+        "  grid_z_mm: [350.0, 550.0]\n",
+        "held_out_residual_um: 4.2\n",
+    ):
+        assert line in text
+
+
+def test_the_file_opens_with_its_provenance(tmp_path):
+    save_model(replace(random_model(np.random.default_rng(0), "paper"), origin=ORIGIN), tmp_path / "m.yaml")
+    text = (tmp_path / "m.yaml").read_text(encoding="utf-8")
+    keys = [line.split(":")[0] for line in text.splitlines() if line[0] not in " -"]
+    assert keys[:9] == [
+        "format",
+        "version",
+        "closed",
+        "machine",
+        "name",
+        "date",
+        "sources",
+        "held_out_residual_um",
+        "note",
+    ]
+    assert keys[9:] == ["reversal_threshold_um", "structure", "struts", "thermal", "field", "end"]
+    assert "Größe: 4 µm" in text
+
+
+# Reading.
+
+
+def test_a_file_written_by_hand(tmp_path):
+    """Truth: the numbers in BY_HAND, times their units."""
+    model = load(tmp_path, BY_HAND)
+    assert (model.machine, model.name) == ("paper", "by hand")
+    assert_equal(model.origin, ModelOrigin("2026-01-31", (("laser.csv", DIGEST),), 4.2e-6), relative=3e-16)
+    np.testing.assert_array_equal(model.valid_box, [[-0.2, -0.2, 0.35], [0.2, 0.2, 0.55]])
+    assert model.reversal_threshold == 3e-6
+    np.testing.assert_array_equal(model.base_deviation[[0, 5]], [[1e-6, 2e-6, 3e-6], [-4e-6, 5.5e-6, 0]])
+    assert not model.platform_deviation.any()
+    struts = model.struts
+    np.testing.assert_array_equal(struts.offset, np.array([1, 2, 3, 4, 5, 6]) / 1e5)
+    np.testing.assert_array_equal(struts.pitch, np.full(6, 12e-6))
+    np.testing.assert_allclose(struts.reference_length, 0.508, rtol=1e-15)
+    assert not struts.cosine.any()
+    np.testing.assert_array_equal(struts.sine, np.full(6, 2e-6))
+    np.testing.assert_array_equal(struts.period, [0.005] * 5 + [0.004])
+    np.testing.assert_array_equal(struts.backlash, np.full(6, 1e-5))
+    np.testing.assert_array_equal(struts.expansion, np.full(6, 11.7e-6))
+    np.testing.assert_array_equal(struts.map_knots, [0.33, 0.88])
+    np.testing.assert_array_equal(struts.map_values[:, 1], np.array([1, 2, 3, 4, 5, 6]) / 1e6)
+    assert (model.base_expansion, model.platform_expansion) == (0.0, 23.1e-6)
+
+
+def test_a_field_written_by_hand(tmp_path):
+    """Truth: the lines in BY_HAND. Shorter polynomials are filled up with zeros, what is left out is zero."""
+    field = load(tmp_path, BY_HAND).field
+    np.testing.assert_allclose(field.grid[1], [-0.2032, 0.2032], rtol=1e-15)
+    np.testing.assert_array_equal(field.grid[2], [0.35, 0.4, 0.55])
+    np.testing.assert_array_equal(field.probe, [0, 0, -0.1])
+    assert field.outside == "hold"
+    assert [family.shape for family in field.lines] == [(2, 2, 3, 6, 0), (2, 2, 3, 6, 0), (2, 2, 2, 6, 3)]
+    truth = np.zeros((2, 2, 2, 6, 3))
+    truth[:, 0, 0, 2] = [1e-6, 2e-6, 3e-6]
+    truth[:, 0, 0, 3, 0] = 7e-6
+    truth[1, 0, 1, 2, 0] = 1e-6
+    np.testing.assert_array_equal(field.lines[2], truth)
+
+
+@pytest.mark.parametrize(
+    "date",
+    [
+        "'2026-01-31'",
+        "2026-01-31T12:30:00",
+        "'2026-01-31T12:30:00Z'",
+        "'2026-01-31 12:30'",
+        "2026-01-31T12:30:00+01:00",
+        "'2026-01-31T12:30:00.123456+01:00'",
+    ],
+)
+def test_dates_that_are_understood(tmp_path, date):
+    model = load(tmp_path, BY_HAND.replace("2026-01-31", date))
+    assert model.origin.date.startswith("2026-01-31")
+    assert_equal(there_and_back(model, tmp_path, PAPER), model)
+
+
+# Refused, naming file, key and value.
+
+LAST_LINE = "  - {axis: z, at: [1, 1], direction: both, dx_um: []}\n"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("version: 1", "version: 2", ["version", "only version 1", "found 2"]),
+        ("hexapod_comp/model", "hexapod_comp/geometry", ["format", "hexapod_comp/model", "geometry"]),
+        ("machine: paper", "machine: other", ["machine", "another machine", "'paper'", "'other'"]),
+        ("name: by hand\n", "", ["name", "missing"]),
+        ("date: 2026-01-31\n", "", ["date", "missing"]),
+        ("2026-01-31", "31.1.2026", ["date", "ISO 8601", "31.1.2026"]),
+        ("2026-01-31", "'2026-02-30'", ["date", "ISO 8601", "2026-02-30"]),
+        ("2026-01-31", "2026", ["date", "ISO 8601", "found 2026"]),
+        ("2026-01-31", "yesterday", ["date", "ISO 8601", "yesterday"]),
+        (DIGEST, DIGEST[1:], ["sources[0].sha256", "64", "laser.csv", DIGEST[1:10]]),
+        (DIGEST, DIGEST.upper(), ["sources[0].sha256", "lower-case"]),
+        (DIGEST, "g" * 64, ["sources[0].sha256", "hexadecimal", "gggg"]),
+        (f", sha256: {DIGEST}", "", ["sources[0].sha256", "missing"]),
+        ("{file: laser.csv,", "{file: laser.csv, size: 3,", ["sources[0].size", "not a known key", "3"]),
+        (f"sources:\n- {{file: laser.csv, sha256: {DIGEST}}}\n", "", ["sources", "missing"]),
+        ("valid_box_mm", "valid_box", ["valid_box", "no unit", "valid_box_mm"]),
+        ("[200, 200, 550]]", "[200, 200, 350]]", ["valid_box", "lowest", "0.35"]),
+        ("[200, 200, 550]]", "[200, 200]]", ["valid_box_mm", "2×3"]),
+        ("residual_um: 4.2", "residual_um: .nan", ["held_out_residual_um", "finite", "nan"]),
+        ("residual_um: 4.2", "residual_um: -1", ["held_out_residual", "negative", "-1e-06"]),
+        ("threshold_um: 3", "threshold_um: -3", ["reversal_threshold", "negative", "-3e-06"]),
+        ("threshold_um: 3", "threshold: 3", ["reversal_threshold", "no unit", "reversal_threshold_um"]),
+        ("base_deviation_um", "base_deviation", ["structure.base_deviation", "no unit"]),
+        ("base_deviation_um", "bass_deviation_um", ["structure.bass_deviation_um", "not a known key"]),
+        ("base_deviation_um", "base_deviation_m", ["structure.base_deviation", "±50 mm", "unit", "5.5"]),
+        ("[1, 2, 3], ", "", ["structure.base_deviation_um", "6×3", "5×3"]),
+        ("[1, 2, 3], ", "[1, .inf, 3], ", ["structure.base_deviation_um[0][1]", "finite", "inf"]),
+        ("[10, 20, 30, 40, 50, 60]", "[10, 20]", ["struts.offset_um", "shape 6"]),
+        ("[10, 20, 30, 40, 50, 60]", "a lot", ["struts.offset_um", "number", "a lot"]),
+        ("pitch_ppm: 12", "pitch_um: 12", ["struts.pitch_um", "not a known key", "12"]),
+        ("pitch_ppm: 12", "pitch_percent: 50", ["struts", "0.50", "allowed 0.2"]),
+        ("backlash_mm: 0.01", "backlash_mm: -0.01", ["struts.backlash", "negative", "-1e-05"]),
+        ("    period_mm: [5, 5, 5, 5, 5, 4]\n", "", ["struts.wave.period", "missing", "period_mm"]),
+        ("[5, 5, 5, 5, 5, 4]", "0", ["struts.period", "above zero", "0.0"]),
+        ("knots_mm: [330, 880]", "knots_mm: [880, 330]", ["struts.map_knots", "increasing", "0.88"]),
+        ("knots_mm: [330, 880]", "knots_mm: [330, 600, 880]", ["struts.map_values", "(6, 3)", "(6, 2)"]),
+        (", [0, 6]]", "]", ["struts.map.values_um", "6×n", "5×2"]),
+        (
+            "thermal:\n",
+            "thermal:\n  tool_expansion_ppm_per_K: 5\n",
+            ["thermal.tool_expansion_ppm_per_K", "5"],
+        ),
+        ("thermal:\n  platform_expansion_ppm_per_K: 23.1", "thermal:", ["thermal", "mapping"]),
+        ("grid_x_mm: [-200, 200]", "grid_x_mm: [200, -200]", ["field.grid_x", "increasing", "0.2"]),
+        ("grid_x_mm: [-200, 200]", "grid_x_mm: 200", ["field.grid_x_mm", "shape n"]),
+        ("  grid_x_mm: [-200, 200]\n", "", ["field.grid_x", "missing", "grid_x_mm"]),
+        ("  probe_mm", "  outside: guess\n  probe_mm", ["field.outside", "hold, refuse", "guess"]),
+        ("axis: z, at: [0, 0]", "axis: w, at: [0, 0]", ["field.lines[0].axis", "x, y, z", "'w'"]),
+        (
+            "direction: forward",
+            "direction: up",
+            ["field.lines[1].direction", "forward, backward, both", "up"],
+        ),
+        ("at: [1, 1]", "at: [1, 2]", ["field.lines[4].at", "0…1 and 0…1", "[1, 2]"]),
+        ("at: [1, 1]", "at: [-1, 1]", ["field.lines[4].at", "0…1", "[-1, 1]"]),
+        ("at: [1, 1]", "at: [1.0, 1]", ["field.lines[4].at", "indices", "[1.0, 1]"]),
+        ("at: [1, 1]", "at: [1]", ["field.lines[4].at", "two node indices", "[1]"]),
+        ("at: [1, 1]", "at: [true, 1]", ["field.lines[4].at", "True"]),
+        ("dx_um: []", "dx: [1]", ["field.lines[4].dx", "no unit", "dx_um"]),
+        ("dx_um: []", "rx_um: [1]", ["field.lines[4].rx_um", "not a known key"]),
+        ("dx_um: []", "dx_um: 1", ["field.lines[4].dx_um", "shape n"]),
+        ("dz_um: [1, 2, 3]", "dz_um: [1, .nan, 3]", ["field.lines[0].dz_um[1]", "finite", "nan"]),
+        (LAST_LINE, "", ["field.lines", "the forward line along z at [1, 1] is missing"]),
+        (
+            "at: [0, 1], direction: backward",
+            "at: [0, 0], direction: backward",
+            ["lines[2].at", "given twice"],
+        ),
+        (
+            "direction: backward",
+            "direction: both",
+            ["lines[2].at", "forward line along z", "twice", "[0, 1]"],
+        ),
+        ("direction: forward", "direction: backward", ["lines[2].at", "backward line along z", "twice"]),
+        (LAST_LINE, LAST_LINE + "tuning: 1\n", ["tuning", "not a known key", "1"]),
+        (LAST_LINE, LAST_LINE + "name: again\n", ["'name' is given twice"]),
+    ],
+)
+def test_refused(tmp_path, old, new, said):
+    assert old in BY_HAND
+    with pytest.raises(InputFileError) as caught:
+        load(tmp_path, BY_HAND.replace(old, new, 1))
+    message = str(caught.value)
+    assert message.startswith(str(tmp_path / "model.yaml"))
+    for part in said:
+        assert part in message[len(str(tmp_path)) :]
+
+
+def test_one_missing_line_of_a_family_is_named(tmp_path):
+    """A family is whole or absent: a hole in it would count as a machine without error there."""
+    text = BY_HAND.replace("direction: forward}", "direction: both}").replace(
+        "  - {axis: z, at: [0, 1], direction: backward, dz_mm: [0.001]}\n", ""
+    )
+    assert load(tmp_path, text).field.lines[2].shape[4] == 3
+    with pytest.raises(InputFileError, match=r"the backward line along z at \[0, 1\] is missing"):
+        load(tmp_path, text.replace("at: [0, 1], direction: both", "at: [0, 1], direction: forward"))
+
+
+def test_many_nodes_with_few_lines_take_no_memory(tmp_path):
+    """20,000 nodes both ways would be 100 GB of coefficients; the missing lines are found first."""
+    nodes = "[" + ", ".join(str(n) for n in range(20_000)) + "]"
+    text = BY_HAND.replace("[-200, 200]", nodes, 1).replace("grid_y_in: [-8, 8]", f"grid_y_mm: {nodes}")
+    with pytest.raises(InputFileError, match="is missing"):
+        load(tmp_path, text)
+
+
+@fixed
+@given(st.data())
+def test_no_damage_to_a_file_gets_through_as_another_error(tmp_path_factory, data):
+    """Truth: a damaged file is either still a model or an InputFileError; nothing else ever comes out."""
+    start = data.draw(st.integers(0, len(BY_HAND) - 1))
+    end = data.draw(st.integers(start, min(len(BY_HAND), start + 12)))
+    junk = data.draw(st.text("0123456789.-+eE[]{}:,#&*!|>'\"% \n\tnax\x00é", max_size=6))
+    with contextlib.suppress(InputFileError):
+        load(tmp_path_factory.getbasetemp(), BY_HAND[:start] + junk + BY_HAND[end:])
+
+
+# Writing.
+
+
+@pytest.mark.parametrize(
+    ("origin", "said"),
+    [
+        (ModelOrigin(), "date: must be ISO 8601"),
+        (ModelOrigin("2026-13-01"), "date: must be ISO 8601.*2026-13-01"),
+        (ModelOrigin("2026-01-31", (("x.csv", "abc"),)), r"sources\[0\].sha256.*64.*x.csv.*abc"),
+        (ModelOrigin("2026-01-31", (), np.nan), "held_out_residual.*nan"),
+    ],
+)
+def test_a_model_without_provenance_is_not_written(tmp_path, origin, said):
+    path = tmp_path / "m.yaml"
+    path.write_text("the old one")
+    with pytest.raises(ModelError, match=said):
+        save_model(MachineModel("paper", origin=origin), path)
+    assert path.read_text() == "the old one"
+
+
+def test_a_file_that_cannot_be_written_says_so(tmp_path):
+    with pytest.raises(InputFileError, match="cannot be written"):
+        save_model(MachineModel("paper", origin=ORIGIN), tmp_path / "nowhere" / "m.yaml")
+    assert not os.listdir(tmp_path)
+
+
+@fixed
+@given(seeds)
+def test_names_of_every_kind_come_back(tmp_path_factory, seed):
+    """Text that YAML would take for something else (no, 1.5, null, a date, colons) stays text."""
+    rng = np.random.default_rng(seed)
+    words = [
+        "no",
+        "1.5",
+        "null",
+        "2026-01-31",
+        "a: b",
+        "- x",
+        "#1",
+        "0400",
+        "é µ 漢",
+        "'",
+        '"',
+        "!x",
+        "&a",
+        "*b",
+    ]
+    name, note, file = (" ".join(rng.choice(words, rng.integers(1, 4))) for _ in range(3))
+    model = MachineModel("paper", name, origin=ModelOrigin("2026-01-31", ((file, DIGEST),), None, note))
+    assert_equal(there_and_back(model, tmp_path_factory.getbasetemp(), PAPER), model)
+
+
+def test_a_file_cut_off_anywhere_is_refused(tmp_path):
+    """Every block is optional, so a beginning of a file may read well; a hundred places, line ends among them."""
+    path, whole = tmp_path / "m.yaml", tmp_path / "whole.yaml"
+    save_model(replace(random_model(np.random.default_rng(5), "paper"), origin=ORIGIN), whole)
+    text = whole.read_text(encoding="utf-8")
+    ends = [number for number, letter in enumerate(text[:-1]) if letter == "\n"]
+    places = {*np.linspace(1, len(text) - 2, 60, dtype=int), *np.random.default_rng(6).choice(ends, 40), ends[-1]}
+    accepted = []
+    for place in sorted(places):
+        path.write_text(text[:place], encoding="utf-8")
+        with contextlib.suppress(InputFileError):
+            load_model(path, PAPER)
+            accepted.append(text[:place][-20:])
+    assert accepted == []
+    assert load_model(whole, PAPER).origin == ORIGIN
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        (BY_HAND.replace("machine: paper", "machine: paper\nclosed: true"), "end"),
+        (BY_HAND + "end: true\n", "closed"),
+        (BY_HAND.replace("machine: paper", "machine: paper\nclosed: 1") + "end: true\n", "closed"),
+        (BY_HAND.replace("machine: paper", "machine: paper\nclosed: true") + "end: false\n", "end"),
+    ],
+)
+def test_marks_of_a_closed_file_belong_together(text, key, tmp_path):
+    path = tmp_path / "m.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputFileError) as caught:
+        load_model(path, PAPER)
+    assert caught.value.key == key

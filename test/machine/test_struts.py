@@ -1,0 +1,295 @@
+"""Strut errors: every term alone by its closed form, all together undone, and the rotation of the screws."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation
+from strategies import fixed, paper_geometry, random_pose, random_struts, seeds, skewed_geometry
+
+from hexapod_comp.errors import ModelError
+from hexapod_comp.kernels.struts import actual_length, command_for_length, screw_twist
+from hexapod_comp.machine.model import MachineModel, RealMachine, Temperatures
+from hexapod_comp.machine.motion import MotionState
+from hexapod_comp.machine.struts import STEEPEST_ERROR, StrutErrors
+from hexapod_comp.pose import Pose
+
+PAPER = paper_geometry()
+COMMANDS = np.linspace(0.35, 0.65, 61)
+
+
+def arrays(struts, growth=0.0):
+    """Return what the kernels read, for a machine whose screws cannot turn."""
+    table = struts.parameter_table(PAPER, np.full(6, growth))
+    return table, struts.map_knots.copy(), struts.spline_coefficients()
+
+
+def length(struts, command, sense=0.0, strut=0, growth=0.0, shift=0.0):
+    return actual_length(command, sense, shift, *arrays(struts, growth), strut)
+
+
+def on_strut_4(value):
+    """Return six values of which only strut 4 (index 3) has one."""
+    return np.where(np.arange(6) == 3, value, 0.0)
+
+
+# One term at a time. Truth: the closed form beside each; tolerance: two roundings of half a metre, 2e-16.
+
+
+@pytest.mark.parametrize("strut", [3, 0])
+@pytest.mark.parametrize(
+    ("struts", "truth"),
+    [
+        pytest.param(StrutErrors(), lambda c: 0.0 * c, id="none"),
+        pytest.param(StrutErrors(offset=on_strut_4(7e-6)), lambda c: 7e-6 + 0.0 * c, id="offset"),
+        pytest.param(
+            StrutErrors(pitch=on_strut_4(50e-6), reference_length=on_strut_4(0.4)),
+            lambda c: 50e-6 * (c - 0.4),
+            id="pitch",
+        ),
+        pytest.param(
+            StrutErrors(cosine=on_strut_4(3e-6), period=np.full(6, 0.005)),
+            lambda c: 3e-6 * np.cos(2.0 * np.pi * c / 0.005),
+            id="cosine",
+        ),
+        pytest.param(
+            StrutErrors(sine=on_strut_4(3e-6), period=np.full(6, 0.004)),
+            lambda c: 3e-6 * np.sin(2.0 * np.pi * c / 0.004),
+            id="sine",
+        ),
+    ],
+)
+def test_each_term_by_its_closed_form(struts, truth, strut):
+    for command in COMMANDS:
+        expected = command + (truth(command) if strut == 3 else 0.0)
+        # sin(2πc/T) near c/T = 160 carries the argument's rounding: 1e-13 of 3 µm.
+        assert length(struts, command, strut=strut) == pytest.approx(expected, abs=3e-16)
+
+
+def test_backlash_lags_behind_the_motion():
+    """Truth: a nut with 40 µm of play stands half of it behind: shorter going out, longer coming back."""
+    struts = StrutErrors(backlash=np.full(6, 40e-6))
+    assert length(struts, 0.5, +1.0) == pytest.approx(0.5 - 20e-6, abs=2e-16)
+    assert length(struts, 0.5, -1.0) == pytest.approx(0.5 + 20e-6, abs=2e-16)
+    assert length(struts, 0.5, 0.0) == 0.5
+
+
+def test_growth_stretches_the_whole_strut():
+    """Truth: (1 + g)·(c + offset); growth acts on the strut as it is, errors included."""
+    struts = StrutErrors(offset=np.full(6, 1e-3))
+    assert length(struts, 0.5, growth=2e-4) == pytest.approx(0.501 * 1.0002, abs=2e-16)
+
+
+def test_growth_comes_from_the_temperature_above_20_degrees():
+    """Truth: L·(1 + a·(T − T_ref)) (DESIGN): 12 ppm/K · 15 K of 0.5 m are 90 µm, on strut 2 alone."""
+    model = MachineModel("paper", struts=StrutErrors(expansion=np.full(6, 12e-6)))
+    machine = RealMachine(PAPER, model, Temperatures({"strut_2": 35.0}))
+    lengths = [actual_length(0.5, 0.0, 0.0, *machine.strut_arrays, i) for i in range(6)]
+    np.testing.assert_allclose(np.array(lengths) - 0.5, np.where(np.arange(6) == 1, 90e-6, 0.0), atol=2e-16)
+
+
+def test_length_map_is_the_natural_spline():
+    """Truth: SciPy's B-spline interpolation, another algorithm than the piecewise one under test.
+
+    Tolerance: 1e-12 of 50 µm; outside the knots the end values hold.
+    """
+    struts = random_struts(np.random.default_rng(11))
+    knots, values = struts.map_knots, struts.map_values
+    only_map = StrutErrors(map_knots=knots, map_values=values)
+    for strut in range(6):
+        natural = ([(2, 0.0)], [(2, 0.0)])
+        spline = make_interp_spline(knots, values[strut], k=3, bc_type=natural)
+        for command in np.linspace(0.25, 0.75, 101):
+            truth = spline(np.clip(command, knots[0], knots[-1]))
+            assert length(only_map, command, strut=strut) - command == pytest.approx(truth, abs=2e-16)
+        for knot, value in zip(knots, values[strut], strict=True):
+            assert length(only_map, knot, strut=strut) - knot == pytest.approx(value, abs=2e-16)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_length_map_of_few_knots(count):
+    """Truth: a natural spline through two points is their straight line; through three, SciPy's."""
+    knots, values = np.array([0.3, 0.5, 0.6])[:count], np.array([1e-5, -2e-5, 3e-5])[:count]
+    struts = StrutErrors(map_knots=knots, map_values=np.tile(values, (6, 1)))
+    truth = -0.5e-5 if count == 2 else make_interp_spline(knots, values, 3, bc_type="natural")(0.4)
+    assert length(struts, 0.4) - 0.4 == pytest.approx(truth, abs=2e-16)
+
+
+# There and back.
+
+
+@fixed
+@given(seeds, st.floats(0.25, 0.75), st.sampled_from([-1.0, 0.0, 1.0]), st.floats(-5e-3, 5e-3))
+def test_command_and_length_undo_each_other(seed, command, sense, shift):
+    """Truth: the inverse of a function. Tolerance: three roundings of half a metre."""
+    struts = random_struts(np.random.default_rng(seed))
+    read = arrays(struts, growth=3e-4)
+    for strut in range(6):
+        real = actual_length(command, sense, shift, *read, strut)
+        assert command_for_length(real, sense, shift, *read, strut) == pytest.approx(command, abs=4e-16)
+        back = command_for_length(command, sense, shift, *read, strut)
+        assert actual_length(back, sense, shift, *read, strut) == pytest.approx(command, abs=4e-16)
+
+
+@fixed
+@example(period=0.0005, offset=0.01, phase=0.0, at=0.5)
+@given(st.floats(0.0005, 0.05), st.floats(-0.01, 0.01), st.floats(0.0, 6.283), st.floats(0.3, 0.8))
+def test_undone_also_where_the_error_is_as_steep_as_allowed(period, offset, phase, at):
+    """Truth: the inverse of a function, at the slope up to which StrutErrors accepts a wave."""
+    amplitude = 0.999 * STEEPEST_ERROR * period / (2.0 * np.pi)
+    struts = StrutErrors(
+        offset=np.full(6, offset),
+        cosine=np.full(6, amplitude * np.cos(phase)),
+        sine=np.full(6, amplitude * np.sin(phase)),
+        period=np.full(6, period),
+    )
+    read = arrays(struts)
+    command = command_for_length(at, 0.0, 0.0, *read, 0)
+    assert actual_length(command, 0.0, 0.0, *read, 0) == pytest.approx(at, abs=1e-15)
+
+
+# What no strut can be.
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"offset": np.full(5, 0.0)}, r"struts.offset.*\(5,\)"),
+        ({"pitch": np.array([0, 0, np.nan, 0, 0, 0])}, "struts.pitch.*finite.*nan"),
+        ({"backlash": np.array([0, -1e-6, 0, 0, 0, 0])}, "struts.backlash.*negative.*-1e-06"),
+        ({"period": np.zeros(6)}, "struts.period.*above zero"),
+        ({"pitch": on_strut_4(0.5)}, r"struts\[3\].*0.5 m per m, allowed 0.2"),
+        ({"sine": np.full(6, 1e-3)}, r"struts\[0\].*allowed 0.2"),
+        ({"map_knots": np.array([0.4]), "map_values": np.zeros((6, 1))}, "struts.map_knots.*two"),
+        ({"map_knots": np.array([0.4, 0.4]), "map_values": np.zeros((6, 2))}, "struts.map_knots.*increasing"),
+        ({"map_knots": np.array([0.4, 0.5]), "map_values": np.zeros((6, 3))}, r"struts.map_values.*\(6, 3\)"),
+    ],
+)
+def test_refused(bad, message):
+    with pytest.raises(ModelError, match=message):
+        StrutErrors(**bad)
+
+
+# Rotation of the screws.
+
+
+def genhexkins_correction(lead, base_axis, platform_axis, strut, rotation):
+    """Return what LinuxCNC adds to a strut's length for its screw's rotation.
+
+    Written from StrutLengthCorrection in src/emc/kinematics/genhexkins.c of LinuxCNC/linuxcnc (read at
+    commit 032ef12c): with u along the strut from base to platform, nb2 = nb1 × u, nb3 = unit(u × nb2),
+    na2 = unit(R·na0 × u), correction = lead·asin(nb3·na2)/2π; genhexKinematicsInverse adds it to the length.
+    """
+    u = strut / np.linalg.norm(strut)
+    nb3 = np.cross(u, np.cross(base_axis, u))
+    na2 = np.cross(rotation @ platform_axis, u)
+    sine = nb3 @ na2 / (np.linalg.norm(nb3) * np.linalg.norm(na2))
+    return lead * np.arcsin(sine) / (2.0 * np.pi)
+
+
+def struts_at(geometry, pose):
+    return pose.position + geometry.platform_joints @ pose.rotation.T - geometry.base_joints
+
+
+def shifts(geometry, pose):
+    """Return what the model adds to the six commands of an otherwise ideal machine at a pose."""
+    commands, _, _ = RealMachine(geometry, MachineModel(geometry.name)).commands_for(pose, MotionState())
+    return commands - np.linalg.norm(struts_at(geometry, pose), axis=1)
+
+
+@fixed
+@given(seeds)
+def test_sine_of_the_twist_is_genhexkins(seed):
+    """Truth: genhexkins' formula, for arbitrary axes. Tolerance: axes nearly along the strut lose digits."""
+    rng = np.random.default_rng(seed)
+    geometry = skewed_geometry()
+    pose = random_pose(rng, geometry.home)
+    axes = rng.normal(size=(2, 6, 3))
+    axes /= np.linalg.norm(axes, axis=2)[:, :, None]
+    for i, strut in enumerate(struts_at(geometry, pose)):
+        twist = screw_twist(*geometry.kernel_joints, *axes, pose.position, pose.rotation, i)
+        truth = genhexkins_correction(2.0 * np.pi, axes[0, i], axes[1, i], strut, pose.rotation)
+        assert np.sin(twist) == pytest.approx(np.sin(truth), abs=1e-11)
+
+
+@fixed
+@given(seeds)
+def test_command_grows_by_genhexkins_correction_since_home(seed):
+    """Truth: genhexkins' correction here minus that at home, on struts 1–3, whose axes are parallel at home.
+
+    An axle has no direction, but genhexkins' arcsine gives it one: only with axis vectors more than 90°
+    apart, as LinuxCNC's own defaults are, does its lead mean what its header says, positive for a
+    right-hand thread. So it gets the platform's axes turned round. Tolerance: lengths
+    of half a metre are rounded to 1e-16, the difference of two arcsines of small angles no worse.
+    """
+    lead = 0.008
+    geometry = skewed_geometry(lead)
+    pose = random_pose(np.random.default_rng(seed), geometry.home)
+    found = shifts(geometry, pose)
+    for i in range(3):
+        axes = geometry.base_axes[i], -geometry.platform_axes[i]
+        here, home = (
+            genhexkins_correction(lead, *axes, struts_at(geometry, at)[i], at.rotation) for at in (pose, geometry.home)
+        )
+        assert found[i] == pytest.approx(here - home, abs=1e-15)
+
+
+def test_nothing_is_added_at_home():
+    """Truth: home is where the correction starts to count."""
+    geometry = skewed_geometry(0.01)
+    np.testing.assert_allclose(shifts(geometry, geometry.home), 0.0, atol=2e-16)
+
+
+@pytest.mark.parametrize("strut", range(6))
+@pytest.mark.parametrize("body", ["base_axes", "platform_axes"])
+def test_an_axis_has_no_direction(body, strut):
+    """Truth: an axle is the same line whichever way its vector points, so the command must not change."""
+    geometry = skewed_geometry(0.01)
+    axes = getattr(geometry, body).copy()
+    axes[strut] *= -1.0
+    turned = replace(geometry, **{body: axes})
+    rng = np.random.default_rng(strut)
+    for _ in range(5):
+        pose = random_pose(rng, geometry.home, tilt=30.0)
+        np.testing.assert_allclose(shifts(turned, pose), shifts(geometry, pose), atol=1e-15)
+
+
+def test_sign_and_size_by_hand():
+    """Truth: worked by hand. A platform turned by +10° about z, seen from above counter-clockwise.
+
+    On a strut along u = z with both axes along x at home, nb3 = x and na2 = (cos 10°, sin 10°, 0) × z =
+    (sin 10°, −cos 10°, 0), so nb3·na2 = sin 10° and genhexkins adds lead·10/360. The strut's joints lie on
+    the axis of the turn, so that it stays upright.
+    """
+    geometry = skewed_geometry()
+    base, platform = geometry.base_joints.copy(), geometry.platform_joints.copy()
+    base[0], platform[0] = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+    axes = np.tile([1.0, 0.0, 0.0], (6, 1))
+    turned = Rotation.from_rotvec([0.0, 0.0, np.deg2rad(10.0)]).as_matrix()
+    twist = screw_twist(base, platform, axes, axes.copy(), np.array([0.0, 0.0, 0.4]), turned, 0)
+    assert np.rad2deg(twist) == pytest.approx(10.0, abs=1e-12)
+
+
+def test_correction_does_not_jump_at_the_arctangents_cut():
+    """Truth: continuity. With axes 170° apart at home, a sweep of ±60° crosses 180° on the way.
+
+    Every step of 0.5° of platform rotation turns a screw by less than 1°, so no step of the command may
+    exceed lead·1/360; a lost turn would be the whole lead.
+    """
+    lead = 0.01
+    geometry = skewed_geometry(lead)
+    along = struts_at(geometry, geometry.home) @ geometry.home.rotation
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    turns = Rotation.from_rotvec(np.deg2rad(170.0) * along)
+    geometry = replace(geometry, platform_axes=turns.apply(geometry.platform_axes.copy()))
+    sweep = [
+        Pose(geometry.home.position, Rotation.from_euler("z", a, degrees=True).as_matrix())
+        for a in np.arange(-60.0, 60.0, 0.5)
+    ]
+    steps = np.diff([shifts(geometry, pose) for pose in sweep], axis=0)
+    assert np.abs(steps).max() < lead / 360.0

@@ -1,0 +1,277 @@
+"""Refractive index of air against published check values and another equation; readings corrected by counting fringes.
+
+In the tables of papers the index is written as (n − 1)·10⁸, printed to a tenth.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import fixed
+
+from hexapod_comp.errors import ModelError
+from hexapod_comp.measurements.air import (
+    STANDARD_AIR,
+    VACUUM_WAVELENGTH,
+    Air,
+    ciddor_index,
+    correct_displacement,
+    from_reference,
+    shop_index,
+    to_reference,
+)
+
+AT_633 = 633e-9
+"""The wavelength of the papers' tables, m."""
+
+PRINTED = 0.05
+"""Half a unit of the last digit of (n − 1)·10⁸ in Ciddor's tables."""
+
+
+def refractivity(air: Air, wavelength: float = AT_633, co2_ppm: float = 450.0) -> np.ndarray:
+    return 1e8 * (ciddor_index(air, wavelength, co2_ppm) - 1.0)
+
+
+@pytest.mark.parametrize(
+    ("temperature", "pressure_kpa", "printed"),
+    [(20, 80, 21458.0), (20, 100, 26824.4), (20, 120, 32191.6), (10, 100, 27774.7), (30, 100, 25937.2)],
+)
+def test_dry_air_as_printed(temperature: float, pressure_kpa: float, printed: float) -> None:
+    """Truth: Ciddor 1996, Table 1 (633 nm, 450 ppm CO₂), to the printed digit."""
+    assert refractivity(Air(temperature, pressure_kpa * 1e3, 0.0)) == pytest.approx(printed, abs=PRINTED)
+
+
+@pytest.mark.parametrize(
+    ("temperature", "pressure_kpa", "humidity", "printed"),
+    [
+        (20, 80, 0.75, 21394.0),
+        (20, 120, 0.75, 32127.8),
+        (40, 80, 0.75, 19896.5),  # printed 19996.5; the table's own column of differences gives 19896.5
+        (40, 120, 0.75, 29941.8),
+        (50, 80, 1.0, 19058.4),
+        (50, 120, 1.0, 28792.4),
+    ],
+)
+def test_moist_air_as_printed(temperature: float, pressure_kpa: float, humidity: float, printed: float) -> None:
+    """Truth: Ciddor 1996, Table 3 (633 nm, 450 ppm CO₂), to the printed digit."""
+    assert refractivity(Air(temperature, pressure_kpa * 1e3, humidity)) == pytest.approx(printed, abs=PRINTED)
+
+
+@pytest.mark.parametrize(
+    ("temperature", "pressure", "vapour_pressure", "co2_ppm", "measured"),
+    [
+        (19.526, 102094.8, 1065.0, 510.0, 27392.3),
+        (19.517, 102096.8, 1065.0, 510.0, 27394.0),
+        (19.173, 102993.0, 641.0, 450.0, 27683.4),
+        (19.173, 103006.0, 642.0, 440.0, 27686.9),
+        (19.188, 102918.8, 706.0, 450.0, 27659.1),
+        (19.189, 102927.8, 708.0, 440.0, 27661.4),
+        (19.532, 103603.2, 986.0, 600.0, 27802.1),
+        (19.534, 103596.2, 962.0, 600.0, 27800.3),
+        (19.534, 103599.2, 951.0, 610.0, 27801.8),
+    ],
+)
+def test_ambient_air_as_measured(
+    temperature: float, pressure: float, vapour_pressure: float, co2_ppm: float, measured: float
+) -> None:
+    """Truth: refractometer readings of real air, as listed beside Ciddor's equation (Ciddor 1996, Table 2).
+
+    The table gives the water as partial pressure; Magnus' formula (within 0.1 % here, so 0.05 in the result)
+    makes a relative humidity of it. Ciddor's own equation leaves up to 1.1 on these rows.
+    """
+    saturation = 610.94 * np.exp(17.625 * temperature / (243.04 + temperature))
+    air = Air(temperature, pressure, vapour_pressure / saturation)
+    assert refractivity(air, co2_ppm=co2_ppm) == pytest.approx(measured, abs=1.2)
+
+
+@pytest.mark.parametrize(
+    ("temperature", "pressure", "humidity", "wavelength_nm", "printed"),
+    [
+        (20, 101_325, 0.0, 633, 1.000271800),
+        (20, 60_000, 0.0, 633, 1.000160924),
+        (20, 120_000, 0.0, 633, 1.000321916),
+        (50, 100_000, 0.0, 633, 1.000243285),
+        (5, 100_000, 0.0, 633, 1.000282756),
+        (50, 120_000, 1.0, 633, 1.000287924),
+        (40, 120_000, 0.75, 633, 1.000299418),
+        (20, 100_000, 1.0, 633, 1.000267394),
+        (40, 110_000, 1.0, 1700, 1.000270247),
+        (20, 101_325, 0.0, 1700, 1.000268479),
+        (40, 110_000, 1.0, 300, 1.000289000),
+        (20, 101_325, 0.0, 300, 1.000286581),
+    ],
+)
+def test_nist_check_values(
+    temperature: float, pressure: float, humidity: float, wavelength_nm: float, printed: float
+) -> None:
+    """Truth: values of NIST's Engineering Metrology Toolbox (Ciddor equation, 450 ppm CO₂), printed to 10⁻⁹.
+
+    The toolbox takes another formula for saturation pressure (IAPWS), within 0.05 % of Ciddor's.
+    """
+    index = ciddor_index(Air(temperature, pressure, humidity), wavelength_nm * 1e-9)
+    assert index == pytest.approx(printed, abs=1e-9)
+
+
+workshop_air = st.builds(Air, st.floats(10.0, 35.0), st.floats(80e3, 120e3), st.floats(0.0, 1.0))
+
+
+def edlen_index(air: Air, wavelength: float = VACUUM_WAVELENGTH) -> float:
+    """Return n by the Edlén equation as Birch and Downs revised it (Metrologia 31, 315, 1994), with NIST's T factor.
+
+    Another equation from other measurements; water by Magnus' formula.
+    """
+    t, pressure, wavenumber2 = air.temperature, air.pressure, (1e-6 / wavelength) ** 2
+    standard = 1e-8 * (8342.54 + 2406147.0 / (130.0 - wavenumber2) + 15998.0 / (38.9 - wavenumber2))
+    dry = standard * pressure / 96095.43 * (1.0 + 1e-8 * (0.601 - 0.00972 * t) * pressure) / (1.0 + 0.003661 * t)
+    vapour_pressure = air.humidity * 610.94 * np.exp(17.625 * t / (243.04 + t))
+    return float(1.0 + dry - 1e-10 * vapour_pressure * 292.75 / (t + 273.15) * (3.7345 - 0.0401 * wavenumber2))
+
+
+@fixed
+@given(workshop_air, st.sampled_from([VACUUM_WAVELENGTH, 532e-9, 780e-9]))
+def test_agrees_with_edlen(air: Air, wavelength: float) -> None:
+    """Truth: the revised Edlén equation. On this box they differ by 1.4·10⁻⁸ at most; both claim about 3·10⁻⁸."""
+    assert ciddor_index(air, wavelength) == pytest.approx(edlen_index(air, wavelength), abs=2e-8)
+
+
+def test_shop_formula_on_its_whole_range() -> None:
+    """Truth: Ciddor's equation. 0.111·10⁻⁶ is the largest difference on this grid."""
+    grid = np.meshgrid(np.linspace(0.0, 40.0, 41), np.linspace(50e3, 120e3, 15), np.linspace(0.0, 1.0, 11))
+    air = Air(*grid)
+    assert np.abs(shop_index(air) - ciddor_index(air)).max() < 0.12e-6
+
+
+def test_shop_formula_by_hand() -> None:
+    """7.86e-4·101.325/293 = 271.814e-6; 1.5e-11·50·(400 + 160) = 0.420e-6; difference 271.394e-6."""
+    assert shop_index(STANDARD_AIR) == pytest.approx(1.000271394, abs=1e-9)
+
+
+@pytest.mark.parametrize("index", [ciddor_index, shop_index])
+def test_sensitivities_at_20_degrees(index) -> None:
+    """Truth: a gas. Dry air has n − 1 = 271.8 ppm, in proportion to p/T: 2.68 ppm/kPa, −0.927 ppm/K.
+
+    Saturated air takes up 145 Pa of water more per K, and each Pa costs 0.00036 ppm: −0.026 ppm/K at 50 %.
+    23.4 Pa are 1 % of humidity: −0.0085 ppm. Tolerance 2 %: real gas, and the shop formula's two digits.
+    """
+    n = index(Air([20.0, 20.1, 20.0, 20.0], [101_325.0, 101_325.0, 101_425.0, 101_325.0], [0.5, 0.5, 0.5, 0.51]))
+    per_kelvin, per_kilopascal, per_percent = 1e6 * (n[1:] - n[0]) * [10.0, 10.0, 1.0]
+    assert per_kelvin == pytest.approx(-0.953, rel=0.02)
+    assert per_kilopascal == pytest.approx(2.68, rel=0.02)
+    assert per_percent == pytest.approx(-0.0085, rel=0.02)
+
+
+# Readings: what a counter of fringes would show, made here from the optics, must come back as the true way.
+
+
+@fixed
+@given(
+    way=st.floats(-0.5, 0.5),
+    dead_path=st.floats(0.0, 2.0),
+    assumed=st.sampled_from([1.0, 1.000271]),
+    now=workshop_air,
+    zero=workshop_air,
+    sense=st.sampled_from([1.0, -1.0]),
+)
+def test_counted_fringes_give_the_way_back(
+    way: float, dead_path: float, assumed: float, now: Air, zero: Air, sense: float
+) -> None:
+    """Truth: fringes in a path of D + L now, less those in D at the zero, times the wavelength that it assumes.
+
+    Towards the interferometer (sense −1) the counter runs backwards, and is shown reversed.
+    Tolerance: rounding of 3 m.
+    """
+    half_wave = VACUUM_WAVELENGTH / 2.0
+    away = sense * way
+    fringes = ciddor_index(now) * (dead_path + away) / half_wave - ciddor_index(zero) * dead_path / half_wave
+    shown = sense * fringes * half_wave / assumed
+    corrected = correct_displacement(shown, now, assumed, sense * dead_path, zero)
+    assert corrected == pytest.approx(way, abs=3e-15)
+
+
+@pytest.mark.parametrize(("humidity", "index"), [(0.2, 1.0002716285340578), (0.8, 1.0002711183472626)])
+def test_a_metre_of_air(humidity: float, index: float) -> None:
+    """Truth: another implementation's documentation (ref-index 1.0, after NIST's text) for 633 nm.
+
+    Tolerance: the 0.009 nm to the helium-neon laser's own wavelength, 0.1 nm, and another saturation pressure.
+    """
+    assert correct_displacement(index, Air(20.0, 101_325.0, humidity)) == pytest.approx(1.0, abs=3e-10)
+
+
+def test_columns_of_a_file_are_corrected_row_by_row() -> None:
+    """Truth: the same rows one at a time."""
+    raw, rows = np.array([0.1, 0.2, 0.3]), [(19.0, 98e3, 0.3), (20.0, 99e3, 0.4), (21.0, 100e3, 0.5)]
+    together = correct_displacement(raw, Air(*np.array(rows).T), 1.000271, 0.2, STANDARD_AIR)
+    single = [correct_displacement(r, Air(*a), 1.000271, 0.2, STANDARD_AIR) for r, a in zip(raw, rows, strict=True)]
+    assert together.tolist() == [float(value) for value in single]
+
+
+def test_no_correction_where_the_instrument_has_done_it() -> None:
+    assert correct_displacement(0.3, STANDARD_AIR, ciddor_index(STANDARD_AIR)) == pytest.approx(0.3, abs=1e-16)
+
+
+def test_dead_path_by_hand() -> None:
+    """1 K over 1 m of dead path: 0.95 µm that nothing has moved (−0.95 ppm/K, above)."""
+    warmer = Air(21.0, 101_325.0, 0.5)
+    moved = correct_displacement(0.0, warmer, ciddor_index(warmer), 1.0, STANDARD_AIR)
+    assert moved == pytest.approx(0.95e-6, rel=0.02)
+
+
+def test_another_laser() -> None:
+    """Truth: the dispersion of the Edlén equation between 633 and 532 nm, 1.653 ppm; both agree to 0.001 ppm."""
+    green = partial(ciddor_index, vacuum_wavelength=532e-9)
+    red_way, green_way = (correct_displacement(1.0, STANDARD_AIR, index=i) for i in (ciddor_index, green))
+    dispersion = edlen_index(STANDARD_AIR, 532e-9) - edlen_index(STANDARD_AIR)
+    assert red_way - green_way == pytest.approx(dispersion, abs=3e-9)
+
+
+def test_reference_length_by_hand() -> None:
+    """0.5 m of steel, 11.5 ppm/K, at 24 °C: 0.5/(1 + 46e-6) = 0.499977001058 m."""
+    assert to_reference(0.5, 11.5e-6, 24.0) == pytest.approx(0.499977001058, abs=1e-12)
+    assert from_reference(0.499977001058, 11.5e-6, 24.0) == pytest.approx(0.5, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("air", "says"),
+    [
+        ((293.15, 1e5, 0.5), "air temperature: must lie within 0…60 °C"),
+        ((20.0, 1013.25, 0.5), "air pressure: must lie within 50…120 kPa"),
+        ((20.0, 101.325, 0.5), "air pressure"),
+        ((20.0, 1e5, 50.0), "air humidity: must lie within 0…1"),
+        (([20.0, float("nan")], 1e5, 0.5), "air temperature, reading 2"),
+        ((20.0, float("inf"), 0.5), "air pressure"),
+        (([20.0, 21.0], [1e5, 1e5, 1e5], 0.5), "must each be one number or one a reading"),
+    ],
+)
+def test_air_in_the_wrong_unit_is_refused(air: tuple, says: str) -> None:
+    with pytest.raises(ModelError, match=says):
+        Air(*air)
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: ciddor_index(STANDARD_AIR, 633.0), "vacuum wavelength"),
+        (lambda: ciddor_index(STANDARD_AIR, co2_ppm=1e5), "CO2"),
+        (lambda: correct_displacement(0.1, STANDARD_AIR, 271.0), "assumed index"),
+        (lambda: correct_displacement(0.1, STANDARD_AIR, 0.000271), "assumed index"),
+        (lambda: correct_displacement(0.1, STANDARD_AIR, dead_path=0.3), "air at zero"),
+        (lambda: to_reference(0.1, 11.5, 20.0), "expansion"),
+        (lambda: to_reference(0.1, 11.5e-6, 293.15), "material temperature"),
+    ],
+)
+def test_what_cannot_be_is_refused(call, says: str) -> None:
+    with pytest.raises(ModelError, match=says):
+        call()
+
+
+def test_air_is_a_private_copy() -> None:
+    temperature = np.array([20.0, 21.0])
+    air = Air(temperature, 1e5, 0.5)
+    temperature[0] = 30.0
+    assert air.temperature[0] == 20.0
+    with pytest.raises(ValueError, match="read-only"):
+        air.temperature[0] = 30.0

@@ -1,0 +1,336 @@
+"""Readings gathered: which are one station, which way the machine came, and sets that become one.
+
+The truth is what the readings say themselves, and closed-form strut lengths from the paper's two hexagons
+(plane geometry, written down here), not the package's kinematics.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from strategies import paper_geometry
+
+from hexapod_comp.errors import InputFileError
+from hexapod_comp.machine.geometry import HexapodGeometry
+from hexapod_comp.measurements.campaign import Campaign, template
+from hexapod_comp.measurements.files import read_files
+from hexapod_comp.measurements.readings import (
+    BACKWARD,
+    FORWARD,
+    FROM_PREVIOUS,
+    UNKNOWN,
+    MeasurementSet,
+    Reading,
+    Source,
+)
+from hexapod_comp.measurements.runs import assemble, joined
+from hexapod_comp.measurements.tidy_csv import read_measurements
+from hexapod_comp.measurements.writing import write_measurements
+from hexapod_comp.pose import Pose
+
+PAPER = paper_geometry()
+LEVEL = np.eye(3)
+
+PER_READING = ("station", "run", "cycle", "direction", "channel", "value", "uncertainty")
+PER_STATION = ("positions", "rotations", "commands", "sense", "temperatures")
+
+HEADER = "run,direction,x_mm,y_mm,z_mm,channel,value,unit,temperature_degC\n"
+
+FIRST = HEADER + (
+    "x line,forward,-100,0,400,linear,0,um,20\n"
+    "x line,forward,0,0,400,linear,3,um,20\n"
+    "x line,forward,100,0,400,linear,5,um,21\n"
+    "x line,backward,100,0,400,linear,4,um,21\n"
+)
+SECOND = HEADER + (
+    "tracker,sequence,10,20,420,position_x,10.001,mm,22\n"
+    "tracker,sequence,10,20,420,position_y,19.998,mm,22\n"
+    "tracker,sequence,30,20,420,position_x,30.002,mm,22\n"
+    "x line,,50,0,400,linear,1,um,20\n"
+    "x line,,90,0,400,linear,2,um,20\n"
+)
+
+
+def lengths_at(points: np.ndarray) -> np.ndarray:
+    """Return the paper machine's strut lengths of level poses, (n, 6) m: 001's sides of 300, 572 and 243 mm."""
+    radius = np.sqrt((0.572**2 + 0.572 * 0.243 + 0.243**2) / 3.0)
+    half = np.arcsin(0.243 / (2.0 * radius))
+    corners = np.deg2rad([0.0, 120.0, 120.0, 240.0, 240.0, 360.0]) + half * np.array([1, -1, 1, -1, 1, -1])
+    tips = np.deg2rad([60.0, 60.0, 180.0, 180.0, 300.0, 300.0])
+    across = 0.3 / np.sqrt(3.0) * np.stack([np.cos(tips), np.sin(tips)], axis=1)
+    across -= radius * np.stack([np.cos(corners), np.sin(corners)], axis=1)
+    legs = points[:, None] + np.append(across, np.zeros((6, 1)), axis=1)
+    return np.linalg.norm(legs, axis=2)
+
+
+def at(*points: tuple[float, float, float]) -> list[Pose]:
+    """Return level poses at points in mm."""
+    return [Pose((np.array(point) * 1e-3).round(9), LEVEL) for point in points]
+
+
+def tracked(poses: list[Pose], channels: tuple[str, ...] = ("position_x",), run: str = "tracker") -> MeasurementSet:
+    """Return a set of poses that were measured one after the other, each in some channels."""
+    readings = [
+        Reading(run, 1, FROM_PREVIOUS, pose, channel, 1e-6 * n, source=Source("test", n))
+        for n, pose in enumerate(poses)
+        for channel in channels
+    ]
+    return assemble(PAPER, readings)
+
+
+def file_of(folder: Path, name: str, text: str) -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def assert_same(one: MeasurementSet, other: MeasurementSet) -> None:
+    """Compare everything that a fit looks at; names of files and of runs are compared by the tests themselves."""
+    for name in PER_READING:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+    for name in PER_STATION:
+        np.testing.assert_array_equal(getattr(one.stations, name), getattr(other.stations, name), err_msg=name)
+    assert len(one.runs) == len(other.runs)
+    for run, same in zip(one.runs, other.runs, strict=True):
+        np.testing.assert_array_equal(run.axis, same.axis)
+        np.testing.assert_array_equal(run.origin, same.origin)
+    np.testing.assert_array_equal(one.probe, other.probe)
+    np.testing.assert_array_equal(one.points(), other.points())
+    np.testing.assert_array_equal(one.along(), other.along())
+    np.testing.assert_array_equal(one.directions(), other.directions())
+
+
+# Sets that become one.
+
+
+def test_two_sets_are_one_file_with_both(tmp_path: Path) -> None:
+    """The rows of two files, whose runs have different names, in one file: the same set to the last bit."""
+    second = SECOND.replace("x line", "another line")
+    both = read_measurements(file_of(tmp_path, "both.csv", FIRST + second.removeprefix(HEADER)), PAPER)
+    parts = [read_measurements(file_of(tmp_path, n, t), PAPER) for n, t in (("a.csv", FIRST), ("b.csv", second))]
+    together = joined(parts)
+    assert_same(together, both)
+    assert [run.name for run in together.runs] == [run.name for run in both.runs]
+    assert together.files == parts[0].files + parts[1].files
+    assert [source.line for source in together.sources] == [2, 3, 4, 5, 2, 3, 4, 5, 6]
+
+
+def test_runs_of_equal_names_stay_apart(tmp_path: Path) -> None:
+    """Another day's line of the same name has its own zero: joined, or read at once, five runs and not four."""
+    paths = [file_of(tmp_path, name, text) for name, text in (("a.csv", FIRST), ("b.csv", SECOND))]
+    together = joined([read_measurements(path, PAPER) for path in paths])
+    assert [run.name for run in together.runs] == ["x line", "tracker", "x line"]
+    assert list(together.run) == [0, 0, 0, 0, 1, 1, 1, 2, 2]
+    np.testing.assert_allclose([run.origin[0] for run in together.runs], [-0.1, 0.01, 0.05], atol=1e-15)
+    assert_same(together, read_measurements(paths, PAPER))
+
+
+def test_stations_of_several_sets_are_found_again() -> None:
+    """A reading of each part still points to its own command, direction and temperature."""
+    parts = [tracked(at((0, 0, 400), (10, 0, 400))), tracked(at((0, 50, 450))), tracked(at((5, 5, 405), (0, 5, 405)))]
+    together = joined(parts)
+    rows = [(p, n) for p in range(3) for n in range(len(parts[p]))]
+    assert len(together) == len(rows) == 5
+    for n, (part, row) in enumerate(rows):
+        mine, theirs = together.station[n], parts[part].station[row]
+        for name in PER_STATION:
+            found, wanted = getattr(together.stations, name)[mine], getattr(parts[part].stations, name)[theirs]
+            np.testing.assert_array_equal(found, wanted)
+    assert list(together.run) == [0, 0, 1, 2, 2]
+
+
+def test_notes_are_kept_and_one_set_is_itself() -> None:
+    one, two = (replace(tracked(at((0, 0, z))), notes=(f"at {z}",)) for z in (400, 410))
+    assert joined([one, two]).notes == ("at 400", "at 410")
+    assert joined([one]) is one
+
+
+def test_sets_of_different_points_are_refused() -> None:
+    """A reflector that sits elsewhere reads other errors: the model file has one probe only."""
+    one = tracked(at((0, 0, 400)))
+    moved = replace(one, probe=one.probe + np.array([0.0, 0.0, 1e-6]))
+    with pytest.raises(InputFileError, match="different measured points cannot be fitted together"):
+        joined([one, one, moved])
+    assert len(joined([one, replace(one, probe=one.probe + 1e-12)])) == 2  # rounding of a file
+
+
+def test_one_door_for_tidy_and_wide_files(tmp_path: Path) -> None:
+    """The same readings as rows of one channel and as rows of one pose; wide files become a run each."""
+    columns = file_of(
+        tmp_path,
+        "columns.yaml",
+        "format: hexapod_comp/columns\nversion: 1\norder: sequence\n"
+        "commanded: {position: [x, y, z], unit: mm}\nmeasured: {position: [mx, my, mz], unit: mm}\n",
+    )
+    wide = "x,y,z,mx,my,mz\n10,20,420,10.001,19.998,420\n30,20,420,30.002,20,420.003\n"
+    paths = [file_of(tmp_path, "monday.csv", wide), file_of(tmp_path, "tuesday.csv", wide.replace("30", "35"))]
+    found = read_files(paths, PAPER, columns)
+    assert [run.name for run in found.runs] == ["monday", "tuesday"]
+    assert [name for name, _ in found.files] == ["monday.csv", "tuesday.csv"]
+    assert (len(found), len(found.stations)) == (12, 4)
+    np.testing.assert_allclose(found.value[:6] * 1e6, [1.0, -2.0, 0.0, 2.0, 0.0, 3.0], atol=1e-9)
+    assert len(read_files(paths[:1], PAPER, columns)) == 6
+
+
+def test_no_file_is_refused() -> None:
+    with pytest.raises(InputFileError, match="no file is given"):
+        read_files([], PAPER)
+
+
+# Which way the machine came.
+
+
+def test_directions_of_a_sequence_follow_from_the_row_before() -> None:
+    """Axes from the commanded positions, struts from closed-form lengths; the first row's is not known."""
+    points = np.array([[0, 0, 400], [10, 0, 400], [10, -20, 430], [0, 0, 400], [0, 0, 380]]) * 1e-3
+    found = tracked(at(*(points * 1e3)))
+    assert list(found.station) == [0, 1, 2, 3, 4]
+    np.testing.assert_array_equal(found.stations.sense[0], np.zeros(9))
+    moved = np.concatenate([np.diff(points, axis=0), np.diff(lengths_at(points), axis=0)], axis=1)
+    assert (np.abs(moved[:, 3:]) > 1e-5).all(), "no strut stands still here: signs are no rounding"
+    np.testing.assert_array_equal(found.stations.sense[1:], np.sign(moved.round(12)))
+
+
+def test_only_the_order_counts_not_the_values() -> None:
+    """The same places visited the other way round: every direction turns but the first row's."""
+    there = at((0, 0, 400), (15, 5, 410), (40, 20, 440))
+    forth, back = tracked(there), tracked(there[::-1])
+    np.testing.assert_array_equal(forth.stations.sense[1:], -back.stations.sense[1:][::-1])
+
+
+def test_all_channels_of_a_visit_are_one_station() -> None:
+    """Three rows at a pose are one stop; the direction of the stop is that of its first row."""
+    found = tracked(at((0, 0, 400), (10, 0, 400)), ("position_x", "position_y", "position_z"))
+    assert list(found.station) == [0, 0, 0, 1, 1, 1]
+    assert found.stations.sense[1, 0] == 1.0
+
+
+def test_a_place_reached_from_both_sides_is_two_stations() -> None:
+    """To the middle from the left, from the right, from the left: backlash differs. The first row has no past."""
+    left, middle, right = at((-10, 0, 400), (0, 0, 400), (10, 0, 400))
+    found = tracked([left, middle, right, middle, left, middle])
+    assert list(found.stations.sense[found.station, 0]) == [0.0, 1.0, 1.0, -1.0, -1.0, 1.0]
+    assert found.station[1] != found.station[3]
+
+
+def test_strut_readings_tell_directions_even_where_the_pose_stands_still() -> None:
+    """Encoders 1 µm longer at the same pose: struts out, axes nowhere. Closer than 1 nm is the same command."""
+    pose = at((0, 0, 400))[0]
+    struts = lengths_at(pose.position[None])[0]
+    told = [struts, struts + 1e-6, struts + 1e-6 + 1e-10]
+    readings = [
+        Reading("r", 1, FROM_PREVIOUS, pose, "position_x", 0.0, commands=tuple(c.tolist()), source=Source("test", n))
+        for n, c in enumerate(told)
+    ]
+    sense = assemble(PAPER, readings).stations.sense
+    np.testing.assert_array_equal(sense, [np.zeros(9), np.repeat([0.0, 1.0], [3, 6]), np.zeros(9)])
+
+
+def test_a_new_run_has_no_past() -> None:
+    """The last row of another run says nothing about where this one came from."""
+    poses = at((0, 0, 400), (10, 0, 400))
+    readings = [Reading(run, 1, FROM_PREVIOUS, pose, "position_x", 0.0) for run, pose in zip("ab", poses, strict=True)]
+    np.testing.assert_array_equal(assemble(PAPER, readings).stations.sense, np.zeros((2, 9)))
+
+
+def test_directions_of_a_line_are_those_of_its_axis() -> None:
+    """Forward is along the first axis that moves, whichever end is read first; unknown is neither."""
+    poses = at((50, 0, 400), (-50, 0, 500))
+    readings = [
+        Reading("diagonal", 1, direction, pose, "linear", 0.0)
+        for direction in (FORWARD, BACKWARD, UNKNOWN)
+        for pose in poses
+    ]
+    found = assemble(PAPER, readings)
+    np.testing.assert_allclose(found.runs[0].axis, np.array([1.0, 0.0, -1.0]) / np.sqrt(2.0), atol=1e-12)
+    axes = found.stations.sense[found.station, :3]
+    np.testing.assert_array_equal(axes[:2], [[1.0, 0.0, -1.0]] * 2)
+    np.testing.assert_array_equal(axes[2:4], -axes[:2])
+    np.testing.assert_array_equal(axes[4:], 0.0)
+
+
+# Stations.
+
+
+def test_repeated_passes_share_stations_and_temperatures_part_them() -> None:
+    """Two cycles over three places, both ways: six stations. The same with another temperature: two more."""
+    plan = Campaign(np.array([[-0.1, -0.1, 0.4], [0.1, 0.1, 0.6]]), 0.2, 0.1, "1-D", 0, cycles=2)
+    found = template(plan, PAPER)
+    assert len(found) == 2 * 2 * 3 * 12
+    assert len(found.stations) == 2 * 3 * 12
+    first = found.station[(found.run == 0) & (found.cycle == 1)]
+    np.testing.assert_array_equal(first, found.station[(found.run == 0) & (found.cycle == 2)])
+    poses = at((0, 0, 400), (10, 0, 400))
+    warm = (21.0,) * 8
+    cold = [Reading("line", 1, FORWARD, pose, "linear", 0.0) for pose in poses]
+    assert len(assemble(PAPER, cold + [replace_temperatures(r, warm) for r in cold]).stations) == 4
+
+
+def replace_temperatures(reading: Reading, temperatures: tuple[float, ...]) -> Reading:
+    """Return the same reading of the next cycle, taken under other temperatures."""
+    return reading._replace(cycle=reading.cycle + 1, temperatures=temperatures)
+
+
+def test_lines_that_cross_have_their_own_stations() -> None:
+    """At the crossing one line travels along x, the other along y: backlash differs."""
+    across = [Reading("x", 1, FORWARD, pose, "linear", 0.0) for pose in at((-10, 0, 400), (0, 0, 400))]
+    along = [Reading("y", 1, FORWARD, pose, "linear", 0.0) for pose in at((0, 0, 400), (0, 10, 400))]
+    found = assemble(PAPER, across + along)
+    assert len(found.stations) == 4
+    np.testing.assert_array_equal(found.stations.sense[1, :3], [1.0, 0.0, 0.0])
+    np.testing.assert_array_equal(found.stations.sense[2, :3], [0.0, 1.0, 0.0])
+
+
+def test_a_joined_set_survives_its_file(tmp_path: Path) -> None:
+    """Written and read back: directions from the rows before, stations and values to the last bit."""
+    parts = [tracked(at((0, 0, 400), (10, 5, 400), (0, 0, 410)), run="a"), tracked(at((0, 0, 400)), run="b")]
+    together = joined(parts)
+    write_measurements(together, tmp_path / "joined.csv")
+    assert_same(read_measurements(tmp_path / "joined.csv", PAPER), together)
+
+
+# What cannot be.
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"channel": "colour"}, "test: line 7: channel must be one of linear"),
+        ({"value": float("nan")}, "test: line 7: value must be finite"),
+        ({"uncertainty": 0.0}, "test: line 7: uncertainty must be finite and above zero"),
+        ({"pose": at((0, 0, 950))[0]}, "test: line 7: the commanded pose is out of the machine's reach: strut_1"),
+        ({"channel": "position_x"}, "mixes channels of a line with absolute ones"),
+        ({"pose": at((5, 1, 400))[0]}, "test: line 7: run line: the commanded point is 1.0000 mm off the run's line"),
+        ({"pose": at((0, 0, 400))[0]}, "run line: has one commanded point only"),
+    ],
+)
+def test_what_no_machine_or_instrument_does_is_refused(change: dict[str, object], complaint: str) -> None:
+    first, second = at((0, 0, 400), (10, 0, 400))
+    row = Reading("line", 1, FORWARD, second, "linear", 0.0, source=Source("test", 7))
+    rows = [row._replace(pose=first, source=Source("test", 6)), row._replace(**change)]  # type: ignore[arg-type]
+    if "off the run's line" in complaint:
+        rows.append(row._replace(source=Source("test", 8)))
+    with pytest.raises(InputFileError, match=complaint):
+        assemble(PAPER, rows)
+
+
+def test_no_reading_is_refused() -> None:
+    with pytest.raises(InputFileError, match="hold no reading"):
+        assemble(PAPER, [])
+
+
+def test_a_tool_and_a_work_frame_say_where_the_point_is() -> None:
+    """Work frame turned by 90° about z and 20 mm up, tool turned alike and 80 mm below the platform: by hand.
+    A command of (10, 0, 300) mm is the base's (0, 10, 320); forward along the work frame's x is the base's y."""
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    frames = [Pose(np.array([0.0, 0.0, z]), quarter) for z in (0.02, -0.08)]
+    framed: HexapodGeometry = replace(PAPER, work=frames[0], tool=frames[1])
+    readings = [Reading("line", 1, FORWARD, pose, "linear", 0.0) for pose in at((0, 0, 300), (10, 0, 300))]
+    found = assemble(framed, readings)
+    np.testing.assert_allclose(found.points(), [[0.0, 0.0, 0.32], [0.0, 0.01, 0.32]], atol=1e-15)
+    np.testing.assert_allclose(found.stations.positions[:, 2], 0.4, atol=1e-15)
+    np.testing.assert_allclose(found.runs[0].axis, [0.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_array_equal(found.stations.sense[:, :3], [[0.0, 1.0, 0.0]] * 2)

@@ -1,0 +1,208 @@
+"""Recordings of the real node: what a recorder hears over DDS, written as a bag, gives the same bits again.
+
+The recorder takes messages as they travel, as ``ros2 bag record`` does, with that program's quality of service:
+reliable where the publisher is, kept for late subscribers where the publisher does so. The truth is what the node
+has sent.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped
+from node_helpers import HOME, Bench, model_file, near
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+
+from hexapod_comp.nodes.messages import pose_message
+from hexapod_comp.pose import Pose
+
+pytest.importorskip("rosbags")
+
+from replay_helpers import KINDS, Messages, write_bag
+
+from hexapod_comp.replay.bag import Files, Recording, read_recording
+from hexapod_comp.replay.replay import BEFORE, IDENTICAL, Replay, replay
+
+TYPES = {"PoseStamped": PoseStamped, "JointState": JointState, "String": String}
+
+RECORDER_DEPTH = 10
+"""The least that ``ros2 bag record`` has ever given a topic; newer ones keep all where the depth is not known."""
+
+
+@pytest.fixture
+def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
+    with Bench(ros_context, spin_until, capfd) as made:
+        yield made
+
+
+class Recorder:
+    """Hears a machine's topics from now on, as serialized messages."""
+
+    def __init__(self, bench: Bench) -> None:
+        self.messages, self._bench = Messages(), bench
+        node = bench.witness
+        self._subscriptions = []
+        for topic, kind in KINDS.items():
+            kept = topic.startswith("compensator/")
+            qos = QoSProfile(
+                depth=RECORDER_DEPTH,
+                reliability=ReliabilityPolicy.BEST_EFFORT
+                if topic == "tool_pose_estimate"
+                else ReliabilityPolicy.RELIABLE,
+                durability=DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE,
+            )
+            name = node.resolve_topic_name(topic)
+            message_type = TYPES[kind.rpartition("/")[2]]
+            self._subscriptions.append(
+                node.create_subscription(message_type, topic, self._keeper(name, kind), qos, raw=True)
+            )
+        wanted = [s for s in self._subscriptions if not s.topic_name.endswith("strut_states")]
+        bench.until(lambda: all(s.get_publisher_count() for s in wanted), "the recorder's discovery")
+        bench.until(lambda: self.heard("/compensator/journal"), "a page of the journal")
+
+    def _keeper(self, topic: str, kind: str):
+        return lambda raw: self.messages.append((time.time_ns(), topic, kind, bytes(raw)))
+
+    def heard(self, ending: str) -> int:
+        """Return how many messages of a topic have come."""
+        return sum(topic.endswith(ending) for _, topic, _, _ in self.messages)
+
+    def stop(self) -> None:
+        """Wait until the journal confirms all answers, and hear no more."""
+        pages = self.heard("/compensator/journal")
+        self._bench.until(lambda: self.heard("/compensator/journal") > pages + 1, "two more pages of the journal")
+        for subscription in self._subscriptions:
+            self._bench.witness.destroy_subscription(subscription)
+
+
+def replayed(bag: Path, namespace: str | None = None) -> tuple[Recording, Replay]:
+    """Read a bag and replay it."""
+    recording = read_recording(bag, namespace)
+    return recording, replay(recording, Files(recording, {}))
+
+
+def along(n: int) -> Pose:
+    """Return the pose number `n` of a motion that turns struts round."""
+    return near(
+        HOME, (0.003 * np.sin(0.1 * n), 0.002 * np.sin(0.13 * n), 0.001 * np.sin(0.07 * n)), 0.3 * np.sin(0.1 * n)
+    )
+
+
+def test_a_run_with_everything_is_replayed_bit_for_bit(bench, tmp_path):
+    """Ramps in and out, a temperature, another model, a reset to measured struts, refused commands."""
+    model = model_file(tmp_path, struts={"offset_um": 30.0, "backlash_um": 8.0, "expansion_ppm_per_K": 11.0})
+    bench.compensator(model_file=model, temperature_time_constant_s=0.0)
+    recorder = Recorder(bench)
+    answers = [bench.ask(along(n)) for n in range(40)]
+    bench.warm("strut_3", 24.7)
+    answers += [bench.ask(along(n)) for n in range(40, 60)]
+    bench.enable(False)
+    answers += [bench.ask(along(n)) for n in range(60, 80)]
+    model_file(tmp_path, struts={"offset_um": -20.0, "pitch_ppm": 40.0})
+    assert bench.trigger("reload_model").success
+    bench.enable(True)
+    answers += [bench.ask(along(n)) for n in range(80, 120)]
+    bench.send(near(HOME, (0.1, 0.0, 0.0)))  # too far in one step
+    bench.barrier()
+    bench.send(pose_message(HOME, "nowhere"))
+    bench.feed(answers[-1].lengths + 5e-6)
+    assert bench.trigger("reset").success
+    bench.feed(answers[-1].lengths + 5e-6)
+    bench.barrier()
+    answers += [bench.ask(along(n)) for n in range(119, 150)]
+    recorder.stop()
+    recording, result = replayed(write_bag(tmp_path / "run", recorder.messages))
+    assert (result.outcome == IDENTICAL).all()
+    assert len(result.outcome) == len(answers)
+    sent = np.array([answer.lengths for answer in answers])
+    assert result.lengths[:, 0].tobytes() == sent.tobytes(), "the truth is what the node sent, not what the bag says"
+    assert not result.states_differ
+    assert {event.entry.what for event in result.changes} == {"temperature", "enable", "model", "reset"}
+    assert [event.entry.values["reason"] for event in result.refused] == ["step", "frame_id"]
+    assert len(recording.sources) >= 3, "geometry and both models"
+
+
+def test_a_start_from_the_last_command_is_replayed_bit_for_bit(bench, tmp_path):
+    """A reset and an activation without feedback: the page says where the next command began."""
+    bench.compensator(model_file=model_file(tmp_path, struts={"offset_um": 30.0, "backlash_um": 8.0}))
+    recorder = Recorder(bench)
+    answers = [bench.ask(along(n)) for n in range(40)]
+    assert bench.trigger("reset").success
+    bench.send(near(HOME, (0.05, 0.0, 0.0)))  # further than a step from the last command
+    bench.barrier()
+    answers += [bench.ask(along(n)) for n in range(41, 60)]
+    assert bench.change("deactivate")
+    assert bench.change("activate")
+    answers += [bench.ask(along(n)) for n in range(60, 80)]
+    recorder.stop()
+    _, result = replayed(write_bag(tmp_path / "run", recorder.messages))
+    assert (result.outcome == IDENTICAL).all()
+    assert result.lengths[:, 0].tobytes() == np.array([answer.lengths for answer in answers]).tobytes()
+    assert [event.entry.values["reason"] for event in result.refused] == ["step"]
+    resets = [event.entry.values["measured"] for event in result.changes if event.entry.what == "reset"]
+    assert resets[-2:] == [answers[39].lengths.tolist(), answers[58].lengths.tolist()]
+
+
+def test_recording_may_begin_in_motion_and_two_machines_share_a_bag(ros_context, spin_until, capfd, tmp_path):
+    """A recorder that comes late replays what its first snapshot precedes; each machine has its own namespace."""
+    messages = Messages()
+    for namespace in ("mill", "lathe"):
+        with Bench(ros_context, spin_until, capfd, namespace) as bench:
+            bench.compensator()
+            for n in range(140):
+                bench.ask(along(n))
+                if n % 10 == 9:
+                    bench.until(later(0.06), "the page that the journal now writes")
+            recorder = Recorder(bench)
+            for n in range(140, 200):
+                bench.ask(along(n))
+            recorder.stop()
+        messages += recorder.messages
+    bag = write_bag(tmp_path / "both", messages, "sqlite3")
+    for namespace in ("mill", "/lathe/"):
+        _, result = replayed(bag, namespace)
+        count, begun = len(result.outcome), int(np.argmax(result.outcome == IDENTICAL))
+        assert 60 <= count < 200, "what was kept for late subscribers, and all from then on"
+        assert begun <= count - 60, "a snapshot is among the pages that are kept"
+        assert (result.outcome[:begun] == BEFORE).all()
+        assert (result.outcome[begun:] == IDENTICAL).all()
+        np.testing.assert_array_equal(result.answers["pose"][-1, :3], along(199).position)
+
+
+def later(seconds: float) -> Callable[[], bool]:
+    """Return a condition that holds from a while from now on."""
+    end = time.monotonic() + seconds
+    return lambda: time.monotonic() > end
+
+
+def test_commands_without_stamp_are_replayed_too(bench, tmp_path):
+    """The answer's stamp is when they came."""
+    bench.compensator()
+    recorder = Recorder(bench)
+    for n in range(20):
+        count = len(bench.seen["strut_corrections"])
+        bench.send(pose_message(along(n), "base"))
+        bench.until(lambda count=count: len(bench.seen["strut_corrections"]) > count, "an answer")
+    recorder.stop()
+    _, result = replayed(write_bag(tmp_path / "run", recorder.messages))
+    assert len(result.outcome) == 20
+    assert (result.outcome == IDENTICAL).all()
+    assert not (result.outcome == BEFORE).any()
+
+
+def test_journal_reaches_late_subscribers(bench):
+    """Both topics are reliable and kept: the page that comes first tells all that is needed to go on."""
+    bench.compensator()
+    bench.warm("base", 22.0)
+    bench.ask(HOME)
+    for topic in ("compensator/journal", "compensator/files"):
+        (info,) = bench.witness.get_publishers_info_by_topic(topic)
+        assert info.topic_type == "std_msgs/msg/String"
+        assert info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+        assert info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL

@@ -1,0 +1,847 @@
+"""Recordings and their replay without ROS: what comes back, what is lost, and what a bag may not be.
+
+The recordings are made by a compensator that keeps its journal as the node does; the truth is the numbers that
+it gave while it was recorded. Damage is done to the messages, or to the bytes of the bag, by the test.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import contextlib
+import csv
+import json
+import math
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip("rosbags")
+
+import lz4.frame
+from replay_helpers import (
+    BEGAN,
+    CONFIG,
+    MILLISECOND,
+    STORE,
+    TYPES,
+    Messages,
+    RecordedMachine,
+    serialized,
+    wave_pose,
+    write_bag,
+)
+from rosbags.rosbag2 import CompressionMode, storage_mcap
+
+from hexapod_comp.cli import main
+from hexapod_comp.cli import replay as verb
+from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.compensation.journal import (
+    ANSWER,
+    FORMAT,
+    REFUSALS_PER_PAGE,
+    SNAPSHOT_PERIOD,
+    JournalError,
+    read_page,
+    read_sources,
+)
+from hexapod_comp.errors import HexapodError, InputFileError, ModelError
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.model import MachineModel
+from hexapod_comp.machine.model_file import load_model, save_model
+from hexapod_comp.pose import Pose
+from hexapod_comp.replay import unpacking
+from hexapod_comp.replay.bag import Files, Recording, read_recording
+from hexapod_comp.replay.replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Replay, replay
+
+FAR = Pose([0.2, 0.0, 0.4], np.eye(3))
+"""From home, struts would change by some 90 mm in one command: refused."""
+
+JOINT_STATE, TEXT = "sensor_msgs/msg/JointState", "std_msgs/msg/String"
+
+
+def warm_model(folder: Path) -> Path:
+    """Write the shipped machine's model with expansions added, so that temperatures matter."""
+    model = load_model(CONFIG / "paper_machine.yaml", load_geometry(CONFIG / "paper.yaml"))
+    struts = replace(model.struts, expansion=np.full(6, 11e-6))
+    save_model(replace(model, struts=struts, base_expansion=12e-6), folder / "warm.yaml")
+    return folder / "warm.yaml"
+
+
+def full_run(folder: Path, namespace: str = "") -> RecordedMachine:
+    """Return a run of 1,200 commands in which everything happens, a page every 20 ms, a snapshot every 100 ms."""
+    machine = RecordedMachine(namespace, warm_model(folder))
+    core = machine.compensator
+    happenings: dict[int, Callable[[], object]] = {
+        150: lambda: core.set_temperature("strut_1", 23.4),
+        151: lambda: core.set_temperature("base", 21.1),
+        350: lambda: core.enable(False),
+        650: lambda: core.enable(True),
+        900: lambda: core.reset(core.command + 1e-6),
+        950: lambda: core.set_model(machine.load(CONFIG / "paper_machine.yaml")),
+        1000: lambda: machine.send(FAR),
+        1001: lambda: core.reset(),
+    }
+    for n in range(1200):
+        happenings.get(n, lambda: None)()
+        assert machine.send(wave_pose(n))
+        if n % 20 == 19:
+            machine.page(snapshot=n % 100 == 99)
+    return machine
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> RecordedMachine:
+    return full_run(tmp_path_factory.mktemp("model"))
+
+
+def opened(bag: Path, namespace: str | None = None) -> tuple[Recording, Replay]:
+    """Read a bag and replay it."""
+    recording = read_recording(bag, namespace)
+    return recording, replay(recording, Files(recording, {}))
+
+
+def counted(result: Replay) -> dict[int, int]:
+    """Return how often each outcome is there."""
+    values, counts = np.unique(result.outcome, return_counts=True)
+    return dict(zip(values.tolist(), counts.tolist(), strict=True))
+
+
+def of_topic(messages: Messages, ending: str) -> list[int]:
+    """Return the numbers of a topic's messages."""
+    return [n for n, message in enumerate(messages) if message[1].endswith(ending)]
+
+
+def without(messages: Messages, *numbers: int) -> Messages:
+    """Return messages without some."""
+    return [message for n, message in enumerate(messages) if n not in numbers]
+
+
+def call(*arguments: object) -> int:
+    """Run the verb as the command line does, errors apart."""
+    parser = argparse.ArgumentParser()
+    verb.add_parser(parser.add_subparsers())
+    args = parser.parse_args(["replay", *map(str, arguments)])
+    return int(args.run(args))
+
+
+# ---- the same bits ----
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_everything_comes_back_bit_for_bit(run, tmp_path, storage):
+    """The truth is what the compensator gave while it was recorded, not what the bag says."""
+    bag = write_bag(tmp_path / "run", run.messages, storage)
+    for path in (bag, bag / "metadata.yaml", *bag.glob("run.[md]*")):
+        recording, result = opened(path)
+        assert counted(result) == {IDENTICAL: 1200}
+        assert result.lengths.tobytes() == np.array(run.answers).tobytes()
+        assert not result.states_differ
+        assert not result.lost
+        assert [event.entry.what for event in result.changes] == [
+            "temperature", "temperature", "enable", "enable", "reset", "model", "reset",
+        ]  # fmt: skip
+        assert [event.row for event in result.changes] == [150, 151, 350, 650, 900, 950, 1001]
+        assert [(event.row, event.entry.values["reason"]) for event in result.refused] == [(1000, "step")]
+        assert recording.heard == 1201
+        assert not recording.notes
+
+
+def altered(messages: Messages, number: int, change: Callable[[dict], None]) -> Messages:
+    """Return messages with the content of a page of the journal changed."""
+    messages, place = list(messages), of_topic(messages, "journal")[number]
+    time, topic, kind, raw = messages[place]
+    page = json.loads(STORE.deserialize_cdr(raw, kind).data)
+    change(page)
+    messages[place] = time, topic, kind, serialized(kind, TYPES[TEXT](json.dumps(page)))
+    return messages
+
+
+def answers_of(page: dict) -> np.ndarray:
+    """Return a copy of the answers of a page's content."""
+    return np.frombuffer(base64.b64decode(page["answers"]), ANSWER).copy()
+
+
+@pytest.mark.parametrize(("kind", "name"), [(0, "command"), (1, "correction")])
+def test_replay_sees_a_difference_of_one_bit(run, tmp_path, capsys, kind, name):
+    """One number is moved to its neighbouring float; nothing else may be called different."""
+
+    def move(page: dict) -> None:
+        answers = answers_of(page)
+        value = answers["lengths"][7, kind, 3]
+        answers["lengths"][7, kind, 3] = np.nextafter(value, 1.0)
+        page["answers"] = base64.b64encode(answers.tobytes()).decode()
+
+    bag = write_bag(tmp_path / "run", altered(run.messages, 36, move))  # page 0 is empty, each other has 20 answers
+    recording, result = opened(bag)
+    assert counted(result) == {IDENTICAL: 1199, DIFFERENT: 1}
+    assert result.outcome[707] == DIFFERENT
+    assert call(bag) == 1
+    said = capsys.readouterr().out
+    stamp = int(recording.answers["stamp"][707])
+    assert f"stamp {stamp // 10**9}.{stamp % 10**9:09d}" in said
+    assert f"strut_4, {name} recorded" in said
+    assert call(bag, "--tolerance-um", "1e-6") == 0
+
+
+def test_a_change_that_the_journal_hides_is_found(run, tmp_path):
+    """A temperature of the journal is altered by 1 K: from there on until the next snapshot answers differ."""
+
+    def warm(page: dict) -> None:
+        (entry,) = [entry for entry in page["entries"] if entry.get("name") == "strut_1"]
+        entry["value"] += 1.0
+
+    _, result = opened(write_bag(tmp_path / "run", altered(run.messages, 8, warm)))
+    different = np.flatnonzero(result.outcome == DIFFERENT)
+    assert 150 <= different[0] < 152
+    assert different[-1] < 200
+    assert result.states_differ == [200]
+
+
+def test_stamps_need_not_tell_commands_apart(tmp_path):
+    """Commands without stamp, twice under one stamp, twice the same, refused ones between; order is all there is."""
+    machine = RecordedMachine()
+    for n in range(60):
+        machine.send(wave_pose(n), stamped=n % 2 == 0)
+        if n % 3 == 1:
+            machine.now -= MILLISECOND
+            machine.send(FAR if n % 2 else wave_pose(n))
+            machine.now -= MILLISECOND
+            machine.send(wave_pose(n + 1), frame="work" if n % 4 else "base")
+    machine.page()
+    _, result = opened(write_bag(tmp_path / "run", machine.messages))
+    assert counted(result) == {IDENTICAL: len(machine.answers)}
+    assert [event.entry.values["reason"] for event in result.refused] == ["step"] * 10
+
+
+def test_a_node_that_is_restarted_begins_anew(tmp_path):
+    """Two lives of a node in one bag: counts begin at zero again, and so does its state."""
+    first, second = RecordedMachine(), RecordedMachine()
+    first.wave(120)
+    first.page()
+    second.messages.clear()
+    second.now = first.now + 700 * MILLISECOND
+    second.page()
+    second.wave(80, 40)
+    second.page()
+    _, result = opened(write_bag(tmp_path / "run", first.messages + second.messages))
+    assert counted(result) == {IDENTICAL: 200}
+
+
+def test_pages_carry_numbers_exactly():
+    machine = RecordedMachine()
+    machine.compensator.set_temperature("strut_2", 20.1)
+    machine.wave(3)
+    snapshot, page = machine.compensator.snapshot(), read_page(machine.journal.page(9.0))
+    assert page.snapshot is not None
+    assert page.snapshot.state.pop("temperatures") == snapshot.pop("temperatures") == {"strut_2": 20.1}
+    assert page.snapshot.state.keys() == snapshot.keys()
+    for name, numbers in snapshot.items():
+        np.testing.assert_array_equal(page.snapshot.state[name], np.array(numbers))
+    assert page.entries[0].values == {"name": "strut_2", "value": 20.1}
+    assert page.answers["lengths"].tobytes() == np.array(machine.answers).tobytes()
+    assert page.answers["stamp"].tolist() == [BEGAN + n * MILLISECOND for n in (1, 2, 3)]
+    np.testing.assert_array_equal(page.answers["pose"][2, :3], wave_pose(2).position)
+    fresh = read_page(RecordedMachine().journal.page(9.0))
+    assert fresh.snapshot is not None
+    assert np.isnan(fresh.snapshot.state["command"]).all(), "NaN is null on the way"
+
+
+def test_pages_without_a_snapshot_are_small():
+    """Twenty pages a second: 161 bytes per answer, by a third longer in base64, and a few words."""
+    machine = RecordedMachine()
+    machine.wave(50)
+    text = machine.journal.page(SNAPSHOT_PERIOD + 0.1)
+    assert read_page(text).snapshot is None
+    assert len(text) < 50 * 161 * 4 / 3 + 250
+
+
+def test_snapshot_takes_another_compensator_to_the_same_place():
+    """After a snapshot both give the same bits, in the middle of a ramp too."""
+    one = RecordedMachine()
+    one.compensator.set_temperature("platform", 25.0)
+    one.wave(50)
+    one.compensator.enable(False)
+    one.wave(5, 50)
+    other = Compensator(one.geometry, one.compensator.model)
+    other.restore(one.compensator.snapshot())
+    assert other.ramping
+    for compensator in (one.compensator, other):
+        compensator.set_temperature("strut_6", 19.0)
+        compensator.correct(wave_pose(55), 1e-3)
+    assert one.compensator.command.tobytes() == other.command.tobytes()
+    before, whole = repr(other.snapshot()), one.compensator.snapshot()
+    for change, complaint in (
+        ({"nominal": [1.0]}, r"snapshot\.nominal: must be 6 numbers"),
+        ({"platform_rotation": np.eye(3)}, r"snapshot\.platform_rotation: must be 9 numbers"),
+        ({"speed": [1.0]}, r"snapshot\.speed: is nothing that this release knows"),
+        ({"temperatures": {"strut_7": 20.0}}, "temperature: must be of one of"),
+    ):
+        with pytest.raises(ModelError, match=complaint):
+            other.restore(whole | change)
+    for name in whole:
+        with pytest.raises(ModelError, match=rf"snapshot\.{name}: is missing"):
+            other.restore({key: value for key, value in whole.items() if key != name})
+    assert repr(other.snapshot()) == before, "what is refused changes nothing"
+
+
+def test_journal_stays_short_when_something_goes_wrong_very_often():
+    """Refused first commands reset each time; refused commands may come at a kilohertz."""
+    machine = RecordedMachine()
+    for _ in range(300):
+        machine.compensator.reset(np.full(6, 0.5))
+    for n in range(300):
+        machine.journal.refused(n, "step", "too far")
+    page = read_page(machine.journal.page(0.0))
+    assert [entry.what for entry in page.entries] == ["reset"] + ["refused"] * REFUSALS_PER_PAGE
+    assert page.refused_more == 300 - REFUSALS_PER_PAGE
+
+
+# ---- what a recorder may lose ----
+
+
+def test_recording_that_begins_in_motion_is_replayed_from_its_first_snapshot(run, tmp_path):
+    """A recorder that comes late gets pages from before, and hears the next snapshot after a while."""
+    first = of_topic(run.messages, "journal")[22]
+    kept = run.messages[of_topic(run.messages, "files")[4]]
+    recording, result = opened(write_bag(tmp_path / "run", [kept, *run.messages[first:]]))
+    assert counted(result) == {BEFORE: 80, IDENTICAL: 700}
+    assert (result.outcome[:80] == BEFORE).all()
+    assert not result.lost
+    assert recording.heard == 1201 - 440
+
+
+def test_recording_that_begins_at_rest_needs_no_further_snapshot(run, tmp_path):
+    """The page from before says what the first answer follows from, when no command lies between."""
+    last = of_topic(run.messages, "journal")[20]
+    kept = [run.messages[of_topic(run.messages, "files")[4]], run.messages[last]]
+    _, result = opened(write_bag(tmp_path / "run", kept + run.messages[last + 1 :]))
+    assert counted(result) == {BEFORE: 20, IDENTICAL: 800}
+
+
+@pytest.mark.parametrize(
+    ("lost", "silent"),
+    [([3], 2), ([5], 5), ([1], 4), ([7, 8, 9], 1), ([24, 51], 1 + 4), ([59, 60], 0)],
+)
+def test_what_the_recorder_has_lost_is_never_called_a_difference(run, tmp_path, capsys, lost, silent):
+    """What is compared is identical; what lies between a lost page and the next snapshot is counted, not judged.
+
+    Page 0 is empty, each other holds 20 answers; every fifth, and page 0, closes with a snapshot. So after the loss of
+    page 3 pages 4 and 5 are `silent`.
+    """
+    pages = of_topic(run.messages, "journal")
+    messages = without(run.messages, *(pages[n] for n in lost))
+    bag = write_bag(tmp_path / "run", messages)
+    _, result = opened(bag)
+    found = counted(result)
+    assert DIFFERENT not in found
+    assert not result.states_differ
+    assert found.get(LOST, 0) == 20 * silent
+    assert found[IDENTICAL] == 1200 - 20 * (silent + len(lost))
+    assert call(bag) == 0
+    if lost[-1] == 60:
+        assert result.lost == 0, "what follows the last page nobody knows"
+        return
+    assert result.lost == 20 * len(lost)
+    assert f"the recorder has lost answers that the journal counts: {result.lost}" in capsys.readouterr().out
+
+
+def test_a_journal_without_its_end_is_noticed(run, tmp_path, capsys):
+    """The node is killed: what it took since its last page is on the topic, and not in the journal."""
+    last = of_topic(run.messages, "journal")[-1]
+    bag = write_bag(tmp_path / "run", without(run.messages, last))
+    assert counted(opened(bag)[1]) == {IDENTICAL: 1180}
+    assert call(bag) == 0
+    assert "1181 commands taken, 1180 answered, 1 refused; the recorder heard 1201" in capsys.readouterr().out
+
+
+def test_pages_that_come_twice_or_late_do_no_harm(run, tmp_path):
+    """A recorder that joins twice is given old pages again; two recordings may have been put together."""
+    pages = of_topic(run.messages, "journal")
+    messages = list(run.messages)
+    messages += [(BEGAN + 5_000 * MILLISECOND, *run.messages[n][1:]) for n in pages[-10:]]
+    early = run.messages[pages[30]]
+    messages[pages[30]] = (early[0] + 300 * MILLISECOND, *early[1:])
+    _, result = opened(write_bag(tmp_path / "run", sorted(messages, key=lambda message: message[0])))
+    assert counted(result) == {IDENTICAL: 1200}
+
+
+@pytest.mark.parametrize("also", [(), ("strut_states",)])
+def test_the_journal_is_enough_and_other_topics_do_not_disturb(run, tmp_path, also):
+    """Without commands and answers, with measured struts in another order, with a topic of a type nobody knows."""
+    messages = [message for message in run.messages if "compensator/" in message[1]]
+    names = [f"strut_{n}" for n in (6, 5, 4, 3, 2, 1)]
+    for n, broken in enumerate((False, True)):
+        numbers = np.arange(6.0 - broken)
+        message = TYPES[JOINT_STATE](RecordedMachine().header(BEGAN), names, numbers, np.zeros(0), np.zeros(0))
+        messages += [(BEGAN + n, f"/{topic}", JOINT_STATE, serialized(JOINT_STATE, message)) for topic in also]
+    messages.append((BEGAN, "/other/journal", "std_msgs/msg/Header", b"\0\1\0\0"))
+    recording, result = opened(write_bag(tmp_path / "run", messages))
+    assert counted(result) == {IDENTICAL: 1200}
+    assert recording.heard == 0
+    if also:
+        assert recording.topics["strut_states"].values.tolist() == [[5.0, 4.0, 3.0, 2.0, 1.0, 0.0]]
+        assert "1 messages of strut_states left out" in recording.notes[0]
+
+
+def test_spare_bytes_behind_messages_do_no_harm(run, tmp_path):
+    """What rclpy's serialize_message makes may end in four bytes that belong to nothing."""
+    messages = [(*message[:3], message[3] + b"\xe0\0\0\0") for message in run.messages]
+    _, result = opened(write_bag(tmp_path / "run", messages))
+    assert counted(result) == {IDENTICAL: 1200}
+
+
+def test_folder_of_a_killed_recorder_is_read_without_metadata(run, tmp_path):
+    """Only metadata.yaml is missing, and the bag is split in two files."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name, part in (("a", run.messages[:2000]), ("b", run.messages[2000:])):
+        bag = write_bag(tmp_path / name, part)
+        shutil.move(bag / f"{name}.mcap", folder)
+    recording, result = opened(folder)
+    assert counted(result) == {IDENTICAL: 1200}
+    assert "metadata.yaml is missing" in recording.notes[0]
+
+
+def test_bag_of_an_older_recorder(run, tmp_path):
+    """Until ROS 2 Humble sqlite bags had no message definitions, and no tables about themselves."""
+    (file,) = write_bag(tmp_path / "run", run.messages, "sqlite3").glob("*.db3")
+    with contextlib.closing(sqlite3.connect(file)) as database, database:
+        for table in ("schema", "metadata", "message_definitions"):
+            database.execute(f"DROP TABLE {table}")
+        database.execute("ALTER TABLE topics DROP COLUMN type_description_hash")
+    _, result = opened(file)
+    assert counted(result) == {IDENTICAL: 1200}
+
+
+# ---- with another model ----
+
+
+def offset_model(folder: Path, offset_um: float) -> Path:
+    """Write a model whose struts are all too long by an offset."""
+    data = {"format": "hexapod_comp/model", "version": 1, "machine": "paper", "name": "all too long"}
+    data |= {"date": "2026-01-31", "sources": [], "struts": {"offset_um": offset_um}}
+    path = folder / "offset.yaml"
+    path.write_text(yaml.safe_dump(data), encoding="utf-8")
+    return path
+
+
+def test_another_model_shows_what_it_would_have_corrected(tmp_path, capsys):
+    """Recorded without a model, so with corrections of zero; struts too long by 30 µm are told 30 µm less.
+
+    A difference of lengths below a metre is exact to 1e-16 m.
+    """
+    machine = RecordedMachine(model=offset_model(tmp_path, 0.0))
+    machine.wave(200)
+    machine.page()
+    bag = write_bag(tmp_path / "run", machine.messages)
+    model = offset_model(tmp_path, 30.0)
+    assert call(bag, "--model", model, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["outcomes"]["identical"] == 200
+    np.testing.assert_allclose(told["other"]["largest_difference_m"], 30e-6, rtol=0.0, atol=1e-15)
+    assert call(bag, "--model", model, "--out", tmp_path / "run.csv", "--pictures", tmp_path / "pictures") == 0
+    with open(tmp_path / "run.csv", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 200
+    assert {row["other_L3_um"] for row in rows} == {"-30.000000"}
+    assert {row["outcome"] for row in rows} == {"identical"}
+    assert "model all too long" in capsys.readouterr().out
+    assert call(bag, "--model", "ideal") == 0
+    assert "model ideal" in capsys.readouterr().out
+
+
+def test_bag_without_files_asks_for_them(tmp_path, capsys):
+    """Geometry and model in use are known by their hash only; the user has them."""
+    machine = RecordedMachine()
+    machine.wave(40)
+    machine.page()
+    messages = [message for message in machine.messages if not message[1].endswith("files")]
+    bag = write_bag(tmp_path / "run", messages)
+    with pytest.raises(InputFileError, match=r"does not carry the machine 'paper'.*--machine"):
+        call(bag)
+    with pytest.raises(InputFileError, match=r"does not carry the model 'virtual machine'.*--model"):
+        call(bag, "--machine", "paper")
+    assert call(bag, "--machine", "paper", "--model", "paper_machine") == 0
+    assert "identical bit for bit" in capsys.readouterr().out
+    assert call(bag, "--machine", "paper", "--model", "paper_lines_model") == 0
+    said = capsys.readouterr().out
+    assert "not at hand" in said
+    assert "corrections differ" in said
+
+
+# ---- what the verb writes ----
+
+
+def test_verb_writes_report_pictures_and_json(run, tmp_path, capsys):
+    bag = write_bag(tmp_path / "run", run.messages)
+    assert call(bag, "--pictures", tmp_path / "pictures") == 0
+    said = capsys.readouterr().out
+    assert "1201 commands taken, 1200 answered, 1 refused; the recorder heard 1201" in said
+    assert "replayed 1200 of 1200 answers: identical bit for bit" in said
+    assert "changes between commands: 2 × enable, 1 × model, 2 × reset, 2 × temperature" in said
+    pictures = {path.name for path in (tmp_path / "pictures").iterdir()}
+    assert pictures == {"corrections.png", "commands.png", "tool.png", "refused.png"}
+    assert call(bag, "--json", "--out", tmp_path / "run.json") == 0
+    told = json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))
+    assert told["same"] is True
+    assert told["outcomes"]["identical"] == 1200
+    assert told["refusals"][0]["reason"] == "step"
+    assert told["changes"][0]["name"] == "strut_1"
+    assert math.isclose(told["changes"][0]["value"], 23.4, rel_tol=0.0)
+
+
+def test_replay_needs_no_ros(run, tmp_path):
+    bag = write_bag(tmp_path / "run", run.messages)
+    here = Path(__file__).parents[1]
+    env = {**os.environ, "PYTHONPATH": f"{here}{os.pathsep}{here.parent}"}
+    code = (
+        "import sys\n"
+        "for name in ('rclpy', 'std_msgs', 'sensor_msgs', 'geometry_msgs'): sys.modules[name] = None\n"
+        "import test_replay\n"
+        f"sys.exit(test_replay.call({str(bag)!r}))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
+    assert done.returncode == 0, done.stderr
+    assert "identical bit for bit" in done.stdout
+
+
+# ---- bags that cannot be used ----
+
+
+def test_several_machines_are_told_apart(run, tmp_path):
+    mill = full_run(tmp_path, "/shop/mill")
+    bag = write_bag(tmp_path / "both", run.messages + mill.messages)
+    with pytest.raises(InputFileError, match=r"several machines; choose one with --namespace: /, /shop/mill"):
+        read_recording(bag)
+    with pytest.raises(InputFileError, match=r"no machine in lathe: /, /shop/mill"):
+        read_recording(bag, "lathe")
+    for namespace, node in (("/", "/compensator"), ("shop/mill", "/shop/mill/compensator")):
+        recording, result = opened(bag, namespace)
+        assert recording.node == node
+        assert counted(result) == {IDENTICAL: 1200}
+
+
+def test_missing_journal_is_named(run, tmp_path):
+    messages = [message for message in run.messages if not message[1].endswith("journal")]
+    with pytest.raises(InputFileError, match=r"holds no journal of a compensator.*Its topics: /compensator/files"):
+        read_recording(write_bag(tmp_path / "run", messages))
+
+
+def test_recordings_of_earlier_releases_are_refused(run, tmp_path, capsys):
+    """Their journal had no commands in it; the words say what is missing and what to do."""
+    bag = write_bag(tmp_path / "run", altered(run.messages, 0, lambda page: page.update(journal=1)))
+    assert main(["replay", str(bag)]) == 2
+    said = capsys.readouterr().err
+    assert "is of version 1, which does not hold what the compensator consumed" in said
+    assert "Replay the recording with the release that made it" in said
+    assert said.count("\n") == 1
+
+
+def test_wrong_types_are_named(run, tmp_path):
+    for topic in ("files", "journal"):
+        messages = [
+            (time, name, "std_msgs/msg/Header" if name.endswith(topic) else kind, raw)
+            for time, name, kind, raw in run.messages[:10]
+        ]
+        with pytest.raises(InputFileError, match=rf"{topic}: must be of type \w+/msg/\w+ .found 'std_msgs/msg/Header'"):
+            read_recording(write_bag(tmp_path / topic, messages))
+
+
+def test_paths_that_are_no_bag(tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
+    (tmp_path / "zero.mcap").touch()
+    write_bag(tmp_path / "nothing", [])
+    for name, message in (
+        ("none", "no such file or folder"),
+        ("empty", "neither metadata.yaml nor"),
+        ("old.bag", "must be a bag"),
+        ("zero.mcap", "seems to be empty"),
+        ("nothing", "without messages"),
+    ):
+        with pytest.raises(InputFileError, match=message):
+            read_recording(tmp_path / name)
+    assert main(["replay", str(tmp_path / "none")]) == 2
+    assert capsys.readouterr().err == f"hexapod_comp: error: {tmp_path}/none: there is no such file or folder\n"
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_damaged_files_end_in_a_clear_error(run, tmp_path, storage):
+    """Cut anywhere, or with bytes altered anywhere: an error that names the file, or what can still be read."""
+    bag = write_bag(tmp_path / "run", run.messages[:400], storage)
+    (file,) = bag.glob("run.[md][cb]*")
+    whole, draw = file.read_bytes(), np.random.default_rng(5)
+    for case in range(60):
+        damaged = bytearray(whole)
+        if case % 2:
+            del damaged[int(draw.integers(len(whole))) :]
+        else:
+            for place in draw.integers(len(whole), size=8):
+                damaged[place] = draw.integers(256)
+        target = tmp_path / f"{case}{file.suffix}"
+        target.write_bytes(damaged)
+        with contextlib.suppress(HexapodError):  # nothing else may be raised
+            opened(target)
+        if case % 2 and storage == "mcap" and len(damaged):
+            with pytest.raises(InputFileError, match="recorder is killed"):
+                read_recording(target)
+
+
+def page_text(**changes: object) -> str:
+    """Return an empty page with changes."""
+    content = {"journal": FORMAT, "session": "x", "number": 1, "begins": 0, "answers": "", "entries": []}
+    return json.dumps({**content, "refused_more": 0, "snapshot": None, **changes})
+
+
+def test_messages_that_are_damaged_are_named(run, tmp_path):
+    """A message cut short, a page that is no JSON, of another version, or without its numbers."""
+    pages = [
+        ("{", "not JSON"),
+        ("[1]", "must be of version 3"),
+        ('{"journal": 9}', "must be of version 3, not 9"),
+        ('{"journal": 1}', "is of version 1, which does not hold"),
+        ('{"journal": 2}', "is of version 2, which holds the compensator's state as numbers without names"),
+        ('{"journal": 3}', "not a page of the journal"),
+        (page_text(answers="AAAA"), "not a page of the journal"),
+        (page_text(answers="?"), "not a page of the journal"),
+        (page_text(entries=[{"after": 3, "what": "enable", "on": True}]), "not in an order"),
+        (page_text(answers=base64.b64encode(b"\xff" * ANSWER.itemsize).decode()), "not in an order"),
+    ]
+    for n, (text, message) in enumerate(pages):
+        messages = [*run.messages[:10], (BEGAN, "/compensator/journal", TEXT, serialized(TEXT, TYPES[TEXT](text)))]
+        with pytest.raises(InputFileError, match=f"/compensator/journal at {BEGAN} ns: .*{message}"):
+            read_recording(write_bag(tmp_path / str(n), messages))
+    time, topic, kind, raw = run.messages[of_topic(run.messages, "journal")[1]]
+    with pytest.raises(InputFileError, match=f"/compensator/journal at {time} ns: cannot be read"):
+        read_recording(write_bag(tmp_path / "cut", [*run.messages[:8], (time, topic, kind, raw[:20])]))
+
+
+JUNK = (None, [], {}, "x", "\x1b[2J", -1, 0.5, math.inf, 1e30, 10**30, True, [None] * 6, {"x": 1})
+"""What stands in a page where something else should."""
+
+
+def places_in(content: object, path: tuple = ()) -> list[tuple]:
+    """Return the way to every value inside nested lists and mappings."""
+    items = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
+    inner = [place for key, value in items for place in places_in(value, (*path, key))]
+    return [path, *inner] if path else inner
+
+
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
+def test_pages_that_are_wrong_somewhere_never_end_in_a_traceback(tmp_path, capsys):
+    """One value of the journal is junk, 40 times: an error of the package, or a report."""
+    machine, draw = RecordedMachine(model=offset_model(tmp_path, 10.0)), np.random.default_rng(11)
+    machine.wave(20)
+    machine.compensator.set_temperature("strut_1", 21.0)
+    machine.compensator.enable(False)
+    machine.compensator.set_model(machine.load(offset_model(tmp_path, 20.0)))
+    machine.compensator.reset(machine.compensator.command)
+    machine.send(FAR)
+    machine.page()
+    machine.wave(20, 20)
+    machine.page()
+    numbers = of_topic(machine.messages, "journal")
+    for case in range(40):
+        messages = list(machine.messages)
+        place = numbers[case % len(numbers)]
+        time, topic, kind, raw = messages[place]
+        page = json.loads(STORE.deserialize_cdr(raw, kind).data)
+        ways = [way for way in places_in(page) if way[:2] != ("snapshot", "state") or way[-1] == 0 or len(way) < 4]
+        *way, last = ways[int(draw.integers(len(ways)))]
+        target = page
+        for key in way:
+            target = target[key]
+        target[last] = JUNK[int(draw.integers(len(JUNK)))]
+        messages[place] = time, topic, kind, serialized(kind, TYPES[TEXT](json.dumps(page)))
+        with contextlib.suppress(HexapodError):
+            call(write_bag(tmp_path / str(case), messages))
+    assert "\x1b" not in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value", "ignore:Mean of empty slice")
+def test_answers_that_are_wrong_somewhere_never_end_in_a_traceback(run, tmp_path, capsys):
+    """Bytes of commands and answers are junk, 30 times: an error of the package, or a report that sees it."""
+    draw = np.random.default_rng(12)
+    for case in range(30):
+
+        def spoil(page: dict) -> None:
+            answers = bytearray(base64.b64decode(page["answers"]))
+            for place in draw.integers(len(answers), size=5):
+                answers[place] ^= int(draw.integers(1, 256))
+            page["answers"] = base64.b64encode(answers).decode()
+
+        bag = write_bag(tmp_path / str(case), altered(run.messages[:300], 1 + case % 3, spoil))
+        with contextlib.suppress(HexapodError):
+            assert call(bag) == 1
+            assert call(bag, "--tolerance-um", "1e9", "--json") in (0, 1)
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_nothing_to_compare_is_an_error(run, tmp_path):
+    """Recorded in motion, and shorter than from one snapshot to the next; or without any; or without commands."""
+    pages = [run.messages[n] for n in of_topic(run.messages, "journal")]
+    files = run.messages[of_topic(run.messages, "files")[4]]
+    for n, (some, message) in enumerate(
+        (
+            ((pages[20], pages[22]), "nothing in it can be compared"),
+            (pages[21:25], "holds no snapshot"),
+            (pages[:1], "not a single answer"),
+        )
+    ):
+        with pytest.raises(InputFileError, match=message):
+            call(write_bag(tmp_path / str(n), [files, *some]))
+
+
+def test_files_of_the_journal_must_have_their_hash():
+    text = json.dumps({"journal": FORMAT, "files": {"model": {"name": "m", "sha256": "0" * 64, "text": "x"}}})
+    with pytest.raises(JournalError, match="does not have the hash"):
+        read_sources(text)
+
+
+def renamed(page: dict) -> None:
+    page["snapshot"]["state"]["offset"] = page["snapshot"]["state"].pop("ramp")
+
+
+def test_snapshot_with_other_names_or_numbers_is_refused(run, tmp_path):
+    """A state with other parts than here comes from another version of the arithmetic."""
+    messages = altered(run.messages, 0, renamed)
+    with pytest.raises(HexapodError, match=r"snapshot\.offset: is nothing that this release knows"):
+        opened(write_bag(tmp_path / "renamed", messages))
+    messages = altered(run.messages, 0, lambda page: page["snapshot"]["state"]["ramp"].append(1.0))
+    with pytest.raises(HexapodError, match=r"snapshot\.ramp: must be 6 numbers"):
+        opened(write_bag(tmp_path / "longer", messages))
+
+
+def test_order_of_the_names_does_not_matter(run, tmp_path):
+    """Names, not places, say what a number is: with all of them in reverse order the replay is as identical."""
+
+    def reverse(page: dict) -> None:
+        if page["snapshot"] is not None:
+            page["snapshot"]["state"] = dict(reversed(page["snapshot"]["state"].items()))
+
+    messages = run.messages
+    for n in range(len(of_topic(messages, "journal"))):
+        messages = altered(messages, n, reverse)
+    _, result = opened(write_bag(tmp_path / "run", messages))
+    assert result.identical
+    assert not result.states_differ
+
+
+def test_bag_of_sqlite_without_its_tables(tmp_path):
+    path = tmp_path / "other.db3"
+    with sqlite3.connect(path) as database:
+        database.execute("CREATE TABLE t (a)")
+    with pytest.raises(InputFileError, match="cannot be read as a bag"):
+        read_recording(path)
+
+
+def test_without_rosbags_the_error_says_how_to_get_it(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    (tmp_path / "run.mcap").touch()
+    with pytest.raises(HexapodError, match=r"pip install hexapod_comp\[bags\].*python3-rosbags-pip"):
+        read_recording(tmp_path / "run.mcap")
+
+
+def test_ideal_model_is_recorded_as_none(tmp_path):
+    machine = RecordedMachine(model=offset_model(tmp_path, 0.0))
+    from hexapod_comp.compensation.journal import Source
+
+    machine.sources["model"] = Source.of("ideal", "")
+    machine.compensator.set_model(MachineModel(machine.geometry.name))
+    machine.wave(10)
+    machine.page()
+    _, result = opened(write_bag(tmp_path / "run", machine.messages))
+    assert counted(result) == {IDENTICAL: 10}
+
+
+COMPRESSED = [
+    ("mcap", CompressionMode.STORAGE),
+    ("mcap", CompressionMode.MESSAGE),
+    ("mcap", CompressionMode.FILE),
+    ("sqlite3", CompressionMode.MESSAGE),
+    ("sqlite3", CompressionMode.FILE),
+]
+
+
+@pytest.mark.parametrize(("storage", "mode"), COMPRESSED)
+def test_compressed_bags_come_back_bit_for_bit(run, tmp_path, storage, mode):
+    _, result = opened(write_bag(tmp_path / "run", run.messages, storage, mode))
+    assert counted(result) == {IDENTICAL: 1200}
+
+
+@pytest.mark.parametrize(
+    ("bound", "message"), [("FREE", "more than a recording of"), ("AT_ONCE", "more than the allowed|blob too big")]
+)
+@pytest.mark.parametrize(("storage", "mode"), COMPRESSED)
+def test_bag_that_unpacks_to_too_much_is_refused(run, tmp_path, monkeypatch, storage, mode, bound, message):
+    """A text of 8 MB of blanks packs into some hundred bytes; the bounds are lowered, to test fast."""
+    blanks = serialized(TEXT, TYPES[TEXT](" " * 8 * unpacking.MEGABYTE))
+    messages = [*run.messages[:50], (BEGAN, "/compensator/journal", TEXT, blanks)]
+    bag = write_bag(tmp_path / "run", messages, storage, mode)
+    monkeypatch.setattr(unpacking, "RATIO", 1)
+    monkeypatch.setattr(unpacking, bound, 2 * unpacking.MEGABYTE)
+    unpacked = []
+    monkeypatch.setattr(unpacking.Allowance, "take", spied(unpacking.Allowance.take, unpacked))
+    with pytest.raises(InputFileError, match=message):
+        read_recording(bag)
+    assert sum(unpacked) <= 4 * unpacking.MEGABYTE or mode == CompressionMode.FILE  # files go to the disk first
+
+
+def spied(take: Callable, seen: list[int]) -> Callable:
+    """Return `take` that notes what it counts."""
+
+    def noting(self: object, count: int) -> None:
+        seen.append(count)
+        take(self, count)
+
+    return noting
+
+
+def test_chunks_packed_by_lz4_are_bounded_too(monkeypatch):
+    monkeypatch.setattr(unpacking, "AT_ONCE", 2 * unpacking.MEGABYTE)
+    own = storage_mcap.DECOMPRESSORS
+    with unpacking.bounded(unpacking.Allowance(0)):
+        unpack = storage_mcap.DECOMPRESSORS["lz4"]
+        assert unpack(lz4.frame.compress(b"hexapod" * 99), 693) == b"hexapod" * 99
+        with pytest.raises(unpacking.UnpackingError, match="allowed 2 MB"):
+            unpack(lz4.frame.compress(bytes(3 * unpacking.MEGABYTE)), 100)
+    assert storage_mcap.DECOMPRESSORS is own
+
+
+def test_chunks_of_one_time_are_bounded_together():
+    """Chunks are merged by time: a hundred of the same second would be in memory together, one after another not."""
+    chunk = lambda began, ended: SimpleNamespace(  # noqa: E731
+        message_start_time=began, message_end_time=ended, uncompressed_size=unpacking.AT_ONCE // 4
+    )
+    reader = lambda chunks: SimpleNamespace(storage=SimpleNamespace(chunks=chunks))  # noqa: E731
+    unpacking.refuse_overlapping_chunks(reader([chunk(n, n + 2) for n in range(100)]))
+    with pytest.raises(unpacking.UnpackingError, match="at one time"):
+        unpacking.refuse_overlapping_chunks(reader([chunk(n, n + 5) for n in range(100)]))
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "ALTER TABLE messages ADD COLUMN more BLOB AS (zeroblob(900000000))",
+        "CREATE VIEW message_definitions_2 AS SELECT 1",
+    ],
+)
+def test_tables_that_compute_what_they_hold_are_refused(run, tmp_path, statement):
+    bag = write_bag(tmp_path / "run", run.messages[:50], "sqlite3")
+    (file,) = bag.glob("*.db3")
+    with contextlib.closing(sqlite3.connect(file)) as database:
+        database.execute(statement)
+        database.commit()
+    with pytest.raises(InputFileError, match="computes what it seems to hold"):
+        read_recording(bag)

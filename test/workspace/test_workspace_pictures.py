@@ -1,0 +1,284 @@
+"""Pictures and page of the workspace study: what they show, that the page needs no network, that it runs."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from test_reach import unit
+
+from hexapod_comp.errors import GeometryError, HexapodError, InputFileError
+from hexapod_comp.formats.figures import save
+from hexapod_comp.workspace.page import MOST_BYTES, PageData, page_text, write_page
+from hexapod_comp.workspace.pictures import (
+    ROTATION,
+    TRANSLATION,
+    Layer,
+    RankedRow,
+    causes_figure,
+    outline,
+    ranking_figure,
+    shells_figure,
+)
+
+RINGS, SECTORS = 9, 16
+PAGE_LIMIT = 15e6
+
+
+def mesh(radius: float = 0.05) -> np.ndarray:
+    """Return a ball above the unit's platform as a mesh."""
+    up, around = np.linspace(-np.pi / 2, np.pi / 2, RINGS)[:, None], np.linspace(0, 2 * np.pi, SECTORS + 1)
+    unit_ball = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up) + 0 * around], axis=-1)
+    unit_ball[[0, -1], :, :2] = 0.0  # poles are points, as those of shells are
+    return radius * unit_ball + [0.0, 0.0, 0.25]
+
+
+def layers() -> list[Layer]:
+    return [Layer(mesh(radius), 1e-6 + 1e-3 * mesh(radius)[..., 0] ** 2) for radius in (0.02, 0.035, 0.05)]
+
+
+def texts(figure: Figure) -> str:
+    """Return all that is written in a figure."""
+    return "\n".join(text.get_text() for text in figure.findobj(lambda part: hasattr(part, "get_text")))
+
+
+# Pictures.
+
+
+def test_shells_say_what_they_show(tmp_path):
+    """Truth: values from 1 µm to 1 µm + 10⁻³·0.05² m = 3.5 µm; six struts, base, platform and tool in the context."""
+    figure = shells_figure(unit(), layers(), TRANSLATION, "unit: screw pitch on strut 1")
+    written = texts(figure)
+    for part in ("unit: screw pitch on strut 1", "translation of the tool, µm", "x, mm", "3.5", "1", "at home"):
+        assert part in written
+    context, near, bar = figure.axes
+    assert len(context.lines) == 9
+    assert bar.get_ylim() == pytest.approx((1.0, 3.5))
+    assert [len(axes.collections) for axes in (context, near)] == [1, 1]
+    save(figure, tmp_path / "shells.png")
+    assert (tmp_path / "shells.png").stat().st_size > 20_000
+
+
+def test_outer_shells_are_cut_open_and_the_innermost_is_whole():
+    """Truth: 3·8·16 faces, of which the outermost loses the 130° towards the eye, the middle one 65°."""
+    near = shells_figure(unit(), layers(), TRANSLATION, "").axes[1]
+    (body,) = near.collections
+    whole = (RINGS - 1) * SECTORS
+    lost = 3 * whole - len(body.get_facecolor())
+    assert lost == pytest.approx(whole * (130 + 65) / 360, abs=2 * (RINGS - 1))
+
+
+def test_the_outline_is_the_machine_at_home():
+    """Truth: the file: base in z = 0, platform at 225 mm, tool 25 mm above it, struts between."""
+    base, platform, *struts, tool = outline(unit())
+    assert base.shape == platform.shape == (7, 3)
+    np.testing.assert_allclose(base[:, 2], 0.0)
+    np.testing.assert_allclose(platform[:, 2], 0.16)
+    np.testing.assert_allclose(tool, [[0, 0, 0.16], [0, 0, 0.185]])
+    assert len(struts) == 6
+    np.testing.assert_allclose(struts[3], [base[3], platform[3]])
+
+
+def test_causes_have_a_legend_with_their_share():
+    """Truth: the upper half of a ball has half of its area."""
+    findings = np.where(np.arange(RINGS)[:, None] < RINGS // 2, 1, 2) * np.ones((1, SECTORS + 1), int)
+    written = texts(causes_figure(unit(), mesh(), findings, "what limits"))
+    for part in ("stroke, shortest: 50.0% of the area", "stroke, longest: 50.0% of the area", "from below"):
+        assert part in written
+    assert "cone" not in written
+
+
+def test_bars_from_minimum_to_maximum(tmp_path):
+    """Truth: 004, Table 1, two of its rows; 15.41 m° are 268.95 µrad."""
+    rows = [
+        RankedRow("screw pitch ±20 µm", (22.4e-6, 34.4e-6), (186.92e-6, 268.95e-6)),
+        RankedRow("base joint x/y ±10 µm", (1e-12, 13.68e-6), (0.0, 107.51e-6)),
+    ]
+    figure = ranking_figure(rows, "Table 1 of 004")
+    left, right = figure.axes
+    bar = left.patches[0]
+    assert (bar.get_x(), bar.get_x() + bar.get_width()) == pytest.approx((22.4, 34.4))
+    assert right.patches[0].get_x() + right.patches[0].get_width() == pytest.approx(15.41, abs=1e-3)
+    for part in ("Table 1 of 004", "screw pitch ±20 µm", "22.4 – 34.4", "≈ 0 – 13.7", "µm", "m°", "minimum – maximum"):
+        assert part in texts(figure)
+    assert left.get_ylim()[0] > left.get_ylim()[1]  # the worst on top
+    save(figure, tmp_path / "bars.png")
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        pytest.param(lambda: shells_figure(unit(), [], TRANSLATION, ""), "layers: .*at least one", id="no layer"),
+        pytest.param(lambda: Layer(mesh(), np.zeros((3, 3))), r"layer: .*\(9, 17, 3\).*\(3, 3\)", id="shapes"),
+        pytest.param(lambda: ranking_figure([], ""), "rows: .*at least one", id="no row"),
+        pytest.param(
+            lambda: shells_figure(unit(), [Layer(mesh(), np.full((9, 17), np.nan))], TRANSLATION, ""),
+            "values: .*finite",
+            id="NaN",
+        ),
+    ],
+)
+def test_no_picture_of_nothing(make, said):
+    with pytest.raises(GeometryError, match=said):
+        make()
+
+
+# The page.
+
+TYPES = [("pitch <±20 µm>", "strut 1"), ("pitch <±20 µm>", "strut 2"), ("joint", "base 1 x")]
+
+
+def page_data(title: str = "unit & errors @NOTE@", **other: object) -> PageData:
+    """Return two frames, three errors, two quantities, two shells; each value names its place."""
+    points = np.array([[mesh(0.03), mesh(0.05)], [mesh(0.02), mesh(0.04)]])
+    values = np.linspace(1e-6, 9e-6, 2 * 3 * 2 * 2 * RINGS * (SECTORS + 1)).reshape(2, 3, 2, 2, RINGS, SECTORS + 1)
+    given = {
+        "title": title,
+        "note": "</script> is no end",
+        "errors": TYPES,
+        "quantities": (TRANSLATION, ROTATION),
+        "frame_title": "tilt about x",
+        "frames": ("−5°", "</script>5°"),
+        "layers": ("60 %", "100 %"),
+        "points": points,
+        "values": values,
+    }
+    return PageData(**{**given, **other})
+
+
+class Loads(HTMLParser):
+    """Collects tags, and every attribute by which a page can load something."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.loads: list[tuple[str, str, str | None]] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.loads += [(tag, name, value) for name, value in attrs if name in ("src", "href", "srcset", "data")]
+
+
+def test_the_page_loads_nothing():
+    """Truth: HTML: only src, href and their like load, and a policy of default-src 'none' forbids the rest."""
+    pytest.importorskip("plotly", reason="the page needs plotly")
+    text = page_text(unit(), page_data())
+    parsed = Loads(text)
+    assert not parsed.loads
+    assert parsed.tags.count("script") == 3
+    assert not {"link", "iframe", "img", "object", "embed", "base"} & set(parsed.tags)
+    assert "@import" not in text[: text.index("<script>")]
+    policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', text)[1]
+    assert "default-src 'none'" in policy
+    assert "http" not in policy
+    assert "unit &amp; errors @NOTE@</h1>" in text
+    assert len(text.encode()) < PAGE_LIMIT
+
+
+def test_the_largest_page_that_is_allowed_is_below_its_limit(tmp_path):
+    """Truth: the file's size, of as many frames as are taken; two bytes a value, four a coordinate."""
+    pytest.importorskip("plotly", reason="the page needs plotly")
+    count = MOST_BYTES // (2 * RINGS * (SECTORS + 1) * (2 * 3 * 2 + 4 * 3))
+    points = np.broadcast_to(page_data().points[:1], (count, 2, RINGS, SECTORS + 1, 3))
+    values = np.ones((count, 3, 2, 2, RINGS, SECTORS + 1))
+    write_page(tmp_path / "page.html", unit(), page_data(frames=["level"] * count, points=points, values=values))
+    assert (tmp_path / "page.html").stat().st_size < PAGE_LIMIT
+    with pytest.raises(GeometryError, match="at most 7000000 bytes"):
+        page_data(frames=["level"] * (2 * count), points=np.tile(points, (2, 1, 1, 1, 1)),
+                  values=np.tile(values, (2, 1, 1, 1, 1, 1)))  # fmt: skip
+
+
+def test_without_plotly_it_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "plotly.offline", None)
+    with pytest.raises(HexapodError, match=r"pip install hexapod_comp\[pages\]"):
+        page_text(unit(), page_data())
+
+
+def test_a_page_that_cannot_be_written(tmp_path):
+    pytest.importorskip("plotly", reason="the page needs plotly")
+    with pytest.raises(InputFileError, match="cannot be written"):
+        write_page(tmp_path / "no folder" / "page.html", unit(), page_data())
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        pytest.param({"frames": ("a", "b", "c")}, r"page: .*\(3, 3, 2, 2\)", id="frames"),
+        pytest.param({"errors": ()}, r"page: has \(2, 0, 2, 2\) frames, errors", id="no error"),
+        pytest.param({"values": np.zeros((1, 1))}, "which does not fit", id="shape"),
+        pytest.param({"points": np.full((2, 2, RINGS, SECTORS + 1, 3), np.nan)}, "page.points: .*finite", id="NaN"),
+    ],
+)
+def test_a_page_of_what_does_not_fit(other, said):
+    with pytest.raises(GeometryError, match=said):
+        page_data(**other)
+
+
+def chromium() -> str:
+    """Return a Chromium; as root on a Debian system install the package, and skip where none can be had."""
+    for name in ("chromium", "chromium-browser", "google-chrome"):
+        if found := shutil.which(name):
+            return found
+    if os.geteuid() == 0 and shutil.which("apt-get"):
+        command = ["apt-get", "install", "-y", "--no-install-recommends", "chromium"]
+        environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+        try:
+            for step in (["apt-get", "update"], command):
+                subprocess.run(step, check=True, capture_output=True, timeout=300, env=environment)
+        except (subprocess.SubprocessError, OSError) as error:
+            pytest.skip(f"no Chromium here, and installing Debian's failed: {error}")
+        return shutil.which("chromium") or pytest.skip("Debian's chromium was installed, but is not there")
+    return pytest.skip("no Chromium here, and installing Debian's takes root and apt-get")
+
+
+def rendered(page: Path, profile: Path) -> tuple[str, str]:
+    """Open a page in headless Chromium without a network; return the document then, less scripts, and the log."""
+    options = "--headless --no-sandbox --disable-dev-shm-usage --use-angle=swiftshader --enable-unsafe-swiftshader"
+    command = [chromium(), *options.split(), "--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={profile}"]
+    command += ["--virtual-time-budget=20000", "--enable-logging=stderr", "--dump-dom", page.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
+    document = re.sub(r"<script.*?</script>", "", done.stdout, flags=re.DOTALL)
+    return document, "\n".join(line for line in done.stderr.splitlines() if "CONSOLE" in line)
+
+
+@pytest.mark.timeout(900)
+def test_the_page_runs_in_a_browser_and_its_selectors_choose(tmp_path):
+    """Truth: the smallest and the largest of the values that were put in for the chosen frame, error and quantity."""
+    pytest.importorskip("plotly", reason="the page needs plotly")
+    data, page = page_data(), tmp_path / "page.html"
+    write_page(page, unit(), data)
+    found, log = rendered(page, tmp_path / "profile")
+    assert 'data-ready="yes"' in found, log
+    assert "Refused" not in log
+    assert "Uncaught" not in log
+    assert "WebGL is not supported" not in found
+    assert "gl-container" in found
+    assert says(found) == shown(data.values[0, 0, 0] * 1e6, "µm")
+    act = """<script>get("type").value = "joint"; get("type").onchange(); get("quantity").value = 1;
+      get("quantity").onchange(); get("frame").value = 1; get("frame").oninput(); get("play").onclick();</script>"""
+    page.write_text(page.read_text(encoding="utf-8").replace("</body>", act + "</body>"), encoding="utf-8")
+    found, log = rendered(page, tmp_path / "profile")
+    assert "Uncaught" not in log
+    assert ">pause<" in found
+    played = [shown(data.values[frame, 2, 1] * 1e3 * 180 / np.pi, "m°") for frame in (0, 1)]
+    assert says(found) in played
+
+
+def says(document: str) -> tuple[str, str]:
+    """Return largest and smallest value with unit, as the page says them."""
+    line = re.search(r'<div id="found">([^<]*)</div>', document)[1]
+    return re.search(r"largest (\S+ \S+) at", line)[1], re.search(r"smallest (\S+ \S+) at", line)[1]
+
+
+def shown(values: np.ndarray, unit_name: str) -> tuple[str, str]:
+    """Return the same from the values that were put in, four digits as JavaScript's toPrecision writes them."""
+    return f"{values.max():#.4g} {unit_name}", f"{values.min():#.4g} {unit_name}"
