@@ -21,7 +21,6 @@ from ..kernels.compensation import (
     OUTSIDE,
     STATE_SIZE,
     UNSOLVED,
-    State,
     compensate_one,
     compensate_quaternion,
     estimate_one,
@@ -119,7 +118,7 @@ class _Command:
 
     def __init__(self, ramp_rate: float) -> None:
         self.numbers = np.full(STATE_SIZE, math.nan)
-        self.state: State = state_of.py_func(self.numbers)
+        self.state = state_of(self.numbers)
         self.motion = MotionState(self.state.motion_low, self.state.motion_sense)
         self.state.ramp[:], self.state.ramp_rate[:] = 0.0, ramp_rate
         self.state.enabled[:], self.state.changed[:] = 1.0, 0.0
@@ -128,7 +127,12 @@ class _Command:
     @property
     def platform(self) -> Pose:
         """Commanded ``pose_platform_in_base``."""
-        return Pose(self.state.platform_position, self.state.platform_rotation)
+        return Pose(self.state.platform_position, self.state.platform_rotation.reshape((3, 3)))
+
+    @property
+    def model(self) -> Pose:
+        """The model pose."""
+        return Pose(self.state.model_position, self.state.model_rotation.reshape((3, 3)))
 
     def clear(self) -> None:
         """Forget lengths and motion; the correction stays, as what the struts stand at."""
@@ -309,7 +313,7 @@ class Compensator:
         ``temperatures``, °C by name, and each field of :class:`~hexapod_comp.kernels.compensation.State`: a list of
         numbers, matrices by rows.
         """
-        numbers = {name: part.ravel().tolist() for name, part in self._last.state._asdict().items()}
+        numbers = {name: part.tolist() for name, part in self._last.state._asdict().items()}
         return {**numbers, "temperatures": dict(self.temperatures.values)}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -327,13 +331,13 @@ class Compensator:
             raise ModelError(f"snapshot.{name}", problem)
         values = {name: np.asarray(snapshot[name], dtype=float) for name in parts}
         for name, part in parts.items():
-            if values[name].shape != (part.size,):
+            if values[name].shape != part.shape:
                 raise ModelError(f"snapshot.{name}", f"must be {part.size} numbers", values[name].size)
         temperatures = Temperatures(snapshot["temperatures"])
         self._take_machine(RealMachine(self.geometry, self.model, temperatures))
         self.temperatures = temperatures
         for name, part in parts.items():
-            part[...] = values[name].reshape(part.shape)
+            part[:] = values[name]
 
     def _forget(self) -> None:
         home = self.geometry.home
@@ -488,7 +492,7 @@ class Compensator:
         return Correction(
             tool_pose=tool_pose,
             platform_pose=platform,
-            model_pose=Pose(self._last.state.model_position, self._last.state.model_rotation),
+            model_pose=self._last.model,
             sense=self.motion.sense.copy(),
             temperatures=dict(self.temperatures.values),
             nominal=self.nominal.copy(),

@@ -2,13 +2,15 @@
 
 Handing an array to a compiled function costs more than most of what is computed with it, and a named tuple more
 still. So everything that stays the same between two commands travels in two vectors, and everything that changes in
-a third; here they are taken apart, and their parts get names.
+a third; here they are taken apart, and their parts get names. Of the state, which has many parts, the kernel asks for
+places by name: views of all of them would make a command slower by a tenth.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from itertools import accumulate
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,9 +24,6 @@ from .struts import PARAMETERS
 SOLVED, UNSOLVED, OUTSIDE, NO_POSE = range(4)
 """How it went: solved, field not undone, solved with the field held at its boundary, input is no pose."""
 
-STATE_SIZE = 71
-"""Length of a vector of :class:`State`."""
-
 LONGEST_RAMP_STEP = 0.02
 """A pause between commands counts as no more than this in a ramp, s: a late command must not step."""
 
@@ -34,65 +33,57 @@ TABLE_END = 72 + 6 * PARAMETERS
 class State(NamedTuple):
     """What one command leaves behind, and all that decides the next answer beside geometry, model and temperatures.
 
-    Parts of one vector, which single numbers are too: arrays of one. A recording holds them under these names, so a
-    new meaning needs a new name.
+    Its parts stand one after the other in a vector. A recording holds them under these names, so a new meaning needs
+    a new name.
 
     Attributes
     ----------
-    motion_low, motion_sense : ndarray, shape (9,)
+    motion_low, motion_sense : 9 numbers each
         Windows and directions of motion, see :class:`~hexapod_comp.machine.motion.MotionState`.
-    nominal, correction, command : ndarray, shape (6,)
+    nominal, correction, command : 6 numbers each
         Of the struts, m; after a reset to measured struts, the command is where they stand.
-    ramp : ndarray, shape (6,)
+    ramp : 6 numbers
         The part of the correction that a change has still to take away, m.
-    time : ndarray, shape (1,)
+    time : 1 number
         Of the command, s.
-    platform_position, platform_rotation, model_position, model_rotation : ndarray, shape (3,), (3, 3)
-        ``pose_platform_in_base`` commanded, m, and the model pose q with q ∘ E(q) = that pose.
-    enabled, changed, resumes : ndarray, shape (1,)
+    platform_position, platform_rotation, model_position, model_rotation : 3 and 9 numbers
+        ``pose_platform_in_base`` commanded, m, and the model pose q with q ∘ E(q) = that pose; matrices by rows.
+    enabled, changed, resumes : 1 number each
         1 or 0: corrections are on; model, temperatures or enabling have changed since the last command; the next
         command starts from measured struts.
-    ramp_rate : ndarray, shape (1,)
+    ramp_rate : 1 number
         Largest speed of the ramp, m/s.
     """
 
-    motion_low: np.ndarray
-    motion_sense: np.ndarray
-    nominal: np.ndarray
-    correction: np.ndarray
-    command: np.ndarray
-    ramp: np.ndarray
-    time: np.ndarray
-    platform_position: np.ndarray
-    platform_rotation: np.ndarray
-    model_position: np.ndarray
-    model_rotation: np.ndarray
-    enabled: np.ndarray
-    changed: np.ndarray
-    resumes: np.ndarray
-    ramp_rate: np.ndarray
+    motion_low: Any
+    motion_sense: Any
+    nominal: Any
+    correction: Any
+    command: Any
+    ramp: Any
+    time: Any
+    platform_position: Any
+    platform_rotation: Any
+    model_position: Any
+    model_rotation: Any
+    enabled: Any
+    changed: Any
+    resumes: Any
+    ramp_rate: Any
 
 
-@compiled
-def state_of(numbers):
+SIZES = State(9, 9, 6, 6, 6, 6, 1, 3, 9, 3, 9, 1, 1, 1, 1)
+"""How many numbers each part is."""
+
+AT = State(*accumulate(SIZES[:-1], initial=0))
+"""Where in the vector each part begins."""
+
+STATE_SIZE = sum(SIZES)
+
+
+def state_of(numbers: np.ndarray) -> State:
     """Return the state that a vector, (STATE_SIZE,), holds: its parts, not copies."""
-    return State(
-        motion_low=numbers[:9],
-        motion_sense=numbers[9:18],
-        nominal=numbers[18:24],
-        correction=numbers[24:30],
-        command=numbers[30:36],
-        ramp=numbers[36:42],
-        time=numbers[42:43],
-        platform_position=numbers[43:46],
-        platform_rotation=numbers[46:55].reshape((3, 3)),
-        model_position=numbers[55:58],
-        model_rotation=numbers[58:67].reshape((3, 3)),
-        enabled=numbers[67:68],
-        changed=numbers[68:69],
-        resumes=numbers[69:70],
-        ramp_rate=numbers[70:71],
-    )
+    return State(*(numbers[begin : begin + size] for begin, size in zip(AT, SIZES, strict=True)))
 
 
 @compiled
@@ -141,46 +132,53 @@ def compose(p1, r1, p2, r2, position, rotation):
 
 
 @compiled
-def compensate_one(position, rotation, time, frame, fixed, numbers, next_numbers):
+def compensate_one(position, rotation, time, frame, fixed, last, new):
     """Run the whole chain for one command; return (status, finding, strut, stage, value, condition number).
 
-    `fixed` holds the machine's numbers, the nominal ones, and the arrays whose size varies. The state in `numbers`
-    stays as it is; the one in `next_numbers` is written, and counts only when nothing was found.
+    `fixed` holds the machine's numbers, the nominal ones, and the arrays whose size varies. The state in `last`
+    stays as it is; the one in `new` is written, and counts only when nothing was found.
     """
     machine_numbers, nominal_numbers, varied = fixed
     body, table, probe, thresholds, _ = machine_views(machine_numbers)
     nominal_base, nominal_platform, tool, limits = nominal_views(nominal_numbers)
     struts, field = (table, *varied[:2]), (probe, *varied[2:])
-    next_numbers[:] = numbers
-    last, new = state_of(numbers), state_of(next_numbers)
-    at = np.empty(3), np.empty((3, 3))
-    compose(frame[:3], frame[3:].reshape((3, 3)), position, rotation, at[0], at[1])
-    compose(at[0], at[1], tool[0], tool[1:], new.platform_position, new.platform_rotation)
-    platform, model = (new.platform_position, new.platform_rotation), (new.model_position, new.model_rotation)
-    kernels.strut_lengths_one(nominal_base, nominal_platform, *platform, new.nominal)
-    finding, strut, value, _, condition = check_stage(nominal_base, nominal_platform, *platform, new.nominal, limits)
+    new[:] = last
+    half = np.empty(3), np.empty((3, 3))
+    platform = pose_at(new, AT.platform_position, AT.platform_rotation)
+    model = pose_at(new, AT.model_position, AT.model_rotation)
+    nominal, command = new[AT.nominal : AT.nominal + 6], new[AT.command : AT.command + 6]
+    compose(frame[:3], frame[3:].reshape((3, 3)), position, rotation, half[0], half[1])
+    compose(half[0], half[1], tool[0], tool[1:], platform[0], platform[1])
+    kernels.strut_lengths_one(nominal_base, nominal_platform, *platform, nominal)
+    finding, strut, value, _, condition = check_stage(nominal_base, nominal_platform, *platform, nominal, limits)
     if finding != WITHIN:
         return SOLVED, finding, strut, 0, value, condition
-    motion = new.motion_low, new.motion_sense
-    solved, outside = command_one(*platform, thresholds, *motion, body, struts, field, *model, new.command)
+    motion = new[AT.motion_low : AT.motion_low + 9], new[AT.motion_sense : AT.motion_sense + 9]
+    solved, outside = command_one(*platform, thresholds, *motion, body, struts, field, *model, command)
     if not solved:
         return UNSOLVED, WITHIN, -1, 1, math.nan, condition
     for i in range(6):
-        new.correction[i] = last.enabled[0] * (new.command[i] - new.nominal[i])
-    new.time[0], new.changed[0], new.resumes[0] = time, 0.0, 0.0
+        new[AT.correction + i] = last[AT.enabled] * (command[i] - nominal[i])
+    new[AT.time], new[AT.changed], new[AT.resumes] = time, 0.0, 0.0
     shrink_ramp(last, new)
     for i in range(6):
-        new.correction[i] += new.ramp[i]
-        new.command[i] = new.nominal[i] + new.correction[i]
+        new[AT.correction + i] += new[AT.ramp + i]
+        command[i] = nominal[i] + new[AT.correction + i]
     finding, strut, value, stage = check_command(last, new, limits)
     if finding == WITHIN:
         stage = 1
-        finding, strut, value, _, _ = check_stage(body[0], body[1], *model, new.command, limits)
+        finding, strut, value, _, _ = check_stage(body[0], body[1], *model, command, limits)
     return OUTSIDE if outside else SOLVED, finding, strut, stage, value, condition
 
 
 @compiled
-def compensate_quaternion(x, y, z, qx, qy, qz, qw, time, frame, fixed, numbers, next_numbers):
+def pose_at(numbers, position, rotation):
+    """Return the position and rotation that stand at two places of a vector: its parts, not copies."""
+    return numbers[position : position + 3], numbers[rotation : rotation + 9].reshape((3, 3))
+
+
+@compiled
+def compensate_quaternion(x, y, z, qx, qy, qz, qw, time, frame, fixed, last, new):
     """Run :func:`compensate_one` on a position and a quaternion, as messages carry them.
 
     When the status is NO_POSE, the finding is the outcome of :func:`hexapod_comp.kernels.kinematics.pose.read_pose`.
@@ -189,19 +187,19 @@ def compensate_quaternion(x, y, z, qx, qy, qz, qw, time, frame, fixed, numbers, 
     outcome = read_pose(x, y, z, qx, qy, qz, qw, position, rotation)
     if outcome != POSE_OK:
         return NO_POSE, outcome, -1, 0, math.nan, math.nan
-    return compensate_one(position, rotation, time, frame, fixed, numbers, next_numbers)
+    return compensate_one(position, rotation, time, frame, fixed, last, new)
 
 
 @compiled
 def check_command(last, new, limits):
     """Check correction and steps; return (finding, strut, value, stage)."""
     for i in range(6):
-        if not abs(new.correction[i]) <= limits.correction:
-            return CORRECTION, i, new.correction[i], 1
-    finding, strut, value = check_change(new.nominal, last.nominal, limits.step, STEP)
+        if not abs(new[AT.correction + i]) <= limits.correction:
+            return CORRECTION, i, new[AT.correction + i], 1
+    finding, strut, value = check_change(new[AT.nominal :], last[AT.nominal :], limits.step, STEP)
     if finding != WITHIN:
         return finding, strut, value, 0
-    finding, strut, value = check_change(new.command, last.command, limits.step, STEP)
+    finding, strut, value = check_change(new[AT.command :], last[AT.command :], limits.step, STEP)
     return finding, strut, value, 1
 
 
@@ -213,16 +211,16 @@ def shrink_ramp(last, new):
     difference, so that the command does not move; it then shrinks in proportion, its largest element at no
     more than the ramp rate.
     """
-    pause = new.time[0] - last.time[0]
-    step = 0.0 if math.isnan(pause) else last.ramp_rate[0] * min(max(pause, 0.0), LONGEST_RAMP_STEP)
+    pause = new[AT.time] - last[AT.time]
+    step = 0.0 if math.isnan(pause) else last[AT.ramp_rate] * min(max(pause, 0.0), LONGEST_RAMP_STEP)
     largest = 0.0
     for i in range(6):
-        if last.changed[0] != 0.0 and not math.isnan(last.correction[i]):
-            new.ramp[i] = last.correction[i] - new.correction[i]
-        largest = max(largest, abs(new.ramp[i]))
+        if last[AT.changed] != 0.0 and not math.isnan(last[AT.correction + i]):
+            new[AT.ramp + i] = last[AT.correction + i] - new[AT.correction + i]
+        largest = max(largest, abs(new[AT.ramp + i]))
     keep = 0.0 if largest <= step else 1.0 - step / largest
     for i in range(6):
-        new.ramp[i] *= keep
+        new[AT.ramp + i] *= keep
 
 
 @compiled
@@ -238,7 +236,7 @@ def estimate_one(readings, numbers, fixed, tool_position, tool_rotation, model_p
     position, rotation = np.empty(3), np.empty((3, 3))
     outcome, _, condition, _ = actual_pose_one(
         readings,
-        state_of(numbers).motion_sense,
+        numbers[AT.motion_sense : AT.motion_sense + 9],
         body,
         struts,
         field,
