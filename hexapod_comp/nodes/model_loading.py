@@ -8,7 +8,6 @@ be answered. The process hands back checked numbers as JSON, which is read withi
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import threading
@@ -32,9 +31,6 @@ LOADED_WITHIN = 30.0
 
 PACKAGE_ROOT = Path(__file__).resolve().parents[2]
 """Where the process runs: Python also imports from the folder it runs in, which must not be just any."""
-
-NICENESS = 10
-"""Of the process: the loop goes first."""
 
 
 class LoadingError(HexapodError):
@@ -147,7 +143,6 @@ class Loading:
 def main(argv: Sequence[str] | None = None) -> int:
     """Load the file given for the machine given and print it; or print why not, and return 1."""
     path, machine = sys.argv[1:] if argv is None else argv
-    os.nice(NICENESS)
     try:
         model = load_model(path, cast(HexapodGeometry, _Named(machine)))
     except HexapodError as error:
