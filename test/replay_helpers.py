@@ -15,8 +15,9 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.compensation.compensator import Compensator, pack_pose
+from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.compensation.journal import SNAPSHOT_PERIOD, Journal, load_with_source, sources_text
+from hexapod_comp.compensation.state import pack_pose
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.model_file import load_model

@@ -19,12 +19,10 @@ from ..kernels import kinematics as kernels
 from ..kernels.compensation import (
     NO_POSE,
     OUTSIDE,
-    STATE_SIZE,
     UNSOLVED,
     compensate_one,
     compensate_quaternion,
     estimate_one,
-    state_of,
 )
 from ..kernels.limits import WITHIN
 from ..kernels.pose import POSE_NOT_FINITE, QUATERNION_NORM_TOLERANCE
@@ -33,6 +31,7 @@ from ..machine.kinematics import forward_error, strut_lengths
 from ..machine.model import MachineModel, RealMachine, Temperatures
 from ..machine.motion import MotionState
 from ..pose import Pose
+from .state import CommandState, pack_machine, pack_nominal, pack_pose, read_state
 
 DEFAULT_RAMP_RATE = 1e-3
 """How fast a change of model, temperature or enabling moves a strut, m/s."""
@@ -91,61 +90,6 @@ class Correction:
     outside_box: bool
 
 
-def pack_machine(machine: RealMachine) -> np.ndarray:
-    """Return what :func:`~hexapod_comp.kernels.compensation.machine_views` takes apart."""
-    return _joined(*machine.body, machine.strut_arrays[0], machine.field_arrays[0], machine.thresholds, machine.solver)
-
-
-def pack_nominal(geometry: HexapodGeometry) -> np.ndarray:
-    """Return what :func:`~hexapod_comp.kernels.compensation.nominal_views` takes apart."""
-    tool = geometry.tool.inverse()
-    return _joined(*geometry.kernel_joints, tool.position, tool.rotation, *geometry.limit_numbers)
-
-
-def pack_pose(pose: Pose) -> np.ndarray:
-    """Return position, then rotation matrix by rows, shape (12,)."""
-    return _joined(pose.position, pose.rotation)
-
-
-def _joined(*parts: Any) -> np.ndarray:
-    return np.concatenate([np.ravel(part) for part in parts])
-
-
-class _Command:
-    """One command's state: its vector, and the parts that have names."""
-
-    __slots__ = ("motion", "numbers", "state")
-
-    def __init__(self, ramp_rate: float) -> None:
-        self.numbers = np.full(STATE_SIZE, math.nan)
-        self.state = state_of(self.numbers)
-        self.motion = MotionState(self.state.motion_low, self.state.motion_sense)
-        self.state.ramp[:], self.state.ramp_rate[:] = 0.0, ramp_rate
-        self.state.enabled[:], self.state.changed[:] = 1.0, 0.0
-        self.clear()
-
-    @property
-    def platform(self) -> Pose:
-        """Commanded ``pose_platform_in_base``."""
-        return Pose(self.state.platform_position, self.state.platform_rotation.reshape((3, 3)))
-
-    @property
-    def model(self) -> Pose:
-        """The model pose."""
-        return Pose(self.state.model_position, self.state.model_rotation.reshape((3, 3)))
-
-    def clear(self) -> None:
-        """Forget lengths and motion; the correction stays, as what the struts stand at."""
-        state = self.state
-        state.motion_low[:], state.motion_sense[:] = math.nan, 0.0
-        state.nominal[:], state.command[:], state.time[:], state.resumes[:] = math.nan, math.nan, math.nan, 0.0
-        self.must_ramp()
-
-    def must_ramp(self) -> None:
-        """Let the next command start from the correction that the struts stand at, if there is one."""
-        self.state.changed[:] = float(not math.isnan(self.state.correction[0]))
-
-
 class Compensator:
     """Turns commanded tool poses into compensated strut commands for one machine.
 
@@ -183,7 +127,7 @@ class Compensator:
         self.outside_field = False
         self._nominal_numbers = pack_nominal(geometry)
         self._work = pack_pose(geometry.work)
-        self._last, self._next = _Command(ramp_rate), _Command(ramp_rate)
+        self._last, self._next = CommandState(ramp_rate), CommandState(ramp_rate)
         self._take_machine(RealMachine(geometry, model))
         self._model_pose, self._tool_pose = np.empty(12), np.empty(12)
         self.on_change: Callable[[str, Any], None] = lambda what, value: None
@@ -313,8 +257,7 @@ class Compensator:
         ``temperatures``, °C by name, and each field of :class:`~hexapod_comp.kernels.compensation.State`: a list of
         numbers, matrices by rows.
         """
-        numbers = {name: part.tolist() for name, part in self._last.state._asdict().items()}
-        return {**numbers, "temperatures": dict(self.temperatures.values)}
+        return {**self._last.snapshot(), "temperatures": dict(self.temperatures.values)}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Take over a :meth:`snapshot` of a compensator with this geometry and model.
@@ -325,19 +268,13 @@ class Compensator:
             It does not have the names that a snapshot has, or under one of them not as many numbers; or a
             temperature is not allowed.
         """
-        parts = self._last.state._asdict()
-        for name in sorted({*parts, "temperatures"} ^ {*snapshot}):
-            problem = "is missing" if name in parts or name == "temperatures" else "is nothing that this release knows"
-            raise ModelError(f"snapshot.{name}", problem)
-        values = {name: np.asarray(snapshot[name], dtype=float) for name in parts}
-        for name, part in parts.items():
-            if values[name].shape != part.shape:
-                raise ModelError(f"snapshot.{name}", f"must be {part.size} numbers", values[name].size)
+        if "temperatures" not in snapshot:
+            raise ModelError("snapshot.temperatures", "is missing")
         temperatures = Temperatures(snapshot["temperatures"])
+        numbers = read_state({name: value for name, value in snapshot.items() if name != "temperatures"})
         self._take_machine(RealMachine(self.geometry, self.model, temperatures))
         self.temperatures = temperatures
-        for name, part in parts.items():
-            part[:] = values[name]
+        self._last.numbers[:] = numbers
 
     def _forget(self) -> None:
         home = self.geometry.home
@@ -357,7 +294,7 @@ class Compensator:
             stamps give the same answers bit for bit, and no jump of a clock can step.
         frame : ndarray, shape (12,), optional
             Frame of the commanded pose seen from ``base``, packed by
-            :func:`pack_pose`; the geometry's work frame by default.
+            :func:`~hexapod_comp.compensation.state.pack_pose`; the geometry's work frame by default.
 
         Returns
         -------
@@ -450,7 +387,7 @@ class Compensator:
         """Position (3,) and rotation (3, 3) of the platform in ``base`` by the last estimate, field left out."""
         return self._model_pose[:3], self._model_pose[3:].reshape((3, 3))
 
-    def _outside_error(self, command: _Command) -> HexapodError:
+    def _outside_error(self, command: CommandState) -> HexapodError:
         box = self.model.field.box * 1e3
         platform = command.platform
         point = (platform.position + platform.rotation @ self.model.field.probe) * 1e3

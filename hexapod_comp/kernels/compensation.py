@@ -88,7 +88,7 @@ def state_of(numbers: np.ndarray) -> State:
 
 @compiled
 def machine_views(numbers):
-    """Return what :func:`hexapod_comp.compensation.compensator.pack_machine` packs.
+    """Return what :func:`hexapod_comp.compensation.state.pack_machine` packs.
 
     The body (four arrays), strut table, probe, thresholds, solver's scalars.
     """
@@ -110,7 +110,7 @@ def machine_views(numbers):
 
 @compiled
 def nominal_views(numbers):
-    """Return what :func:`hexapod_comp.compensation.compensator.pack_nominal` packs.
+    """Return what :func:`hexapod_comp.compensation.state.pack_nominal` packs.
 
     Base, platform, tool inverse (position over rotation) and the limits.
     """

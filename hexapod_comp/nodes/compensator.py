@@ -23,8 +23,9 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
-from ..compensation.compensator import Compensator, pack_pose
+from ..compensation.compensator import Compensator
 from ..compensation.journal import Source, load_with_source
+from ..compensation.state import pack_pose
 from ..compensation.thermal import TemperatureFilter
 from ..errors import CommandError, HexapodError, shorten
 from ..formats.paths import confined_file, folder_of

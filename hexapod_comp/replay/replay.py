@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from ..compensation.compensator import Compensator, pack_pose
+from ..compensation.compensator import Compensator
 from ..compensation.journal import Entry, Page, Snapshot
+from ..compensation.state import pack_pose
 from ..errors import HexapodError
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel

@@ -284,7 +284,7 @@ def test_snapshot_takes_another_compensator_to_the_same_place():
     for change, complaint in (
         ({"nominal": [1.0]}, r"snapshot\.nominal: must be 6 numbers"),
         ({"platform_rotation": np.eye(3)}, r"snapshot\.platform_rotation: must be 9 numbers"),
-        ({"speed": [1.0]}, r"snapshot\.speed: is nothing that this release knows"),
+        ({"speed": [1.0]}, r"snapshot\.speed: is unknown to this release"),
         ({"temperatures": {"strut_7": 20.0}}, "temperature: must be of one of"),
     ):
         with pytest.raises(ModelError, match=complaint):
@@ -503,8 +503,7 @@ def test_verb_writes_report_pictures_and_json(run, tmp_path, capsys):
 
 def test_replay_needs_no_ros(run, tmp_path):
     bag = write_bag(tmp_path / "run", run.messages)
-    here = Path(__file__).parents[1]
-    env = {**os.environ, "PYTHONPATH": f"{here}{os.pathsep}{here.parent}"}
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, Path(__file__).parents[:3]))}
     code = (
         "import sys\n"
         "for name in ('rclpy', 'std_msgs', 'sensor_msgs', 'geometry_msgs'): sys.modules[name] = None\n"
@@ -716,7 +715,7 @@ def renamed(page: dict) -> None:
 def test_snapshot_with_other_names_or_numbers_is_refused(run, tmp_path):
     """A state with other parts than here comes from another version of the arithmetic."""
     messages = altered(run.messages, 0, renamed)
-    with pytest.raises(HexapodError, match=r"snapshot\.offset: is nothing that this release knows"):
+    with pytest.raises(HexapodError, match=r"snapshot\.offset: is unknown to this release"):
         opened(write_bag(tmp_path / "renamed", messages))
     messages = altered(run.messages, 0, lambda page: page["snapshot"]["state"]["ramp"].append(1.0))
     with pytest.raises(HexapodError, match=r"snapshot\.ramp: must be 6 numbers"):
