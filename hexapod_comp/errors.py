@@ -240,3 +240,9 @@ def printable(text: str, limit: int = 200) -> str:
         return text
     shown = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text[: limit + 1])
     return shown if len(shown) <= limit else shown[: limit - 1] + "…"
+
+
+class NoAnswerError(HexapodError):
+    """Something that must happen has not happened in time."""
+
+    reason = "timeout"

@@ -29,7 +29,8 @@ from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.instruments import measure
 from hexapod_comp.workspace.effects import effects
-from hexapod_comp.workspace.pictures import TRANSLATION, Layer, shells_figure
+from hexapod_comp.workspace.layers import TRANSLATION, Layer
+from hexapod_comp.workspace.pictures import shells_figure
 from hexapod_comp.workspace.reach import reach
 from hexapod_comp.workspace.shells import shell
 from hexapod_comp.workspace.sources import load_budget

@@ -161,7 +161,8 @@ def _write(study: Study, text: str, folder: Path) -> None:
 def _draw(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...], folder: Path) -> None:
     """Draw the pictures: of the orientation in the middle of the list."""
     from ..formats.figures import save
-    from ..workspace.pictures import TRANSLATION, Layer, RankedRow, causes_figure, ranking_figure, shells_figure
+    from ..workspace.layers import TRANSLATION, Layer
+    from ..workspace.pictures import RankedRow, causes_figure, ranking_figure, shells_figure
     from ..workspace.study import mesh_effects
 
     middle = len(bodies) // 2
@@ -185,7 +186,7 @@ def _draw(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...], folde
 def _publish(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...]) -> None:
     """Keep shells on a latched topic, for RViz and Foxglove, until Ctrl-C."""
     from ..nodes.shell_markers import TOPIC, show_shells
-    from ..workspace.pictures import TRANSLATION, Layer
+    from ..workspace.layers import TRANSLATION, Layer
     from ..workspace.study import mesh_effects
 
     middle = len(bodies) // 2
@@ -206,8 +207,7 @@ def _bar(row: Any, kind: Any) -> Any:
 def _page(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...], folder: Path) -> None:
     """Write the interactive page, or say what it needs."""
     from ..errors import HexapodError, InputFileError
-    from ..workspace.page import write_page
-    from ..workspace.study import page_data
+    from ..workspace.page import page_data, write_page
 
     try:
         write_page(folder / "page.html", study.geometry, page_data(study, bodies, names, "orientation"))

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from tqdm import tqdm
@@ -19,8 +20,13 @@ from ..machine.model import MachineModel
 from ..machine.model_file import load_model
 from ..machine.trajectory import Path, circle, commanded_in_base, join, move, pocket
 from ..pose import Pose
+from . import session
+from .processes import NodeProcess
 from .records import PoseRecord, SessionResult
 from .report import rms
+
+if TYPE_CHECKING:
+    from ..nodes.client import LoopClient
 
 RATES = (1.0, 1000.0)
 """Commands per second that make sense over DDS from Python, Hz."""
@@ -67,9 +73,8 @@ def refuse_broken_limits(path: str, geometry: HexapodGeometry, model: str, rows:
 
 def simulated(
     geometry: HexapodGeometry, machine: str, model: str, truth: str
-) -> AbstractContextManager[Sequence[object]]:
+) -> AbstractContextManager[Sequence[NodeProcess]]:
     """Start compensator and strut drive as two processes in a ROS domain of their own."""
-    session = _session_module()
 
     def checked(name: str, *words: str) -> str:
         """Return a model as the nodes take it, refused here rather than in a process of its own."""
@@ -90,7 +95,7 @@ def simulated(
 
 def witnessed(
     geometry: HexapodGeometry,
-    nodes: Sequence[object],
+    nodes: Sequence[NodeProcess],
     poses: list[Pose],
     path: Path | None,
     rate: float,
@@ -101,8 +106,7 @@ def witnessed(
 
     The result's poses are in the work frame, as the user's file says them; the nodes are told, and tell, ``base``.
     """
-    session = _session_module()
-    client = session.LoopClient(namespace=namespace)
+    client = _client(namespace)
     try:
         session.connect(client, nodes)
         with _progress() as bar:
@@ -126,15 +130,15 @@ def _progress():
         yield bar
 
 
-def _session_module():
-    """Import the part that needs ROS, with a clear word where there is none."""
+def _client(namespace: str) -> LoopClient:
+    """Return a client of the nodes, with a clear word where there is no ROS."""
     try:
-        from . import session
+        from ..nodes.client import LoopClient
     except ImportError as error:
         raise HexapodError(
             f"ROS 2 is needed for this ({error}); install hexapod_comp[ros], or source a ROS 2 installation"
         ) from error
-    return session
+    return LoopClient(namespace=namespace)
 
 
 @dataclass(frozen=True)

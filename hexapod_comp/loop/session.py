@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..compensation.compensator import Compensator
-from ..errors import HexapodError
+from ..errors import HexapodError, NoAnswerError
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel, RealMachine
 from ..machine.trajectory import Path, commanded_in_base, move
-from ..nodes.client import LoopClient, NoAnswerError, Sent
 from ..pose import Pose
 from ..virtual.machine import StrutDrive
 from .processes import NodeProcess, PrivateDomain
 from .records import PathRecord, PoseRecord, SessionResult, Track, track_along
+
+if TYPE_CHECKING:
+    from ..nodes.client import LoopClient, Sent
 
 CONNECT_TIMEOUT = 120.0
 """A first start compiles in both processes; after that it is under three seconds."""

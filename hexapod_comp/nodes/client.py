@@ -16,7 +16,7 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 
-from ..errors import HexapodError
+from ..errors import NoAnswerError
 from ..machine.trajectory import Path
 from ..pose import Pose
 from .messages import StrutReader, message_pose, pose_message
@@ -31,12 +31,6 @@ TRACK_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 ANSWER_TIMEOUT = 1.0
 """A command without an answer after this long is lost or refused, s: longer than a diagnostics period."""
-
-
-class NoAnswerError(HexapodError):
-    """Something that must happen has not happened in time."""
-
-    reason = "timeout"
 
 
 @dataclass

@@ -8,7 +8,6 @@ import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
-from matplotlib import colormaps
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -17,7 +16,8 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ..errors import GeometryError
-from ..workspace.pictures import COLOURS, Layer, Quantity
+from ..workspace.layers import Layer, Quantity
+from ..workspace.pictures import shades
 from .running import keep_discovery_local
 
 SHELL_QOS = QoSProfile(
@@ -117,7 +117,7 @@ def _fill(marker: Marker, layer: Layer, limits: tuple[float, float], opacity: fl
     """Write a layer's triangles and colours."""
     width = limits[1] - limits[0]
     shares = (layer.values.ravel() - limits[0]) / (width if width > 0.0 else 1.0)
-    colours = [ColorRGBA(r=r, g=g, b=b, a=opacity) for r, g, b, _ in colormaps[COLOURS](shares).tolist()]
+    colours = [ColorRGBA(r=r, g=g, b=b, a=opacity) for r, g, b, _ in shades(shares).tolist()]
     points = [Point(x=x, y=y, z=z) for x, y, z in layer.points.reshape(-1, 3).tolist()]
     corners = triangles(layer.points).ravel().tolist()
     marker.points = [points[corner] for corner in corners]

@@ -19,7 +19,10 @@ import numpy as np
 from ..errors import GeometryError, HexapodError
 from ..formats.yaml import write_text_atomically
 from ..machine.geometry import HexapodGeometry
-from .pictures import VIEW_AZIMUTH, VIEW_ELEVATION, WEDGE, Quantity, outline
+from .layers import ROTATION, TRANSLATION, Quantity
+from .pictures import VIEW_AZIMUTH, VIEW_ELEVATION, WEDGE, outline
+from .shells import Shell
+from .study import LAYERS, Study, mesh_effects
 
 MOST_BYTES = 7_000_000
 """Of values, two each, and coordinates, four each; as text a third more: with plotly's 5 MB the page stays below 15."""
@@ -78,6 +81,25 @@ class PageData:
         for name in ("points", "values"):
             if not np.isfinite(getattr(self, name)).all():
                 raise GeometryError(f"page.{name}", "must be finite")
+
+
+def page_data(study: Study, bodies: tuple[Shell, ...], frames: tuple[str, ...], frame_title: str) -> PageData:
+    """Return what the interactive page shows: one frame for each orientation."""
+    meshes, errors = [mesh_effects(study, body) for body in bodies], study.errors
+    return PageData(
+        title=f"{study.geometry.name}: effect of single errors on the tool",
+        note=(
+            "Each shell is the boundary of the workspace at one orientation of the tool, or a smaller one inside it, "
+            "coloured by how far one error alone moves or turns the tool there (exact, not to first order)."
+        ),
+        errors=[(errors.kinds[kind], label) for kind, label in zip(errors.kind, errors.labels, strict=True)],
+        quantities=(TRANSLATION, ROTATION),
+        frame_title=frame_title,
+        frames=frames,
+        layers=tuple(f"{100 * fraction:.0f} %" for fraction in LAYERS),
+        points=np.stack([points for points, _ in meshes]),
+        values=np.stack([values for _, values in meshes]),
+    )
 
 
 def write_page(path: str | Path, geometry: HexapodGeometry, data: PageData) -> None:

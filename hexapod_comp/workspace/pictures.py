@@ -23,6 +23,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-u
 
 from ..errors import GeometryError
 from ..machine.geometry import HexapodGeometry
+from .layers import ROTATION, TRANSLATION, Layer, Quantity
 from .reach import FINDINGS
 
 COLOURS = "viridis"
@@ -36,55 +37,6 @@ VIEW_AZIMUTH, VIEW_ELEVATION = -60.0, 20.0
 
 WEDGE = 130.0
 """How far the outermost of several shells is cut open towards the eye, degrees; inner ones less, the innermost not."""
-
-
-@dataclass(frozen=True)
-class Layer:
-    """A coloured mesh.
-
-    Attributes
-    ----------
-    points : ndarray, shape (H, A, 3)
-        m in the work frame.
-    values : ndarray, shape (H, A)
-        SI.
-    """
-
-    points: np.ndarray
-    values: np.ndarray
-
-    def __post_init__(self) -> None:
-        if self.points.ndim != 3 or self.points.shape[2] != 3 or self.points.shape[:2] != self.values.shape:
-            problem = f"must be (H, A, 3) points and (H, A) values, not {self.points.shape} and {self.values.shape}"
-            raise GeometryError("layer", problem)
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """What values mean and how they are shown.
-
-    Attributes
-    ----------
-    name : str
-        Such as "translation of the tool".
-    unit : str
-        Shown unit.
-    factor : float
-        Shown value per SI value.
-    """
-
-    name: str
-    unit: str
-    factor: float
-
-    @property
-    def label(self) -> str:
-        """Name and unit."""
-        return f"{self.name}, {self.unit}"
-
-
-TRANSLATION = Quantity("translation of the tool", "µm", 1e6)
-ROTATION = Quantity("rotation of the tool, largest of three", "m°", 1e3 * 180.0 / np.pi)
 
 
 @dataclass(frozen=True)
@@ -102,6 +54,11 @@ class RankedRow:
     name: str
     translation: tuple[float, float]
     rotation: tuple[float, float]
+
+
+def shades(shares: np.ndarray) -> np.ndarray:
+    """Return the colours of values from 0 (least) to 1 (most), red, green, blue and opacity, shape (N, 4)."""
+    return colormaps[COLOURS](shares)
 
 
 def outline(geometry: HexapodGeometry) -> list[np.ndarray]:
@@ -151,7 +108,7 @@ def shells_figure(
     for number, layer in enumerate(layers):
         kept, corners = _faces(layer.points, WEDGE * number / max(1, len(layers) - 1))
         faces.append(kept)
-        colours.append(colormaps[COLOURS](norm(_of_faces(layer.values, corners) * quantity.factor)))
+        colours.append(shades(norm(_of_faces(layer.values, corners) * quantity.factor)))
     places = figure.add_gridspec(1, 2, width_ratios=[2, 3])
     _draw(_space(figure, places[0], "the machine at home"), geometry, faces[-1], colours[-1], machine=True)
     axes = _space(figure, places[1], "cut open; the line is the platform at home" if len(layers) > 1 else "")

@@ -11,8 +11,6 @@ from ..machine.geometry import HexapodGeometry
 from ..pose import Pose
 from .combining import RSS, WORST_CASE, Allocation, MonteCarlo, allocate, monte_carlo, root_sum_of_squares, worst_case
 from .effects import EXACT, LINEAR, Extremes, effect_vectors, effects
-from .page import PageData
-from .pictures import ROTATION, TRANSLATION
 from .ranking import RankingRow, ranked
 from .reach import Reach, poses_at
 from .runner import survey
@@ -236,22 +234,3 @@ def mesh_effects(study: Study, body: Shell) -> tuple[np.ndarray, np.ndarray]:
     positions, rotations = (np.concatenate([pose[k] for pose in poses]) for k in range(2))
     found = effects(study.geometry, study.errors, positions, rotations, EXACT)
     return points, np.moveaxis(found.reshape(*points.shape[:3], len(study.errors), 2), (3, 4), (0, 1))
-
-
-def page_data(study: Study, bodies: tuple[Shell, ...], frames: tuple[str, ...], frame_title: str) -> PageData:
-    """Return what the interactive page shows: one frame for each orientation."""
-    meshes, errors = [mesh_effects(study, body) for body in bodies], study.errors
-    return PageData(
-        title=f"{study.geometry.name}: effect of single errors on the tool",
-        note=(
-            "Each shell is the boundary of the workspace at one orientation of the tool, or a smaller one inside it, "
-            "coloured by how far one error alone moves or turns the tool there (exact, not to first order)."
-        ),
-        errors=[(errors.kinds[kind], label) for kind, label in zip(errors.kind, errors.labels, strict=True)],
-        quantities=(TRANSLATION, ROTATION),
-        frame_title=frame_title,
-        frames=frames,
-        layers=tuple(f"{100 * fraction:.0f} %" for fraction in LAYERS),
-        points=np.stack([points for points, _ in meshes]),
-        values=np.stack([values for _, values in meshes]),
-    )

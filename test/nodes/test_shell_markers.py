@@ -10,7 +10,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from hexapod_comp.errors import GeometryError
 from hexapod_comp.nodes.shell_markers import SHELL_QOS, TOPIC, publish_shells, shell_markers, triangles
-from hexapod_comp.workspace.pictures import TRANSLATION, Layer
+from hexapod_comp.workspace.layers import TRANSLATION, Layer
 
 STAMP = Time(sec=7)
 
