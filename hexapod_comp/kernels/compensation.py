@@ -90,7 +90,7 @@ def state_of(numbers: np.ndarray) -> State:
 def machine_views(numbers):
     """Return what :func:`hexapod_comp.compensation.state.pack_machine` packs.
 
-    The body (four arrays), strut table, probe, thresholds, solver's scalars.
+    The body (four arrays), strut table, probe, thresholds, and what a solution is judged by.
     """
     end = TABLE_END
     body = (
@@ -104,7 +104,7 @@ def machine_views(numbers):
         numbers[72:end].reshape((6, PARAMETERS)),
         numbers[end : end + 3],
         numbers[end + 3 : end + 5],
-        numbers[end + 5 : end + 8],
+        (numbers[end + 5], numbers[end + 6], numbers[end + 7]),
     )
 
 

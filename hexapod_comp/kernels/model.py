@@ -131,9 +131,7 @@ def actual_pose_one(commands, sense, body, struts, field, solver, q_position, q_
             lengths[i] = actual_length(commands[i], sense[3 + i], shift, table, knots, pieces, i)
         if turning and outcome == kernels.OK and change < 1e-15:
             break
-        outcome, steps, condition = kernels.solve_pose_one(
-            base, platform, lengths, p, r, solver[0], solver[1], solver[2]
-        )
+        outcome, steps, condition = kernels.solve_pose_one(base, platform, lengths, p, r, *solver)
         iterations += steps
         if outcome != kernels.OK:
             return outcome, iterations, condition, False
