@@ -44,6 +44,9 @@ GIVE_UP = 0.05
 START_WITHIN = 180.0
 """The nodes may have to compile first, s."""
 
+BLIND = "start_without_feedback_after:=0.1"
+"""There are no struts here."""
+
 OURS, RELAY = "ours", "relay"
 
 MODEL = "model_file:=paper_machine.yaml"
@@ -196,7 +199,7 @@ def measure(bouts: int, rounds: int, seconds: float, floor: bool = False) -> lis
     """Run everything and return one row per rate; `floor`: against the relay that does not even look at messages."""
     with ExitStack() as stack:
         stack.enter_context(PrivateDomain())
-        stack.enter_context(process("hexapod_comp.nodes.compensator", OURS, "marker_rate:=0.0", MODEL))
+        stack.enter_context(process("hexapod_comp.nodes.compensator", OURS, "marker_rate:=0.0", BLIND, MODEL))
         stack.enter_context(process("benchmarks.relay", RELAY, f"serialized:={str(floor).lower()}"))
         context = rclpy.Context()
         rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
