@@ -222,14 +222,15 @@ def test_bad_start_ends_with_1_and_a_clear_word(isolated_ros, arguments, texts):
 
 
 PROGRAMS = {
-    "compensator": ("model_file  [ideal]", "tool_pose_command"),
-    "strut_drive": ("truth_file  [paper_machine.yaml]", "strut_commands"),
-    "linuxcnc_bridge": ("units  [mm]", "strut_corrections"),
+    "compensator": ("nodes.compensator", "model_file  [ideal]", "tool_pose_command"),
+    "strut_drive": ("nodes.strut_drive", "truth_file  [paper_machine.yaml]", "strut_commands"),
+    "linuxcnc_bridge": ("linuxcnc.bridge", "units  [mm]", "strut_corrections"),
 }
+"""Executables: module, and texts of their help."""
 
 
 def run_program(name: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", f"hexapod_comp.nodes.{name}", *arguments]
+    command = [sys.executable, "-m", f"hexapod_comp.{PROGRAMS[name][0]}", *arguments]
     return subprocess.run(
         command, capture_output=True, text=True, timeout=60.0, check=False, env={**os.environ, **environment}
     )
@@ -241,8 +242,8 @@ def test_help_lists_every_parameter_and_the_topics(name):
     assert done.returncode == 0
     assert done.stderr == ""
     assert done.stdout.startswith(f"usage: {name} ")
-    assert all(text in done.stdout for text in PROGRAMS[name])
-    module = importlib.import_module(f"hexapod_comp.nodes.{name}")
+    assert all(text in done.stdout for text in PROGRAMS[name][1:])
+    module = importlib.import_module(f"hexapod_comp.{PROGRAMS[name][0]}")
     declared = [*module.PARAMETERS, *getattr(module, "FAULT_PARAMETERS", ())]
     assert all(f"  {parameter.name}  [" in done.stdout for parameter in declared)
     assert max(map(len, done.stdout.splitlines())) <= 120

@@ -39,7 +39,7 @@ from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.nodes import compensator as compensator_module
-from hexapod_comp.nodes import health, runtime, stamps
+from hexapod_comp.nodes import health, running, runtime, stamps
 from hexapod_comp.nodes.compensator import CompensatorNode
 from hexapod_comp.nodes.health import ERROR, OK, WARN, Flow, HealthReport, Refusals
 from hexapod_comp.nodes.messages import message_pose, pose_message
@@ -1140,7 +1140,7 @@ def test_discovery_stays_on_this_machine_unless_told_otherwise(monkeypatch, envi
         monkeypatch.delenv(name, raising=False)
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    runtime.keep_discovery_local()
+    running.keep_discovery_local()
     assert os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") == found
     monkeypatch.delenv("ROS_AUTOMATIC_DISCOVERY_RANGE", raising=False)
 
