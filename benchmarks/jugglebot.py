@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.calibration.fit import fit_joint
+from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import Settings
 from hexapod_comp.calibration.sensitivity import predict
 from hexapod_comp.machine.geometry import load_geometry
@@ -73,7 +73,7 @@ def zeroed_without(measured: MeasurementSet, out: np.ndarray) -> MeasurementSet:
 def left_out(measured: MeasurementSet, out: np.ndarray, settings: Settings) -> tuple[np.ndarray, list[str]]:
     """Fit without some stations; return their squared position misfits, m², and the blocks that the fit kept."""
     is_out = np.isin(measured.station, out)
-    fit = fit_joint(measured.select(~is_out), settings)
+    fit = fit_model(measured.select(~is_out), settings)
     # Everything that the parameters' meaning hangs on (knots, box) comes from the stations that were fitted.
     errors = predict(fit.space, fit.solution.x, measured.stations).errors
     return position_squares(measured, errors)[out], [block.name for block in fit.space.blocks]
@@ -108,7 +108,7 @@ def grid(folder: Path, pool: ProcessPoolExecutor) -> bool:
     count = len(measured.stations)
     raw, corrected = (rms(position_squares(m, np.zeros((len(m.stations), 6)))) for m in (measured, own))
     # Which blocks help is decided once, with all poses; leaving one out hardly changes that.
-    whole = fit_joint(measured, Settings())
+    whole = fit_model(measured, Settings())
     kept = replace(Settings(), blocks=tuple(block.name for block in whole.space.blocks))
     parts = [np.array([n]) for n in range(count)]
     results = list(pool.map(left_out, [measured] * count, parts, [kept] * count, chunksize=5))

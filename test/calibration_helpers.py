@@ -19,7 +19,7 @@ from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.motion import MotionState
 from hexapod_comp.machine.travel import Passes
 from hexapod_comp.measurements.campaign import Campaign, template
-from hexapod_comp.measurements.readings import AXES, FROM_PREVIOUS, MeasurementSet, Reading, Source
+from hexapod_comp.measurements.readings import AXES, FROM_PREVIOUS, FileLine, MeasurementSet, Reading
 from hexapod_comp.measurements.runs import assemble
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
@@ -123,7 +123,7 @@ def scattered(
     """Return absolute readings, all zero, at poses that the machine took one after the other."""
     temperatures = temperatures or [NEUTRAL] * len(poses)
     readings = [
-        Reading("poses", 1, FROM_PREVIOUS, pose, f"{kind}_{axis}", 0.0, temperatures=warmth, source=Source("test", n))
+        Reading("poses", 1, FROM_PREVIOUS, pose, f"{kind}_{axis}", 0.0, temperatures=warmth, source=FileLine("test", n))
         for n, (pose, warmth) in enumerate(zip(poses, temperatures, strict=True))
         for kind in ("position", "attitude")
         for axis in AXES

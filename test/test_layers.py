@@ -48,3 +48,13 @@ def test_imports_point_downwards(path):
             assert ROOMS.index(name[1]) <= ROOMS.index(here), where
         assert name[0] != "rclpy" or here in ROS_ROOMS, where
         assert name[0] not in PICTURE_LIBRARIES or path.stem in PICTURE_MODULES, where
+
+
+def test_no_two_classes_share_a_name():
+    """A name in a message, an import or a talk at the machine means one thing."""
+    places: dict[str, list[str]] = {}
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                places.setdefault(node.name, []).append(f"{path.relative_to(PACKAGE)}:{node.lineno}")
+    assert {name: found for name, found in places.items() if len(found) > 1} == {}

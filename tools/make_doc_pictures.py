@@ -16,10 +16,10 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from hexapod_comp.calibration.fit import JointFit, fit_joint
+from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.lines import fit_lines
 from hexapod_comp.calibration.parameters import Settings
-from hexapod_comp.calibration.pictures import joint_figure, strut_error_figure
+from hexapod_comp.calibration.pictures import fit_figure, strut_error_figure
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
@@ -70,7 +70,7 @@ def measured(geometry: HexapodGeometry, name: str) -> MeasurementSet:
     return measure(template(campaign, geometry, SEED), campaign, truth, SEED)
 
 
-def strut_error_picture(fit: JointFit, one_d: MeasurementSet) -> Figure:
+def strut_error_picture(fit: ModelFit, one_d: MeasurementSet) -> Figure:
     """Return 001's Figures 3 and 4, from 1-D and from 5-D lines, and the same as the joint fit has it."""
     models = {
         "lines, 1-D": fit_lines(one_d).model,
@@ -104,12 +104,12 @@ def main(arguments: list[str] | None = None) -> int:
     # Without these two every run writes other identifiers and another date.
     matplotlib.rcParams["svg.hashsalt"] = "hexapod_comp"
     geometry = load_geometry(ROOT / "config" / "paper.yaml")
-    fit = fit_joint(measured(geometry, "campaign_5d"), Settings(lead=LEAD))
+    fit = fit_model(measured(geometry, "campaign_5d"), Settings(lead=LEAD))
     pictures = {
         "machine.svg": machine_picture(geometry),
         "weights.svg": weights_figure(),
         "direction.svg": direction_figure(),
-        "joint_fit.svg": joint_figure(fit),
+        "joint_fit.svg": fit_figure(fit),
         "strut_errors.svg": strut_error_picture(fit, measured(geometry, "campaign_1d")),
         "shells_screw_pitch.png": shells_picture(),  # thousands of faces: a large file as SVG
     }

@@ -164,7 +164,7 @@ class Posterior:
     determined: np.ndarray
 
 
-class JointProblem:
+class Estimation:
     """Readings against parameters.
 
     Parameters
@@ -253,7 +253,7 @@ class JointProblem:
         except (ModelError, KinematicsError) as error:
             hint = "do units, directions and commanded poses fit, and are all blocks allowed?"
             problem = f"left the machines that can be ({error}); {hint}"
-            raise CalibrationError("joint fit", problem) from error
+            raise CalibrationError("fit", problem) from error
         slopes = derivatives(self.space, prediction, stations)[c.station]
         expected = np.einsum("ci,ci->c", c.directions, prediction.errors[c.station])
         return expected, np.einsum("ci,cip->cp", c.directions, slopes)
@@ -415,7 +415,7 @@ class Solution:
 
 
 def iterate(
-    joint: JointProblem,
+    estimation: Estimation,
     x: np.ndarray,
     tolerances: np.ndarray,
     noise: np.ndarray,
@@ -428,23 +428,23 @@ def iterate(
     CalibrationError
         They do not.
     """
-    weights, robust = np.ones(len(joint.measurements)), joint.space.settings.robust
+    weights, robust = np.ones(len(estimation.measurements)), estimation.space.settings.robust
     share, last = 1.0, np.inf
     for step in range(1, STEPS + 1):
-        problem, residuals = joint.linearise(x, weights)
-        posterior = solve(joint.space, problem, tolerances, noise)
+        problem, residuals = estimation.linearise(x, weights)
+        posterior = solve(estimation.space, problem, tolerances, noise)
         tolerances, noise = posterior.tolerances, posterior.noise
-        change = _change(joint.space.physical(posterior.y) - x, joint.space, posterior)
+        change = _change(estimation.space.physical(posterior.y) - x, estimation.space, posterior)
         progress(f"step {step}: largest change {change:.2g} standard deviations")
         if step > 2 and change > SLOW * last:
             share = max(LEAST_SHARE, 0.5 * share)
-        x, last = x + share * (joint.space.physical(posterior.y) - x), change
+        x, last = x + share * (estimation.space.physical(posterior.y) - x), change
         if (change < SETTLED and (step > 2 or not robust)) or step == STEPS:
             break
         if robust and step > 1:
-            weights = joint.robust_weights(residuals)
+            weights = estimation.robust_weights(residuals)
     if change > 1.0:
-        raise CalibrationError("joint fit", f"did not settle within {STEPS} steps")
+        raise CalibrationError("fit", f"did not settle within {STEPS} steps")
     return Solution(problem, posterior, x, residuals, weights, step)
 
 

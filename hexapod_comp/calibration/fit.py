@@ -10,8 +10,8 @@ import numpy as np
 
 from ..errors import CalibrationError
 from ..machine.model import REFERENCE_TEMPERATURE, MachineModel, ModelOrigin
-from ..measurements.readings import ANGULAR_KINDS, KINDS, MeasurementSet, Source, refuse_unmoved
-from .estimation import HUBER, OUTLIER, JointProblem, Posterior, Solution, held_out, iterate, physical_covariance
+from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementSet, refuse_unmoved
+from .estimation import HUBER, OUTLIER, Estimation, Posterior, Solution, held_out, iterate, physical_covariance
 from .observability import Observability, ToolError, expected_error, observe, without_trace
 from .parameters import ParameterSpace, Settings
 from .selection import Decision, select
@@ -69,7 +69,7 @@ class Outlier:
 
     Attributes
     ----------
-    source : Source
+    source : FileLine
         Where it stands.
     channel : int
         Index of its channel.
@@ -79,14 +79,14 @@ class Outlier:
         The same in standard deviations.
     """
 
-    source: Source
+    source: FileLine
     channel: int
     residual: float
     sigmas: float
 
 
 @dataclass(frozen=True)
-class JointFit:
+class ModelFit:
     """A model with everything that is known about it.
 
     Attributes
@@ -144,11 +144,11 @@ class JointFit:
         return np.sqrt(np.diag(self.covariance))
 
 
-def fit_joint(
+def fit_model(
     measurements: MeasurementSet,
     settings: Settings | None = None,
     progress: Callable[[str], object] = lambda text: None,
-) -> JointFit:
+) -> ModelFit:
     """Fit structure, struts and field to all readings at once.
 
     Parameters
@@ -166,15 +166,15 @@ def fit_joint(
         Too few readings, or such that show nothing, a fit that does not settle, forward and backward swapped.
     """
     settings = settings or Settings()
-    everything = JointProblem(measurements, ParameterSpace(measurements, settings))
+    everything = Estimation(measurements, ParameterSpace(measurements, settings))
     decisions, possible = _decide(everything, None, progress)
-    space, joint, solution = _solve(measurements, decisions, settings, None, progress)
+    space, estimation, solution = _solve(measurements, decisions, settings, None, progress)
     if solution.weights.min() < HUBER / OUTLIER:  # the choice was made with readings that turned out to be wrong
         again, possible = _decide(everything, (space, solution), progress)
         if [d.kept for d in again] != [d.kept for d in decisions]:
-            space, joint, solution = _solve(measurements, again, settings, (space, solution), progress)
+            space, estimation, solution = _solve(measurements, again, settings, (space, solution), progress)
         decisions = again
-    channels = tuple(_channels(joint, solution))
+    channels = tuple(_channels(estimation, solution))
     notes = [*measurements.notes, *_ignored(measurements, settings, space)]
     notes += [*_check_backlash(space, solution), *_check_noise(channels)]
     progress("what is it worth?")
@@ -183,7 +183,7 @@ def fit_joint(
     level, tilted = (expected_error(space, solution.x, covariance, tilt, allowed=allowed) for tilt in (0.0, TILT))
     if level is not None and level.after > level.before:
         notes.append("the model is not expected to help: the readings determine too little of this machine")
-    return JointFit(
+    return ModelFit(
         model=_named(space, solution, measurements, channels, len(decisions)),
         measurements=measurements,
         space=space,
@@ -194,7 +194,7 @@ def fit_joint(
         unseen_errors=unseen_errors(measurements, settings),
         level=level,
         tilted=tilted,
-        outliers=tuple(_outliers(joint, solution)),
+        outliers=tuple(_outliers(estimation, solution)),
         notes=tuple(notes),
     )
 
@@ -205,12 +205,12 @@ def _solve(
     settings: Settings,
     before: tuple[ParameterSpace, Solution] | None,
     progress: Callable[[str], object],
-) -> tuple[ParameterSpace, JointProblem, Solution]:
+) -> tuple[ParameterSpace, Estimation, Solution]:
     """Return a settled fit with the blocks decided on, starting from another one's answer."""
     space = ParameterSpace(measurements, replace(settings, blocks=tuple(d.block for d in decisions if d.kept)))
-    joint = JointProblem(measurements, space)
+    estimation = Estimation(measurements, space)
     x, tolerances, noise = _carried_over(before, space)
-    return space, joint, iterate(joint, x, tolerances, noise, progress)
+    return space, estimation, iterate(estimation, x, tolerances, noise, progress)
 
 
 def _carried_over(
@@ -230,7 +230,7 @@ def _carried_over(
 
 
 def _decide(
-    everything: JointProblem, before: tuple[ParameterSpace, Solution] | None, progress: Callable[[str], object]
+    everything: Estimation, before: tuple[ParameterSpace, Solution] | None, progress: Callable[[str], object]
 ) -> tuple[list[Decision], Posterior]:
     """Return what becomes of every block, and what the readings allow if none is ruled out."""
     x, _, noise = _carried_over(before, everything.space)
@@ -260,8 +260,8 @@ def unseen_errors(measurements: MeasurementSet, settings: Settings) -> tuple[str
         Of the fit.
     """
     space = ParameterSpace(measurements, replace(settings, blocks=("field displacement", "field rotation")))
-    joint = JointProblem(measurements, space)
-    problem, _ = joint.linearise(np.zeros(space.size), np.ones(len(measurements)))
+    estimation = Estimation(measurements, space)
+    problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(measurements)))
     return without_trace(space, problem)
 
 
@@ -317,15 +317,15 @@ def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:
     return [f"{problem}, and the expected tool error may be too low ({', '.join(noisy)})"]
 
 
-def _channels(joint: JointProblem, solution: Solution) -> list[ChannelFit]:
+def _channels(estimation: Estimation, solution: Solution) -> list[ChannelFit]:
     """Return how each kind of channel was met."""
-    problem, posterior, kinds = solution.problem, solution.posterior, joint.measurements.kind
+    problem, posterior, kinds = solution.problem, solution.posterior, estimation.measurements.kind
     errors = held_out(problem, posterior) * posterior.noise[problem.kind]
-    readings_of_cell = np.bincount(joint.cells.of_reading, minlength=len(problem.kind))
+    readings_of_cell = np.bincount(estimation.cells.of_reading, minlength=len(problem.kind))
     result = []
     for k in np.unique(kinds):
         mine = problem.kind == k
-        stated = joint.measurements.stated_of(k)
+        stated = estimation.measurements.stated_of(k)
         mean_square = float((errors[mine] ** 2 / readings_of_cell[mine]).mean())
         factor = float(posterior.noise[k])
         result.append(
@@ -341,10 +341,10 @@ def _channels(joint: JointProblem, solution: Solution) -> list[ChannelFit]:
     return result
 
 
-def _outliers(joint: JointProblem, solution: Solution) -> list[Outlier]:
+def _outliers(estimation: Estimation, solution: Solution) -> list[Outlier]:
     """Return the readings that are too far off to be noise, the worst first."""
-    m = joint.measurements
-    sigmas = solution.residuals / (joint.uncertainty * solution.posterior.noise[m.kind])
+    m = estimation.measurements
+    sigmas = solution.residuals / (estimation.uncertainty * solution.posterior.noise[m.kind])
     worst = np.argsort(-np.abs(sigmas))
     far = worst[np.abs(sigmas[worst]) > OUTLIER]
     return [Outlier(m.sources[i], int(m.channel[i]), float(solution.residuals[i]), float(sigmas[i])) for i in far]

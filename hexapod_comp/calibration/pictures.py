@@ -18,7 +18,7 @@ from ..machine.model import MachineModel, RealMachine
 from ..machine.travel import Passes, commanded_box
 from ..measurements.readings import AXES, KINDS
 from .evaluation import run
-from .fit import JointFit
+from .fit import ModelFit
 from .lines import LineFit, LinesFit
 from .observability import left_in_space
 
@@ -162,7 +162,7 @@ def _label_edges(panels: np.ndarray, axis: int, component: int) -> None:
     panels[0, 0].legend(fontsize=6)
 
 
-def joint_figure(fit: JointFit) -> Figure:
+def fit_figure(fit: ModelFit) -> Figure:
     """Show a joint fit: its residuals, the struts' errors, what the data determine, and what error to expect."""
     figure = Figure(figsize=(11, 7.6), layout="constrained")
     panels = figure.subplots(2, 2)
@@ -174,7 +174,7 @@ def joint_figure(fit: JointFit) -> Figure:
     return figure
 
 
-def _residual_panel(axes: Axes, fit: JointFit) -> None:
+def _residual_panel(axes: Axes, fit: ModelFit) -> None:
     """Show the residuals of each kind of channel against what noise alone would look like."""
     kinds = fit.measurements.kind
     edges = np.linspace(-5.0, 5.0, 51)
@@ -187,7 +187,7 @@ def _residual_panel(axes: Axes, fit: JointFit) -> None:
     axes.legend(fontsize=7)
 
 
-def _strut_panel(axes: Axes, fit: JointFit) -> None:
+def _strut_panel(axes: Axes, fit: ModelFit) -> None:
     """Show what each strut does with its commands, offset and backlash aside."""
     struts = RealMachine(fit.measurements.geometry, fit.model).strut_arrays
     commands = fit.measurements.stations.commands
@@ -199,7 +199,7 @@ def _strut_panel(axes: Axes, fit: JointFit) -> None:
     axes.legend(ncols=2, fontsize=7)
 
 
-def _sight_panel(axes: Axes, fit: JointFit) -> None:
+def _sight_panel(axes: Axes, fit: ModelFit) -> None:
     """Show how many parameters of each block the data determine."""
     blocks = fit.observability.blocks
     names = [block.name for block in blocks]
@@ -210,7 +210,7 @@ def _sight_panel(axes: Axes, fit: JointFit) -> None:
     axes.legend(fontsize=7)
 
 
-def _tool_error_panel(axes: Axes, fit: JointFit) -> None:
+def _tool_error_panel(axes: Axes, fit: ModelFit) -> None:
     """Show the tool error to expect, before and after, for a level and for a tilted tool."""
     cases = {"level": fit.level, "tilted 10°": fit.tilted}
     known = {name: error for name, error in cases.items() if error is not None}
@@ -227,7 +227,7 @@ def _tool_error_panel(axes: Axes, fit: JointFit) -> None:
     axes.legend(fontsize=7)
 
 
-def left_error_figure(fit: JointFit) -> Figure:
+def left_error_figure(fit: ModelFit) -> Figure:
     """Show where in the measured box what error is left after compensation: the RMS to expect, at three heights.
 
     Raises

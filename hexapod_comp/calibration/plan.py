@@ -8,7 +8,7 @@ import numpy as np
 
 from ..measurements.campaign import Campaign
 from ..measurements.readings import DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
-from .estimation import JointProblem, physical_covariance, solve
+from .estimation import Estimation, physical_covariance, solve
 from .fit import TILT, unseen_errors
 from .observability import Observability, ToolError, expected_error, observe
 from .parameters import ParameterSpace, Settings
@@ -53,8 +53,8 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: Settings) -
         Blocks and tolerances.
     """
     space = ParameterSpace(measurements, settings)
-    joint = JointProblem(measurements, space)
-    problem, _ = joint.linearise(np.zeros(space.size), np.ones(len(measurements)))
+    estimation = Estimation(measurements, space)
+    problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(measurements)))
     noise = np.array([_noise_factor(campaign, kind) for kind in KINDS])
     posterior = solve(space, problem, space.start_tolerances(), noise, rounds=0)
     covariance, x = physical_covariance(space, posterior), np.zeros(space.size)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from ..formats.texts import aligned, number
 from ..measurements.readings import ANGULAR_KINDS, CHANNELS
-from .fit import JointFit
+from .fit import ModelFit
 from .observability import BlockSight, Observability, ToolError
 from .plan import Plan
 
@@ -17,7 +17,7 @@ TRUST = 0.1
 """A tilted tool that keeps more than this share of its error is warned of, when parameters are not seen."""
 
 
-def report(fit: JointFit) -> str:
+def report(fit: ModelFit) -> str:
     """Return the report of a joint fit."""
     parts = [
         _headline(fit),
@@ -31,12 +31,12 @@ def report(fit: JointFit) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _notes(fit: JointFit) -> Iterator[str]:
+def _notes(fit: ModelFit) -> Iterator[str]:
     if fit.notes:
         yield "\n".join(f"note: {note}" for note in fit.notes)
 
 
-def _headline(fit: JointFit) -> str:
+def _headline(fit: ModelFit) -> str:
     m = fit.measurements
     kept = ", ".join(block.name for block in fit.space.blocks)
     return (
@@ -68,7 +68,7 @@ def tool_error_text(error: ToolError) -> str:
     )
 
 
-def _channel_table(fit: JointFit) -> str:
+def _channel_table(fit: ModelFit) -> str:
     header = ("channel", "readings", "stated σ", "found σ", "χ²/freedom", "held out", "")
     rows = []
     for c in fit.channels:
@@ -78,7 +78,7 @@ def _channel_table(fit: JointFit) -> str:
     return "residuals; held out: a line or a pose at a time, noise included\n" + aligned(header, rows)
 
 
-def _decision_table(fit: JointFit) -> str:
+def _decision_table(fit: ModelFit) -> str:
     header = ("block", "kept", "gain", "±", "")
     rows = [
         (d.block, "yes" if d.kept else "no", number(100.0 * d.gain, 2), number(100.0 * d.uncertainty, 2), "%")
@@ -111,7 +111,7 @@ def _sight_row(b: BlockSight) -> tuple[str, ...]:
     return (b.name, str(b.parameters), *cells, unit)
 
 
-def _outliers(fit: JointFit) -> Iterator[str]:
+def _outliers(fit: ModelFit) -> Iterator[str]:
     """Yield the list of readings that disagree with all others."""
     if not fit.outliers:
         return
@@ -124,7 +124,7 @@ def _outliers(fit: JointFit) -> Iterator[str]:
     yield "\n".join(lines)
 
 
-def as_json(fit: JointFit) -> dict:
+def as_json(fit: ModelFit) -> dict:
     """Return a joint fit as plain numbers, SI, for ``--json``."""
     x, errors = fit.solution.x, fit.standard_errors
     labels = [(label, block.unit) for block in fit.space.blocks for label in block.labels]

@@ -54,7 +54,7 @@ def add_parser(subparsers: common.Subparsers) -> None:
     parser.add_argument("--pictures", metavar="DIR", help="folder for pictures; made if it is missing")
     parser.add_argument("--truth", metavar="FILE", help="model of the virtual machine that was measured")
     parser.add_argument("--force", action="store_true", help="write a model that the readings do not bear out")
-    add_joint_options(parser)
+    add_fit_options(parser)
     parser.add_argument("--not-robust", action="store_true", help="trust readings that disagree with the rest (joint)")
     text = "what picks the polynomials' order (lines; default adjusted-r2)"
     parser.add_argument("--order", choices=("adjusted-r2", "aicc"), help=text)
@@ -71,7 +71,7 @@ def add_reading_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_joint_options(parser: argparse.ArgumentParser) -> None:
+def add_fit_options(parser: argparse.ArgumentParser) -> None:
     """Add what a joint fit, or a plan for one, is told."""
     add = parser.add_argument_group("scheme joint").add_argument
     add("--lead-mm", type=common.bound, metavar="MM", help="period of the screws' errors (default: the geometry's)")
@@ -100,7 +100,7 @@ def expansion_argument(text: str) -> tuple[float, float, float]:
     return (numbers[0], *(numbers[1:] or (0.0, 0.0)))
 
 
-def joint_settings(args: argparse.Namespace) -> Settings:
+def fit_settings(args: argparse.Namespace) -> Settings:
     """Return what the options say about a joint fit.
 
     Raises
@@ -149,7 +149,7 @@ def run(args: argparse.Namespace) -> int:
     geometry = load_geometry(config_file(args.machine))
     truth = None if args.truth is None else RealMachine(geometry, load_model(config_file(args.truth), geometry))
     columns = None if args.columns is None else config_file(args.columns)
-    settings = joint_settings(args)
+    settings = fit_settings(args)
     measured = read_files(args.files, geometry, columns, args.probe_mm)
     common.mention_compiling("model.actual_pose_one")
     try:
@@ -215,12 +215,12 @@ class _Result:
 
 def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: Settings) -> _Result:
     """Fit with scheme joint."""
-    from ..calibration.fit import fit_joint
+    from ..calibration.fit import fit_model
     from ..calibration.report import as_json, report
     from ..formats.yaml import write_text_atomically
 
     with common.stage_line() as say:
-        fit = fit_joint(measured, settings, say)
+        fit = fit_model(measured, settings, say)
 
     def save_more() -> None:
         if args.json is not None:
@@ -230,9 +230,9 @@ def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: Setting
             _save_arrays(args.covariance, labels=labels, values=fit.solution.x, covariance=fit.covariance)
 
     def pictures() -> dict[str, Figure]:
-        from ..calibration.pictures import joint_figure, left_error_figure, strut_error_figure
+        from ..calibration.pictures import fit_figure, left_error_figure, strut_error_figure
 
-        made = {"fit.png": joint_figure(fit)}
+        made = {"fit.png": fit_figure(fit)}
         if fit.model.valid_box is not None:
             made["left.png"] = left_error_figure(fit)
             made["strut_errors.png"] = strut_error_figure(measured.geometry, {"scheme joint": fit.model})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from . import common
-from .fit import add_joint_options, joint_settings
+from .fit import add_fit_options, fit_settings
 
 SUMMARY = "what a measuring campaign will determine, and what it will not"
 
@@ -21,7 +21,7 @@ def add_parser(subparsers: common.Subparsers) -> None:
     parser = common.add_verb(subparsers, "plan", run, SUMMARY, TEXT)
     parser.add_argument("campaign", metavar="CAMPAIGN", help="campaign file, or the name of a shipped one")
     common.add_machine_options(parser, with_model=False)
-    add_joint_options(parser)
+    add_fit_options(parser)
     parser.add_argument("--seed", type=common.seed, default=0, metavar="N", help="of scattered poses (default 0)")
     parser.add_argument("--json", action="store_true", help="JSON, for programs; SI")
 
@@ -37,6 +37,6 @@ def run(args: argparse.Namespace) -> int:
     geometry = load_geometry(config_file(args.machine))
     campaign = load_campaign(config_file(args.campaign))
     common.mention_compiling("model.actual_pose_one")
-    result = plan(template(campaign, geometry, args.seed, args.campaign), campaign, joint_settings(args))
+    result = plan(template(campaign, geometry, args.seed, args.campaign), campaign, fit_settings(args))
     common.emit(common.json_text(plan_json(result)) if args.json else plan_report(result), None)
     return 0

@@ -168,7 +168,7 @@ def check(
         raise GeometryError("--rate-hz", f"must lie in {RATES[0]:g}…{RATES[1]:g} Hz", rate)
     if mode not in MODES:
         raise GeometryError("mode", f"must be one of {', '.join(MODES)}", mode)
-    run = _Run(geometry, model, len(positions), rate)
+    run = _PathCheck(geometry, model, len(positions), rate)
     if mode == "moves":
         run.check_moves(positions, rotations, progress)
     else:
@@ -223,7 +223,7 @@ class _Worst:
                 self.broken[key] = found
 
 
-class _Run:
+class _PathCheck:
     """One check under way: the machine, its state along the path, and the worst so far."""
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, count: int, rate: float) -> None:

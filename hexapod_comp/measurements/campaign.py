@@ -18,7 +18,7 @@ from ..formats.yaml import Section, read_yaml
 from ..machine.field import CROSS_AXES
 from ..machine.geometry import HexapodGeometry
 from ..pose import Pose, rotation_from_angles
-from .readings import ANGULAR_KINDS, AXES, BACKWARD, FORWARD, KINDS, UNKNOWN, MeasurementSet, Reading, Source
+from .readings import ANGULAR_KINDS, AXES, BACKWARD, FORWARD, KINDS, UNKNOWN, FileLine, MeasurementSet, Reading
 from .runs import assemble
 
 CAMPAIGN_FORMAT = "hexapod_comp/campaign"
@@ -190,7 +190,7 @@ def template(campaign: Campaign, geometry: HexapodGeometry, seed: int = 0, name:
         A pose of the campaign is out of the machine's reach.
     """
     readings = [*_lines(campaign), *_diagonals(campaign), *_scattered(campaign, seed)]
-    return assemble(geometry, [reading._replace(source=Source(name, 0)) for reading in readings])
+    return assemble(geometry, [reading._replace(source=FileLine(name, 0)) for reading in readings])
 
 
 def _lines(campaign: Campaign) -> Iterator[Reading]:

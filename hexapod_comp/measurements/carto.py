@@ -60,7 +60,7 @@ from ..machine.field import CROSS_AXES
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE
 from ..pose import Pose
-from .readings import AXES, BACKWARD, FORWARD, MeasurementSet, Reading, Source
+from .readings import AXES, BACKWARD, FORWARD, FileLine, MeasurementSet, Reading
 from .runs import assemble
 from .tidy_csv import DIMENSIONS, LINE_KINDS, TURN_AXES, TURNS
 
@@ -526,7 +526,7 @@ def _static_readings(path: str | Path, static: Static, line: LineFile) -> tuple[
         passes[direction] += 1
         for target, value, number in rows:
             place = (line.run, passes[direction], direction, poses[target], line.channel)
-            source = Source(str(path), number)
+            source = FileLine(str(path), number)
             temperatures = (line.temperature,) * 8
             readings.append(Reading(*place, sense * value * line.unit, temperatures=temperatures, source=source))
     one_way = [f"{path}: all its runs travel one way"] if len(by_run) > 1 and 0 in passes.values() else []
@@ -553,7 +553,7 @@ def _dynamic_readings(path: str | Path, dynamic: Dynamic, line: LineFile, captur
     means = np.bincount(piece[inside], values[inside]) / count
     places = capture.start + np.bincount(piece[inside], travel[inside]) / count
     direction = FORWARD if capture.speed > 0.0 else BACKWARD
-    source, temperatures = Source(str(path), 0), (line.temperature,) * 8
+    source, temperatures = FileLine(str(path), 0), (line.temperature,) * 8
     return [
         Reading(line.run, capture.cycle, direction, line.pose(place), line.channel, value,
                 temperatures=temperatures, source=source)

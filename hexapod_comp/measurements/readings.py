@@ -63,7 +63,7 @@ LEAST_TRAVEL = 1e-6
 """Components of a line shorter than this, m, are no travel along that axis."""
 
 
-class Source(NamedTuple):
+class FileLine(NamedTuple):
     """Where a reading stands.
 
     Attributes
@@ -104,7 +104,7 @@ class Reading(NamedTuple):
         struts 1–6, base, platform, °C.
     commands : tuple of float or None
         Strut readings, m, when the file has them; otherwise the machine was told nominal lengths.
-    source : Source
+    source : FileLine
         For messages.
     """
 
@@ -117,7 +117,7 @@ class Reading(NamedTuple):
     uncertainty: float = np.nan
     temperatures: tuple[float, ...] = (REFERENCE_TEMPERATURE,) * 8
     commands: tuple[float, ...] | None = None
-    source: Source = Source("", 0)
+    source: FileLine = FileLine("", 0)
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ class MeasurementSet:
         Indices of station, run and channel; number of the pass; direction.
     value, uncertainty : ndarray, shape (N,)
         m or rad; NaN where the uncertainty is not known.
-    sources : tuple of Source
+    sources : tuple of FileLine
         Where each reading stands.
     files : tuple of (str, str)
         Name and SHA-256 of each file read.
@@ -222,7 +222,7 @@ class MeasurementSet:
     channel: np.ndarray
     value: np.ndarray
     uncertainty: np.ndarray
-    sources: tuple[Source, ...]
+    sources: tuple[FileLine, ...]
     files: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = field(default=())
 

@@ -1,4 +1,4 @@
-"""Readings in whatever order they come, gathered into one :class:`~.measurement.MeasurementSet`.
+"""Readings in whatever order they come, assembled into one :class:`~.readings.MeasurementSet`.
 
 Runs are recognised as lines, equal commands become one station, poses out of reach are refused.
 """

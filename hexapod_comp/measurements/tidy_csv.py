@@ -71,9 +71,9 @@ from .readings import (
     FROM_PREVIOUS,
     LEAST_TRAVEL,
     UNKNOWN,
+    FileLine,
     MeasurementSet,
     Reading,
-    Source,
     attitude_error,
 )
 from .runs import assemble
@@ -348,7 +348,7 @@ def _file_readings(
             pairs = [(_channel(file, row, lines), corrected.get(n, row.value))]
         for channel, value in pairs:
             reading = (names[row.run], row.cycle, row.direction, row.pose, channel, value, row.uncertainty)
-            source = Source(file, row.line)
+            source = FileLine(file, row.line)
             readings.append(Reading(*reading, row.temperatures, commands.get(visits[n]), source))
     if not readings:
         raise InputFileError(file, "", "holds strut readings only: nothing that was measured")

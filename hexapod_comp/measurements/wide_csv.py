@@ -40,7 +40,7 @@ from ..formats.yaml import UNITS, Section, read_yaml
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, solve_poses, strut_lengths_batch
 from ..pose import Pose
-from .readings import AXES, FROM_PREVIOUS, UNKNOWN, MeasurementSet, Reading, Source, attitude_error
+from .readings import AXES, FROM_PREVIOUS, UNKNOWN, FileLine, MeasurementSet, Reading, attitude_error
 from .runs import assemble
 
 COLUMNS_FORMAT = "hexapod_comp/columns"
@@ -301,6 +301,6 @@ def _readings(
         for kind, values, uncertainty in errors:
             for axis, value in zip(AXES, values[n].tolist(), strict=True):
                 place = (run, 1, columns.order, pose, f"{kind}_{axis}")
-                source = Source(str(table.path), line)
+                source = FileLine(str(table.path), line)
                 readings.append(Reading(*place, value, uncertainty, commands=told, source=source))
     return readings

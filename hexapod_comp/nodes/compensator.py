@@ -36,7 +36,7 @@ from ..pose import Pose
 from .command_source import CommandSource, OwnTopic
 from .compensator_parameters import PARAMETERS, PROGRAM
 from .compensator_status import CompensatorStatus
-from .following import Reach
+from .following import StrokeRange
 from .health import WARN, seconds
 from .journal import JournalTopics
 from .markers import machine_markers
@@ -118,7 +118,7 @@ class CompensatorNode(MachineNode):
             self._options["base_frame"]: pack_pose(Pose.identity()),
             self._options["work_frame"]: pack_pose(geometry.work),
         }
-        self._reach = Reach(geometry)
+        self._reach = StrokeRange(geometry)
         self._open_topics()
         frames = {name: self._options[f"{name}_frame"] for name in ("base", "work")}
         self._journal = JournalTopics(self, self.compensator, self._sources, frames)

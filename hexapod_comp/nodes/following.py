@@ -18,7 +18,7 @@ FOLLOWED_WITHIN = 0.1
 """A drive follows and tells within this time, s: a strut is right where any command of that time wants it."""
 
 
-class Reach:
+class StrokeRange:
     """The lengths that struts can have, with the largest correction to spare at either end.
 
     Parameters

@@ -17,7 +17,7 @@ from ..errors import LONGEST_TEXT, printable
 from .health import ERROR, Refusals
 
 
-class Guard:
+class CallbackGuard:
     """Catches what a callback raises, counts it, and lets it be said.
 
     A message, a timer, an event or a request must not end a node, whoever sent it and whatever is wrong with it or

@@ -21,7 +21,7 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from .guarding import Guard, PlainLogger
+from .guarding import CallbackGuard, PlainLogger
 from .health import HealthReport, joined
 
 COMMAND_QOS = QoSProfile(depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
@@ -40,8 +40,9 @@ ACKNOWLEDGED_WITHIN = Duration(seconds=0.4)
 class MachineNode(LifecycleNode):
     """What the package's lifecycle nodes have in common: when they act, throttled log, diagnostics, topics.
 
-    Whatever ROS calls here, it calls through a :class:`~.guarding.Guard`. Topics have a QoS that a user may override
-    by parameters. rclpy writes the overrides into the profile that it is given, so every topic gets a copy of its own.
+    Whatever ROS calls here, it calls through a :class:`~.guarding.CallbackGuard`. Topics have a QoS that a user may
+    override by parameters. rclpy writes the overrides into the profile that it is given, so every topic gets a copy of
+    its own.
     """
 
     wants_autostart = True
@@ -49,7 +50,7 @@ class MachineNode(LifecycleNode):
     def __init__(self, name: str, **options: Any) -> None:
         self._active = False
         self._throttle = Throttle()
-        self.guard = Guard(self.warn_of, self.complain_of)
+        self.guard = CallbackGuard(self.warn_of, self.complain_of)
         super().__init__(name, **options)
         self._logger = PlainLogger(self.get_logger().name)
         for service in self.services:  # the lifecycle's are not made by create_service

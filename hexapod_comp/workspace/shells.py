@@ -87,7 +87,7 @@ class Shell:
 
 
 @dataclass(frozen=True)
-class Section:
+class CrossSection:
     """A horizontal cut through a reach: rings about the axis through its centre.
 
     Attributes
@@ -143,7 +143,7 @@ def shell(reach: Reach, rings: int = 37, sectors: int = 72) -> Shell:
     )
 
 
-def section(reach: Reach, height: float, rings: int = 13, sectors: int = 72) -> Section:
+def section(reach: Reach, height: float, rings: int = 13, sectors: int = 72) -> CrossSection:
     """Cut a reach horizontally, by rays from the axis through its centre.
 
     Parameters
@@ -172,7 +172,7 @@ def section(reach: Reach, height: float, rings: int = 13, sectors: int = 72) -> 
     ends[-1] = ends[0]
     shares = np.linspace(0.0, 1.0, rings)[:, None, None]
     points = origin + shares * (ends - origin)
-    return Section(reach.geometry, reach.rotation, points, findings, folded)
+    return CrossSection(reach.geometry, reach.rotation, points, findings, folded)
 
 
 def axis_range(reach: Reach) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import gmean
 
-from hexapod_comp.calibration.estimation import JointProblem, LinearProblem, Posterior, solve
+from hexapod_comp.calibration.estimation import Estimation, LinearProblem, Posterior, solve
 from hexapod_comp.calibration.observability import (
     MACHINE_ERRORS,
     Observability,
@@ -43,8 +43,8 @@ def linearised(
 
 def problem_of(measurements: MeasurementSet, settings: Settings) -> tuple[ParameterSpace, LinearProblem]:
     space = ParameterSpace(measurements, settings)
-    joint = JointProblem(measurements, space)
-    return space, joint.linearise(np.zeros(space.size), np.ones(len(measurements)))[0]
+    estimation = Estimation(measurements, space)
+    return space, estimation.linearise(np.zeros(space.size), np.ones(len(measurements)))[0]
 
 
 def sight(space: ParameterSpace, problem: LinearProblem) -> Observability:
@@ -100,10 +100,10 @@ def test_errors_are_unseen_however_few_terms_the_field_has():
     assert set(without_trace(*linearised("5-D", 0, small_field))) == {*SQUARENESS, *TWISTS, *ROLLS}
 
 
-def readings_of(instrument: str, diagonals: int, model: MachineModel) -> JointProblem:
+def readings_of(instrument: str, diagonals: int, model: MachineModel) -> Estimation:
     """Return what lasers without noise read on a machine, against the nominal one."""
     quiet = small.campaign(instrument, diagonals, noise=(0.0,) * len(KINDS), beam_slope=0.0)
-    return JointProblem(small.measured(RealMachine(small.paper(), model), quiet, 0), linearised("5-D", 0, FIELD)[0])
+    return Estimation(small.measured(RealMachine(small.paper(), model), quiet, 0), linearised("5-D", 0, FIELD)[0])
 
 
 @pytest.mark.parametrize("name", list(MACHINE_ERRORS))
@@ -118,8 +118,8 @@ def test_an_unseen_error_really_changes_no_reading(name: str):
     x = np.zeros(space.size)
     x[[labels.index(f"{component} {term}") for component, term in MACHINE_ERRORS[name]]] = 1e-5
     for instrument, diagonals, is_seen in (("5-D", 0, False), ("6-D" if name in ROLLS else "5-D", 4, True)):
-        joint = readings_of(instrument, diagonals, space.model(x))
-        left, _ = joint.linearise(np.zeros(space.size), np.ones(len(joint.measurements)))
+        estimation = readings_of(instrument, diagonals, space.model(x))
+        left, _ = estimation.linearise(np.zeros(space.size), np.ones(len(estimation.measurements)))
         assert (np.abs(left.target).max() > 1.0) == is_seen
         assert is_seen or np.abs(left.target).max() < 1e-3
 

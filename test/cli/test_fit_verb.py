@@ -22,7 +22,7 @@ import pytest
 
 from hexapod_comp import cli
 from hexapod_comp.calibration import fit as joint_fit
-from hexapod_comp.calibration.fit import JointFit
+from hexapod_comp.calibration.fit import ModelFit
 from hexapod_comp.calibration.parameters import Settings
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
@@ -58,7 +58,7 @@ class Calibration:
     folder: Path
     campaign: Path
     measured: Path
-    fit: JointFit
+    fit: ModelFit
     measure_said: str
     fit_said: str
 
@@ -90,10 +90,10 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
     folder = tmp_path_factory.mktemp("calibration")
     campaign, measured = folder / "campaign.yaml", folder / "measured.csv"
     campaign.write_text(CAMPAIGN)
-    fits: list[JointFit] = []
-    real = joint_fit.fit_joint
+    fits: list[ModelFit] = []
+    real = joint_fit.fit_model
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(joint_fit, "fit_joint", lambda *arguments: fits.append(real(*arguments)) or fits[-1])  # type: ignore[func-returns-value]
+        patch.setattr(joint_fit, "fit_model", lambda *arguments: fits.append(real(*arguments)) or fits[-1])  # type: ignore[func-returns-value]
         measure_said = said_by("measure", "--campaign", campaign, "--seed", 1, "--out", measured)
         files = {"--out": "model.yaml", "--json": "fit.json", "--covariance": "fit.npz", "--report": "report.txt"}
         written = [word for option, name in files.items() for word in (option, folder / name)]
@@ -105,7 +105,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
 @pytest.fixture
 def fitted(done: Calibration, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calibration:
     """Give the fit to whoever asks for one, and an empty folder to write into."""
-    monkeypatch.setattr(joint_fit, "fit_joint", lambda *arguments: done.fit)
+    monkeypatch.setattr(joint_fit, "fit_model", lambda *arguments: done.fit)
     monkeypatch.chdir(tmp_path)
     return done
 
@@ -250,11 +250,11 @@ def test_options_reach_the_fit(
     """In SI, and the field's three blocks under one word."""
     given: list[Settings] = []
 
-    def spy(measured: object, settings: Settings, say: object) -> JointFit:
+    def spy(measured: object, settings: Settings, say: object) -> ModelFit:
         given.append(settings)
         return done.fit
 
-    monkeypatch.setattr(joint_fit, "fit_joint", spy)
+    monkeypatch.setattr(joint_fit, "fit_model", spy)
     options = "--lead-mm 5 --blocks map,field --separate-joints --tolerance-um 20 --field-degree 3 --not-robust"
     expansion = ("--expansion-ppm", "11.7,11,23")
     code, _, err = hexapod("fit", done.measured, *options.split(), *expansion, "--out", tmp_path / "m.yaml")

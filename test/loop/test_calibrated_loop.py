@@ -25,7 +25,7 @@ from scipy.stats import binom
 
 from hexapod_comp import cli
 from hexapod_comp.calibration.evaluation import align, held_out, run
-from hexapod_comp.calibration.fit import fit_joint
+from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
 from hexapod_comp.machine.model_file import load_model, save_model
@@ -246,7 +246,7 @@ def test_promises_are_kept_as_often_as_they_say() -> None:
     settings = replace(SETTINGS, blocks=("pitch", "wave", "backlash"))
     for seed in range(21, 21 + MACHINES):
         truth = virtual_machine(seed)
-        level = (fit := fit_joint(measured(truth, campaign(), seed), settings)).level
+        level = (fit := fit_model(measured(truth, campaign(), seed), settings)).level
         assert level is not None
         before, after = (held_out(truth, model, BOX, 500, seed).aligned_rms for model in (None, fit.model))
         kept.append(level.low <= after <= level.high)

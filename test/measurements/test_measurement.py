@@ -16,8 +16,8 @@ from hexapod_comp.measurements.readings import (
     FORWARD,
     FROM_PREVIOUS,
     UNKNOWN,
+    FileLine,
     Reading,
-    Source,
     attitude_error,
 )
 from hexapod_comp.measurements.runs import assemble
@@ -35,7 +35,7 @@ def line(start: list[float], stop: list[float], count: int = 5, direction: int =
     """Return linear readings on a line, m."""
     points = np.linspace(start, stop, count).round(9)
     return [
-        Reading("line", 1, direction, Pose(p, np.eye(3)), "linear", 0.0, source=Source("f", n + 2))
+        Reading("line", 1, direction, Pose(p, np.eye(3)), "linear", 0.0, source=FileLine("f", n + 2))
         for n, p in enumerate(points)
     ]
 

@@ -29,7 +29,7 @@ from sensor_msgs.msg import JointState, Temperature
 from hexapod_comp.errors import LONGEST_TEXT, CommandError, HexapodError, printable, shorten
 from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
 from hexapod_comp.machine.geometry import STRUT_NAMES
-from hexapod_comp.nodes.guarding import Guard
+from hexapod_comp.nodes.guarding import CallbackGuard
 from hexapod_comp.nodes.health import ERROR
 from hexapod_comp.nodes.messages import pose_message
 
@@ -199,7 +199,7 @@ def test_a_service_that_raises_answers_no(bench, monkeypatch):
 
 def test_the_guard_of_the_spin_loop_holds_whatever_comes():
     said: list[str] = []
-    guard = Guard(lambda *_: None, lambda _, text: said.append(text))
+    guard = CallbackGuard(lambda *_: None, lambda _, text: said.append(text))
     assert guard.around("spinning", broken, "otherwise")(1, two=2) == "otherwise"
     assert guard.around("spinning", lambda one: one)(1) == 1
     assert len(said) == 1

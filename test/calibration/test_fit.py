@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, multivariate_normal
 
-from hexapod_comp.calibration.estimation import HYPER, JointProblem, LinearProblem, held_out, physical_covariance, solve
-from hexapod_comp.calibration.fit import JointFit, fit_joint
+from hexapod_comp.calibration.estimation import HYPER, Estimation, LinearProblem, held_out, physical_covariance, solve
+from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import BLOCKS, ParameterSpace, Settings
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.measurements.campaign import template
-from hexapod_comp.measurements.readings import CHANNELS, KINDS, MeasurementSet, Source
+from hexapod_comp.measurements.readings import CHANNELS, KINDS, FileLine, MeasurementSet
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import ImperfectionBounds
 from hexapod_comp.virtual.instruments import station_errors
@@ -32,14 +32,14 @@ def readings(seed: int = 1, instrument: str = "5-D", diagonals: int = 4, cycles:
 
 
 @cache
-def fitted(seed: int, instrument: str) -> JointFit:
-    return fit_joint(readings(seed, instrument), SOME)
+def fitted(seed: int, instrument: str) -> ModelFit:
+    return fit_model(readings(seed, instrument), SOME)
 
 
 def linearised(measurements: MeasurementSet, settings: Settings = FEW) -> tuple[ParameterSpace, LinearProblem]:
     space = ParameterSpace(measurements, settings)
-    joint = JointProblem(measurements, space)
-    return space, joint.linearise(np.zeros(space.size), np.ones(len(measurements)))[0]
+    estimation = Estimation(measurements, space)
+    return space, estimation.linearise(np.zeros(space.size), np.ones(len(measurements)))[0]
 
 
 # ---------------------------------------------------------------- cells, zeros and slopes
@@ -72,7 +72,7 @@ def test_absolute_poses_keep_their_zero():
     poses = [Pose([x, y, 0.45], np.eye(3)) for x in np.linspace(-0.1, 0.1, 4) for y in np.linspace(-0.1, 0.1, 4)]
     absolute = small.scattered(small.paper(), poses)
     space = ParameterSpace(absolute, Settings(blocks=()))
-    shifted = JointProblem(absolute.with_values(absolute.value + 1e-5), space)
+    shifted = Estimation(absolute.with_values(absolute.value + 1e-5), space)
     problem, residuals = shifted.linearise(np.zeros(space.size), np.ones(len(absolute)))
     np.testing.assert_allclose(residuals, 1e-5, atol=1e-12)
     assert problem.freedom.sum() == len(absolute)
@@ -103,13 +103,13 @@ def test_repeated_readings_count_as_their_weighted_mean():
 
 
 def test_cells_are_left_out_by_line_and_by_pose():
-    lines = JointProblem(readings(), ParameterSpace(readings(), FEW)).cells
+    lines = Estimation(readings(), ParameterSpace(readings(), FEW)).cells
     of_cell = readings().run[[int(np.flatnonzero(lines.of_reading == c)[0]) for c in range(len(lines.fold))]]
     pairs = np.unique(np.stack([lines.fold, of_cell]), axis=1)
     assert pairs.shape[1] == len(readings().runs) == lines.fold.max() + 1
     poses = [Pose([x, 0.02 * x, 0.45], np.eye(3)) for x in np.linspace(-0.1, 0.1, 9)]
     absolute = small.scattered(small.paper(), poses)
-    folds = JointProblem(absolute, ParameterSpace(absolute, Settings(blocks=()))).cells.fold
+    folds = Estimation(absolute, ParameterSpace(absolute, Settings(blocks=()))).cells.fold
     assert np.bincount(folds).tolist() == [6] * 9
 
 
@@ -197,10 +197,10 @@ def test_held_out_lines_are_those_of_fits_without_the_line():
     ours = readings()
     space, problem = linearised(ours)
     errors = held_out(problem, solve(space, problem, space.start_tolerances(), ONES, 0))
-    joint = JointProblem(ours, space)
+    estimation = Estimation(ours, space)
     for fold in (0, 7, 20):
-        out = joint.cells.fold == fold
-        rest = JointProblem(ours.select(~out[joint.cells.of_reading]), space)
+        out = estimation.cells.fold == fold
+        rest = Estimation(ours.select(~out[estimation.cells.of_reading]), space)
         less, _ = rest.linearise(np.zeros(space.size), np.ones(len(rest.measurements)))
         answer = solve(space, less, space.start_tolerances(), ONES, 0)
         np.testing.assert_allclose(errors[out], problem.target[out] - problem.rows[out] @ answer.y, atol=1e-6)
@@ -251,7 +251,7 @@ def test_noise_is_found_with_the_right_freedom():
 # ---------------------------------------------------------------- whole fits
 
 
-def machine_directions(fit: JointFit, truth: RealMachine) -> tuple[np.ndarray, np.ndarray]:
+def machine_directions(fit: ModelFit, truth: RealMachine) -> tuple[np.ndarray, np.ndarray]:
     """Return the errors of the parameters along the covariance's axes in standard deviations, and what is data.
 
     The axes are those of the covariance in units of the priors; a share near 1 means that the data fixed it.
@@ -301,12 +301,12 @@ def test_tool_error_falls_as_predicted(seed: int, instrument: str):
 
 def test_blocks_that_the_machine_has_are_kept_and_no_others():
     """All blocks on offer; then a machine of joints alone."""
-    fit = fit_joint(readings(), replace(small.SETTINGS, field_degree=1))
+    fit = fit_model(readings(), replace(small.SETTINGS, field_degree=1))
     assert [d.block for d in fit.decisions] == list(BLOCKS[1:])
     assert {d.block for d in fit.decisions if d.kept} == {"pitch", "wave", "backlash"}
     assert [block.name for block in fit.space.blocks] == ["structure", "pitch", "wave", "backlash"]
     bare = replace(small.BOUNDS, pitch=0.0, wave=(0.0, 0.0), backlash=(0.0, 0.0))
-    fit = fit_joint(small.measured(small.virtual_machine(1, bare), small.campaign(), 1), SOME)
+    fit = fit_model(small.measured(small.virtual_machine(1, bare), small.campaign(), 1), SOME)
     assert not any(d.kept for d in fit.decisions)
 
 
@@ -316,9 +316,9 @@ def test_a_field_is_found():
                      field_reversal=0.0)  # fmt: skip
     truth = small.virtual_machine(2, bounds)
     ours = small.measured(truth, small.campaign("6-D", 16), 2)
-    fit = fit_joint(ours, replace(SOME, field_degree=3))
+    fit = fit_model(ours, replace(SOME, field_degree=3))
     assert {"field displacement", "field rotation"} <= {d.block for d in fit.decisions if d.kept}
-    without = fit_joint(ours, FEW)
+    without = fit_model(ours, FEW)
     assert small.tool_error(truth, fit.model)[0] < 0.7 * small.tool_error(truth, without.model)[0]
 
 
@@ -326,7 +326,7 @@ def test_noise_twice_and_three_times_as_stated_is_found():
     """2 µm and 3 µrad under a stated 1: known from some 360 to 600 free readings, 4 % each; four of these."""
     plan = small.campaign(noise=(2e-6, 1e-6, 3e-6, 1e-5, 1e-5))
     ours = small.measured(small.virtual_machine(1), plan, 1)
-    fit = fit_joint(replace(ours, uncertainty=np.full(len(ours), 1e-6)), FEW)
+    fit = fit_model(replace(ours, uncertainty=np.full(len(ours), 1e-6)), FEW)
     found = {channel.kind: channel.found / channel.stated for channel in fit.channels}
     assert found == {kind: pytest.approx(n, rel=0.16) for kind, n in zip(KINDS[:3], (2.0, 1.0, 3.0), strict=True)}
     assert all(c.chi_square == pytest.approx((c.found / c.stated) ** 2) for c in fit.channels)
@@ -348,10 +348,10 @@ def test_gross_errors_are_named_and_do_no_harm(bounds: ImperfectionBounds, gross
     """
     truth, where = small.virtual_machine(2, bounds), [100, 700, 1300]
     ours = small.measured(truth, small.campaign(), 2)
-    ours = replace(ours, sources=tuple(Source("shop.csv", n + 2) for n in range(len(ours))))
+    ours = replace(ours, sources=tuple(FileLine("shop.csv", n + 2) for n in range(len(ours))))
     value = ours.value.copy()
     value[where] += [gross, -gross, gross]
-    clean, fit = fit_joint(ours, FEW), fit_joint(ours.with_values(value), FEW)
+    clean, fit = fit_model(ours, FEW), fit_model(ours.with_values(value), FEW)
     assert {o.source.line for o in fit.outliers} == {n + 2 for n in where}
     assert all(abs(o.residual) == pytest.approx(gross, abs=6e-6) for o in fit.outliers)
     assert [d.kept for d in fit.decisions] == [d.kept for d in clean.decisions]
@@ -366,7 +366,7 @@ def test_struts_without_backlash_do_not_upset_the_fit():
     truth = small.virtual_machine(0)
     backlash = truth.model.struts.backlash * [0.0, 1.0, 0.0, 1.0, 0.0, 1.0]
     model = replace(truth.model, struts=replace(truth.model.struts, backlash=backlash))
-    fit = fit_joint(small.measured(RealMachine(small.paper(), model), small.campaign(), 0), FEW)
+    fit = fit_model(small.measured(RealMachine(small.paper(), model), small.campaign(), 0), FEW)
     part = fit.space.block("backlash").part
     errors = np.sqrt(np.diag(physical_covariance(fit.space, fit.solution.posterior)))[part]
     assert (np.abs(fit.solution.x[part] - backlash) < 4.0 * errors).all()
@@ -384,14 +384,14 @@ def swapped(ours: MeasurementSet) -> MeasurementSet:
 
 def test_swapped_directions_are_named():
     with pytest.raises(CalibrationError, match="swapped"):
-        fit_joint(swapped(readings()), FEW)
+        fit_model(swapped(readings()), FEW)
 
 
 def test_too_few_readings_are_refused_with_their_numbers():
     ours = readings()
     few = ours.select((ours.run < 3) & (ours.channel == 0) & (ours.direction == 1))
     with pytest.raises(CalibrationError, match=r"27 readings .* 33 parameters"):
-        fit_joint(few, FEW)
+        fit_model(few, FEW)
 
 
 @pytest.mark.parametrize("factor", [1e3, 1e6], ids=["millimetres", "micrometres"])
@@ -399,7 +399,7 @@ def test_wrong_units_are_a_calibration_error(factor: float):
     """38 µm read as 38 mm or 38 m: no machine is like that."""
     ours = readings()
     with pytest.raises(CalibrationError, match="units"):
-        fit_joint(ours.with_values(factor * ours.value), FEW)
+        fit_model(ours.with_values(factor * ours.value), FEW)
 
 
 def test_commands_in_wrong_units_are_a_calibration_error():
@@ -408,7 +408,7 @@ def test_commands_in_wrong_units_are_a_calibration_error():
     ours = small.scattered(small.paper(), poses)
     ours = replace(ours, stations=replace(ours.stations, commands=1e2 * ours.stations.commands))
     with pytest.raises(CalibrationError, match="units"):
-        fit_joint(ours, Settings(blocks=("pitch",)))
+        fit_model(ours, Settings(blocks=("pitch",)))
 
 
 # ---------------------------------------------------------------- the edge of what can be asked
@@ -426,7 +426,7 @@ def test_a_tracker_at_tilted_poses_is_enough():
     template_of_poses = small.scattered(small.paper(), tilted_poses(80))
     errors = station_errors(template_of_poses, truth)[template_of_poses.station]
     value = (template_of_poses.directions() * errors).sum(axis=1) + 1e-5 * rng.standard_normal(len(errors))
-    fit = fit_joint(template_of_poses.with_values(value), FEW)
+    fit = fit_model(template_of_poses.with_values(value), FEW)
     assert "pitch" in {d.block for d in fit.decisions if d.kept}
     after, _ = small.tool_error(truth, fit.model, fit.space.box)
     assert after < 0.3 * small.tool_error(truth, None, fit.space.box)[0]
@@ -436,14 +436,14 @@ def test_a_tracker_at_tilted_poses_is_enough():
 def test_readings_that_are_all_zero_are_refused():
     """A disconnected instrument, not a perfect machine: without noise it would have infinite weight."""
     with pytest.raises(CalibrationError, match=r"^linear: the 410 readings are all zero"):
-        fit_joint(template(small.campaign(), small.paper()), FEW)
+        fit_model(template(small.campaign(), small.paper()), FEW)
 
 
 def test_readings_without_noise_are_welcome():
     """What a virtual campaign with perfect lasers gives: nanometres are left, of which rounding makes none."""
     plan = small.campaign("6-D", noise=(0.0,) * len(KINDS))
     truth = small.virtual_machine(1)
-    fit = fit_joint(small.measured(truth, plan, 1), FEW)
+    fit = fit_model(small.measured(truth, plan, 1), FEW)
     assert small.tool_error(truth, fit.model)[0] < 10e-9
 
 
@@ -453,20 +453,20 @@ def test_a_channel_that_never_changes_is_refused():
     straightness = ours.kind == KINDS.index("straightness")
     stuck = ours.with_values(np.where(straightness, 3e-6, ours.value))
     with pytest.raises(CalibrationError, match=r"^straightness: the \d+ readings never change within a run"):
-        fit_joint(stuck, FEW)
+        fit_model(stuck, FEW)
 
 
 def test_uncertainties_below_any_instrument_are_refused():
     """1e-15 m against a prior of 100 µm: 22 decimal places, six more than numbers have."""
     ours = readings()
     with pytest.raises(CalibrationError, match="uncertainty"):
-        fit_joint(replace(ours, uncertainty=np.full(len(ours), 1e-15)), FEW)
+        fit_model(replace(ours, uncertainty=np.full(len(ours), 1e-15)), FEW)
 
 
 @pytest.mark.parametrize("kinds", [(ROTATION,), (LINEAR,)], ids=["rotations only", "lengths only"])
 def test_one_kind_of_reading_is_enough_to_go_on(kinds: tuple[int, ...]):
     ours = readings().select(np.isin(readings().kind, kinds))
-    fit = fit_joint(ours, FEW)
+    fit = fit_model(ours, FEW)
     assert [c.kind for c in fit.channels] == [KINDS[k] for k in kinds]
     assert np.isfinite(fit.solution.x).all()
     assert fit.observability.structure_rank < 33
@@ -479,6 +479,6 @@ def test_one_line_can_not_choose_blocks(run: int):
     Whatever the blocks, such a fit would predict nothing: the gain is exactly zero, where rounding made 1e-5 of it,
     with a standard error of zero, and of either sign.
     """
-    fit = fit_joint(readings().select(readings().run == run), FEW)
+    fit = fit_model(readings().select(readings().run == run), FEW)
     assert [(d.kept, d.gain, d.uncertainty) for d in fit.decisions] == [(False, 0.0, 0.0)] * 3
     assert fit.observability.structure_rank < 12

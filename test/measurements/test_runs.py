@@ -22,9 +22,9 @@ from hexapod_comp.measurements.readings import (
     FORWARD,
     FROM_PREVIOUS,
     UNKNOWN,
+    FileLine,
     MeasurementSet,
     Reading,
-    Source,
 )
 from hexapod_comp.measurements.runs import assemble, joined
 from hexapod_comp.measurements.tidy_csv import read_measurements
@@ -74,7 +74,7 @@ def at(*points: tuple[float, float, float]) -> list[Pose]:
 def tracked(poses: list[Pose], channels: tuple[str, ...] = ("position_x",), run: str = "tracker") -> MeasurementSet:
     """Return a set of poses that were measured one after the other, each in some channels."""
     readings = [
-        Reading(run, 1, FROM_PREVIOUS, pose, channel, 1e-6 * n, source=Source("test", n))
+        Reading(run, 1, FROM_PREVIOUS, pose, channel, 1e-6 * n, source=FileLine("test", n))
         for n, pose in enumerate(poses)
         for channel in channels
     ]
@@ -222,7 +222,7 @@ def test_strut_readings_tell_directions_even_where_the_pose_stands_still() -> No
     struts = lengths_at(pose.position[None])[0]
     told = [struts, struts + 1e-6, struts + 1e-6 + 1e-10]
     readings = [
-        Reading("r", 1, FROM_PREVIOUS, pose, "position_x", 0.0, commands=tuple(c.tolist()), source=Source("test", n))
+        Reading("r", 1, FROM_PREVIOUS, pose, "position_x", 0.0, commands=tuple(c.tolist()), source=FileLine("test", n))
         for n, c in enumerate(told)
     ]
     sense = assemble(PAPER, readings).stations.sense
@@ -309,10 +309,10 @@ def test_a_joined_set_survives_its_file(tmp_path: Path) -> None:
 )
 def test_what_no_machine_or_instrument_does_is_refused(change: dict[str, object], complaint: str) -> None:
     first, second = at((0, 0, 400), (10, 0, 400))
-    row = Reading("line", 1, FORWARD, second, "linear", 0.0, source=Source("test", 7))
-    rows = [row._replace(pose=first, source=Source("test", 6)), row._replace(**change)]  # type: ignore[arg-type]
+    row = Reading("line", 1, FORWARD, second, "linear", 0.0, source=FileLine("test", 7))
+    rows = [row._replace(pose=first, source=FileLine("test", 6)), row._replace(**change)]  # type: ignore[arg-type]
     if "off the run's line" in complaint:
-        rows.append(row._replace(source=Source("test", 8)))
+        rows.append(row._replace(source=FileLine("test", 8)))
     with pytest.raises(InputFileError, match=complaint):
         assemble(PAPER, rows)
 
