@@ -30,10 +30,24 @@ class HexapodError(Exception):
     def __init__(self, text: str = ""):
         super().__init__(printable(text, LONGEST_TEXT))
 
+    def __str__(self) -> str:
+        return str(self.args[0])  # also where a parent class has a text of its own, as ImportError
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what pickle needs: text and attributes, whatever the class wants to be made of."""
+        return _remade, (type(self), self.args), self.__dict__
+
     def with_lines(self, lines: str) -> HexapodError:
         """Return the error with lines below its text that are shown as they are: what our own process has logged."""
         self.args = (f"{self}\n{lines}",)
         return self
+
+
+def _remade(kind: type[HexapodError], args: tuple[Any, ...]) -> HexapodError:
+    """Return an error with its text; pickle puts the attributes in."""
+    error = kind.__new__(kind)
+    error.args = args
+    return error
 
 
 class MissingPackageError(HexapodError, ImportError):

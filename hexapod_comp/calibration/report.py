@@ -132,14 +132,14 @@ def as_json(fit: ModelFit) -> dict:
         "machine": fit.measurements.geometry.name,
         "scheme": "joint",
         "parameters": [
-            {"name": name, "value": float(v), "standard_error": float(e), "unit": unit}
+            {"name": name, "value": v, "standard_error": e, "unit": unit}
             for (name, unit), v, e in zip(labels, x, errors, strict=True)
         ],
-        "blocks": [vars(d) for d in fit.decisions],
-        "channels": [vars(c) for c in fit.channels],
-        "expected_tool_error": None if fit.level is None else vars(fit.level),
-        "expected_tool_error_tilted": None if fit.tilted is None else vars(fit.tilted),
-        "observability": {**vars(fit.observability), "blocks": [vars(b) for b in fit.observability.blocks]},
+        "blocks": fit.decisions,
+        "channels": fit.channels,
+        "expected_tool_error": fit.level,
+        "expected_tool_error_tilted": fit.tilted,
+        "observability": fit.observability,
         "unseen_errors": fit.unseen_errors,
         "outliers": [
             {"source": str(o.source), "channel": CHANNELS[o.channel], "residual": o.residual, "sigmas": o.sigmas}
@@ -166,8 +166,8 @@ def plan_json(plan: Plan) -> dict:
         "machine": plan.measurements.geometry.name,
         "readings": len(plan.measurements),
         "parameters": plan.space.size,
-        "expected_tool_error": None if plan.level is None else vars(plan.level),
-        "expected_tool_error_tilted": None if plan.tilted is None else vars(plan.tilted),
-        "observability": {**vars(plan.observability), "blocks": [vars(b) for b in plan.observability.blocks]},
+        "expected_tool_error": plan.level,
+        "expected_tool_error_tilted": plan.tilted,
+        "observability": plan.observability,
         "unseen_errors": plan.unseen_errors,
     }

@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import csv
 import io
-import json
 import math
 import os
 import sys
@@ -183,18 +182,10 @@ def _cell(value: Any, digits: int) -> Any:
 
 
 def json_text(content: Any) -> str:
-    """Return JSON; what is not finite becomes null, since JSON has no word for it."""
-    return json.dumps(_plain(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    """Return a result as JSON, as :func:`hexapod_comp.formats.json.json_text`, which takes its time to import."""
+    from ..formats.json import json_text
 
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return json_text(content)
 
 
 def emit(text: str, out: str | None) -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
+
+from . import common
 
 HELP = "send poses through the loop: two simulated nodes, or your own with --attach"
 
@@ -69,8 +69,7 @@ def run(args: argparse.Namespace) -> int:
     with started as nodes:
         result = loop.witnessed(geometry, nodes, poses, None, rate, compare, args.namespace)
     if args.json:
-        json.dump(loop.as_json(rows, result), sys.stdout, indent=1)
-        print()
+        common.emit(common.json_text(loop.as_json(rows, result)), None)
     else:
         for row, record in zip(rows, result.poses, strict=True):
             print(pose_block(f"pose {row.label}", record))

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from ..compensation.checks import check
 from ..errors import GeometryError, HexapodError, InputFileError
-from ..formats.csv import Row, length_values, pose_values
+from ..formats.csv import Row, length_values
 from ..formats.paths import config_file
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
@@ -199,33 +199,30 @@ def _left(name: str, before: np.ndarray, after: np.ndarray, bars: tuple[float, f
 
 
 def as_json(rows: list[Row], result: SessionResult) -> dict[str, object]:
-    """Return a session as plain data: mm, degrees, tool in ``work``; errors in µm and µrad."""
+    """Return what is told of a session: tool poses in ``work``."""
     return {
         "frame": "work",
         "model": result.model,
         "sent": result.sent,
         "lost": result.lost,
         "refused": result.refused,
-        "latency_median_ms": float(np.median(result.latencies) * 1e3) if len(result.latencies) else None,
+        "latency_median_ms": np.median(result.latencies) * 1e3 if len(result.latencies) else None,
         "poses": [_pose_json(row, record) for row, record in zip(rows, result.poses, strict=True)],
     }
 
 
 def _pose_json(row: Row, record: PoseRecord) -> dict[str, object]:
-    def shown(pose: Pose | None) -> dict[str, float] | None:
-        return None if pose is None else pose_values(pose)
-
     def error(pair: tuple[float, float] | None) -> dict[str, float] | None:
         return None if pair is None else {"position_um": pair[0] * 1e6, "rotation_urad": pair[1] * 1e6}
 
     without, compensated = record.errors()
     return {
         "pose": row.label,
-        "commanded": shown(record.target),
+        "commanded": record.target,
         "struts": length_values(record.command),
-        "correction_um": [float(value) * 1e6 for value in record.correction],
-        "estimated": shown(record.estimate),
-        "true": shown(record.true_with),
+        "correction_um": record.correction * 1e6,
+        "estimated": record.estimate,
+        "true": record.true_with,
         "error_without": error(without),
         "error_with": error(compensated),
     }

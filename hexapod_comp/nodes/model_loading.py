@@ -12,14 +12,13 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
-import numpy as np
-
 from ..compensation.journal import Source, load_with_source
 from ..errors import HexapodError
+from ..formats.json import json_text
 from ..machine.field import GridField
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel, ModelOrigin
@@ -48,7 +47,7 @@ class _Named:
 
 def model_text(model: MachineModel) -> str:
     """Return a model as JSON; its numbers come back bit for bit."""
-    return json.dumps(asdict(model), default=np.ndarray.tolist)
+    return json_text(model, indent=None)
 
 
 def model_of(text: str) -> MachineModel:

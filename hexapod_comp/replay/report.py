@@ -315,7 +315,7 @@ def as_json(report: Report) -> dict[str, Any]:
         difference = np.abs(other.difference)
         content["other"] = {
             "name": report.other_name,
-            "largest_difference_m": [float(np.nanmax(column, initial=0.0)) for column in difference.T],
+            "largest_difference_m": np.nanmax(difference, axis=0, initial=0.0),
             "refused": len(other.refused_now),
         }
     return content
@@ -336,7 +336,7 @@ def _replay_json(replayed: Replay) -> dict[str, Any]:
     return {
         "outcomes": {name: found[outcome] for outcome, name in OUTCOMES.items()},
         "first_difference": first,
-        "largest_difference_m": float(np.nanmax(np.abs(replayed.difference[different]), initial=0.0)),
+        "largest_difference_m": np.nanmax(np.abs(replayed.difference[different]), initial=0.0),
         "states_differ": len(replayed.states_differ),
         "changes": [
             {"before_stamp_ns": _stamp(replayed, event.row), "what": event.entry.what, **event.entry.values}

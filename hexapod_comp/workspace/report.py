@@ -99,11 +99,11 @@ def as_json(study: Study) -> dict[str, Any]:
         "combined_m_rad": {
             "worst_case": study.combined.worst_case,
             "root_sum_of_squares": study.combined.root_sum_of_squares,
-            "percentiles": dict(zip(map(str, drawn.percentiles), drawn.worst_values.tolist(), strict=True)),
+            "percentiles": dict(zip(drawn.percentiles, drawn.worst_values, strict=True)),
         },
         "allocations_m": [
-            {**vars(found), "alone": dict(zip(study.errors.kinds, found.alone.tolist(), strict=True))}
+            {**vars(found), "alone": dict(zip(study.errors.kinds, found.alone, strict=True))}
             for found in study.allocations
         ],
-        "agreement": None if study.agreement is None else vars(study.agreement),
+        "agreement": study.agreement,
     }

@@ -15,6 +15,7 @@ import pytest
 from strategies import paper_geometry
 
 from hexapod_comp.formats.csv import Row
+from hexapod_comp.formats.json import plain
 from hexapod_comp.loop import run as loop
 from hexapod_comp.loop.records import PoseRecord, SessionResult
 from hexapod_comp.loop.report import pose_block
@@ -52,7 +53,7 @@ def result(monkeypatch: pytest.MonkeyPatch) -> SessionResult:
 
 
 def test_json_says_the_frame_and_gives_back_the_users_own_numbers(result: SessionResult):
-    content = loop.as_json([Row(2, "1")], result)
+    content = plain(loop.as_json([Row(2, "1")], result))
     assert content["frame"] == "work"
     (pose,) = content["poses"]
     given = {"x_mm": 12.0, "y_mm": -34.0, "z_mm": 56.0, "alpha_deg": 1.0, "beta_deg": -2.0, "gamma_deg": 3.0}

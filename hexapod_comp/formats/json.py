@@ -1,0 +1,71 @@
+"""Results as JSON: the one way from what the package computes to what other programs read."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from datetime import date
+from os import PathLike, fspath
+from typing import Any
+
+import numpy as np
+
+from ..errors import HexapodError
+from ..pose import Pose
+from .csv import pose_values
+
+
+def json_text(result: Any, indent: int | None = 1) -> str:
+    """Return a result as JSON text that ends with a line break; see :func:`plain`."""
+    return json.dumps(plain(result), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def plain(value: Any) -> Any:
+    """Return a result as what JSON has words for; its numbers come back as the very same floats.
+
+    Parameters
+    ----------
+    value : object
+        A dataclass or named tuple becomes an object with its fields as keys, which should end in their units; a
+        :class:`Pose` one in mm and degrees, as in CSV files; an error one with ``reason`` and ``problem``. Arrays,
+        tuples, sets (sorted) become lists, paths and dates text. What is not finite becomes null.
+
+    Raises
+    ------
+    TypeError
+        It holds something else, as a function: a fault of the caller.
+    """
+    if isinstance(value, str | int | None):
+        return value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, np.ndarray | np.generic):
+        listed = value.tolist()
+        exact = value.dtype.kind in "iubU" or (value.dtype.kind == "f" and np.isfinite(value).all())
+        return listed if exact else plain(listed)
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple) and not hasattr(value, "_asdict"):
+        return [plain(item) for item in value]
+    return plain(_parts(value))
+
+
+def _parts(value: Any) -> Any:
+    """Return what an object is made of."""
+    if isinstance(value, Pose):
+        return pose_values(value)
+    if isinstance(value, tuple):
+        return value._asdict()  # type: ignore[attr-defined]
+    if is_dataclass(value) and not isinstance(value, type):
+        return {part.name: getattr(value, part.name) for part in fields(value) if part.init}
+    if isinstance(value, set | frozenset):
+        return sorted(value)
+    if isinstance(value, HexapodError):
+        return {"reason": value.reason, "problem": str(value)}
+    if isinstance(value, date):
+        return value.isoformat()
+    if isinstance(value, PathLike):
+        return fspath(value)
+    raise TypeError(f"{type(value).__name__} has no place in JSON")

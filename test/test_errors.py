@@ -1,0 +1,66 @@
+"""Errors travel: from worker processes to whoever waits for them, with all that they carry."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import inspect
+import pickle
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import pytest
+
+from hexapod_comp.errors import HexapodError
+
+PACKAGE = Path(__file__).resolve().parents[1] / "hexapod_comp"
+GIVEN = {"path": Path("mine.yaml"), "value": 0.25, "limit": 0.2, "strut": 3}
+"""Arguments that are no text."""
+
+
+def classes() -> list[type[HexapodError]]:
+    """Return every error of the package, wherever it is defined."""
+    for path in PACKAGE.rglob("*.py"):
+        if "Error):" in path.read_text(encoding="utf-8"):
+            importlib.import_module(".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts))
+    found = list(_below(HexapodError))
+    assert len(found) > 20
+    return [HexapodError, *found]
+
+
+def _below(kind: type[HexapodError]) -> Iterator[type[HexapodError]]:
+    for child in kind.__subclasses__():
+        yield child
+        yield from _below(child)
+
+
+def made(kind: type[HexapodError]) -> HexapodError:
+    """Return an error with an argument for each parameter."""
+    names = [name for name in inspect.signature(kind.__init__).parameters if name not in ("self", "args", "kwargs")]
+    return kind(*(GIVEN.get(name, f"some {name}\nof it") for name in names)).with_lines("two\nlines")
+
+
+def throw(error: HexapodError) -> None:
+    raise error
+
+
+def test_every_error_comes_out_of_a_worker_as_it_was_raised():
+    errors = [made(kind) for kind in dict.fromkeys(classes())]
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        for error, future in [(error, pool.submit(throw, error)) for error in errors]:
+            with pytest.raises(HexapodError) as caught:
+                future.result(timeout=60)
+            assert type(caught.value) is type(error)
+            assert str(caught.value) == str(error)
+            assert caught.value.args == error.args
+            assert vars(caught.value) == vars(error)
+            assert caught.value.reason == error.reason
+
+
+@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda error: pickle.loads(pickle.dumps(error, 2))])
+def test_a_copy_says_the_same(again):
+    error = made(importlib.import_module("hexapod_comp.errors").InputFileError)
+    assert str(again(error)) == str(error)
+    assert again(error).key == error.key
