@@ -42,8 +42,8 @@ def result(monkeypatch: pytest.MonkeyPatch) -> SessionResult:
         yield SimpleNamespace(update=None)
 
     client = SimpleNamespace(close=lambda: None)
-    session = SimpleNamespace(LoopClient=lambda **_: client, connect=lambda *_: None, run_session=run_session)
-    monkeypatch.setattr(loop, "_session_module", lambda: session)
+    monkeypatch.setattr(loop, "session", SimpleNamespace(connect=lambda *_: None, run_session=run_session))
+    monkeypatch.setattr(loop, "_client", lambda _: client)
     monkeypatch.setattr(loop, "_progress", no_bar)
     geometry = replace(paper_geometry(), work=TURNED_WORK, tool=TURNED_TOOL)
     found = loop.witnessed(geometry, (), [GIVEN], None, 100.0, False)
