@@ -127,7 +127,7 @@ if not (3, 10) <= sys.version_info[:2] <= (3, 13):
              "  make demo PYTHON=python3.12" % sys.version_info[:2])
 if not sys.platform.startswith("linux") or platform.machine() != "x86_64":
     sys.exit("make: this is %s on %s, but PyPI has ROS 2 only for Linux on x86_64.\n"
-             "  On a ROS 2 machine use colcon build instead (see README)." % (sys.platform, platform.machine()))
+             "  On a ROS 2 machine use colcon build instead (see doc/ros.md)." % (sys.platform, platform.machine()))
 try:
     import ensurepip, venv
 except ImportError:

@@ -1,6 +1,6 @@
 """Time inverse and forward kinematics beside what else people use, on the same poses in one run.
 
-Run ``python -m benchmarks.kernels`` (``--json`` for programs). benchmarks/README.md says what the columns mean.
+Run ``python -m benchmarks.kernels`` (``--json`` for programs). doc/benchmarks.md says what the columns mean.
 MuJoCo, Pinocchio and LinuxCNC are optional: a peer that is not installed is said to be missing. Exits 1 when a bar
 is missed, or somebody's numbers differ from ours.
 """

@@ -18,7 +18,7 @@ UM = 1e-6
 
 
 def rotation(alpha: float, beta: float, gamma: float) -> np.ndarray:
-    """Return R = Ry(β)·Rx(α)·Rz(γ), angles in degrees, as the README has it."""
+    """Return R = Ry(β)·Rx(α)·Rz(γ), angles in degrees, as doc/theory.md has it."""
     (ca, cb, cc), (sa, sb, sc) = (f(np.radians([alpha, beta, gamma])) for f in (np.cos, np.sin))
     about_y = np.array([[cb, 0.0, sb], [0.0, 1.0, 0.0], [-sb, 0.0, cb]])
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, ca, -sa], [0.0, sa, ca]])

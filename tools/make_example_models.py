@@ -101,7 +101,7 @@ def make_lines_model(truth: RealMachine, truth_hash: str) -> tuple[MachineModel,
     model = replace(model, field=replace(model.field, lines=(x, y, z)))
     found = worth(truth, model, BOX)
     note = (
-        "Paper 001's scheme on simulated laser lines of paper_machine.yaml (1 um noise, 3 runs), by "
+        "The scheme of Mou & King (1998) on simulated laser lines of paper_machine.yaml (1 um noise, 3 runs), by "
         "tools/make_example_models.py. Datum: every line is zero (mean of both directions) at home's "
         "coordinate along it. Before and after, um: 3-D RMS "
         f"{micrometres(found.before.raw_rms, found.after.raw_rms)}; rigidly aligned "

@@ -229,8 +229,9 @@ def _kind(fit: LineFit) -> str:
 def _origin_note(order: OrderRule) -> str:
     chosen = f"of order {order}" if isinstance(order, int) else f"of an order chosen by {order}"
     return (
-        f"Scheme lines (001): polynomials {chosen} along grid lines. Datum: displacements and rotations are zero "
-        "(mean of both directions) at home's coordinate along each line; straightness without its straight line."
+        f"Scheme lines (Mou & King 1998): polynomials {chosen} along grid lines. Datum: displacements and rotations "
+        "are zero (mean of both directions) at home's coordinate along each line; straightness without its straight "
+        "line."
     )
 
 

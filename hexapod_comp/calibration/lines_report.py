@@ -102,7 +102,7 @@ def _worth_lines(worth: Worth) -> Iterator[str]:
     before, after, paper = worth.before, worth.after, worth.paper
     along = _fall(paper.before, paper.after, "µm")
     yield f"On the virtual machine, without → with the model (held out: {after.points} points, both ways):"
-    yield f"  001's metric, mean |displacement error| along {paper.lines} lines: {along}"
+    yield f"  metric of Mou & King, mean |displacement error| along {paper.lines} lines: {along}"
     yield f"  error vector in space, RMS, datum aligned: {_fall(before.aligned_rms, after.aligned_rms, 'µm')}"
     yield f"  its largest: {_fall(before.aligned_max, after.aligned_max, 'µm')}"
     yield f"  error vector in space, RMS, as it is: {_fall(before.raw_rms, after.raw_rms, 'µm')}"

@@ -17,10 +17,10 @@ SUMMARY = "rank a machine's errors by what they do to the tool over the whole wo
 
 TEXT = """Finds what the machine reaches (stroke, joint cones, strut clearance, condition number), and the effect of
 every single error of the budget at every grid point of it, by forward kinematics of the machine with that error.
-Prints the ranked table of paper 004 with the paper's figures beside it, what the budget adds up to, and with
---allow-um what each error may be. Writes into the folder of --out: report.txt, ranking.csv, ranking.json, pictures
-(ranking, causes, one of shells for each error type), and with plotly installed page.html, which shows every error
-from all sides.
+Prints the ranked table of v. Daake, Vetter, Böhm & Zirn with their figures beside it, what the budget adds up to,
+and with --allow-um what each error may be. Writes into the folder of --out: report.txt, ranking.csv, ranking.json,
+pictures (ranking, causes, one of shells for each error type), and with plotly installed page.html, which shows
+every error from all sides.
 
 --tilt-deg says which orientations: every combination of the tilts about x and y.
 

@@ -8,7 +8,7 @@ HELP = "show the loop: Table 1 of the paper and a milling path through two real 
 
 EXAMPLE = """example:
   hexapod_comp demo
-  hexapod_comp demo --model paper_lines_model.yaml     (the paper's own 1-D scheme: exits 1, the README says why)
+  hexapod_comp demo --model paper_lines_model.yaml     (the paper's own 1-D scheme: exits 1, doc/demo.md says why)
 
 Exits 0 only when no command was lost or refused, both nodes ended well, and compensation reduced the error;
 with the simulated machine's true model to at most 1 µm at rest and 0.5 µm RMS (10 µm in passing) on the path."""

@@ -3,7 +3,7 @@
 LinuxCNC's commanded axes go out as ``tool_pose_command``, its measured struts as ``strut_states``; the
 compensator's ``strut_corrections`` come back, pass a :class:`~hexapod_comp.linuxcnc.guard.CorrectionGuard`, and
 stand on pins that LinuxCNC adds to its strut commands. Load it from a HAL file with
-``loadusr -Wn hexapod_comp linuxcnc_bridge``; the README lists pins and parameters.
+``loadusr -Wn hexapod_comp linuxcnc_bridge``; doc/linuxcnc.md lists pins and parameters.
 
 The component lives as long as the process and beats as long as its loop runs; activating and deactivating the
 node only decides whether it takes part, so that deactivating ramps the corrections out like any other loss.

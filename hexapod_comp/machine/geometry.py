@@ -200,7 +200,7 @@ def paper_joints(a: float, b: float, d: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def load_geometry(path: str | Path) -> HexapodGeometry:
-    """Read a geometry file (format ``hexapod_comp/geometry``, described in the README).
+    """Read a geometry file (format ``hexapod_comp/geometry``, described in doc/own_machine.md).
 
     Parameters
     ----------

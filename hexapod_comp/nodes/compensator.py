@@ -2,7 +2,7 @@
 
 It holds no mathematics: it converts, calls :class:`~hexapod_comp.compensation.compensator.Compensator`, publishes, and
 reports what it refused. Run it with ``ros2 run hexapod_comp compensator`` or
-``python -m hexapod_comp.nodes.compensator``; the README lists topics, services and parameters.
+``python -m hexapod_comp.nodes.compensator``; doc/nodes.md lists topics, services and parameters.
 """
 
 from __future__ import annotations

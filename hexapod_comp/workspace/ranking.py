@@ -185,7 +185,8 @@ def ranking_text(rows: Sequence[RankingRow], with_paper: bool = True) -> str:
         lines.append([row.title, *(_cell(row, printed, column) for column in range(4))])
     parts = [aligned(head, lines)]
     if with_paper:
-        parts.append("In brackets: 004, Table 1, of a machine whose geometry is not printed, so not to be met.")
+        source = "v. Daake et al., Table 1, of a machine whose geometry is not printed, so not to be met"
+        parts.append(f"In brackets: {source}.")
     parts.append(aligned(["error type", "figure", "by", "tool x, y, z mm", "α, β, γ °"], _places(rows)))
     failed = sum(row.failed for row in rows)
     if failed:

@@ -410,7 +410,7 @@ def test_report(real, real_fit):
     assert text.count("x line at y -203.2, z 350.0 mm\n") == 6  # dx, ry, rz, there and back
     assert f"({100.0 * found.paper.reduction:.1f} % less)" in text
     assert "σ repeated" in text
-    assert "001's metric" not in report(real_fit)
+    assert "metric of Mou & King" not in report(real_fit)
 
 
 def test_strut_errors_of_a_lifted_machine(geometry):

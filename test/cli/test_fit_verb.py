@@ -144,7 +144,7 @@ def test_fit_reports_all_its_sections(done: Calibration) -> None:
         "not seen (left near nominal): base 1",
         "ISO 230-2:2014, both directions",
         "On the virtual machine, without → with the model",
-        "001's metric, mean |displacement error|",
+        "metric of Mou & King, mean |displacement error|",
         f"model: {done.file('model.yaml')}",
         f"picture: {done.file('pictures')}/fit.png",
         f"picture: {done.file('pictures')}/left.png",
@@ -280,7 +280,7 @@ def test_scheme_lines(hexapod: Program, done: Calibration, tmp_path: Path) -> No
     assert "R² least" in out
     assert "4 runs are not parallel to an axis" in out
     assert "ISO 230-2:2014" in out
-    assert "001's metric" in out
+    assert "metric of Mou & King" in out
     assert "error vector in space, RMS, datum aligned" in out
     model = load_model(tmp_path / "lines.yaml", load_geometry(config_file("paper")))
     np.testing.assert_allclose(model.field.box, BOX, atol=1e-12)

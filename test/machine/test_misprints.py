@@ -143,7 +143,7 @@ MISPRINTS = {
 def section() -> str:
     """Return section 21 of doc/theory.md."""
     text = (ROOT / "doc" / "theory.md").read_text(encoding="utf-8")
-    return text.partition("## 21. Misprints")[2].partition("### 001 and 004")[0]
+    return text.partition("## 21. Misprints")[2].partition("### The other two papers")[0]
 
 
 @pytest.mark.parametrize("name", MISPRINTS)
