@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 from rclpy.lifecycle import LifecycleNode
 from rclpy.service import Service
 from std_srvs.srv import Trigger
 
-from ..compensation.journal import Source
+from ..compensation.compensator import Compensator
 from ..errors import HexapodError
-from ..machine.model import MachineModel
 from .health import Refusals
+from .machine_files import MachineFiles
 from .model_loading import Loading
 from .runtime import LateService
 
@@ -24,10 +23,10 @@ class ReloadService:
     ----------
     node : LifecycleNode
         Where the service is.
-    begin : callable
-        Begins to load the file; raises HexapodError where it may not be read.
-    take : callable
-        Takes the model and its text.
+    files : MachineFiles
+        Where the model is read.
+    compensator : Compensator
+        Takes the model.
     failures : Refusals
         Where failures are counted.
     """
@@ -35,11 +34,11 @@ class ReloadService:
     def __init__(
         self,
         node: LifecycleNode,
-        begin: Callable[[], Loading],
-        take: Callable[[MachineModel, Source], None],
+        files: MachineFiles,
+        compensator: Compensator,
         failures: Refusals,
     ) -> None:
-        self._node, self._begin, self._take, self._failures = node, begin, take, failures
+        self._node, self._files, self._compensator, self._failures = node, files, compensator, failures
         self._loading: Loading | None = None
         self._late = LateService(node, Trigger, "~/reload_model", self._on_request)
 
@@ -52,7 +51,7 @@ class ReloadService:
         if self._loading is not None:
             return Trigger.Response(success=False, message="the model is being loaded already")
         try:
-            self._loading = self._begin()
+            self._loading = self._files.begin_loading(self._compensator.geometry.name)
         except HexapodError as error:
             return self._failed(error)
         return None
@@ -65,7 +64,8 @@ class ReloadService:
         self._loading = None
         try:
             model, source = loading.result()
-            self._take(model, source)
+            self._compensator.set_model(model)
+            self._files.sources["model"] = source
         except HexapodError as error:
             self._late.answer(self._failed(error))
             return

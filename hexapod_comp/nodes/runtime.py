@@ -78,6 +78,11 @@ class MachineNode(LifecycleNode):
         guarded = self.guard.answering(srv_name, srv_type, callback)
         return super().create_service(srv_type, srv_name, guarded, *arguments, **options)
 
+    @property
+    def active(self) -> bool:
+        """Whether the node acts."""
+        return self._active
+
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop acting; the struts keep their last command."""
         self._active = False

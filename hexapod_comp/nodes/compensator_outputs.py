@@ -1,0 +1,107 @@
+"""What a compensator publishes: strut commands and corrections, pose estimates, markers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped
+from rclpy.publisher import Publisher
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from visualization_msgs.msg import MarkerArray
+
+from ..compensation.compensator import Compensator
+from .markers import machine_markers
+from .messages import write_pose
+from .runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, STATE_QOS, MachineNode
+from .stamps import period
+from .wire import StrutBytes, read_pose_bytes
+
+
+class CompensatorOutputs:
+    """Publishers of a configured compensator.
+
+    Parameters
+    ----------
+    node : MachineNode
+        Publishes.
+    compensator : Compensator
+        What is published.
+    options : dict
+        The node's parameters.
+    """
+
+    def __init__(self, node: MachineNode, compensator: Compensator, options: dict[str, Any]) -> None:
+        self._node, self._compensator, self._frame = node, compensator, options["base_frame"]
+        self._commands = node.publish_on(JointState, "strut_commands", COMMAND_QOS)
+        self._corrections = node.publish_on(JointState, "strut_corrections", COMMAND_QOS)
+        self._estimates = node.publish_on(PoseStamped, "tool_pose_estimate", STATE_QOS)
+        self._markers = node.create_publisher(MarkerArray, "~/markers", EVENT_QOS)
+        self._array: Publisher | None = None
+        if options["publish_array"]:
+            self._array = node.publish_on(Float64MultiArray, "strut_commands_array", COMMAND_QOS)
+        self._array_out = Float64MultiArray(data=[0.0] * 6)
+        self._array_view = np.frombuffer(self._array_out.data, dtype=float)
+        self._command_out, self._correction_out = StrutBytes(), StrutBytes()
+        self._estimate_out = PoseStamped()
+        self._estimate_out.header.frame_id = self._frame
+        self._answered = 0
+
+    @property
+    def command_topic(self) -> str:
+        """Full name of the topic of strut commands."""
+        return self._commands.topic_name
+
+    def command(self, when: int) -> None:
+        """Publish the compensator's command and correction, stamped `when`, ns."""
+        self._command_out.write(self._compensator.command, period(self._answered, when))
+        self._answered = when
+        self._commands.publish(self._command_out.stamped(when))
+        self._correction_out.write(self._compensator.correction)
+        self._corrections.publish(self._correction_out.stamped(when))
+        if self._array is not None:
+            self._array_view[:] = self._compensator.command
+            self._array.publish(self._array_out)
+
+    def forget(self) -> None:
+        """Take the next command as the first: its velocity is zero."""
+        self._answered = 0
+
+    def estimate(self, pose: np.ndarray, stamp: Time) -> None:
+        """Publish a pose, shape (12,): position, m, and rotation matrix, row by row."""
+        write_pose(self._estimate_out, pose[:3], pose[3:].reshape((3, 3)))
+        self._estimate_out.header.stamp = stamp
+        self._estimates.publish(self._estimate_out)
+
+    def markers(self, corrects: bool) -> None:
+        """Publish the machine as it stands, if anybody looks; with zero corrections before the first command."""
+        if not self._markers.get_subscription_count():
+            return
+        correction = self._compensator.correction if corrects else np.zeros(6)
+        now, pose = self._node.get_clock().now().to_msg(), self._compensator.platform_estimate
+        self._markers.publish(machine_markers(self._compensator.geometry, *pose, correction, self._frame, now))
+
+    def wait(self) -> None:
+        """Wait until the last command has arrived."""
+        self._commands.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+
+    def close(self) -> None:
+        """Destroy the publishers."""
+        for publisher in (self._commands, self._corrections, self._estimates, self._markers, self._array):
+            if publisher is not None:
+                self._node.destroy_publisher(publisher)
+
+
+def warm_up(compensator: Compensator) -> None:
+    """Run every kernel of the loop once, so that none compiles while the machine moves."""
+    trial = Compensator(compensator.geometry, compensator.model)
+    home = trial.geometry.tool_pose(trial.geometry.home)
+    message = PoseStamped()
+    write_pose(message, home.position, home.rotation)
+    _, _, numbers = read_pose_bytes(serialize_message(message))
+    trial.step(numbers, 0.0)
+    trial.estimate(trial.command)
+    StrutBytes().write(trial.command)
