@@ -54,7 +54,8 @@ class Feedback:
     ) -> None:
         self._node, self._compensator, self._status = node, compensator, status
         self._publish, self._stopped = publish, stopped
-        self._order, self._reader, self._range = InOrder("strut_states"), StrutReader(), StrokeRange(compensator.geometry)
+        self._order, self._reader = InOrder("strut_states"), StrutReader()
+        self._range = StrokeRange(compensator.geometry)
         self._filter = TemperatureFilter(options["temperature_time_constant_s"])
         self._subscriptions = (
             node.listen_to(JointState, "strut_states", self._on_states, STATE_QOS),
