@@ -146,7 +146,7 @@ def summed_up(case: Case, machines: list[Machine]) -> Row:
     before, after = (np.array([_figure(case, m, which) for m in machines]) for which in ("before", "after"))
     together = np.mean if case.figure == "paper" else lambda v: np.sqrt(np.mean(v**2))
     removed = 1.0 - together(after) / together(before)
-    largest = max(m.worth.after.aligned_max for m in machines)
+    largest = max(m.worth.after.aligned.largest for m in machines)
     expected = [m.expected for m in machines if m.expected is not None]
     return Row(
         case=case.name,
@@ -162,7 +162,7 @@ def summed_up(case: Case, machines: list[Machine]) -> Row:
         bar=case.bar,
         met=bool(removed >= case.bar and together(after) <= case.largest_rms and largest <= case.largest),
         expected=1e6 * float(np.sqrt(np.mean([e[0] ** 2 for e in expected]))) if expected else None,
-        inside=sum(e[1] <= m.worth.after.aligned_rms <= e[2] for e, m in zip(expected, machines, strict=False))
+        inside=sum(e[1] <= m.worth.after.aligned.rms <= e[2] for e, m in zip(expected, machines, strict=False))
         if expected
         else None,
         seconds=float(np.median([m.seconds for m in machines])),
@@ -173,7 +173,7 @@ def _figure(case: Case, machine: Machine, which: str) -> float:
     if case.figure == "paper":
         return float(getattr(machine.worth.paper, which))
     judged = getattr(machine.worth, which)
-    return float(judged.rotation_rms if case.figure == "rotation" else judged.aligned_rms)
+    return float(judged.rotation.rms if case.figure == "rotation" else judged.aligned.rms)
 
 
 COLUMNS = "campaign, scheme|machine|figure|before|after|largest|removed|mean|least|bar|expected|s"

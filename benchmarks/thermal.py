@@ -23,13 +23,13 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.calibration import CONFIG, LARGE
-from hexapod_comp.calibration.evaluation import run
 from hexapod_comp.compensation.thermal import DEFAULT_TIME_CONSTANT, TemperatureFilter
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.model import REFERENCE_TEMPERATURE, MachineModel, RealMachine, Temperatures
-from hexapod_comp.machine.travel import Passes, random_passes
+from hexapod_comp.machine.passes import Passes, random_passes
 from hexapod_comp.measurements.campaign import load_campaign
 from hexapod_comp.virtual.imperfections import draw_model
+from hexapod_comp.virtual.trial import Trial
 
 STEEL = 11.5e-6
 """Expansion of struts, base and platform, 1/K."""
@@ -126,8 +126,9 @@ def _temperatures(drift: Drift, values: np.ndarray) -> Temperatures:
 
 def _tool(truth: RealMachine, passes: Passes, model: MachineModel, sensed: Temperatures | None) -> np.ndarray:
     """Return where the tool goes, shape (N, 3), m in ``base``."""
-    positions, rotations = run(truth, passes, model, sensed)
-    return positions + rotations @ truth.geometry.tool.position
+    trial = Trial(truth, passes)
+    errors = trial.errors(trial.commands(model, sensed))
+    return errors.points + errors.displacement
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.motion import MotionState
-from hexapod_comp.machine.travel import Passes
+from hexapod_comp.machine.passes import Passes
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import AXES, FROM_PREVIOUS, FileLine, MeasurementSet, Reading
 from hexapod_comp.measurements.runs import assemble
@@ -109,7 +109,7 @@ def tool_error(
 
 
 def _reached(truth: RealMachine, believed: RealMachine, target: Pose, way: np.ndarray) -> Pose:
-    sense = Passes(target.position[None], target.rotation[None], way[None]).senses(truth.geometry)[0]
+    sense = Passes(truth.geometry, target.position[None], target.rotation[None], way[None]).senses()[0]
     commands, _, _ = believed.commands_for(target, MotionState(sense=sense.copy()))
     return truth.pose_for(commands, sense, target)[0]
 

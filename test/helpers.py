@@ -11,6 +11,8 @@ from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.machine.geometry import HexapodGeometry, Limits
+from hexapod_comp.machine.kinematics import Structure, strut_lengths
+from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.pose import Pose
 
 DATA = Path(__file__).parent / "data"
@@ -43,6 +45,11 @@ def table_lengths() -> np.ndarray:
     """Return the ideal strut lengths of 000, Table 2, shape (10, 6), m."""
     table = read_table("table2_strut_lengths_ideal.csv")
     return np.stack([table[f"L{i}"] for i in range(1, 7)], axis=1)
+
+
+def nominal_error(machine: RealMachine, target: Pose, sense: np.ndarray) -> Pose:
+    """Return the platform pose that a machine takes when nominal lengths are commanded."""
+    return machine.pose_for(strut_lengths(Structure.of(machine.geometry), target), sense, target)[0]
 
 
 def segment_distance(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> float:

@@ -7,51 +7,19 @@ parallel to the grid, which is all that a linear laser sees.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..errors import ModelError
 from ..machine.field import CROSS_AXES
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel, RealMachine, Temperatures
-from ..machine.travel import BOTH_WAYS, Passes, drive, model_commands, nominal_commands, random_passes
+from ..machine.passes import BOTH_WAYS, Passes, random_passes
+from ..machine.size import Size
+from ..virtual.trial import Trial
 
 INCH = 0.0254
-
-
-def run(
-    truth: RealMachine, passes: Passes, model: MachineModel | None, sensed: Temperatures | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return where the machine really goes, positions (N, 3), m, and rotations (N, 3, 3) in ``base``.
-
-    Parameters
-    ----------
-    truth : RealMachine
-        The hidden truth, at its real temperatures.
-    passes : Passes
-        What it is told.
-    model : MachineModel or None
-        What the compensator believes; None: it is told nominal lengths.
-    sensed : Temperatures, optional
-        What the compensator believes the temperatures to be; 20 °C by default.
-
-    Raises
-    ------
-    ModelError
-        The model is another machine's.
-    NotConvergedError
-        The model's field is no small correction.
-    KinematicsError
-        As :func:`hexapod_comp.machine.kinematics.solve_pose`.
-    """
-    if model is None:
-        commands = nominal_commands(truth.geometry, passes)
-    else:
-        commands = model_commands(RealMachine(truth.geometry, model, sensed), passes)
-    driven = drive(truth, passes, commands)
-    return driven.positions, driven.rotations
 
 
 @dataclass(frozen=True)
@@ -62,19 +30,16 @@ class HeldOut:
     ----------
     points : int
         How many.
-    raw_rms : float
-        RMS length of the error vector, m.
-    aligned_rms, aligned_max : float
-        RMS and largest length after the datum has been aligned: one rotation and one shift for everything.
-    rotation_rms : float
-        RMS angle of the platform's rotation error after the common rotation has been taken out, rad.
+    raw, aligned : Size
+        The error vector, m, as it is, and after the datum has been aligned: one rotation and one shift for everything.
+    rotation : Size
+        The platform's rotation error after the common rotation has been taken out, rad.
     """
 
     points: int
-    raw_rms: float
-    aligned_rms: float
-    aligned_max: float
-    rotation_rms: float
+    raw: Size
+    aligned: Size
+    rotation: Size
 
 
 def held_out(
@@ -114,27 +79,17 @@ def held_out(
     Raises
     ------
     ModelError
-        Fewer than three points, or as :func:`run`.
+        Fewer than three points, or as :meth:`hexapod_comp.virtual.trial.Trial.commands`.
     """
     if points < 3:
         raise ModelError("points", "must be at least three", points)
     rng = np.random.default_rng(seed)
-    passes = random_passes(truth.geometry, box, points, tilt, rng, level)
-    positions, rotations = run(truth, passes, model, sensed)
-    tool = truth.geometry.tool.position
-    actual = positions + rotations @ tool + repeatability * rng.standard_normal(positions.shape)
-    wanted = passes.points(tool)
-    left = _length(align(actual, wanted) - wanted)
-    turned = Rotation.from_matrix(rotations @ np.swapaxes(passes.rotations, 1, 2))
-    rotation = _length((turned.mean().inv() * turned).as_rotvec())
-    return HeldOut(points, _rms(_length(actual - wanted)), _rms(left), float(left.max()), _rms(rotation))
-
-
-def align(actual: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return points (N, 3) after the rotation and shift that bring them nearest to others, m."""
-    centre, mean = wanted.mean(axis=0), actual.mean(axis=0)
-    turn, _ = Rotation.align_vectors(wanted - centre, actual - mean)
-    return turn.apply(actual - mean) + centre
+    trial = Trial(truth, random_passes(truth.geometry, box, points, tilt, rng, level))
+    errors = trial.errors(trial.commands(model, sensed))
+    stopped = repeatability * rng.standard_normal(errors.displacement.shape)
+    errors = replace(errors, displacement=errors.displacement + stopped)
+    aligned = errors.aligned()
+    return HeldOut(points, Size.of(errors.displacement), Size.of(aligned.displacement), Size.of(aligned.rotation))
 
 
 @dataclass(frozen=True)
@@ -200,7 +155,7 @@ def paper_metric(
     Raises
     ------
     ModelError
-        A line has fewer than two readings, or as :func:`run`.
+        A line has fewer than two readings, or as :meth:`hexapod_comp.virtual.trial.Trial.commands`.
     """
     rng = np.random.default_rng(seed)
     errors: list[list[np.ndarray]] = [[], []]
@@ -241,11 +196,9 @@ def _laser_readings(
     truth: RealMachine, passes: Passes, model: MachineModel | None, lines: int, sensed: Temperatures | None
 ) -> np.ndarray:
     """Return what a laser reads on :func:`_check_lines`, m, without the first reading of each, its zero."""
-    positions, rotations = run(truth, passes, model, sensed)
-    tool = truth.geometry.tool.position
-    errors = (positions + rotations @ tool - passes.points(tool)).reshape(lines, -1, 3)
-    forward = passes.directions[0]
-    readings = errors @ forward
+    trial = Trial(truth, passes)
+    errors = trial.errors(trial.commands(model, sensed)).displacement
+    readings = errors.reshape(lines, -1, 3) @ passes.directions[0]
     return (readings[:, 1:] - readings[:, :1]).ravel()
 
 
@@ -268,17 +221,17 @@ class Worth:
     @property
     def raw_reduction(self) -> float:
         """Share of the RMS error in space that is removed, 0…1."""
-        return 1.0 - self.after.raw_rms / self.before.raw_rms
+        return 1.0 - self.after.raw.rms / self.before.raw.rms
 
     @property
     def aligned_reduction(self) -> float:
         """The same after the datum has been aligned, without and with the model."""
-        return 1.0 - self.after.aligned_rms / self.before.aligned_rms
+        return 1.0 - self.after.aligned.rms / self.before.aligned.rms
 
     @property
     def rotation_reduction(self) -> float:
         """Share of the RMS rotation error that is removed, 0…1."""
-        return 1.0 - self.after.rotation_rms / self.before.rotation_rms
+        return 1.0 - self.after.rotation.rms / self.before.rotation.rms
 
 
 def worth(
@@ -298,13 +251,3 @@ def worth(
     before = held_out(truth, None, box, points, seed, repeatability, level=level)
     after = held_out(truth, model, box, points, seed, repeatability, sensed=sensed, level=level)
     return Worth(before, after, paper_metric(truth, model, box, seed=seed, sensed=sensed, level=level))
-
-
-def _length(vectors: np.ndarray) -> np.ndarray:
-    """Return the lengths of (N, 3) vectors."""
-    return np.linalg.norm(vectors, axis=1)
-
-
-def _rms(values: np.ndarray) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import CalibrationError
 from ..machine.model import REFERENCE_TEMPERATURE, MachineModel, ModelOrigin
+from ..machine.size import rms
 from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementSet, refuse_unmoved
 from .estimation import HUBER, OUTLIER, Estimation, Posterior, Solution, held_out, iterate, physical_covariance
 from .observability import Observability, ToolError, expected_error, observe, without_trace
@@ -361,6 +362,6 @@ def _named(
     kept = ", ".join(block.name for block in space.blocks)
     lengths = [c.held_out for c in channels if c.kind not in ANGULAR_KINDS]
     note = f"scheme joint, {len(measurements)} readings, blocks {kept} (of {tried + 1} tried)"
-    residual = float(np.sqrt(np.mean(np.square(lengths)))) if lengths else None
+    residual = rms(lengths) if lengths else None
     origin = ModelOrigin(date.today().isoformat(), measurements.files, residual, note)
     return replace(space.model(solution.x.round(DIGITS)), origin=origin)

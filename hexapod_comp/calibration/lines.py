@@ -44,6 +44,7 @@ from numpy.polynomial import Legendre, Polynomial, legendre
 from ..errors import CalibrationError
 from ..machine.field import CROSS_AXES, GridField
 from ..machine.model import MachineModel, ModelOrigin
+from ..machine.size import rms
 from ..measurements.readings import AXES, KINDS, LEAST_NOISE, MeasurementSet, refuse_unmoved
 from .grid_readings import (
     Readings,
@@ -215,7 +216,7 @@ def _misfit(measurements: MeasurementSet, fits: Sequence[LineFit]) -> str:
             (left, [fit.residual_std for fit in mine]),
         ):
             if values:
-                found[int(kind)] = float(np.sqrt(np.mean(np.square(values))))
+                found[int(kind)] = rms(values)
     return measurements.misfit(repeated, MISFIT) or measurements.misfit(left, LINES_MISFIT)
 
 

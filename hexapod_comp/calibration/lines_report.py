@@ -103,10 +103,10 @@ def _worth_lines(worth: Worth) -> Iterator[str]:
     along = _fall(paper.before, paper.after, "µm")
     yield f"On the virtual machine, without → with the model (held out: {after.points} points, both ways):"
     yield f"  metric of Mou & King, mean |displacement error| along {paper.lines} lines: {along}"
-    yield f"  error vector in space, RMS, datum aligned: {_fall(before.aligned_rms, after.aligned_rms, 'µm')}"
-    yield f"  its largest: {_fall(before.aligned_max, after.aligned_max, 'µm')}"
-    yield f"  error vector in space, RMS, as it is: {_fall(before.raw_rms, after.raw_rms, 'µm')}"
-    yield f"  rotation, RMS, datum aligned: {_fall(before.rotation_rms, after.rotation_rms, 'µrad')}"
+    yield f"  error vector in space, RMS, datum aligned: {_fall(before.aligned.rms, after.aligned.rms, 'µm')}"
+    yield f"  its largest: {_fall(before.aligned.largest, after.aligned.largest, 'µm')}"
+    yield f"  error vector in space, RMS, as it is: {_fall(before.raw.rms, after.raw.rms, 'µm')}"
+    yield f"  rotation, RMS, datum aligned: {_fall(before.rotation.rms, after.rotation.rms, 'µrad')}"
 
 
 def _fall(before: float, after: float, unit: str) -> str:

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..machine.model import REFERENCE_TEMPERATURE, Temperatures
-from ..machine.travel import BOTH_WAYS, Passes, nominal_commands
+from ..machine.passes import Passes, random_directions
+from ..machine.size import rms
 from ..measurements.readings import Stations
 from ..pose import rotation_from_angles
+from ..virtual.trial import without_datum
 from .estimation import LinearProblem, Posterior, physical_covariance
 from .parameters import ParameterSpace
 from .sensitivity import derivatives, predict
@@ -265,7 +267,7 @@ def expected_error(
     def shown(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return RMS displacement and rotation of errors (M, 6, D) after aligning the datum."""
         turned = errors[:, 3:] - errors[:, 3:].mean(axis=0)
-        squares = (_aligned(points, errors[:, :3]) ** 2).sum(axis=1), (turned**2).sum(axis=1)
+        squares = (without_datum(points, errors[:, :3]) ** 2).sum(axis=1), (turned**2).sum(axis=1)
         return np.sqrt(squares[0].mean(axis=0)), np.sqrt(squares[1].mean(axis=0))
 
     errors = prediction.errors[:, :, None] if prior is None else rows @ _drawn(prior)
@@ -279,12 +281,12 @@ def expected_error(
     low, high = np.percentile(after, [2.5, 97.5])
     high = max(high, np.percentile(possible, 97.5))
     return ToolError(
-        before=_rms(before),
-        after=_rms(after),
+        before=rms(before),
+        after=rms(after),
         low=float(low),
         high=float(high),
-        rotation_before=_rms(rotation_before),
-        rotation_after=_rms(rotation_after),
+        rotation_before=rms(rotation_before),
+        rotation_after=rms(rotation_after),
     )
 
 
@@ -303,24 +305,17 @@ def left_in_space(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, 
     """
     level = np.tile(space.level, (len(points), 1, 1))
     along_x = np.tile(space.geometry.work.rotation[:, 0], (len(points), 1))
-    every = Passes(points - space.level @ space.probe, level, along_x)
-    reachable = np.array([refusal is None for refusal in every.refusals(space.geometry)])
+    every = Passes(space.geometry, points - space.level @ space.probe, level, along_x)
+    reachable = every.reachable()
     left = np.full(len(points), np.nan)
     if not reachable.any():
         return left
-    stations = _there_and_back(space, every.select(reachable))
+    stations = _stations(every.select(reachable).both_ways())
     rows = derivatives(space, predict(space, x, stations), stations)[:, :3]
     places = np.tile(points[reachable], (2, 1))
-    squares = (_aligned(places, rows @ _drawn(covariance)) ** 2).sum(axis=1).mean(axis=1)
+    squares = (without_datum(places, rows @ _drawn(covariance)) ** 2).sum(axis=1).mean(axis=1)
     left[reachable] = np.sqrt(squares.reshape(2, -1).mean(axis=0))
     return left
-
-
-def _aligned(points: np.ndarray, displacements: np.ndarray) -> np.ndarray:
-    """Return displacements (M, 3, D) of points (M, 3) less what one shift and rotation of the datum explain."""
-    free = np.linalg.qr(_datum(points - points.mean(axis=0)))[0]
-    flat = displacements.reshape(3 * len(points), -1)
-    return (flat - free @ (free.T @ flat)).reshape(displacements.shape)
 
 
 def _drawn(covariance: np.ndarray) -> np.ndarray:
@@ -328,17 +323,6 @@ def _drawn(covariance: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(covariance)
     z = np.random.default_rng(SEED).standard_normal((len(covariance), DRAWS))
     return vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * z)
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt((values**2).mean()))
-
-
-def _datum(points: np.ndarray) -> np.ndarray:
-    """Return how a shift and a rotation of the datum move points (n, 3), shape (3n, 6)."""
-    columns = [np.tile(axis, (len(points), 1)) for axis in np.eye(3)]
-    columns += [np.cross(axis, points) for axis in np.eye(3)]
-    return np.stack([column.ravel() for column in columns], axis=1)
 
 
 def box_stations(space: ParameterSpace, tilt: float = 0.0) -> Stations | None:
@@ -349,30 +333,22 @@ def box_stations(space: ParameterSpace, tilt: float = 0.0) -> Stations | None:
     """
     rng = np.random.default_rng(SEED)
     points = space.places(rng.uniform(space.work_box[0], space.work_box[1], (POINTS, 3)))
-    directions = rng.standard_normal((POINTS, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = random_directions(rng, POINTS)
     headings = rng.uniform(0.0, 2.0 * np.pi, POINTS)
     angles = tilt * np.stack([np.cos(headings), np.sin(headings), np.zeros(POINTS)], axis=1)
     work = space.geometry.work.rotation
     rotations = work @ rotation_from_angles(angles) @ work.T @ space.level
-    every = Passes(points - rotations @ space.probe, rotations, directions)
-    reachable = np.array([refusal is None for refusal in every.refusals(space.geometry)])
-    if not reachable.any():
-        return None
-    return _there_and_back(space, every.select(reachable))
+    every = Passes(space.geometry, points - rotations @ space.probe, rotations, directions)
+    reachable = every.reachable()
+    return _stations(every.select(reachable).both_ways()) if reachable.any() else None
 
 
-def _there_and_back(space: ParameterSpace, there: Passes) -> Stations:
-    """Return the stations of passes there, and then of the same passes back."""
-    passes = Passes(
-        np.tile(there.positions, (2, 1)),
-        np.tile(there.rotations, (2, 1, 1)),
-        np.concatenate([way * there.directions for way in BOTH_WAYS]),
-    )
+def _stations(passes: Passes) -> Stations:
+    """Return the stations of some passes, told nominal lengths, at 20 °C."""
     return Stations(
         positions=passes.positions,
         rotations=passes.rotations,
-        commands=nominal_commands(space.geometry, passes),
-        sense=passes.senses(space.geometry),
+        commands=passes.nominal_commands(),
+        sense=passes.senses(),
         temperatures=np.full((len(passes), len(Temperatures.NAMES)), REFERENCE_TEMPERATURE),
     )

@@ -14,10 +14,10 @@ from ..kernels.struts import smooth_error
 from ..machine.field import COMPONENTS, CROSS_AXES
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths_batch
-from ..machine.model import MachineModel, RealMachine
-from ..machine.travel import Passes, commanded_box
+from ..machine.model import MachineModel, RealMachine, commanded_box
+from ..machine.passes import Passes
 from ..measurements.readings import AXES, KINDS
-from .evaluation import run
+from ..virtual.trial import Trial
 from .fit import ModelFit
 from .lines import LineFit, LinesFit
 from .observability import left_in_space
@@ -56,10 +56,8 @@ def strut_length_errors(
     errors = []
     for way in ARROWS:
         passes = Passes.of_tool(geometry, points, level, np.tile([float(way), 0.0, 0.0], (len(points), 1)))
-        actual = run(RealMachine(geometry, model), passes, None)
-        errors.append(
-            strut_lengths_batch(nominal, *actual) - strut_lengths_batch(nominal, passes.positions, passes.rotations)
-        )
+        driven = Trial(RealMachine(geometry, model), passes).drive(passes.nominal_commands())
+        errors.append(strut_lengths_batch(nominal, *driven.actual) - passes.nominal_commands())
     return np.array(errors)
 
 

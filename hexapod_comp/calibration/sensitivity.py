@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..machine.model import MachinesByTemperature
-from ..measurements.readings import Stations, attitude_error
+from ..measurements.readings import Stations
+from ..virtual.trial import drive
 from .parameters import ParameterSpace
 
 
@@ -47,19 +48,14 @@ def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Predict
     """
     positive, sense = _without_negative_backlash(space, x, stations.sense)
     model = space.model(positive, with_field=False)
-    count = len(stations)
-    positions, rotations = np.empty((count, 3)), np.empty((count, 3, 3))
-    base, platform = np.empty((count, 6, 3)), np.empty((count, 6, 3))
-    machines = MachinesByTemperature(space.geometry, model)
-    for n in range(count):
-        machine = machines.at(stations.temperatures[n])
-        actual, _ = machine.pose_for(stations.commands[n], sense[n], stations.pose(n))
-        positions[n], rotations[n] = actual.position, actual.rotation
-        base[n], platform[n] = machine.structure.base_joints, machine.structure.platform_joints
-    errors = _errors(space, stations, positions, rotations)
-    points = positions + rotations @ space.probe
-    errors += space.field_errors(x, points, stations.sense[:, :3])
-    return Prediction(errors, positions, rotations, base, platform)
+    machines = MachinesByTemperature(space.geometry, model).at_each(stations.temperatures)
+    commanded = stations.positions, stations.rotations
+    driven = drive(machines, commanded, sense, stations.commands)
+    errors = driven.errors(commanded, space.probe).as_array()
+    errors += space.field_errors(x, driven.actual[0] + driven.actual[1] @ space.probe, stations.sense[:, :3])
+    base = np.array([machine.structure.base_joints for machine in machines])
+    platform = np.array([machine.structure.platform_joints for machine in machines])
+    return Prediction(errors, *driven.actual, base, platform)
 
 
 def _without_negative_backlash(
@@ -77,13 +73,6 @@ def _without_negative_backlash(
     sense[:, 3:] *= np.where(x[block.part] < 0.0, -1.0, 1.0)
     x[block.part] = np.abs(x[block.part])
     return x, sense
-
-
-def _errors(space: ParameterSpace, stations: Stations, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Return e between commanded and actual platform poses, shape (M, 6)."""
-    actual = positions + rotations @ space.probe
-    commanded = stations.positions + stations.rotations @ space.probe
-    return np.hstack([actual - commanded, attitude_error(rotations, stations.rotations)])
 
 
 def derivatives(space: ParameterSpace, prediction: Prediction, stations: Stations) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from ..formats import texts
@@ -90,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ..errors import InputFileError
     from ..export.worth import ExportTrial
-    from ..machine.travel import commanded_box
+    from ..machine.model import commanded_box
 
     if args.linuxcnc is None and args.table is None:
         raise InputFileError("export", "--linuxcnc, --table", "at least one is needed: nothing to write")
@@ -157,8 +158,8 @@ def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray) -> lis
     left_out.append("tilt: the table holds for a level tool; above stands what a tilted one keeps")
     write_table(table, args.table, _titles(model, box))
     back = read_table(args.table)
-    by_struts = trial.check(lambda travel: commands_by_struts(back, geometry, travel))
-    by_poses = trial.check(lambda travel: commands_by_poses(back, geometry, travel))
+    by_struts = trial.check(partial(commands_by_struts, back))
+    by_poses = trial.check(partial(commands_by_poses, back))
     lost = model.struts.backlash.max() * 1e6
     backlash = [f"backlash of struts, up to {lost:.3f} µm: no pose correction fits six directions"] if lost else []
     return [("table, struts", by_struts, left_out), ("table, poses", by_poses, [*left_out, *backlash])]

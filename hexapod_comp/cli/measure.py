@@ -9,8 +9,6 @@ from ..formats import texts
 from . import common
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from ..measurements.readings import MeasurementSet
 
 SUMMARY = "measure the virtual machine: a campaign's readings as a CSV file"
@@ -78,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _report(measured: MeasurementSet, args: argparse.Namespace) -> str:
     """Say what was measured, how much of each kind, and where it went."""
+    from ..machine.size import rms
     from ..measurements.readings import ANGULAR_KINDS, KINDS
 
     told = "nominal strut lengths" if args.model == "ideal" else f"the strut lengths of {args.model}"
@@ -87,14 +86,10 @@ def _report(measured: MeasurementSet, args: argparse.Namespace) -> str:
         values = measured.value[measured.kind == number] * 1e6
         if len(values):
             unit = "urad" if kind in ANGULAR_KINDS else "um"
-            rows.append([kind, str(len(values)), _digits(_rms(values)), _digits(abs(values).max()), unit])
+            rows.append([kind, str(len(values)), _digits(rms(values)), _digits(abs(values).max()), unit])
     lines.append(texts.aligned(["channel", "readings", "rms", "max", ""], rows))
     count = f"{len(measured)} readings of {len(measured.runs)} runs at {len(measured.stations)} stations"
     return "\n".join([*lines, f"{count}: {args.out}"])
-
-
-def _rms(values: np.ndarray) -> float:
-    return float((values @ values / len(values)) ** 0.5)
 
 
 def _digits(value: float) -> str:

@@ -25,8 +25,8 @@ from ..errors import GeometryError
 from ..kernels.struts import LEAD, TWIST_HOME, command_for_length, screw_twist
 from ..machine.geometry import STRUT_NAMES
 from ..machine.model import RealMachine
-from ..machine.travel import Passes
-from .worth import Travel
+from ..machine.passes import Passes
+from ..machine.size import rms
 
 MOST_POINTS = 256
 """EMCMOT_COMP_SIZE."""
@@ -100,10 +100,11 @@ class Genhexkins:
         sine = (across * moving).sum(axis=2) / (np.linalg.norm(across, axis=2) * np.linalg.norm(moving, axis=2))
         return lengths + self.lead * np.arcsin(sine) / (2.0 * np.pi)
 
-    def commands(self, travel: Travel) -> np.ndarray:
-        """Return the motor commands, shape (N, 6), m, along a travel."""
-        joints = self.joints(travel.positions, travel.rotations)
-        ahead = self.joints(travel.positions + 1e-6 * travel.directions, travel.rotations)
+    def commands(self, passes: Passes) -> np.ndarray:
+        """Return the motor commands, shape (N, 6), m, for some passes."""
+        positions, rotations, directions = passes.of_the_tool()
+        joints = self.joints(positions, rotations)
+        ahead = self.joints(positions + 1e-6 * directions, rotations)
         corrections = [t.correction(joints[:, i], ahead[:, i] > joints[:, i]) for i, t in enumerate(self.tables)]
         return joints + np.stack(corrections, axis=1)
 
@@ -160,9 +161,9 @@ def _side(machine: RealMachine, box: np.ndarray) -> np.ndarray:
     if not geometry.screw_lead.any():
         return np.ones(6)
     nodes = _box_nodes(box, 5)
-    level = Passes.of_tool(geometry, nodes, np.tile(np.eye(3), (len(nodes), 1, 1)), np.zeros_like(nodes))
+    level = geometry.platform_poses(nodes, np.tile(np.eye(3), (len(nodes), 1, 1)))
     cosines = np.empty((len(nodes), 6))
-    for row, pose in enumerate(zip(level.positions, level.rotations, strict=True)):
+    for row, pose in enumerate(zip(*level, strict=True)):
         cosines[row] = np.cos([screw_twist(*machine.body, *pose, i) for i in range(6)])
     side = np.where(np.cos(machine.strut_arrays[0][:, TWIST_HOME]) > 0.0, 1.0, -1.0)
     nearest = (side * cosines).min(axis=0)
@@ -234,5 +235,5 @@ def table_misfit(machine: RealMachine, told: Genhexkins, box: np.ndarray) -> np.
                 for sense in (1.0, -1.0)
             ]
         )
-        misfits.append([np.sqrt((rest**2).mean()), np.abs(rest).max()])
+        misfits.append([rms(rest), np.abs(rest).max()])
     return np.array(misfits)

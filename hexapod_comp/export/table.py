@@ -28,10 +28,11 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import Structure, solve_pose
 from ..machine.model import MachineModel, RealMachine
 from ..machine.model_file import DIRECTIONS
-from ..machine.motion import MotionState
-from ..machine.travel import Passes, at, nominal_commands
+from ..machine.passes import Passes, at
+from ..measurements.readings import attitude_error
 from ..pose import Pose
-from .worth import DIAGONAL, Travel, refuse_unreachable
+from ..virtual.trial import model_commands
+from .worth import DIAGONAL
 
 POSITION = ("x", "y", "z")
 CORRECTION = tuple(f"correction_L{i}" for i in range(1, 7))
@@ -162,16 +163,16 @@ def make_table(
     if 2 * math.prod(shape) > MOST_ROWS:
         raise ModelError("step", f"gives {2 * math.prod(shape)} rows, allowed {MOST_ROWS}; take a larger one, m", step)
     places = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)
-    level = np.tile(np.eye(3), (2 * len(places), 1, 1))
-    travel = Travel(np.tile(places, (2, 1)), level, np.repeat([DIAGONAL, -DIAGONAL], len(places), axis=0))
-    refuse_unreachable(geometry, travel)
+    level = np.tile(np.eye(3), (len(places), 1, 1))
+    passes = Passes.of_tool(geometry, places, level, np.tile(DIAGONAL, (len(places), 1))).both_ways()
+    passes.refuse_unreachable()
     carried, left_out = _without_fine_waves(model, step)
     machine = RealMachine(geometry, carried)
-    held = _outside_field(machine, travel)
+    held = _outside_field(machine, passes)
     if held:
-        left_out.append(f"{held} of {len(level)} rows are outside the field's box: its boundary value is held")
-    struts, backlash = _strut_corrections(machine, travel)
-    values = (struts, backlash, _pose_corrections(geometry, travel, struts))
+        left_out.append(f"{held} of {len(passes)} rows are outside the field's box: its boundary value is held")
+    struts, backlash = _strut_corrections(machine, passes)
+    values = (struts, backlash, _pose_corrections(passes, struts))
     return GridTable((nodes[0], nodes[1], nodes[2]), *(v.reshape(2, *shape, 6) for v in values)), left_out
 
 
@@ -194,7 +195,7 @@ def _without_fine_waves(model: MachineModel, step: float) -> tuple[MachineModel,
     return replace(model, struts=smooth), [text]
 
 
-def _outside_field(machine: RealMachine, travel: Travel) -> int:
+def _outside_field(machine: RealMachine, passes: Passes) -> int:
     """Return how many rows have their measured point outside the field's box.
 
     Raises
@@ -204,7 +205,6 @@ def _outside_field(machine: RealMachine, travel: Travel) -> int:
     """
     field = machine.model.field
     low, high = field.box + np.array([[-EDGE], [EDGE]])
-    passes = travel.passes(machine.geometry)
     points = passes.points(field.probe)
     outside = ((points < low) | (points > high)).any(axis=1)
     if outside.any() and field.outside == "refuse":
@@ -214,52 +214,42 @@ def _outside_field(machine: RealMachine, travel: Travel) -> int:
     return int(outside.sum())
 
 
-def _strut_corrections(machine: RealMachine, travel: Travel) -> tuple[np.ndarray, np.ndarray]:
+def _strut_corrections(machine: RealMachine, passes: Passes) -> tuple[np.ndarray, np.ndarray]:
     """Return corrections without backlash, shape (N, 6), and backlash, shape (N, 6), m."""
-    passes = travel.passes(machine.geometry)
-    nominal = nominal_commands(machine.geometry, passes)
-    found = np.empty((3, *nominal.shape))
-    for row in range(len(passes)):
-        target = Pose(passes.positions[row], passes.rotations[row])
-        along = np.sign(passes.directions[row])
-        for k, sense in enumerate((0.0, 1.0, -1.0)):
-            motion = MotionState()
-            motion.sense[:] = np.concatenate([along, np.full(6, sense)])
-            found[k, row] = machine.commands_for(target, motion)[0]
-    return found[0] - nominal, found[1] - found[2]
+    found = []
+    for sense in (0.0, 1.0, -1.0):
+        senses = np.hstack([np.sign(passes.directions), np.full((len(passes), 6), sense)])
+        found.append(model_commands([machine] * len(passes), passes.poses, senses)[0])
+    return found[0] - passes.nominal_commands(), found[1] - found[2]
 
 
-def _pose_corrections(geometry: HexapodGeometry, travel: Travel, corrections: np.ndarray) -> np.ndarray:
+def _pose_corrections(passes: Passes, corrections: np.ndarray) -> np.ndarray:
     """Return the changes of the commanded tool pose, shape (N, 6), that amount to strut corrections (N, 6)."""
-    structure = Structure.of(geometry)
-    passes = travel.passes(geometry)
-    lengths = nominal_commands(geometry, passes) + corrections
-    changes = np.empty((len(lengths), 6))
-    for row in range(len(passes)):
-        commanded = Pose(passes.positions[row], passes.rotations[row])
-        told = geometry.tool_pose(solve_pose(structure, lengths[row], commanded))
-        changes[row, :3] = told.position - travel.positions[row]
-        changes[row, 3:] = Rotation.from_matrix(told.rotation @ travel.rotations[row].T).as_rotvec()
-    return changes
+    geometry, structure = passes.geometry, Structure.of(passes.geometry)
+    starts = map(Pose, *passes.poses)
+    lengths = passes.nominal_commands() + corrections
+    found = [solve_pose(structure, row, start) for row, start in zip(lengths, starts, strict=True)]
+    told = geometry.tool_poses(np.array([pose.position for pose in found]), np.array([pose.rotation for pose in found]))
+    positions, rotations, _ = passes.of_the_tool()
+    return np.hstack([told[0] - positions, attitude_error(told[1], rotations)])
 
 
 # Applying
 
 
-def commands_by_struts(table: GridTable, geometry: HexapodGeometry, travel: Travel) -> np.ndarray:
+def commands_by_struts(table: GridTable, passes: Passes) -> np.ndarray:
     """Return strut commands, shape (N, 6), m: nominal lengths plus strut corrections, backlash by each strut."""
-    passes = travel.passes(geometry)
-    own = passes.senses(geometry)[:, 3:]
-    corrections = table.strut_corrections(travel.positions, travel.directions[:, 0] < 0.0, own)
-    return nominal_commands(geometry, passes) + corrections
+    positions, _, directions = passes.of_the_tool()
+    corrections = table.strut_corrections(positions, directions[:, 0] < 0.0, passes.senses()[:, 3:])
+    return passes.nominal_commands() + corrections
 
 
-def commands_by_poses(table: GridTable, geometry: HexapodGeometry, travel: Travel) -> np.ndarray:
+def commands_by_poses(table: GridTable, passes: Passes) -> np.ndarray:
     """Return strut commands, shape (N, 6), m: nominal lengths of the corrected tool poses."""
-    changes = table.pose_corrections(travel.positions, travel.directions[:, 0] < 0.0)
-    rotations = Rotation.from_rotvec(changes[:, 3:]).as_matrix() @ travel.rotations
-    told = Passes.of_tool(geometry, travel.positions + changes[:, :3], rotations, travel.directions)
-    return nominal_commands(geometry, told)
+    positions, rotations, directions = passes.of_the_tool()
+    changes = table.pose_corrections(positions, directions[:, 0] < 0.0)
+    turned = Rotation.from_rotvec(changes[:, 3:]).as_matrix() @ rotations
+    return Passes.of_tool(passes.geometry, positions + changes[:, :3], turned, directions).nominal_commands()
 
 
 # Files

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from ..machine.size import rms
 from ..pose import Pose
 from .records import PathRecord, PoseRecord, SessionResult
 
@@ -68,11 +69,6 @@ def _comparison(title: str, before: np.ndarray, after: np.ndarray) -> str:
         f"{text}; without RMS {rms(before) * 1e6:.2f} µm, maximum {before.max() * 1e6:.2f} µm: "
         f"{removed:.2f} % of the RMS removed"
     )
-
-
-def rms(values: np.ndarray) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def _pose_text(pose: Pose) -> str:

@@ -18,12 +18,12 @@ from ..formats.paths import config_file
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
 from ..machine.model_file import load_model
+from ..machine.size import rms
 from ..machine.trajectory import Path, circle, commanded_in_base, join, move, pocket
 from ..pose import Pose
 from . import session
 from .processes import NodeProcess
 from .records import PoseRecord, SessionResult
-from .report import rms
 
 if TYPE_CHECKING:
     from ..nodes.client import LoopClient

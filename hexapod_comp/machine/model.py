@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..errors import ModelError, NotConvergedError, UnreachableError
+from ..errors import ModelError, NotConvergedError
 from ..kernels import kinematics as kernels
 from ..kernels.model import actual_pose_one, command_one
 from ..pose import Pose
@@ -308,27 +308,6 @@ class RealMachine:
             actual_rotation,
         )
 
-    def nominal_error(self, target: Pose, sense: np.ndarray) -> Pose:
-        """Return the platform pose that the machine takes when nominal lengths are commanded.
-
-        Parameters
-        ----------
-        target : Pose
-            Commanded ``pose_platform_in_base``.
-        sense : ndarray, shape (9,)
-            Directions of motion.
-
-        Raises
-        ------
-        UnreachableError
-            Nominal lengths cannot be computed at a pose where a strut has no length.
-        """
-        lengths = np.empty(6)
-        kernels.strut_lengths_one(*self.geometry.kernel_joints, target.position, target.rotation, lengths)
-        if not (lengths > 0.0).all():
-            raise UnreachableError("a strut would have no length at this pose")
-        return self.pose_for(lengths, sense, target)[0]
-
 
 class MachinesByTemperature:
     """Real machines at temperatures that come again and again, each made once.
@@ -350,3 +329,32 @@ class MachinesByTemperature:
             temperatures = Temperatures(dict(zip(Temperatures.NAMES, key, strict=True)))
             self._known[key] = RealMachine(self._geometry, self._model, temperatures)
         return self._known[key]
+
+    def at_each(self, temperatures: np.ndarray) -> list[RealMachine]:
+        """Return the machine at each row of temperatures, °C, shape (N, 8)."""
+        return [self.at(values) for values in temperatures]
+
+
+def commanded_box(geometry: HexapodGeometry, model: MachineModel) -> np.ndarray:
+    """Return the box of level tool positions in ``work`` for which a model was measured, shape (2, 3), m.
+
+    It is the model's valid box of platform positions, or where its field's box of measured points lets the
+    platform be. With a work frame that is turned it is the largest box of the work frame, alike in proportions to
+    the one around it, that fits inside: poses outside were not measured.
+
+    Raises
+    ------
+    ModelError
+        The model has neither.
+    """
+    level = geometry.work.rotation @ geometry.tool.rotation.T  # of the platform, when the tool is level
+    box = model.valid_box
+    if box is None and any(family.shape[4] for family in model.field.lines):
+        box = model.field.box - level @ model.field.probe
+    if box is None:
+        raise ModelError("valid_box", "the model has neither a valid box nor a field; give a box of tool positions")
+    centre, half = geometry.tool_pose(Pose(box.mean(axis=0), level)).position, 0.5 * np.ptp(box, axis=0)
+    turned = np.abs(geometry.work.rotation)
+    around = turned.T @ half
+    inside = around * (half / (turned @ around)).min()
+    return np.array([centre - inside, centre + inside])

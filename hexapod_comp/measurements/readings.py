@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import CalibrationError
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import REFERENCE_TEMPERATURE, Temperatures
+from ..machine.size import rms
 from ..pose import Pose
 
 AXES = ("x", "y", "z")
@@ -243,7 +244,7 @@ class MeasurementSet:
     def stated_of(self, kind: int) -> float:
         """Return the root mean square of :attr:`stated` over a kind's readings, m or rad; 1 where there are none."""
         mine = self.stated[self.kind == kind]
-        return float(np.sqrt((mine**2).mean())) if len(mine) else 1.0
+        return rms(mine) if len(mine) else 1.0
 
     def misfit(self, found: Mapping[int, float], times: float) -> str:
         """Return what is wrong when kinds of reading are further off than they may be; empty when none is.

@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import InputFileError
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths
-from ..machine.travel import Passes
+from ..machine.passes import Passes
 from ..pose import Pose
 from .readings import (
     ANGULAR_KINDS,
@@ -211,7 +211,7 @@ def _sense(
 ) -> np.ndarray:
     """Return the directions of motion at a station, shape (9,); `came_from` is the station before."""
     if direction in (FORWARD, BACKWARD):
-        return Passes(pose.position[None], pose.rotation[None], direction * run.axis[None]).senses(geometry)[0]
+        return Passes(geometry, pose.position[None], pose.rotation[None], direction * run.axis[None]).senses()[0]
     if came_from is not None:
         change = np.concatenate([pose.position - came_from[0], commands - came_from[2]])
         return np.sign(change) * (np.abs(change) > SAME)

@@ -12,15 +12,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from ..errors import KinematicsError
 from ..machine.geometry import HexapodGeometry
-from ..machine.kinematics import Structure, strut_lengths
-from ..machine.model import MachineModel, RealMachine
-from ..machine.motion import FOLLOWED, MotionState
-from ..pose import Pose, rotation_angle
+from ..machine.model import RealMachine
+from ..machine.passes import Passes, Poses
+from ..measurements.readings import attitude_error
+from ..pose import Pose
 from .imperfections import ImperfectionBounds, draw_model
+from .trial import drive, model_commands
 
 
 @dataclass(frozen=True)
@@ -109,47 +108,29 @@ def assess(
         Seed or bounds that are none.
     """
     names = names or [f"pose {n + 1}" for n in range(len(poses))]
-    platform = [geometry.platform_pose(pose) for pose in poses]
-    ideal = np.array([strut_lengths(Structure.of(geometry), pose) for pose in platform])
+    tool = np.array([pose.position for pose in poses]), np.array([pose.rotation for pose in poses])
+    passes = Passes.of_tool(geometry, *tool, np.zeros_like(tool[0]))
     seeds = tuple(range(seed, seed + machines))
     runs = []
     for one in seeds:
-        runs.append(_run_machine(geometry, draw_model(geometry, bounds, one), poses, platform, ideal, names))
+        runs.append(_run_machine(RealMachine(geometry, draw_model(geometry, bounds, one)), passes, tool, names))
         progress(1)
     real, positions, rotations, errors, trips = (np.array(part) for part in zip(*runs, strict=True))
-    return Assessment(seeds, ideal, real, positions, rotations, errors, trips)
+    return Assessment(seeds, passes.nominal_commands(), real, positions, rotations, errors, trips)
 
 
-def _run_machine(
-    geometry: HexapodGeometry,
-    model: MachineModel,
-    poses: Sequence[Pose],
-    platform: Sequence[Pose],
-    ideal: np.ndarray,
-    names: Sequence[str],
-) -> tuple[np.ndarray, ...]:
-    """Return real lengths, taken positions and rotations, pose errors and round trips of one machine."""
-    machine = RealMachine(geometry, model)
-    rows = []
-    for n, pose in enumerate(poses):
-        try:
-            rows.append(_run_pose(geometry, machine, pose, platform[n], ideal[n]))
-        except KinematicsError as error:
-            raise KinematicsError(f"{names[n]}, {model.name}: {error}", error.value, error.limit) from error
-    real, positions, rotations, errors, trips = (np.array(part) for part in zip(*rows, strict=True))
-    return real, positions, rotations, errors, trips
+def _run_machine(machine: RealMachine, passes: Passes, tool: Poses, names: Sequence[str]) -> tuple[np.ndarray, ...]:
+    """Return real lengths, taken tool poses, their errors and round trips of one machine; `tool` as commanded."""
 
+    def name_of(n: int) -> str:
+        return f"{names[n]}, {machine.model.name}"
 
-def _run_pose(
-    geometry: HexapodGeometry, machine: RealMachine, pose: Pose, platform: Pose, ideal: np.ndarray
-) -> tuple[np.ndarray, ...]:
-    unknown = np.zeros(FOLLOWED)
-    real, model_pose, _ = machine.commands_for(platform, MotionState())
-    taken = geometry.tool_pose(machine.pose_for(ideal, unknown, platform)[0])
-    turn = Rotation.from_matrix(taken.rotation @ pose.rotation.T).as_rotvec()
+    machines, unknown = [machine] * len(passes), passes.senses()
+    real, modelled = model_commands(machines, passes.poses, unknown, name_of)
+    driven = drive(machines, passes.poses, unknown, passes.nominal_commands(), name_of)
+    taken = machine.geometry.tool_poses(*driven.actual)
     # The start is 1 mm off, so that Newton has something to do.
-    start = Pose(model_pose.position + 1e-3, model_pose.rotation)
-    back = machine.pose_for(real, unknown, start)[0]
-    distance = float(np.linalg.norm(back.position - platform.position))
-    trip = np.array([distance, rotation_angle(back.rotation @ platform.rotation.T)])
-    return real, taken.position, taken.rotation, np.concatenate([taken.position - pose.position, turn]), trip
+    back = drive(machines, (modelled[0] + 1e-3, modelled[1]), unknown, real, name_of)
+    trip = back.errors(passes.poses, np.zeros(3)).as_array().reshape(-1, 2, 3)
+    errors = np.hstack([taken[0] - tool[0], attitude_error(taken[1], tool[1])])
+    return real, *taken, errors, np.linalg.norm(trip, axis=2)

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from ..errors import HexapodError, KinematicsError
 from ..machine.model import MachineModel, MachinesByTemperature, RealMachine
-from ..machine.motion import MotionState
 from ..measurements.campaign import Campaign
-from ..measurements.readings import AXES, CHANNELS, KINDS, MeasurementSet, attitude_error
+from ..measurements.readings import AXES, CHANNELS, KINDS, MeasurementSet
+from .trial import drive, model_commands
 
 VISITS, SLOPES, NOISE = range(3)
 """Streams of random numbers, one per cause: changing one leaves the others' draws alone."""
@@ -26,7 +26,7 @@ def measure(
     campaign: Campaign,
     truth: RealMachine,
     seed: int,
-    advance: Callable[[int], object] | None = None,
+    advance: Callable[[int], object] = lambda stations: None,
 ) -> MeasurementSet:
     """Return a template's readings as instruments would take them on the real machine.
 
@@ -63,28 +63,18 @@ def measure(
 
 
 def station_errors(
-    measurements: MeasurementSet, truth: RealMachine, advance: Callable[[int], object] | None = None
+    measurements: MeasurementSet, truth: RealMachine, advance: Callable[[int], object] = lambda stations: None
 ) -> np.ndarray:
     """Return the real error of the measured point at each station, shape (M, 6), m and rad along ``base``.
 
     Displacement of the point and rotation of the platform, actual minus commanded, under the stations'
     commands, directions of motion and temperatures.
     """
-    machines = MachinesByTemperature(truth.geometry, truth.model)
-    stations, probe = measurements.stations, measurements.probe
-    errors = np.empty((len(stations), 6))
-    for n in range(len(stations)):
-        commanded = stations.pose(n)
-        try:
-            machine = machines.at(stations.temperatures[n])
-            actual, _ = machine.pose_for(stations.commands[n], stations.sense[n], commanded)
-        except KinematicsError as error:
-            raise _at_station(measurements, n, error) from error
-        errors[n, :3] = actual.position - commanded.position + (actual.rotation - commanded.rotation) @ probe
-        errors[n, 3:] = attitude_error(actual.rotation, commanded.rotation)
-        if advance is not None:
-            advance(1)
-    return errors
+    machines = MachinesByTemperature(truth.geometry, truth.model).at_each(measurements.stations.temperatures)
+    stations, name_of = measurements.stations, partial(_station_name, measurements)
+    commanded = stations.positions, stations.rotations
+    driven = drive(machines, commanded, stations.sense, stations.commands, name_of, advance)
+    return driven.errors(commanded, measurements.probe).as_array()
 
 
 def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet:
@@ -102,25 +92,19 @@ def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet
     HexapodError
         A pose at which the model cannot be undone; names the reading.
     """
-    machines, stations = MachinesByTemperature(template.geometry, model), template.stations
-    commands = np.empty_like(stations.commands)
-    for n in range(len(stations)):
-        motion = MotionState(sense=stations.sense[n].copy())
-        try:
-            machine = machines.at(stations.temperatures[n])
-            commands[n] = machine.commands_for(stations.pose(n), motion)[0]
-        except KinematicsError as error:
-            raise _at_station(template, n, error) from error
+    stations = template.stations
+    machines = MachinesByTemperature(template.geometry, model).at_each(stations.temperatures)
+    targets, name_of = (stations.positions, stations.rotations), partial(_station_name, template)
+    commands, _ = model_commands(machines, targets, stations.sense, name_of)
     return replace(template, stations=replace(stations, commands=commands))
 
 
-def _at_station(measurements: MeasurementSet, station: int, error: KinematicsError) -> HexapodError:
-    """Return an error that says at which reading it happened."""
+def _station_name(measurements: MeasurementSet, station: int) -> str:
+    """Return at which reading a station comes first."""
     reading = int((measurements.station == station).argmax())
     position = (measurements.stations.positions[station] * 1e3).round(3).tolist()
     run = measurements.runs[measurements.run[reading]].name
-    where = f"run {run}, reading {reading + 1}, platform at {position} mm"
-    return KinematicsError(f"{where}: {error}", error.value, error.limit)
+    return f"run {run}, reading {reading + 1}, platform at {position} mm"
 
 
 def _stopping(template: MeasurementSet, repeatability: float, rng: np.random.Generator) -> np.ndarray:

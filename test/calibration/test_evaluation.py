@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.calibration.evaluation import INCH, held_out, paper_metric, run, worth
+from hexapod_comp.calibration.evaluation import INCH, held_out, paper_metric, worth
 from hexapod_comp.errors import ModelError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.field import GridField
@@ -14,10 +14,11 @@ from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import Structure, jacobian
 from hexapod_comp.machine.model import MachineModel, RealMachine, Temperatures
 from hexapod_comp.machine.motion import MotionState
+from hexapod_comp.machine.passes import Passes, random_passes
 from hexapod_comp.machine.struts import StrutErrors
-from hexapod_comp.machine.travel import Passes, random_passes
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
+from hexapod_comp.virtual.trial import Trial
 
 BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])
 BOUNDS = ImperfectionBounds(joint=1e-4, strut_offset=1e-4, pitch=1e-4, wave=(4e-6, 4e-6), backlash=(3e-6, 5e-6))
@@ -60,18 +61,18 @@ def field_machine(geometry: HexapodGeometry, forward: list[float], backward: lis
 def test_the_true_model_leaves_nothing(truth, tilt):
     """Backward and forward run of one model: rounding, 1e-12 m as in test_machine."""
     found = held_out(truth, truth.model, BOX, 200, seed=3, tilt=tilt)
-    assert found.raw_rms < 1e-12
-    assert found.rotation_rms < 1e-11
+    assert found.raw.rms < 1e-12
+    assert found.rotation.rms < 1e-11
 
 
 def test_a_shifted_machine_errs_by_the_shift_and_aligned_not_at_all(geometry, framed):
     """Closed form: every point is off by the same vector, 50 µm long, whatever tool and work frame."""
     for machine in (geometry, framed):
         found = held_out(moved(machine, np.zeros(3), np.array([30e-6, 0.0, -40e-6])), None, BOX * 0.5, 100)
-        assert found.raw_rms == pytest.approx(50e-6, abs=1e-11)
-        assert found.aligned_rms < 1e-11
-        assert found.aligned_max < 1e-11
-        assert found.rotation_rms < 1e-9
+        assert found.raw.rms == pytest.approx(50e-6, abs=1e-11)
+        assert found.aligned.rms < 1e-11
+        assert found.aligned.largest < 1e-11
+        assert found.rotation.rms < 1e-9
 
 
 def test_a_turned_machine_has_no_error_once_aligned(geometry, framed):
@@ -79,17 +80,17 @@ def test_a_turned_machine_has_no_error_once_aligned(geometry, framed):
     turn = np.array([1e-4, -2e-4, 3e-4])
     for machine in (geometry, framed):
         found = held_out(moved(machine, turn, np.array([1e-4, 0.0, 0.0])), None, BOX * 0.5, 100, tilt=0.1)
-        assert found.raw_rms > 5e-5
-        assert found.aligned_rms < 1e-11
-        assert found.rotation_rms < 1e-9
+        assert found.raw.rms > 5e-5
+        assert found.aligned.rms < 1e-11
+        assert found.rotation.rms < 1e-9
 
 
 def test_repeatability_alone(geometry):
     """√3 times the figure per axis; 6000 draws scatter by 1/√12000 ≈ 1 %, four times that is allowed."""
     perfect = RealMachine(geometry, MachineModel(geometry.name))
     found = held_out(perfect, None, BOX, 1000, repeatability=1e-6)
-    assert found.raw_rms == pytest.approx(np.sqrt(3.0) * 1e-6, rel=0.04)
-    assert found.rotation_rms < 1e-9
+    assert found.raw.rms == pytest.approx(np.sqrt(3.0) * 1e-6, rel=0.04)
+    assert found.rotation.rms < 1e-9
 
 
 def test_temperatures_seen_and_not_seen(geometry):
@@ -97,8 +98,8 @@ def test_temperatures_seen_and_not_seen(geometry):
     model = MachineModel(geometry.name, struts=StrutErrors(expansion=np.full(6, 11e-6)))
     warm = Temperatures(dict.fromkeys(Temperatures.NAMES, 21.0))
     truth = RealMachine(geometry, model, warm)
-    assert held_out(truth, model, BOX, 50, sensed=warm).raw_rms < 1e-12
-    assert held_out(truth, model, BOX, 50).raw_rms > 4e-6
+    assert held_out(truth, model, BOX, 50, sensed=warm).raw.rms < 1e-12
+    assert held_out(truth, model, BOX, 50).raw.rms > 4e-6
     assert paper_metric(truth, model, BOX, lines=2, sensed=warm).after < 1e-12
 
 
@@ -107,8 +108,9 @@ def test_all_passes_at_once_are_the_machine_one_by_one(framed):
     truth = RealMachine(framed, draw_model(framed, BOUNDS, 5))
     model = draw_model(framed, BOUNDS, 6)
     passes = random_passes(framed, BOX * 0.5 + np.array([0.0, 0.0, 0.1]), 20, 0.1, np.random.default_rng(0))
-    positions, rotations = run(truth, passes, model)
-    believed, found = RealMachine(framed, model), passes.senses(framed)
+    trial = Trial(truth, passes)
+    positions, rotations = trial.drive(trial.commands(model)).actual
+    believed, found = RealMachine(framed, model), passes.senses()
     for n in range(len(passes)):
         pose = Pose(passes.positions[n], passes.rotations[n])
         motion = MotionState()

@@ -389,10 +389,10 @@ def test_five_components_are_worth_more_than_one(geometry, real, real_fit):
     campaign = replace(LASER, instrument="6-D")
     six = fit_lines(measure(template(campaign, geometry), campaign, real, 3)).model
     bare, first, fifth, sixth = (held_out(real, m, BOX, 300) for m in (None, one, real_fit.model, six))
-    assert fifth.aligned_rms < first.aligned_rms < bare.aligned_rms
-    assert first.rotation_rms == pytest.approx(bare.rotation_rms, rel=0.01)
-    assert sixth.rotation_rms < 0.25 * bare.rotation_rms
-    assert sixth.rotation_rms < fifth.rotation_rms < 0.8 * bare.rotation_rms
+    assert fifth.aligned.rms < first.aligned.rms < bare.aligned.rms
+    assert first.rotation.rms == pytest.approx(bare.rotation.rms, rel=0.01)
+    assert sixth.rotation.rms < 0.25 * bare.rotation.rms
+    assert sixth.rotation.rms < fifth.rotation.rms < 0.8 * bare.rotation.rms
 
 
 def test_the_model_goes_through_its_file(real_fit, geometry, tmp_path):

@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from helpers import nominal_error
 from scipy.spatial.transform import Rotation
 from strategies import (
     UNEVEN_GRID,
@@ -192,7 +193,7 @@ def test_the_predicted_error_is_right_to_first_order(geometry: HexapodGeometry) 
         )
         compensator = Compensator(geometry, model)
         record = compensator.correct(tool_poses(geometry, 1, 10)[0])
-        taken = compensator.machine.nominal_error(record.platform_pose, record.sense) @ geometry.tool
+        taken = nominal_error(compensator.machine, record.platform_pose, record.sense) @ geometry.tool
         wanted = record.platform_pose @ geometry.tool
         turn = Rotation.from_matrix(taken.rotation @ wanted.rotation.T).as_rotvec()
         exact = np.concatenate([taken.position - wanted.position, turn])

@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,14 +29,14 @@ from hexapod_comp.export.table import (
     read_table,
     write_table,
 )
-from hexapod_comp.export.worth import ExportTrial, Travel, draw_travel
+from hexapod_comp.export.worth import ExportTrial, diagonal_passes
 from hexapod_comp.machine.field import GridField, no_field
 from hexapod_comp.machine.geometry import HexapodGeometry
-from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.machine.model import MachineModel, RealMachine, commanded_box
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.motion import MotionState
+from hexapod_comp.machine.passes import Passes
 from hexapod_comp.machine.struts import StrutErrors
-from hexapod_comp.machine.travel import commanded_box, nominal_commands
 from hexapod_comp.pose import Pose
 
 MACHINE_FILE = PAPER_FILE.with_name("paper_machine.yaml")
@@ -120,8 +121,8 @@ def test_reader_agrees_with_linuxcnc(tmp_path: Path) -> None:
         found = told.joints(position[None], rotation[None])[0]
         np.testing.assert_allclose(found * 1e3, joints, atol=1e-9, rtol=0.0)
         for sign, noted in zip((1.0, -1.0), corrections, strict=True):
-            travel = Travel(position[None], rotation[None], np.full((1, 3), sign))
-            np.testing.assert_allclose((told.commands(travel)[0] - found) * 1e3, noted, atol=1e-7, rtol=0.0)
+            passes = Passes.of_tool(cardanic_machine(), position[None], rotation[None], np.full((1, 3), sign))
+            np.testing.assert_allclose((told.commands(passes)[0] - found) * 1e3, noted, atol=1e-7, rtol=0.0)
 
 
 @pytest.mark.parametrize("turned", [1.0, -1.0])
@@ -203,7 +204,7 @@ def test_paper_machine_keeps_its_field_only(tmp_path: Path) -> None:
 def test_tilt_out_of_reach_is_not_driven() -> None:
     geometry = paper_geometry()
     trial = ExportTrial(geometry, paper_machine(), PAPER_BOX, 20, tilt=1.5)
-    check = trial.check(lambda travel: nominal_commands(geometry, travel.passes(geometry)))
+    check = trial.check(Passes.nominal_commands)
     assert check.tilted is None
     assert check.level.after == check.level.before
 
@@ -211,10 +212,10 @@ def test_tilt_out_of_reach_is_not_driven() -> None:
 def test_inches_and_millimetres_say_the_same(tmp_path: Path) -> None:
     """Numbers have 12 digits after the point (trims, joints) or 9 (nominal): below a tenth of a nanometre."""
     geometry, model = paper_geometry(), paper_machine()
-    travel = draw_travel(PAPER_BOX, 50, 3)
+    passes = diagonal_passes(geometry, PAPER_BOX, 50, 3)
     for unit in ("mm", "inch"):
         told, back = written(tmp_path / unit, geometry, model, PAPER_BOX, unit)
-        np.testing.assert_allclose(back.commands(travel), told.commands(travel), atol=1e-10, rtol=0.0)
+        np.testing.assert_allclose(back.commands(passes), told.commands(passes), atol=1e-10, rtol=0.0)
 
 
 def test_files_are_what_linuxcnc_reads(tmp_path: Path) -> None:
@@ -369,9 +370,9 @@ def test_table_leaves_what_its_step_leaves(tmp_path: Path, step: float, left: fl
     write_table(table, tmp_path / "t.csv", [])
     back = read_table(tmp_path / "t.csv")
     trial = ExportTrial(geometry, model, PAPER_BOX, 200)
-    by_struts = trial.check(lambda travel: commands_by_struts(back, geometry, travel))
+    by_struts = trial.check(partial(commands_by_struts, back))
     assert by_struts.level.after.rms < left
-    by_poses = trial.check(lambda travel: commands_by_poses(back, geometry, travel))
+    by_poses = trial.check(partial(commands_by_poses, back))
     assert by_struts.level.after.rms < by_poses.level.after.rms < left + 5e-6  # backlash, 3–5 µm, stays
 
 
@@ -426,7 +427,7 @@ def test_verb_says_what_thermal_growth_costs(tmp_path: Path) -> None:
     model = MachineModel("paper", struts=struts, base_expansion=11e-6, platform_expansion=11e-6)
     _, back = written(tmp_path, paper_geometry(), model, PAPER_BOX)
     check = ExportTrial(paper_geometry(), model, PAPER_BOX, 200).check(back.commands)
-    far = np.linalg.norm(draw_travel(PAPER_BOX, 200, 0).positions, axis=1)
+    far = np.linalg.norm(diagonal_passes(paper_geometry(), PAPER_BOX, 200, 0).positions, axis=1)
     assert check.per_kelvin is not None
     assert check.per_kelvin.largest == pytest.approx(11e-6 * far.max(), rel=1e-4)
     assert check.per_kelvin.rms == pytest.approx(11e-6 * np.sqrt((far**2).mean()), rel=1e-4)

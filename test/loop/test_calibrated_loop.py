@@ -24,16 +24,18 @@ from node_helpers import HOME, Bench, closed_form_lengths, geometry_file
 from scipy.stats import binom
 
 from hexapod_comp import cli
-from hexapod_comp.calibration.evaluation import align, held_out, run
+from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
 from hexapod_comp.machine.model_file import load_model, save_model
+from hexapod_comp.machine.passes import Passes
+from hexapod_comp.machine.size import Size
 from hexapod_comp.machine.trajectory import move
-from hexapod_comp.machine.travel import Passes
 from hexapod_comp.nodes.messages import message_pose
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import draw_model
+from hexapod_comp.virtual.trial import ToolErrors, Trial
 
 CAMPAIGN = """format: hexapod_comp/campaign
 version: 1
@@ -187,8 +189,9 @@ def visit(bench: Bench, geometry: HexapodGeometry, points: np.ndarray, ways: np.
     return np.array(found[0] + found[1])
 
 
-def rms_length(vectors: np.ndarray) -> float:
-    return float(np.sqrt((vectors**2).sum(axis=-1).mean()))
+def aligned_rms(points: np.ndarray, displacement: np.ndarray) -> float:
+    rest = np.zeros_like(points)
+    return Size.of(ToolErrors(points, displacement, rest, rest).aligned().displacement).rms
 
 
 def leverage(point: np.ndarray) -> np.ndarray:
@@ -210,7 +213,7 @@ def test_the_loop_leaves_what_the_fit_promised(bench: Bench, tmp_path: Path, pro
     geometry = start_loop(bench, tmp_path, promise)
     points, ways = held_out_points(geometry)
     actual, wanted = visit(bench, geometry, points, ways), np.tile(points, (2, 1))
-    after = rms_length(align(actual, wanted) - wanted)
+    after = aligned_rms(wanted, actual - wanted)
 
     levers = np.array([leverage(point) for point in points])
     steps = STEP / np.sqrt(12.0) * float(np.sqrt((levers**2).sum(axis=(1, 2)).mean()))
@@ -220,14 +223,13 @@ def test_the_loop_leaves_what_the_fit_promised(bench: Bench, tmp_path: Path, pro
           f"{promise.high * 1e6:.3f}) µm, steps {steps * 1e6:.3f} µm")  # fmt: skip
     assert low <= after <= np.hypot(high, steps)
 
-    passes = Passes(wanted, np.tile(np.eye(3), (2 * POINTS, 1, 1)), np.concatenate([ways, -ways]))
-    nominal, _ = run(promise.truth, passes, None)
-    before = rms_length(align(nominal, wanted) - wanted)
+    trial = Trial(promise.truth, Passes(geometry, points, np.tile(np.eye(3), (POINTS, 1, 1)), ways).both_ways())
+    before = aligned_rms(wanted, trial.errors(trial.commands(None)).displacement)
     assert before == pytest.approx(promise.before, rel=4.0 * sampling)  # as the machine is: larger, and less even
     assert 1.0 - after / before >= 0.97
 
     # Nothing else stands between the model file and the tool: struts off by half a step, all the same way at worst.
-    expected, _ = run(promise.truth, passes, promise.model)
+    expected, _ = trial.drive(trial.commands(promise.model)).actual
     bound = np.tile(np.abs(levers).sum(axis=2) * STEP / 2.0 + REST, (2, 1))
     assert (np.abs(actual - expected) <= bound).all()
 
@@ -248,7 +250,7 @@ def test_promises_are_kept_as_often_as_they_say() -> None:
         truth = virtual_machine(seed)
         level = (fit := fit_model(measured(truth, campaign(), seed), settings)).level
         assert level is not None
-        before, after = (held_out(truth, model, BOX, 500, seed).aligned_rms for model in (None, fit.model))
+        before, after = (held_out(truth, model, BOX, 500, seed).aligned.rms for model in (None, fit.model))
         kept.append(level.low <= after <= level.high)
         left.append((before, after))
         assert level.before == pytest.approx(before, rel=0.1)

@@ -1,0 +1,158 @@
+"""Poses that a machine is sent through, each in a direction.
+
+For everything that judges models: directions of motion are given, not followed, so that any number of poses
+can be tried in any order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import HexapodError
+from ..pose import rotation_from_angles
+from .geometry import HexapodGeometry
+from .kinematics import Structure, strut_lengths_batch
+
+LEAST_SPEED = 1e-9
+"""Below this share of the speed of travel an axis or a strut stands still."""
+
+BOTH_WAYS = (1.0, -1.0)
+"""Forward, backward."""
+
+Poses = tuple[np.ndarray, np.ndarray]
+"""Positions, shape (N, 3), m, and rotations, shape (N, 3, 3), of ``pose_platform_in_base``."""
+
+
+@dataclass(frozen=True)
+class Passes:
+    """Platform poses of a machine, each passed in a direction.
+
+    Attributes
+    ----------
+    geometry : HexapodGeometry
+        The nominal machine.
+    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
+        Commanded ``pose_platform_in_base``, m.
+    directions : ndarray, shape (N, 3)
+        Directions of travel in ``base``; length does not matter.
+    """
+
+    geometry: HexapodGeometry
+    positions: np.ndarray
+    rotations: np.ndarray
+    directions: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @staticmethod
+    def of_tool(
+        geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, directions: np.ndarray
+    ) -> Passes:
+        """Return the passes that bring the tool to poses in the work frame.
+
+        Parameters
+        ----------
+        geometry : HexapodGeometry
+            With its tool and work frames.
+        positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
+            ``pose_tool_in_work``, m.
+        directions : ndarray, shape (N, 3)
+            Directions of travel in the work frame.
+        """
+        platform = geometry.platform_poses(positions, rotations)
+        return Passes(geometry, *platform, directions @ geometry.work.rotation.T)
+
+    @property
+    def poses(self) -> Poses:
+        """Positions and rotations."""
+        return self.positions, self.rotations
+
+    def of_the_tool(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return positions and rotations of ``pose_tool_in_work``, m, and directions in ``work``."""
+        tool = self.geometry.tool_poses(self.positions, self.rotations)
+        return *tool, self.directions @ self.geometry.work.rotation
+
+    def both_ways(self) -> Passes:
+        """Return these passes, and then all of them in the opposite direction."""
+        directions = np.concatenate([way * self.directions for way in BOTH_WAYS])
+        twice = np.tile(self.positions, (2, 1)), np.tile(self.rotations, (2, 1, 1))
+        return Passes(self.geometry, *twice, directions)
+
+    def points(self, point: np.ndarray) -> np.ndarray:
+        """Return where a point of ``platform``, shape (3,), is sent, shape (N, 3), m in ``base``."""
+        return self.positions + self.rotations @ point
+
+    def senses(self) -> np.ndarray:
+        """Return the directions of motion of axes and struts, shape (N, 9), each −1, 0 or 1.
+
+        An axis or a strut that does not move has none (0: the mean of both ways).
+        """
+        struts = self.positions[:, None] + self.geometry.platform_joints @ np.swapaxes(self.rotations, 1, 2)
+        struts -= self.geometry.base_joints
+        struts /= np.linalg.norm(struts, axis=2, keepdims=True)
+        speeds = np.einsum("nij,nj->ni", struts, self.directions)
+        moving = np.concatenate([self.directions, speeds], axis=1)
+        return np.sign(moving) * (np.abs(moving) > LEAST_SPEED)
+
+    def select(self, mask: np.ndarray) -> Passes:
+        """Return those in a mask or at indices."""
+        return Passes(self.geometry, self.positions[mask], self.rotations[mask], self.directions[mask])
+
+    def nominal_commands(self) -> np.ndarray:
+        """Return the strut lengths of the nominal machine, shape (N, 6), m: the commands without compensation."""
+        return strut_lengths_batch(Structure.of(self.geometry), *self.poses)
+
+    def refusals(self) -> list[HexapodError | None]:
+        """Return, for each pass, why the nominal machine may not take its pose, or None."""
+        lengths = self.nominal_commands()
+        return [self.geometry.refusal(*pose) for pose in zip(self.positions, self.rotations, lengths, strict=True)]
+
+    def reachable(self) -> np.ndarray:
+        """Return the mask, shape (N,), of the passes whose poses the nominal machine may take."""
+        return np.array([refusal is None for refusal in self.refusals()])
+
+    def refuse_unreachable(self) -> None:
+        """Raise the error of the first pass that the nominal machine may not take.
+
+        Raises
+        ------
+        LimitError, KinematicsError
+            Naming the position.
+        """
+        for position, refusal in zip(self.positions, self.refusals(), strict=True):
+            if refusal is not None:
+                refusal.args = (f"{at(position)}: {refusal}",)
+                raise refusal
+
+
+def at(position: np.ndarray) -> str:
+    """Say where the platform is, for messages; position (3,), m."""
+    return "platform at ({:.3f}, {:.3f}, {:.3f}) mm".format(*(position * 1e3))
+
+
+def random_directions(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Return random unit vectors, shape (count, 3)."""
+    directions = rng.standard_normal((count, 3))
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def random_passes(
+    geometry: HexapodGeometry,
+    box: np.ndarray,
+    points: int,
+    tilt: float,
+    rng: np.random.Generator,
+    level: np.ndarray | None = None,
+) -> Passes:
+    """Return passes through random points of a box of the work frame: all one way, then all back.
+
+    Tilts start from a level tool, shape (3, 3) in the work frame; by default parallel to it.
+    """
+    positions = rng.uniform(box[0], box[1], (points, 3))
+    directions = random_directions(rng, points)
+    tilts = np.append(rng.uniform(-tilt, tilt, (points, 2)), np.zeros((points, 1)), axis=1)
+    rotations = rotation_from_angles(tilts) @ (np.eye(3) if level is None else level)
+    return Passes.of_tool(geometry, positions, rotations, directions).both_ways()

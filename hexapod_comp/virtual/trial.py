@@ -1,0 +1,225 @@
+"""A machine sent through poses, and what its tool does there: the trial behind every figure of a tool error.
+
+Commands come from the nominal machine, from a model, or from whatever is tried; the machine is the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..errors import NotConvergedError
+from ..kernels.kinematics import OK
+from ..kernels.model import command_one
+from ..machine.kinematics import forward_error
+from ..machine.model import MachineModel, RealMachine, Temperatures
+from ..machine.motion import FOLLOWED
+from ..machine.passes import Passes, Poses, at
+from ..measurements.readings import attitude_error
+
+NameOf = Callable[[int], str]
+"""Says in an error which row it is about."""
+
+
+@dataclass(frozen=True)
+class ToolErrors:
+    """What a point of the platform, the tool's tip as a rule, does beside what it was sent to do, in ``base``.
+
+    Attributes
+    ----------
+    points : ndarray, shape (N, 3)
+        Where the point was sent, m.
+    displacement, rotation : ndarray, shape (N, 3)
+        Actual minus commanded position, m, and rotation vector from commanded to actual, rad.
+    field_share : ndarray, shape (N, 3)
+        The part of the displacement that the machine's field adds, m.
+    """
+
+    points: np.ndarray
+    displacement: np.ndarray
+    rotation: np.ndarray
+    field_share: np.ndarray
+
+    def as_array(self) -> np.ndarray:
+        """Return displacement, m, and rotation vector, rad, shape (N, 6)."""
+        return np.hstack([self.displacement, self.rotation])
+
+    def aligned(self) -> ToolErrors:
+        """Return the same once the datum is aligned: less the turn and shift that best explain the displacements.
+
+        Rotations lose their mean.
+        """
+        actual = self.points + self.displacement
+        centre, mean = self.points.mean(axis=0), actual.mean(axis=0)
+        turn, _ = Rotation.align_vectors(self.points - centre, actual - mean)
+        turned = Rotation.from_rotvec(self.rotation)
+        displacement = turn.apply(actual - mean) + centre - self.points
+        return replace(self, displacement=displacement, rotation=(turned.mean().inv() * turned).as_rotvec())
+
+
+def without_datum(points: np.ndarray, displacements: np.ndarray) -> np.ndarray:
+    """Return displacements (M, 3, D) of points (M, 3) less what one shift and rotation of the datum explain.
+
+    The linear case of :meth:`ToolErrors.aligned`, for D sets of small displacements at once.
+    """
+    arms = points - points.mean(axis=0)
+    columns = [np.tile(axis, (len(arms), 1)) for axis in np.eye(3)]
+    columns += [np.cross(axis, arms) for axis in np.eye(3)]
+    free = np.linalg.qr(np.stack([column.ravel() for column in columns], axis=1))[0]
+    flat = displacements.reshape(3 * len(points), -1)
+    return (flat - free @ (free.T @ flat)).reshape(displacements.shape)
+
+
+@dataclass(frozen=True)
+class Driven:
+    """Where a machine went.
+
+    Attributes
+    ----------
+    actual, without_field : tuple of ndarray, shape (N, 3) and (N, 3, 3)
+        ``pose_platform_in_base``, m, and what structure and struts alone would have made of it.
+    """
+
+    actual: Poses
+    without_field: Poses
+
+    def errors(self, commanded: Poses, point: np.ndarray) -> ToolErrors:
+        """Return the errors of a point of ``platform``, shape (3,), m, beside commanded poses."""
+        (positions, rotations), (modelled, turned) = self.actual, self.without_field
+        return ToolErrors(
+            points=commanded[0] + commanded[1] @ point,
+            displacement=positions - commanded[0] + (rotations - commanded[1]) @ point,
+            rotation=attitude_error(rotations, commanded[1]),
+            field_share=positions - modelled + (rotations - turned) @ point,
+        )
+
+
+def drive(
+    machines: Sequence[RealMachine],
+    starts: Poses,
+    senses: np.ndarray,
+    commands: np.ndarray,
+    name_of: NameOf | None = None,
+    advance: Callable[[int], object] = lambda rows: None,
+) -> Driven:
+    """Return where machines go under strut commands.
+
+    Parameters
+    ----------
+    machines : sequence of N RealMachine
+        The machine of each row, at that row's temperatures.
+    starts : Poses
+        Where the search for each pose starts: the commanded poses.
+    senses : ndarray, shape (N, 9)
+        Directions of motion of axes and struts.
+    commands : ndarray, shape (N, 6)
+        Strut commands, m.
+    name_of : callable, optional
+        What a row is called in errors; by default where it starts.
+    advance : callable, optional
+        Called with the number of rows just done.
+
+    Raises
+    ------
+    KinematicsError
+        A machine has no pose for its row's commands; names the row.
+    """
+    commands, senses = np.ascontiguousarray(commands, dtype=float), np.ascontiguousarray(senses, dtype=float)
+    modelled = np.array(starts[0]), np.array(starts[1])
+    actual = np.empty_like(modelled[0]), np.empty_like(modelled[1])
+    for row, machine in enumerate(machines):
+        arrays = (modelled[0][row], modelled[1][row], actual[0][row], actual[1][row])
+        outcome, _, condition, _ = machine.forward(commands[row], senses[row], *arrays)
+        if outcome != OK:
+            error = forward_error(outcome, condition, machine.structure.max_condition)
+            where = at(starts[0][row]) if name_of is None else name_of(row)
+            raise type(error)(f"{where}: {error}", error.value, error.limit)
+        advance(1)
+    return Driven(actual, modelled)
+
+
+def model_commands(
+    machines: Sequence[RealMachine], targets: Poses, senses: np.ndarray, name_of: NameOf | None = None
+) -> tuple[np.ndarray, Poses]:
+    """Return the strut commands by which models reach poses, shape (N, 6), m, and the structure's own poses.
+
+    :meth:`RealMachine.commands_for` without its objects: a study asks for millions.
+
+    Raises
+    ------
+    NotConvergedError
+        A model's field is no small correction; names the row.
+    """
+    positions, rotations = np.ascontiguousarray(targets[0]), np.ascontiguousarray(targets[1])
+    commands, modelled = np.empty((len(positions), 6)), (np.empty_like(positions), np.empty_like(rotations))
+    low, sense = np.empty(FOLLOWED), np.empty(FOLLOWED)
+    for n, machine in enumerate(machines):
+        low[:], sense[:] = np.nan, senses[n]  # no window yet: the direction is the one given
+        given = positions[n], rotations[n], machine.thresholds, low, sense
+        arrays = machine.body, machine.strut_arrays, machine.field_arrays
+        solved, _ = command_one(*given, *arrays, modelled[0][n], modelled[1][n], commands[n])
+        if not solved:
+            where = at(positions[n]) if name_of is None else name_of(n)
+            raise NotConvergedError(f"{where}: the error field is too steep to be undone at this pose")
+    return commands, modelled
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A machine and the passes that it is sent through.
+
+    Parameters
+    ----------
+    machine : RealMachine
+        The truth, at its real temperatures.
+    passes : Passes
+        Poses and directions.
+    """
+
+    machine: RealMachine
+    passes: Passes
+
+    def commands(self, model: MachineModel | None, sensed: Temperatures | None = None) -> np.ndarray:
+        """Return what the machine is told, shape (N, 6), m.
+
+        Parameters
+        ----------
+        model : MachineModel or None
+            What the compensator believes; None for nominal lengths.
+        sensed : Temperatures, optional
+            What the compensator believes the temperatures to be; 20 °C by default.
+
+        Raises
+        ------
+        ModelError
+            The model is another machine's.
+        NotConvergedError
+            The model's field is no small correction.
+        """
+        if model is None:
+            return self.passes.nominal_commands()
+        believed = RealMachine(self.passes.geometry, model, sensed)
+        return model_commands([believed] * len(self.passes), self.passes.poses, self.passes.senses())[0]
+
+    def drive(self, commands: np.ndarray) -> Driven:
+        """Return where the machine goes under strut commands, shape (N, 6), m.
+
+        Raises
+        ------
+        KinematicsError
+            The machine has no pose for a row's commands; names the commanded position.
+        """
+        return drive([self.machine] * len(self.passes), self.passes.poses, self.passes.senses(), commands)
+
+    def errors(self, commands: np.ndarray) -> ToolErrors:
+        """Return the errors of the tool's tip under strut commands, shape (N, 6), m.
+
+        Raises
+        ------
+        KinematicsError
+            As :meth:`drive`.
+        """
+        return self.drive(commands).errors(self.passes.poses, self.passes.geometry.tool.position)
