@@ -19,24 +19,23 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
-from rclpy.task import Future
 from sensor_msgs.msg import JointState
-from std_srvs.srv import Trigger
 
 from ..errors import CommandError
 from ..nodes.command_source import CommandSource
-from ..nodes.health import ERROR, OK, WARN, Flow, Refusals, seconds
+from ..nodes.health import OK
 from ..nodes.messages import StrutMessage, StrutReader
 from ..nodes.parameters import ParameterError, declare
 from ..nodes.running import keep_discovery_local, run
-from ..nodes.runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, STATE_QOS, MachineNode
+from ..nodes.runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, STATE_QOS, MachineNode
 from ..nodes.stamps import nanoseconds_of, stamp_of
+from .bridge_status import BridgeStatus
 from .guard import ON_LOSS, CorrectionGuard, GuardStatus
 from .hal import COUNTS, METRES, HalComponent, pose_from_axes
 from .parameters import AXES, CORRECTIONS, COUNTERS, FEEDBACK, FLAGS, PARAMETERS, PINS, PROGRAM, SWITCHES
+from .restarting import CompensatorReset
 
 CHECK_PERIOD = 0.05
 """How often the node looks whether its state has changed, s."""
@@ -47,29 +46,11 @@ NEVER = 1e9
 STANDING = 2e-3
 """Struts slower than this stand, m/s: no drive lags behind by more than some micrometres then."""
 
-RESET_AFTER = 0.15
-"""A compensator that has been lost for so long is asked to start anew, s: it has forgotten its feedback by then."""
-
-RESET_PERIOD = 0.5
-"""The compensator is asked to start anew no more often than this, s."""
-
-COMPLAINT_COUNTS_FOR = 1.2
-"""The compensator's last diagnostics tell how it is for so long, s: it sends some every second."""
-
 LARGEST_PIN = 1e6
 """No axis stands beyond this, in LinuxCNC's units or degrees; and nothing made of such numbers overflows."""
 
 LONGEST_FAREWELL = 1.0
 """Corrections that can be ramped out within this time are, before the process ends, s."""
-
-STATUS_TEXTS = {
-    GuardStatus.OFF: (OK, "off"),
-    GuardStatus.RAMPING: (OK, "running, corrections are ramping in"),
-    GuardStatus.COMPENSATING: (OK, "running"),
-    GuardStatus.HOLDING: (ERROR, "compensator lost, corrections hold"),
-    GuardStatus.RETURNING: (OK, "off, corrections are ramping out"),
-    GuardStatus.WAITING: (WARN, "waiting for the first correction"),
-}
 
 
 class LinuxcncBridgeNode(MachineNode):
@@ -95,18 +76,15 @@ class LinuxcncBridgeNode(MachineNode):
         self._metres = METRES[self._choice("units", tuple(METRES))]
         self._choice("on_loss", ON_LOSS)
         self._guard = CorrectionGuard(*(self._options[name] for name in ("limit", "ramp_rate", "timeout", "on_loss")))
-        self._refusals, self._bad_pins = Refusals(), Refusals()
-        self._cycles, self._sent, self._states, self._heard = Flow(), Flow(), Flow(), Flow()
+        self._status = status = BridgeStatus(self._guard)
+        self._sent, self._states, self._heard = status.sent, status.states, status.heard
+        self._refusals = status.refusals
         # Half a cycle less, since cycles come a little early or late.
         self._states_period = 1.0 / self._options["states_rate"] - 0.5 / self._options["rate"]
         self._reader = StrutReader()
-        self._machine_on = self._enabled = self._beat = False
-        self._streaming_since = math.inf
-        self._asked_at = self._moved_at = self._complained_at = -math.inf
-        self._compensator = f"{self.get_namespace()}/compensator:".lstrip("/")
-        self._resets, self._latency, self._last_text = 0, 0.0, ""
-        self._question: Future | None = None
-        self._talks = False
+        self._streaming_since, self._moved_at = math.inf, -math.inf
+        self._beat, self._last_text = False, ""
+        self._reset: CompensatorReset | None = None  # while topics are open
         self._hal: HalComponent | None = HalComponent(self._options["component"], PINS, hal)
         self._open_pins(self._hal)
         self._make_messages()
@@ -138,12 +116,10 @@ class LinuxcncBridgeNode(MachineNode):
         self._pose_pub = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS)
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
         self.open_diagnostics(self._options["component"])
-        self._talks = True
         self._subscription = self.obey(JointState, "strut_corrections", self._on_correction, self._look_at_publishers)
         topic, count = self._subscription.topic_name, self._subscription.get_publisher_count
         self._source = CommandSource(self, topic, count, self._options["allow_several_publishers"])
-        self._complaints = self.listen_to(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
-        self._reset_client = self.create_client(Trigger, "compensator/reset")
+        self._reset = CompensatorReset(self, self._status, self._options["timeout"])
         self._check = self.every(CHECK_PERIOD, self._check_state)
         return super().on_configure(state)
 
@@ -155,11 +131,12 @@ class LinuxcncBridgeNode(MachineNode):
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close topics; the HAL component stays."""
-        self._active = self._talks = False
+        self._active = False
         self.destroy_timer(self._check)
-        self.destroy_client(self._reset_client)
-        for subscription in (self._subscription, self._complaints):
-            self.destroy_subscription(subscription)
+        if self._reset is not None:
+            self._reset.close()
+            self._reset = None
+        self.destroy_subscription(self._subscription)
         for publisher in (self._pose_pub, self._states_pub, self._diagnostics_pub):
             self.destroy_publisher(publisher)
         return super().on_cleanup(state)
@@ -174,7 +151,7 @@ class LinuxcncBridgeNode(MachineNode):
         while any(self._guard.output) and time.monotonic() < end:
             self._cycle()
             time.sleep(period)
-        if self._talks:
+        if self._reset is not None:
             self._check_state()
             self._diagnostics_pub.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 
@@ -189,12 +166,14 @@ class LinuxcncBridgeNode(MachineNode):
 
     def _cycle(self) -> None:
         now = time.monotonic()
-        self._machine_on, self._enabled = self._read_switches()
-        if self._active and self._machine_on:
+        status = self._status
+        status.machine_on, status.enabled = self._read_switches()
+        if self._active and status.machine_on:
             self._send(now)
-            self._ask_for_reset(now)
-        output = self._guard.update(now, self._active and self._machine_on and self._enabled)
-        self._cycles.tick(now)
+            if self._reset is not None:
+                self._reset.ask(self._streaming_since, self._heard.last, now)
+        output = self._guard.update(now, self._active and status.machine_on and status.enabled)
+        status.cycles.tick(now)
         self._write_corrections([value / self._metres for value in output])
         self._write_state(self._state_numbers(now, output))
 
@@ -210,7 +189,7 @@ class LinuxcncBridgeNode(MachineNode):
             self._beat,
             guard.accepted % COUNTS,
             rejected % COUNTS,
-            self._resets % COUNTS,
+            self._status.resets % COUNTS,
         )
 
     def _send(self, now: float) -> None:
@@ -261,7 +240,7 @@ class LinuxcncBridgeNode(MachineNode):
             return True
         which, said = ", ".join(bad), ", ".join(f"{name} = {value}" for name, value in bad.items())
         text = f"pins that are no numbers within ±{LARGEST_PIN:g}: {said}"
-        self._bad_pins.add(which, text, now)
+        self._status.bad_pins.add(which, text, now)
         self.warn_of(which, text)
         return False
 
@@ -287,88 +266,26 @@ class LinuxcncBridgeNode(MachineNode):
         age = (time.time_ns() - nanoseconds_of(stamp)) * 1e-9
         if not abs(age) <= self._options["timeout"]:
             raise CommandError("stamp", f"it answers a command of {age:.3f} s ago, or somebody else's")
-        self._latency = age
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            if status.level == ERROR and status.name.startswith(self._compensator):
-                self._complained_at = time.monotonic()
-
-    def _ask_for_reset(self, now: float) -> None:
-        """Let a compensator that refuses every command start anew, as one does when the machine moved on unheard.
-
-        Only one that complains is asked: requests to one that is stopped get lost, and DDS then keeps back those
-        that follow for seconds.
-        """
-        waited = min(now - self._streaming_since, self._heard.age(now))
-        if waited < self._options["timeout"] + RESET_AFTER or now - self._asked_at < RESET_PERIOD:
-            return
-        if self._complained_at < self._heard.last or now - self._complained_at > COMPLAINT_COUNTS_FOR:
-            return
-        self._asked_at = now
-        if not self._reset_client.service_is_ready():
-            return
-        if self._question is not None:
-            self._reset_client.remove_pending_request(self._question)
-        self._question = self._reset_client.call_async(Trigger.Request())
-        self._resets += 1
-        self.warn_of("reset", "the compensator refuses every command; asked it to start anew")
+        self._status.latency = age
 
     # ---- state ----
 
-    def _state(self, now: float) -> tuple[bytes, str]:
-        """Return level and message of the diagnostics."""
-        status = self._guard.status
-        if not self._active:
-            return WARN, "not active"
-        if self._bad_pins.recent(now):
-            return ERROR, f"unusable pins: {self._bad_pins.last_reason}"
-        if self._refusals.recent(now):
-            return ERROR, f"refusing corrections: {self._refusals.last_reason}"
-        if not self._machine_on:
-            return OK, "machine off"
-        if self._enabled and self._guard.accepted and status is GuardStatus.WAITING:
-            return ERROR, "compensator lost, corrections are zero"
-        if self._enabled and status is GuardStatus.RETURNING:
-            return ERROR, "compensator lost, corrections are ramping out"
-        return STATUS_TEXTS[status]
-
     def _check_state(self) -> None:
-        if not self._talks:
+        if self._reset is None:
             return
         now = time.monotonic()
         self._source.look(now)
-        level, text = self._state(now)
+        level, text = self._status.judged(self._active, now)
         if text != self._last_text:
             self._last_text = text
             self._say(level, text)
-        self.tell(level, text, lambda: self._values(now))
+        self.tell(level, text, lambda: self._status.values(", ".join(self._source.names), now))
 
     def _say(self, level: bytes, text: str) -> None:
         if level != OK:
             self.warn_of(text, text)
         elif self._throttle.passes(text) is not None:
             self.get_logger().info(text)
-
-    def _values(self, now: float) -> dict[str, str]:
-        guard = self._guard
-        return {
-            "status": guard.status.name.lower(),
-            "machine_on": str(self._machine_on).lower(),
-            "enabled": str(self._enabled).lower(),
-            "cycle_rate_hz": f"{self._cycles.rate(now):.1f}",
-            "command_rate_hz": f"{self._sent.rate(now):.1f}",
-            "correction_rate_hz": f"{self._heard.rate(now):.1f}",
-            "correction_age_s": seconds(guard.age(now)),
-            "latency_s": f"{self._latency:.6f}",
-            "largest_correction_m": f"{max(map(abs, guard.output)):.9f}",
-            "accepted": str(guard.accepted),
-            "resets": str(self._resets),
-            "compensated_by": ", ".join(self._source.names),
-            "last_refusal": self._refusals.last_text,
-            "last_bad_pins": self._bad_pins.last_text,
-            **self._refusals.values(),
-        }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
