@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
     except ModelError as error:  # refused before the work starts
         raise InputFileError(budget_file, error.key, error.problem, error.value) from error
     folder = _folder(args.out)
-    common.mention_compiling("effects.extremes_many")
+    common.mention_compiling("kinematics.solve_pose_many")
     turned = orientations(geometry, (args.tilt_deg, args.tilt_deg, (0.0,)))
     found = reaches(geometry, turned, args.cells)
     names = _names(args.tilt_deg)

@@ -42,7 +42,7 @@ from .lanes import (
     take_lengths,
     three_rows,
 )
-from .linalg import frobenius_condition, inlined, internal, norm, solve_six
+from .linalg import add, dot, frobenius_condition, inlined, internal, norm, scale, solve_six, subtract
 
 OK, NOT_FINITE, NOT_CONVERGED, SINGULAR, UNREACHABLE, OTHER_ASSEMBLY = range(6)
 """Outcome of a forward solution; everything but OK leaves the caller's pose untouched."""
@@ -82,6 +82,13 @@ def jacobian_one(base, platform, position, rotation, jacobian):
     for i in range(6):
         sx, sy, sz = strut_vector(base, platform, position, rotation, i)
         _jacobian_row(base, position, i, sx, sy, sz, jacobian)
+
+
+@compiled
+def jacobian_many(base, platform, positions, rotations, jacobians):
+    """Batch of :func:`jacobian_one`: (N, 3), (N, 3, 3) → (N, 6, 6)."""
+    for n in range(positions.shape[0]):
+        jacobian_one(base, platform, positions[n], rotations[n], jacobians[n])
 
 
 @internal
@@ -124,6 +131,38 @@ def orthonormalise(rotation):
     for i in range(3):
         for j in range(3):
             rotation[i, j] = r[i][j]
+
+
+@compiled
+def motions_many(positions, rotations, to_positions, to_rotations, point, axes, motions):
+    """Write the motion from each pose to another: displacement of a point of the platform, and rotation vector.
+
+    Rotations are subtracted before they are multiplied: the smallest motion is off by no more than the poses are.
+
+    Parameters
+    ----------
+    positions, rotations, to_positions, to_rotations : ndarray, shape (N, 3), (N, 3, 3) each
+        Poses and where they go, in ``base``, m.
+    point : ndarray, shape (3,)
+        In ``platform``, m.
+    axes : ndarray, shape (3, 3)
+        Its columns are the axes, in ``base``, along which the motions are written.
+    motions : ndarray, shape (6, N)
+        m and rad. NaN after exactly half a turn, whose axis could point either way.
+    """
+    t, along = (point[0], point[1], point[2]), three_rows(axes.T)
+    for n in range(positions.shape[0]):
+        r, s = three_rows(rotations[n]), three_rows(to_rotations[n])
+        x, y, z = subtract(s[0], r[0]), subtract(s[1], r[1]), subtract(s[2], r[2])
+        shift = add(subtract(row_of(to_positions, n), row_of(positions, n)), (dot(x, t), dot(y, t), dot(z, t)))
+        twice = (dot(z, r[1]) - dot(y, r[2]), dot(x, r[2]) - dot(z, r[0]), dot(y, r[0]) - dot(x, r[1]))
+        sine, versine = 0.5 * norm(twice), 0.25 * (dot(x, x) + dot(y, y) + dot(z, z))
+        if sine > 1e-4 or versine > 1.0:
+            turn = scale(0.5 * math.atan2(sine, 1.0 - versine) / sine, twice)
+        else:  # the series' next term is below 1e-17
+            turn = scale(0.5 + sine * sine / 12.0, twice)
+        for k in range(3):
+            motions[k, n], motions[3 + k, n] = dot(along[k], shift), dot(along[k], turn)
 
 
 @compiled
@@ -217,6 +256,7 @@ def _solve_carefully(base, platform, lengths, position, rotation, characteristic
         return UNREACHABLE, 0, math.nan
     p, r = np.empty(3), np.empty((3, 3))
     _copy_pose(position, rotation, p, r)
+    orthonormalise(r)  # or what a rounded guess is off stays in a step too small to be followed by another
     outcome, iterations = _newton(base, platform, lengths, p, r)
     if outcome != OK:
         return outcome, iterations, math.nan

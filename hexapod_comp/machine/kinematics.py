@@ -180,6 +180,22 @@ def jacobian(structure: Structure, pose: Pose) -> np.ndarray:
     return matrix
 
 
+def jacobian_batch(structure: Structure, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Return :func:`jacobian` at N poses, shape (N, 6, 6); NaN where a pose is.
+
+    Parameters
+    ----------
+    structure : Structure
+        Ideal or real joints.
+    positions, rotations : array_like, shape (N, 3), (N, 3, 3)
+        Platform poses in ``base``, m.
+    """
+    positions, rotations = _batch_poses(positions, rotations)
+    matrices = np.empty((len(positions), 6, 6))
+    kernels.jacobian_many(structure.base_joints, structure.platform_joints, positions, rotations, matrices)
+    return matrices
+
+
 def condition_number(structure: Structure, pose: Pose) -> tuple[float, float]:
     """Return (condition number, sign of det J) at a pose.
 
@@ -232,8 +248,13 @@ def solve_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> Pose:
     return Pose(position, rotation)
 
 
-def solve_poses(structure: Structure, lengths: np.ndarray, guess: Pose, threads: int | None = None) -> ForwardBatch:
-    """Solve the forward kinematics of N sets of lengths from one guess, on all cores.
+def solve_poses(
+    structure: Structure,
+    lengths: np.ndarray,
+    guess: Pose | tuple[np.ndarray, np.ndarray],
+    threads: int | None = None,
+) -> ForwardBatch:
+    """Solve the forward kinematics of N sets of lengths, on all cores.
 
     Parameters
     ----------
@@ -241,8 +262,8 @@ def solve_poses(structure: Structure, lengths: np.ndarray, guess: Pose, threads:
         Ideal or real joints.
     lengths : array_like, shape (N, 6)
         m.
-    guess : Pose
-        Start for every row.
+    guess : Pose, or tuple of ndarray of shapes (N, 3), (N, 3, 3)
+        Start for every row, or positions and rotations with a start for each; m.
     threads : int, optional
         Most threads to use; all cores by default. A batch of some milliseconds stays on the calling thread.
 
@@ -255,12 +276,13 @@ def solve_poses(structure: Structure, lengths: np.ndarray, guess: Pose, threads:
     if lengths.ndim != 2 or lengths.shape[1] != 6:
         raise KinematicsError(f"lengths must have shape (N, 6), not {lengths.shape}", lengths.shape)
     count = len(lengths)
+    guesses = _guesses(guess, count)
     positions, rotations = np.empty((count, 3)), np.empty((count, 3, 3))
     outcomes, iterations = np.empty(count, np.int64), np.empty(count, np.int64)
     conditions = np.empty(count)
 
     def run(rows: slice) -> None:
-        positions[rows], rotations[rows] = guess.position, guess.rotation
+        positions[rows], rotations[rows] = guesses[0][rows], guesses[1][rows]
         kernels.solve_pose_many(
             structure.base_joints,
             structure.platform_joints,
@@ -282,7 +304,24 @@ def solve_poses(structure: Structure, lengths: np.ndarray, guess: Pose, threads:
     return ForwardBatch(positions, rotations, outcomes, iterations, conditions)
 
 
-def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = None) -> None:
+def _guesses(guess: Pose | tuple[np.ndarray, np.ndarray], count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions and rotations with a start for each row.
+
+    Raises
+    ------
+    KinematicsError
+        There are not as many as rows.
+    """
+    if isinstance(guess, Pose):
+        return np.broadcast_to(guess.position, (count, 3)), np.broadcast_to(guess.rotation, (count, 3, 3))
+    positions, rotations = (np.asarray(rows, dtype=float) for rows in guess)
+    if positions.shape != (count, 3) or rotations.shape != (count, 3, 3):
+        problem = f"guesses must have shapes ({count}, 3) and ({count}, 3, 3), as there are {count} sets of lengths"
+        raise KinematicsError(f"{problem}; not {positions.shape} and {rotations.shape}", positions.shape)
+    return positions, rotations
+
+
+def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = None, first: int = FIRST_SLICE) -> None:
     """Call `run` on slices that cover ``range(count)``; for kernels without the GIL.
 
     The calling thread begins alone. Others help only when it has worked for :data:`ALONE` of processor time and what
@@ -297,9 +336,11 @@ def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = 
         Rows in the batch.
     threads : int, optional
         Most threads to use, the calling one included; all cores that this process may use by default.
+    first : int
+        Rows in the first slice; more for work that has a fixed part.
     """
     workers = threads or len(os.sched_getaffinity(0))
-    size, done, took, began = FIRST_SLICE, 0, 0.0, time.thread_time()
+    size, done, took, began = first, 0, 0.0, time.thread_time()
     while done < count:
         if workers > 1 and took > ALONE and took * (count - done) > ALONE * done:
             _share([slice(k, min(k + size, count)) for k in range(done, count, size)], run, workers)

@@ -7,22 +7,25 @@ the rotation vector about the axes of the work frame.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..errors import KinematicsError
-from ..kernels.effects import effect_vectors_many, extremes_many, sizes_many
+from ..kernels import kinematics as kernels
 from ..machine.geometry import HexapodGeometry
-from ..machine.kinematics import Structure, over_chunks, strut_lengths
-from .sources import SingleErrors
+from ..machine.kinematics import ForwardBatch, Structure, jacobian_batch, over_chunks, solve_poses, strut_lengths
+from .sources import BASE_JOINT, LENGTH, TOOL, SingleErrors
 
 EXACT, LINEAR = "exact", "linear"
 METHODS = (EXACT, LINEAR)
 
 COLUMNS = ("translation max", "translation min", "rotation max", "rotation min")
 """Columns of :class:`Extremes`."""
+
+BLOCK = 4096
+"""Poses handled together: long beside what an error costs once, small enough for a processor's own memory."""
 
 
 @dataclass(frozen=True)
@@ -94,13 +97,14 @@ def effect_vectors(
         Shapes do not fit, or the method is unknown.
     """
     positions, rotations = _poses(positions, rotations)
-    machine, parts, exact = _arguments(geometry, errors, method)
+    each = _way(method)
     vectors = np.empty((len(positions), len(errors), 6))
 
     def run(rows: slice) -> None:
-        effect_vectors_many(machine, positions[rows], rotations[rows], parts, exact, vectors[rows])
+        for e, vector in enumerate(each(geometry, errors, positions[rows], rotations[rows])):
+            vectors[rows, e] = vector.T
 
-    over_chunks(run, len(positions), threads)
+    over_chunks(run, len(positions), threads, BLOCK)
     return vectors
 
 
@@ -117,15 +121,14 @@ def effects(
     Arguments and errors as for :func:`effect_vectors`.
     """
     positions, rotations = _poses(positions, rotations)
-    machine, parts, exact = _arguments(geometry, errors, method)
+    each = _way(method)
     sizes = np.empty((len(positions), len(errors), 2))
 
     def run(rows: slice) -> None:
-        vectors = np.empty((rows.stop - rows.start, len(errors), 6))
-        effect_vectors_many(machine, positions[rows], rotations[rows], parts, exact, vectors)
-        sizes_many(vectors, sizes[rows])
+        for e, vector in enumerate(each(geometry, errors, positions[rows], rotations[rows])):
+            sizes[rows, e] = _sizes(vector).T
 
-    over_chunks(run, len(positions), threads)
+    over_chunks(run, len(positions), threads, BLOCK)
     return sizes
 
 
@@ -149,33 +152,33 @@ def extremes(
         Number of the first of these poses. The other arguments are those of :func:`effect_vectors`.
     """
     positions, rotations = _poses(positions, rotations)
-    machine, parts, exact = _arguments(geometry, errors, method)
-    kinds, types = np.array(errors.kind, dtype=np.int64), len(errors.kinds)
+    each, types = _way(method), len(errors.kinds)
     of_slice: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def run(rows: slice) -> None:
-        values = np.tile([-np.inf, np.inf, -np.inf, np.inf], (types, 1))
-        at, failed = np.full((types, 4, 2), -1), np.zeros(types, np.int64)
-        extremes_many(machine, positions[rows], rotations[rows], parts, exact, kinds, values, at, failed)
-        at[..., 0] += np.where(at[..., 0] < 0, 0, rows.start)
-        of_slice[rows.start] = values, at, failed
+        best, at = np.empty((len(errors), 4)), np.empty((len(errors), 4), int)
+        failed = np.zeros(types, int)
+        for e, vector in enumerate(each(geometry, errors, positions[rows], rotations[rows])):
+            signed = _SIGNS[:, None] * _sizes(vector)[[0, 0, 1, 1]]
+            missing = np.isnan(signed).any(axis=0)
+            signed[:, missing] = -np.inf
+            at[e] = signed.argmax(axis=1)
+            best[e] = signed[range(4), at[e]]
+            failed[errors.kind[e]] += missing.sum()
+        of_slice[rows.start] = best, at + rows.start, failed
 
-    over_chunks(run, len(positions), threads)
+    over_chunks(run, len(positions), threads, BLOCK)
     slices = [of_slice[start] for start in sorted(of_slice)]
-    failed = np.array([part[2] for part in slices], np.int64).reshape(-1, types)
-    values, at = _first_best(
-        np.array([part[0] for part in slices]).reshape(-1, types, 4),
-        np.array([part[1] for part in slices], int).reshape(-1, types, 4, 2),
-    )
-    found = at[..., 0] >= 0
+    best, at_pose, at_error = _best_of_kinds(errors, slices)
+    found = np.isfinite(best)
     return Extremes(
         errors=errors,
-        values=np.where(found, values, np.nan),
-        at_pose=np.where(found, at[..., 0] + first, -1),
-        at_error=at[..., 1],
-        positions=_picked(positions, at[..., 0], found),
-        rotations=_picked(rotations, at[..., 0], found),
-        failed=failed.sum(axis=0),
+        values=np.where(found, best * _SIGNS, np.nan),
+        at_pose=np.where(found, at_pose + first, -1),
+        at_error=np.where(found, at_error, -1),
+        positions=_picked(positions, at_pose, found),
+        rotations=_picked(rotations, at_pose, found),
+        failed=sum((part[2] for part in slices), np.zeros(types, int)),
         poses=len(positions),
     )
 
@@ -215,12 +218,18 @@ def _merged_pair(a: Extremes, b: Extremes) -> Extremes:
 _SIGNS = np.array([1.0, -1.0, 1.0, -1.0])
 
 
-def _first_best(values: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the best of several slices, (S, K, 4) → (K, 4); the first of equals."""
-    best = np.argmax(values * _SIGNS, axis=0)[None] if len(values) else np.empty((0, *values.shape[1:]), int)
-    if not len(best):
-        return np.full(values.shape[1:], np.nan), np.full(at.shape[1:], -1)
-    return np.take_along_axis(values, best, 0)[0], np.take_along_axis(at, best[..., None], 0)[0]
+def _best_of_kinds(
+    errors: SingleErrors, slices: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return best values, (K, 4), −∞ for none, with pose and error; of equals the first pose's first error."""
+    types, count = len(errors.kinds), len(errors)
+    kind = np.concatenate([np.arange(types), np.tile(errors.kind, len(slices))])
+    error = np.concatenate([np.full(types, -1), np.tile(np.arange(count), len(slices))])
+    best = np.concatenate([np.full((types, 4), -np.inf), *(part[0] for part in slices)])
+    pose = np.concatenate([np.full((types, 4), -1), *(part[1] for part in slices)])
+    order = np.stack([np.lexsort((pose[:, k], -best[:, k], kind)) for k in range(4)], axis=1)
+    chosen = order[np.searchsorted(kind[order[:, 0]], np.arange(types))]
+    return np.take_along_axis(best, chosen, 0), np.take_along_axis(pose, chosen, 0), error[chosen]
 
 
 def _picked(rows: np.ndarray, at: np.ndarray, found: np.ndarray) -> np.ndarray:
@@ -230,31 +239,101 @@ def _picked(rows: np.ndarray, at: np.ndarray, found: np.ndarray) -> np.ndarray:
     return picked
 
 
-def _arguments(geometry: HexapodGeometry, errors: SingleErrors, method: str) -> tuple[tuple, tuple, bool]:
-    """Return machine and errors as the kernels take them, and whether to be exact.
+def _exact(
+    geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray
+) -> Iterator[np.ndarray]:
+    """Yield the effects of one error after the other by forward kinematics, shape (6, N)."""
+    structure = Structure.of(geometry)
+    home = strut_lengths(structure, geometry.home)
+    lengths, start = _nominal(structure, positions, rotations)
+    before, axes = (start.positions, start.rotations), np.array(geometry.work.rotation)
+    for part, i, vector in zip(errors.part, errors.strut, errors.vector, strict=True):
+        if part == TOOL:
+            yield _tool_shift(geometry, rotations, start.ok, vector)
+            continue
+        told, base, platform = lengths.copy(), np.zeros((6, 3)), np.zeros((6, 3))
+        if part == LENGTH:
+            told[:, i] += _stretch(vector, lengths[:, i], home[i])
+        else:
+            (base if part == BASE_JOINT else platform)[i] = vector
+        after = solve_poses(structure.moved(base, platform), told, before, threads=1)
+        motions = np.empty((6, len(lengths)))
+        kernels.motions_many(*before, after.positions, after.rotations, geometry.tool.position, axes, motions)
+        yield motions
+
+
+def _linear(
+    geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray
+) -> Iterator[np.ndarray]:
+    """Yield the effects of one error after the other by the inverse Jacobian, shape (6, N)."""
+    structure = Structure.of(geometry)
+    home = strut_lengths(structure, geometry.home)
+    lengths, start = _nominal(structure, positions, rotations)
+    rows = jacobian_batch(structure, start.positions, start.rotations)
+    in_platform = np.einsum("nij,nki->nkj", start.rotations, rows[..., :3])
+    per_length = _per_length(geometry, rows, start)
+    for part, i, vector in zip(errors.part, errors.strut, errors.vector, strict=True):
+        if part == TOOL:
+            yield _tool_shift(geometry, rotations, start.ok, vector)
+        elif part == LENGTH:
+            yield per_length[i] * _stretch(vector, lengths[:, i], home[i])
+        elif part == BASE_JOINT:
+            yield per_length[i] * np.einsum("nj,j->n", rows[:, i, :3], vector)
+        else:
+            yield per_length[i] * -np.einsum("nj,j->n", in_platform[:, i], vector)
+
+
+def _way(method: str) -> Callable[..., Iterator[np.ndarray]]:
+    """Return what yields the effects by a method.
 
     Raises
     ------
     KinematicsError
-        The method is unknown.
+        It is unknown.
     """
     if method not in METHODS:
         raise KinematicsError(f"method must be one of {', '.join(METHODS)}, not {method!r}", method)
-    structure = Structure.of(geometry)
-    certificate = [geometry.characteristic_length, geometry.home_sign, geometry.limits.condition]
-    machine = (
-        *geometry.kernel_joints,
-        strut_lengths(structure, geometry.home),
-        np.array(geometry.tool.position),
-        np.array(geometry.work.rotation),
-        np.array(certificate),
-    )
-    parts = (
-        np.array(errors.part, dtype=np.int64),
-        np.array(errors.strut, dtype=np.int64),
-        np.array(errors.vector, dtype=float, order="C"),
-    )
-    return machine, parts, method == EXACT
+    return _exact if method == EXACT else _linear
+
+
+def _nominal(structure: Structure, positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, ForwardBatch]:
+    """Return the nominal lengths (N, 6), and the poses that they give: certified, NaN where they cannot be."""
+    lengths = np.empty((len(positions), 6))
+    kernels.strut_lengths_many(structure.base_joints, structure.platform_joints, positions, rotations, lengths)
+    return lengths, solve_poses(structure, lengths, (positions, rotations), threads=1)
+
+
+def _stretch(coefficients: np.ndarray, lengths: np.ndarray, home: float) -> np.ndarray:
+    """Return a strut's length error at its lengths, shape (N,), m: a + b·(L − L_home) + c·L."""
+    a, b, c = coefficients
+    return a + b * (lengths - home) + c * lengths
+
+
+def _tool_shift(
+    geometry: HexapodGeometry, rotations: np.ndarray, certified: np.ndarray, offset: np.ndarray
+) -> np.ndarray:
+    """Return the effects of a wrong tool, shape (6, N): its offset along the axes of the work frame."""
+    vectors = np.zeros((6, len(rotations)))
+    vectors[:3] = np.einsum("ik,ni->kn", geometry.work.rotation, np.einsum("nij,j->ni", rotations, offset))
+    vectors[:, ~certified] = np.nan
+    return vectors
+
+
+def _per_length(geometry: HexapodGeometry, rows: np.ndarray, start: ForwardBatch) -> np.ndarray:
+    """Return displacement of the tool and turn per length of each strut, shape (6 struts, 6, N), in the work frame."""
+    inverse = np.full((len(rows), 6, 6), np.nan)
+    inverse[start.ok] = np.linalg.inv(rows[start.ok])
+    columns = inverse.transpose(0, 2, 1)
+    lever = np.einsum("nij,j->ni", start.rotations, geometry.tool.position)
+    shift, turn = columns[..., :3] + np.cross(columns[..., 3:], lever[:, None]), columns[..., 3:]
+    return np.concatenate([np.einsum("ik,nsi->skn", geometry.work.rotation, part) for part in (shift, turn)], axis=1)
+
+
+def _sizes(vectors: np.ndarray) -> np.ndarray:
+    """Return displacements and largest rotations about an axis, (6, N) → (2, N)."""
+    x, y, z = vectors[:3]
+    a, b, c = np.abs(vectors[3:])
+    return np.stack([np.sqrt(x * x + y * y + z * z), np.maximum(np.maximum(a, b), c)])
 
 
 def _poses(positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,11 +15,13 @@ import numpy as np
 
 from ..errors import InputFileError, ModelError
 from ..formats.yaml import Section, read_yaml
-from ..kernels.effects import BASE_JOINT, LENGTH, PLATFORM_JOINT, TOOL
 from ..machine.geometry import HexapodGeometry
 
 BUDGET_FORMAT = "hexapod_comp/error_budget"
 BUDGET_VERSION = 1
+
+LENGTH, BASE_JOINT, PLATFORM_JOINT, TOOL = range(4)
+"""What a single error moves."""
 
 AXES = ("x", "y", "z")
 

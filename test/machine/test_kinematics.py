@@ -35,6 +35,7 @@ from hexapod_comp.machine.kinematics import (
     Structure,
     condition_number,
     jacobian,
+    jacobian_batch,
     solve_pose,
     solve_poses,
     strut_lengths,
@@ -170,6 +171,48 @@ def test_jacobian_against_central_differences(machine: HexapodGeometry) -> None:
         np.testing.assert_allclose(jacobian(structure, pose), expected, rtol=0.0, atol=1e-9)
 
 
+def test_jacobians_of_many_poses_are_those_of_each() -> None:
+    positions, rotations = poses_about(HOME, 5, seed=4)
+    positions[3, 1] = np.nan
+    batch = jacobian_batch(IDEAL, positions, rotations)
+    assert np.isnan(batch[3]).any()
+    for n in (0, 1, 2, 4):
+        np.testing.assert_array_equal(batch[n], jacobian(IDEAL, Pose(positions[n], rotations[n])))
+
+
+@pytest.mark.parametrize(
+    ("angle", "tolerance"),
+    [
+        (1e-9, 4e-16),  # rounding of the two rotations alone
+        (1e-4, 4e-16),
+        (0.3, 1e-15),
+        (3.0, 1e-14),  # … over the sine of the angle, 0.14
+    ],
+)
+def test_motions_between_poses_against_rotations_by_their_vectors(angle: float, tolerance: float) -> None:
+    """The turn comes back that made the second pose, and a point goes where it carries it, along turned axes."""
+    rng = np.random.default_rng(21)
+    (positions, rotations), point = poses_about(HOME, 40, seed=22), np.array([0.03, -0.02, 0.08])
+    axes = Rotation.from_rotvec([0.4, -0.2, 0.7])
+    vectors = rng.normal(size=(40, 3))
+    vectors *= angle / np.linalg.norm(vectors, axis=1)[:, None]
+    shifts = angle * rng.normal(size=(40, 3))
+    arms, motions = rotations @ point, np.empty((6, 40))
+    # exp(ω)·a − a = sin θ·(k × a) + (1 − cos θ)·k × (k × a), without a difference of nearly equal numbers
+    swing, axis = np.cross(vectors, arms) / angle, vectors / angle
+    carried = shifts + np.sin(angle) * swing + 2.0 * np.sin(0.5 * angle) ** 2 * np.cross(axis, swing)
+    turned = Rotation.from_rotvec(vectors).as_matrix() @ rotations
+    kernels.motions_many(positions, rotations, positions + shifts, turned, point, axes.as_matrix(), motions)
+    np.testing.assert_allclose(motions[:3].T, axes.inv().apply(carried), rtol=0.0, atol=tolerance)
+    np.testing.assert_allclose(motions[3:].T, axes.inv().apply(vectors), rtol=0.0, atol=tolerance)
+
+
+def test_the_motion_by_half_a_turn_has_no_axis() -> None:
+    half, motions = np.diag([1.0, -1.0, -1.0])[None], np.empty((6, 1))
+    kernels.motions_many(np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 3)), half, np.zeros(3), np.eye(3), motions)
+    np.testing.assert_array_equal(motions[:, 0], [1.0, 1.0, 1.0, np.nan, np.nan, np.nan])
+
+
 @machines
 def test_condition_number_and_sign_against_linear_algebra(machine: HexapodGeometry) -> None:
     """NumPy's inverse and determinant of the Jacobian, whose own test is above; 1e-11 covers κ²·1e-16."""
@@ -225,6 +268,35 @@ def test_batch_of_lengths_equals_single_bit_for_bit(machine: HexapodGeometry) ->
     lengths = strut_lengths_batch(structure, positions, rotations)
     for n in range(50):
         assert (strut_lengths(structure, Pose(positions[n], rotations[n])) == lengths[n]).all()
+
+
+@machines
+def test_every_row_may_have_a_start_of_its_own(machine: HexapodGeometry) -> None:
+    """From the answer itself one step of rounding's size is enough, which no common start could give to all rows."""
+    structure = Structure.of(machine)
+    poses = poses_about(machine.home, 50, seed=7, tilt_deg=15.0)
+    batch = solve_poses(structure, strut_lengths_batch(structure, *poses), poses)
+    assert (batch.iterations == 1).all()
+    np.testing.assert_allclose(batch.positions, poses[0], rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(batch.rotations, poses[1], rtol=0.0, atol=1e-13)
+
+
+@machines
+def test_a_start_may_be_a_rounded_rotation(machine: HexapodGeometry) -> None:
+    """Ten digits pass as a pose; a start at the answer, off by 5e-11, once left a closure that was refused."""
+    structure = Structure.of(machine)
+    positions, rotations = poses_about(machine.home, 20, seed=9, tilt_deg=15.0)
+    lengths = strut_lengths_batch(structure, positions, rotations)
+    assert solve_poses(structure, lengths, (positions, np.round(rotations, 9))).ok.all()
+    for n in range(20):
+        found = solve_pose(structure, lengths[n], Pose(positions[n], np.round(rotations[n], 10)))
+        np.testing.assert_allclose(found.position, positions[n], rtol=0.0, atol=1e-14)
+
+
+def test_starts_that_are_not_as_many_as_rows_are_refused() -> None:
+    lengths = np.ones((4, 6))
+    with pytest.raises(KinematicsError, match=r"\(4, 3\) and \(4, 3, 3\).*not \(3, 3\)"):
+        solve_poses(IDEAL, lengths, (np.zeros((3, 3)), np.zeros((3, 3, 3))))
 
 
 def test_number_of_threads_does_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from hexapod_comp.machine import kinematics
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import Structure, solve_pose, strut_lengths
 from hexapod_comp.pose import Pose
-from hexapod_comp.workspace.effects import LINEAR, effect_vectors, effects, extremes, merged
+from hexapod_comp.workspace.effects import EXACT, LINEAR, effect_vectors, effects, extremes, merged
 from hexapod_comp.workspace.sources import BASE_JOINT, LENGTH, PLATFORM_JOINT, TOOL, Budget, SingleErrors
 from hexapod_comp.workspace.tangential import STEP, tangential_effect
 
@@ -206,6 +206,41 @@ def test_a_joint_that_is_far_off_is_solved_with_pivoting():
         np.testing.assert_allclose(found[n], [*(actual.position - p), *turn], atol=1e-12)
 
 
+def test_effects_of_a_nanometre_keep_their_digits():
+    # Errors of 1 nm: exact and linear effects differ by their square over the platform's size, 1e-17. What is left is
+    # the rounding of lengths of half a metre, 1e-16 m, times gains of the machine of about ten.
+    geometry = tooled(general_machine())
+    names = [name for name in SIZES if name not in ("thermal_growth", "screw_pitch_slope")]
+    errors = every_error(geometry, dict.fromkeys(names, 1e-9))
+    poses = poses_about(geometry.home, 20, seed=12, tilt_deg=15.0)
+    exact, linear = (effect_vectors(geometry, errors, *poses, method) for method in (EXACT, LINEAR))
+    assert np.abs(linear).max() > 1e-9
+    np.testing.assert_allclose(exact, linear, rtol=0.0, atol=5e-15)
+
+
+def test_rotations_that_are_rounded_to_nine_digits_change_no_effect():
+    # 5e-10 off a rotation matrix, at a tool of 90 mm, is 4e-11 m: it must be no part of an effect. The effect itself,
+    # some 1e-5, changes by that share of it.
+    geometry = tooled(paper())
+    errors = every_error(geometry)
+    positions, rotations = poses_about(geometry.home, 5, seed=13, tilt_deg=15.0)
+    found = effect_vectors(geometry, errors, positions, rotations)
+    rounded = effect_vectors(geometry, errors, positions, np.round(rotations, 9))
+    np.testing.assert_allclose(rounded, found, rtol=0.0, atol=1e-12)
+
+
+def test_a_type_without_errors_has_no_extremes():
+    geometry = paper()
+    errors = every_error(geometry)
+    some = errors.select(errors.kind != 1)
+    poses = poses_about(geometry.home, 3, seed=14)
+    found, every = extremes(geometry, some, *poses), extremes(geometry, errors, *poses)
+    assert np.isnan(found.values[1]).all()
+    assert (found.at_pose[1] == -1).all()
+    assert (found.at_error[1] == -1).all()
+    np.testing.assert_array_equal(np.delete(found.values, 1, axis=0), np.delete(every.values, 1, axis=0))
+
+
 def test_poses_without_a_certified_answer_are_nan_and_counted():
     geometry = paper()
     errors = every_error(geometry)
@@ -231,13 +266,15 @@ def test_a_strut_error_longer_than_the_strut_is_nan():
     assert np.isnan(far).all()
 
 
-def test_extremes_are_those_of_all_effects_however_they_are_parted(monkeypatch):
+@pytest.mark.parametrize("method", [EXACT, LINEAR])
+def test_extremes_are_those_of_all_effects_however_they_are_parted(method, monkeypatch):
     monkeypatch.setattr(kinematics, "ALONE", -1.0)  # others help from the second slice on
     geometry = tooled(paper())
     errors = every_error(geometry)
     positions, rotations = poses_about(geometry.home, 5000, seed=9)
-    whole = extremes(geometry, errors, positions, rotations, threads=3)
-    sizes = effects(geometry, errors, positions, rotations)
+    monkeypatch.setattr("hexapod_comp.workspace.effects.BLOCK", 1024)
+    whole = extremes(geometry, errors, positions, rotations, method, threads=3)
+    sizes = effects(geometry, errors, positions, rotations, method)
     for kind in range(len(errors.kinds)):
         of_kind = np.flatnonzero(errors.kind == kind)
         for column, (quantity, best) in enumerate([(0, np.argmax), (0, np.argmin), (1, np.argmax), (1, np.argmin)]):
@@ -248,7 +285,8 @@ def test_extremes_are_those_of_all_effects_however_they_are_parted(monkeypatch):
             np.testing.assert_array_equal(whole.positions[kind, column], positions[pose])
     cuts = [0, 1, 1500, 4097, 5000]
     parts = merged(
-        extremes(geometry, errors, positions[a:b], rotations[a:b], first=a, threads=1) for a, b in pairwise(cuts)
+        extremes(geometry, errors, positions[a:b], rotations[a:b], method, first=a, threads=1)
+        for a, b in pairwise(cuts)
     )
     for name in ("values", "at_pose", "at_error", "positions", "rotations", "failed", "poses"):
         np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
