@@ -107,7 +107,7 @@ def test_the_report_has_all_its_parts(done: Done) -> None:
             "machine positioning_unit: 48 single errors of 6 types at",
             "limited by (share of the boundary)",
             "transl. max µm",
-            "004, Table 1",
+            "v. Daake et al., Table 1",
             "tool x, y, z mm",
             "whole budget, worst pose",
             "allowed 50 µm, root sum of squares",
