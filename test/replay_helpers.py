@@ -16,11 +16,10 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.compensation.journal import SNAPSHOT_PERIOD, Journal, load_with_source, sources_text
+from hexapod_comp.compensation.journal import SNAPSHOT_PERIOD, Journal, Source, sources_text
 from hexapod_comp.compensation.state import pack_pose
 from hexapod_comp.errors import HexapodError
-from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
-from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.pose import Pose
 
 CONFIG = Path(__file__).resolve().parents[1] / "config"
@@ -99,7 +98,8 @@ class RecordedMachine:
 
     def __init__(self, namespace: str = "", model: str | Path = CONFIG / "paper_machine.yaml") -> None:
         self.namespace, self.messages = namespace, Messages()
-        self.geometry, geometry_source = load_with_source(CONFIG / "paper.yaml", load_geometry)
+        geometry_source = Source.read(CONFIG / "paper.yaml")
+        self.geometry = geometry_source.geometry()
         self.sources = {"geometry": geometry_source}
         self.now, self.answers = BEGAN, list[np.ndarray]()
         self.compensator = Compensator(self.geometry, self.load(model))
@@ -110,8 +110,8 @@ class RecordedMachine:
 
     def load(self, path: str | Path) -> Any:
         """Return a model and keep its text."""
-        model, self.sources["model"] = load_with_source(path, lambda file: load_model(file, self.geometry))
-        return model
+        self.sources["model"] = Source.read(path)
+        return self.sources["model"].model(self.geometry.name)
 
     def keep(self, topic: str, message: Any) -> None:
         """Keep a message as recorded now."""

@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     from ..virtual.assessment import assess
     from ..virtual.imperfections import ImperfectionBounds
 
-    rows, poses = read_poses(common.input_file(args.poses))
+    rows, poses = read_poses(args.poses)
     if args.machines * len(poses) > MOST_RESULTS:
         most = MOST_RESULTS // len(poses)
         problem = f"--machines: at most {most} at {len(poses)} poses, not {args.machines}"

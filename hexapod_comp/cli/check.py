@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     from ..compensation.checks import check
     from ..formats.csv import read_pose_arrays
 
-    rows, positions, rotations = read_pose_arrays(common.input_file(args.poses))
+    rows, positions, rotations = read_pose_arrays(args.poses)
     geometry, model = common.load_machine(args)
     mode = "stream" if args.stream else "moves"
     common.mention_compiling("checks.examine_many")

@@ -16,8 +16,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from ..formats.texts import number
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import numpy as np
 
     from ..formats.csv import Row
@@ -124,25 +122,13 @@ def _not_a_number(text: str) -> Any:
     raise argparse.ArgumentTypeError(f"is not finite numbers: {text!r}")
 
 
-def input_file(name: str) -> str | Path:
-    """Return the file meant by a name: ``-`` is standard input, else a path, else a shipped file."""
-    from ..formats.paths import config_file
-
-    if name == "-":
-        return "/dev/stdin"
-    return name if os.path.exists(name) else config_file(name)
-
-
 def load_machine(args: argparse.Namespace) -> tuple[HexapodGeometry, MachineModel]:
     """Return the geometry and the model that the options name."""
-    from ..formats.paths import config_file
     from ..machine.geometry import load_geometry
-    from ..machine.model import MachineModel
     from ..machine.model_file import load_model
 
-    geometry = load_geometry(config_file(args.machine))
-    model = getattr(args, "model", "ideal")
-    return geometry, MachineModel(geometry.name) if model == "ideal" else load_model(config_file(model), geometry)
+    geometry = load_geometry(args.machine)
+    return geometry, load_model(getattr(args, "model", "ideal"), geometry)
 
 
 def one_row(

@@ -75,7 +75,7 @@ def _read(args: argparse.Namespace) -> tuple[list[Row], np.ndarray]:
     from ..formats.csv import Row, read_lengths
 
     if args.lengths is None:
-        return read_lengths(common.input_file(args.lengths_file))
+        return read_lengths(args.lengths_file)
     return [Row(0, "1")], np.array([args.lengths])
 
 

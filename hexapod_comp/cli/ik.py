@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     from ..compensation.checks import check
     from ..formats.csv import read_pose_arrays
 
-    rows, positions, rotations = _given_pose(args) or read_pose_arrays(common.input_file(args.poses))
+    rows, positions, rotations = _given_pose(args) or read_pose_arrays(args.poses)
     geometry, model = common.load_machine(args)
     common.mention_compiling("checks.examine_many")
     result = check(geometry, model, positions, rotations, "poses")

@@ -109,25 +109,20 @@ def _show(args: argparse.Namespace, report: Report) -> None:
 def _given(args: argparse.Namespace) -> dict[str, Source]:
     """Return the texts of the files that the options name, by hash."""
     from ..compensation.journal import Source
-    from ..formats.paths import config_file
-    from ..formats.yaml import read_text
+    from ..formats.paths import input_file
 
     names = [name for name in (args.machine, args.model) if name is not None and name != "ideal"]
-    sources = [Source.of(name, read_text(config_file(name))) for name in names]
+    sources = [Source.read(input_file(name)) for name in names]
     return {source.sha256: source for source in sources}
 
 
 def _other(args: argparse.Namespace, recording: Recording, files: Files) -> tuple[HexapodGeometry, MachineModel] | None:
     """Return the geometry and the model of the options, when one of them is another than was in use."""
-    from ..formats.paths import config_file
     from ..machine.geometry import load_geometry
-    from ..machine.model import MachineModel
     from ..machine.model_file import load_model
 
     first, ideal = recording.first, args.model == "ideal"
     if not (set(_given(args)) - files.used or (ideal and not files.used_ideal)):
         return None
-    geometry = load_geometry(config_file(args.machine)) if args.machine else files.geometry(first.geometry)
-    if ideal:
-        return geometry, MachineModel(geometry.name)
-    return geometry, load_model(config_file(args.model), geometry) if args.model else files.model(first.model, geometry)
+    geometry = load_geometry(args.machine) if args.machine else files.geometry(first.geometry)
+    return geometry, load_model(args.model, geometry) if args.model else files.model(first.model, geometry)

@@ -24,13 +24,15 @@ import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from ..errors import HexapodError, InputFileError
 from ..formats.yaml import read_text
+from ..machine.geometry import HexapodGeometry, parse_geometry
 from ..machine.model import MachineModel
+from ..machine.model_file import IDEAL, parse_model
 from .compensator import Compensator
 
 FORMAT = 3
@@ -64,8 +66,6 @@ LARGEST_SOURCE = 250_000
 
 CPU_INFO = Path("/proc/cpuinfo")
 
-Loaded = TypeVar("Loaded")
-
 
 class JournalError(HexapodError):
     """A page that is none: what is wrong in it."""
@@ -96,20 +96,29 @@ class Source:
         """Return the source with a text."""
         return cls(name, text, hashlib.sha256(text.encode()).hexdigest())
 
+    @classmethod
+    def read(cls, path: str | Path) -> Source:
+        """Return a file as it is now; what is made of it is made of this text, and never of a later one."""
+        return cls.of(str(path), read_text(path))
 
-def load_with_source(path: str | Path, load: Callable[[str | Path], Loaded]) -> tuple[Loaded, Source]:
-    """Load a file and return also the text it was loaded from.
+    def geometry(self) -> HexapodGeometry:
+        """Return the machine that it describes; errors as :func:`~hexapod_comp.machine.geometry.load_geometry`."""
+        return parse_geometry(self._whole(), self.name)
 
-    Raises
-    ------
-    InputFileError
-        As `load`; or the file changes while it is read.
-    """
-    before = read_text(path)
-    loaded = load(path)
-    if read_text(path) != before:
-        raise InputFileError(path, "", "is being written while it is read; try again")
-    return loaded, Source.of(str(path), before)
+    def model(self, machine: str) -> MachineModel:
+        """Return the model that it describes, of a machine; errors as :func:`~..machine.model_file.load_model`."""
+        if self.sha256 == IDEAL_SOURCE.sha256:
+            return MachineModel(machine)
+        return parse_model(self._whole(), machine, self.name)
+
+    def _whole(self) -> str:
+        if self.text is None:
+            raise InputFileError(self.name, "", "was too long to be copied")
+        return self.text
+
+
+IDEAL_SOURCE = Source.of(IDEAL, "")
+"""Stands for the file of the ideal model, which has none."""
 
 
 @dataclass(frozen=True)

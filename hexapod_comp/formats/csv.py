@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import InputFileError, PoseError
 from ..kernels.pose import QUATERNION_NORM_TOLERANCE
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
+from .paths import input_file
 from .yaml import UNITS
 
 LABEL_COLUMNS = ("sequence", "name")
@@ -263,7 +264,7 @@ def _column_names(name: str, dimension: str | None) -> str:
 
 
 def read_poses(path: str | Path) -> tuple[list[Row], list[Pose]]:
-    """Read poses from a CSV file.
+    """Read poses from a CSV file; the name of a shipped one, as ``table1.csv``, or ``-`` for standard input will do.
 
     Columns: ``x_mm``, ``y_mm``, ``z_mm`` (or ``_m``, ``_um``, ``_in``); optionally ``alpha_deg``,
     ``beta_deg``, ``gamma_deg`` (the paper's angles; or ``_rad``, …) or ``qx``, ``qy``, ``qz``, ``qw``;
@@ -300,7 +301,7 @@ def read_pose_arrays(path: str | Path) -> tuple[list[Row], np.ndarray, np.ndarra
     InputFileError
         Naming file, line and column.
     """
-    table = Table(path)
+    table = Table(input_file(path))
     positions, rotations = table.poses()
     table.refuse_unknown()
     return table.labels(), positions, rotations
@@ -319,7 +320,7 @@ def _rotations_from_quaternions(path: str | Path, rows: list[Row], quaternions: 
 
 
 def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
-    """Read strut lengths from a CSV file with the columns ``L1_mm`` … ``L6_mm`` (or ``_m``, …).
+    """Read strut lengths from a CSV file (or ``-``) with the columns ``L1_mm`` … ``L6_mm`` (or ``_m``, …).
 
     The columns ``nominal_L…`` and ``correction_L…`` that ``ik --model`` adds are known and passed over.
 
@@ -335,7 +336,7 @@ def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
     InputFileError
         Naming file, line and column.
     """
-    table = Table(path)
+    table = Table(input_file(path))
     lengths = table.numbers(table.required(LENGTH_COLUMNS, "length"))
     for group in (NOMINAL_COLUMNS, CORRECTION_COLUMNS):
         table.columns(group, "length")

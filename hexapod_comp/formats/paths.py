@@ -41,6 +41,25 @@ def config_file(name: str | os.PathLike[str]) -> Path:
     raise InputFileError(os.fspath(name) or "''", "", _not_found(os.fspath(name), shipped))
 
 
+def input_file(name: str | os.PathLike[str]) -> Path:
+    """Find what is to be read: anything but a folder at a path, pipes too; else a shipped file.
+
+    Parameters
+    ----------
+    name : str or path
+        As for :func:`config_file`, or ``-`` for standard input.
+
+    Raises
+    ------
+    InputFileError
+        As :func:`config_file`.
+    """
+    own = os.path.expanduser(name)
+    if own == "-":
+        return Path("/dev/stdin")
+    return Path(own) if os.path.exists(own) and not os.path.isdir(own) else config_file(name)
+
+
 def confined_file(name: str | os.PathLike[str], folder: Path | None) -> Path:
     """Find a configuration file as :func:`config_file` does, but only in one folder or among the shipped ones.
 
@@ -117,4 +136,5 @@ def _not_found(name: str, shipped: list[str]) -> str:
     """Say that `name` is neither a file nor shipped, and what is."""
     near = difflib.get_close_matches(name, shipped, 1)
     hint = f"; did you mean {near[0]}?" if near else ""
-    return f"there is no such file, and the shipped ones are {', '.join(shipped)}{hint}"
+    what = "is a folder" if os.path.isdir(os.path.expanduser(name)) else "there is no such file"
+    return f"{what}, and the shipped ones are {', '.join(shipped)}{hint}"

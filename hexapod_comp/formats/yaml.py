@@ -118,12 +118,19 @@ def read_text(path: str | Path) -> str:
 
 
 def read_yaml(path: str | Path, file_format: str, version: int) -> Section:
-    """Read a YAML file and check its `format` and `version` lines.
+    """Read a YAML file as :func:`parse_yaml` does its text."""
+    return parse_yaml(read_text(path), path, file_format, version)
+
+
+def parse_yaml(text: str, name: str | Path, file_format: str, version: int) -> Section:
+    """Parse YAML with the safe loader and check its `format` and `version` lines.
 
     Parameters
     ----------
-    path : str or Path
-        File to read, with the safe loader.
+    text : str
+        All of it.
+    name : str or Path
+        Where it comes from, for messages.
     file_format : str
         Expected value of the key ``format``.
     version : int
@@ -137,20 +144,19 @@ def read_yaml(path: str | Path, file_format: str, version: int) -> Section:
     Raises
     ------
     InputFileError
-        Unreadable, not YAML, another format or version.
+        Not YAML, another format or version.
     """
     try:
-        text = read_text(path)
         _refuse_tricks(text)
         content = yaml.load(text, Loader=_StrictLoader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         problem = getattr(error, "problem", None) or type(error).__name__
         mark = getattr(error, "problem_mark", None)
         where = f"line {mark.line + 1}" if mark is not None else ""
-        raise InputFileError(path, where, f"is not valid YAML: {problem}") from error
+        raise InputFileError(name, where, f"is not valid YAML: {problem}") from error
     if not isinstance(content, dict):
-        raise InputFileError(path, "", "must hold keys and values at its top level", content)
-    section = Section(path, "", content)
+        raise InputFileError(name, "", "must hold keys and values at its top level", content)
+    section = Section(name, "", content)
     found = section.text("format")
     if found != file_format:
         raise section.error("format", f"must be {file_format!r}", found)

@@ -26,11 +26,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import HexapodError, KinematicsError
-from ..formats.paths import config_file
 from ..kernels.drives import follow_point
 from ..kernels.motion import follow
-from ..machine.geometry import HexapodGeometry, load_geometry
-from ..machine.model import MachineModel, RealMachine
+from ..machine.geometry import load_geometry
+from ..machine.model import RealMachine
 from ..machine.model_file import load_model
 from ..machine.motion import MotionState
 from ..pose import Pose
@@ -168,8 +167,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(argv)
     stop = threading.Event()
     try:
-        geometry = load_geometry(config_file(options.geometry))
-        shown = MachineComponent(RealMachine(geometry, _truth(options.truth, geometry)), options.units, options.name)
+        geometry = load_geometry(options.geometry)
+        machine = RealMachine(geometry, load_model(options.truth, geometry))
+        shown = MachineComponent(machine, options.units, options.name)
     except HexapodError as error:
         print(f"cannot start: {error}", file=sys.stderr)
         return 1
@@ -183,10 +183,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         due = max(due + period, time.monotonic())
     shown.component.exit()
     return 0
-
-
-def _truth(name: str, geometry: HexapodGeometry) -> MachineModel:
-    return MachineModel(geometry.name) if name == "ideal" else load_model(config_file(name), geometry)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -16,7 +16,6 @@ from ..errors import GeometryError, HexapodError, InputFileError
 from ..formats.csv import Row, length_values
 from ..formats.paths import config_file
 from ..machine.geometry import HexapodGeometry
-from ..machine.model import MachineModel
 from ..machine.model_file import load_model
 from ..machine.size import rms
 from ..machine.trajectory import Path, circle, commanded_in_base, join, move, pocket
@@ -61,7 +60,7 @@ def refuse_broken_limits(path: str, geometry: HexapodGeometry, model: str, rows:
     InputFileError
         A limit is broken; names the first pose and says how to see them all.
     """
-    known = MachineModel(geometry.name) if model == "ideal" else load_model(config_file(model), geometry)
+    known = load_model(model, geometry)
     positions = np.array([pose.position for pose in poses])
     rotations = np.array([pose.rotation for pose in poses])
     found = check(geometry, known, positions, rotations).breaches

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import GeometryError, InputFileError, KinematicsError, LimitError, PoseError
-from ..formats.yaml import Section, read_yaml
+from ..formats.paths import input_file
+from ..formats.yaml import Section, parse_yaml, read_text
 from ..kernels import kinematics as kernels
 from ..kernels.limits import WITHIN, LimitNumbers, check_stage
 from ..pose import Pose
@@ -205,7 +206,7 @@ def load_geometry(path: str | Path) -> HexapodGeometry:
     Parameters
     ----------
     path : str or Path
-        YAML file.
+        YAML file, or the name of a shipped one: ``paper``.
 
     Returns
     -------
@@ -216,11 +217,23 @@ def load_geometry(path: str | Path) -> HexapodGeometry:
     InputFileError
         Naming file, key and value.
     """
-    top = read_yaml(path, GEOMETRY_FORMAT, GEOMETRY_VERSION)
-    name = top.text("machine")
+    file = input_file(path)
+    return parse_geometry(read_text(file), file)
+
+
+def parse_geometry(text: str, name: str | Path = "geometry") -> HexapodGeometry:
+    """Return the machine of a geometry file's text; `name` is what messages call the file.
+
+    Raises
+    ------
+    InputFileError
+        As :func:`load_geometry`.
+    """
+    top = parse_yaml(text, name, GEOMETRY_FORMAT, GEOMETRY_VERSION)
+    machine = top.text("machine")
     base, platform, axes = _read_joints(top)
     home = read_pose(top, "home")
-    limits = _read_limits(top.section("limits"), path)
+    limits = _read_limits(top.section("limits"))
     lead = np.zeros(6)
     if "screw" in top:
         screw = top.section("screw")
@@ -230,9 +243,9 @@ def load_geometry(path: str | Path) -> HexapodGeometry:
     work = read_pose(top, "work") if "work" in top else Pose.identity()
     top.finish()
     try:
-        return HexapodGeometry(name, base, platform, home, limits, screw_lead=lead, tool=tool, work=work, **axes)
+        return HexapodGeometry(machine, base, platform, home, limits, screw_lead=lead, tool=tool, work=work, **axes)
     except GeometryError as error:
-        raise InputFileError(path, error.key, error.problem, error.value) from error
+        raise InputFileError(name, error.key, error.problem, error.value) from error
 
 
 def read_pose(parent: Section, key: str) -> Pose:
@@ -272,7 +285,7 @@ def _read_joints(top: Section) -> tuple[np.ndarray, np.ndarray, dict[str, np.nda
     return joints["base"], joints["platform"], axes
 
 
-def _read_limits(section: Section, path: str | Path) -> Limits:
+def _read_limits(section: Section) -> Limits:
     stroke = section.pairs_per_strut("stroke", "length")
     values = {
         "stroke": stroke,
@@ -288,7 +301,7 @@ def _read_limits(section: Section, path: str | Path) -> Limits:
     try:
         return Limits(**values)  # type: ignore[arg-type]
     except GeometryError as error:
-        raise InputFileError(path, error.key, error.problem, error.value) from error
+        raise InputFileError(section.path, error.key, error.problem, error.value) from error
 
 
 def _refuse_coincident(base_joints: np.ndarray) -> None:

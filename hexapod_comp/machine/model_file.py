@@ -76,7 +76,8 @@ import numpy as np
 import yaml
 
 from ..errors import InputFileError, ModelError
-from ..formats.yaml import UNITS, Section, in_si, read_yaml, write_text_atomically
+from ..formats.paths import input_file
+from ..formats.yaml import UNITS, Section, in_si, parse_yaml, read_text, write_text_atomically
 from .field import COMPONENTS, CROSS_AXES, OUTSIDE_POLICIES, GridField, no_field
 from .geometry import HexapodGeometry
 from .model import MachineModel, ModelOrigin
@@ -84,6 +85,9 @@ from .struts import StrutErrors
 
 MODEL_FORMAT = "hexapod_comp/model"
 MODEL_VERSION = 1
+
+IDEAL = "ideal"
+"""What :func:`load_model` and parameters call the model of a machine without errors."""
 
 DIRECTIONS = ("forward", "backward")
 """Order of the directions of motion in a field's arrays."""
@@ -114,7 +118,7 @@ def load_model(path: str | Path, geometry: HexapodGeometry) -> MachineModel:
     Parameters
     ----------
     path : str or Path
-        YAML file.
+        YAML file, or the name of a shipped one; ``ideal`` is the machine without errors.
     geometry : HexapodGeometry
         The machine that it must belong to.
 
@@ -127,11 +131,34 @@ def load_model(path: str | Path, geometry: HexapodGeometry) -> MachineModel:
     InputFileError
         Naming file, key, value and what is allowed.
     """
-    top = read_yaml(path, MODEL_FORMAT, MODEL_VERSION)
+    if path == IDEAL:
+        return MachineModel(geometry.name)
+    file = input_file(path)
+    return parse_model(read_text(file), geometry.name, file)
+
+
+def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineModel:
+    """Return the model of a model file's text.
+
+    Parameters
+    ----------
+    text : str
+        All of it.
+    machine : str
+        Name of the machine that it must belong to.
+    name : str or Path
+        What messages call the file.
+
+    Raises
+    ------
+    InputFileError
+        As :func:`load_model`.
+    """
+    top = parse_yaml(text, name, MODEL_FORMAT, MODEL_VERSION)
     _refuse_cut_off(top)
-    machine = top.text("machine")
-    if machine != geometry.name:
-        raise top.error("machine", f"the model is for another machine, must be {geometry.name!r}", machine)
+    found = top.text("machine")
+    if found != machine:
+        raise top.error("machine", f"the model is for another machine, must be {machine!r}", found)
     try:
         values = {
             "name": top.text("name"),
@@ -147,11 +174,11 @@ def load_model(path: str | Path, geometry: HexapodGeometry) -> MachineModel:
         top.finish()
         return MachineModel(machine, **values)
     except ModelError as error:
-        raise InputFileError(path, error.key, error.problem, error.value) from error
+        raise InputFileError(name, error.key, error.problem, error.value) from error
 
 
 def save_model(model: MachineModel, path: str | Path) -> None:
-    """Write a model file, whole or not at all; equal models give equal files.
+    """Write a model file, whole or not at all.
 
     Parameters
     ----------
@@ -167,6 +194,11 @@ def save_model(model: MachineModel, path: str | Path) -> None:
     InputFileError
         The file cannot be written.
     """
+    write_text_atomically(path, model_text(model))
+
+
+def model_text(model: MachineModel) -> str:
+    """Return the text that :func:`save_model` writes; equal models give equal texts."""
     _check_origin(model.origin)
     content: dict[str, Any] = {"format": MODEL_FORMAT, "version": MODEL_VERSION, "closed": True}
     content |= {"machine": model.machine, "name": model.name, "date": model.origin.date}
@@ -185,8 +217,7 @@ def save_model(model: MachineModel, path: str | Path) -> None:
         "field": _field_block(model.field),
     }
     content |= {name: block for name, block in blocks.items() if block} | {"end": True}
-    text = yaml.dump(content, Dumper=_ModelDumper, sort_keys=False, allow_unicode=True, width=math.inf)
-    write_text_atomically(path, text)
+    return yaml.dump(content, Dumper=_ModelDumper, sort_keys=False, allow_unicode=True, width=math.inf)
 
 
 # Reading

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputFileError
+from ..formats.paths import input_file
 from ..formats.yaml import Section, read_yaml
 from ..machine.field import CROSS_AXES
 from ..machine.geometry import HexapodGeometry
@@ -130,13 +131,14 @@ class Campaign:
 
 
 def load_campaign(path: str | Path) -> Campaign:
-    """Read a campaign file (YAML, see config/campaign_5d.yaml).
+    """Read a campaign file (YAML, see config/campaign_5d.yaml), or a shipped one by its name.
 
     Raises
     ------
     InputFileError
         With file, key and value.
     """
+    path = input_file(path)
     top = read_yaml(path, CAMPAIGN_FORMAT, CAMPAIGN_VERSION)
     instrument = top.choice("instrument", (*INSTRUMENTS, "none"), "none")
     try:

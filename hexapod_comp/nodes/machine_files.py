@@ -5,16 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ..compensation.journal import Source, load_with_source
+from ..compensation.journal import IDEAL_SOURCE, Source
 from ..formats.paths import confined_file, folder_of
-from ..machine.geometry import HexapodGeometry, load_geometry
+from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
-from ..machine.model_file import load_model
+from ..machine.model_file import IDEAL
 from .model_loading import Loading
 from .parameters import ParameterError
-
-IDEAL = "ideal"
-"""The word for no model."""
 
 
 class MachineFiles:
@@ -43,27 +40,28 @@ class MachineFiles:
 
     def geometry(self) -> HexapodGeometry:
         """Read the geometry."""
-        geometry, self.sources["geometry"] = load_with_source(self._path(self._geometry_file), load_geometry)
-        return geometry
+        self.sources["geometry"] = Source.read(self._path(self._geometry_file))
+        return self.sources["geometry"].geometry()
 
     def model(self, geometry: HexapodGeometry) -> MachineModel:
         """Read the model."""
-        if self._model_file == IDEAL:
-            self.sources["model"] = Source.of(IDEAL, "")
-            return MachineModel(geometry.name)
-        path = self._path(self._model_file)
-        model, self.sources["model"] = load_with_source(path, lambda file: load_model(file, geometry))
-        return model
+        path = self._model_path()
+        self.sources["model"] = IDEAL_SOURCE if path is None else Source.read(path)
+        return self.sources["model"].model(geometry.name)
 
     def begin_loading(self, machine: str) -> Loading:
         """Begin to read the model of a machine again, elsewhere."""
-        return Loading(None if self._model_file == IDEAL else self._path(self._model_file), machine)
+        return Loading(self._model_path(), machine)
 
     def described(self, model: MachineModel) -> str:
         """Return what to say of the model at the start."""
         if self._model_file == IDEAL:
             return "the ideal model, which corrects nothing (parameter model_file)"
         return f"model {model.name!r}"
+
+    def _model_path(self) -> Path | None:
+        """Return the model's file; None for the ideal model, which has none."""
+        return None if self._model_file == IDEAL else self._path(self._model_file)
 
     def _path(self, name: str) -> Path:
         return confined_file(name, self._folders[name])

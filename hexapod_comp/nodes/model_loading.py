@@ -1,8 +1,8 @@
 """Loading a model while the machine moves: a process of its own reads and checks the file.
 
 Parsing YAML keeps Python's lock for tens of milliseconds, a large model's for hundreds, in which no command would
-be answered. The process hands back checked numbers as JSON, which is read within a millisecond. It is
-``python -m hexapod_comp.nodes.model_loading FILE MACHINE``.
+be answered. The process is given the file's text and hands back checked numbers as JSON, which is read within a
+millisecond. It is ``python -m hexapod_comp.nodes.model_loading NAME MACHINE < TEXT``.
 """
 
 from __future__ import annotations
@@ -12,17 +12,14 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
-from ..compensation.journal import Source, load_with_source
+from ..compensation.journal import IDEAL_SOURCE, Source
 from ..errors import HexapodError
 from ..formats.json import json_text
 from ..machine.field import GridField
-from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel, ModelOrigin
-from ..machine.model_file import load_model
+from ..machine.model_file import parse_model
 from ..machine.struts import StrutErrors
 
 LOADED_WITHIN = 30.0
@@ -38,20 +35,13 @@ class LoadingError(HexapodError):
     reason = "bad_file"
 
 
-@dataclass(frozen=True)
-class _Named:
-    """All that :func:`load_model` asks of a geometry: the machine's name."""
-
-    name: str
-
-
-def model_text(model: MachineModel) -> str:
+def model_json(model: MachineModel) -> str:
     """Return a model as JSON; its numbers come back bit for bit."""
     return json_text(model, indent=None)
 
 
 def model_of(text: str) -> MachineModel:
-    """Return the model of a :func:`model_text`.
+    """Return the model of a :func:`model_json`.
 
     Raises
     ------
@@ -67,30 +57,30 @@ def model_of(text: str) -> MachineModel:
     return MachineModel(**data)
 
 
-def load_elsewhere(path: str | Path, machine: str) -> MachineModel:
-    """Load a model for a machine in a process of its own, and wait for it without keeping Python's lock.
+def load_elsewhere(source: Source, machine: str) -> MachineModel:
+    """Read a model file's text for a machine in a process of its own, and wait for it without keeping Python's lock.
 
     Raises
     ------
     LoadingError
-        As :func:`load_model`, or the process failed.
+        As :func:`~hexapod_comp.machine.model_file.parse_model`, or the process failed.
     """
-    command = [sys.executable, "-m", __name__, str(Path(path).resolve()), machine]
+    command = [sys.executable, "-m", __name__, source.name, machine]
     try:
         done = subprocess.run(
             command,
             cwd=PACKAGE_ROOT,
-            stdin=subprocess.DEVNULL,
+            input=(source.text or "").encode(),
             stdout=subprocess.PIPE,
             timeout=LOADED_WITHIN,
             check=False,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise LoadingError(f"{path}: could not be loaded: {error}") from error
+        raise LoadingError(f"{source.name}: could not be loaded: {error}") from error
     said = done.stdout.decode("utf-8", "replace")
     if done.returncode == 0:
         return model_of(said)
-    raise LoadingError(said or f"{path}: the loading process ended with {done.returncode}")
+    raise LoadingError(said or f"{source.name}: the loading process ended with {done.returncode}")
 
 
 class Loading:
@@ -130,9 +120,10 @@ class Loading:
     def _run(self, path: Path | None, machine: str) -> None:
         try:
             if path is None:
-                self._loaded = MachineModel(machine), Source.of("ideal", "")
+                self._loaded = MachineModel(machine), IDEAL_SOURCE
             else:
-                self._loaded = load_with_source(path, lambda file: load_elsewhere(file, machine))
+                source = Source.read(path)
+                self._loaded = load_elsewhere(source, machine), source
         except HexapodError as error:
             self._error = error
         except Exception as error:  # a thread's error would be lost, and the service never answer
@@ -140,14 +131,14 @@ class Loading:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Load the file given for the machine given and print it; or print why not, and return 1."""
-    path, machine = sys.argv[1:] if argv is None else argv
+    """Read a model file's text, called as given, for the machine given and print it; or print why not, return 1."""
+    name, machine = sys.argv[1:] if argv is None else argv
     try:
-        model = load_model(path, cast(HexapodGeometry, _Named(machine)))
+        model = parse_model(sys.stdin.buffer.read().decode(), machine, name)
     except HexapodError as error:
         sys.stdout.buffer.write(str(error).encode())
         return 1
-    sys.stdout.write(model_text(model))
+    sys.stdout.write(model_json(model))
     return 0
 
 

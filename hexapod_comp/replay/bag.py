@@ -8,7 +8,6 @@ whatever their types.
 
 from __future__ import annotations
 
-import tempfile
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
@@ -18,11 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from ..compensation.journal import JournalError, Page, Snapshot, Source, read_page, read_sources
+from ..compensation.journal import IDEAL_SOURCE, JournalError, Page, Snapshot, Source, read_page, read_sources
 from ..errors import HexapodError, InputFileError, printable
-from ..machine.geometry import STRUT_NAMES, HexapodGeometry, load_geometry
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.model import MachineModel
-from ..machine.model_file import load_model
 from .unpacking import Allowance, UnpackingError, bounded, refuse_overlapping_chunks, refuse_too_much_at_once
 
 POSE, STRUTS, TEXT = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState", "std_msgs/msg/String"
@@ -53,7 +51,7 @@ SPARE = 4
 
 RECORD = "record at least compensator/journal and compensator/files"
 
-IDEAL = Source.of("", "").sha256
+IDEAL = IDEAL_SOURCE.sha256
 """Hash of the model that is none."""
 
 
@@ -431,7 +429,7 @@ class Files:
         """Return a geometry by its name and hash."""
         key = identity["sha256"], ""
         if key not in self._loaded:
-            self._loaded[key] = self._load("machine", identity, load_geometry)
+            self._loaded[key] = self._load("machine", identity, Source.geometry)
         return self._loaded[key]
 
     def model(self, identity: Mapping[str, str], geometry: HexapodGeometry) -> MachineModel:
@@ -439,12 +437,12 @@ class Files:
         key = identity["sha256"], geometry.name
         if key not in self._loaded:
             if identity["sha256"] == IDEAL:
-                self._loaded[key] = MachineModel(geometry.name)
+                self._loaded[key] = IDEAL_SOURCE.model(geometry.name)
             else:
-                self._loaded[key] = self._load("model", identity, lambda path: load_model(path, geometry))
+                self._loaded[key] = self._load("model", identity, lambda source: source.model(geometry.name))
         return self._loaded[key]
 
-    def _load(self, what: str, identity: Mapping[str, str], load: Callable[[Path], Any]) -> Any:
+    def _load(self, what: str, identity: Mapping[str, str], load: Callable[[Source], Any]) -> Any:
         source = self._sources.get(identity["sha256"])
         if source is None or source.text is None:
             problem = (
@@ -452,11 +450,8 @@ class Files:
                 f"give its file with --{what} (sha256 {identity['sha256']})"
             )
             raise InputFileError(self._path, "", problem)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "text.yaml"
-            path.write_text(source.text, encoding="utf-8")
-            try:
-                return load(path)
-            except InputFileError as error:
-                # A file of another version of this package, most likely: name the bag, not our copy.
-                raise InputFileError(self._path, f"{source.name}: {error.key}", error.problem, error.value) from error
+        try:
+            return load(source)
+        except InputFileError as error:
+            # A file of another version of this package, most likely: name the bag, not a file of today.
+            raise InputFileError(self._path, f"{source.name}: {error.key}", error.problem, error.value) from error

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputFileError, ModelError
+from ..formats.paths import input_file
 from ..formats.yaml import Section, read_yaml
 from ..machine.geometry import HexapodGeometry
 
@@ -198,13 +199,14 @@ class Budget:
 
 
 def load_budget(path: str | Path) -> Budget:
-    """Read a budget file (YAML, see config/error_budget.yaml).
+    """Read a budget file (YAML, see config/error_budget.yaml), or a shipped one by its name.
 
     Raises
     ------
     InputFileError
         With file, key and value: unknown type, no unit, negative size.
     """
+    path = input_file(path)
     top = read_yaml(path, BUDGET_FORMAT, BUDGET_VERSION)
     machine, section = top.text("machine"), top.section("errors")
     top.finish()

@@ -99,8 +99,8 @@ def test_malformed_poses_are_refused_with_file_line_and_column(
 
 
 def test_a_missing_file_and_a_folder_are_named(tmp_path: Path) -> None:
-    for path in (tmp_path / "nowhere.csv", tmp_path):
-        with pytest.raises(InputFileError, match="cannot be read") as caught:
+    for path, problem in ((tmp_path / "nowhere.csv", "there is no such file"), (tmp_path, "is a folder")):
+        with pytest.raises(InputFileError, match=problem) as caught:
             read_poses(path)
         assert caught.value.path == str(path)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import threading
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from hypothesis import strategies as st
 from strategies import PAPER_FILE, fixed, paper_geometry
 
 from hexapod_comp.errors import GeometryError, InputFileError
-from hexapod_comp.machine.geometry import HexapodGeometry, Limits, load_geometry, paper_joints
+from hexapod_comp.machine.geometry import HexapodGeometry, Limits, load_geometry, paper_joints, parse_geometry
 
 PAPER_TEXT = PAPER_FILE.read_text(encoding="utf-8")
 
@@ -256,3 +258,36 @@ def test_no_damage_to_a_file_gets_through_as_another_error(tmp_path_factory, dat
     path.write_text(text[:start] + junk + text[end:], encoding="utf-8")
     with contextlib.suppress(InputFileError):
         load_geometry(path)
+
+
+# ---- text, path, shipped name ----
+
+
+def test_a_text_says_the_same_as_its_file():
+    from_text = parse_geometry(PAPER_FILE.read_text(encoding="utf-8"))
+    np.testing.assert_array_equal(from_text.base_joints, load_geometry(PAPER_FILE).base_joints)
+    with pytest.raises(InputFileError, match="handed over: machine: must be text"):
+        parse_geometry("format: hexapod_comp/geometry\nversion: 1\nmachine: 3", "handed over")
+
+
+@pytest.mark.parametrize("name", ["paper", "paper.yaml"])
+def test_a_shipped_machine_goes_by_its_name(name, tmp_path, monkeypatch):
+    """From any folder, also where an output folder has the name."""
+    (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert load_geometry(name).name == "paper"
+
+
+def test_a_file_is_read_once(tmp_path):
+    """What a pipe has given, it never gives again."""
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    writer = threading.Thread(target=path.write_bytes, args=(PAPER_FILE.read_bytes(),), daemon=True)
+    writer.start()
+    assert load_geometry(path).name == "paper"
+    writer.join(timeout=10)
+
+
+def test_no_such_machine_says_which_there_are(tmp_path):
+    with pytest.raises(InputFileError, match=r"no such file, and the shipped ones are .*paper\.yaml"):
+        load_geometry(tmp_path / "papper.yaml")

@@ -16,7 +16,7 @@ from strategies import UNEVEN_GRID, fixed, paper_geometry, random_field, random_
 from hexapod_comp.errors import InputFileError, ModelError
 from hexapod_comp.machine.field import CROSS_AXES, GridField
 from hexapod_comp.machine.model import MachineModel, ModelOrigin
-from hexapod_comp.machine.model_file import load_model, save_model
+from hexapod_comp.machine.model_file import load_model, model_text, parse_model, save_model
 from hexapod_comp.machine.struts import StrutErrors
 
 PAPER, SKEWED = paper_geometry(), skewed_geometry()
@@ -477,3 +477,24 @@ def test_marks_of_a_closed_file_belong_together(text, key, tmp_path):
     with pytest.raises(InputFileError) as caught:
         load_model(path, PAPER)
     assert caught.value.key == key
+
+
+# ---- text, shipped name, ideal ----
+
+
+def test_a_text_says_the_same_as_its_file():
+    """What is written is read: the text of a model, read and written again, is the same text."""
+    text = model_text(load_model("paper_machine", PAPER))
+    assert model_text(parse_model(text, "paper")) == text
+    with pytest.raises(InputFileError, match=r"handed over: machine: .* another machine, must be 'skewed'"):
+        parse_model(text, "skewed", "handed over")
+
+
+def test_the_ideal_model_has_no_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ideal").write_text("no model")
+    model = load_model("ideal", SKEWED)
+    assert (model.machine, model.name) == (SKEWED.name, "ideal")
+    assert not any(block.any() for block in (model.base_deviation, model.platform_deviation, model.struts.offset))
+    with pytest.raises(InputFileError):  # a path means the file
+        load_model(tmp_path / "ideal", SKEWED)
