@@ -31,7 +31,7 @@ VERSIONS ?= 3.10 3.11 3.12 3.13
 
 help:
 	@echo 'make demo    run the compensator against a simulated machine; figures, out/demo.png'
-	@echo 'make test    ruff, mypy and the tests'
+	@echo 'make test    ruff, mypy and the tests, in two processes'
 	@echo 'make test-all     the same with every Python found here, each in .venv-3.x; VERSIONS="3.10 3.13" for some'
 	@echo 'make constraints  renew constraints.txt: the versions of all that is installed'
 	@echo 'make bench   speed beside NumPy, SciPy, MuJoCo, Pinocchio, LinuxCNC and a relay node'
@@ -46,9 +46,11 @@ demo: $(VENV)/with-ros
 
 test: $(VENV)/with-ros,test
 	$(BIN)/ruff check
+	$(BIN)/ruff format --check
 	$(BIN)/mypy
-	@# The matrices of the tests are small: more threads of OpenBLAS would only wait for each other.
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest --ignore=test/linuxcnc/test_linuxcnc.py
+	@# Two processes, each with a ROS domain of its own. The matrices of the tests are small: more threads of OpenBLAS
+	@# would only wait for each other.
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile --ignore=test/linuxcnc/test_linuxcnc.py
 
 test-all:
 	@PYTHON='$(PYTHON)' tools/pythons | { passed=; failed=; while read -r version python; do \

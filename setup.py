@@ -86,6 +86,7 @@ setup(
         "test": [
             "pytest>=8",
             "pytest-timeout>=2.2",
+            "pytest-xdist>=3.5",
             "packaging>=23",
             "hypothesis>=6.98",
             "ruff==0.17.*",
