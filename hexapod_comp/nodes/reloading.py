@@ -64,8 +64,8 @@ class ReloadService:
         self._loading = None
         try:
             model, source = loading.result()
+            self._files.sources["model"] = source  # first: the journal notes it with the change
             self._compensator.set_model(model)
-            self._files.sources["model"] = source
         except HexapodError as error:
             self._late.answer(self._failed(error))
             return
