@@ -109,11 +109,6 @@ class PaperMetric:
     lines: int
     readings: int
 
-    @property
-    def reduction(self) -> float:
-        """Share removed, 0…1."""
-        return 1.0 - self.after / self.before
-
 
 def paper_metric(
     truth: RealMachine,
@@ -217,21 +212,6 @@ class Worth:
     before: HeldOut
     after: HeldOut
     paper: PaperMetric
-
-    @property
-    def raw_reduction(self) -> float:
-        """Share of the RMS error in space that is removed, 0…1."""
-        return 1.0 - self.after.raw.rms / self.before.raw.rms
-
-    @property
-    def aligned_reduction(self) -> float:
-        """The same after the datum has been aligned, without and with the model."""
-        return 1.0 - self.after.aligned.rms / self.before.aligned.rms
-
-    @property
-    def rotation_reduction(self) -> float:
-        """Share of the RMS rotation error that is removed, 0…1."""
-        return 1.0 - self.after.rotation.rms / self.before.rotation.rms
 
 
 def worth(

@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 
 from ..errors import CalibrationError, ModelError
 from ..machine.field import GridField, no_field
-from ..machine.geometry import COINCIDENT, STRUT_NAMES, HexapodGeometry
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry, first_of_same
 from ..machine.kinematics import Structure, strut_lengths
 from ..machine.model import MachineModel
 from ..machine.struts import StrutErrors
@@ -333,10 +333,7 @@ def _groups(geometry: HexapodGeometry, shared: bool) -> np.ndarray:
     """Return which ball joint of the platform each strut ends in, numbered in order, shape (6,)."""
     if not shared:
         return np.arange(6)
-    joints = geometry.platform_joints
-    same = np.linalg.norm(joints[:, None] - joints[None], axis=2) < COINCIDENT
-    first = same.argmax(axis=1)
-    return np.unique(first, return_inverse=True)[1]
+    return np.unique(first_of_same(geometry.platform_joints), return_inverse=True)[1]
 
 
 def _periods(geometry: HexapodGeometry, lead: float | None) -> np.ndarray:

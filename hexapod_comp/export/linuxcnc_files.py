@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputFileError
+from ..formats.csv import number_in
 from ..formats.yaml import UNITS, read_text, write_text_atomically
 from ..machine.geometry import STRUT_NAMES
 from .linuxcnc import MOST_POINTS, Genhexkins, ScrewTable
@@ -179,7 +180,7 @@ def _read_pins(path: Path, text: str) -> dict[str, float]:
             raise InputFileError(path, f"line {number}", "is not setp of a genhexkins pin", line)
         if found[1] in pins:
             raise InputFileError(path, f"line {number}", "sets a pin again", line)
-        pins[found[1]] = _number(path, number, found[2])
+        pins[found[1]] = number_in(path, f"line {number}", found[2])
     return {"screw-lead": 0.0} | pins
 
 
@@ -216,7 +217,7 @@ def _read_table(path: Path, text: str, size: float) -> ScrewTable:
         words = line.split()[:3]
         if len(words) < 3 or line.startswith("#"):
             break
-        rows.append([_number(path, number, word) for word in words])
+        rows.append([number_in(path, f"line {number}", word) for word in words])
         if len(rows) > MOST_POINTS:
             raise InputFileError(path, f"line {number}", f"LinuxCNC takes at most {MOST_POINTS} points")
         if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
@@ -225,13 +226,3 @@ def _read_table(path: Path, text: str, size: float) -> ScrewTable:
         raise InputFileError(path, "line 1", "has no points: LinuxCNC stops at a line that is not three numbers")
     values = np.array(rows) * size
     return ScrewTable(values[:, 0], values[:, 1:].T)
-
-
-def _number(path: Path, line: int, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value) or "_" in text or not text.isascii():  # Python reads 1_0 and １０ as ten, C does not
-        raise InputFileError(path, f"line {line}", "must be a finite number", text)
-    return value

@@ -20,6 +20,7 @@ from ..errors import InputFileError, PoseError
 from ..kernels.pose import QUATERNION_NORM_TOLERANCE
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
 from .paths import input_file
+from .texts import plain_number
 from .yaml import UNITS
 
 LABEL_COLUMNS = ("sequence", "name")
@@ -161,14 +162,7 @@ class Table:
 
     def number(self, line: int, index: int, text: str) -> float:
         """Return the finite number in a cell."""
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value) or "_" in text or not text.isascii():  # Python reads 1_0 and １０ as ten
-            where = f"line {line}, column {self.header[index]}"
-            raise InputFileError(self.path, where, "must be a finite number", text)
-        return value
+        return number_in(self.path, f"line {line}, column {self.header[index]}", text)
 
     def labels(self) -> list[Row]:
         """Return line and label of every row."""
@@ -176,6 +170,14 @@ class Table:
         return [
             Row(line, row[columns[0]].strip() if columns else str(n + 1)) for n, (line, row) in enumerate(self.rows)
         ]
+
+
+def number_in(path: str | Path, where: str, text: str) -> float:
+    """Return the finite number that stands somewhere in a file."""
+    value = plain_number(text)
+    if math.isnan(value):
+        raise InputFileError(path, where, "must be a finite number", text)
+    return value
 
 
 class _Hashed(io.RawIOBase):

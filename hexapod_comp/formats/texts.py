@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import sys
 from collections.abc import Iterable, Sequence
 
@@ -10,6 +11,15 @@ from collections.abc import Iterable, Sequence
 def number(value: float, digits: int) -> str:
     """Return a number with so many digits after its point, never −0."""
     return f"{round(value, digits) + 0.0:.{digits}f}"
+
+
+def plain_number(text: str) -> float:
+    """Return the finite number that a text is to everybody, else NaN: Python also reads 1_0 and １０ as ten."""
+    try:
+        value = float(text)
+    except ValueError:
+        return math.nan
+    return value if math.isfinite(value) and text.isascii() and "_" not in text else math.nan
 
 
 def aligned(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

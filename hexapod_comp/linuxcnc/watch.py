@@ -26,6 +26,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import HexapodError, KinematicsError
+from ..formats.texts import plain_number
 from ..kernels.drives import follow_point
 from ..kernels.motion import follow
 from ..machine.geometry import load_geometry
@@ -33,7 +34,7 @@ from ..machine.model import RealMachine
 from ..machine.model_file import load_model
 from ..machine.motion import MotionState
 from ..pose import Pose
-from .hal import METRES, HalComponent, pins
+from .hal import METRES, HalComponent, pins, quaternion_from_axes
 
 AXES = ("x", "y", "z", "a", "b", "c")
 STRUTS = tuple(f"strut.{n}" for n in range(6))
@@ -45,19 +46,6 @@ PINS = (
     *pins("out", "float", *TRUE, *ERRORS),
     *pins("out", "bit", "valid"),
 )
-
-
-def pose_from_axes(position: np.ndarray, degrees: np.ndarray) -> Pose:
-    """Return the pose that LinuxCNC's axes stand for: R = Rz(C)·Ry(B)·Rx(A).
-
-    Parameters
-    ----------
-    position : ndarray, shape (3,)
-        X, Y, Z, m.
-    degrees : ndarray, shape (3,)
-        A, B, C.
-    """
-    return Pose(position, Rotation.from_euler("xyz", degrees, degrees=True).as_matrix())
 
 
 class WatchedMachine:
@@ -150,7 +138,7 @@ class MachineComponent:
         """Read, look, write; lengths without a pose, as before homing, only take ``valid`` away."""
         axes = np.array(self._read_axes())
         struts = np.array(self._read_struts()) * self._metres
-        command = pose_from_axes(axes[:3] * self._metres, axes[3:])
+        command = Pose.from_quaternion(axes[:3] * self._metres, np.array(quaternion_from_axes(*axes[3:])))
         try:
             true, error = self._watched.look(struts, command, self._read_tool()[0] * self._metres)
         except KinematicsError:
@@ -198,10 +186,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _rate(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
+    value = plain_number(text)
     if not 0.1 <= value <= 1000.0:
         raise argparse.ArgumentTypeError(f"must be a number from 0.1 to 1000, not {text}")
     return value

@@ -133,7 +133,7 @@ class HexapodGeometry:
         put("home_sign", float(kernels.condition_one(*self.kernel_joints, *pose, self.characteristic_length)[1]))
         cone_axes, joints = np.array([self.base_cone_axes, self.platform_cone_axes]), self.platform_joints
         # The distance of struts that share a joint cannot be limited.
-        apart = (np.linalg.norm(joints[:, None] - joints, axis=2) > COINCIDENT).astype(float)
+        apart = (~coincident(joints)).astype(float)
         put("limit_numbers", self.limits.numbers(cone_axes, apart, self.characteristic_length, self.home_sign))
         refusal = self.refusal(*pose, lengths)
         if refusal is not None:
@@ -305,11 +305,19 @@ def _read_limits(section: Section) -> Limits:
 
 
 def _refuse_coincident(base_joints: np.ndarray) -> None:
-    for i in range(6):
-        for j in range(i):
-            if np.linalg.norm(base_joints[i] - base_joints[j]) < COINCIDENT:
-                problem = f"coincides with base joint {j + 1}; every strut needs a base joint of its own"
-                raise GeometryError(f"base.joints[{i}]", problem, base_joints[i].tolist())
+    for i, j in np.argwhere(np.tril(coincident(base_joints), -1)):
+        problem = f"coincides with base joint {j + 1}; every strut needs a base joint of its own"
+        raise GeometryError(f"base.joints[{i}]", problem, base_joints[i].tolist())
+
+
+def coincident(joints: np.ndarray) -> np.ndarray:
+    """Return which joints (6, 3) are at the same place, each with itself too, shape (6, 6)."""
+    return np.linalg.norm(joints[:, None] - joints, axis=2) <= COINCIDENT
+
+
+def first_of_same(joints: np.ndarray) -> np.ndarray:
+    """Return, for each joint, the index of the first one at the same place, shape (6,)."""
+    return coincident(joints).argmax(axis=1)
 
 
 def _unit_vectors(values: object, key: str) -> np.ndarray:

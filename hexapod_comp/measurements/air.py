@@ -1,4 +1,4 @@
-"""What the air does to a laser's length, and what temperature does to steel.
+"""What the air does to a laser's length.
 
 An interferometer counts wavelengths, and the wavelength in air is the one in vacuum divided by the refractive
 index n: about 1.00027, falling by 0.95·10⁻⁶ per K, rising by 2.7·10⁻⁶ per kPa. Readings are corrected here
@@ -7,14 +7,12 @@ once, and only when the instrument has not done so itself. Humidity bends the la
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 
 from ..errors import ModelError
-from ..machine.model import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE
 
 Values: TypeAlias = "float | np.ndarray"
 """One number, or one a reading."""
@@ -43,9 +41,6 @@ CO2_RANGE = (0.0, 2000.0)
 
 LARGEST_INDEX = 1.001
 """No air of :data:`AIR_RANGES` comes near it: an index above is a mistake."""
-
-LARGEST_EXPANSION = 100e-6
-"""Steel has 12·10⁻⁶, aluminium 23·10⁻⁶ per K: above is a unit error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,10 +88,6 @@ def _check_range(key: str, values: Values, low: float, high: float, allowed: str
         index = int(wrong.argmax())
         where = f"{key}, reading {index + 1}" if array.ndim else key
         raise ModelError(where, f"must lie within {allowed}; is the unit right?", float(array.flat[index]))
-
-
-STANDARD_AIR = Air(20.0, 101_325.0, 0.5)
-"""What instruments take for the air when nobody has told them otherwise; n = 1.00027137."""
 
 
 def ciddor_index(air: Air, vacuum_wavelength: float = VACUUM_WAVELENGTH, co2_ppm: float = USUAL_CO2_PPM) -> np.ndarray:
@@ -167,40 +158,11 @@ def _molar_density(pressure: Values, temperature: Values, vapour: Values) -> Val
     return ratio / compressibility
 
 
-def shop_index(air: Air) -> np.ndarray:
-    """Return the refractive index of air for a helium-neon laser by the formula of the shop floor.
+def correct_displacement(raw: Values, air: Air, assumed_index: Values = 1.0) -> np.ndarray:
+    """Return the displacement L that an interferometer measured, from what it showed.
 
-    NIST, *Engineering Metrology Toolbox*, refractive index of air, appendix B (Stone and Zimmerman). For
-    checks by hand: at 0…40 °C and 50…120 kPa, any humidity, it stays within 0.12·10⁻⁶ of
-    :func:`ciddor_index` (measured, see the tests); beyond 40 °C it does not.
-
-    Parameters
-    ----------
-    air : Air
-        State of the air.
-
-    Returns
-    -------
-    ndarray
-        n, in the shape of the air's readings.
-    """
-    dry = 7.86e-4 * (air.pressure / 1e3) / (273.0 + air.temperature)
-    return np.asarray(1.0 + dry - 1.5e-11 * (100.0 * air.humidity) * (air.temperature**2 + 160.0))
-
-
-def correct_displacement(
-    raw: Values,
-    air: Air,
-    assumed_index: Values = 1.0,
-    dead_path: Values = 0.0,
-    air_at_zero: Air | None = None,
-    index: Callable[[Air], np.ndarray] = ciddor_index,
-) -> np.ndarray:
-    """Return the displacement that an interferometer measured, from what it showed.
-
-    It counts what the optical path n·(D + L) has changed since the zero, n₀·D, and shows the count divided by
-    the index that it assumes. So L = (raw·n_assumed + n₀·D)/n − D. For straightness and angles, which are
-    differences of two such paths, leave the dead path out.
+    It counts by how much the optical path n·L has grown, and divides by the index that it assumes. So
+    L = raw·n_assumed/n.
 
     Parameters
     ----------
@@ -209,15 +171,7 @@ def correct_displacement(
     air : Air
         Air when each reading was taken.
     assumed_index : float or ndarray
-        Index that the instrument divided by: 1 when it counts vacuum wavelengths, its setting otherwise,
-        as ``ciddor_index(STANDARD_AIR)``. With ``ciddor_index(air)`` only the dead path is left to correct.
-    dead_path : float or ndarray
-        D, m: from interferometer to reflector where the counter was zeroed; negative when readings grow
-        towards the interferometer. What the air does to it during the run looks like a displacement.
-    air_at_zero : Air, optional
-        Air when the counter was zeroed; needed with a dead path.
-    index : callable
-        Air to n; ``functools.partial(ciddor_index, …)`` for another laser.
+        Index that the instrument divided by: 1 when it counts vacuum wavelengths, its setting otherwise.
 
     Returns
     -------
@@ -227,58 +181,7 @@ def correct_displacement(
     Raises
     ------
     ModelError
-        An index that no air has, or a dead path without the air at the zero.
+        An index that no air has.
     """
     _check_range("assumed index", assumed_index, 1.0, LARGEST_INDEX, f"1…{LARGEST_INDEX:g}")
-    n = index(air)
-    displacement = np.asarray(raw) * (assumed_index / n)
-    if not np.any(dead_path):
-        return displacement
-    if air_at_zero is None:
-        raise ModelError("air at zero", "is needed to correct a dead path", float(np.max(np.abs(dead_path))))
-    return displacement - dead_path * (n - index(air_at_zero)) / n
-
-
-def to_reference(length: Values, expansion: float, temperature: Values) -> np.ndarray:
-    """Return at 20 °C a length measured at another temperature.
-
-    For ISO 230-2 figures and for artefacts. Calibration does not need it: there the model's own growth
-    (:class:`~hexapod_comp.machine.model.RealMachine`) takes struts, base and platform to 20 °C.
-
-    Parameters
-    ----------
-    length : float or ndarray
-        As measured, m.
-    expansion : float
-        Of the material, 1/K.
-    temperature : float or ndarray
-        Of the material, °C.
-
-    Returns
-    -------
-    ndarray
-        m.
-
-    Raises
-    ------
-    ModelError
-        Temperature or expansion that no machine has.
-    """
-    return np.asarray(length) / _stretch(expansion, temperature)
-
-
-def from_reference(length: Values, expansion: float, temperature: Values) -> np.ndarray:
-    """Return as measured a length that an instrument with a material sensor has taken to 20 °C.
-
-    The inverse of :func:`to_reference`: the growth that the instrument took out would otherwise be taken out
-    again by the model. Parameters, units and errors are the same; `expansion` is the instrument's setting.
-    """
-    return np.asarray(length) * _stretch(expansion, temperature)
-
-
-def _stretch(expansion: float, temperature: Values) -> Values:
-    """Return 1 + a·(T − 20 °C)."""
-    _check_range("expansion", expansion, -LARGEST_EXPANSION, LARGEST_EXPANSION, "±100 ppm/K, given in 1/K")
-    low, high = TEMPERATURE_RANGE
-    _check_range("material temperature", temperature, low, high, f"{low:g}…{high:g} °C")
-    return 1.0 + expansion * (np.asarray(temperature) - REFERENCE_TEMPERATURE)
+    return np.asarray(raw) * (assumed_index / ciddor_index(air))

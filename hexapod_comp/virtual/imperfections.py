@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import ModelError
 from ..machine.field import CROSS_AXES, GridField, no_field
-from ..machine.geometry import COINCIDENT, HexapodGeometry
+from ..machine.geometry import HexapodGeometry, first_of_same
 from ..machine.kinematics import Structure, strut_lengths
 from ..machine.model import MachineModel, ModelOrigin
 from ..machine.struts import StrutErrors
@@ -128,7 +128,7 @@ def draw_model(geometry: HexapodGeometry, bounds: ImperfectionBounds, seed: int,
     base = bounds.joint * rng.uniform(-1.0, 1.0, (6, 3))
     platform = bounds.joint * rng.uniform(-1.0, 1.0, (6, 3))
     if bounds.shared_platform_joints:
-        platform = platform[_first_of_same(geometry.platform_joints)]
+        platform = platform[first_of_same(geometry.platform_joints)]
     return MachineModel(
         machine=geometry.name,
         name=name or f"virtual-{seed}",
@@ -138,12 +138,6 @@ def draw_model(geometry: HexapodGeometry, bounds: ImperfectionBounds, seed: int,
         field=_draw_field(bounds, rng),
         origin=ModelOrigin(note=f"virtual machine drawn with seed {seed}"),
     )
-
-
-def _first_of_same(joints: np.ndarray) -> np.ndarray:
-    """Return, for each joint, the index of the first one at the same place."""
-    distances = np.linalg.norm(joints[:, None] - joints[None], axis=2)
-    return (distances < COINCIDENT).argmax(axis=1)
 
 
 def _draw_struts(geometry: HexapodGeometry, bounds: ImperfectionBounds, rng: np.random.Generator) -> StrutErrors:

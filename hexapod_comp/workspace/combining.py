@@ -34,14 +34,6 @@ LARGEST_FACTOR = 1e9
 """A source that may grow by more has no effect that counts."""
 
 
-def absolute_sum(vectors: np.ndarray) -> np.ndarray:
-    """Return the sums of the sizes of all effects, shape (N, 2): simple, and never below the worst case.
-
-    The sum of lengths bounds the length of any sum; only if all errors pushed in one direction would it be met.
-    """
-    return np.stack([np.linalg.norm(vectors[..., :3], axis=2).sum(axis=1), _turns(vectors)], axis=1)
-
-
 def worst_case(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
     """Return the largest effect that errors within their bounds can have together, shape (N, 2).
 

@@ -13,7 +13,6 @@ from ..formats.texts import aligned, number
 from ..machine.geometry import HexapodGeometry
 from ..pose import angles_from_rotation
 from .effects import Extremes
-from .sources import SOURCE_TYPES
 
 MICRO = 1e6
 MILLIDEGREE = np.pi / 180e3
@@ -234,33 +233,4 @@ def ranking_rows(rows: Sequence[RankingRow]) -> list[dict[str, Any]]:
                 record[f"{name}_{angle}_deg"] = float(np.rad2deg(value))
         record["failed"] = row.failed
         records.append(record)
-    return records
-
-
-def ratios_to_paper(rows: Sequence[RankingRow], sizes: dict[str, float]) -> list[dict[str, Any]]:
-    """Return how the machine's largest effects per input error compare with the paper's, type by type.
-
-    Parameters
-    ----------
-    rows : sequence of RankingRow
-        The ranking.
-    sizes : dict of str to float
-        Size of each type by its name in the budget, SI.
-
-    Returns
-    -------
-    list of dict
-        ``error_type``, ``gain`` and ``gain_paper`` (largest displacement per input error), for the rows that the
-        paper has.
-    """
-    by_title = {source.title: sizes[source.name] for source in SOURCE_TYPES if source.name in sizes}
-    records = []
-    for row in rows:
-        printed = paper_row(row.title)
-        members = JOINED.get(row.title, (row.title,))
-        size = max((by_title[member] for member in members if member in by_title), default=None)
-        if printed is None or size is None:
-            continue
-        gain, gain_paper = row.translation_max.value / size, float(printed.figures[0] / printed.size)
-        records.append({"error_type": row.title, "gain": gain, "gain_paper": gain_paper})
     return records

@@ -17,9 +17,6 @@ from ..kernels.limits import WITHIN
 from ..machine.geometry import HexapodGeometry
 from .reach import Examiner, Reach, poses_at
 
-FRACTIONS = (0.4, 0.7, 1.0)
-"""Sizes of nested shells, inside to outside, relative to the boundary."""
-
 SAMPLES = 96
 """Points along a ray at which gaps are looked for: one smaller than a hundredth of the reach can stay unseen."""
 

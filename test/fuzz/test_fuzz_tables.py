@@ -29,7 +29,8 @@ from hexapod_comp.export.linuxcnc_files import COMP_FILES, HAL_FILE, INI_FILE, r
 from hexapod_comp.export.table import make_table, read_table, write_table
 from hexapod_comp.formats.csv import read_lengths, read_poses
 from hexapod_comp.machine.model import RealMachine
-from hexapod_comp.measurements.carto import load_line, read_carto, read_rtl, read_rtx
+from hexapod_comp.measurements.carto import load_line, read_carto
+from hexapod_comp.measurements.carto_files import read_rtl, read_rtx
 from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.measurements.tidy_csv import read_measurements
 from hexapod_comp.measurements.wide_csv import read_wide

@@ -19,9 +19,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.linuxcnc.hal_sweep import dead_components
-from hexapod_comp.linuxcnc.watch import MachineComponent, WatchedMachine, main, pose_from_axes
+from hexapod_comp.linuxcnc.watch import MachineComponent, WatchedMachine, main
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.pose import Pose
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 LINUXCNC = CONFIG / "linuxcnc"
@@ -116,7 +117,7 @@ TILTED = [0.02, -0.03, 0.42, 6.0, -5.0, 4.0]
 @pytest.mark.parametrize("tool_length", [0.0, 0.05])
 def test_a_perfect_machine_is_where_it_is_told(geometry: HexapodGeometry, tool_length: float) -> None:
     """To a nanometre, which is the forward kinematics' tolerance many times over."""
-    command = pose_from_axes(np.array(TILTED[:3]), np.array(TILTED[3:]))
+    command = Pose(TILTED[:3], Rotation.from_euler("xyz", TILTED[3:], degrees=True).as_matrix())
     watched = WatchedMachine(RealMachine(geometry, MachineModel("paper")))
     true, error = watched.look(lengths(geometry, TILTED, tool_length), command, tool_length)
     np.testing.assert_allclose(error, 0.0, atol=1e-9)
@@ -129,7 +130,7 @@ def test_a_machine_that_is_off_as_a_whole(geometry: HexapodGeometry, tool_length
     """A moved base takes the tool along; a moved platform joint pattern leaves the tool behind, in its own frame."""
     moved, left = np.array([100e-6, -50e-6, 30e-6]), np.array([20e-6, 40e-6, -60e-6])
     truth = MachineModel("paper", base_deviation=np.tile(moved, (6, 1)), platform_deviation=np.tile(left, (6, 1)))
-    command = pose_from_axes(np.array(TILTED[:3]), np.array(TILTED[3:]))
+    command = Pose(TILTED[:3], Rotation.from_euler("xyz", TILTED[3:], degrees=True).as_matrix())
     watched = WatchedMachine(RealMachine(geometry, truth))
     _, error = watched.look(lengths(geometry, TILTED, tool_length), command, tool_length)
     turn = Rotation.from_euler("ZYX", TILTED[5:2:-1], degrees=True).as_matrix()

@@ -1,4 +1,4 @@
-"""Files of laser software, built here as the sources in carto.py's docstring describe them: no real one is at hand.
+"""Files of laser software, built here as carto_files.py describes them: no real one is at hand.
 
 The header of the .rtx is that of a capture by CARTO 4.13 (TanmayPani/rtx2csv, its test's header.json).
 """
@@ -16,7 +16,8 @@ from strategies import fixed, paper_geometry
 from test_measurement_csv import edits, mutated
 
 from hexapod_comp.errors import HexapodError, InputFileError
-from hexapod_comp.measurements.carto import load_line, read_carto, read_rtl, read_rtx, read_sections
+from hexapod_comp.measurements.carto import load_line, read_carto
+from hexapod_comp.measurements.carto_files import read_rtl, read_rtx, read_sections
 from hexapod_comp.measurements.iso230 import iso230_runs
 from hexapod_comp.measurements.readings import BACKWARD, CHANNELS, FORWARD
 
