@@ -50,12 +50,6 @@ def _remade(kind: type[HexapodError], args: tuple[Any, ...]) -> HexapodError:
     return error
 
 
-class MissingPackageError(HexapodError, ImportError):
-    """A package that this one needs is not installed; the message says how to get it."""
-
-    reason = "missing_package"
-
-
 LONGEST_PATH = 500
 """A file's name is shown up to this length: what is wrong with it must still fit into the message."""
 

@@ -54,6 +54,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except HexapodError as error:
         print(f"{PROGRAM}: error: {error}", file=sys.stderr)
         return USAGE_ERROR
+    except ImportError as error:
+        if error.name != "numba":
+            raise
+        print(f"{PROGRAM}: error: {error}", file=sys.stderr)
+        return USAGE_ERROR
     except MemoryError as error:
         print(f"{PROGRAM}: error: this needs more memory than there is: {error}", file=sys.stderr)
         return USAGE_ERROR

@@ -16,14 +16,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from ..errors import MissingPackageError
-
 try:
     import numba
 except ImportError as error:
-    raise MissingPackageError(
+    raise ImportError(
         f"needs Numba, which compiles the kinematics ({error}): apt install python3-numba, or where there is none "
-        "(Ubuntu 24.04): pip install numba, in a virtual environment made with --system-site-packages"
+        "(Ubuntu 24.04): pip install numba, in a virtual environment made with --system-site-packages",
+        name="numba",
     ) from error
 
 FOLDER_PREFIX = "kernels-"

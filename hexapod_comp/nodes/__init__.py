@@ -2,9 +2,7 @@
 
 import sys
 
-from ..errors import MissingPackageError
-
 try:
     from ..kernels import compiling  # noqa: F401
-except MissingPackageError as error:
+except ImportError as error:
     sys.exit(f"cannot start: {error}")
