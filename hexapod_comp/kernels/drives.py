@@ -99,7 +99,7 @@ def run_struts(
 
 @compiled
 def follow_point(position, rotation, probe, threshold, low, sense):
-    """Follow the measured point of a platform pose along the three axes, see :mod:`hexapod_comp.motion`."""
+    """Follow the measured point of a platform pose along the three axes, see :mod:`hexapod_comp.machine.motion`."""
     arm = lever(rotation, probe)
     for axis in range(3):
         follow(position[axis] + arm[axis], threshold, low, sense, axis)

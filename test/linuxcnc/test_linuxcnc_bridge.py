@@ -548,7 +548,7 @@ def test_found_in_debians_folder_without_leaving_a_trace(packages):
 
 LOADS_IT = """
 import signal, sys, numpy
-from hexapod_comp.hal_component import DEBIAN_PACKAGES, load_module
+from hexapod_comp.linuxcnc.hal import DEBIAN_PACKAGES, load_module
 before = list(sys.path), signal.getsignal(signal.SIGTERM), numpy.__file__
 print(load_module("hal").HAL_FLOAT, load_module("linuxcnc").MODE_MDI)
 import scipy.spatial
