@@ -92,7 +92,7 @@ def cases(geometry: HexapodGeometry) -> dict[str, Callable[[np.random.Generator]
 def random_structure(rng: np.random.Generator, height: float) -> Structure:
     """Draw a 6-3 machine with joints anywhere; `height` 0 keeps the base in a plane."""
     base = rng.normal(0.0, 0.3, (6, 3)) * [1.0, 1.0, height]
-    return Structure(base, np.repeat(rng.normal(0.0, 0.2, (3, 3)), 2, axis=0), 0.2, 1.0, NO_LIMIT)
+    return Structure(base, np.repeat(rng.normal(0.0, 0.2, (3, 3)), 2, axis=0), 0.2, 1.0, NO_LIMIT, Pose.identity())
 
 
 def random_pose(rng: np.random.Generator) -> Pose:

@@ -28,7 +28,7 @@ from tqdm import tqdm
 from hexapod_comp.calibration.evaluation import Worth, worth
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.lines import fit_lines
-from hexapod_comp.calibration.parameters import Settings
+from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.measurements.campaign import Campaign, load_campaign, template
@@ -111,7 +111,7 @@ def one_machine(number: int, seed: int) -> Machine:
     if case.scheme == "lines":
         model = fit_lines(measured).model
     else:
-        fit = fit_model(measured, Settings(lead=LEAD))
+        fit = fit_model(measured, FitSettings(lead=LEAD))
         model = fit.model
         if fit.level is not None:
             expected = (fit.level.after, fit.level.low, fit.level.high)

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.calibration.fit import fit_model
-from hexapod_comp.calibration.parameters import Settings
+from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.sensitivity import predict
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
@@ -70,7 +70,7 @@ def zeroed_without(measured: MeasurementSet, out: np.ndarray) -> MeasurementSet:
     return replace(measured, stations=replace(s, commands=s.commands + zero))
 
 
-def left_out(measured: MeasurementSet, out: np.ndarray, settings: Settings) -> tuple[np.ndarray, list[str]]:
+def left_out(measured: MeasurementSet, out: np.ndarray, settings: FitSettings) -> tuple[np.ndarray, list[str]]:
     """Fit without some stations; return their squared position misfits, m², and the blocks that the fit kept."""
     is_out = np.isin(measured.station, out)
     fit = fit_model(measured.select(~is_out), settings)
@@ -94,7 +94,7 @@ def poses(folder: Path, pool: ProcessPoolExecutor) -> bool:
         fold = np.random.default_rng(seed).permutation(count) % FOLDS
         parts = [np.flatnonzero(fold == k) for k in range(FOLDS)]
         zeroed = [zeroed_without(measured, part) for part in parts]
-        results = list(pool.map(left_out, zeroed, parts, [Settings()] * FOLDS))
+        results = list(pool.map(left_out, zeroed, parts, [FitSettings()] * FOLDS))
         found.append(rms(np.concatenate([squares for squares, _ in results])))
         print(f"108 poses, split {seed + 1}: {raw * 1e3:.2f} -> {found[-1] * 1e3:.3f} mm RMS", flush=True)
     print(f"108 poses, mean of {SPLITS} splits: {np.mean(found) * 1e3:.3f} mm RMS (bar {POSES_BAR * 1e3:.2f})")
@@ -108,8 +108,8 @@ def grid(folder: Path, pool: ProcessPoolExecutor) -> bool:
     count = len(measured.stations)
     raw, corrected = (rms(position_squares(m, np.zeros((len(m.stations), 6)))) for m in (measured, own))
     # Which blocks help is decided once, with all poses; leaving one out hardly changes that.
-    whole = fit_model(measured, Settings())
-    kept = replace(Settings(), blocks=tuple(block.name for block in whole.space.blocks))
+    whole = fit_model(measured, FitSettings())
+    kept = replace(FitSettings(), blocks=tuple(block.name for block in whole.space.blocks))
     parts = [np.array([n]) for n in range(count)]
     results = list(pool.map(left_out, [measured] * count, parts, [kept] * count, chunksize=5))
     left = rms(np.concatenate([squares for squares, _ in results]))

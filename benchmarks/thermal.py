@@ -67,7 +67,7 @@ DRIFTS = (
 
 
 @dataclass(frozen=True)
-class Settings:
+class FitSettings:
     """How a machine is judged: points, standard deviation of a reading (K), time constant of the filter (s)."""
 
     points: int
@@ -75,7 +75,7 @@ class Settings:
     time_constant: float
 
 
-def one_machine(drift: Drift, seed: int, settings: Settings) -> np.ndarray:
+def one_machine(drift: Drift, seed: int, settings: FitSettings) -> np.ndarray:
     """Return mean squares, m², of the tool's displacement by a drift, shape (phase, compensation)."""
     geometry, rng = load_geometry(CONFIG / "paper.yaml"), np.random.default_rng(seed)
     model = draw_model(geometry, LARGE, seed)
@@ -99,7 +99,7 @@ def one_machine(drift: Drift, seed: int, settings: Settings) -> np.ndarray:
 
 
 def warm_up(
-    drift: Drift, settings: Settings, rng: np.random.Generator
+    drift: Drift, settings: FitSettings, rng: np.random.Generator
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """Return true temperatures and readings, unfiltered and filtered, °C, each of shape (seconds, parts)."""
     warmth = np.minimum(np.arange(2 * HALF_HOUR + 1) / HALF_HOUR, 1.0)
@@ -192,7 +192,7 @@ def main() -> int:
     parser.add_argument("--time-constant", type=float, default=DEFAULT_TIME_CONSTANT, help="of the filter, s")
     parser.add_argument("--json", action="store_true", help="JSON instead of a table")
     args = parser.parse_args()
-    settings = Settings(args.points, args.noise, args.time_constant)
+    settings = FitSettings(args.points, args.noise, args.time_constant)
     rows = []
     if not args.json:
         print(HEADER, flush=True)

@@ -1,0 +1,99 @@
+"""Error compensation for hexapod machine tools.
+
+>>> import numpy as np
+>>> import hexapod_comp as hc
+>>> geometry = hc.load_geometry("paper")
+>>> compensator = hc.Compensator(geometry, hc.load_model("paper_machine", geometry))
+>>> pose = hc.Pose.from_angles([0.0, 0.0, 0.4], np.radians([0.0, 0.0, 5.0]))
+>>> microns = compensator.correct(pose).correction * 1e6
+
+These names are the public ones; they are imported when they are first used. Everything is in SI units (m, rad, s; °C);
+a pose is the tool's in the work frame unless a parameter says ``pose_platform_in_base``. Whatever is wrong with an
+input is a :class:`HexapodError`.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .calibration.fit import ModelFit as ModelFit
+    from .calibration.fit import fit_model as fit_model
+    from .calibration.parameters import FitSettings as FitSettings
+    from .calibration.report import fit_report as fit_report
+    from .compensation.checks import CheckResult as CheckResult
+    from .compensation.checks import check as check
+    from .compensation.compensator import Compensator as Compensator
+    from .compensation.compensator import Correction as Correction
+    from .errors import HexapodError as HexapodError
+    from .formats.csv import read_poses as read_poses
+    from .formats.json import json_text as json_text
+    from .machine.geometry import HexapodGeometry as HexapodGeometry
+    from .machine.geometry import load_geometry as load_geometry
+    from .machine.kinematics import jacobian as jacobian
+    from .machine.kinematics import solve_pose as solve_pose
+    from .machine.kinematics import strut_lengths as strut_lengths
+    from .machine.limits import Limits as Limits
+    from .machine.model import MachineModel as MachineModel
+    from .machine.model import RealMachine as RealMachine
+    from .machine.model import Temperatures as Temperatures
+    from .machine.model_file import load_model as load_model
+    from .machine.model_file import save_model as save_model
+    from .measurements.files import read_measurements as read_measurements
+    from .measurements.readings import MeasurementSet as MeasurementSet
+    from .pose import Pose as Pose
+    from .replay.bag import Recording as Recording
+    from .replay.bag import read_recording as read_recording
+    from .replay.replay import Replay as Replay
+    from .replay.replay import replay_recording as replay_recording
+    from .workspace.sources import Budget as Budget
+    from .workspace.sources import load_budget as load_budget
+    from .workspace.study import Study as Study
+    from .workspace.study import classify as classify
+
+    __version__: str
+
+_HOMES = {
+    "calibration.fit": ("ModelFit", "fit_model"),
+    "calibration.parameters": ("FitSettings",),
+    "calibration.report": ("fit_report",),
+    "compensation.checks": ("CheckResult", "check"),
+    "compensation.compensator": ("Compensator", "Correction"),
+    "errors": ("HexapodError",),
+    "formats.csv": ("read_poses",),
+    "formats.json": ("json_text",),
+    "machine.geometry": ("HexapodGeometry", "load_geometry"),
+    "machine.kinematics": ("jacobian", "solve_pose", "strut_lengths"),
+    "machine.limits": ("Limits",),
+    "machine.model": ("MachineModel", "RealMachine", "Temperatures"),
+    "machine.model_file": ("load_model", "save_model"),
+    "measurements.files": ("read_measurements",),
+    "measurements.readings": ("MeasurementSet",),
+    "pose": ("Pose",),
+    "replay.bag": ("Recording", "read_recording"),
+    "replay.replay": ("Replay", "replay_recording"),
+    "workspace.sources": ("Budget", "load_budget"),
+    "workspace.study": ("Study", "classify"),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = ["__version__", *sorted(_HOME_OF)]
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name when it is first used; ``hexapod_comp --help`` then need not wait for NumPy."""
+    if name == "__version__":
+        from .formats.paths import version
+
+        value: object = version()
+    elif name in _HOME_OF:
+        value = getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -7,9 +7,11 @@ are the moving frame's axes. The paper's angles (degrees or radians) and quatern
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from .errors import PoseError
@@ -57,7 +59,7 @@ class Pose:
         return Pose(np.zeros(3), np.eye(3))
 
     @staticmethod
-    def from_angles(position: np.ndarray, angles: np.ndarray) -> Pose:
+    def from_angles(position: ArrayLike, angles: ArrayLike) -> Pose:
         """Make a pose from the paper's angles.
 
         Parameters
@@ -67,10 +69,10 @@ class Pose:
         angles : array_like, shape (3,)
             α, β, γ in radians; R = Ry(β)·Rx(α)·Rz(γ) (000, T_BASE^TOP).
         """
-        return Pose(position, rotation_from_angles(_finite(angles, (3,), "angles")))
+        return Pose(np.asarray(position), rotation_from_angles(_finite(angles, (3,), "angles")))
 
     @staticmethod
-    def from_quaternion(position: np.ndarray, quaternion: np.ndarray) -> Pose:
+    def from_quaternion(position: ArrayLike, quaternion: ArrayLike) -> Pose:
         """Make a pose from a unit quaternion (x, y, z, w).
 
         Raises
@@ -82,7 +84,7 @@ class Pose:
         norm = float(np.linalg.norm(quaternion))
         if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
             raise PoseError(f"quaternion must have norm 1, not {norm:.6g}", quaternion.tolist())
-        return Pose(position, Rotation.from_quat(quaternion).as_matrix())
+        return Pose(np.asarray(position), Rotation.from_quat(quaternion).as_matrix())
 
     def angles(self) -> np.ndarray:
         """Return the paper's α, β, γ, radians, shape (3,)."""
@@ -98,6 +100,24 @@ class Pose:
 
     def __matmul__(self, other: Pose) -> Pose:
         return Pose(self.position + self.rotation @ other.position, self.rotation @ other.rotation)
+
+
+def stacked(poses: Sequence[Pose] | tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the positions, shape (N, 3), and the rotations, shape (N, 3, 3), of N poses; arrays as they are.
+
+    Raises
+    ------
+    PoseError
+        Arrays of another shape, or not finite.
+    """
+    listed = [pose for pose in poses if isinstance(pose, Pose)]
+    if len(listed) == len(poses):
+        positions, rotations = [pose.position for pose in listed], [pose.rotation for pose in listed]
+        return np.reshape(positions, (-1, 3)), np.reshape(rotations, (-1, 3, 3))
+    if len(poses) != 2:
+        raise PoseError("must be poses, or an array of positions and one of rotations", type(poses[0]).__name__)
+    count = len(poses[0])  # type: ignore[arg-type]
+    return _finite(poses[0], (count, 3), "positions"), _finite(poses[1], (count, 3, 3), "rotations")
 
 
 def rotation_from_angles(angles: np.ndarray) -> np.ndarray:
@@ -143,7 +163,7 @@ def rotation_angle(rotation: np.ndarray) -> float:
     return float(Rotation.from_matrix(rotation).magnitude())
 
 
-def _finite(values: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:
+def _finite(values: object, shape: tuple[int, ...], name: str) -> np.ndarray:
     array = np.array(values, dtype=float, order="C")
     if array.shape != shape:
         raise PoseError(f"{name} must have shape {shape}, not {array.shape}")

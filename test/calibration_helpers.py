@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.calibration.parameters import ParameterSpace, Settings
+from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -32,7 +32,7 @@ LEAD = 0.01
 BOUNDS = ImperfectionBounds(joint=1e-4, strut_offset=1e-4, pitch=1e-4, wave=(4e-6, 4e-6), backlash=(3e-6, 5e-6))
 """Machine B of the calibration bars."""
 
-SETTINGS = Settings(lead=LEAD, field_degree=3)
+SETTINGS = FitSettings(lead=LEAD, field_degree=3)
 """Everything that there is, the field kept small."""
 
 FEW = replace(SETTINGS, blocks=("pitch", "wave", "backlash"))

@@ -26,7 +26,7 @@ def classes() -> list[type[HexapodError]]:
         if "Error):" in path.read_text(encoding="utf-8"):
             importlib.import_module(".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts))
     found = list(_below(HexapodError))
-    assert len(found) > 20
+    assert len(found) > 15  # or they were not looked for where they are
     return [HexapodError, *found]
 
 

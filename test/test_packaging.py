@@ -88,12 +88,33 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return found
 
 
-def test_the_wheel_runs_and_says_what_it_is(wheel: Path, tmp_path: Path):
-    """Installed by pip alone: the command, its version, its configuration files, its types."""
-    target = tmp_path / "prefix"
+@pytest.fixture(scope="module")
+def site_packages(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Install the wheel by pip alone; return where its modules are."""
+    target = tmp_path_factory.mktemp("prefix")
     options = ["--no-deps", "--no-index", "--ignore-installed", "--prefix", str(target)]
     subprocess.run([sys.executable, "-m", "pip", "install", "-q", *options, str(wheel)], check=True)
-    site_packages = next(target.glob("**/hexapod_comp/__init__.py")).parents[1]
+    return next(target.glob("**/hexapod_comp/__init__.py")).parents[1]
+
+
+def test_a_client_passes_a_strict_type_check(site_packages: Path, tmp_path: Path):
+    """Against what the wheel installs: its types reach whoever imports it, and none of them is unknown."""
+    client = tmp_path / "client.py"
+    shutil.copy2(ROOT / "test" / "data" / "client.py", client)
+    with client.open("a", encoding="utf-8") as stream:
+        stream.write("\n\nreveal_type(hc.load_geometry)\nhc.load_geometry(3)\n")
+    options = ["--strict", "--config-file", os.devnull, "--cache-dir", str(ROOT / ".mypy_cache" / "client")]
+    command = [sys.executable, "-m", "mypy", *options, client.name]
+    environment = os.environ | {"PYTHONPATH": str(site_packages)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    revealed, wrong, found = done.stdout.strip().splitlines()
+    assert "HexapodGeometry" in revealed
+    assert 'incompatible type "int"' in wrong  # the deliberate fault is seen, and no other
+    assert found.startswith("Found 1 error in 1 file")
+
+
+def test_the_wheel_runs_and_says_what_it_is(site_packages: Path, tmp_path: Path):
+    """The command, its version, its configuration files, its types."""
     environment = os.environ | {"PYTHONPATH": str(site_packages)}
     command = [sys.executable, "-m", "hexapod_comp", "--version"]  # which it reads beside its configuration files
     output = subprocess.check_output(command, env=environment, cwd=tmp_path, text=True, timeout=60)

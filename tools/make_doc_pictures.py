@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.lines import fit_lines
-from hexapod_comp.calibration.parameters import Settings
+from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.pictures import fit_figure, strut_error_figure
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import RealMachine
@@ -104,7 +104,7 @@ def main(arguments: list[str] | None = None) -> int:
     # Without these two every run writes other identifiers and another date.
     matplotlib.rcParams["svg.hashsalt"] = "hexapod_comp"
     geometry = load_geometry(ROOT / "config" / "paper.yaml")
-    fit = fit_model(measured(geometry, "campaign_5d"), Settings(lead=LEAD))
+    fit = fit_model(measured(geometry, "campaign_5d"), FitSettings(lead=LEAD))
     pictures = {
         "machine.svg": machine_picture(geometry),
         "weights.svg": weights_figure(),

@@ -14,7 +14,7 @@ from ..machine.size import rms
 from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementSet, refuse_unmoved
 from .estimation import HUBER, OUTLIER, Estimation, Posterior, Solution, held_out, iterate, physical_covariance
 from .observability import Observability, ToolError, expected_error, observe, without_trace
-from .parameters import ParameterSpace, Settings
+from .parameters import FitSettings, ParameterSpace
 from .selection import Decision, select
 from .smooth_field import DIGITS
 
@@ -147,7 +147,7 @@ class ModelFit:
 
 def fit_model(
     measurements: MeasurementSet,
-    settings: Settings | None = None,
+    settings: FitSettings | None = None,
     progress: Callable[[str], object] = lambda text: None,
 ) -> ModelFit:
     """Fit structure, struts and field to all readings at once.
@@ -156,7 +156,7 @@ def fit_model(
     ----------
     measurements : MeasurementSet
         Readings of any kind.
-    settings : Settings, optional
+    settings : FitSettings, optional
         What else is known.
     progress : callable
         Told in a few words what goes on.
@@ -166,7 +166,7 @@ def fit_model(
     CalibrationError
         Too few readings, or such that show nothing, a fit that does not settle, forward and backward swapped.
     """
-    settings = settings or Settings()
+    settings = settings or FitSettings()
     everything = Estimation(measurements, ParameterSpace(measurements, settings))
     decisions, possible = _decide(everything, None, progress)
     space, estimation, solution = _solve(measurements, decisions, settings, None, progress)
@@ -203,7 +203,7 @@ def fit_model(
 def _solve(
     measurements: MeasurementSet,
     decisions: list[Decision],
-    settings: Settings,
+    settings: FitSettings,
     before: tuple[ParameterSpace, Solution] | None,
     progress: Callable[[str], object],
 ) -> tuple[ParameterSpace, Estimation, Solution]:
@@ -250,14 +250,14 @@ def _allowed(
     return everything, everything.physical(possible.y) - x, physical_covariance(everything, possible)
 
 
-def unseen_errors(measurements: MeasurementSet, settings: Settings) -> tuple[str, ...]:
+def unseen_errors(measurements: MeasurementSet, settings: FitSettings) -> tuple[str, ...]:
     """Return the machine errors that the readings cannot show, whatever blocks are allowed in a fit.
 
     Parameters
     ----------
     measurements : MeasurementSet
         The readings; their values do not matter.
-    settings : Settings
+    settings : FitSettings
         Of the fit.
     """
     space = ParameterSpace(measurements, replace(settings, blocks=("field displacement", "field rotation")))
@@ -287,7 +287,7 @@ def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
     return [f"strut_{i + 1}: backlash of {values[i] * 1e6:.2f} µm found, taken as none" for i in negative]
 
 
-def _ignored(measurements: MeasurementSet, settings: Settings, space: ParameterSpace) -> list[str]:
+def _ignored(measurements: MeasurementSet, settings: FitSettings, space: ParameterSpace) -> list[str]:
     """Return remarks on what the fit was not told and therefore takes for something else."""
     notes = []
     if not np.isfinite(space.periods).all():

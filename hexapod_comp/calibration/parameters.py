@@ -52,7 +52,7 @@ SHORTEST_LEAD, LONGEST_LEAD = 0.1e-3, 1.0
 
 
 @dataclass(frozen=True)
-class Settings:
+class FitSettings:
     """What a joint fit is told besides the measurements.
 
     Parameters
@@ -134,7 +134,7 @@ class ParameterSpace:
     ----------
     measurements : MeasurementSet
         Tells which commands the length map, and which box the field must cover.
-    settings : Settings
+    settings : FitSettings
         Which blocks.
 
     Attributes
@@ -161,7 +161,7 @@ class ParameterSpace:
         Attitude of the platform, in ``base``, with a level tool (:meth:`MeasurementSet.level`).
     """
 
-    def __init__(self, measurements: MeasurementSet, settings: Settings) -> None:
+    def __init__(self, measurements: MeasurementSet, settings: FitSettings) -> None:
         geometry = measurements.geometry
         self.geometry, self.settings = geometry, settings
         self.home_lengths = strut_lengths(Structure.of(geometry), geometry.home)

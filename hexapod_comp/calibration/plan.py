@@ -11,7 +11,7 @@ from ..measurements.readings import DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
 from .estimation import Estimation, physical_covariance, solve
 from .fit import TILT, unseen_errors
 from .observability import Observability, ToolError, expected_error, observe
-from .parameters import ParameterSpace, Settings
+from .parameters import FitSettings, ParameterSpace
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Plan:
     tilted: ToolError | None
 
 
-def plan(measurements: MeasurementSet, campaign: Campaign, settings: Settings) -> Plan:
+def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings) -> Plan:
     """Return what a campaign's readings would determine on a machine within the settings' tolerances.
 
     Parameters
@@ -49,7 +49,7 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: Settings) -
         The campaign's template.
     campaign : Campaign
         Tells the instruments' noise and the machine's repeatability.
-    settings : Settings
+    settings : FitSettings
         Blocks and tolerances.
     """
     space = ParameterSpace(measurements, settings)

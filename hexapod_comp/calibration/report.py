@@ -17,8 +17,8 @@ TRUST = 0.1
 """A tilted tool that keeps more than this share of its error is warned of, when parameters are not seen."""
 
 
-def report(fit: ModelFit) -> str:
-    """Return the report of a joint fit."""
+def fit_report(fit: ModelFit) -> str:
+    """Return the report of a fit, for people: what is left, what was found, what the readings could not show."""
     parts = [
         _headline(fit),
         *_expected(fit.level, fit.tilted, fit.observability),

@@ -85,14 +85,12 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 class _Version(argparse.Action):
-    """Print the version of the code that runs: package.xml is installed beside the configuration."""
+    """Print the version of the code that runs."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from ..formats.paths import config_folder
-        from ..formats.yaml import read_text
+        from ..formats.paths import version
 
-        found = re.search(r"<version>\s*(.*?)\s*</version>", read_text(config_folder().parent / "package.xml"))
-        print(f"{PROGRAM} {found.group(1) if found else 'of unknown version'}")
+        print(f"{PROGRAM} {version()}")
         parser.exit()
 
 

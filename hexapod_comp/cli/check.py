@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     mode = "stream" if args.stream else "moves"
     common.mention_compiling("checks.examine_many")
     with common.progress_bar(len(rows), " poses") as bar:
-        result = check(geometry, model, positions, rotations, mode, args.rate_hz, bar.update)
+        result = check(geometry, model, (positions, rotations), mode, args.rate_hz, bar.update)
     if args.json:
         common.emit(common.json_text(_as_json(geometry, model, rows, result)), args.out)
     else:

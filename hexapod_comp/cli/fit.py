@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike
 
-    from ..calibration.parameters import Settings
+    from ..calibration.parameters import FitSettings
     from ..machine.model import MachineModel
     from ..measurements.readings import MeasurementSet
 
@@ -100,7 +100,7 @@ def expansion_argument(text: str) -> tuple[float, float, float]:
     return (numbers[0], *(numbers[1:] or (0.0, 0.0)))
 
 
-def fit_settings(args: argparse.Namespace) -> Settings:
+def fit_settings(args: argparse.Namespace) -> FitSettings:
     """Return what the options say about a joint fit.
 
     Raises
@@ -108,7 +108,7 @@ def fit_settings(args: argparse.Namespace) -> Settings:
     ModelError
         An unknown block.
     """
-    from ..calibration.parameters import TOLERANCES, Settings
+    from ..calibration.parameters import TOLERANCES, FitSettings
 
     said: dict[str, Any] = {}
     if args.blocks is not None:
@@ -123,7 +123,7 @@ def fit_settings(args: argparse.Namespace) -> Settings:
     if args.tolerance_um is not None:
         said["tolerances"] = tuple({**TOLERANCES, "structure": args.tolerance_um * 1e-6}.items())
     robust = not getattr(args, "not_robust", False)
-    return Settings(shared_platform_joints=not args.separate_joints, robust=robust, **said)
+    return FitSettings(shared_platform_joints=not args.separate_joints, robust=robust, **said)
 
 
 def _blocks_called(name: str) -> tuple[str, ...]:
@@ -141,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
     from ..machine.geometry import load_geometry
     from ..machine.model import RealMachine
     from ..machine.model_file import load_model, save_model
-    from ..measurements.files import read_files
+    from ..measurements.files import read_measurements
 
     _refuse_options_of_the_other_scheme(args)
     for path in (args.out, args.report, args.json, args.covariance):
@@ -150,7 +150,7 @@ def run(args: argparse.Namespace) -> int:
     truth = None if args.truth is None else RealMachine(geometry, load_model(config_file(args.truth), geometry))
     columns = None if args.columns is None else config_file(args.columns)
     settings = fit_settings(args)
-    measured = read_files(args.files, geometry, columns, args.probe_mm)
+    measured = read_measurements(args.files, geometry, columns, args.probe_mm)
     common.mention_compiling("model.actual_pose_one")
     try:
         result = _joint(args, measured, settings) if args.scheme == "joint" else _lines(args, measured)
@@ -213,10 +213,10 @@ class _Result:
         return replace(self.model, origin=replace(origin, note=f"FORCED: {self.misfit}. {origin.note}"))
 
 
-def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: Settings) -> _Result:
+def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSettings) -> _Result:
     """Fit with scheme joint."""
     from ..calibration.fit import fit_model
-    from ..calibration.report import as_json, report
+    from ..calibration.report import as_json, fit_report
     from ..formats.yaml import write_text_atomically
 
     with common.stage_line() as say:
@@ -239,7 +239,7 @@ def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: Setting
         return made
 
     model = fit.model if args.name is None else replace(fit.model, name=args.name)
-    return _Result(model, report(fit), pictures, fit.misfit, save_more)
+    return _Result(model, fit_report(fit), pictures, fit.misfit, save_more)
 
 
 def _lines(args: argparse.Namespace, measured: MeasurementSet) -> _Result:

@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     rows, positions, rotations = _given_pose(args) or read_pose_arrays(args.poses)
     geometry, model = common.load_machine(args)
     common.mention_compiling("checks.examine_many")
-    result = check(geometry, model, positions, rotations, "poses")
+    result = check(geometry, model, (positions, rotations), "poses")
     _refuse_lengthless(result, rows)
     with_model = args.model != "ideal"
     common.emit(_text(args, geometry, model, rows, result, with_model), args.out)

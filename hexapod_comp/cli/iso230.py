@@ -29,12 +29,12 @@ def run(args: argparse.Namespace) -> int:
     from ..errors import CalibrationError
     from ..formats.paths import config_file
     from ..machine.geometry import load_geometry
-    from ..measurements.files import read_files
+    from ..measurements.files import read_measurements
     from ..measurements.iso230 import evaluate, iso230_runs, report, table
 
     geometry = load_geometry(config_file(args.machine))
     columns = None if args.columns is None else config_file(args.columns)
-    measured = read_files(args.files, geometry, columns, args.probe_mm)
+    measured = read_measurements(args.files, geometry, columns, args.probe_mm)
     common.say_notes(measured.notes)
     tests = {run.name: evaluate(run.targets, run.deviations) for run in iso230_runs(measured)}
     if not tests:

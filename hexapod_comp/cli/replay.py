@@ -77,7 +77,7 @@ def _replayed(args: argparse.Namespace, recording: Recording) -> tuple[Report, H
     """Replay with what was in use, where that is at hand, and with what the options name, where that is another."""
     from ..errors import InputFileError
     from ..replay.bag import Files
-    from ..replay.replay import replay, what_if
+    from ..replay.replay import replay_recording, what_if
     from ..replay.report import Report
 
     files = Files(recording, _given(args))
@@ -86,7 +86,7 @@ def _replayed(args: argparse.Namespace, recording: Recording) -> tuple[Report, H
     report = Report(recording, None, tolerance=args.tolerance_um * 1e-6)
     with common.progress_bar(len(recording.answers) * (as_it_was + bool(other)), " answers") as bar:
         if as_it_was:
-            report.replayed = replay(recording, files, bar.update)
+            report.replayed = replay_recording(recording, files, bar.update)
             if other is None and not report.replayed.compared:
                 raise InputFileError(args.bag, "", NOTHING)
         if other is not None:

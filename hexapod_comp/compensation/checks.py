@@ -6,7 +6,7 @@ all poses, all struts and both stages (nominal and compensated), and nothing sto
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,6 +19,7 @@ from ..machine.limits import REASONS, STAGES
 from ..machine.model import MachineModel, RealMachine
 from ..machine.motion import MotionState
 from ..machine.trajectory import moves
+from ..pose import Pose, stacked
 
 LIMITS = ("stroke", "base_cone", "platform_cone", "clearance", "condition", "correction", "step", "speed")
 """Limits that have a margin, in the order in which they are shown."""
@@ -132,8 +133,7 @@ class CheckResult:
 def check(
     geometry: HexapodGeometry,
     model: MachineModel,
-    positions: np.ndarray,
-    rotations: np.ndarray,
+    poses: Sequence[Pose] | tuple[np.ndarray, np.ndarray],
     mode: str = "moves",
     rate: float = 250.0,
     progress: Callable[[int], object] = lambda rows: None,
@@ -146,8 +146,8 @@ def check(
         Nominal machine and limits.
     model : MachineModel
         What the compensator would run.
-    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
-        ``pose_tool_in_work``, m.
+    poses : sequence of N Pose, or (ndarray, ndarray) of shape (N, 3) and (N, 3, 3)
+        ``pose_tool_in_work``, m; a long path as its positions and its rotation matrices.
     mode : str
         ``moves``: the poses are targets, joined by :func:`hexapod_comp.machine.trajectory.moves`, and the whole path
         is checked. ``stream``: they are consecutive commands, checked for step and speed. ``poses``: each is
@@ -168,6 +168,7 @@ def check(
         raise GeometryError("--rate-hz", f"must lie in {RATES[0]:g}…{RATES[1]:g} Hz", rate)
     if mode not in MODES:
         raise GeometryError("mode", f"must be one of {', '.join(MODES)}", mode)
+    positions, rotations = stacked(poses)
     run = _PathCheck(geometry, model, len(positions), rate)
     if mode == "moves":
         run.check_moves(positions, rotations, progress)

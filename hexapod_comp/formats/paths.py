@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 from functools import cache
 from pathlib import Path
 
@@ -130,6 +131,17 @@ def config_folder() -> Path:
         if folder.is_dir():
             return folder
     raise InputFileError(package, "", f"no share/{PACKAGE}/config in any folder above it; install it anew")
+
+
+def version() -> str:
+    """Return the version of the code that runs: package.xml is installed beside the configuration."""
+    path = config_folder().parent / "package.xml"
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputFileError(path, "", f"cannot be read: {error.strerror}; install it anew") from error
+    found = re.search(r"<version>\s*(.*?)\s*</version>", text)
+    return found.group(1) if found else "unknown"
 
 
 def _not_found(name: str, shipped: list[str]) -> str:

@@ -61,9 +61,7 @@ def refuse_broken_limits(path: str, geometry: HexapodGeometry, model: str, rows:
         A limit is broken; names the first pose and says how to see them all.
     """
     known = load_model(model, geometry)
-    positions = np.array([pose.position for pose in poses])
-    rotations = np.array([pose.rotation for pose in poses])
-    found = check(geometry, known, positions, rotations).breaches
+    found = check(geometry, known, poses).breaches
     if found:
         row = rows[found[0].row]
         problem = f"pose {row.label}: {found[0].error}; `hexapod_comp check` lists all {len(found)} breaches"

@@ -12,8 +12,10 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -53,6 +55,8 @@ class Structure:
         Sign of det J in the working assembly mode.
     max_condition : float
         Largest condition number accepted as a solution.
+    home : Pose
+        ``pose_platform_in_base`` from which poses are sought when nothing better is known.
     """
 
     base_joints: np.ndarray
@@ -60,6 +64,7 @@ class Structure:
     characteristic_length: float
     home_sign: float
     max_condition: float
+    home: Pose
 
     @staticmethod
     def of(geometry: HexapodGeometry) -> Structure:
@@ -69,6 +74,7 @@ class Structure:
             geometry.characteristic_length,
             geometry.home_sign,
             geometry.limits.condition,
+            geometry.home,
         )
 
     def moved(self, base_deviation: np.ndarray, platform_deviation: np.ndarray) -> Structure:
@@ -79,7 +85,17 @@ class Structure:
             self.characteristic_length,
             self.home_sign,
             self.max_condition,
+            self.home,
         )
+
+
+Machine: TypeAlias = "HexapodGeometry | Structure"
+"""Whose kinematics are asked for: the nominal machine's, or those of a structure, as :attr:`RealMachine.structure`."""
+
+
+def structure_of(machine: Machine) -> Structure:
+    """Return a machine's structure."""
+    return machine if isinstance(machine, Structure) else Structure.of(machine)
 
 
 @dataclass(frozen=True)
@@ -110,12 +126,12 @@ class ForwardBatch:
         return self.outcomes == kernels.OK
 
 
-def strut_lengths(structure: Structure, pose: Pose) -> np.ndarray:
+def strut_lengths(machine: Machine, pose: Pose) -> np.ndarray:
     """Return the six strut lengths at a pose (000, inverse kinematic model).
 
     Parameters
     ----------
-    structure : Structure
+    machine : HexapodGeometry or Structure
         Ideal or real joints.
     pose : Pose
         ``pose_platform_in_base``.
@@ -125,7 +141,7 @@ def strut_lengths(structure: Structure, pose: Pose) -> np.ndarray:
     ndarray, shape (6,)
         |P + R·t_i − b_i|, m.
     """
-    lengths = np.empty(6)
+    structure, lengths = structure_of(machine), np.empty(6)
     kernels.strut_lengths_one(structure.base_joints, structure.platform_joints, pose.position, pose.rotation, lengths)
     return lengths
 
@@ -167,7 +183,7 @@ def strut_lengths_batch(
     return lengths
 
 
-def jacobian(structure: Structure, pose: Pose) -> np.ndarray:
+def jacobian(machine: Machine, pose: Pose) -> np.ndarray:
     """Return ∂L/∂(v, ω) at a pose: strut speeds per platform twist expressed in ``base``.
 
     Returns
@@ -175,7 +191,7 @@ def jacobian(structure: Structure, pose: Pose) -> np.ndarray:
     ndarray, shape (6, 6)
         Columns 0–2 per metre, 3–5 per radian; row i is (u_i, R·t_i × u_i).
     """
-    matrix = np.empty((6, 6))
+    structure, matrix = structure_of(machine), np.empty((6, 6))
     kernels.jacobian_one(structure.base_joints, structure.platform_joints, pose.position, pose.rotation, matrix)
     return matrix
 
@@ -196,12 +212,13 @@ def jacobian_batch(structure: Structure, positions: np.ndarray, rotations: np.nd
     return matrices
 
 
-def condition_number(structure: Structure, pose: Pose) -> tuple[float, float]:
+def condition_number(machine: Machine, pose: Pose) -> tuple[float, float]:
     """Return (condition number, sign of det J) at a pose.
 
     The condition number is ‖J‖·‖J⁻¹‖/6 in Frobenius norms with rotations scaled by the characteristic
     length: 1 for an isotropic machine, ∞ at a singular pose.
     """
+    structure = structure_of(machine)
     return kernels.condition_one(
         structure.base_joints,
         structure.platform_joints,
@@ -211,7 +228,7 @@ def condition_number(structure: Structure, pose: Pose) -> tuple[float, float]:
     )
 
 
-def solve_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> Pose:
+def solve_pose(machine: Machine, lengths: ArrayLike, guess: Pose | None = None) -> Pose:
     """Return the pose at which the machine has these strut lengths (forward kinematics).
 
     Newton on the six loop closures with the analytic Jacobian and a multiplicative rotation update. The
@@ -220,12 +237,12 @@ def solve_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> Pose:
 
     Parameters
     ----------
-    structure : Structure
+    machine : HexapodGeometry or Structure
         Ideal or real joints.
     lengths : array_like, shape (6,)
         Strut lengths, m.
-    guess : Pose
-        ``pose_platform_in_base`` to start from, usually the last pose.
+    guess : Pose, optional
+        ``pose_platform_in_base`` to start from, usually the last pose; home by default.
 
     Returns
     -------
@@ -237,7 +254,8 @@ def solve_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> Pose:
     NotFiniteError, UnreachableError, SingularError, NotConvergedError, OtherAssemblyModeError
         Each says what was found and what is allowed.
     """
-    lengths = six_lengths(lengths)
+    structure, lengths = structure_of(machine), six_lengths(lengths)
+    guess = structure.home if guess is None else guess
     position, rotation = guess.position.copy(), guess.rotation.copy()
     outcome, _, condition = _solve_one(structure, lengths, position, rotation)
     if outcome == kernels.NOT_CONVERGED or (outcome == kernels.SINGULAR and not np.isfinite(condition)):
@@ -435,7 +453,7 @@ def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tup
     return pose_at(fit.x)
 
 
-def six_lengths(lengths: np.ndarray) -> np.ndarray:
+def six_lengths(lengths: ArrayLike) -> np.ndarray:
     lengths = np.ascontiguousarray(lengths, dtype=float)
     if lengths.shape != (6,):
         raise KinematicsError(f"six strut lengths are needed, not shape {lengths.shape}", lengths.shape)

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..errors import ModelError, NotConvergedError
 from ..kernels import kinematics as kernels
@@ -214,15 +215,15 @@ class RealMachine:
     def _growth(self, name: str, expansion: float) -> float:
         return float(expansion) * self.temperatures.above_reference(name)
 
-    def commands_for(self, target: Pose, motion: MotionState) -> tuple[np.ndarray, Pose, bool]:
+    def commands_for(self, target: Pose, motion: MotionState | None = None) -> tuple[np.ndarray, Pose, bool]:
         """Return the strut commands that really bring the platform to a pose (backward run).
 
         Parameters
         ----------
         target : Pose
             ``pose_platform_in_base`` wanted.
-        motion : MotionState
-            Directions of motion; updated.
+        motion : MotionState, optional
+            Directions of motion; updated. By default they are not known.
 
         Returns
         -------
@@ -238,7 +239,7 @@ class RealMachine:
         NotConvergedError
             q ∘ E(q) = target could not be solved: the field is no small correction.
         """
-        commands = np.empty(6)
+        motion, commands = MotionState() if motion is None else motion, np.empty(6)
         position, rotation = np.empty(3), np.empty((3, 3))
         solved, outside = command_one(
             target.position,
@@ -257,17 +258,19 @@ class RealMachine:
             raise NotConvergedError("the error field is too steep to be undone at this pose")
         return commands, Pose(position, rotation), bool(outside)
 
-    def pose_for(self, commands: np.ndarray, sense: np.ndarray, guess: Pose) -> tuple[Pose, Pose]:
+    def pose_for(
+        self, commands: ArrayLike, sense: np.ndarray | None = None, guess: Pose | None = None
+    ) -> tuple[Pose, Pose]:
         """Return where the platform really goes under given strut commands (forward run).
 
         Parameters
         ----------
         commands : array_like, shape (6,)
             Strut commands, or encoder readings, m.
-        sense : ndarray, shape (9,)
-            Directions of motion, as in :class:`MotionState`.
-        guess : Pose
-            Model pose to start from, usually the last one.
+        sense : ndarray, shape (9,), optional
+            Directions of motion, as in :class:`MotionState`. By default they are not known.
+        guess : Pose, optional
+            Model pose to start from, usually the last one; home by default.
 
         Returns
         -------
@@ -279,6 +282,8 @@ class RealMachine:
         KinematicsError
             As :func:`hexapod_comp.machine.kinematics.solve_pose`.
         """
+        guess = self.geometry.home if guess is None else guess
+        sense = MotionState().sense if sense is None else sense
         position, rotation = guess.position.copy(), guess.rotation.copy()
         actual_position, actual_rotation = np.empty(3), np.empty((3, 3))
         outcome, _, condition, _ = self.forward(

@@ -12,15 +12,15 @@ from ..machine.geometry import HexapodGeometry
 from .carto import read_carto
 from .readings import MeasurementSet
 from .runs import joined
-from .tidy_csv import read_measurements
+from .tidy_csv import read_tidy
 from .wide_csv import read_wide
 
 LASER_SUFFIXES = (".rtl", ".rtx")
 """Files of the laser software; each needs its line file beside it."""
 
 
-def read_files(
-    paths: Sequence[str | Path],
+def read_measurements(
+    paths: str | Path | Sequence[str | Path],
     geometry: HexapodGeometry,
     columns: str | Path | None = None,
     probe: np.ndarray | None = None,
@@ -29,7 +29,7 @@ def read_files(
 
     Parameters
     ----------
-    paths : sequence of path
+    paths : path or sequence of paths
         ``.rtl`` and ``.rtx`` files, each with a line file of the same name and ``.yaml`` beside it; all others
         are CSV.
     geometry : HexapodGeometry
@@ -44,6 +44,7 @@ def read_files(
     InputFileError
         Naming file and place.
     """
+    paths = [paths] if isinstance(paths, str | Path) else paths
     if not paths:
         raise InputFileError("measurements", "", "no file is given")
     laser = [path for path in paths if Path(path).suffix.lower() in LASER_SUFFIXES]
@@ -52,7 +53,7 @@ def read_files(
     if laser:
         sets.append(read_carto([(path, f"{path}.yaml") for path in laser], geometry, probe))
     if tables and columns is None:
-        sets.append(read_measurements(tables, geometry, probe))
+        sets.append(read_tidy(tables, geometry, probe))
     if tables and columns is not None:
         if probe is not None:
             raise InputFileError(tables[0], "", "a wide file is of the tool's tip; leave the probe out")

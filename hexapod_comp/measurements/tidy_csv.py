@@ -121,7 +121,7 @@ class _Row(NamedTuple):
     line: int
 
 
-def read_measurements(
+def read_tidy(
     paths: str | Path | Sequence[str | Path], geometry: HexapodGeometry, probe: np.ndarray | None = None
 ) -> MeasurementSet:
     """Read tidy CSV files (described above) as one set.

@@ -22,7 +22,7 @@ from .tidy_csv import DIRECTIONS
 
 
 def write_measurements(measurements: MeasurementSet, path: str | Path) -> None:
-    """Write a set as the file that :func:`~.tidy_csv.read_measurements` reads back, to the last bit.
+    """Write a set as the file that :func:`~.tidy_csv.read_tidy` reads back, to the last bit.
 
     Commanded poses are written to 10⁻¹³ m and 10⁻¹² degrees. The measured point is not a column: where it is not
     the tool's tip, a comment in the file says where it is, and it has to be given again for reading.

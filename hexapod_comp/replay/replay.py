@@ -95,15 +95,17 @@ class Replay:
         return self.lengths[:, 1] - self.answers["lengths"][:, 1]
 
 
-def replay(recording: Recording, files: Files, progress: Progress = lambda answers: None) -> Replay:
+def replay_recording(
+    recording: Recording, files: Files | None = None, progress: Progress = lambda answers: None
+) -> Replay:
     """Run a recording through the compensator again.
 
     Parameters
     ----------
     recording : Recording
         What was read.
-    files : Files
-        Geometry and model in use.
+    files : Files, optional
+        Geometry and model in use; by default as the recording carries them.
     progress : callable, optional
         Called with the number of answers just compared.
 
@@ -112,7 +114,7 @@ def replay(recording: Recording, files: Files, progress: Progress = lambda answe
     InputFileError
         Geometry or model in use are not at hand.
     """
-    return _AsItWas(recording, progress, files).run()
+    return _AsItWas(recording, progress, files or Files(recording, {})).run()
 
 
 def what_if(

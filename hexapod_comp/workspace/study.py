@@ -12,7 +12,7 @@ from ..pose import Pose
 from .combining import RSS, WORST_CASE, Allocation, MonteCarlo, allocate, monte_carlo, root_sum_of_squares, worst_case
 from .effects import EXACT, LINEAR, Extremes, effect_vectors, effects
 from .ranking import RankingRow, ranked
-from .reach import Reach, poses_at
+from .reach import Reach, poses_at, reach
 from .runner import survey
 from .shells import Shell, shell
 from .sources import LENGTH, TOOL, Budget, SingleErrors
@@ -108,7 +108,7 @@ class Study:
 def classify(
     geometry: HexapodGeometry,
     budget: Budget,
-    reaches: tuple[Reach, ...],
+    reaches: tuple[Reach, ...] | None = None,
     method: str = EXACT,
     allowed: float | None = None,
     compare: int = 0,
@@ -125,8 +125,8 @@ def classify(
         The machine.
     budget : Budget
         Sizes of its errors.
-    reaches : tuple of Reach
-        From :func:`~hexapod_comp.workspace.reach.reaches`.
+    reaches : tuple of Reach, optional
+        From :func:`~hexapod_comp.workspace.reach.reaches`; by default what is reached with the tool as at home.
     method : str
         ``exact`` or ``linear``, for the ranking.
     allowed : float, optional
@@ -144,6 +144,7 @@ def classify(
         The budget is another machine's, or the allowed error is not above zero.
     """
     errors = budget.single_errors(geometry)
+    reaches = (reach(geometry),) if reaches is None else reaches
     extremes = survey(reaches, errors, method, workers, scheduler, progress)
     positions, rotations = _random_poses(reaches, COMBINED_POSES, seed)
     vectors = effect_vectors(geometry, errors, positions, rotations, LINEAR)

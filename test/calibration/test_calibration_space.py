@@ -10,7 +10,13 @@ from numpy.polynomial import legendre
 from scipy.interpolate import CubicSpline
 from scipy.spatial.distance import cdist
 
-from hexapod_comp.calibration.parameters import BLOCKS, KNOT_DISTANCE, MAP_CORRELATION_LENGTH, ParameterSpace, Settings
+from hexapod_comp.calibration.parameters import (
+    BLOCKS,
+    KNOT_DISTANCE,
+    MAP_CORRELATION_LENGTH,
+    FitSettings,
+    ParameterSpace,
+)
 from hexapod_comp.calibration.smooth_field import DECAY, GRID_TOLERANCE, SmoothField
 from hexapod_comp.errors import ModelError
 from hexapod_comp.measurements.campaign import template
@@ -164,16 +170,16 @@ def test_a_machine_without_coinciding_joints_has_42_either_way():
     geometry = general_machine()
     positions, rotations = poses_about(geometry.home, 3, seed=1)
     poses = [Pose(p, r) for p, r in zip(positions, rotations, strict=True)]
-    shared = ParameterSpace(small.scattered(geometry, poses), Settings(lead=0.01))
+    shared = ParameterSpace(small.scattered(geometry, poses), FitSettings(lead=0.01))
     assert len(shared.blocks[0].labels) == 42
 
 
 def test_without_a_lead_there_are_no_waves(readings: MeasurementSet):
     geometry = replace(readings.geometry, screw_lead=np.zeros(6))
-    assert ParameterSpace(replace(readings, geometry=geometry), Settings()).block("wave") is None
+    assert ParameterSpace(replace(readings, geometry=geometry), FitSettings()).block("wave") is None
     across = np.tile([1.0, 0.0, 0.0], (6, 1))
     led = replace(geometry, screw_lead=np.full(6, -0.005), base_axes=across, platform_axes=across)
-    np.testing.assert_array_equal(ParameterSpace(replace(readings, geometry=led), Settings()).periods, 0.005)
+    np.testing.assert_array_equal(ParameterSpace(replace(readings, geometry=led), FitSettings()).periods, 0.005)
 
 
 def test_knots_cover_the_commands_close_enough(space: ParameterSpace, readings: MeasurementSet):
@@ -245,4 +251,4 @@ def test_model_says_what_the_vector_says(readings: MeasurementSet):
 )
 def test_settings_that_cannot_be(options: dict, what: str):
     with pytest.raises(ModelError, match=what):
-        Settings(**options)
+        FitSettings(**options)

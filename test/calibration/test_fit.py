@@ -10,7 +10,7 @@ from scipy.stats import chi2, multivariate_normal
 
 from hexapod_comp.calibration.estimation import HYPER, Estimation, LinearProblem, held_out, physical_covariance, solve
 from hexapod_comp.calibration.fit import ModelFit, fit_model
-from hexapod_comp.calibration.parameters import BLOCKS, ParameterSpace, Settings
+from hexapod_comp.calibration.parameters import BLOCKS, FitSettings, ParameterSpace
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.measurements.campaign import template
@@ -36,7 +36,7 @@ def fitted(seed: int, instrument: str) -> ModelFit:
     return fit_model(readings(seed, instrument), SOME)
 
 
-def linearised(measurements: MeasurementSet, settings: Settings = FEW) -> tuple[ParameterSpace, LinearProblem]:
+def linearised(measurements: MeasurementSet, settings: FitSettings = FEW) -> tuple[ParameterSpace, LinearProblem]:
     space = ParameterSpace(measurements, settings)
     estimation = Estimation(measurements, space)
     return space, estimation.linearise(np.zeros(space.size), np.ones(len(measurements)))[0]
@@ -71,7 +71,7 @@ def test_a_slope_of_a_linear_reading_is_not_forgotten():
 def test_absolute_poses_keep_their_zero():
     poses = [Pose([x, y, 0.45], np.eye(3)) for x in np.linspace(-0.1, 0.1, 4) for y in np.linspace(-0.1, 0.1, 4)]
     absolute = small.scattered(small.paper(), poses)
-    space = ParameterSpace(absolute, Settings(blocks=()))
+    space = ParameterSpace(absolute, FitSettings(blocks=()))
     shifted = Estimation(absolute.with_values(absolute.value + 1e-5), space)
     problem, residuals = shifted.linearise(np.zeros(space.size), np.ones(len(absolute)))
     np.testing.assert_allclose(residuals, 1e-5, atol=1e-12)
@@ -109,7 +109,7 @@ def test_cells_are_left_out_by_line_and_by_pose():
     assert pairs.shape[1] == len(readings().runs) == lines.fold.max() + 1
     poses = [Pose([x, 0.02 * x, 0.45], np.eye(3)) for x in np.linspace(-0.1, 0.1, 9)]
     absolute = small.scattered(small.paper(), poses)
-    folds = Estimation(absolute, ParameterSpace(absolute, Settings(blocks=()))).cells.fold
+    folds = Estimation(absolute, ParameterSpace(absolute, FitSettings(blocks=()))).cells.fold
     assert np.bincount(folds).tolist() == [6] * 9
 
 
@@ -408,7 +408,7 @@ def test_commands_in_wrong_units_are_a_calibration_error():
     ours = small.scattered(small.paper(), poses)
     ours = replace(ours, stations=replace(ours.stations, commands=1e2 * ours.stations.commands))
     with pytest.raises(CalibrationError, match="units"):
-        fit_model(ours, Settings(blocks=("pitch",)))
+        fit_model(ours, FitSettings(blocks=("pitch",)))
 
 
 # ---------------------------------------------------------------- the edge of what can be asked

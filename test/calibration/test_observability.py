@@ -17,7 +17,7 @@ from hexapod_comp.calibration.observability import (
     observe,
     without_trace,
 )
-from hexapod_comp.calibration.parameters import ParameterSpace, Settings
+from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.sensitivity import predict
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -28,20 +28,20 @@ SQUARENESS = ("squareness xy", "squareness xz", "squareness yz")
 TWISTS = ("twist dx ~ y z", "twist dy ~ x z", "twist dz ~ x y")
 ROLLS = ("roll of x", "roll of y", "roll of z")
 ONES = np.ones(len(KINDS))
-STRUCTURE = Settings(blocks=())
-FIELD = Settings(blocks=("field displacement", "field rotation"), field_degree=3)
+STRUCTURE = FitSettings(blocks=())
+FIELD = FitSettings(blocks=("field displacement", "field rotation"), field_degree=3)
 
 
 @cache
 def linearised(
-    instrument: str, diagonals: int, settings: Settings, poses: int = 0, tilt: float = 0.0
+    instrument: str, diagonals: int, settings: FitSettings, poses: int = 0, tilt: float = 0.0
 ) -> tuple[ParameterSpace, LinearProblem]:
     """Return space and linear problem of a campaign on the nominal machine: what it sees needs no readings."""
     plan = small.campaign(instrument, diagonals, poses=poses, tilt=tilt)
     return problem_of(template(plan, small.paper()), settings)
 
 
-def problem_of(measurements: MeasurementSet, settings: Settings) -> tuple[ParameterSpace, LinearProblem]:
+def problem_of(measurements: MeasurementSet, settings: FitSettings) -> tuple[ParameterSpace, LinearProblem]:
     space = ParameterSpace(measurements, settings)
     estimation = Estimation(measurements, space)
     return space, estimation.linearise(np.zeros(space.size), np.ones(len(measurements)))[0]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import central_difference, general_machine, poses_about
 
-from hexapod_comp.calibration.parameters import ParameterSpace, Settings
+from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.sensitivity import derivatives, predict
 from hexapod_comp.calibration.smooth_field import GRID_TOLERANCE
 from hexapod_comp.machine.geometry import HexapodGeometry
@@ -17,7 +17,7 @@ from hexapod_comp.measurements.readings import Stations, attitude_error
 from hexapod_comp.pose import Pose
 
 PROBE = np.array([0.02, -0.03, -0.06])
-COLD = Settings(lead=small.LEAD, field_degree=2)
+COLD = FitSettings(lead=small.LEAD, field_degree=2)
 WARM = replace(COLD, strut_expansion=12e-6, base_expansion=11e-6, platform_expansion=23e-6)
 SPLIT = replace(WARM, shared_platform_joints=False)
 STRUTS_ONLY = replace(COLD, blocks=("pitch", "wave", "backlash", "map"))
@@ -29,7 +29,7 @@ def led() -> HexapodGeometry:
     return replace(small.paper(), screw_lead=np.full(6, 0.01), base_axes=across, platform_axes=across)
 
 
-def case(geometry: HexapodGeometry, settings: Settings) -> tuple[ParameterSpace, Stations, np.ndarray]:
+def case(geometry: HexapodGeometry, settings: FitSettings) -> tuple[ParameterSpace, Stations, np.ndarray]:
     """Return a space, tilted poses with a probe and eight temperatures, and a machine as its priors expect one."""
     rng = np.random.default_rng(11)
     positions, rotations = poses_about(geometry.home, 12, seed=12, reach=0.04, tilt_deg=8.0)
@@ -80,7 +80,7 @@ def worst(found: np.ndarray, wanted: np.ndarray) -> float:
     ids=["shared joints", "separate joints", "twelve joints", "turning screws"],
 )
 def test_every_block_against_finite_differences(
-    make: Callable[[], HexapodGeometry], settings: Settings, tolerance: float
+    make: Callable[[], HexapodGeometry], settings: FitSettings, tolerance: float
 ):
     space, stations, x = case(make(), settings)
     analytic = derivatives(space, predict(space, x, stations), stations)
@@ -110,7 +110,7 @@ def test_negative_backlash_is_not_cut_off():
 
 
 @pytest.mark.parametrize("settings", [WARM, SPLIT, STRUTS_ONLY], ids=["warm", "separate joints", "no field"])
-def test_prediction_is_the_machine_that_the_compensator_runs(settings: Settings):
+def test_prediction_is_the_machine_that_the_compensator_runs(settings: FitSettings):
     """Errors of the measured point of RealMachine with the whole model, field as a grid.
 
     The grid may differ by its tolerance; rotations of 1 mrad and 50 µrad do not commute: half their product.

@@ -326,14 +326,10 @@ def test_check_names_a_correction_that_is_too_large() -> None:
     """A strut 2.5 mm short needs 2.5 mm of correction, 2 mm are allowed: at every pose, for that strut alone."""
     model = MachineModel("paper", struts=StrutErrors(offset=np.array([0.0, 0.0, 0.0, -2.5e-3, 0.0, 0.0])))
     poses = table_poses()
-    result = check(PAPER, model, *stacked(poses), mode="poses")
+    result = check(PAPER, model, poses, mode="poses")
     assert {(b.limit, b.error.strut) for b in result.breaches} == {("correction", 3)}  # type: ignore[attr-defined]
     assert [b.row for b in result.breaches] == list(range(10))
     assert result.limits["correction"].margin[:, 1] == pytest.approx(-0.5e-3, abs=1e-12)
-
-
-def stacked(poses: Sequence[Pose]) -> tuple[np.ndarray, np.ndarray]:
-    return np.array([pose.position for pose in poses]), np.array([pose.rotation for pose in poses])
 
 
 def test_check_lists_every_breach_not_the_first(hexapod, tmp_path: Path) -> None:
@@ -363,8 +359,8 @@ def test_check_finds_what_happens_on_the_way() -> None:
         condition=100.0,
     )
     geometry = replace(PAPER, limits=limits)
-    assert check(geometry, IDEAL, *stacked(ends), mode="poses").ok
-    result = check(geometry, IDEAL, *stacked(ends), mode="moves")
+    assert check(geometry, IDEAL, ends, mode="poses").ok
+    result = check(geometry, IDEAL, ends, mode="moves")
     assert [(b.row, b.limit, b.error.strut) for b in result.breaches] == [(1, "stroke", 0)]  # type: ignore[attr-defined]
     assert result.breaches[0].share == pytest.approx(0.5, abs=0.01)
     assert result.limits["stroke"].margin[1, 0] == pytest.approx(lengths[2] - limits.stroke[0, 0], abs=1e-6)
@@ -387,7 +383,7 @@ def test_check_agrees_with_the_compensator_on_a_random_stream() -> None:
     model = replace(random_model(rng, "paper"), field=random_field(rng, outside="refuse"))
     positions = PAPER.home.position + rng.uniform(-0.12, 0.12, (400, 3))
     rotations = Rotation.from_rotvec(rng.uniform(-0.3, 0.3, (400, 3))).as_matrix()
-    result = check(geometry, model, positions, rotations, mode="poses")
+    result = check(geometry, model, (positions, rotations), mode="poses")
     reasons = [{b.limit for b in result.breaches if b.row == n} for n in range(400)]
     for n in range(400):
         compensator = Compensator(geometry, model)
@@ -410,7 +406,7 @@ def test_check_follows_a_stream_like_the_compensator() -> None:
     angle = np.linspace(0.0, 4.0 * np.pi, 700)
     positions = PAPER.home.position + 0.02 * np.stack([np.cos(angle), np.sin(2 * angle), 0.2 * np.sin(angle)], axis=1)
     rotations = Rotation.from_rotvec(0.05 * np.stack([np.sin(angle)] * 3, axis=1)).as_matrix()
-    result = check(geometry, model, positions, rotations, mode="stream")
+    result = check(geometry, model, (positions, rotations), mode="stream")
     compensator = Compensator(geometry, model)
     records = [
         compensator.correct(Pose(p, r), n / 250) for n, (p, r) in enumerate(zip(positions, rotations, strict=True))
@@ -434,7 +430,7 @@ def test_check_says_where_a_field_cannot_be_undone() -> None:
     lines[0][:, :, :, 0, 1] = 0.3  # u runs from −1 to 1 over 0.4 m
     model = MachineModel("paper", field=GridField(grid, tuple(lines)))  # type: ignore[arg-type]
     poses = [Pose([0.03, 0.0, 0.4], np.eye(3)), Pose([0.05, 0.0, 0.4], np.eye(3))]
-    result = check(PAPER, model, *stacked(poses), mode="stream")
+    result = check(PAPER, model, poses, mode="stream")
     assert [(b.row, b.limit) for b in result.breaches if b.limit == "not_converged"] == [
         (0, "not_converged"),
         (1, "not_converged"),
@@ -447,7 +443,7 @@ def test_check_long_streams_in_pieces() -> None:
     positions = np.stack([0.02 * np.cos(angle), 0.02 * np.sin(angle), np.full_like(angle, 0.4)], axis=1)
     rotations = np.tile(np.eye(3), (len(angle), 1, 1))
     done: list[int] = []
-    result = check(PAPER, IDEAL, positions, rotations, "stream", 250.0, done.append)
+    result = check(PAPER, IDEAL, (positions, rotations), "stream", 250.0, done.append)
     assert result.ok
     assert (result.examined, sum(done)) == (40_000, 40_000)
     lengths = np.linalg.norm(positions[:, None] + PAPER.platform_joints - PAPER.base_joints, axis=2)
@@ -501,7 +497,7 @@ def test_check_says_when_poses_leave_the_measured_box(hexapod, tmp_path: Path) -
 @pytest.mark.parametrize(("mode", "rate"), [("moves", 0.5), ("moves", np.nan), ("jumps", 250.0)])
 def test_check_refuses_what_makes_no_sense(mode: str, rate: float) -> None:
     with pytest.raises(GeometryError):
-        check(PAPER, IDEAL, *stacked(table_poses()), mode=mode, rate=rate)
+        check(PAPER, IDEAL, table_poses(), mode=mode, rate=rate)
 
 
 # assess.

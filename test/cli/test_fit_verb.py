@@ -23,11 +23,11 @@ import pytest
 from hexapod_comp import cli
 from hexapod_comp.calibration import fit as joint_fit
 from hexapod_comp.calibration.fit import ModelFit
-from hexapod_comp.calibration.parameters import Settings
+from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import load_model
-from hexapod_comp.measurements.files import read_files
+from hexapod_comp.measurements.files import read_measurements
 
 CAMPAIGN = """format: hexapod_comp/campaign
 version: 1
@@ -248,9 +248,9 @@ def test_options_reach_the_fit(
     hexapod: Program, done: Calibration, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """In SI, and the field's three blocks under one word."""
-    given: list[Settings] = []
+    given: list[FitSettings] = []
 
-    def spy(measured: object, settings: Settings, say: object) -> ModelFit:
+    def spy(measured: object, settings: FitSettings, say: object) -> ModelFit:
         given.append(settings)
         return done.fit
 
@@ -659,7 +659,7 @@ def test_iso230_judges_every_line(hexapod: Program, done: Calibration) -> None:
 def test_iso230_figures_follow_from_the_readings(hexapod: Program, done: Calibration) -> None:
     """The standard's M and B of one line by hand, from the readings themselves: M is the range of the means of both
     directions, B the largest difference of the two means of a target. Numbers in the table have 1 nm."""
-    measured = read_files([done.measured], load_geometry(config_file("paper")))
+    measured = read_measurements([done.measured], load_geometry(config_file("paper")))
     name = "x line at y 0.0, z 350.0"
     number = [run.name for run in measured.runs].index(name)
     along = measured.along().round(9)

@@ -18,7 +18,7 @@ from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.measurements.campaign import Campaign, load_campaign, template
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
-from hexapod_comp.measurements.tidy_csv import read_measurements
+from hexapod_comp.measurements.tidy_csv import read_tidy
 from hexapod_comp.virtual.instruments import compensated, measure, station_errors
 
 BOX = np.array([[-0.1, -0.1, 0.4], [0.1, 0.1, 0.55]])
@@ -169,7 +169,7 @@ def test_verb_writes_what_it_says(tmp_path: Path, capsys: pytest.CaptureFixture[
     expected = measure(template(campaign, geometry, 1), campaign, truth, 1)
     assert f"{len(expected)} readings of 21 runs" in text  # 16 lines, 4 diagonals, the poses
     # The file has what instruments show: a tenth of a nanometre.
-    np.testing.assert_allclose(read_measurements(paths[0], geometry).value, expected.value, rtol=0.0, atol=0.51e-10)
+    np.testing.assert_allclose(read_tidy(paths[0], geometry).value, expected.value, rtol=0.0, atol=0.51e-10)
 
 
 def test_verb_measures_the_compensated_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -178,7 +178,7 @@ def test_verb_measures_the_compensated_machine(tmp_path: Path, capsys: pytest.Ca
     assert run("--campaign", "campaign_1d", "--model", "paper_machine", "--out", path) == 0
     assert "told the strut lengths of paper_machine" in capsys.readouterr().out
     geometry = paper_geometry()
-    found = read_measurements(path, geometry)
+    found = read_tidy(path, geometry)
     assert found.value.std() == pytest.approx(1e-6, rel=0.1)
     model = load_model(config_file("paper_machine"), geometry)
     plan = compensated(template(load_campaign(config_file("campaign_1d")), geometry), model)

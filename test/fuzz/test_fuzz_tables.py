@@ -32,7 +32,7 @@ from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.measurements.carto import load_line, read_carto
 from hexapod_comp.measurements.carto_files import read_rtl, read_rtx
 from hexapod_comp.measurements.readings import MeasurementSet
-from hexapod_comp.measurements.tidy_csv import read_measurements
+from hexapod_comp.measurements.tidy_csv import read_tidy
 from hexapod_comp.measurements.wide_csv import read_wide
 
 PAPER = paper_geometry()
@@ -158,7 +158,7 @@ def test_tidy_measurements(folder: Path, changes: list) -> None:
     path = put(folder, "tidy.csv", data)
     try:
         with reader_of("tidy", path):
-            found = read_measurements(path, PAPER)
+            found = read_tidy(path, PAPER)
     except Refused:
         assert changes
         return

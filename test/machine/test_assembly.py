@@ -70,7 +70,7 @@ def random_machine(seed: int, planar: bool) -> tuple[Structure, np.ndarray]:
     rng = np.random.default_rng(seed)
     base = rng.normal(0.0, 0.3, (6, 3)) * [1.0, 1.0, 0.0 if planar else 1.0]
     platform = np.repeat(rng.normal(0.0, 0.2, (3, 3)), 2, axis=0)
-    structure = Structure(base, platform, 0.2, 1.0, 1e9)
+    structure = Structure(base, platform, 0.2, 1.0, 1e9, Pose.identity())
     pose = Pose(rng.normal(0.0, 0.4, 3), Rotation.from_rotvec(rng.normal(0.0, 1.0, 3)).as_matrix())
     return structure, distances(structure, pose)
 

@@ -416,7 +416,7 @@ def test_check_reach_cold_start_and_compensator_agree(name: str, seed: int) -> N
     poses = [random_pose(rng, machine.home, 0.04, 12.0) for _ in range(4)]
     told = [machine.tool_pose(pose) for pose in poses]
     positions, rotations = np.array([p.position for p in told]), np.array([p.rotation for p in told])
-    result = check(machine, model, positions, rotations, "poses")
+    result = check(machine, model, (positions, rotations), "poses")
     reach, _ = Examiner(machine).findings(positions, rotations)
     for row, (pose, tool) in enumerate(zip(poses, told, strict=True)):
         breaches = {(b.limit, getattr(b.error, "strut", None)) for b in result.breaches if b.row == row}

@@ -23,7 +23,7 @@ from hexapod_comp.machine.kinematics import Structure, strut_lengths
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.iso230 import iso230_runs
 from hexapod_comp.measurements.readings import CHANNELS, MeasurementSet
-from hexapod_comp.measurements.tidy_csv import read_measurements
+from hexapod_comp.measurements.tidy_csv import read_tidy
 from hexapod_comp.measurements.wide_csv import read_wide
 from hexapod_comp.measurements.writing import write_measurements
 from hexapod_comp.pose import Pose
@@ -44,7 +44,7 @@ def written(folder: Path, rows: str, header: str = HEADER, name: str = "m.csv") 
 
 
 def read(folder: Path, rows: str, header: str = HEADER) -> MeasurementSet:
-    return read_measurements(written(folder, rows, header), paper_geometry())
+    return read_tidy(written(folder, rows, header), paper_geometry())
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_positions_and_quaternions_are_absolute_in_the_work_frame(tmp_path: Path
     rows = "".join(f"t,,{pose},position_{a},{float(v)!r},mm\n" for a, v in zip("xyz", position, strict=True))
     rows += "".join(f"t,,{pose},quaternion_{a},{float(v)!r},\n" for a, v in zip("xyzw", quaternion, strict=True))
     header = "run,direction,x_mm,y_mm,z_mm,qx,qy,qz,qw,channel,value,unit"
-    found = read_measurements(written(tmp_path, rows, header), geometry)
+    found = read_tidy(written(tmp_path, rows, header), geometry)
     np.testing.assert_allclose(found.value[:3], error, atol=1e-15)
     np.testing.assert_allclose(found.value[3:], turn, atol=1e-14)
     in_base = np.concatenate([work.rotation @ error, work.rotation @ turn])
@@ -104,7 +104,7 @@ def test_the_measured_point_may_be_another_than_the_tools_tip(tmp_path: Path) ->
     """A reflector 100 mm beside the tip, on a tool turned 30° about z: it stands at 86.603, 50 mm."""
     header = HEADER.replace("z_mm", "z_mm,alpha_deg,beta_deg,gamma_deg")
     rows = "t,,0,0,400,0,0,30,position_x,86.60254037844386,mm\nt,,0,0,400,0,0,30,position_y,50.001,mm\n"
-    found = read_measurements(written(tmp_path, rows, header), paper_geometry(), probe=np.array([0.1, 0.0, 0.0]))
+    found = read_tidy(written(tmp_path, rows, header), paper_geometry(), probe=np.array([0.1, 0.0, 0.0]))
     np.testing.assert_allclose(found.value, [0.0, 1e-6], atol=1e-15)
 
 
@@ -160,11 +160,11 @@ def test_sequences_come_back_to_a_place(tmp_path: Path) -> None:
 def test_runs_of_the_same_name_in_two_files_are_two(tmp_path: Path) -> None:
     one = written(tmp_path, LINE, name="one.csv")
     two = written(tmp_path, LINE.replace("1.5", "7") + LINE.replace("a,", "b,"), name="two.csv")
-    found = read_measurements([one, two], paper_geometry())
+    found = read_tidy([one, two], paper_geometry())
     assert [run.name for run in found.runs] == ["a [one.csv]", "a [two.csv]", "b"]
     assert found.files[0] == ("one.csv", hashlib.sha256(one.read_bytes()).hexdigest())
     with pytest.raises(InputFileError, match=r"two\.csv: is the same file as"):
-        read_measurements([two, two], paper_geometry())
+        read_tidy([two, two], paper_geometry())
 
 
 BAD = {
@@ -234,7 +234,7 @@ def assert_same(found: MeasurementSet, expected: MeasurementSet, tilted: float =
 def test_round_trip_of_lines_is_exact(tmp_path: Path) -> None:
     expected = random_set(1, poses=0)
     write_measurements(expected, tmp_path / "c.csv")
-    assert_same(read_measurements(tmp_path / "c.csv", paper_geometry()), expected)
+    assert_same(read_tidy(tmp_path / "c.csv", paper_geometry()), expected)
 
 
 def test_round_trip_of_everything(tmp_path: Path) -> None:
@@ -249,7 +249,7 @@ def test_round_trip_of_everything(tmp_path: Path) -> None:
     uncertainty = np.where(rng.random(len(expected)) < 0.5, np.nan, rng.uniform(1e-7, 1e-5, len(expected)))
     expected = replace(expected, stations=stations, uncertainty=uncertainty)
     write_measurements(expected, tmp_path / "c.csv")
-    found = read_measurements(tmp_path / "c.csv", paper_geometry())
+    found = read_tidy(tmp_path / "c.csv", paper_geometry())
     assert_same(found, expected, tilted=1e-14)
     np.testing.assert_array_equal(found.stations.commands, expected.stations.commands)
     write_measurements(found, tmp_path / "again.csv")
@@ -263,11 +263,11 @@ def test_round_trip_of_sequences_and_of_another_point(tmp_path: Path) -> None:
         rows += "".join(f"t,sequence,0,0,{z},strut_{i + 1},{v},mm\n" for i, v in enumerate(lengths))
         rows += f"t,sequence,0,0,{z},position_z,{z - 49.99},mm\n"
     probe = np.array([0.01, 0.0, -0.05])
-    expected = read_measurements(written(tmp_path, rows), paper_geometry(), probe)
+    expected = read_tidy(written(tmp_path, rows), paper_geometry(), probe)
     np.testing.assert_allclose(expected.value, 1e-5, atol=1e-15)
     write_measurements(expected, tmp_path / "c.csv")
     assert (tmp_path / "c.csv").read_text().startswith("# measured point in the platform frame, mm: 10, 0, -50\n")
-    assert_same(read_measurements(tmp_path / "c.csv", paper_geometry(), probe), expected)
+    assert_same(read_tidy(tmp_path / "c.csv", paper_geometry(), probe), expected)
 
 
 def test_25000_rows_take_two_seconds(tmp_path: Path) -> None:
@@ -277,7 +277,7 @@ def test_25000_rows_take_two_seconds(tmp_path: Path) -> None:
     plan = plan.with_values(np.random.default_rng(0).normal(0.0, 1e-5, len(plan)))
     write_measurements(plan, tmp_path / "c.csv")
     start = time.process_time()
-    found = read_measurements(tmp_path / "c.csv", paper_geometry())
+    found = read_tidy(tmp_path / "c.csv", paper_geometry())
     assert len(found) > 25_000
     assert time.process_time() - start < 4.0 * len(found) / 25_000
 
@@ -332,7 +332,7 @@ def test_mutated_files_are_read_or_refused(tmp_path_factory: pytest.TempPathFact
     path = tmp_path_factory.mktemp("fuzz") / "m.csv"
     path.write_bytes(mutated(SEED_TEXT, edits).encode("utf-8", "surrogatepass"))
     try:
-        found = read_measurements(path, paper_geometry())
+        found = read_tidy(path, paper_geometry())
     except HexapodError:
         return
     assert np.isfinite(found.value).all()

@@ -16,7 +16,7 @@ from strategies import paper_geometry
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.measurements.campaign import Campaign, template
-from hexapod_comp.measurements.files import read_files
+from hexapod_comp.measurements.files import read_measurements
 from hexapod_comp.measurements.readings import (
     BACKWARD,
     FORWARD,
@@ -27,7 +27,7 @@ from hexapod_comp.measurements.readings import (
     Reading,
 )
 from hexapod_comp.measurements.runs import assemble, joined
-from hexapod_comp.measurements.tidy_csv import read_measurements
+from hexapod_comp.measurements.tidy_csv import read_tidy
 from hexapod_comp.measurements.writing import write_measurements
 from hexapod_comp.pose import Pose
 
@@ -109,8 +109,8 @@ def assert_same(one: MeasurementSet, other: MeasurementSet) -> None:
 def test_two_sets_are_one_file_with_both(tmp_path: Path) -> None:
     """The rows of two files, whose runs have different names, in one file: the same set to the last bit."""
     second = SECOND.replace("x line", "another line")
-    both = read_measurements(file_of(tmp_path, "both.csv", FIRST + second.removeprefix(HEADER)), PAPER)
-    parts = [read_measurements(file_of(tmp_path, n, t), PAPER) for n, t in (("a.csv", FIRST), ("b.csv", second))]
+    both = read_tidy(file_of(tmp_path, "both.csv", FIRST + second.removeprefix(HEADER)), PAPER)
+    parts = [read_tidy(file_of(tmp_path, n, t), PAPER) for n, t in (("a.csv", FIRST), ("b.csv", second))]
     together = joined(parts)
     assert_same(together, both)
     assert [run.name for run in together.runs] == [run.name for run in both.runs]
@@ -121,11 +121,11 @@ def test_two_sets_are_one_file_with_both(tmp_path: Path) -> None:
 def test_runs_of_equal_names_stay_apart(tmp_path: Path) -> None:
     """Another day's line of the same name has its own zero: joined, or read at once, five runs and not four."""
     paths = [file_of(tmp_path, name, text) for name, text in (("a.csv", FIRST), ("b.csv", SECOND))]
-    together = joined([read_measurements(path, PAPER) for path in paths])
+    together = joined([read_tidy(path, PAPER) for path in paths])
     assert [run.name for run in together.runs] == ["x line", "tracker", "x line"]
     assert list(together.run) == [0, 0, 0, 0, 1, 1, 1, 2, 2]
     np.testing.assert_allclose([run.origin[0] for run in together.runs], [-0.1, 0.01, 0.05], atol=1e-15)
-    assert_same(together, read_measurements(paths, PAPER))
+    assert_same(together, read_tidy(paths, PAPER))
 
 
 def test_stations_of_several_sets_are_found_again() -> None:
@@ -167,17 +167,17 @@ def test_one_door_for_tidy_and_wide_files(tmp_path: Path) -> None:
     )
     wide = "x,y,z,mx,my,mz\n10,20,420,10.001,19.998,420\n30,20,420,30.002,20,420.003\n"
     paths = [file_of(tmp_path, "monday.csv", wide), file_of(tmp_path, "tuesday.csv", wide.replace("30", "35"))]
-    found = read_files(paths, PAPER, columns)
+    found = read_measurements(paths, PAPER, columns)
     assert [run.name for run in found.runs] == ["monday", "tuesday"]
     assert [name for name, _ in found.files] == ["monday.csv", "tuesday.csv"]
     assert (len(found), len(found.stations)) == (12, 4)
     np.testing.assert_allclose(found.value[:6] * 1e6, [1.0, -2.0, 0.0, 2.0, 0.0, 3.0], atol=1e-9)
-    assert len(read_files(paths[:1], PAPER, columns)) == 6
+    assert len(read_measurements(paths[:1], PAPER, columns)) == 6
 
 
 def test_no_file_is_refused() -> None:
     with pytest.raises(InputFileError, match="no file is given"):
-        read_files([], PAPER)
+        read_measurements([], PAPER)
 
 
 # Which way the machine came.
@@ -289,7 +289,7 @@ def test_a_joined_set_survives_its_file(tmp_path: Path) -> None:
     parts = [tracked(at((0, 0, 400), (10, 5, 400), (0, 0, 410)), run="a"), tracked(at((0, 0, 400)), run="b")]
     together = joined(parts)
     write_measurements(together, tmp_path / "joined.csv")
-    assert_same(read_measurements(tmp_path / "joined.csv", PAPER), together)
+    assert_same(read_tidy(tmp_path / "joined.csv", PAPER), together)
 
 
 # What cannot be.

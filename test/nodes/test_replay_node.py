@@ -26,8 +26,8 @@ pytest.importorskip("rosbags")
 
 from replay_helpers import KINDS, Messages, write_bag
 
-from hexapod_comp.replay.bag import Files, Recording, read_recording
-from hexapod_comp.replay.replay import BEFORE, IDENTICAL, Replay, replay
+from hexapod_comp.replay.bag import Recording, read_recording
+from hexapod_comp.replay.replay import BEFORE, IDENTICAL, Replay, replay_recording
 
 TYPES = {"PoseStamped": PoseStamped, "JointState": JointState, "String": String}
 
@@ -84,7 +84,7 @@ class Recorder:
 def replayed(bag: Path, namespace: str | None = None) -> tuple[Recording, Replay]:
     """Read a bag and replay it."""
     recording = read_recording(bag, namespace)
-    return recording, replay(recording, Files(recording, {}))
+    return recording, replay_recording(recording)
 
 
 def along(n: int) -> Pose:

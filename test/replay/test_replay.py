@@ -61,8 +61,8 @@ from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.model_file import load_model, save_model
 from hexapod_comp.pose import Pose
 from hexapod_comp.replay import unpacking
-from hexapod_comp.replay.bag import Files, Recording, read_recording
-from hexapod_comp.replay.replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Replay, replay
+from hexapod_comp.replay.bag import Recording, read_recording
+from hexapod_comp.replay.replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Replay, replay_recording
 
 FAR = Pose([0.2, 0.0, 0.4], np.eye(3))
 """From home, struts would change by some 90 mm in one command: refused."""
@@ -108,7 +108,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RecordedMachine:
 def opened(bag: Path, namespace: str | None = None) -> tuple[Recording, Replay]:
     """Read a bag and replay it."""
     recording = read_recording(bag, namespace)
-    return recording, replay(recording, Files(recording, {}))
+    return recording, replay_recording(recording)
 
 
 def counted(result: Replay) -> dict[int, int]:

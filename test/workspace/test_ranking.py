@@ -11,7 +11,7 @@ import pytest
 from helpers import poses_about
 from scipy import stats
 
-from hexapod_comp.calibration.parameters import ParameterSpace, Settings
+from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.sensitivity import Prediction, derivatives
 from hexapod_comp.errors import CalibrationError, KinematicsError, ModelError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
@@ -310,7 +310,7 @@ def test_calibrations_derivatives_are_effects_of_single_errors():
     positions, rotations = poses_about(geometry.home, 4, seed=6, reach=0.04, tilt_deg=8.0)
     poses = [Pose(p, r) for p, r in zip(positions, rotations, strict=True)]
     readings = small.scattered(small.paper(), poses, None, probe)
-    space = ParameterSpace(readings, Settings(lead=small.LEAD, field_degree=2))
+    space = ParameterSpace(readings, FitSettings(lead=small.LEAD, field_degree=2))
     joints = (np.tile(array, (len(poses), 1, 1)) for array in (geometry.base_joints, geometry.platform_joints))
     nominal = Prediction(np.zeros((len(poses), 6)), positions, rotations, *joints)
     rows = derivatives(space, nominal, readings.stations)[:, :, space.block("structure").part][:, :, :18]

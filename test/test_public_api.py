@@ -1,0 +1,99 @@
+"""The front door: the public names, what importing them costs, and the examples that use them."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import io
+import re
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from calibration_helpers import campaign, paper, virtual_machine
+from data import client
+
+import hexapod_comp as hc
+from hexapod_comp.measurements.campaign import template
+from hexapod_comp.measurements.writing import write_measurements
+from hexapod_comp.virtual.instruments import measure
+
+ROOT = Path(__file__).resolve().parents[1]
+DOOR = ROOT / "hexapod_comp" / "__init__.py"
+
+
+def examples() -> list[str]:
+    """Return the Python blocks of the README that use the package."""
+    blocks = re.findall(r"^```python\n(.*?)^```$", (ROOT / "README.md").read_text(encoding="utf-8"), re.M | re.S)
+    return [block for block in blocks if "hexapod_comp" in block]
+
+
+def test_type_checkers_are_told_the_same_names():
+    """What stands under TYPE_CHECKING is what mypy sees, the table what Python finds."""
+    (guarded,) = (node for node in ast.parse(DOOR.read_text(encoding="utf-8")).body if isinstance(node, ast.If))
+    told = {}
+    for node in guarded.body:
+        if isinstance(node, ast.ImportFrom):
+            (alias,) = node.names
+            assert alias.asname == alias.name  # else strict type checkers do not let it out
+            told[alias.name] = node.module
+    assert told == hc._HOME_OF
+
+
+@pytest.mark.parametrize("name", hc.__all__)
+def test_every_public_name_is_there(name: str):
+    value = getattr(hc, name)
+    assert name == "__version__" or value.__name__ == name
+    assert name == "__version__" or len(value.__doc__) > 20
+    assert name in dir(hc)
+    assert not (DOOR.parent / name).exists()  # a room of that name would take its place once imported
+    assert not (DOOR.parent / f"{name}.py").exists()
+
+
+def test_other_names_are_refused():
+    with pytest.raises(AttributeError, match="no attribute 'load_hexapod'"):
+        _ = hc.load_hexapod  # type: ignore[attr-defined]
+    assert not hasattr(hc, "__path__x")
+
+
+def test_the_version_is_the_packages():
+    assert hc.__version__ == ElementTree.parse(ROOT / "package.xml").findtext("version")
+
+
+@pytest.mark.parametrize("command", ["import hexapod_comp", "from hexapod_comp.cli import main; main(['--help'])"])
+def test_the_door_opens_without_numpy(command: str):
+    """NumPy, SciPy and Numba take a second of processor time; the rest of --help a tenth."""
+    heavy = "{'numpy', 'scipy', 'numba', 'yaml', 'matplotlib', 'rclpy'}"
+    code = f"import sys; {command}; sys.exit(str(sorted({heavy} & set(sys.modules))))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stderr.strip() == "[]"
+
+
+def test_the_readmes_example_runs():
+    """It prints a correction for each strut, in µm, of a machine whose joints are off by some tens."""
+    (example,) = examples()
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        exec(compile(example, "README.md", "exec"), {})
+    numbers = [float(word) for word in re.findall(r"-?\d+\.?\d*(?:e[-+]\d+)?", printed.getvalue())]
+    assert len(numbers) == 6
+    assert 1.0 < np.abs(numbers).max() < 1000.0
+
+
+def test_a_client_calibrates_and_compensates(tmp_path: Path):
+    """A machine sent its own model's commands goes where it was told: Newton leaves 1e-12 m, a thousandth of this."""
+    coarse, measured = campaign(), tmp_path / "measured.csv"
+    write_measurements(measure(template(coarse, paper(), 1, "coarse"), coarse, virtual_machine(1), 1), measured)
+    report = client.calibrate("paper", [measured], tmp_path / "model.yaml")
+    assert "expected tool error" in report
+    poses = [hc.Pose.from_angles([x, 0.02, 0.45], np.radians([2.0, 0.0, 5.0])) for x in (-0.05, 0.0, 0.05)]
+    for model in (tmp_path / "model.yaml", "paper_machine"):
+        assert client.error_left("paper", model, poses) < 1e-9
+
+
+def test_a_client_ranks_errors():
+    """The screws' pitch comes first, as in the ranking that doc/classification.md shows."""
+    assert client.worst_error("positioning_unit", "error_budget") == "screw pitch"
