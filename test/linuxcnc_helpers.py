@@ -283,8 +283,9 @@ class Linuxcnc:
             self._socket = socket.socket(socket.AF_UNIX)
             self._socket.connect(str(socket_path))
         except (TimeoutError, OSError) as error:
+            said = self.said()  # before its folder goes
             self.close()
-            raise RuntimeError(f"LinuxCNC did not start: {error}\n{self.said()}") from error
+            raise RuntimeError(f"LinuxCNC did not start: {error}\n{said}") from error
         self._lines = self._socket.makefile("rw", encoding="utf-8")
         self.has_real_time = give_real_time()
 
@@ -293,9 +294,9 @@ class Linuxcnc:
             shutil.copy(source, self.folder)
         run = f"{sys.executable} -m hexapod_comp"
         edits = {
-            "BRIDGE = linuxcnc_bridge": f"BRIDGE = {run}.nodes.linuxcnc_bridge",
-            "SWEEP = hal_sweep": f"SWEEP = {run}.hal_sweep",
-            "MACHINE = linuxcnc_machine": f"MACHINE = {run}.linuxcnc_machine",
+            "BRIDGE = linuxcnc_bridge": f"BRIDGE = {run}.linuxcnc.bridge",
+            "SWEEP = hal_sweep": f"SWEEP = {run}.linuxcnc.hal_sweep",
+            "MACHINE = linuxcnc_machine": f"MACHINE = {run}.linuxcnc.watch",
             "HALFILE = machine.hal\n": "HALFILE = machine.hal\nHALFILE = recorder.hal\n",
             **changes,
         }
