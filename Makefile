@@ -25,7 +25,7 @@ BESIDE_LINUXCNC = $(MAKE) --no-print-directory VENV=.venv-linuxcnc PYTHON='$(LIN
 # Which versions of Python `make test-all` takes, of those that are here.
 VERSIONS ?= 3.10 3.11 3.12 3.13
 
-.PHONY: help demo test test-all constraints test-linuxcnc linuxcnc bench fuzz clean run-linuxcnc-tests ros
+.PHONY: help demo test test-all docs constraints test-linuxcnc linuxcnc bench fuzz clean run-linuxcnc-tests ros
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
@@ -33,6 +33,7 @@ help:
 	@echo 'make demo    run the compensator against a simulated machine; figures, out/demo.png'
 	@echo 'make test    ruff, mypy and the tests, in two processes'
 	@echo 'make test-all     the same with every Python found here, each in .venv-3.x; VERSIONS="3.10 3.13" for some'
+	@echo 'make docs    the pages of doc/ as a site with a search and the Python reference, in out/doc'
 	@echo 'make constraints  renew constraints.txt: the versions of all that is installed'
 	@echo 'make bench   speed beside NumPy, SciPy, MuJoCo, Pinocchio, LinuxCNC and a relay node'
 	@echo 'make fuzz    a nightly run of the fuzzing tests: 100,000 cases and more'
@@ -61,10 +62,16 @@ test-all:
 	    echo "make: tests passed with Python:$${passed:- none}; failed:$${failed:- none}"; \
 	    [ -n "$$passed" ] && [ -z "$$failed" ]; }
 
+# All anew each time: the notebooks run, and a page of a module that went would stay.
+docs: $(VENV)/with-ros,docs
+	@rm -rf doc/api out/doc
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m sphinx -q -E -W --keep-going -d out/doctrees doc out/doc
+	@echo 'The pages: out/doc/index.html'
+
 # On purpose only: until then everybody gets the versions that were tested.
 constraints: $(VENV)/made-in
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check 'uv>=0.5'
-	$(BIN)/uv pip compile setup.py --extra ros --extra test --universal --python-version 3.10 --upgrade --quiet \
+	$(BIN)/uv pip compile setup.py --extra ros --extra test --extra docs --universal --python-version 3.10 --upgrade --quiet \
 	    --no-annotate --custom-compile-command 'make constraints' --output-file constraints.txt
 
 bench: $(VENV)/with-ros,bench
@@ -89,7 +96,7 @@ run-linuxcnc-tests: $(VENV)/with-ros,test
 	LINUXCNC_TESTS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -s test/linuxcnc/test_linuxcnc.py
 
 clean:
-	rm -rf .venv .venv-* build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-* build install log doc/api *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/made-in:

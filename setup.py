@@ -99,6 +99,8 @@ setup(
             "distributed>=2023.12",
             "rosbags>=0.11",
         ],
+        # The site: `make docs`. Formulas become MathML, which needs no script from elsewhere.
+        "docs": ["sphinx>=8.1", "myst-nb>=1.1", "furo>=2024.8", "latex2mathml>=3.77"],
         "bench": ["mujoco>=3.1", "pin>=2.7"],
         # No rosdep keys: imported where used, with a clear message when missing.
         "pages": ["plotly>=5.18"],

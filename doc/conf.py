@@ -3,32 +3,40 @@
 from __future__ import annotations
 
 import os
+import re
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
+from docutils import nodes
+from latex2mathml.converter import convert
+from sphinx.application import Sphinx
+from sphinx.writers.html5 import HTML5Translator
+
 ROOT = Path(__file__).resolve().parents[1]
+# Where the package is not installed, and for the notebooks, which run in processes of their own.
+sys.path.insert(0, str(ROOT))
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
 
 project = "hexapod_comp"
 author = "The hexapod_comp maintainers"
 copyright = author
 release = version = ElementTree.parse(ROOT / "package.xml").findtext("version") or ""
 
-extensions = [
-    "myst_nb",
-    "sphinx.ext.autodoc",
-    "sphinx.ext.autosummary",
-    "sphinx.ext.napoleon",
-    "sphinx.ext.viewcode",
-]
-source_suffix = {".md": "myst-nb"}
-exclude_patterns = ["_build"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+exclude_patterns = ["_build", "templates"]
+templates_path = ["templates"]
 
 html_theme = "furo"
 html_title = f"hexapod_comp {release}"
+html_static_path = ["static"]
+html_css_files = ["site.css"]
+html_math_renderer = "mathml"  # drawn by the browser itself: no script, no network
 
 # Every heading is a target, as where the pages are read without being built.
 myst_heading_anchors = 3
 myst_enable_extensions = ["dollarmath"]
+myst_fence_as_directive = ["math"]
 
 # The notebooks run at each build: what they show is what the package does now.
 nb_execution_mode = "force"
@@ -40,6 +48,31 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 autosummary_generate = True
 autodoc_typehints = "signature"
 autodoc_member_order = "bysource"
-# A page of the kernels would say nothing: compiled functions take arrays, and their docstrings stand in the source.
 napoleon_google_docstring = False
+napoleon_use_ivar = True
 napoleon_use_rtype = False
+default_role = "literal"  # `size` in a docstring is an argument's name
+suppress_warnings = ["ref.python"]  # napoleon looks attributes up by their name alone, which two classes may share
+
+
+def inline_math(writer: HTML5Translator, node: nodes.math) -> None:
+    """Write a formula in a line as MathML."""
+    writer.body.append(convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def block_math(writer: HTML5Translator, node: nodes.math_block) -> None:
+    """Write a formula on lines of its own as MathML; a wide one scrolls."""
+    writer.body.append(f'<div class="math">{convert(node.astext(), display="block")}</div>')
+    raise nodes.SkipNode
+
+
+def keep_bars(_app: Sphinx, _what: str, _name: str, _thing: object, _options: object, lines: list[str]) -> None:
+    """Keep |x| in a docstring what it is there, a magnitude; reStructuredText would look for a substitution."""
+    lines[:] = [re.sub(r"(``.*?``)|\|", lambda match: match[1] or r"\|", line) for line in lines]
+
+
+def setup(app: Sphinx) -> None:
+    """Let formulas be written as MathML, and docstrings be read as they are meant."""
+    app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))
+    app.connect("autodoc-process-docstring", keep_bars)

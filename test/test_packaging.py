@@ -150,7 +150,7 @@ def test_constraints_pin_all_that_make_installs(version: str, monkeypatch: pytes
     assert all([specifier.operator for specifier in found] == ["=="] for found in pinned.values())
     setup = _setup_arguments()
     wanted = [Requirement(line) for line in (*setup["install_requires"], *setup["extras_require"]["ros"])]
-    wanted += [Requirement(line) for line in setup["extras_require"]["test"]]
+    wanted += [Requirement(line) for extra in ("test", "docs") for line in setup["extras_require"][extra]]
     for requirement in wanted:
         (exact,) = pinned[canonicalize_name(requirement.name)]
         assert requirement.specifier.contains(exact.version), requirement
