@@ -57,16 +57,12 @@ def held_out(
 
     Parameters
     ----------
-    truth : RealMachine
-        The hidden truth.
-    model : MachineModel or None
-        What the compensator believes; None for the machine as it is.
+    truth, model : RealMachine, MachineModel or None
+        The machine, and what the compensator believes; None for the machine as it is.
     box : ndarray, shape (2, 3)
         Lowest and highest position of the tool in the work frame, m.
-    points : int
-        How many, at least three: fewer do not tell a rotation.
-    seed : int
-        Picks points, directions and tilts; equal seeds give equal passes, whatever the model.
+    points, seed : int
+        How many, at least three: fewer do not tell a rotation. Equal seeds give equal passes, whatever the model.
     repeatability : float
         Standard deviation, along each axis, of where the machine really stops, m.
     tilt : float
@@ -130,27 +126,17 @@ def paper_metric(
 
     Parameters
     ----------
-    truth : RealMachine
-        The hidden truth.
-    model : MachineModel
-        What the compensator believes.
-    box : ndarray, shape (2, 3)
-        Lowest and highest position of the tool in the work frame, m.
+    truth, model, box, seed, sensed, level
+        As for :func:`held_out`.
     step : float
         Distance of the readings along a line, m.
     lines : int
         Lines along each axis.
-    seed : int
-        Picks the lines.
-    sensed : Temperatures, optional
-        What the compensator believes the temperatures to be; 20 °C by default.
-    level : ndarray, shape (3, 3), optional
-        Attitude of a level tool in the work frame; parallel to it by default.
 
     Raises
     ------
     ModelError
-        A line has fewer than two readings, or as :meth:`hexapod_comp.virtual.trial.Trial.commands`.
+        A line has fewer than two readings, or as for :func:`held_out`.
     """
     rng = np.random.default_rng(seed)
     errors: list[list[np.ndarray]] = [[], []]

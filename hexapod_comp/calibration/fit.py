@@ -159,7 +159,7 @@ def fit_model(
     settings : FitSettings, optional
         What else is known.
     progress : callable
-        Told in a few words what goes on.
+        Told what goes on.
 
     Raises
     ------
@@ -168,22 +168,13 @@ def fit_model(
     """
     settings = settings or FitSettings()
     everything = Estimation(measurements, ParameterSpace(measurements, settings))
-    decisions, possible = _decide(everything, None, progress)
-    space, estimation, solution = _solve(measurements, decisions, settings, None, progress)
-    if solution.weights.min() < HUBER / OUTLIER:  # the choice was made with readings that turned out to be wrong
-        again, possible = _decide(everything, (space, solution), progress)
-        if [d.kept for d in again] != [d.kept for d in decisions]:
-            space, estimation, solution = _solve(measurements, again, settings, (space, solution), progress)
-        decisions = again
+    decisions, possible, (space, estimation, solution) = _choose(everything, settings, progress)
     channels = tuple(_channels(estimation, solution))
-    notes = [*measurements.notes, *_ignored(measurements, settings, space)]
-    notes += [*_check_backlash(space, solution), *_check_noise(channels)]
+    notes = [*_ignored(measurements, settings, space), *_check_backlash(space, solution), *_check_noise(channels)]
     progress("what is it worth?")
     covariance = physical_covariance(space, solution.posterior)
     allowed = _allowed(everything.space, possible, (space, solution))
     level, tilted = (expected_error(space, solution.x, covariance, tilt, allowed=allowed) for tilt in (0.0, TILT))
-    if level is not None and level.after > level.before:
-        notes.append("the model is not expected to help: the readings determine too little of this machine")
     return ModelFit(
         model=_named(space, solution, measurements, channels, len(decisions)),
         measurements=measurements,
@@ -196,8 +187,23 @@ def fit_model(
         level=level,
         tilted=tilted,
         outliers=tuple(_outliers(estimation, solution)),
-        notes=tuple(notes),
+        notes=(*measurements.notes, *notes, *_check_worth(level)),
     )
+
+
+def _choose(
+    everything: Estimation, settings: FitSettings, progress: Callable[[str], object]
+) -> tuple[list[Decision], Posterior, tuple[ParameterSpace, Estimation, Solution]]:
+    """Return what is fitted, what the data allow with all blocks in, and the fit."""
+    measurements = everything.measurements
+    decisions, possible = _decide(everything, None, progress)
+    space, estimation, solution = _solve(measurements, decisions, settings, None, progress)
+    if solution.weights.min() < HUBER / OUTLIER:  # the choice was made with readings that turned out to be wrong
+        again, possible = _decide(everything, (space, solution), progress)
+        if [d.kept for d in again] != [d.kept for d in decisions]:
+            space, estimation, solution = _solve(measurements, again, settings, (space, solution), progress)
+        decisions = again
+    return decisions, possible, (space, estimation, solution)
 
 
 def _solve(
@@ -296,6 +302,13 @@ def _ignored(measurements: MeasurementSet, settings: FitSettings, space: Paramet
     if warmth > WARM and not (settings.strut_expansion or settings.base_expansion or settings.platform_expansion):
         notes.append(f"read up to {warmth:.1f} K from 20 °C, but no expansion is given: growth is taken for an error")
     return notes
+
+
+def _check_worth(level: ToolError | None) -> list[str]:
+    """Return a remark on a model that is expected to do harm."""
+    if level is None or level.after <= level.before:
+        return []
+    return ["the model is not expected to help: the readings determine too little of this machine"]
 
 
 def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:

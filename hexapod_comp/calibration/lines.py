@@ -162,10 +162,8 @@ def fit_lines(
         How the order of each line's polynomial is chosen: by the highest adjusted R² or the lowest corrected
         Akaike criterion, with at most a third of the line's points as coefficients. Or the order itself; lines
         whose points do not carry it get the highest that they do, and are noted.
-    date : str, optional
-        ISO 8601 date of the model; today by default.
-    name : str, optional
-        Name of the model; tells the scheme by default.
+    date, name : str, optional
+        ISO 8601 date and name of the model; today, and the scheme's, by default.
 
     Raises
     ------
@@ -181,8 +179,7 @@ def fit_lines(
     check_complete(readings, grid)
     datum, remark = datum_of(measurements, grid)
     notes += remark
-    empty = GridField(grid, _no_lines(grid), probe=measurements.probe)
-    field, fits = _fit_families(readings, empty, order, datum)
+    field, fits = _fit_families(readings, GridField(grid, _no_lines(grid), probe=measurements.probe), order, datum)
     notes += _fit_notes(fits, order)
     left = _without_means(measurements)
     if np.abs(left).max() <= LEAST_NOISE:  # one silent kind among others does this scheme no harm

@@ -233,29 +233,20 @@ def expected_error(
 ) -> ToolError | None:
     """Return the tool error that the parameters' covariance leaves, at random points, both directions.
 
-    The parameters are drawn from their distribution and the machine is moved accordingly, to first order;
-    what one shift and one rotation of the datum take away is taken away.
+    Machines are drawn from the parameters' distribution, to first order, and the datum is aligned. None where no
+    machine takes such poses.
 
     Parameters
     ----------
-    space : ParameterSpace
-        The parameters.
-    x : ndarray, shape (size,)
-        Their values.
-    covariance : ndarray, shape (size, size)
-        Their covariance.
+    space, x, covariance : ParameterSpace, ndarray, shape (size,), ndarray, shape (size, size)
+        The parameters, their values and their covariance.
     tilt : float
         Tilt of the tool, rad, in random directions.
     prior : ndarray, shape (size, size), optional
-        Take the error before from machines of this covariance instead of the one that x describes.
+        The error before is that of machines of this covariance, not of x.
     allowed : (ParameterSpace, ndarray, ndarray), optional
-        A larger space in which nothing is ruled out, how far its most probable parameters are from x, and their
-        covariance: what may hide there widens the interval upwards.
-
-    Returns
-    -------
-    ToolError or None
-        None where the machine cannot take such poses.
+        A larger space with nothing ruled out, the way from x to its most probable parameters, and their covariance:
+        what may hide there widens the interval upwards.
     """
     stations = box_stations(space, tilt)
     if stations is None:
@@ -263,31 +254,24 @@ def expected_error(
     prediction = predict(space, x, stations)
     rows = derivatives(space, prediction, stations)
     points = stations.positions + stations.rotations @ space.probe
-
-    def shown(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return RMS displacement and rotation of errors (M, 6, D) after aligning the datum."""
-        turned = errors[:, 3:] - errors[:, 3:].mean(axis=0)
-        squares = (without_datum(points, errors[:, :3]) ** 2).sum(axis=1), (turned**2).sum(axis=1)
-        return np.sqrt(squares[0].mean(axis=0)), np.sqrt(squares[1].mean(axis=0))
-
     errors = prediction.errors[:, :, None] if prior is None else rows @ _drawn(prior)
-    before, rotation_before = shown(errors)
-    after, rotation_after = shown(rows @ _drawn(covariance))
+    before, rotation_before = _aligned_rms(points, errors)
+    after, rotation_after = _aligned_rms(points, rows @ _drawn(covariance))
     possible = after
     if allowed is not None:
         wide_space, shift, wide_covariance = allowed
         wide = derivatives(wide_space, prediction, stations)
-        possible, _ = shown(wide @ (shift[:, None] + _drawn(wide_covariance)))
+        possible, _ = _aligned_rms(points, wide @ (shift[:, None] + _drawn(wide_covariance)))
     low, high = np.percentile(after, [2.5, 97.5])
     high = max(high, np.percentile(possible, 97.5))
-    return ToolError(
-        before=rms(before),
-        after=rms(after),
-        low=float(low),
-        high=float(high),
-        rotation_before=rms(rotation_before),
-        rotation_after=rms(rotation_after),
-    )
+    return ToolError(rms(before), rms(after), float(low), float(high), rms(rotation_before), rms(rotation_after))
+
+
+def _aligned_rms(points: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return RMS displacement and rotation, shape (D,) each, of errors (M, 6, D) after aligning the datum."""
+    turned = errors[:, 3:] - errors[:, 3:].mean(axis=0)
+    squares = (without_datum(points, errors[:, :3]) ** 2).sum(axis=1), (turned**2).sum(axis=1)
+    return np.sqrt(squares[0].mean(axis=0)), np.sqrt(squares[1].mean(axis=0))
 
 
 def left_in_space(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, points: np.ndarray) -> np.ndarray:

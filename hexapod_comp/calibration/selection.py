@@ -70,10 +70,8 @@ def select(
 
     Returns
     -------
-    decisions : list of Decision
-        One for each block but the structure.
-    everything : Posterior
-        With all blocks in: what the data allow if nothing may be ruled out.
+    list of Decision, Posterior
+        One decision for each block but the structure; and with all blocks in, what the data allow if nothing is out.
     """
     trials = _Trials(space, problem, noise, progress)
     names = [b.name for b in space.blocks[1:]]

@@ -27,7 +27,7 @@ from ..formats.yaml import write_text_atomically
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import Structure, solve_pose
 from ..machine.model import MachineModel, RealMachine
-from ..machine.model_file import DIRECTIONS
+from ..machine.model_blocks import DIRECTIONS
 from ..machine.passes import Passes, at
 from ..measurements.readings import attitude_error
 from ..pose import Pose
@@ -142,9 +142,8 @@ def make_table(
 
     Returns
     -------
-    table : GridTable
-    left_out : list of str
-        What of the model is not in it.
+    GridTable, list of str
+        The table, and what of the model is not in it.
 
     Raises
     ------
@@ -155,13 +154,8 @@ def make_table(
     OutsideFieldError
         A node is outside the field's box, and the field refuses that.
     """
-    rows = 2.0 * float((np.ptp(box, axis=0) / step + 1.0).prod())  # before any node is made
-    if rows > 2.0 * MOST_ROWS:
-        raise ModelError("step", f"gives some {rows:.3g} rows, allowed {MOST_ROWS}; take a larger one, m", step)
-    nodes = tuple(_nodes(low, high, step) for low, high in box.T)
+    nodes = _grid_nodes(box, step)
     shape = tuple(len(n) for n in nodes)
-    if 2 * math.prod(shape) > MOST_ROWS:
-        raise ModelError("step", f"gives {2 * math.prod(shape)} rows, allowed {MOST_ROWS}; take a larger one, m", step)
     places = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)
     level = np.tile(np.eye(3), (len(places), 1, 1))
     passes = Passes.of_tool(geometry, places, level, np.tile(DIAGONAL, (len(places), 1))).both_ways()
@@ -176,8 +170,13 @@ def make_table(
     return GridTable((nodes[0], nodes[1], nodes[2]), *(v.reshape(2, *shape, 6) for v in values)), left_out
 
 
-def _nodes(low: float, high: float, step: float) -> np.ndarray:
-    return np.linspace(low, high, max(1, math.ceil((high - low) / step - 1e-9)) + 1)
+def _grid_nodes(box: np.ndarray, step: float) -> tuple[np.ndarray, ...]:
+    """Return the coordinates of the nodes along x, y and z, m; refuse too many, before any is made."""
+    cells = np.maximum(1.0, np.ceil(np.ptp(box, axis=0) / step - 1e-9))
+    rows = 2.0 * float((cells + 1.0).prod())
+    if not rows <= MOST_ROWS:
+        raise ModelError("step", f"gives {rows:.6g} rows, allowed {MOST_ROWS}; take a larger one, m", step)
+    return tuple(np.linspace(low, high, int(n) + 1) for (low, high), n in zip(box.T, cells, strict=True))
 
 
 def _without_fine_waves(model: MachineModel, step: float) -> tuple[MachineModel, list[str]]:

@@ -15,24 +15,11 @@ NOTHING, UNSOLVED, OUTSIDE = range(3)
 
 @compiled
 def examine_many(
-    positions,
-    rotations,
-    independent,
-    nominal_base,
-    nominal_platform,
-    limits,
-    thresholds,
-    low,
-    sense,
-    body,
-    struts,
-    field,
-    found,
-    flags,
+    positions, rotations, independent, nominal, limits, thresholds, low, sense, body, struts, field, found, flags
 ):
     """Write the limited quantities of N platform poses in both stages, and a flag each.
 
-    Where the flag is UNSOLVED, the compensated stage is not written.
+    `nominal` are the joints of base and platform. Where the flag is UNSOLVED, the compensated stage is not written.
 
     `low` and `sense` (9,) are the motion state, carried from pose to pose unless they are `independent`.
     """
@@ -42,20 +29,10 @@ def examine_many(
             low[:] = np.nan
             sense[:] = 0.0
         position, rotation = positions[n], rotations[n]
-        strut_lengths_one(nominal_base, nominal_platform, position, rotation, found.lengths[n, 0])
-        examine(nominal_base, nominal_platform, position, rotation, limits, found, n, 0)
+        strut_lengths_one(nominal[0], nominal[1], position, rotation, found.lengths[n, 0])
+        examine(nominal[0], nominal[1], position, rotation, limits, found, n, 0)
         solved, outside = command_one(
-            position,
-            rotation,
-            thresholds,
-            low,
-            sense,
-            body,
-            struts,
-            field,
-            q_position,
-            q_rotation,
-            commands,
+            position, rotation, thresholds, low, sense, body, struts, field, q_position, q_rotation, commands
         )
         flags[n] = OUTSIDE if outside else NOTHING
         if not solved:

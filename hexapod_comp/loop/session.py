@@ -183,22 +183,16 @@ def run_session(
 
     Parameters
     ----------
-    client : LoopClient
-        Connected.
-    geometry : HexapodGeometry
-        The machine commanded.
-    targets : sequence of Pose
-        ``pose_tool_in_base``.
-    path : Path or None
-        In ``base``.
+    client, geometry : LoopClient, HexapodGeometry
+        Connected, and the machine commanded.
+    targets, path : sequence of Pose, Path or None
+        ``pose_tool_in_base``, and poses in ``base``.
     rate : float
         Commands per second, Hz.
     compare : bool
         Make the uncompensated pass.
-    progress : callable, optional
-        Called with a number of commands just sent.
-    announce : callable, optional
-        Called with a line about what happens now.
+    progress, announce : callable, optional
+        Called with a number of commands just sent, and with a line about what happens now.
     """
     session = Session(client, geometry, rate, progress)
     records = [PoseRecord(target) for target in targets]

@@ -136,8 +136,7 @@ def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.nd
 def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose) -> list[str]:
     """Return what keeps a pose from being the working mode; empty when nothing does.
 
-    The machine can work only with det J of home's sign, the platform on home's side of the base, condition
-    number and joint cones within their limits.
+    The machine can work only with det J of home's sign, the platform on home's side, and its limits kept.
 
     Parameters
     ----------
@@ -153,7 +152,7 @@ def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose)
     list of str
         One short phrase per objection, with found and allowed values.
     """
-    at = structure.base_joints, structure.platform_joints, pose.position, pose.rotation
+    at = *structure.joints, pose.position, pose.rotation
     measured, limits = Quantities.empty(1), geometry.limits
     kernels.strut_lengths_one(*at, measured.lengths[0, 0])
     examine(*at, geometry.limit_numbers, measured, 0, 0)
@@ -335,14 +334,6 @@ def _same(structure: Structure, one: Pose, other: Pose, lengths: np.ndarray) -> 
 def _newton(structure: Structure, lengths: np.ndarray, start: Pose) -> Pose | None:
     """Return the pose that Newton on the six loop closures finds, whatever its sign and condition number."""
     position, rotation = start.position.copy(), start.rotation.copy()
-    outcome, _, _ = kernels.solve_pose_one(
-        structure.base_joints,
-        structure.platform_joints,
-        lengths,
-        position,
-        rotation,
-        structure.characteristic_length,
-        0.0,
-        math.inf,
-    )
+    anything = structure.characteristic_length, 0.0, math.inf
+    outcome, _, _ = kernels.solve_pose_one(*structure.joints, lengths, position, rotation, *anything)
     return Pose(position, rotation) if outcome == kernels.OK else None

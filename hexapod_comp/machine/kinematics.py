@@ -66,6 +66,16 @@ class Structure:
     max_condition: float
     home: Pose
 
+    @property
+    def joints(self) -> tuple[np.ndarray, np.ndarray]:
+        """Base and platform joints, as compiled kernels take them."""
+        return self.base_joints, self.platform_joints
+
+    @property
+    def solver(self) -> tuple[float, float, float]:
+        """What the forward solution is judged by, as compiled kernels take it."""
+        return self.characteristic_length, self.home_sign, self.max_condition
+
     @staticmethod
     def of(geometry: HexapodGeometry) -> Structure:
         """Return the nominal structure of a machine."""
@@ -82,9 +92,7 @@ class Structure:
         return Structure(
             np.ascontiguousarray(self.base_joints + base_deviation),
             np.ascontiguousarray(self.platform_joints + platform_deviation),
-            self.characteristic_length,
-            self.home_sign,
-            self.max_condition,
+            *self.solver,
             self.home,
         )
 
@@ -142,7 +150,7 @@ def strut_lengths(machine: Machine, pose: Pose) -> np.ndarray:
         |P + R·t_i − b_i|, m.
     """
     structure, lengths = structure_of(machine), np.empty(6)
-    kernels.strut_lengths_one(structure.base_joints, structure.platform_joints, pose.position, pose.rotation, lengths)
+    kernels.strut_lengths_one(*structure.joints, pose.position, pose.rotation, lengths)
     return lengths
 
 
@@ -169,13 +177,7 @@ def strut_lengths_batch(
     lengths = np.empty((len(positions), 6))
 
     def run(rows: slice) -> None:
-        kernels.strut_lengths_many(
-            structure.base_joints,
-            structure.platform_joints,
-            positions[rows],
-            rotations[rows],
-            lengths[rows],
-        )
+        kernels.strut_lengths_many(*structure.joints, positions[rows], rotations[rows], lengths[rows])
 
     over_chunks(run, len(positions), threads)
     if not np.isfinite(lengths).all():
@@ -192,7 +194,7 @@ def jacobian(machine: Machine, pose: Pose) -> np.ndarray:
         Columns 0–2 per metre, 3–5 per radian; row i is (u_i, R·t_i × u_i).
     """
     structure, matrix = structure_of(machine), np.empty((6, 6))
-    kernels.jacobian_one(structure.base_joints, structure.platform_joints, pose.position, pose.rotation, matrix)
+    kernels.jacobian_one(*structure.joints, pose.position, pose.rotation, matrix)
     return matrix
 
 
@@ -208,7 +210,7 @@ def jacobian_batch(structure: Structure, positions: np.ndarray, rotations: np.nd
     """
     positions, rotations = _batch_poses(positions, rotations)
     matrices = np.empty((len(positions), 6, 6))
-    kernels.jacobian_many(structure.base_joints, structure.platform_joints, positions, rotations, matrices)
+    kernels.jacobian_many(*structure.joints, positions, rotations, matrices)
     return matrices
 
 
@@ -219,13 +221,7 @@ def condition_number(machine: Machine, pose: Pose) -> tuple[float, float]:
     length: 1 for an isotropic machine, ∞ at a singular pose.
     """
     structure = structure_of(machine)
-    return kernels.condition_one(
-        structure.base_joints,
-        structure.platform_joints,
-        pose.position,
-        pose.rotation,
-        structure.characteristic_length,
-    )
+    return kernels.condition_one(*structure.joints, pose.position, pose.rotation, structure.characteristic_length)
 
 
 def solve_pose(machine: Machine, lengths: ArrayLike, guess: Pose | None = None) -> Pose:
@@ -267,10 +263,7 @@ def solve_pose(machine: Machine, lengths: ArrayLike, guess: Pose | None = None) 
 
 
 def solve_poses(
-    structure: Structure,
-    lengths: np.ndarray,
-    guess: Pose | tuple[np.ndarray, np.ndarray],
-    threads: int | None = None,
+    structure: Structure, lengths: np.ndarray, guess: Pose | tuple[np.ndarray, np.ndarray], threads: int | None = None
 ) -> ForwardBatch:
     """Solve the forward kinematics of N sets of lengths, on all cores.
 
@@ -301,19 +294,9 @@ def solve_poses(
 
     def run(rows: slice) -> None:
         positions[rows], rotations[rows] = guesses[0][rows], guesses[1][rows]
-        kernels.solve_pose_many(
-            structure.base_joints,
-            structure.platform_joints,
-            lengths[rows],
-            positions[rows],
-            rotations[rows],
-            structure.characteristic_length,
-            structure.home_sign,
-            structure.max_condition,
-            outcomes[rows],
-            iterations[rows],
-            conditions[rows],
-        )
+        given = lengths[rows], positions[rows], rotations[rows]
+        found = outcomes[rows], iterations[rows], conditions[rows]
+        kernels.solve_pose_many(*structure.joints, *given, *structure.solver, *found)
 
     over_chunks(run, count, threads)
     failed = outcomes != kernels.OK
@@ -406,16 +389,7 @@ def forward_error(outcome: int, condition: float, max_condition: float) -> Kinem
 def _solve_one(
     structure: Structure, lengths: np.ndarray, position: np.ndarray, rotation: np.ndarray
 ) -> tuple[int, int, float]:
-    return kernels.solve_pose_one(
-        structure.base_joints,
-        structure.platform_joints,
-        lengths,
-        position,
-        rotation,
-        structure.characteristic_length,
-        structure.home_sign,
-        structure.max_condition,
-    )
+    return kernels.solve_pose_one(*structure.joints, lengths, position, rotation, *structure.solver)
 
 
 def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tuple[np.ndarray, np.ndarray]:
@@ -438,7 +412,7 @@ def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tup
 
     def misfit(x: np.ndarray) -> np.ndarray:
         found = np.empty(6)
-        kernels.strut_lengths_one(structure.base_joints, structure.platform_joints, *pose_at(x), found)
+        kernels.strut_lengths_one(*structure.joints, *pose_at(x), found)
         return found - lengths
 
     first = misfit(np.zeros(6))

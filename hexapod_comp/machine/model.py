@@ -198,8 +198,8 @@ class RealMachine:
         )
         growth = np.array([self._growth(n, a) for n, a in zip(STRUT_NAMES, model.struts.expansion, strict=True)])
         structure = self.structure
-        self.body = (structure.base_joints, structure.platform_joints, *geometry.kernel_axes)
-        self.solver = (structure.characteristic_length, structure.home_sign, structure.max_condition)
+        self.body = (*structure.joints, *geometry.kernel_axes)
+        self.solver = structure.solver
         self.strut_arrays = (
             model.struts.parameter_table(geometry, growth),
             model.struts.map_knots.copy(),

@@ -66,7 +66,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator
 from datetime import date, datetime
 from itertools import product
 from pathlib import Path
@@ -77,10 +76,21 @@ import yaml
 
 from ..errors import InputFileError, ModelError
 from ..formats.paths import input_file
-from ..formats.yaml import UNITS, Section, in_si, parse_yaml, read_text, write_text_atomically
-from .field import COMPONENTS, CROSS_AXES, OUTSIDE_POLICIES, GridField, no_field
+from ..formats.yaml import Section, parse_yaml, read_text, write_text_atomically
+from .field import CROSS_AXES, OUTSIDE_POLICIES, GridField, no_field
 from .geometry import HexapodGeometry
 from .model import MachineModel, ModelOrigin
+from .model_blocks import (
+    COMPONENT_UNITS,
+    DIRECTIONS,
+    STRUT_TERMS,
+    ModelDumper,
+    field_block,
+    structure_block,
+    struts_block,
+    thermal_block,
+    written,
+)
 from .struts import StrutErrors
 
 MODEL_FORMAT = "hexapod_comp/model"
@@ -88,20 +98,6 @@ MODEL_VERSION = 1
 
 IDEAL = "ideal"
 """What :func:`load_model` and parameters call the model of a machine without errors."""
-
-DIRECTIONS = ("forward", "backward")
-"""Order of the directions of motion in a field's arrays."""
-
-STRUT_TERMS = {
-    "offset": ("length", "um"),
-    "pitch": ("ratio", "ppm"),
-    "reference_length": ("length", "mm"),
-    "backlash": ("length", "um"),
-    "expansion": ("expansion", "ppm_per_K"),
-}
-"""Per-strut terms: kind of quantity, and the unit in which they are written."""
-
-COMPONENT_UNITS = {name: ("length", "um") if name[0] == "d" else ("angle", "urad") for name in COMPONENTS}
 
 ISO_8601 = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d(\.\d{3}(\d{3})?)?)?(Z|[+-]\d\d:\d\d)?)?")
 """The extended forms that every supported Python reads alike."""
@@ -204,20 +200,20 @@ def model_text(model: MachineModel) -> str:
     content |= {"machine": model.machine, "name": model.name, "date": model.origin.date}
     content["sources"] = [{"file": name, "sha256": digest} for name, digest in model.origin.sources]
     if model.valid_box is not None:
-        content["valid_box_mm"] = _written(model.valid_box, "length", "mm")
+        content["valid_box_mm"] = written(model.valid_box, "length", "mm")
     if model.origin.held_out_residual is not None:
-        content["held_out_residual_um"] = _written(model.origin.held_out_residual, "length", "um")
+        content["held_out_residual_um"] = written(model.origin.held_out_residual, "length", "um")
     if model.origin.note:
         content["note"] = model.origin.note
-    content["reversal_threshold_um"] = _written(model.reversal_threshold, "length", "um")
+    content["reversal_threshold_um"] = written(model.reversal_threshold, "length", "um")
     blocks = {
-        "structure": _structure_block(model),
-        "struts": _struts_block(model.struts),
-        "thermal": _thermal_block(model),
-        "field": _field_block(model.field),
+        "structure": structure_block(model),
+        "struts": struts_block(model.struts),
+        "thermal": thermal_block(model),
+        "field": field_block(model.field),
     }
     content |= {name: block for name, block in blocks.items() if block} | {"end": True}
-    return yaml.dump(content, Dumper=_ModelDumper, sort_keys=False, allow_unicode=True, width=math.inf)
+    return yaml.dump(content, Dumper=ModelDumper, sort_keys=False, allow_unicode=True, width=math.inf)
 
 
 # Reading
@@ -382,136 +378,3 @@ def _family_array(
     for line, coefficients in family.items():
         array[line][:, : coefficients.shape[1]] = coefficients
     return array
-
-
-# Writing
-
-
-class _ModelDumper(yaml.SafeDumper):
-    """Rows of numbers on one line, everything else in blocks, nothing by reference."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
-
-
-def _represent_list(dumper: yaml.SafeDumper, data: list) -> yaml.Node:
-    row = not any(isinstance(item, list | dict) for item in data)
-    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=row)
-
-
-_ModelDumper.add_representer(list, _represent_list)
-
-
-def _written(values: Any, kind: str, unit: str) -> Any:
-    """Return SI values in a unit, as nested lists of floats that read back to the same values."""
-    factor = UNITS[kind][unit]
-    return _map_numbers(lambda value: _in_unit(value, factor), np.asarray(values, dtype=float).tolist())
-
-
-def _map_numbers(function: Callable[[float], float], values: Any) -> Any:
-    return [_map_numbers(function, item) for item in values] if isinstance(values, list) else function(values)
-
-
-def _in_unit(value: float, factor: float) -> float:
-    """Return the shortest number that reads back as `value`, or as its neighbour where no number does."""
-    exact = _exact_in_unit(value, factor)
-    if exact is None:
-        nearest = value / factor
-        exact = _exact_in_unit(float(in_si(nearest, factor)), factor)  # what will be read is written alike
-        return nearest if exact is None else exact
-    return exact
-
-
-def _exact_in_unit(value: float, factor: float) -> float | None:
-    quotient = value / factor
-    candidates = [float(f"{quotient:.{digits}g}") for digits in (15, 16, 17)]
-    candidates += [math.nextafter(quotient, math.inf), math.nextafter(quotient, -math.inf)]
-    return next((number + 0.0 for number in candidates if in_si(number, factor) == value), None)
-
-
-def _per_strut(values: np.ndarray, kind: str, unit: str) -> Any:
-    """Return one number where all six are equal, else the six."""
-    return _written(values[0] if (values == values[0]).all() else values, kind, unit)
-
-
-def _structure_block(model: MachineModel) -> dict[str, Any]:
-    given = {"base_deviation": model.base_deviation, "platform_deviation": model.platform_deviation}
-    return {f"{name}_um": _written(values, "length", "um") for name, values in given.items() if values.any()}
-
-
-def _thermal_block(model: MachineModel) -> dict[str, Any]:
-    given = {"base_expansion": model.base_expansion, "platform_expansion": model.platform_expansion}
-    unit = "ppm_per_K"
-    return {f"{name}_{unit}": _written(value, "expansion", unit) for name, value in given.items() if value}
-
-
-def _struts_block(struts: StrutErrors) -> dict[str, Any]:
-    block = {}
-    for name, (kind, unit) in STRUT_TERMS.items():
-        if getattr(struts, name).any():
-            block[f"{name}_{unit}"] = _per_strut(getattr(struts, name), kind, unit)
-    if struts.cosine.any() or struts.sine.any() or (struts.period != StrutErrors().period).any():
-        block["wave"] = {
-            f"{name}_{unit}": _per_strut(getattr(struts, name), "length", unit)
-            for name, unit in (("cosine", "um"), ("sine", "um"), ("period", "mm"))
-        }
-    if len(struts.map_knots):
-        knots = _written(struts.map_knots, "length", "mm")
-        block["map"] = {"knots_mm": knots, "values_um": _written(struts.map_values, "length", "um")}
-    return block
-
-
-def _field_block(field: GridField) -> dict[str, Any]:
-    if _is_no_field(field):
-        return {}
-    block: dict[str, Any] = {}
-    for axis, nodes in zip("xyz", field.grid, strict=True):
-        block[f"grid_{axis}_mm"] = _written(nodes, "length", "mm")
-    block["probe_mm"] = _written(field.probe, "length", "mm")
-    block["reversal_threshold_um"] = _written(field.reversal_threshold, "length", "um")
-    block["outside"] = field.outside
-    block["lines"] = [
-        line for axis, family in zip("xyz", field.lines, strict=True) for line in _family_lines(axis, family)
-    ]
-    return block
-
-
-def _is_no_field(field: GridField) -> bool:
-    """Return whether leaving the block out brings the same field back."""
-    nothing = no_field()
-    return (
-        not any(family.shape[4] for family in field.lines)
-        and all(np.array_equal(mine, its) for mine, its in zip(field.grid, nothing.grid, strict=True))
-        and not field.probe.any()
-        and field.outside == nothing.outside
-        and field.reversal_threshold == nothing.reversal_threshold
-    )
-
-
-def _family_lines(axis: str, family: np.ndarray) -> Iterator[dict[str, Any]]:
-    """Yield the family's lines, each with the components that any line of the family has.
-
-    Rows keep their full number of powers, and a family of zeros keeps one component, so that reading
-    brings back the same shape.
-    """
-    if not family.shape[4]:
-        return
-    used = np.flatnonzero(family.any(axis=(0, 1, 2, 4)))
-    components = used.tolist() or ["xyz".index(axis)]
-    for first, second in np.ndindex(family.shape[1:3]):
-        forward, backward = family[:, first, second]
-        given = {"both": forward}
-        if not np.array_equal(forward, backward):
-            given = dict(zip(DIRECTIONS, (forward, backward), strict=True))
-        for direction, line in given.items():
-            rows = _component_rows(line, components)
-            yield {"axis": axis, "at": [first, second], "direction": direction, **rows}
-
-
-def _component_rows(line: np.ndarray, components: list[int]) -> dict[str, Any]:
-    rows = {}
-    for component in components:
-        name = COMPONENTS[component]
-        kind, unit = COMPONENT_UNITS[name]
-        rows[f"{name}_{unit}"] = _written(line[component], kind, unit)
-    return rows

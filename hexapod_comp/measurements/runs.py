@@ -51,39 +51,24 @@ def assemble(
 
     Parameters
     ----------
-    geometry : HexapodGeometry
-        The machine as designed.
-    readings : sequence of Reading
-        In the order in which they were taken, as far as ``FROM_PREVIOUS`` needs it.
+    geometry, readings : HexapodGeometry, sequence of Reading
+        The machine as designed; readings in the order in which they were taken, as far as ``FROM_PREVIOUS`` needs it.
     probe : array_like, shape (3,), optional
         Measured point in ``platform``, m; the tool's tip by default.
-    files : iterable of (str, str)
-        Name and SHA-256 of each file.
-    notes : iterable of str
-        Remarks so far.
+    files, notes : iterable of (str, str), iterable of str
+        Name and SHA-256 of each file, and remarks so far.
 
     Raises
     ------
     InputFileError
-        No readings, an unknown channel, values that are not finite, poses out of the machine's reach, line
-        channels in a run that is no line. Names file and line.
+        No readings, an unknown channel, values not finite, poses out of reach, line channels without a line.
     """
-    if not readings:
-        raise InputFileError("measurements", "", "hold no reading")
     probe = np.array(geometry.tool.position if probe is None else probe, dtype=float)
     _check_readings(readings)
     poses = _platform_poses(geometry, readings)
     points = np.array([pose.position + pose.rotation @ probe for pose in poses])
-    members: dict[str, list[int]] = {}
-    for index, reading in enumerate(readings):
-        members.setdefault(reading.run, []).append(index)
-    along = geometry.work.rotation.T
-    runs = tuple(_recognise([readings[i] for i in rows], points[rows], along) for rows in members.values())
-    number = {run.name: index for index, run in enumerate(runs)}
-    run_of = np.array([number[r.run] for r in readings])
+    runs, run_of, swapped = _runs(readings, points, geometry.work.rotation.T)
     stations, station = _collect_stations(geometry, readings, poses, [runs[i] for i in run_of])
-    swapped = [_swapped_note(run, [readings[i] for i in rows], points[rows])
-               for run, rows in zip(runs, members.values(), strict=True)]  # fmt: skip
     return MeasurementSet(
         geometry=geometry,
         probe=probe,
@@ -98,8 +83,22 @@ def assemble(
         uncertainty=np.array([r.uncertainty for r in readings], dtype=float),
         sources=tuple(r.source for r in readings),
         files=tuple(files),
-        notes=(*notes, *filter(None, swapped)),
+        notes=(*notes, *swapped),
     )
+
+
+def _runs(
+    readings: Sequence[Reading], points: np.ndarray, along: np.ndarray
+) -> tuple[tuple[Run, ...], np.ndarray, list[str]]:
+    """Return the runs, each reading's run, and remarks on runs whose directions look swapped."""
+    members: dict[str, list[int]] = {}
+    for index, reading in enumerate(readings):
+        members.setdefault(reading.run, []).append(index)
+    parts = [([readings[i] for i in rows], points[rows]) for rows in members.values()]
+    runs = tuple(_recognise(*part, along) for part in parts)
+    number = {name: index for index, name in enumerate(members)}
+    notes = [_swapped_note(run, *part) for run, part in zip(runs, parts, strict=True)]
+    return runs, np.array([number[r.run] for r in readings]), [note for note in notes if note]
 
 
 def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> list[Pose]:
@@ -116,6 +115,8 @@ def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> l
 
 def _check_readings(readings: Sequence[Reading]) -> None:
     """Refuse what no instrument reads."""
+    if not readings:
+        raise InputFileError("measurements", "", "hold no reading")
     for r in readings:
         if r.channel not in CHANNELS:
             raise InputFileError(r.source.file, _line(r), f"channel must be one of {', '.join(CHANNELS)}", r.channel)

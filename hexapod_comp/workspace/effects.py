@@ -72,10 +72,8 @@ def effect_vectors(
 
     Parameters
     ----------
-    geometry : HexapodGeometry
-        The nominal machine, with its tool and work frames.
-    errors : SingleErrors
-        E errors, each acting alone.
+    geometry, errors : HexapodGeometry, SingleErrors
+        The nominal machine, with its tool and work frames; E errors, each acting alone.
     positions, rotations : array_like, shape (N, 3), (N, 3, 3)
         Nominal ``pose_platform_in_base``, m.
     method : str
@@ -152,19 +150,12 @@ def extremes(
         Number of the first of these poses. The other arguments are those of :func:`effect_vectors`.
     """
     positions, rotations = _poses(positions, rotations)
-    each, types = _way(method), len(errors.kinds)
+    each = _way(method)
     of_slice: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def run(rows: slice) -> None:
-        best, at = np.empty((len(errors), 4)), np.empty((len(errors), 4), int)
-        failed = np.zeros(types, int)
-        for e, vector in enumerate(each(geometry, errors, positions[rows], rotations[rows])):
-            signed = _SIGNS[:, None] * _sizes(vector)[[0, 0, 1, 1]]
-            missing = np.isnan(signed).any(axis=0)
-            signed[:, missing] = -np.inf
-            at[e] = signed.argmax(axis=1)
-            best[e] = signed[range(4), at[e]]
-            failed[errors.kind[e]] += missing.sum()
+        vectors = each(geometry, errors, positions[rows], rotations[rows])
+        best, at, failed = _best_of_errors(errors, vectors)
         of_slice[rows.start] = best, at + rows.start, failed
 
     over_chunks(run, len(positions), threads, BLOCK)
@@ -178,9 +169,23 @@ def extremes(
         at_error=np.where(found, at_error, -1),
         positions=_picked(positions, at_pose, found),
         rotations=_picked(rotations, at_pose, found),
-        failed=sum((part[2] for part in slices), np.zeros(types, int)),
+        failed=sum((part[2] for part in slices), np.zeros(len(errors.kinds), int)),
         poses=len(positions),
     )
+
+
+def _best_of_errors(errors: SingleErrors, vectors: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return each error's four extremes over some poses, (E, 4), where they are, and the failures by type."""
+    best, at = np.empty((len(errors), 4)), np.empty((len(errors), 4), int)
+    failed = np.zeros(len(errors.kinds), int)
+    for e, vector in enumerate(vectors):
+        signed = _SIGNS[:, None] * _sizes(vector)[[0, 0, 1, 1]]
+        missing = np.isnan(signed).any(axis=0)
+        signed[:, missing] = -np.inf
+        at[e] = signed.argmax(axis=1)
+        best[e] = signed[range(4), at[e]]
+        failed[errors.kind[e]] += missing.sum()
+    return best, at, failed
 
 
 def merged(parts: Iterable[Extremes]) -> Extremes:
@@ -299,7 +304,7 @@ def _way(method: str) -> Callable[..., Iterator[np.ndarray]]:
 def _nominal(structure: Structure, positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, ForwardBatch]:
     """Return the nominal lengths (N, 6), and the poses that they give: certified, NaN where they cannot be."""
     lengths = np.empty((len(positions), 6))
-    kernels.strut_lengths_many(structure.base_joints, structure.platform_joints, positions, rotations, lengths)
+    kernels.strut_lengths_many(*structure.joints, positions, rotations, lengths)
     return lengths, solve_poses(structure, lengths, (positions, rotations), threads=1)
 
 

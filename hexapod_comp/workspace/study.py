@@ -121,22 +121,16 @@ def classify(
 
     Parameters
     ----------
-    geometry : HexapodGeometry
-        The machine.
-    budget : Budget
-        Sizes of its errors.
+    geometry, budget : HexapodGeometry, Budget
+        The machine and the sizes of its errors.
     reaches : tuple of Reach, optional
         From :func:`~hexapod_comp.workspace.reach.reaches`; by default what is reached with the tool as at home.
-    method : str
-        ``exact`` or ``linear``, for the ranking.
-    allowed : float, optional
-        Allowed displacement of the tool, m, to allocate tolerances for.
-    compare : int
-        Poses at which exact, linear and tangential effects are compared; 0 for none.
+    method, allowed : str, float, optional
+        ``exact`` or ``linear``, for the ranking; displacement of the tool to allocate tolerances for, m.
+    compare, seed : int
+        Poses at which exact, linear and tangential effects are compared, 0 for none; the seed picks them.
     workers, scheduler, progress
         As for :func:`~hexapod_comp.workspace.runner.survey`.
-    seed : int
-        Picks the random poses and draws.
 
     Raises
     ------
@@ -146,24 +140,24 @@ def classify(
     errors = budget.single_errors(geometry)
     reaches = (reach(geometry),) if reaches is None else reaches
     extremes = survey(reaches, errors, method, workers, scheduler, progress)
-    positions, rotations = _random_poses(reaches, COMBINED_POSES, seed)
-    vectors = effect_vectors(geometry, errors, positions, rotations, LINEAR)
+    vectors = effect_vectors(geometry, errors, *_random_poses(reaches, COMBINED_POSES, seed), LINEAR)
     vectors = vectors[np.isfinite(vectors).all(axis=(1, 2))]
     ways = () if allowed is None else (RSS, WORST_CASE)
     return Study(
-        geometry=geometry,
-        budget=budget,
-        errors=errors,
-        reaches=reaches,
-        extremes=extremes,
+        *(geometry, budget, errors, reaches, extremes),
         rows=tuple(ranked(extremes, geometry)),
-        combined=Combined(
-            worst_case=worst_case(errors, vectors).max(axis=0),
-            root_sum_of_squares=root_sum_of_squares(vectors).max(axis=0),
-            monte_carlo=monte_carlo(vectors, DRAWS, seed=seed),
-        ),
+        combined=_combined(errors, vectors, seed),
         allocations=tuple(allocate(errors, vectors, float(allowed or 0.0), way) for way in ways),
         agreement=compared(geometry, errors, reaches, compare, seed) if compare else None,
+    )
+
+
+def _combined(errors: SingleErrors, vectors: np.ndarray, seed: int) -> Combined:
+    """Return the worst of all errors at once over the poses of some effects."""
+    return Combined(
+        worst_case=worst_case(errors, vectors).max(axis=0),
+        root_sum_of_squares=root_sum_of_squares(vectors).max(axis=0),
+        monte_carlo=monte_carlo(vectors, DRAWS, seed=seed),
     )
 
 

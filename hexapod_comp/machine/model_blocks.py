@@ -1,0 +1,163 @@
+"""The blocks of a model file as they are written: a model's arrays as nested lists, in the file's units."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import yaml
+
+from ..formats.yaml import UNITS, in_si
+from .field import COMPONENTS, GridField, no_field
+from .model import MachineModel
+from .struts import StrutErrors
+
+DIRECTIONS = ("forward", "backward")
+"""Order of the directions of motion in a field's arrays."""
+
+STRUT_TERMS = {
+    "offset": ("length", "um"),
+    "pitch": ("ratio", "ppm"),
+    "reference_length": ("length", "mm"),
+    "backlash": ("length", "um"),
+    "expansion": ("expansion", "ppm_per_K"),
+}
+"""Per-strut terms: kind of quantity, and the unit in which they are written."""
+
+COMPONENT_UNITS = {name: ("length", "um") if name[0] == "d" else ("angle", "urad") for name in COMPONENTS}
+
+
+class ModelDumper(yaml.SafeDumper):
+    """Rows of numbers on one line, everything else in blocks, nothing by reference."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _represent_list(dumper: yaml.SafeDumper, data: list) -> yaml.Node:
+    row = not any(isinstance(item, list | dict) for item in data)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=row)
+
+
+ModelDumper.add_representer(list, _represent_list)
+
+
+def written(values: Any, kind: str, unit: str) -> Any:
+    """Return SI values in a unit, as nested lists of floats that read back to the same values."""
+    factor = UNITS[kind][unit]
+    return _map_numbers(lambda value: _in_unit(value, factor), np.asarray(values, dtype=float).tolist())
+
+
+def _map_numbers(function: Callable[[float], float], values: Any) -> Any:
+    return [_map_numbers(function, item) for item in values] if isinstance(values, list) else function(values)
+
+
+def _in_unit(value: float, factor: float) -> float:
+    """Return the shortest number that reads back as `value`, or as its neighbour where no number does."""
+    exact = _exact_in_unit(value, factor)
+    if exact is None:
+        nearest = value / factor
+        exact = _exact_in_unit(float(in_si(nearest, factor)), factor)  # what will be read is written alike
+        return nearest if exact is None else exact
+    return exact
+
+
+def _exact_in_unit(value: float, factor: float) -> float | None:
+    quotient = value / factor
+    candidates = [float(f"{quotient:.{digits}g}") for digits in (15, 16, 17)]
+    candidates += [math.nextafter(quotient, math.inf), math.nextafter(quotient, -math.inf)]
+    return next((number + 0.0 for number in candidates if in_si(number, factor) == value), None)
+
+
+def _per_strut(values: np.ndarray, kind: str, unit: str) -> Any:
+    """Return one number where all six are equal, else the six."""
+    return written(values[0] if (values == values[0]).all() else values, kind, unit)
+
+
+def structure_block(model: MachineModel) -> dict[str, Any]:
+    """Return where the real joints are, µm."""
+    given = {"base_deviation": model.base_deviation, "platform_deviation": model.platform_deviation}
+    return {f"{name}_um": written(values, "length", "um") for name, values in given.items() if values.any()}
+
+
+def thermal_block(model: MachineModel) -> dict[str, Any]:
+    """Return how much the two bodies grow, ppm/K."""
+    given = {"base_expansion": model.base_expansion, "platform_expansion": model.platform_expansion}
+    unit = "ppm_per_K"
+    return {f"{name}_{unit}": written(value, "expansion", unit) for name, value in given.items() if value}
+
+
+def struts_block(struts: StrutErrors) -> dict[str, Any]:
+    """Return the struts' own errors, those that are not zero."""
+    block = {}
+    for name, (kind, unit) in STRUT_TERMS.items():
+        if getattr(struts, name).any():
+            block[f"{name}_{unit}"] = _per_strut(getattr(struts, name), kind, unit)
+    if struts.cosine.any() or struts.sine.any() or (struts.period != StrutErrors().period).any():
+        block["wave"] = {
+            f"{name}_{unit}": _per_strut(getattr(struts, name), "length", unit)
+            for name, unit in (("cosine", "um"), ("sine", "um"), ("period", "mm"))
+        }
+    if len(struts.map_knots):
+        knots = written(struts.map_knots, "length", "mm")
+        block["map"] = {"knots_mm": knots, "values_um": written(struts.map_values, "length", "um")}
+    return block
+
+
+def field_block(field: GridField) -> dict[str, Any]:
+    """Return the field, empty where leaving it out brings the same one back."""
+    if _is_no_field(field):
+        return {}
+    block: dict[str, Any] = {}
+    for axis, nodes in zip("xyz", field.grid, strict=True):
+        block[f"grid_{axis}_mm"] = written(nodes, "length", "mm")
+    block["probe_mm"] = written(field.probe, "length", "mm")
+    block["reversal_threshold_um"] = written(field.reversal_threshold, "length", "um")
+    block["outside"] = field.outside
+    block["lines"] = [
+        line for axis, family in zip("xyz", field.lines, strict=True) for line in _family_lines(axis, family)
+    ]
+    return block
+
+
+def _is_no_field(field: GridField) -> bool:
+    """Return whether leaving the block out brings the same field back."""
+    nothing = no_field()
+    return (
+        not any(family.shape[4] for family in field.lines)
+        and all(np.array_equal(mine, its) for mine, its in zip(field.grid, nothing.grid, strict=True))
+        and not field.probe.any()
+        and field.outside == nothing.outside
+        and field.reversal_threshold == nothing.reversal_threshold
+    )
+
+
+def _family_lines(axis: str, family: np.ndarray) -> Iterator[dict[str, Any]]:
+    """Yield the family's lines, each with the components that any line of the family has.
+
+    Rows keep their full number of powers, and a family of zeros keeps one component, so that reading
+    brings back the same shape.
+    """
+    if not family.shape[4]:
+        return
+    used = np.flatnonzero(family.any(axis=(0, 1, 2, 4)))
+    components = used.tolist() or ["xyz".index(axis)]
+    for first, second in np.ndindex(family.shape[1:3]):
+        forward, backward = family[:, first, second]
+        given = {"both": forward}
+        if not np.array_equal(forward, backward):
+            given = dict(zip(DIRECTIONS, (forward, backward), strict=True))
+        for direction, line in given.items():
+            rows = _component_rows(line, components)
+            yield {"axis": axis, "at": [first, second], "direction": direction, **rows}
+
+
+def _component_rows(line: np.ndarray, components: list[int]) -> dict[str, Any]:
+    rows = {}
+    for component in components:
+        name = COMPONENTS[component]
+        kind, unit = COMPONENT_UNITS[name]
+        rows[f"{name}_{unit}"] = written(line[component], kind, unit)
+    return rows
