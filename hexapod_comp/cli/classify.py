@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
     from ..workspace.sources import load_budget
     from ..workspace.study import classify, shells_of
 
-    geometry = load_geometry(config_file(args.machine))
+    geometry = load_geometry(args.machine)
     if args.clearance_mm is not None:
         geometry = replace(geometry, limits=replace(geometry.limits, clearance=args.clearance_mm * 1e-3))
     budget_file = config_file(args.budget)

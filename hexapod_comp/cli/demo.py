@@ -30,15 +30,14 @@ def run(args: argparse.Namespace) -> int:
     """Run the verb."""
     from ..formats.csv import read_poses
     from ..formats.figures import save
-    from ..formats.paths import config_file
     from ..loop import run as loop
     from ..loop.pictures import session_figure
     from ..loop.report import pose_block, summary
     from ..machine.geometry import load_geometry
 
     rate = loop.checked_rate(args.rate_hz)
-    geometry = load_geometry(config_file(args.machine))
-    rows, poses = read_poses(config_file("table1.csv"))
+    geometry = load_geometry(args.machine)
+    rows, poses = read_poses("table1.csv")
     path = loop.demo_path(geometry, rate)
     with loop.simulated(geometry, args.machine, args.model, args.truth) as nodes:
         result = loop.witnessed(geometry, nodes, poses, path, rate, compare=True)

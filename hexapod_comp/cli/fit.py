@@ -146,8 +146,8 @@ def run(args: argparse.Namespace) -> int:
     _refuse_options_of_the_other_scheme(args)
     for path in (args.out, args.report, args.json, args.covariance):
         _refuse_missing_folder(path)
-    geometry = load_geometry(config_file(args.machine))
-    truth = None if args.truth is None else RealMachine(geometry, load_model(config_file(args.truth), geometry))
+    geometry = load_geometry(args.machine)
+    truth = None if args.truth is None else RealMachine(geometry, load_model(args.truth, geometry))
     columns = None if args.columns is None else config_file(args.columns)
     settings = fit_settings(args)
     measured = read_measurements(args.files, geometry, columns, args.probe_mm)

@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     from ..measurements.files import read_measurements
     from ..measurements.iso230 import evaluate, iso230_runs, report, table
 
-    geometry = load_geometry(config_file(args.machine))
+    geometry = load_geometry(args.machine)
     columns = None if args.columns is None else config_file(args.columns)
     measured = read_measurements(args.files, geometry, columns, args.probe_mm)
     common.say_notes(measured.notes)

@@ -52,7 +52,6 @@ def add_parser(subparsers: common.Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
-    from ..formats.paths import config_file
     from ..machine.model import RealMachine
     from ..machine.model_file import load_model
     from ..measurements.campaign import load_campaign, template
@@ -60,8 +59,8 @@ def run(args: argparse.Namespace) -> int:
     from ..virtual.instruments import compensated, measure
 
     geometry, model = common.load_machine(args)
-    truth = load_model(config_file(args.truth), geometry)
-    campaign = load_campaign(config_file(args.campaign))
+    truth = load_model(args.truth, geometry)
+    campaign = load_campaign(args.campaign)
     common.mention_compiling("model.actual_pose_one")
     plan = template(campaign, geometry, args.seed, args.campaign)
     if args.model != "ideal":

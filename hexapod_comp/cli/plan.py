@@ -30,12 +30,11 @@ def run(args: argparse.Namespace) -> int:
     """Run the verb."""
     from ..calibration.plan import plan
     from ..calibration.report import plan_json, plan_report
-    from ..formats.paths import config_file
     from ..machine.geometry import load_geometry
     from ..measurements.campaign import load_campaign, template
 
-    geometry = load_geometry(config_file(args.machine))
-    campaign = load_campaign(config_file(args.campaign))
+    geometry = load_geometry(args.machine)
+    campaign = load_campaign(args.campaign)
     common.mention_compiling("model.actual_pose_one")
     result = plan(template(campaign, geometry, args.seed, args.campaign), campaign, fit_settings(args))
     common.emit(common.json_text(plan_json(result)) if args.json else plan_report(result), None)

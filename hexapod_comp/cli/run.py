@@ -54,15 +54,14 @@ def run(args: argparse.Namespace) -> int:
 
     from ..formats.csv import read_poses
     from ..formats.figures import save
-    from ..formats.paths import config_file
     from ..loop import run as loop
     from ..loop.pictures import session_figure
     from ..loop.report import pose_block, summary
     from ..machine.geometry import load_geometry
 
     rate = loop.checked_rate(args.rate_hz)
-    geometry = load_geometry(config_file(args.machine))
-    rows, poses = read_poses(config_file(args.poses))
+    geometry = load_geometry(args.machine)
+    rows, poses = read_poses(args.poses)
     loop.refuse_broken_limits(args.poses, geometry, "ideal" if args.attach else args.model, rows, poses)
     started = nullcontext(()) if args.attach else loop.simulated(geometry, args.machine, args.model, args.truth)
     compare = not (args.attach or args.no_compare)  # nobody switches a real machine's compensation off in passing
