@@ -1,7 +1,7 @@
 """Classification of single errors: every pose of a workspace × every single error, exact, and who else could do it.
 
 The effect of 48 single errors (lengths of six struts, their screws' pitch, 18 coordinates of base joints, 18
-of platform joints) at random poses about home, solved by our compiled kernels, by the iteration of paper 004
+of platform joints) at random poses about home, solved by our compiled kernels, by the iteration of v. Daake et al.
 (Python, 0.01 mm a step, as the paper has it) and by a batch Newton in NumPy. The slow ones get a few of the
 same poses, and their time counts per effect.
 
@@ -40,7 +40,7 @@ SIZES = {
     "platform_joint_xy": 10e-6,
     "platform_joint_z": 10e-6,
 }
-"""004's sizes of its error types: 48 single errors."""
+"""v. Daake et al.'s sizes of their error types: 48 single errors."""
 
 CHUNK = 65_536
 """Poses handed over at once."""
@@ -206,7 +206,7 @@ def main() -> int:
     us = 1e6 * seconds / (args.poses * len(errors))
     results = [
         Result("hexapod_comp", args.poses, seconds, us, 1.0, 0.0),
-        beside("iteration of paper 004", by_iteration, geometry, errors, ITERATION_POSES, us),
+        beside("iteration of v. Daake et al.", by_iteration, geometry, errors, ITERATION_POSES, us),
         beside("NumPy batch Newton", by_numpy, geometry, errors, NUMPY_POSES, us),
     ]
     failed = int(found.failed.sum())

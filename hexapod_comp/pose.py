@@ -67,7 +67,7 @@ class Pose:
         position : array_like, shape (3,)
             m.
         angles : array_like, shape (3,)
-            α, β, γ in radians; R = Ry(β)·Rx(α)·Rz(γ) (000, T_BASE^TOP).
+            α, β, γ in radians; R = Ry(β)·Rx(α)·Rz(γ) (Song et al., T_BASE^TOP).
         """
         return Pose(np.asarray(position), rotation_from_angles(_finite(angles, (3,), "angles")))
 
@@ -121,7 +121,7 @@ def stacked(poses: Sequence[Pose] | tuple[np.ndarray, np.ndarray]) -> tuple[np.n
 
 
 def rotation_from_angles(angles: np.ndarray) -> np.ndarray:
-    """Return R = Ry(β)·Rx(α)·Rz(γ) (000, T_BASE^TOP).
+    """Return R = Ry(β)·Rx(α)·Rz(γ) (Song et al., T_BASE^TOP).
 
     Parameters
     ----------

@@ -71,7 +71,7 @@ def measured(geometry: HexapodGeometry, name: str) -> MeasurementSet:
 
 
 def strut_error_picture(fit: ModelFit, one_d: MeasurementSet) -> Figure:
-    """Return 001's Figures 3 and 4, from 1-D and from 5-D lines, and the same as the joint fit has it."""
+    """Return Mou & King's Figures 3 and 4, from 1-D and from 5-D lines, and the same as the joint fit has it."""
     models = {
         "lines, 1-D": fit_lines(one_d).model,
         "lines, 5-D": fit_lines(fit.measurements).model,
@@ -82,7 +82,7 @@ def strut_error_picture(fit: ModelFit, one_d: MeasurementSet) -> Figure:
 
 
 def shells_picture() -> Figure:
-    """Return what the first strut's screw pitch error does to the tool of the positioning unit (004, Figure 2)."""
+    """Show what an error of the first screw's pitch does to the unit's tool (v. Daake et al., Figure 2)."""
     geometry = load_geometry(ROOT / "config" / "positioning_unit.yaml")
     errors = load_budget(ROOT / "config" / "error_budget.yaml").single_errors(geometry)
     first = errors.select((errors.kind == errors.kinds.index("screw pitch")) & (errors.strut == 0))

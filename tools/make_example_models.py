@@ -5,7 +5,7 @@
 paper's geometry with ±100 µm on every joint coordinate and strut, ±100 ppm of pitch, a 4 µm screw wave of
 10 mm period, 3–5 µm of backlash and a smooth six-component field.
 
-``paper_lines_model.yaml`` is what paper 001 would make of that machine: scheme ``lines`` of
+``paper_lines_model.yaml`` is what Mou & King would make of that machine: scheme ``lines`` of
 :mod:`hexapod_comp.calibration.lines` on the readings of a 1-D laser, taken on the uncompensated machine along
 the lines of a 4-inch grid, every inch, forward and backward, three times.
 

@@ -1,7 +1,7 @@
 """What a model is worth: the virtual machine told what the model says, seen where nothing was fitted.
 
 Two measures. The honest one is the error vector of the tool in space at random points of the workspace,
-passed in random directions. The paper's own (001) is the mean absolute displacement error along lines
+passed in random directions. That of Mou & King (1998) is the mean absolute displacement error along lines
 parallel to the grid, which is all that a linear laser sees.
 """
 
@@ -90,7 +90,7 @@ def held_out(
 
 @dataclass(frozen=True)
 class PaperMetric:
-    """001's own measure, without and with a model.
+    """Mou & King's own measure, without and with a model.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ def paper_metric(
 ) -> PaperMetric:
     """Return the mean absolute displacement error along lines parallel to the grid, without and with a model.
 
-    001: the predicted values "were compared with the laser interferometer readings at various points within
+    Mou & King: the predicted values "were compared with the laser interferometer readings at various points within
     the selected workspace". So: lines along x, y and z at random places between the grid's, from end to end of
     the box, forward and backward, each with its zero where an interferometer is zeroed: at the first reading,
     the line's start. That reading, zero by definition, does not count. The others stand every `step`, half a
@@ -192,7 +192,7 @@ class Worth:
     before, after : HeldOut
         The tool's error in space without and with the model.
     paper : PaperMetric
-        001's own measure.
+        Mou & King's own measure.
     """
 
     before: HeldOut

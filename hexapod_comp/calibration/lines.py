@@ -1,4 +1,4 @@
-"""Scheme ``lines``, paper 001's: a polynomial along each measured grid line, forward and backward apart.
+"""Scheme ``lines``, Mou & King's: a polynomial along each measured grid line, forward and backward apart.
 
 Every line of a full rectangular grid gets one polynomial per direction and component, by linear regression
 on the mean of its cycles; between the lines :class:`hexapod_comp.machine.field.GridField` weights bilinearly. The
@@ -20,11 +20,11 @@ displacement on x-lines and a straightness on y- and z-lines. Were all three add
 x·y², which x-lines see as a displacement that differs from line to line and y-lines as a bow that differs
 from line to line, would count twice. But the x-lines leave open only what does not depend on x, their zeros:
 dx(x, y, z) = X(x; y, z) + f(y, z) with X from the x-lines. So each component belongs first to one family,
-read line by line as 001 does; the others are asked only for what it leaves over: its prediction is taken off
+read line by line as Mou & King do; the others are asked only for what it leaves over: its prediction is taken off
 their readings, and since the rest is the same for all lines that differ only in the first family's
 coordinate, these are averaged and share one polynomial. A displacement belongs first to the lines along it
 (the only ones without an unknown slope); a rotation to the first of x, y, z that reads it as pitch or yaw.
-001 does not say how its 5-D model did this. On twenty virtual machines (±100 µm on joints and struts, screw
+Mou & King do not say how their 5-D model did this. On twenty virtual machines (±100 µm on joints and struts, screw
 waves, backlash) the RMS error in space after alignment of the datum fell from 27.9 µm to 19.0 µm with own
 displacements alone, to 18.3 µm with everything added as read, to 18.1 µm so; with strut maps of 5 µm as well
 from 29.2 µm to 21.0, 20.6 and 20.1 µm. Adding as read also raised what is left along lines by a tenth.
@@ -151,7 +151,7 @@ class LinesFit:
 def fit_lines(
     measurements: MeasurementSet, order: OrderRule = "adjusted-r2", date: str = "", name: str = ""
 ) -> LinesFit:
-    """Fit 001's polynomials to the readings on a rectangular grid of lines.
+    """Fit Mou & King's polynomials to the readings on a rectangular grid of lines.
 
     Parameters
     ----------
@@ -420,7 +420,7 @@ def _zeroed(fits: list[LineFit], u: float) -> list[LineFit]:
 def _regress(u: np.ndarray, values: np.ndarray, order: OrderRule, name: str) -> tuple[np.ndarray, float, float, float]:
     """Return coefficients in powers of u, R², adjusted R² and the standard deviation of the residuals.
 
-    Legendre's polynomials keep the regression well conditioned (001 has powers of x: the same functions).
+    Legendre's polynomials keep the regression well conditioned (Mou & King have powers of x: the same functions).
     """
     count = len(u)
     if count < FEWEST_POINTS:

@@ -34,7 +34,7 @@ ARROWS = {1: "→", -1: "←"}
 def strut_length_errors(
     geometry: HexapodGeometry, model: MachineModel, along_x: np.ndarray, y: float, z: float
 ) -> np.ndarray:
-    """Return ΔL = L_actual − L_ideal (001) along a line in x, forward and backward, shape (2, n, 6), m.
+    """Return ΔL = L_actual − L_ideal (Mou & King) along a line in x, forward and backward, shape (2, n, 6), m.
 
     L_ideal are the nominal lengths of the commanded pose; L_actual those of the pose to which the machine,
     told L_ideal, really goes as the model has it. To first order the strut correction is −ΔL.
@@ -67,14 +67,14 @@ def strut_error_figure(
     y: float | None = None,
     z: float | None = None,
 ) -> Figure:
-    """Show 001's Figures 3 and 4: the six struts' length errors along x, forward (a) and backward (b).
+    """Show Mou & King's Figures 3 and 4: the six struts' length errors along x, forward (a) and backward (b).
 
     Parameters
     ----------
     geometry : HexapodGeometry
         The machine as designed.
     models : mapping of str to MachineModel
-        One row of two panels each, under its title; 001 has a row from 1-D and one from 5-D data.
+        One row of two panels each, under its title; Mou & King have a row from 1-D and one from 5-D data.
     y, z : float, optional
         Where the line stands in the work frame, m; the middle of the first model's box by default.
 

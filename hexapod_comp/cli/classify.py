@@ -1,4 +1,4 @@
-"""``hexapod_comp classify``: which error hurts most, and where (paper 004)."""
+"""``hexapod_comp classify``: which error hurts most, and where (v. Daake et al.)."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ def locate(value, nodes):
 def add_family(u, sense, lines, i, s, j, t, error):
     """Add one family of lines: bilinear weights of its four lines around the point times their polynomials.
 
-    The weight of a line is the area of the rectangle opposite to it (001, W_xi): (1 − s)(1 − t) for the
+    The weight of a line is the area of the rectangle opposite to it (Mou & King, W_xi): (1 − s)(1 − t) for the
     line at the lower node of both cross axes, and so on; they sum to 1.
     """
     for direction in range(2):

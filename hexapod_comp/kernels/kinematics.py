@@ -53,7 +53,7 @@ ONE = np.int64(1)
 
 @compiled
 def strut_lengths_one(base, platform, position, rotation, lengths):
-    """Write |P + R·t_i − b_i| into `lengths`, shape (6,), m (000, inverse kinematics)."""
+    """Write |P + R·t_i − b_i| into `lengths`, shape (6,), m (Song et al., inverse kinematics)."""
     _write_lengths(six_rows(base), six_rows(platform), position, rotation, lengths)
 
 

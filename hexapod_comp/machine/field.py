@@ -1,4 +1,4 @@
-"""The error field of paper 001: polynomials along grid lines, four lines weighted bilinearly.
+"""The error field of Mou & King: polynomials along grid lines, four lines weighted bilinearly.
 
 A field gives the error of the measured point (the reflector) as six components along and about the axes of
 ``base``: dx, dy, dz in metres, rx, ry, rz in radians. Three families of lines, one along each axis, run

@@ -180,7 +180,7 @@ def paper_joints(a: float, b: float, d: float) -> tuple[np.ndarray, np.ndarray]:
     Returns
     -------
     base_joints, platform_joints : ndarray, shape (6, 3)
-        000, Figure 3, with its misprint in X_B5 mended (see doc/theory.md).
+        Song et al., Figure 3, with its misprint in X_B5 mended (see doc/theory.md).
     """
     for key, value in (("a", a), ("b", b), ("d", d)):
         if not (np.isfinite(value) and value > 0.0):

@@ -135,7 +135,7 @@ class ForwardBatch:
 
 
 def strut_lengths(machine: Machine, pose: Pose) -> np.ndarray:
-    """Return the six strut lengths at a pose (000, inverse kinematic model).
+    """Return the six strut lengths at a pose (Song et al., inverse kinematic model).
 
     Parameters
     ----------

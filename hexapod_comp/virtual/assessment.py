@@ -1,4 +1,4 @@
-"""The performance assessment of paper 000: what random imperfections do to strut lengths and to poses.
+"""The performance assessment of Song et al.: what random imperfections do to strut lengths and to poses.
 
 For machines drawn within bounds: the strut lengths that the ideal and that the real machine need at a pose
 (Tables 2 and 4), and the pose that the real machine takes when it is told the ideal lengths. Where the
@@ -31,9 +31,9 @@ class Assessment:
     seeds : tuple of int
         The machines' seeds.
     ideal_lengths : ndarray, shape (P, 6)
-        Strut lengths of the nominal machine (000, Table 2).
+        Strut lengths of the nominal machine (Song et al., Table 2).
     real_lengths : ndarray, shape (M, P, 6)
-        Strut commands that bring each real machine exactly to the poses (000, Table 4).
+        Strut commands that bring each real machine exactly to the poses (Song et al., Table 4).
     taken_positions, taken_rotations : ndarray, shape (M, P, 3), (M, P, 3, 3)
         ``pose_tool_in_work`` that each real machine takes when told the ideal lengths.
     pose_errors : ndarray, shape (M, P, 6)

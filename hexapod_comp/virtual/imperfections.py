@@ -29,7 +29,7 @@ FIELD_POWERS = 4
 class ImperfectionBounds:
     """How imperfect a machine may be; all draws are uniform.
 
-    The defaults are paper 000's assessment: ±10 µm on every joint coordinate and on every strut, nothing
+    The defaults are Song et al.'s assessment: ±10 µm on every joint coordinate and on every strut, nothing
     else.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Effect of every single error at every pose on the tool (paper 004), exact or to first order.
+"""Effect of every single error at every pose on the tool (v. Daake et al.), exact or to first order.
 
 The effect of an error is where the tool of the machine with that one error stands, told the nominal strut
 lengths of a pose, beside where it should stand: Euclidean distance, and the largest of the three components of
@@ -114,7 +114,7 @@ def effects(
     method: str = EXACT,
     threads: int | None = None,
 ) -> np.ndarray:
-    """Return the size of every error's effect at every pose, shape (N, E, 2): m and rad (004, Results).
+    """Return the size of every error's effect at every pose, shape (N, E, 2): m and rad (v. Daake et al., Results).
 
     Arguments and errors as for :func:`effect_vectors`.
     """
@@ -139,7 +139,7 @@ def extremes(
     first: int = 0,
     threads: int | None = None,
 ) -> Extremes:
-    """Return the largest and smallest effects of each error type over some poses (004, Table 1).
+    """Return the largest and smallest effects of each error type over some poses (v. Daake et al., Table 1).
 
     Of more poses than memory takes, hand over one part after the other and join the results with :func:`merged`:
     they are the same to the last bit however the poses are parted.

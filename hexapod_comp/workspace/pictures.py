@@ -79,7 +79,7 @@ def shells_figure(
     title: str,
     limits: tuple[float, float] | None = None,
 ) -> Figure:
-    """Show shells of the workspace coloured by an effect (004, Figure 2), with the machine at home.
+    """Show shells of the workspace coloured by an effect (v. Daake et al., Figure 2), with the machine at home.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def causes_figure(geometry: HexapodGeometry, points: np.ndarray, findings: np.nd
 
 
 def ranking_figure(rows: Sequence[RankedRow], title: str) -> Figure:
-    """Show a ranked table as bars from the smallest to the largest effect over the workspace (004, Table 1).
+    """Show a ranked table as bars from smallest to largest effect over the workspace (v. Daake et al., Table 1).
 
     Parameters
     ----------

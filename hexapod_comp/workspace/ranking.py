@@ -1,4 +1,4 @@
-"""The ranking of error types by their effect on the tool, beside the figures that paper 004 prints (Table 1)."""
+"""The ranking of error types by their effect on the tool, beside Table 1 of v. Daake et al."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ JOINED = {
     "base-/platform joint (x/y)": ("base joint x/y", "platform joint x/y"),
     "base-/platform joint (z)": ("base joint z", "platform joint z"),
 }
-"""Types that 004 puts into one row, by their titles."""
+"""Types that v. Daake et al. put into one row, by their titles."""
 
 QUANTITIES = ("translation_max", "translation_min", "rotation_max", "rotation_min")
 
@@ -79,7 +79,7 @@ class RankingRow:
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A row of 004, Table 1, as printed; zeros where it prints "≈ 0"; m and rad.
+    """A row of v. Daake et al., Table 1, as printed; zeros where they print "≈ 0"; m and rad.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ PAPER_TABLE = (
     _paper_row("base-/platform joint (z)", 10.0, (11.2, 11.18), (5.36, 3.84)),
     _paper_row("quantization", 7.0, (10.85, 7.84), (4.39, 3.81)),
 )
-"""004, Table 1. Its machine's geometry is not printed: another machine cannot give the same digits."""
+"""v. Daake et al., Table 1. Their machine's geometry is not printed: another machine cannot give the same digits."""
 
 _SAME_AS_PAPER = {"quantisation": "quantization"}
 
@@ -114,7 +114,7 @@ _SAME_AS_PAPER = {"quantisation": "quantization"}
 def ranked(
     extremes: Extremes, geometry: HexapodGeometry, joined: dict[str, tuple[str, ...]] | None = None
 ) -> list[RankingRow]:
-    """Return one row per error type, the largest displacement of the tool first (004, Table 1).
+    """Return one row per error type, the largest displacement of the tool first (v. Daake et al., Table 1).
 
     Parameters
     ----------
@@ -123,8 +123,8 @@ def ranked(
     geometry : HexapodGeometry
         For the tool's poses.
     joined : dict of str to tuple of str, optional
-        Titles of types that share a row, by the row's title; those of 004 by default, {} for none. A group of
-        which the budget has only one type keeps that type's own title.
+        Titles of types that share a row, by the row's title; those of v. Daake et al. by default, {} for none. A group
+        of which the budget has only one type keeps that type's own title.
 
     Raises
     ------
@@ -170,7 +170,7 @@ def _extreme(extremes: Extremes, geometry: HexapodGeometry, title: str, kinds: l
 
 
 def paper_row(title: str) -> PaperRow | None:
-    """Return the row of 004, Table 1, that stands for an error type; None for a type that it does not have."""
+    """Return the row of v. Daake et al., Table 1, for an error type; None for a type that it does not have."""
     wanted = _SAME_AS_PAPER.get(title, title)
     return next((row for row in PAPER_TABLE if row.title == wanted), None)
 

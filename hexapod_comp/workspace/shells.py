@@ -1,4 +1,4 @@
-"""Shells of the workspace at constant orientation (004, Figure 2), as meshes to colour.
+"""Shells of the workspace at constant orientation (v. Daake et al., Figure 2), as meshes to colour.
 
 A shell is found by rays from one point well inside: along each the boundary is bracketed and bisected. That
 gives the whole boundary only where every point of it can be seen from there (the reach is star-shaped). It is

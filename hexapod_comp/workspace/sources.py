@@ -1,4 +1,4 @@
-"""Single errors of a machine, each with its size, and the budget file that lists them (paper 004).
+"""Single errors of a machine, each with its size, and the budget file that lists them (v. Daake et al.).
 
 A single error is one number that is not what it should be: a strut's length, a joint's coordinate, the
 tool's offset. A budget says how large the errors of each type are; every strut and every coordinate of a
@@ -146,8 +146,9 @@ SOURCE_TYPES = (
     SourceType("thermal_growth", "ratio", "thermal growth", _temperature),
     SourceType("tool_offset", "length", "tool offset", _tool),
 )
-"""Types that a budget may have. Screw pitch as 004 has it, a bound of the length error; as a slope it grows with the
-way from home. A strut is off by half its backlash. Thermal growth is relative: expansion times kelvins."""
+"""Types that a budget may have. Screw pitch as v. Daake et al. have it, a bound of the length error; as a slope it
+grows with the way from home. A strut is off by half its backlash. Thermal growth is relative: expansion
+times kelvins."""
 
 
 @dataclass(frozen=True)

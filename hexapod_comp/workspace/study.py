@@ -1,4 +1,4 @@
-"""The whole classification of a machine's errors (paper 004): reach, ranking, combined budgets, meshes to show."""
+"""The whole classification of a machine's errors (v. Daake et al.): reach, ranking, combined budgets, meshes."""
 
 from __future__ import annotations
 

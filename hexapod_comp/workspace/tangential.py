@@ -1,4 +1,4 @@
-"""The paper's own iteration for the effect of one error (004, chapter 1), kept as a check and as a yardstick.
+"""The iteration of v. Daake et al. (chapter 1) for the effect of one error, kept as a check and as a yardstick.
 
 Tangents to the motion that one active leg causes are followed in small steps. Each needs the motion relations
 of all legs, which virtual displacements of the tool give through the inverse kinematics alone. Nothing is
@@ -19,7 +19,7 @@ from ..pose import Pose
 from .sources import BASE_JOINT, LENGTH, PLATFORM_JOINT, TOOL, SingleErrors
 
 STEP = 1e-5
-"""Travel of the active leg per step, m (004: 0.01 mm)."""
+"""Travel of the active leg per step, m (v. Daake et al.: 0.01 mm)."""
 
 TOLERANCE = 1e-9
 """ε: legs that are off by more, m, are corrected."""
@@ -78,13 +78,13 @@ class _State:
         return self.tip + motion[:3], Rotation.from_rotvec(motion[3:]).as_matrix() @ self.rotation
 
     def motion_matrix(self) -> np.ndarray:
-        """Return V: leg lengths per motion of the tool, one virtual displacement after another (004, eq. 1–2)."""
+        """Return V: leg lengths per virtual displacement of the tool, one after another (v. Daake et al., eq. 1–2)."""
         here = self.lengths()
         columns = [(self.lengths(VIRTUAL * axis) - here) / VIRTUAL for axis in np.eye(6)]
         return np.stack(columns, axis=1)
 
     def follow(self, change: np.ndarray) -> None:
-        """Move the tool along the tangent on which the legs change by so much (004, eq. 3–4: V·R = A)."""
+        """Move the tool along the tangent on which the legs change by so much (v. Daake et al., eq. 3–4: V·R = A)."""
         try:
             motion = np.linalg.solve(self.motion_matrix(), change)
         except np.linalg.LinAlgError:
