@@ -98,14 +98,16 @@ setup(
             "plotly>=5.18",
             "distributed>=2023.12",
             "rosbags>=0.11",
+            "argcomplete>=3.1",
         ],
         # The site: `make docs`. Formulas become MathML, which needs no script from elsewhere.
         "docs": ["sphinx>=8.1", "myst-nb>=1.1", "furo>=2024.8", "latex2mathml>=3.77"],
         "bench": ["mujoco>=3.1", "pin>=2.7"],
-        # No rosdep keys: imported where used, with a clear message when missing.
+        # Imported where used. The first three have no rosdep keys, and a clear message says when one is missing.
         "pages": ["plotly>=5.18"],
         "cluster": ["distributed>=2023.12"],
         "bags": ["rosbags>=0.11"],
+        "completion": ["argcomplete>=3.1"],  # rosdep: python3-argcomplete; nobody needs it to run anything
     },
     entry_points={
         "console_scripts": [

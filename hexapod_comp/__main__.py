@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """``python -m hexapod_comp`` is the command ``hexapod_comp``."""
 
 import sys

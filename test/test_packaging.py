@@ -38,7 +38,7 @@ PYPI_NAMES = {"yaml": "pyyaml"}
 # and lz4 with rosbags, hal and linuxcnc with LinuxCNC, benchmarks are the source tree's; the others are optional
 # extras and benchmark tools.
 COMING_WITH = {"setuptools", "mpl_toolkits", "llvmlite", "apsw", "lz4", "hal", "linuxcnc", "benchmarks"}
-EXEMPT = COMING_WITH | {"plotly", "distributed", "rosbags", "mujoco", "pinocchio"}
+EXEMPT = COMING_WITH | {"argcomplete", "plotly", "distributed", "rosbags", "mujoco", "pinocchio"}
 WITHOUT_ROS = """
 import importlib, sys
 

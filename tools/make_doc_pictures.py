@@ -64,7 +64,7 @@ def machine_picture(geometry: HexapodGeometry) -> Figure:
 
 
 def measured(geometry: HexapodGeometry, name: str) -> MeasurementSet:
-    """Return what ``hexapod_comp measure --campaign NAME --seed 1`` reads."""
+    """Return what ``hexapod_comp simulate --campaign NAME --seed 1`` reads."""
     campaign = load_campaign(ROOT / "config" / f"{name}.yaml")
     truth = RealMachine(geometry, load_model(ROOT / "config" / "paper_machine.yaml", geometry))
     return measure(template(campaign, geometry, SEED), campaign, truth, SEED)

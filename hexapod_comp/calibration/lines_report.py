@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 
@@ -96,6 +97,49 @@ def _line_row(line: LineFit) -> Sequence[str]:
 def worth_text(worth: Worth) -> str:
     """Return what a model is worth on a virtual machine: the paper's measure next to the honest one."""
     return "\n".join(_worth_lines(worth))
+
+
+def as_json(fit: LinesFit) -> dict[str, Any]:
+    """Return a fit of scheme lines as plain numbers; SI units are in the keys."""
+    field = fit.model.field
+    return {
+        "machine": fit.model.machine,
+        "scheme": "lines",
+        "grid_m": [axis.tolist() for axis in field.grid],
+        "lines": [_line_json(line) for line in fit.lines],
+        "notes": fit.notes,
+    }
+
+
+def _line_json(line: LineFit) -> dict[str, Any]:
+    unit = "m" if line.component < 3 else "rad"
+    return {
+        "name": line.name,
+        "component": COMPONENTS[line.component],
+        "direction": WAYS[line.direction],
+        "points": len(line.values),
+        f"coefficients_{unit}": line.coefficients.tolist(),
+        "r2": line.r2,
+        "adjusted_r2": line.adjusted_r2,
+        f"residual_std_{unit}": line.residual_std,
+        f"repeat_std_{unit}": line.repeat_std,
+    }
+
+
+def worth_json(worth: Worth) -> dict[str, Any]:
+    """Return what a model is worth on a virtual machine as plain numbers; SI units are in the keys."""
+    error = {
+        name: {
+            "points": one.points,
+            "rms_m": one.raw.rms,
+            "aligned_rms_m": one.aligned.rms,
+            "aligned_max_m": one.aligned.largest,
+            "rotation_rms_rad": one.rotation.rms,
+        }
+        for name, one in (("error_without", worth.before), ("error_with", worth.after))
+    }
+    along = {"without_m": worth.paper.before, "with_m": worth.paper.after, "lines": worth.paper.lines}
+    return {**error, "mean_displacement_error_along_lines": along}
 
 
 def _worth_lines(worth: Worth) -> Iterator[str]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from ..formats.texts import aligned, number
 from ..measurements.readings import ANGULAR_KINDS, CHANNELS
-from .fit import ModelFit
+from .fit import ChannelFit, ModelFit, Outlier
 from .observability import BlockSight, Observability, ToolError
 from .plan import Plan
 
@@ -125,7 +125,7 @@ def _outliers(fit: ModelFit) -> Iterator[str]:
 
 
 def as_json(fit: ModelFit) -> dict:
-    """Return a joint fit as plain numbers, SI, for ``--json``."""
+    """Return a fit of scheme joint as plain numbers; SI units are in the keys, or stand beside numbers as ``unit``."""
     x, errors = fit.solution.x, fit.standard_errors
     labels = [(label, block.unit) for block in fit.space.blocks for label in block.labels]
     return {
@@ -136,16 +136,44 @@ def as_json(fit: ModelFit) -> dict:
             for (name, unit), v, e in zip(labels, x, errors, strict=True)
         ],
         "blocks": fit.decisions,
-        "channels": fit.channels,
-        "expected_tool_error": fit.level,
-        "expected_tool_error_tilted": fit.tilted,
-        "observability": fit.observability,
-        "unseen_errors": fit.unseen_errors,
-        "outliers": [
-            {"source": str(o.source), "channel": CHANNELS[o.channel], "residual": o.residual, "sigmas": o.sigmas}
-            for o in fit.outliers
-        ],
+        "channels": [_channel_json(c) for c in fit.channels],
+        **_expected_json(fit.level, fit.tilted, fit.observability, fit.unseen_errors),
+        "outliers": [_outlier_json(o) for o in fit.outliers],
         "notes": fit.notes,
+    }
+
+
+def _channel_json(channel: ChannelFit) -> dict:
+    unit = _unit(channel.kind)
+    sizes = {f"{name}_{unit}": getattr(channel, name) for name in ("stated", "found", "held_out")}
+    return {"kind": channel.kind, "readings": channel.readings, "chi_square": channel.chi_square, **sizes}
+
+
+def _outlier_json(outlier: Outlier) -> dict:
+    name = CHANNELS[outlier.channel]
+    residual = {f"residual_{_unit(name.partition('_')[0])}": outlier.residual, "sigmas": outlier.sigmas}
+    return {"source": str(outlier.source), "channel": name, **residual}
+
+
+def _unit(kind: str) -> str:
+    return "rad" if kind in ANGULAR_KINDS else "m"
+
+
+def _expected_json(
+    level: ToolError | None, tilted: ToolError | None, seen: Observability, unseen_errors: tuple[str, ...]
+) -> dict:
+    """Return what a fit and a plan for one both say."""
+
+    def error(found: ToolError | None) -> dict | None:
+        if found is None:
+            return None
+        return {f"{name}_{'rad' if 'rotation' in name else 'm'}": value for name, value in vars(found).items()}
+
+    return {
+        "expected_tool_error": error(level),
+        "expected_tool_error_tilted": error(tilted),
+        "observability": {**vars(seen), "blocks": [vars(block) for block in seen.blocks]},
+        "unseen_errors": unseen_errors,
     }
 
 
@@ -161,13 +189,10 @@ def plan_report(plan: Plan) -> str:
 
 
 def plan_json(plan: Plan) -> dict:
-    """Return a plan as plain numbers, SI, for ``--json``."""
+    """Return a plan as plain numbers; units as in :func:`as_json`."""
     return {
         "machine": plan.measurements.geometry.name,
         "readings": len(plan.measurements),
         "parameters": plan.space.size,
-        "expected_tool_error": plan.level,
-        "expected_tool_error_tilted": plan.tilted,
-        "observability": plan.observability,
-        "unseen_errors": plan.unseen_errors,
+        **_expected_json(plan.level, plan.tilted, plan.observability, plan.unseen_errors),
     }

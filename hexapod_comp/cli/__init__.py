@@ -1,8 +1,9 @@
-"""The command ``hexapod_comp <verb>``; every verb lives in a module of :mod:`hexapod_comp.cli`."""
+# PYTHON_ARGCOMPLETE_OK
+"""The command ``hexapod_comp <verb>``: light parsers, and a module for each verb that is loaded when it is chosen."""
 
 from __future__ import annotations
 
-import argparse
+import importlib
 import os
 import re
 import sys
@@ -11,14 +12,7 @@ from collections.abc import Sequence
 from ..errors import HexapodError
 from ..formats.outputs import inputs_protected
 from ..formats.texts import accept_any_terminal
-
-PROGRAM = "hexapod_comp"
-
-DESCRIPTION = """Error compensation for hexapod machine tools: tool poses in, compensated strut lengths out.
-
-Lengths are shown in mm, corrections in µm, angles in degrees. A pose is the tool's pose in the work frame:
-x, y, z and the angles α, β, γ with R = Ry(β)·Rx(α)·Rz(γ). A machine or model is a file, or the name of a
-shipped one (paper, paper_machine, …)."""
+from .parsers import PROGRAM, make_parser
 
 NEGATIVE = re.compile(r"-[.\d]")
 """What follows an option and looks like this is its value, not another option."""
@@ -42,13 +36,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = sys.argv[1:] if argv is None else argv
     accept_any_terminal()
+    parser = make_parser()
+    if "_ARGCOMPLETE" in os.environ:
+        from .completion import complete
+
+        complete(parser)
     try:
-        args = make_parser().parse_args(_with_negative_values(arguments))
+        args = parser.parse_args(_with_negative_values(arguments))
     except SystemExit as leaving:  # argparse has printed help or what is wrong
         return leaving.code if isinstance(leaving.code, int) else USAGE_ERROR
+    if args.called != args.verb:
+        print(f"{PROGRAM}: note: {args.called} is now called {args.verb}", file=sys.stderr)
     try:
         with inputs_protected(args):
-            code = int(args.run(args))
+            code = int(importlib.import_module(f".{args.verb}", __name__).run(args))
         sys.stdout.flush()
         return code
     except HexapodError as error:
@@ -68,30 +69,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader has gone (| head); the interpreter must not complain when it flushes at its end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
-
-
-def make_parser() -> argparse.ArgumentParser:
-    """Return the parser with all verbs; importing them must stay cheap: ``--help`` answers at once."""
-    from . import assess, check, classify, demo, export, fit, fk, ik, iso230, measure, plan, replay, run
-
-    parser = argparse.ArgumentParser(
-        PROGRAM, description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and leave")
-    subparsers = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
-    for verb in (ik, fk, check, assess, run, demo, plan, measure, fit, iso230, export, classify, replay):
-        verb.add_parser(subparsers)
-    return parser
-
-
-class _Version(argparse.Action):
-    """Print the version of the code that runs."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from ..formats.paths import version
-
-        print(f"{PROGRAM} {version()}")
-        parser.exit()
 
 
 def _with_negative_values(arguments: Sequence[str]) -> list[str]:

@@ -18,65 +18,12 @@ if TYPE_CHECKING:
     from ..pose import Pose
     from ..virtual.assessment import Assessment
 
-SUMMARY = "what random imperfections within bounds do to strut lengths (mm) and poses (mm, degrees)"
-
-TEXT = """Draws machines within the bounds (uniform, ±) and prints for the first one, laid out as the paper's
-tables, the ideal strut lengths, the lengths that the real machine needs for the same poses, their difference, and
-the pose that the real machine takes under ideal lengths. With --machines N, percentiles over N machines
-with consecutive seeds. --out writes every machine and pose to a CSV file.
-
-example:
-  $ hexapod_comp assess config/table1.csv --joint-um 10 --strut-um 10 --machines 200 --seed 1
-  machine paper, joints ±10 µm, struts ±10 µm; seed 1…200
-  …
-  real minus ideal (Table 4 − Table 2):
-  sequence  dL1_um  dL2_um  dL3_um  dL4_um  dL5_um  dL6_um
-         1  21.763  -0.247  -2.168  13.330  -3.268  -4.341
-  …
-  largest strut change 34.198 µm (two joints in a corner of their cubes and a strut allow 44.641 µm)"""
-
 POSE_COLUMNS = ("alpha_deg", "beta_deg", "gamma_deg", "x_mm", "y_mm", "z_mm")
 MOST_RESULTS = 10_000_000
 """Machines times poses: more results are refused, they would need gigabytes."""
 
 PERCENTILES = (50.0, 95.0, 100.0)
 NAMES = ("median", "95 %", "max")
-
-
-def add_parser(subparsers: common.Subparsers) -> None:
-    """Add the verb."""
-    parser = common.add_verb(subparsers, "assess", run, SUMMARY, TEXT)
-    parser.add_argument(
-        "poses",
-        nargs="?",
-        default="table1.csv",
-        metavar="POSES.csv",
-        help="CSV file of poses (mm, degrees; default: the paper's Table 1); - for standard input",
-    )
-    for name, default, what in (
-        ("joint-um", 10.0, "every coordinate of every joint, µm"),
-        ("strut-um", 10.0, "every strut's length offset, µm"),
-        ("pitch-ppm", 0.0, "every screw's pitch error, ppm"),
-        ("wave-um", 0.0, "every screw's periodic error (its amplitude, drawn from 0 up), µm"),
-    ):
-        text = f"bound of {what} (default {default:g})"
-        parser.add_argument(f"--{name}", type=common.bound, default=default, metavar="BOUND", help=text)
-    parser.add_argument(
-        "--wave-period-mm",
-        type=common.bound,
-        default=10.0,
-        metavar="MM",
-        help="period of that error (default 10)",
-    )
-    parser.add_argument(
-        "--separate-platform-joints",
-        action="store_true",
-        help="struts that share a platform joint nominally each get one of their own",
-    )
-    parser.add_argument("--machines", type=common.count, default=1, metavar="N", help="how many to draw (default 1)")
-    parser.add_argument("--seed", type=common.seed, default=0, metavar="N", help="of the first machine (default 0)")
-    common.add_machine_options(parser, with_model=False)
-    common.add_output_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -104,12 +51,9 @@ def run(args: argparse.Namespace) -> int:
     names = [common.where(row) for row in rows]
     with common.progress_bar(args.machines, " machines") as bar:
         result = assess(geometry, poses, bounds, args.seed, args.machines, names, bar.update)
-    if args.json:
-        common.emit(common.json_text(_as_json(args, geometry, rows, poses, result)), args.out)
-        return 0
-    if args.out:
-        common.emit(common.csv_text(_records(rows, result)), args.out)
-    print(_report(args, geometry, rows, poses, result))
+    common.write_table(args, _records(rows, result) if args.out is not None else ())
+    as_json = common.json_text(_as_json(args, geometry, rows, poses, result)) if args.json else ""
+    common.show(as_json or _report(args, geometry, rows, poses, result))
     return 0
 
 

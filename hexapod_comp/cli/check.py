@@ -15,31 +15,6 @@ if TYPE_CHECKING:
     from ..machine.geometry import HexapodGeometry, Limits
     from ..machine.model import MachineModel
 
-SUMMARY = "which pose of a CSV file breaks which limit, with all margins, before anything moves"
-
-TEXT = """By default the rows are targets: the tool moves from one to the next with a rest at each, as `run`
-does, and the whole way is checked. With --stream the rows are consecutive commands at --rate-hz, and their steps
-and strut speeds are checked as they are. Limits hold for nominal and for compensated values (--model).
-Margins: stroke in mm to the nearer end, joint cones in degrees, distance of the struts' axes in mm if the machine
-limits it; condition number, correction (µm), step (mm) and speed (mm/s) are shown as values. Exit code: 0 all
-within, 1 a limit is broken, 2 bad input.
-
-example:
-  $ hexapod_comp check config/table1.csv
-  machine paper, model ideal: 10 poses as targets joined by moves at 250 Hz; 753 poses examined
-
-  margins of stroke and cones, values of the rest, the worst of the move to each pose:
-  row  line  stroke_mm  base_cone_deg  platform_cone_deg  condition  correction_um  step_mm  speed_mm_s
-    1     2    179.192         50.000             75.000      1.166           0.00        –           –
-    2     3    168.955         49.029             69.450      1.169           0.00   0.7646      191.15
-  …
-
-  smallest margin per limit:
-          limit   margin    value  allowed  unit  strut        stage  row  line  of the move
-         stroke  149.137  479.137  330.000    mm      3      nominal    9    10  at the pose
-  …
-  all within limits"""
-
 MOST_ROWS = 100
 """Rows of margins printed; --out writes all."""
 
@@ -59,18 +34,6 @@ LIMITS_SHOWN = {
 }
 
 
-def add_parser(subparsers: common.Subparsers) -> None:
-    """Add the verb."""
-    parser = common.add_verb(subparsers, "check", run, SUMMARY, TEXT)
-    parser.add_argument("poses", metavar="POSES.csv", help="CSV file of poses (mm, degrees); - for standard input")
-    parser.add_argument("--stream", action="store_true", help="rows are consecutive commands")
-    parser.add_argument(
-        "--rate-hz", type=common.finite, default=250.0, metavar="HZ", help="commands per second (default 250)"
-    )
-    common.add_machine_options(parser)
-    common.add_output_options(parser)
-
-
 def run(args: argparse.Namespace) -> int:
     """Run the verb; 0 when all limits are kept, 1 when one is broken."""
     from ..compensation.checks import check
@@ -82,12 +45,9 @@ def run(args: argparse.Namespace) -> int:
     common.mention_compiling("checks.examine_many")
     with common.progress_bar(len(rows), " poses") as bar:
         result = check(geometry, model, (positions, rotations), mode, args.rate_hz, bar.update)
-    if args.json:
-        common.emit(common.json_text(_as_json(geometry, model, rows, result)), args.out)
-    else:
-        if args.out:
-            common.emit(common.csv_text(_row_values(rows[n], n, result) for n in range(len(rows))), args.out)
-        print(_report(args, geometry, model, rows, result))
+    common.write_table(args, (_row_values(rows[n], n, result) for n in range(len(rows))))
+    as_json = common.json_text(_as_json(geometry, model, rows, result)) if args.json else ""
+    common.show(as_json or _report(args, geometry, model, rows, result))
     return 0 if result.ok else 1
 
 

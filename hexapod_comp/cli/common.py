@@ -1,4 +1,4 @@
-"""What the verbs share: options, how numbers are read from the command line, how results are shown."""
+"""What the verbs share: how files are found, how results are shown and written."""
 
 from __future__ import annotations
 
@@ -11,115 +11,20 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 from ..formats.texts import number
 
 if TYPE_CHECKING:
     import numpy as np
+    from matplotlib.figure import Figure
 
     from ..formats.csv import Row
     from ..machine.geometry import HexapodGeometry
     from ..machine.model import MachineModel
 
-Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
-
-POSE_HELP = "mm and degrees: x,y,z or x,y,z,alpha,beta,gamma"
-
 DECIMALS = {"mm": 9, "deg": 9, "um": 6, "urad": 6}
 """Digits after the point in CSV files: a picometre, and less than that at the platform's edge."""
-
-
-def add_verb(subparsers: Subparsers, name: str, run: Callable, summary: str, text: str) -> argparse.ArgumentParser:
-    """Add a verb's parser with its one-line summary and the text below its options."""
-    parser = subparsers.add_parser(
-        name,
-        help=summary,
-        description=summary,
-        epilog=text,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.set_defaults(run=run)
-    return parser
-
-
-def add_machine_options(parser: argparse.ArgumentParser, with_model: bool = True) -> None:
-    """Add ``--machine`` and ``--model``."""
-    parser.add_argument(
-        "--machine",
-        metavar="FILE",
-        default="paper.yaml",
-        help="geometry file, or the name of a shipped one (default paper.yaml)",
-    )
-    if with_model:
-        parser.add_argument(
-            "--model",
-            metavar="FILE",
-            default="ideal",
-            help="model of the machine's errors: a file, the name of a shipped one, or ideal (default)",
-        )
-
-
-def add_output_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--json`` and ``--out``."""
-    parser.add_argument("--json", action="store_true", help="JSON, for programs; units are in the keys")
-    parser.add_argument("--out", metavar="FILE", help="write to a file: CSV, or JSON with --json")
-
-
-def pose_argument(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Read ``x,y,z[,alpha,beta,gamma]`` in mm and degrees; return position, m, and angles, rad."""
-    numbers = _numbers(text)
-    if len(numbers) not in (3, 6):
-        raise argparse.ArgumentTypeError(f"needs three or six numbers ({POSE_HELP}), not {len(numbers)}")
-    angles = numbers[3:] or (0.0, 0.0, 0.0)
-    return tuple(v * 1e-3 for v in numbers[:3]), tuple(math.radians(v) for v in angles)
-
-
-def lengths_argument(text: str) -> tuple[float, ...]:
-    """Read six lengths in mm; return them in m."""
-    numbers = _numbers(text)
-    if len(numbers) != 6:
-        raise argparse.ArgumentTypeError(f"needs six lengths in mm, not {len(numbers)}")
-    return tuple(v * 1e-3 for v in numbers)
-
-
-def finite(text: str) -> float:
-    """Read one finite number."""
-    return _numbers(text)[0] if "," not in text else _not_a_number(text)
-
-
-def bound(text: str) -> float:
-    """Read a finite number that is not negative."""
-    number = finite(text)
-    if number < 0.0:
-        raise argparse.ArgumentTypeError(f"must not be negative, not {text}")
-    return number
-
-
-def count(text: str, most: int = 10_000_000) -> int:
-    """Read a whole number above zero, and not so large that nobody lives to see the end."""
-    if not text.isdecimal() or len(text) > 12 or not 1 <= int(text) <= most:
-        raise argparse.ArgumentTypeError(f"must be a whole number from 1 to {most}, not {text!r}")
-    return int(text)
-
-
-def seed(text: str) -> int:
-    """Read a whole number, zero or above."""
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"must be a whole number, 0 or above, not {text!r}")
-    return int(text)
-
-
-def _numbers(text: str) -> tuple[float, ...]:
-    try:
-        numbers = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        _not_a_number(text)
-    return numbers if all(map(math.isfinite, numbers)) else _not_a_number(text)
-
-
-def _not_a_number(text: str) -> Any:
-    raise argparse.ArgumentTypeError(f"is not finite numbers: {text!r}")
 
 
 def load_machine(args: argparse.Namespace) -> tuple[HexapodGeometry, MachineModel]:
@@ -174,14 +79,34 @@ def json_text(content: Any) -> str:
     return json_text(content)
 
 
-def emit(text: str, out: str | None) -> None:
-    """Print a result, or write it to the file that ``--out`` names."""
+def show(text: str) -> None:
+    """Print a result that may end with a line break or not."""
+    print(text, end="" if text.endswith("\n") else "\n")
+
+
+def write_table(args: argparse.Namespace, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write rows to the CSV file that ``--out`` names, if it names one."""
     from ..formats.yaml import write_text_atomically
 
-    if out is None:
-        print(text, end="" if text.endswith("\n") else "\n")
-    else:
-        write_text_atomically(out, text)
+    if args.out is not None:
+        write_text_atomically(args.out, csv_text(rows))
+
+
+def mention(args: argparse.Namespace, text: str) -> None:
+    """Print what was written where; beside JSON that is no part of the result."""
+    print(text, file=sys.stderr if args.json else sys.stdout)
+
+
+def save_pictures(args: argparse.Namespace, pictures: Callable[[], Mapping[str, Figure]]) -> None:
+    """Draw pictures and write them into the folder of ``--pictures``, if there is one, and say where they are."""
+    from ..formats.figures import save
+
+    if args.pictures is None:
+        return
+    for name, figure in pictures().items():
+        path = os.path.join(args.pictures, name)
+        save(figure, path)
+        mention(args, f"picture: {path}")
 
 
 def mention_compiling(kernel: str) -> None:

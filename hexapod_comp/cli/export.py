@@ -16,73 +16,8 @@ if TYPE_CHECKING:
     from ..export.worth import Comparison, ExportCheck, ExportTrial, Size
     from ..machine.model import MachineModel
 
-SUMMARY = "write a model as LinuxCNC configuration or as a trilinear table, and check what it leaves"
-
-TEXT = """--linuxcnc writes into a folder: genhexkins.hal (setp lines with the real joints), strut_1.comp … strut_6.comp
-(offset, pitch, screw wave, length map and backlash of each strut, at most 256 points) and comp.ini (lines to copy
-into the ini file). --table writes corrections of struts and of poses on a grid of positions of a level tool, forward
-and backward, as CSV. Files of the same names are replaced.
-
-Every file is then read back, and the machine that the model describes is driven through it along random poses, level
-and tilted, forward and backward: the report gives the tool's 3-D error before and after, and the size of what
-the export cannot carry. The exit code is 1 when it would make the error larger.
-
-example:
-  $ hexapod_comp export --machine paper.yaml --model paper_machine.yaml --linuxcnc linuxcnc --table table.csv"""
-
 HARMLESS = 10e-9
 """An error that grows by less than this, m, has not grown: the files' digits and LinuxCNC's floats count for more."""
-
-
-def add_parser(subparsers: common.Subparsers) -> None:
-    """Add the verb."""
-    parser = common.add_verb(subparsers, "export", run, SUMMARY, TEXT)
-    common.add_machine_options(parser)
-    parser.add_argument("--linuxcnc", metavar="DIR", help="folder for LinuxCNC's files; made if it is missing")
-    parser.add_argument("--table", metavar="FILE.csv", help="CSV file for the trilinear table")
-    parser.add_argument(
-        "--units", choices=("mm", "inch"), default="mm", help="LinuxCNC's machine unit, [TRAJ]LINEAR_UNITS (default mm)"
-    )
-    parser.add_argument(
-        "--box",
-        type=box_argument,
-        metavar="X0,Y0,Z0,X1,Y1,Z1",
-        help="lowest and highest tool position, mm (default: the model's valid box, else its field's)",
-    )
-    parser.add_argument(
-        "--step-mm", type=step_argument, default=25.4, metavar="MM", help="largest step of the table (default 25.4)"
-    )
-    parser.add_argument(
-        "--poses", type=check_count, default=1000, metavar="N", help="random poses to check (default 1000, the least)"
-    )
-    parser.add_argument("--tilt-deg", type=common.bound, default=5.0, metavar="DEG", help="tilt to check (default 5)")
-    parser.add_argument("--seed", type=common.seed, default=0, metavar="N", help="of the random poses (default 0)")
-    parser.add_argument("--json", action="store_true", help="report as JSON, for programs; units are in the keys")
-
-
-def box_argument(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Read two corners in mm; return the lowest and the highest, m."""
-    numbers = common.lengths_argument(text)
-    low, high = numbers[:3], numbers[3:]
-    if not all(a < b for a, b in zip(low, high, strict=True)):
-        raise argparse.ArgumentTypeError(f"must be the lowest corner, then the highest, not {text}")
-    return low, high
-
-
-def step_argument(text: str) -> float:
-    """Read a step in mm, above zero."""
-    step = common.finite(text)
-    if step <= 0.0:
-        raise argparse.ArgumentTypeError(f"must be above zero, not {text}")
-    return step
-
-
-def check_count(text: str) -> int:
-    """Read how many poses to check: a thousand or more."""
-    number = common.count(text)
-    if number < 1000:
-        raise argparse.ArgumentTypeError(f"must be 1000 or more, not {text}")
-    return number
 
 
 def run(args: argparse.Namespace) -> int:

@@ -16,39 +16,7 @@ if TYPE_CHECKING:
     from ..machine.model import MachineModel
     from ..pose import Pose
 
-SUMMARY = "tool pose (mm, degrees) for six strut lengths (mm) or a CSV file of them"
-
-TEXT = """A file's columns are L1_mm … L6_mm (or _m, _um, _in), optionally sequence or name; CSV in gives CSV
-out, which ik and check read. With --model the lengths are commands, and the pose is where the real machine
-goes. Newton starts at home, or at --guess; --cold needs no guess: it finds every pose with these lengths
-and picks the one in which the machine can work (6-3 machines).
-
-example:
-  $ hexapod_comp fk --lengths 519.494,519.808,509.192,509.192,499.282,498.955
-  machine paper
-       x_mm      y_mm        z_mm  alpha_deg  beta_deg  gamma_deg
-  -0.000130  0.000034  400.000021   5.000127  0.000074   0.000011
-  $ hexapod_comp ik config/table1.csv | hexapod_comp fk -"""
-
 MODE_COLUMNS = ("mode", "x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg", "")
-
-
-def add_parser(subparsers: common.Subparsers) -> None:
-    """Add the verb."""
-    parser = common.add_verb(subparsers, "fk", run, SUMMARY, TEXT)
-    parser.add_argument("lengths_file", nargs="?", metavar="LENGTHS.csv", help="CSV file; - for standard input")
-    parser.add_argument("--lengths", type=common.lengths_argument, metavar="L1,…,L6", help="six lengths, mm")
-    start = parser.add_mutually_exclusive_group()
-    start.add_argument(
-        "--guess",
-        type=common.pose_argument,
-        metavar="X,Y,Z[,A,B,C]",
-        help=f"{common.POSE_HELP}; default home",
-    )
-    start.add_argument("--cold", action="store_true", help="no guess: pick the working assembly mode")
-    start.add_argument("--all-modes", action="store_true", help="list every assembly mode of the nominal machine")
-    common.add_machine_options(parser)
-    common.add_output_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -63,9 +31,9 @@ def run(args: argparse.Namespace) -> int:
     geometry, model = common.load_machine(args)
     common.mention_compiling("kinematics.solve_pose_many")
     if args.all_modes:
-        common.emit(_all_modes(args, geometry, lengths[0]), args.out)
+        _all_modes(args, geometry, lengths[0])
     else:
-        common.emit(_poses(args, geometry, model, rows, lengths), args.out)
+        _poses(args, geometry, model, rows, lengths)
     return 0
 
 
@@ -85,21 +53,23 @@ def _poses(
     model: MachineModel,
     rows: list[Row],
     lengths: np.ndarray,
-) -> str:
-    """Solve all rows and return the result as JSON, CSV or, for one set of lengths, as a table."""
+) -> None:
+    """Solve all rows; write the CSV file, print JSON or, where no file was written, CSV or a table of one pose."""
     from ..formats.csv import pose_values
 
     poses = _solve(args, geometry, model, rows, lengths)
     table: list[dict[str, Any]] = [
         {"sequence": row.label, **pose_values(geometry.tool_pose(pose))} for row, pose in zip(rows, poses, strict=True)
     ]
+    common.write_table(args, table)
     if args.json:
-        return common.json_text({"machine": geometry.name, "model": model.name, "rows": table})
-    if args.lengths is None or args.out:
-        return common.csv_text(table)
-    header = list(table[0])[1:]
-    title = f"machine {geometry.name}" + (f", model {model.name}" if args.model != "ideal" else "")
-    return f"{title}\n{texts.aligned(header, [[texts.number(table[0][name], 6) for name in header]])}\n"
+        common.show(common.json_text({"machine": geometry.name, "model": model.name, "rows": table}))
+    elif args.out is None and args.lengths is None:
+        common.show(common.csv_text(table))
+    elif args.out is None:
+        header = list(table[0])[1:]
+        title = f"machine {geometry.name}" + (f", model {model.name}" if args.model != "ideal" else "")
+        common.show(f"{title}\n{texts.aligned(header, [[texts.number(table[0][name], 6) for name in header]])}")
 
 
 def _solve(
@@ -151,8 +121,8 @@ def _guess(args: argparse.Namespace, geometry: HexapodGeometry) -> Pose:
     return geometry.platform_pose(Pose.from_angles(*args.guess))
 
 
-def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.ndarray) -> str:
-    """List every assembly mode, and say for each why it is, or is not, the working one."""
+def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.ndarray) -> None:
+    """Show every assembly mode, and say for each why it is, or is not, the working one."""
     from ..errors import KinematicsError, UnreachableError
     from ..formats.csv import pose_values
     from ..machine.assembly import assembly_modes, mode_objections, working_mode
@@ -166,17 +136,21 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
         working, reason = working_mode(geometry, structure, lengths), ""
     except KinematicsError as error:
         working, reason = None, str(error)
-    found: list[dict[str, Any]] = []
+    listed: list[dict[str, Any]] = []
     for index, mode in enumerate(modes, start=1):
         objections = mode_objections(geometry, structure, mode)
         is_working = working is not None and _same(mode, working)
         values = pose_values(geometry.tool_pose(mode))
-        found.append({"mode": index, **values, "working": is_working, "objections": objections})
+        listed.append({"mode": index, **values, "working": is_working, "objections": objections})
+    joined = [{**m, "working": int(m["working"]), "objections": "; ".join(m["objections"])} for m in listed]
+    common.write_table(args, joined)
     if args.json:
-        return common.json_text({"machine": geometry.name, "modes": found, "no_working_mode": reason})
-    body = [[str(m["mode"]), *(texts.number(m[name], 6) for name in MODE_COLUMNS[1:7]), _verdict(m)] for m in found]
-    lines = [f"machine {geometry.name}: {len(modes)} assembly modes", texts.aligned(MODE_COLUMNS, body)]
-    return "\n".join(lines + [f"no working mode: {reason}"] * bool(reason)) + "\n"
+        common.show(common.json_text({"machine": geometry.name, "modes": listed, "no_working_mode": reason}))
+    elif args.out is None:
+        numbers = MODE_COLUMNS[1:7]
+        body = [[str(m["mode"]), *(texts.number(m[name], 6) for name in numbers), _verdict(m)] for m in listed]
+        lines = [f"machine {geometry.name}: {len(modes)} assembly modes", texts.aligned(MODE_COLUMNS, body)]
+        common.show("\n".join(lines + [f"no working mode: {reason}"] * bool(reason)))
 
 
 def _same(one: Pose, other: Pose) -> bool:

@@ -7,7 +7,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from ..formats import texts
-from . import common
+from . import arguments, common
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,41 +16,6 @@ if TYPE_CHECKING:
     from ..formats.csv import Row
     from ..machine.geometry import HexapodGeometry
     from ..machine.model import MachineModel
-
-SUMMARY = "strut lengths (mm) for a tool pose or a CSV file of poses (mm, degrees)"
-
-TEXT = """A file's columns are x_mm, y_mm, z_mm, optionally alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw)
-and sequence or name; other units by their suffix (_m, _um, _in, _rad). CSV in gives CSV out, L1_mm … L6_mm,
-which fk reads. With --model, L1_mm … L6_mm are the lengths to command, nominal_L1_mm … and
-correction_L1_um … (command − nominal) follow. Directions of motion are not known here: a backlash counts
-half either way. Lengths are given for any pose; limits that it breaks are named on stderr (see check).
-
-example:
-  $ hexapod_comp ik --pose 0,0,400,5,0,0
-  machine paper
-    strut  nominal_mm
-  strut_1  519.493721
-  strut_2  519.807869
-  strut_3  509.191843
-  strut_4  509.191843
-  strut_5  499.282327
-  strut_6  498.955256
-  $ hexapod_comp ik config/table1.csv --model paper_machine --out lengths.csv"""
-
-POSE_OPTIONS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
-
-
-def add_parser(subparsers: common.Subparsers) -> None:
-    """Add the verb."""
-    parser = common.add_verb(subparsers, "ik", run, SUMMARY, TEXT)
-    parser.add_argument("poses", nargs="?", metavar="POSES.csv", help="CSV file of poses; - for standard input")
-    parser.add_argument("--pose", type=common.pose_argument, metavar="X,Y,Z[,A,B,C]", help=common.POSE_HELP)
-    for name in POSE_OPTIONS:
-        unit = "mm" if name.endswith("mm") else "degrees"
-        text = f"the pose number by number, {unit}"
-        parser.add_argument(f"--{name.replace('_', '-')}", type=common.finite, metavar="NUMBER", help=text)
-    common.add_machine_options(parser)
-    common.add_output_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -63,8 +28,7 @@ def run(args: argparse.Namespace) -> int:
     common.mention_compiling("checks.examine_many")
     result = check(geometry, model, (positions, rotations), "poses")
     _refuse_lengthless(result, rows)
-    with_model = args.model != "ideal"
-    common.emit(_text(args, geometry, model, rows, result, with_model), args.out)
+    _show(args, geometry, model, rows, result)
     for breach in result.breaches:
         print(f"hexapod_comp: note: {common.where(rows[breach.row])}: {breach.error}", file=sys.stderr)
     return 0
@@ -74,7 +38,7 @@ def _given_pose(args: argparse.Namespace) -> tuple[list[Row], np.ndarray, np.nda
     """Return the pose given by options, None when a file is; refuse both and neither."""
     from ..errors import CommandError
 
-    single = [getattr(args, name) for name in POSE_OPTIONS]
+    single = [getattr(args, name) for name in arguments.POSE_OPTIONS]
     ways = [args.poses is not None, args.pose is not None, any(value is not None for value in single)]
     if sum(ways) != 1:
         problem = "give a CSV file of poses, or --pose, or --x-mm --y-mm --z-mm; exactly one of the three"
@@ -83,10 +47,10 @@ def _given_pose(args: argparse.Namespace) -> tuple[list[Row], np.ndarray, np.nda
         return None
     if args.pose is not None:
         return common.one_row(args.pose)
-    missing = [name for name, value in zip(POSE_OPTIONS[:3], single, strict=False) if value is None]
+    missing = [name for name, value in zip(arguments.POSE_OPTIONS[:3], single, strict=False) if value is None]
     if missing:
         raise CommandError("usage", f"--{missing[0].replace('_', '-')} is missing")
-    return common.one_row(common.pose_argument(",".join(repr(value or 0.0) for value in single)))
+    return common.one_row(arguments.pose(",".join(repr(value or 0.0) for value in single)))
 
 
 def _refuse_lengthless(result: CheckResult, rows: list[Row]) -> None:
@@ -104,22 +68,18 @@ def _refuse_lengthless(result: CheckResult, rows: list[Row]) -> None:
     raise NotFiniteError(f"{common.where(rows[row])}: strut lengths are not finite")
 
 
-def _text(
-    args: argparse.Namespace,
-    geometry: HexapodGeometry,
-    model: MachineModel,
-    rows: list[Row],
-    result: CheckResult,
-    with_model: bool,
-) -> str:
-    """Return the result as JSON, CSV or, for one pose, as a table."""
+def _show(
+    args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel, rows: list[Row], result: CheckResult
+) -> None:
+    """Write the CSV file; print JSON or, where no file was written, CSV or a table of one pose."""
+    with_model = args.model != "ideal"
     table = [_columns(row, lengths, with_model) for row, lengths in zip(rows, result.lengths, strict=True)]
+    common.write_table(args, table)
     if args.json:
-        head = {"machine": geometry.name, "model": model.name}
-        return common.json_text({**head, "rows": table})
-    if args.poses is not None or args.out:
-        return common.csv_text(table)
-    return _one_pose(geometry, model, result.lengths[0], with_model)
+        common.show(common.json_text({"machine": geometry.name, "model": model.name, "rows": table}))
+    elif args.out is None:
+        one = args.poses is None
+        common.show(_one_pose(geometry, model, result.lengths[0], with_model) if one else common.csv_text(table))
 
 
 def _columns(row: Row, lengths: np.ndarray, with_model: bool) -> dict[str, Any]:

@@ -5,23 +5,6 @@ from __future__ import annotations
 import argparse
 
 from . import common
-from .fit import add_reading_options
-
-SUMMARY = "the figures of ISO 230-2:2014 (A, E, R, M, B) of measured lines"
-
-TEXT = """Judges every linear run with two cycles or more, all targets read from both sides in each (the standard asks
-for five cycles; a campaign says how many it makes). --targets prints each run target by target.
-
-example:
-  $ hexapod_comp iso230 measured.csv"""
-
-
-def add_parser(subparsers: common.Subparsers) -> None:
-    """Add the verb."""
-    parser = common.add_verb(subparsers, "iso230", run, SUMMARY, TEXT)
-    add_reading_options(parser)
-    parser.add_argument("--targets", action="store_true", help="each run target by target, with notes")
-    parser.add_argument("--json", action="store_true", help="JSON, for programs; m")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -41,10 +24,15 @@ def run(args: argparse.Namespace) -> int:
         problem = "no linear run has two cycles or more with every target read from both sides in each"
         raise CalibrationError("measurements", problem)
     if args.json:
-        text = common.json_text({name: test.figures() for name, test in tests.items()})
+        text = common.json_text({name: with_units(test.figures()) for name, test in tests.items()})
     elif args.targets:
         text = "\n\n".join(f"{name}\n{report(test)}" for name, test in tests.items())
     else:
         text = table(tests)
-    common.emit(text, None)
+    common.show(text)
     return 0
+
+
+def with_units(figures: dict[str, float]) -> dict[str, float]:
+    """Return the standard's figures with their unit in the keys: ``A_m``, ``E_up_m``, …"""
+    return {f"{name}_m": value for name, value in figures.items()}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import TYPE_CHECKING
 
 from . import common
@@ -15,46 +14,10 @@ if TYPE_CHECKING:
     from ..replay.bag import Files, Recording
     from ..replay.report import Report
 
-SUMMARY = "run a recorded bag through the compensator again: the same corrections, bit for bit?"
-
-TEXT = """BAG is a folder that `ros2 bag record` has written (MCAP or sqlite3), or one of its files. It must hold
-compensator/journal; with compensator/files the geometry and the model that were in use come along. strut_states and
-tool_pose_estimate are shown in the pictures.
-
-With --model (or --machine) of another file than was in use, the report also says what that would have corrected.
-Exit code 0: the same bits, or within --tolerance-um; 1: not the same; 2: the bag cannot be used.
-
-example:
-  $ ros2 bag record --storage mcap --output run --all
-  $ hexapod_comp replay run --pictures out/replay
-  run: /compensator, machine paper, model shipped example: the virtual machine of the demo
-  from 2026-11-21 20:11:05 UTC, 12.0 s: 3001 commands taken, 3000 answered, 1 refused
-  replayed 3000 of 3000 answers: identical bit for bit
-  …"""
-
 NOTHING = (
     "nothing in it can be compared: no answer follows a snapshot of the journal without a page lost between; "
     "record for longer than a second"
 )
-
-
-def add_parser(subparsers: common.Subparsers) -> None:
-    """Add the verb."""
-    parser = common.add_verb(subparsers, "replay", run, SUMMARY, TEXT)
-    parser.add_argument("bag", metavar="BAG", help="folder of a bag, .mcap or .db3 file")
-    parser.add_argument("--namespace", metavar="NAME", help="the machine meant, when the bag holds several")
-    own = "(default: what the recording carries)"
-    parser.add_argument("--machine", metavar="FILE", help=f"geometry file, or the name of a shipped one {own}")
-    parser.add_argument("--model", metavar="FILE", help=f"model file, the name of a shipped one, or ideal {own}")
-    parser.add_argument(
-        "--tolerance-um",
-        type=common.bound,
-        default=0.0,
-        metavar="UM",
-        help="accept differences up to this, µm (default 0: the same bits)",
-    )
-    parser.add_argument("--pictures", metavar="FOLDER", help="write pictures into a folder")
-    common.add_output_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -69,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
         from ..replay.pictures import write_pictures
 
         for path in write_pictures(report, geometry, args.pictures):
-            print(f"hexapod_comp: wrote {path}", file=sys.stderr)
+            common.mention(args, f"picture: {path}")
     return 0 if report.same else 1
 
 
@@ -98,12 +61,8 @@ def _replayed(args: argparse.Namespace, recording: Recording) -> tuple[Report, H
 def _show(args: argparse.Namespace, report: Report) -> None:
     from ..replay.report import as_json, rows_of, text
 
-    if args.json:
-        common.emit(common.json_text(as_json(report)), args.out)
-        return
-    if args.out:
-        common.emit(common.csv_text(rows_of(report)), args.out)
-    print(text(report))
+    common.write_table(args, rows_of(report) if args.out is not None else ())
+    common.show(common.json_text(as_json(report)) if args.json else text(report))
 
 
 def _given(args: argparse.Namespace) -> dict[str, Source]:

@@ -14,8 +14,11 @@ from ..errors import InputFileError
 READ = ("bag", "budget", "campaign", "columns", "files", "lengths_file", "machine", "model", "poses", "truth")
 """Arguments of all verbs that name what is read: files, shipped files, or a bag's folder."""
 
-WRITTEN = ("covariance", "json", "linuxcnc", "out", "pictures", "plot", "report", "table")
-"""Arguments that name what is written: files, or folders for them. ``json`` is a switch for most verbs."""
+WRITTEN = ("covariance", "out", "report", "table")
+"""Arguments that name files to write."""
+
+FOLDERS = ("linuxcnc", "pictures")
+"""Arguments that name folders to write into; they are made."""
 
 _protected: dict[tuple[int, int], str] = {}
 """What this command reads, by device and inode, and as what it was named; empty outside of a command."""
@@ -28,7 +31,7 @@ def inputs_protected(args: argparse.Namespace) -> Iterator[None]:
     Raises
     ------
     InputFileError
-        An output is one of the inputs.
+        An output is one of the inputs, or its place cannot take it: better now than after a long calculation.
     """
     try:
         for name in READ:
@@ -36,10 +39,11 @@ def inputs_protected(args: argparse.Namespace) -> Iterator[None]:
             for value in given if isinstance(given, list) else [given]:
                 if isinstance(value, str):
                     _protected.update((identity, value) for identity in _identities(value))
-        for name in WRITTEN:
+        for name in (*WRITTEN, *FOLDERS):
             value = getattr(args, name, None)
             if isinstance(value, str):
                 refuse_replacing_input(value)
+                (_refuse_no_folder if name in FOLDERS else _refuse_no_file)(value)
         yield
     finally:
         _protected.clear()
@@ -51,6 +55,22 @@ def refuse_replacing_input(path: str | Path) -> None:
     if identity is not None and identity in _protected:
         problem = f"is read by this command, as {_protected[identity]}, and would be replaced; write to another file"
         raise InputFileError(path, "", problem)
+
+
+def _refuse_no_file(path: str) -> None:
+    """Raise where no file of this name can be."""
+    if os.path.isdir(path):
+        raise InputFileError(path, "", "cannot be written: it is a folder, and a file is wanted")
+    if not os.path.isdir(os.path.dirname(path) or "."):
+        raise InputFileError(path, "", "cannot be written: its folder does not exist")
+
+
+def _refuse_no_folder(path: str) -> None:
+    """Raise where a file is in the way of a folder, here or above."""
+    while path and not os.path.exists(path):
+        path = os.path.dirname(path)
+    if path and not os.path.isdir(path):
+        raise InputFileError(path, "", "cannot be made a folder: it is a file")
 
 
 def _identities(name: str) -> list[tuple[int, int]]:

@@ -22,7 +22,7 @@ from ..machine.trajectory import Path, circle, commanded_in_base, join, move, po
 from ..pose import Pose
 from . import session
 from .processes import NodeProcess
-from .records import PoseRecord, SessionResult
+from .records import PathRecord, PoseRecord, SessionResult, Track
 
 if TYPE_CHECKING:
     from ..nodes.client import LoopClient
@@ -205,7 +205,18 @@ def as_json(rows: list[Row], result: SessionResult) -> dict[str, object]:
         "refused": result.refused,
         "latency_median_ms": np.median(result.latencies) * 1e3 if len(result.latencies) else None,
         "poses": [_pose_json(row, record) for row, record in zip(rows, result.poses, strict=True)],
+        "path": None if result.path is None else _path_json(result.path),
     }
+
+
+def _path_json(record: PathRecord) -> dict[str, object]:
+    def distance(track: Track | None) -> dict[str, float] | None:
+        found = None if track is None else track.deviation * 1e6
+        return None if found is None else {"rms_um": rms(found), "max_um": float(found.max())}
+
+    without, compensated = distance(record.without), distance(record.compensated)
+    sent = {"poses": len(record.path), "rate_hz": record.path.rate}
+    return {**sent, "distance_without": without, "distance_with": compensated}
 
 
 def _pose_json(row: Row, record: PoseRecord) -> dict[str, object]:

@@ -29,7 +29,7 @@ from hexapod_comp.workspace import runner, study
 PNG = b"\x89PNG\r\n\x1a\n"
 TYPES = ("screw_pitch", "quantisation", "base_joint_xy", "base_joint_z", "platform_joint_xy", "platform_joint_z")
 PICTURES = {"ranking.png", "causes.png", *(f"shells_{name}.png" for name in TYPES)}
-TABLES = {"report.txt", "ranking.csv", "ranking.json"}
+TABLE = {"ranking.csv"}
 PAGE = {"page.html"} if importlib.util.find_spec("plotly") else set()
 
 QUICK = ("--cells", "4", "--tilt-deg", "0", "--no-page")
@@ -51,6 +51,7 @@ class Done:
 
     folder: Path
     outcome: Run
+    json: str = ""
 
     @property
     def rows(self) -> list[dict[str, str]]:
@@ -59,7 +60,7 @@ class Done:
 
     @property
     def content(self) -> dict:
-        return json.loads((self.folder / "ranking.json").read_text(encoding="utf-8"))
+        return json.loads(self.json)
 
 
 @pytest.fixture(scope="module")
@@ -67,13 +68,23 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
     """The shipped machine and budget: four orientations tilted about x and y, allowed error, three methods."""
     folder = tmp_path_factory.mktemp("classified") / "deep" / "out"
     options = ("--cells", "8", "--tilt-deg", "-4,4", "--allow-um", "50", "--compare", "2")
-    return Done(folder, classify("--out", folder, *options))
+    folder.mkdir(parents=True)
+    written = ("--out", folder / "ranking.csv", "--pictures", folder)
+    studies: list[study.Study] = []
+    real = study.classify
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study, "classify", lambda *a, **o: studies.append(real(*a, **o)) or studies[-1])
+        outcome = classify(*written, *options)
+        patch.setattr(study, "classify", lambda *a, **o: studies[0])
+        code, text, err = classify("--json", *options)
+        assert (code, err) == (0, "")
+    return Done(folder, outcome, text)
 
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the pictures out, which take longer than all the rest."""
-    monkeypatch.setattr("hexapod_comp.cli.classify._draw", lambda *arguments: None)
+    monkeypatch.setattr("hexapod_comp.cli.classify._figures", lambda *arguments: {})
 
 
 def assert_refused(outcome: Run, folder: Path, complaint: str) -> None:
@@ -93,8 +104,7 @@ def assert_refused(outcome: Run, folder: Path, complaint: str) -> None:
 def test_everything_is_written_and_nothing_else(done: Done) -> None:
     code, out, err = done.outcome
     assert (code, err) == (0, "")
-    assert {path.name for path in done.folder.iterdir()} == TABLES | PICTURES | PAGE
-    assert out.startswith((done.folder / "report.txt").read_text(encoding="utf-8"))
+    assert {path.name for path in done.folder.iterdir()} == TABLE | PICTURES | PAGE
     for name in PICTURES | PAGE:
         assert name in out
 
@@ -217,14 +227,14 @@ def test_the_page_is_one_whole_file(done: Done) -> None:
 def test_without_plotly_the_rest_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undrawn: None) -> None:
     for name in ("plotly", "plotly.offline"):
         monkeypatch.setitem(sys.modules, name, None)
-    code, out, _ = classify("--out", tmp_path, "--cells", 4, "--tilt-deg", 0)
+    out = ("--out", tmp_path / "ranking.csv", "--pictures", tmp_path)
+    code, out, _ = classify(*out, "--cells", 4, "--tilt-deg", 0)
     assert code == 0
     assert "no page: the interactive page needs plotly: pip install hexapod_comp[pages]" in out
-    assert {path.name for path in tmp_path.iterdir()} == TABLES
+    assert {path.name for path in tmp_path.iterdir()} == TABLE
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_options_reach_the_survey(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_options_reach_the_survey(monkeypatch: pytest.MonkeyPatch) -> None:
     """What they do there is test_runner's."""
     given: list[tuple[object, ...]] = []
 
@@ -234,11 +244,10 @@ def test_options_reach_the_survey(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(study, "survey", spy)
     options = ("--workers", 3, "--scheduler", "tcp://127.0.0.1:8786", "--method", "linear")
-    assert classify("--out", tmp_path, *QUICK, *options)[0] == 0
+    assert classify(*QUICK, *options)[0] == 0
     assert [one[:3] for one in given] == [("linear", 3, "tcp://127.0.0.1:8786")]
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_a_budget_of_ones_own(tmp_path: Path) -> None:
     """Types that 004 has no row for stand without brackets; the tool's error is as large as it is everywhere."""
     budget = tmp_path / "mine.yaml"
@@ -247,7 +256,7 @@ def test_a_budget_of_ones_own(tmp_path: Path) -> None:
         "errors: {tool_offset_um: 5, backlash_um: 4, thermal_growth_ppm: 60}\n",
         encoding="utf-8",
     )
-    done = Done(tmp_path / "out", classify("--budget", budget, "--out", tmp_path / "out", *QUICK))
+    done = Done(tmp_path, classify("--budget", budget, "--out", tmp_path / "ranking.csv", *QUICK))
     assert done.outcome[0] == 0
     assert "15 single errors of 3 types" in done.outcome[1]
     rows = {row["error_type"]: row for row in done.rows}
@@ -303,23 +312,36 @@ def test_what_is_wrong_is_refused(
     (tmp_path / "in").mkdir()
     monkeypatch.chdir(tmp_path / "in")
     Path("b.yaml").write_text(f"{BUDGET}{brace}{errors}\n", encoding="utf-8")
-    assert_refused(classify("--out", tmp_path / "out", *QUICK, *given.split()), tmp_path / "out", complaint)
+    written = ("--out", tmp_path / "ranking.csv", "--pictures", tmp_path / "out")
+    assert_refused(classify(*written, *QUICK, *given.split()), tmp_path / "out", complaint)
+    assert {path.name for path in tmp_path.iterdir()} == {"in"}
 
 
 @pytest.mark.parametrize("below", ["", "/deeper"])
-def test_a_file_is_no_folder(tmp_path: Path, below: str) -> None:
+def test_a_file_is_no_folder_for_pictures(tmp_path: Path, below: str) -> None:
     """And it stays as it is."""
     out = tmp_path / "file"
     out.write_text("mine", encoding="utf-8")
-    assert_refused(classify("--out", f"{out}{below}", *QUICK), tmp_path / "none", "file")
+    assert_refused(classify("--pictures", f"{out}{below}", *QUICK), tmp_path / "none", "it is a file")
     assert out.read_text(encoding="utf-8") == "mine"
     assert list(tmp_path.iterdir()) == [out]
 
 
-def test_out_is_needed() -> None:
-    code, _, err = classify("--cells", 8)
-    assert code == 2
-    assert "--out" in err.splitlines()[-1]
+@pytest.mark.parametrize(
+    ("out", "complaint"),
+    [("", "it is a folder, and a file is wanted"), ("none/r.csv", "folder does not exist"), ("r.json", "--json > ")],
+)
+def test_the_ranking_is_a_csv_file(tmp_path: Path, out: str, complaint: str) -> None:
+    """Said before anything is calculated; ``--out`` was a folder once."""
+    assert_refused(classify("--out", tmp_path / out, *QUICK), tmp_path, complaint)
+
+
+def test_without_options_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, out, err = classify("--cells", 4, "--tilt-deg", 0)
+    assert (code, err) == (0, "")
+    assert "transl. max µm" in out
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("when", ["survey", "report", "drawing"])
@@ -337,10 +359,10 @@ def test_an_interruption_leaves_no_half_written_file(
         "drawing": "hexapod_comp.workspace.pictures.ranking_figure",
     }
     monkeypatch.setattr(where[when], interrupted)
-    code, _, err = classify("--out", tmp_path, *QUICK)
+    code, _, err = classify("--out", tmp_path / "ranking.csv", "--pictures", tmp_path, *QUICK)
     assert code == 130
     assert "Traceback" not in err
     written = {path.name for path in tmp_path.iterdir()}
-    assert written == (TABLES if when == "drawing" else set())
+    assert written == (TABLE if when == "drawing" else set())
     if when == "drawing":
         assert len(Done(tmp_path, (code, "", err)).rows) == 4

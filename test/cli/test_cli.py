@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 import re
 import subprocess
 import sys
@@ -19,8 +20,8 @@ from scipy.spatial.transform import Rotation
 from strategies import paper_geometry, random_field, random_model
 
 from hexapod_comp import cli
-from hexapod_comp.cli import assess, fk, ik
-from hexapod_comp.cli import check as check_verb
+from hexapod_comp.cli import ik
+from hexapod_comp.cli.verbs import VERBS
 from hexapod_comp.compensation.checks import LIMITS, check
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.errors import GeometryError, HexapodError
@@ -72,8 +73,95 @@ def test_help_is_fast_and_needs_no_compiler() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=20)
     assert done.returncode == 0, done.stderr
-    for verb in ("ik", "fk", "check", "assess", "run", "demo"):
-        assert re.search(rf"^    {verb} ", done.stdout, re.MULTILINE)
+    listed = re.findall(r"^ +(\w+):$|^    (\w+)  ", done.stdout, re.MULTILINE)
+    assert " ".join(group + ":" if group else verb for group, verb in listed) == (
+        "kinematics: ik fk check loop: run demo replay calibration: plan simulate fit iso230 export "
+        "analysis: assess classify"
+    )
+    assert all(len(line) <= 80 for line in done.stdout.splitlines() if line.startswith("    ")), "one line a verb"
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_each_verb_explains_itself_and_its_module_is_not_loaded(verb: str) -> None:
+    """A verb's module is imported when it runs; its help has an example, and units where it shows numbers."""
+    code = (
+        f"import sys, hexapod_comp.cli as cli; assert cli.main(['{verb}', '--help']) == 0; "
+        f"heavy = {{'numpy', 'numba', 'scipy', 'matplotlib', 'hexapod_comp.cli.{verb}'}} & set(sys.modules); "
+        "assert not heavy, heavy"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=20)
+    assert done.returncode == 0, done.stderr
+    assert f"$ hexapod_comp {verb} " in done.stdout.partition("example:\n")[2] + " "
+    assert re.search(r"mm|um|µm|degrees", done.stdout)
+
+
+def test_an_old_name_works_and_says_the_new_one(hexapod, tmp_path: Path) -> None:
+    code, out, err = hexapod("measure", "--out", str(tmp_path / "none" / "m.csv"))
+    assert (code, out) == (2, "")
+    note, error = err.splitlines()
+    assert note == "hexapod_comp: note: measure is now called simulate"
+    assert "its folder does not exist" in error
+    assert hexapod("measure", "--help")[1].startswith("usage: hexapod_comp simulate")
+
+
+def test_an_old_option_names_the_new_one(hexapod) -> None:
+    code, out, err = hexapod("demo", "--plot", "out/demo.png")
+    assert (code, out) == (2, "")
+    assert err.endswith("error: argument --plot: is now --pictures FOLDER\n")
+
+
+def test_json_is_printed_and_out_stays_csv(hexapod, tmp_path: Path) -> None:
+    """Both at once: the file is the one that is written without --json."""
+    one, two = str(tmp_path / "one.csv"), str(tmp_path / "two.csv")
+    for verb, given in (("ik", TABLE_1), ("check", TABLE_1), ("assess", TABLE_1)):
+        hexapod(verb, given, "--out", one)
+        code, out, err = hexapod(verb, given, "--out", two, "--json")
+        assert (code, err) == (0, "")
+        assert json.loads(out)["machine"] == "paper"
+        assert Path(one).read_bytes() == Path(two).read_bytes()
+        code, out, err = hexapod(verb, given, "--out", str(tmp_path / "x.json"))
+        assert (code, out) == (2, "")
+        assert "argument --out: writes CSV; for JSON: --json > " in err
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        ("", set(VERBS)),
+        ("re", {"replay"}),
+        ("ik --m", {"--machine", "--model"}),
+        ("ik --machine pap", {"paper.yaml"}),
+        ("ik --machine ", {"paper.yaml", "jugglebot.yaml", "positioning_unit.yaml", "mine.csv", "deep/"}),
+        ("ik --model ", {"ideal", "paper_machine.yaml", "paper_lines_model.yaml", "mine.csv", "deep/"}),
+        ("plan campaign_", {"campaign_1d.yaml", "campaign_5d.yaml", "campaign_full.yaml"}),
+        ("classify --budget e", {"error_budget.yaml"}),
+        ("check ", {"table1.csv", "mine.csv", "deep/"}),
+        ("fit --scheme ", {"joint", "lines"}),
+        ("demo --pictures d", {"deep/"}),
+        ("ik --x-mm ", set()),
+    ],
+)
+def test_the_shell_completes(tmp_path: Path, typed: str, offered: set[str]) -> None:
+    """As bash asks, by argcomplete's protocol: a line, a cursor, a file for the answers. Nothing heavy is loaded."""
+    pytest.importorskip("argcomplete")
+    (tmp_path / "mine.csv").touch()
+    (tmp_path / "deep").mkdir()
+    line = f"hexapod_comp {typed}"
+    asked = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_STDOUT_FILENAME": "answers", "_ARGCOMPLETE_IFS": "\n"}
+    asked |= {"COMP_LINE": line, "COMP_POINT": str(len(line)), "COMP_TYPE": "9", "_ARGCOMPLETE_SUPPRESS_SPACE": "1"}
+    path = os.pathsep.join([str(ROOT), *filter(None, sys.path)])
+    code = "import sys; sys.modules['numpy'] = None; import hexapod_comp.cli as cli; cli.main()"
+    subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=os.environ | asked | {"PYTHONPATH": path}, timeout=20
+    )
+    answers = {name.strip() for name in (tmp_path / "answers").read_text().split("\n") if name.strip()}
+    assert {name for name in answers if typed.endswith("--m") or not name.startswith("-")} - {"answers"} == offered
+
+
+def test_the_marks_by_which_the_shell_finds_out_are_at_the_top() -> None:
+    """argcomplete's global completion reads the first 1,024 bytes of what a command imports."""
+    for name in ("cli/__init__.py", "__main__.py"):
+        assert "PYTHON_ARGCOMPLETE_OK" in (ROOT / "hexapod_comp" / name).read_text(encoding="utf-8")[:1024]
 
 
 def test_version_is_the_packages(hexapod) -> None:
@@ -143,11 +231,11 @@ def test_a_closed_pipe_is_quiet(tmp_path: Path) -> None:
     assert done.stderr == ""
 
 
-@pytest.mark.parametrize("verb", [ik, fk, check_verb, assess], ids=lambda verb: verb.__name__.rpartition(".")[2])
-def test_the_example_in_the_help_is_real(hexapod, monkeypatch: pytest.MonkeyPatch, verb) -> None:
+@pytest.mark.parametrize("verb", ["ik", "fk", "check", "assess"])
+def test_the_example_in_the_help_is_real(hexapod, monkeypatch: pytest.MonkeyPatch, verb: str) -> None:
     """Every line of output shown under the first command of a help text comes out of that command."""
     monkeypatch.chdir(ROOT)
-    lines = verb.TEXT.partition("example:\n")[2].splitlines()
+    lines = VERBS[verb].text.partition("example:\n")[2].splitlines()
     first = lines[0].split()
     assert first[:2] == ["$", "hexapod_comp"]
     code, out, err = hexapod(*first[2:])

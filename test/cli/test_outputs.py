@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
+from argparse import SUPPRESS
 from pathlib import Path
 
 import pytest
 
 from hexapod_comp import cli
+from hexapod_comp.cli import arguments
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.formats import outputs
 
@@ -18,35 +20,55 @@ WORDS = {"name", "namespace", "blocks", "order", "scheme", "method", "scheduler"
 """Options whose text is no file's name."""
 
 
+def parsers() -> dict[str, argparse.ArgumentParser]:
+    """Return the parser of each verb."""
+    (subparsers,) = (a for a in cli.make_parser()._actions if isinstance(a, argparse._SubParsersAction))
+    return dict(subparsers.choices)
+
+
 def options() -> dict[str, set[str]]:
     """Return the options and arguments of each verb whose values are text."""
-    (subparsers,) = (a for a in cli.make_parser()._actions if isinstance(a, argparse._SubParsersAction))
     return {
-        verb: {a.dest for a in parser._actions if a.nargs != 0 and a.type is None and a.choices is None}
-        for verb, parser in subparsers.choices.items()
+        verb: {
+            a.dest
+            for a in parser._actions
+            if a.nargs != 0 and a.type in (None, arguments.csv_file) and a.choices is None and a.help != SUPPRESS
+        }
+        for verb, parser in parsers().items()
     }
 
 
 def test_every_option_that_names_a_file_is_known_as_read_or_written():
-    known = set(outputs.READ) | set(outputs.WRITTEN) | WORDS
-    assert not set(outputs.READ) & set(outputs.WRITTEN)
+    written = {*outputs.WRITTEN, *outputs.FOLDERS}
+    known = set(outputs.READ) | written | WORDS
+    assert not set(outputs.READ) & written
     assert {verb: found - known for verb, found in options().items() if found - known} == {}
-    assert set(outputs.READ) | set(outputs.WRITTEN) <= set().union(*options().values())
+    assert set(outputs.READ) | written <= set().union(*options().values())
+
+
+def test_three_options_mean_the_same_in_all_verbs():
+    """--out a file, --pictures a folder, --json a switch that every verb has."""
+    for verb, parser in parsers().items():
+        named = {a.dest: a for a in parser._actions if a.help != SUPPRESS}
+        assert named["json"].nargs == 0, verb
+        assert "out" not in named or named["out"].metavar in ("FILE", "MODEL"), verb
+        assert "pictures" not in named or named["pictures"].metavar == "FOLDER", verb
+        assert "plot" not in named, verb
 
 
 COMMANDS = [
     ("ik {in}/table1.csv --out {in}/table1.csv", "table1.csv"),
     ("ik {in}/table1.csv --json --out {in}/table1.csv", "table1.csv"),
+    ("classify --budget {in}/c.yaml --out {in}/c.yaml", "c.yaml"),
     ("ik --pose 0,0,400 --machine {in}/paper.yaml --out {in}/paper.yaml", "paper.yaml"),
     ("fk {in}/table1.csv --out {in}/table1.csv", "table1.csv"),
     ("check {in}/table1.csv --out {in}/table1.csv", "table1.csv"),
     ("assess {in}/table1.csv --out {in}/table1.csv", "table1.csv"),
-    ("run {in}/table1.csv --plot {in}/table1.csv", "table1.csv"),
-    ("demo --truth {in}/paper_machine.yaml --plot {in}/paper_machine.yaml", "paper_machine.yaml"),
-    ("measure --campaign {in}/campaign_5d.yaml --out {in}/campaign_5d.yaml", "campaign_5d.yaml"),
+    ("run {in}/table1.csv --pictures {in}/table1.csv", "table1.csv"),
+    ("demo --truth {in}/paper_machine.yaml --pictures {in}/paper_machine.yaml", "paper_machine.yaml"),
+    ("simulate --campaign {in}/campaign_5d.yaml --out {in}/campaign_5d.yaml", "campaign_5d.yaml"),
     ("fit {in}/m.csv --out {in}/m.csv", "m.csv"),
     ("fit {in}/other.csv {in}/m.csv --out {in}/new --report {in}/m.csv", "m.csv"),
-    ("fit {in}/m.csv --out {in}/new --json {in}/m.csv", "m.csv"),
     ("fit {in}/m.csv --out {in}/new --covariance {in}/m.csv", "m.csv"),
     ("fit {in}/m.csv --out {in}/new --columns {in}/c.yaml --report {in}/c.yaml", "c.yaml"),
     ("fit {in}/m.csv --truth {in}/paper_machine.yaml --out {in}/paper_machine.yaml", "paper_machine.yaml"),
@@ -109,7 +131,7 @@ def test_a_file_in_an_output_folder_that_is_read_is_not_replaced(folder: Path):
     """Which files a folder will get only their writers know: they ask too."""
     from hexapod_comp.formats.yaml import write_text_atomically
 
-    with outputs.inputs_protected(argparse.Namespace(budget=str(folder / "c.yaml"), out=str(folder))):
+    with outputs.inputs_protected(argparse.Namespace(budget=str(folder / "c.yaml"), pictures=str(folder))):
         with pytest.raises(InputFileError, match="is read by this command"):
             write_text_atomically(folder / "c.yaml", "new")
         write_text_atomically(folder / "other.csv", "new")

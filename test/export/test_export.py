@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import re
@@ -17,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from strategies import PAPER_FILE, paper_geometry, random_model, skewed_geometry
 
 from hexapod_comp.cli import export
+from hexapod_comp.cli.parsers import make_parser
 from hexapod_comp.errors import GeometryError, HexapodError, InputFileError, LimitError, ModelError, OutsideFieldError
 from hexapod_comp.export.linuxcnc import Genhexkins, make_genhexkins, table_misfit
 from hexapod_comp.export.linuxcnc_files import COMP_FILES, HAL_FILE, INI_FILE, read_genhexkins, write_genhexkins
@@ -396,10 +396,7 @@ def test_what_no_table_can_hold_is_refused() -> None:
 
 
 def run_verb(*arguments: str) -> int:
-    parser = argparse.ArgumentParser()
-    export.add_parser(parser.add_subparsers())
-    args = parser.parse_args(["export", "--machine", str(PAPER_FILE), *arguments])
-    return int(args.run(args))
+    return export.run(make_parser().parse_args(["export", "--machine", str(PAPER_FILE), *arguments]))
 
 
 def test_verb_writes_reads_back_and_reports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -88,10 +88,10 @@ COMMANDS = (
     ("assess", "poses.csv", ("--machines", "2")),
     ("fit", "tidy.csv", ("--scheme", "lines", "--out", "fitted.yaml")),
     ("fit", "paper.yaml", ("tidy.csv", "--scheme", "lines", "--out", "fitted.yaml", "--machine", "paper.yaml")),
-    ("classify", "budget.yaml", ("--budget", "budget.yaml", "--out", "/dev/null/no")),
-    ("classify", "unit.yaml", ("--machine", "unit.yaml", "--budget", "budget.yaml", "--out", "/dev/null/no")),
+    ("classify", "budget.yaml", ("--budget", "budget.yaml", "--cells", "3")),
+    ("classify", "unit.yaml", ("--machine", "unit.yaml", "--budget", "budget.yaml", "--cells", "3")),
     ("export", "model.yaml", ("--model", "model.yaml", "--table", "t.csv", "--box=-9000,-9000,0,9000,9000,1")),
-    ("measure", "model.yaml", ("--campaign", "campaign.yaml", "--truth", "model.yaml", "--out", "m.csv")),
+    ("simulate", "model.yaml", ("--campaign", "campaign.yaml", "--truth", "model.yaml", "--out", "m.csv")),
 )
 """Verb, the file that is mutated, and the rest of the command; file names stand for files of the folder."""
 
@@ -159,12 +159,12 @@ OPTIONS = {
     "assess": ("--joint-um", "--strut-um", "--pitch-ppm", "--wave-um", "--wave-period-mm", "--seed", "--json"),
     "iso230": ("--probe-mm", "--columns", "--targets", "--machine"),
     "plan": ("--lead-mm", "--blocks", "--tolerance-um", "--expansion-ppm", "--seed", "--machine"),
-    "measure": ("--seed", "--truth", "--campaign", "--out", "--model"),
+    "simulate": ("--seed", "--truth", "--campaign", "--out", "--model"),
     "fit": ("--scheme", "--lead-mm", "--blocks", "--probe-mm", "--order", "--columns", "--out", "--truth"),
     "export": ("--units", "--box", "--step-mm", "--poses", "--tilt-deg", "--seed", "--table"),
     "classify": ("--cells", "--clearance-mm", "--tilt-deg", "--compare", "--allow-um", "--workers", "--budget"),
-    "run": ("--rate-hz", "--machine", "--model", "--truth", "--plot"),
-    "demo": ("--rate-hz", "--machine", "--model", "--truth", "--plot"),
+    "run": ("--rate-hz", "--machine", "--model", "--truth", "--pictures"),
+    "demo": ("--rate-hz", "--machine", "--model", "--truth", "--pictures"),
 }
 """Verbs and options that are given nonsense; a file that does not exist keeps the long ones from starting."""
 
@@ -186,7 +186,7 @@ def test_nonsense_options(folder: Path, verb: str, place: int, value: str, other
         arguments += [options[other[0] % len(options)], other[1]]
     if verb not in ("ik", "fk", "demo"):
         arguments.append("no_such_file.csv")
-    if verb in ("measure", "export", "classify", "demo"):
+    if verb in ("simulate", "export", "classify", "demo"):
         arguments += ["--machine", "no_such_machine"]
     COUNTS["options"] += 1
     command(*arguments)

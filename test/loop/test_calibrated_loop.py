@@ -8,6 +8,8 @@ in which it lies with 95 %.
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import time
 from collections.abc import Iterator
@@ -88,21 +90,22 @@ class Promise:
 def promise(tmp_path_factory: pytest.TempPathFactory) -> Promise:
     """Calibrate the machine by the command line, from file to file."""
     folder = tmp_path_factory.mktemp("calibration")
-    files = {n: str(folder / n) for n in ("truth.yaml", "campaign.yaml", "measured.csv", "model.yaml", "fit.json")}
+    files = {n: str(folder / n) for n in ("truth.yaml", "campaign.yaml", "measured.csv", "model.yaml")}
     Path(files["campaign.yaml"]).write_text(CAMPAIGN)
     dated = ModelOrigin("2026-01-31", note="hidden truth of a test")
     save_model(replace(draw_model(paper(), BOUNDS, seed=11), origin=dated), files["truth.yaml"])
     options = ["--truth", files["truth.yaml"], "--campaign", files["campaign.yaml"], "--seed", "11"]
-    assert cli.main(["measure", *options, "--out", files["measured.csv"]]) == 0
-    options = ["--lead-mm", "10", "--blocks", ",".join(BLOCKS), "--json", files["fit.json"]]
-    assert cli.main(["fit", files["measured.csv"], *options, "--out", files["model.yaml"]]) == 0
-    said = json.loads(Path(files["fit.json"]).read_text())["expected_tool_error"]
+    assert cli.main(["simulate", *options, "--out", files["measured.csv"]]) == 0
+    options = ["--lead-mm", "10", "--blocks", ",".join(BLOCKS), "--json"]
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        assert cli.main(["fit", files["measured.csv"], *options, "--out", files["model.yaml"]]) == 0
+    expected = json.loads(out.getvalue())["expected_tool_error"]
     return Promise(
         truth_file=files["truth.yaml"],
         model_file=files["model.yaml"],
         truth=RealMachine(paper(), load_model(files["truth.yaml"], paper())),
         model=load_model(files["model.yaml"], paper()),
-        **{name: said[name] for name in ("before", "after", "low", "high")},
+        **{name: expected[f"{name}_m"] for name in ("before", "after", "low", "high")},
     )
 
 

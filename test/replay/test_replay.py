@@ -6,7 +6,6 @@ it gave while it was recorded. Damage is done to the messages, or to the bytes o
 
 from __future__ import annotations
 
-import argparse
 import base64
 import contextlib
 import csv
@@ -45,6 +44,7 @@ from rosbags.rosbag2 import CompressionMode, storage_mcap
 
 from hexapod_comp.cli import main
 from hexapod_comp.cli import replay as verb
+from hexapod_comp.cli.parsers import make_parser
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.compensation.journal import (
     ANSWER,
@@ -129,10 +129,7 @@ def without(messages: Messages, *numbers: int) -> Messages:
 
 def call(*arguments: object) -> int:
     """Run the verb as the command line does, errors apart."""
-    parser = argparse.ArgumentParser()
-    verb.add_parser(parser.add_subparsers())
-    args = parser.parse_args(["replay", *map(str, arguments)])
-    return int(args.run(args))
+    return verb.run(make_parser().parse_args(["replay", *map(str, arguments)]))
 
 
 # ---- the same bits ----
@@ -492,8 +489,9 @@ def test_verb_writes_report_pictures_and_json(run, tmp_path, capsys):
     assert "changes between commands: 2 × enable, 1 × model, 2 × reset, 2 × temperature" in said
     pictures = {path.name for path in (tmp_path / "pictures").iterdir()}
     assert pictures == {"corrections.png", "commands.png", "tool.png", "refused.png"}
-    assert call(bag, "--json", "--out", tmp_path / "run.json") == 0
-    told = json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))
+    capsys.readouterr()
+    assert call(bag, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
     assert told["same"] is True
     assert told["outcomes"]["identical"] == 1200
     assert told["refusals"][0]["reason"] == "step"

@@ -1,8 +1,7 @@
-"""Virtual instruments against errors known in closed form, and the verb ``measure`` from file to file."""
+"""Virtual instruments against errors known in closed form, and the verb ``simulate`` from file to file."""
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +9,8 @@ import numpy as np
 import pytest
 from strategies import paper_geometry
 
-from hexapod_comp.cli import measure as verb
+from hexapod_comp import cli
+from hexapod_comp.cli.verbs import VERBS
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.model import MachineModel, RealMachine, Temperatures
@@ -149,9 +149,7 @@ tilt_deg: 5
 
 
 def run(*arguments: str) -> int:
-    parser = argparse.ArgumentParser()
-    verb.add_parser(parser.add_subparsers())
-    return int(verb.run(parser.parse_args(["measure", *arguments])))
+    return cli.main(["simulate", *arguments])
 
 
 def test_verb_writes_what_it_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -176,7 +174,7 @@ def test_verb_measures_the_compensated_machine(tmp_path: Path, capsys: pytest.Ca
     """With the truth for a model only the instrument's noise of 1 µm is left; the file says what struts were told."""
     path = str(tmp_path / "compensated.csv")
     assert run("--campaign", "campaign_1d", "--model", "paper_machine", "--out", path) == 0
-    assert "told the strut lengths of paper_machine" in capsys.readouterr().out
+    assert "moved by the strut lengths of paper_machine" in capsys.readouterr().out
     geometry = paper_geometry()
     found = read_tidy(path, geometry)
     assert found.value.std() == pytest.approx(1e-6, rel=0.1)
@@ -189,6 +187,6 @@ def test_the_example_in_the_help_is_real(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    lines = verb.TEXT.partition("example:\n")[2].splitlines()
+    lines = VERBS["simulate"].text.partition("example:\n")[2].splitlines()
     assert run(*lines[0].split()[3:]) == 0
     assert capsys.readouterr().out.splitlines() == [line[2:] for line in lines[1:]]

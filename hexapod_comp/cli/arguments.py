@@ -1,0 +1,130 @@
+"""What is typed becomes numbers in SI; :mod:`argparse` says which option was wrong."""
+
+from __future__ import annotations
+
+import argparse
+import math
+
+POSE_HELP = "mm and degrees: x,y,z or x,y,z,alpha,beta,gamma"
+
+POSE_OPTIONS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
+"""A pose number by number: the options of ik."""
+
+
+def pose(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Read ``x,y,z[,alpha,beta,gamma]`` in mm and degrees; return position, m, and angles, rad."""
+    values = numbers(text)
+    if len(values) not in (3, 6):
+        raise argparse.ArgumentTypeError(f"needs three or six numbers ({POSE_HELP}), not {len(values)}")
+    angles = values[3:] or (0.0, 0.0, 0.0)
+    return tuple(v * 1e-3 for v in values[:3]), tuple(math.radians(v) for v in angles)
+
+
+def point(text: str) -> tuple[float, ...]:
+    """Read ``x,y,z`` in mm; return m."""
+    position, angles = pose(text)
+    if any(angles):
+        raise argparse.ArgumentTypeError(f"needs three numbers, mm, not {text}")
+    return position
+
+
+def lengths(text: str) -> tuple[float, ...]:
+    """Read six lengths in mm; return them in m."""
+    values = numbers(text)
+    if len(values) != 6:
+        raise argparse.ArgumentTypeError(f"needs six lengths in mm, not {len(values)}")
+    return tuple(v * 1e-3 for v in values)
+
+
+def box(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Read two corners in mm; return the lowest and the highest, m."""
+    values = lengths(text)
+    low, high = values[:3], values[3:]
+    if not all(a < b for a, b in zip(low, high, strict=True)):
+        raise argparse.ArgumentTypeError(f"must be the lowest corner, then the highest, not {text}")
+    return low, high
+
+
+def tilts(text: str) -> tuple[float, ...]:
+    """Read tilts in degrees; return them in rad, rising, each once."""
+    return tuple(math.radians(v) for v in sorted({finite(part) for part in text.split(",")}))
+
+
+def expansions(text: str) -> tuple[float, float, float]:
+    """Read one or three expansions in ppm/K; return them in 1/K, for struts, base and platform."""
+    values = [finite(part) * 1e-6 for part in text.split(",")]
+    if len(values) not in (1, 3):
+        raise argparse.ArgumentTypeError(f"needs one or three numbers, not {text}")
+    return (values[0], *(values[1:] or (0.0, 0.0)))
+
+
+def finite(text: str) -> float:
+    """Read one finite number."""
+    if "," in text:
+        raise _not_finite(text)
+    return numbers(text)[0]
+
+
+def bound(text: str) -> float:
+    """Read a finite number that is not negative."""
+    value = finite(text)
+    if value < 0.0:
+        raise argparse.ArgumentTypeError(f"must not be negative, not {text}")
+    return value
+
+
+def above_zero(text: str) -> float:
+    """Read a finite number above zero."""
+    value = finite(text)
+    if value <= 0.0:
+        raise argparse.ArgumentTypeError(f"must be above zero, not {text}")
+    return value
+
+
+def count(text: str, most: int = 10_000_000) -> int:
+    """Read a whole number above zero, and not so large that nobody lives to see the end."""
+    if not text.isdecimal() or len(text) > 12 or not 1 <= int(text) <= most:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1 to {most}, not {text!r}")
+    return int(text)
+
+
+def trials(text: str) -> int:
+    """Read how many poses to check: a thousand or more."""
+    value = count(text)
+    if value < 1000:
+        raise argparse.ArgumentTypeError(f"must be 1000 or more, not {text}")
+    return value
+
+
+def workers(text: str) -> int:
+    """Read a number of processes; each takes some 200 MB."""
+    return count(text, most=256)
+
+
+def seed(text: str) -> int:
+    """Read a whole number, zero or above."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"must be a whole number, 0 or above, not {text!r}")
+    return int(text)
+
+
+def csv_file(text: str) -> str:
+    """Read the name of a CSV file to write; JSON is printed, so a name that ends so was meant for that."""
+    if text.lower().endswith(".json"):
+        raise argparse.ArgumentTypeError(f"writes CSV; for JSON: --json > {text}")
+    return text
+
+
+def numbers(text: str) -> tuple[float, ...]:
+    """Read finite numbers with commas between them."""
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise _not_finite(text) from None
+    if not all(map(math.isfinite, values)):
+        raise _not_finite(text)
+    return values
+
+
+def _not_finite(text: str) -> argparse.ArgumentTypeError:
+    return argparse.ArgumentTypeError(f"is not finite numbers: {text!r}")

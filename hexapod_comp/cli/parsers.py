@@ -1,0 +1,347 @@
+"""The parsers of all verbs. This loads nothing heavy: ``--help`` and the shell's completion answer at once.
+
+Three options mean the same wherever they stand. ``--out`` is the file to which a verb writes what it makes,
+``--pictures`` is the folder for its pictures, and ``--json`` prints the result as JSON in place of text, with the
+units in the keys.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from itertools import groupby
+from typing import Any, NoReturn
+
+from . import arguments
+from .verbs import VERBS
+
+PROGRAM = "hexapod_comp"
+
+DESCRIPTION = """Error compensation for hexapod machine tools: tool poses in, compensated strut lengths out.
+
+Lengths are shown in mm, corrections in µm, angles in degrees. A pose is the tool's pose in the work frame:
+x, y, z and the angles α, β, γ with R = Ry(β)·Rx(α)·Rz(γ). A machine or model is a file, or the name of a
+shipped one (paper, paper_machine, …)."""
+
+EPILOG = """Verbs, options and files complete in the shell: pip install hexapod_comp[completion], then
+eval "$(register-python-argcomplete hexapod_comp)"."""
+
+ALIASES = {"simulate": ("measure",)}
+"""Old names of verbs, which still work."""
+
+SHAPE = "X,Y,Z[,A,B,C]"
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser; it leaves the verb as ``verb``, and the name under which it was called as ``called``."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(PROGRAM, description=DESCRIPTION, epilog=EPILOG, formatter_class=raw)
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and leave")
+    hint = "VERB --help gives its options, units and an example"
+    subparsers = parser.add_subparsers(
+        title="verbs", description=_listed(), dest="called", metavar="VERB", required=True, help=hint
+    )
+    for name, (_, summary, text) in VERBS.items():
+        verb = subparsers.add_parser(
+            name, aliases=ALIASES.get(name, ()), description=summary, epilog=text, formatter_class=raw
+        )
+        OPTIONS[name](verb)
+        verb.set_defaults(verb=name)
+    return parser
+
+
+def _listed() -> str:
+    """Return the verbs in their groups, a line each."""
+    lines = []
+    for group, verbs in groupby(VERBS.items(), lambda item: item[1].group):
+        lines += [f"{group}:", *(f"  {name:<9} {verb.summary}" for name, verb in verbs)]
+    return "\n".join(lines)
+
+
+class _Version(argparse.Action):
+    """Print the version of the code that runs."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from ..formats.paths import version
+
+        print(f"{PROGRAM} {version()}")
+        parser.exit()
+
+
+class _Renamed(argparse.Action):
+    """Refuse an option of an older version, and say what it is called now."""
+
+    def __call__(self, parser: argparse.ArgumentParser, _: object, __: object, option: str | None = None) -> NoReturn:
+        parser.error(f"argument {option}: is now {self.const}")
+
+
+Add = Callable[..., Any]
+"""``add_argument`` of a parser."""
+
+
+def _machine(add: Add, default: str = "paper.yaml") -> None:
+    text = f"geometry file, or the name of a shipped one (default {default})"
+    add("--machine", metavar="FILE", default=default, help=text)
+
+
+def _machine_and_model(add: Add) -> None:
+    _machine(add)
+    text = "model of the machine's errors: a file, the name of a shipped one, or ideal (default)"
+    add("--model", metavar="FILE", default="ideal", help=text)
+
+
+def _json(add: Add) -> None:
+    add("--json", action="store_true", help="print JSON, for programs, in place of text; units are in the keys")
+
+
+def _table_out(add: Add, what: str) -> None:
+    add("--out", type=arguments.csv_file, metavar="FILE", help=f"write {what} to a CSV file")
+
+
+def _pictures(add: Add, default: str | None = None) -> None:
+    text = "folder for pictures; made if it is missing" + (f" (default {default})" if default else "")
+    add("--pictures", metavar="FOLDER", default=default, help=text)
+
+
+def _seed(add: Add, what: str) -> None:
+    add("--seed", type=arguments.seed, default=0, metavar="N", help=f"of {what} (default 0)")
+
+
+def _ik(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("poses", nargs="?", metavar="POSES.csv", help="CSV file of poses; - for standard input")
+    add("--pose", type=arguments.pose, metavar=SHAPE, help=arguments.POSE_HELP)
+    for name in arguments.POSE_OPTIONS:
+        unit = "mm" if name.endswith("mm") else "degrees"
+        text = f"the pose number by number, {unit}"
+        add(f"--{name.replace('_', '-')}", type=arguments.finite, metavar="NUMBER", help=text)
+    _machine_and_model(add)
+    _table_out(add, "the lengths")
+    _json(add)
+
+
+def _fk(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("lengths_file", nargs="?", metavar="LENGTHS.csv", help="CSV file; - for standard input")
+    add("--lengths", type=arguments.lengths, metavar="L1,…,L6", help="six lengths, mm")
+    start = parser.add_mutually_exclusive_group().add_argument
+    start("--guess", type=arguments.pose, metavar=SHAPE, help=f"{arguments.POSE_HELP}; default home")
+    start("--cold", action="store_true", help="no guess: pick the working assembly mode")
+    start("--all-modes", action="store_true", help="list every assembly mode of the nominal machine")
+    _machine_and_model(add)
+    _table_out(add, "the poses")
+    _json(add)
+
+
+def _check(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("poses", metavar="POSES.csv", help="CSV file of poses (mm, degrees); - for standard input")
+    add("--stream", action="store_true", help="rows are consecutive commands")
+    text = "commands per second (default 250)"
+    add("--rate-hz", type=arguments.finite, default=250.0, metavar="HZ", help=text)
+    _machine_and_model(add)
+    _table_out(add, "all margins")
+    _json(add)
+
+
+def _loop(add: Add) -> None:
+    """Add what ``run`` and ``demo`` share."""
+    _machine(add)
+    text = "model that the compensator runs: file, shipped name or ideal (default paper_machine.yaml)"
+    add("--model", metavar="FILE", default="paper_machine.yaml", help=text)
+    text = "hidden truth of the simulated machine: model file, shipped name, ideal or random"
+    add("--truth", metavar="FILE", default="paper_machine.yaml", help=text)
+    add("--rate-hz", type=float, default=250.0, metavar="HZ", help="commands per second (default 250)")
+    add("--plot", action=_Renamed, const="--pictures FOLDER", metavar="PNG", help=argparse.SUPPRESS)
+    _json(add)
+
+
+def _run(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("poses", metavar="POSES.csv", help="CSV file of poses (mm, degrees)")
+    _loop(add)
+    _pictures(add)
+    add("--attach", action="store_true", help="use nodes that already run; one pass, as they are")
+    add("--namespace", default="", metavar="NAME", help="namespace of those nodes")
+    add("--no-compare", action="store_true", help="leave out the simulated pass without compensation")
+
+
+def _demo(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    _loop(add)
+    _pictures(add, "out")
+
+
+def _replay(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("bag", metavar="BAG", help="folder of a bag, .mcap or .db3 file")
+    add("--namespace", metavar="NAME", help="the machine meant, when the bag holds several")
+    own = "(default: what the recording carries)"
+    add("--machine", metavar="FILE", help=f"geometry file, or the name of a shipped one {own}")
+    add("--model", metavar="FILE", help=f"model file, the name of a shipped one, or ideal {own}")
+    text = "accept differences up to this, µm (default 0: the same bits)"
+    add("--tolerance-um", type=arguments.bound, default=0.0, metavar="UM", help=text)
+    _pictures(add)
+    _table_out(add, "all corrections")
+    _json(add)
+
+
+def _plan(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("campaign", metavar="CAMPAIGN", help="campaign file, or the name of a shipped one")
+    _machine(add)
+    _estimation(parser)
+    _seed(add, "scattered poses")
+    _json(add)
+
+
+def _simulate(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    _machine_and_model(add)
+    text = "model of the virtual machine's real errors (default paper_machine.yaml)"
+    add("--truth", metavar="FILE", default="paper_machine.yaml", help=text)
+    text = "campaign file, or the name of a shipped one (default campaign_5d.yaml)"
+    add("--campaign", metavar="FILE", default="campaign_5d.yaml", help=text)
+    _seed(add, "all that is random")
+    add("--out", type=arguments.csv_file, metavar="FILE", required=True, help="write the readings to a CSV file")
+    _json(add)
+
+
+def _fit(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    _readings(add)
+    add("--scheme", choices=("joint", "lines"), default="joint", help="how to fit (default joint)")
+    add("--out", metavar="MODEL", required=True, help="write the model to a YAML file")
+    add("--name", metavar="TEXT", help="name of the model")
+    add("--report", metavar="FILE", help="write the report to a file too")
+    add("--covariance", metavar="FILE.npz", help="write the parameters' covariance (scheme joint)")
+    _pictures(add)
+    _json(add)
+    add("--truth", metavar="FILE", help="model of the virtual machine that was measured")
+    add("--force", action="store_true", help="write a model that the readings do not bear out")
+    _estimation(parser)
+    text = "trust readings that disagree with the rest (scheme joint)"
+    add("--not-robust", action="store_true", help=text)
+    text = "what picks the polynomials' order (scheme lines; default adjusted-r2)"
+    add("--order", choices=("adjusted-r2", "aicc"), help=text)
+    text = "report order, R² and residual of each line (scheme lines)"
+    add("--every-line", action="store_true", help=text)
+
+
+def _readings(add: Add) -> None:
+    """Add the measured files, the machine, and how the files are read."""
+    add("files", nargs="+", metavar="FILE", help="measured files")
+    _machine(add)
+    add("--columns", metavar="FILE", help="columns file that explains wide CSV files")
+    text = "measured point in platform (default: the tool's tip)"
+    add("--probe-mm", type=arguments.point, metavar="X,Y,Z", help=text)
+
+
+def _estimation(parser: argparse.ArgumentParser) -> None:
+    """Add what a fit of scheme joint, or a plan for one, can be given."""
+    add = parser.add_argument_group("scheme joint").add_argument
+    text = "period of the screws' errors (default: the geometry's)"
+    add("--lead-mm", type=arguments.bound, metavar="MM", help=text)
+    text = "what may be fitted: pitch, wave, backlash, map, field (default all)"
+    add("--blocks", metavar="A,B,…", help=text)
+    text = "platform joints at the same place are two joints, not one"
+    add("--separate-joints", action="store_true", help=text)
+    text = "how well joints are built, to start from, µm (default 100)"
+    add("--tolerance-um", type=arguments.bound, metavar="UM", help=text)
+    add("--field-degree", type=arguments.count, metavar="N", help="degree of the field (default 6)")
+    text = "thermal expansion of struts, or of struts, base and platform, ppm/K (default 0)"
+    add("--expansion-ppm", type=arguments.expansions, metavar="S[,B,P]", help=text)
+
+
+def _iso230(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    _readings(add)
+    add("--targets", action="store_true", help="each run target by target, with notes")
+    _json(add)
+
+
+def _export(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    _machine_and_model(add)
+    add("--linuxcnc", metavar="FOLDER", help="folder for LinuxCNC's files; made if it is missing")
+    add("--table", type=arguments.csv_file, metavar="FILE.csv", help="CSV file for the trilinear table")
+    text = "LinuxCNC's machine unit, [TRAJ]LINEAR_UNITS (default mm)"
+    add("--units", choices=("mm", "inch"), default="mm", help=text)
+    text = "lowest and highest tool position, mm (default: the model's valid box, else its field's)"
+    add("--box", type=arguments.box, metavar="X0,Y0,Z0,X1,Y1,Z1", help=text)
+    text = "largest step of the table (default 25.4)"
+    add("--step-mm", type=arguments.above_zero, default=25.4, metavar="MM", help=text)
+    text = "random poses to check (default 1000, the least)"
+    add("--poses", type=arguments.trials, default=1000, metavar="N", help=text)
+    add("--tilt-deg", type=arguments.bound, default=5.0, metavar="DEG", help="tilt to check (default 5)")
+    _seed(add, "the random poses")
+    _json(add)
+
+
+def _assess(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    text = "CSV file of poses (mm, degrees; default: Table 1 of Song, Mou & King); - for standard input"
+    add("poses", nargs="?", default="table1.csv", metavar="POSES.csv", help=text)
+    for name, default, what in (
+        ("joint-um", 10.0, "every coordinate of every joint, µm"),
+        ("strut-um", 10.0, "every strut's length offset, µm"),
+        ("pitch-ppm", 0.0, "every screw's pitch error, ppm"),
+        ("wave-um", 0.0, "every screw's periodic error (its amplitude, drawn from 0 up), µm"),
+    ):
+        text = f"bound of {what} (default {default:g})"
+        add(f"--{name}", type=arguments.bound, default=default, metavar="BOUND", help=text)
+    text = "period of that error (default 10)"
+    add("--wave-period-mm", type=arguments.bound, default=10.0, metavar="MM", help=text)
+    text = "struts that share a platform joint nominally each get one of their own"
+    add("--separate-platform-joints", action="store_true", help=text)
+    add("--machines", type=arguments.count, default=1, metavar="N", help="how many to draw (default 1)")
+    _seed(add, "the first machine")
+    _machine(add)
+    _table_out(add, "every machine and pose")
+    _json(add)
+
+
+def _classify(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    _machine(add, "positioning_unit.yaml")
+    text = "error budget, or the name of a shipped one (default error_budget.yaml)"
+    add("--budget", metavar="FILE", default="error_budget.yaml", help=text)
+    _table_out(add, "the ranking")
+    _pictures(add)
+    _json(add)
+    text = "cells along the grid's longest edge (default 30)"
+    add("--cells", type=arguments.count, default=30, metavar="N", help=text)
+    text = "smallest distance between the axes of two struts, mm; 0: not limited (default: the geometry's)"
+    add("--clearance-mm", type=arguments.bound, metavar="MM", help=text)
+    text = "tilts about x and y (default -4,0,4)"
+    add("--tilt-deg", type=arguments.tilts, default=arguments.tilts("-4,0,4"), metavar="A,B,…", help=text)
+    add("--method", choices=("exact", "linear"), default="exact", help="of the ranking (default exact)")
+    text = "compare exact, linear and the iteration of v. Daake et al. at N poses"
+    add("--compare", type=arguments.count, metavar="N", help=text)
+    text = "allowed error of the tool: says what the errors may be"
+    add("--allow-um", type=arguments.above_zero, metavar="UM", help=text)
+    text = "processes (default 1, with all threads)"
+    add("--workers", type=arguments.workers, default=1, metavar="N", help=text)
+    add("--scheduler", metavar="tcp://…", help="Dask scheduler that does the work instead")
+    _seed(add, "random poses and draws")
+    add("--no-page", action="store_true", help="leave the interactive page out of --pictures")
+    text = "then keep the worst type's shells on workspace/shells until Ctrl-C"
+    add("--publish", action="store_true", help=text)
+
+
+OPTIONS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
+    "ik": _ik,
+    "fk": _fk,
+    "check": _check,
+    "run": _run,
+    "demo": _demo,
+    "replay": _replay,
+    "plan": _plan,
+    "simulate": _simulate,
+    "fit": _fit,
+    "iso230": _iso230,
+    "export": _export,
+    "assess": _assess,
+    "classify": _classify,
+}
+"""What adds each verb's options."""

@@ -1,0 +1,76 @@
+"""``hexapod_comp simulate``: a calibration campaign on the virtual machine."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from ..formats import texts
+from . import common
+
+if TYPE_CHECKING:
+    from ..measurements.readings import MeasurementSet
+
+RESOLUTION = 10
+"""Digits after the point of the instruments, m and rad: a tenth of a nanometre."""
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the verb."""
+    from ..machine.model import RealMachine
+    from ..machine.model_file import load_model
+    from ..measurements.campaign import load_campaign, template
+    from ..measurements.writing import write_measurements
+    from ..virtual.instruments import compensated, measure
+
+    geometry, model = common.load_machine(args)
+    truth = load_model(args.truth, geometry)
+    campaign = load_campaign(args.campaign)
+    common.mention_compiling("model.actual_pose_one")
+    plan = template(campaign, geometry, args.seed, args.campaign)
+    if args.model != "ideal":
+        plan = compensated(plan, model)
+    with common.progress_bar(len(plan.stations), " stations") as bar:
+        read = measure(plan, campaign, RealMachine(geometry, truth), args.seed, bar.update)
+    measured = read.with_values(read.value.round(RESOLUTION))
+    write_measurements(measured, args.out)
+    common.show(common.json_text(_as_json(measured, args)) if args.json else _report(measured, args))
+    return 0
+
+
+def _report(measured: MeasurementSet, args: argparse.Namespace) -> str:
+    """Say what was measured, how much of each kind, and where it went."""
+    lengths = "nominal strut lengths" if args.model == "ideal" else f"the strut lengths of {args.model}"
+    errors = f"machine {measured.geometry.name} with the errors of {args.truth}"
+    lines = [f"{errors}, moved by {lengths}; seed {args.seed}"]
+    rows = [
+        [kind, str(count), texts.number(rms, 3), texts.number(largest, 3), unit]
+        for kind, count, rms, largest, unit in _channels(measured)
+    ]
+    lines.append(texts.aligned(["channel", "readings", "rms", "max", ""], rows))
+    count = f"{len(measured)} readings of {len(measured.runs)} runs at {len(measured.stations)} stations"
+    return "\n".join([*lines, f"{count}: {args.out}"])
+
+
+def _as_json(measured: MeasurementSet, args: argparse.Namespace) -> dict[str, Any]:
+    """Return the same for programs."""
+    head = {"machine": measured.geometry.name, "truth": args.truth, "model": args.model, "seed": args.seed}
+    channels = [
+        {"channel": kind, "readings": count, f"rms_{unit}": rms, f"max_{unit}": largest}
+        for kind, count, rms, largest, unit in _channels(measured)
+    ]
+    counts = {"readings": len(measured), "runs": len(measured.runs), "stations": len(measured.stations)}
+    return {**head, **counts, "channels": channels, "written": args.out}
+
+
+def _channels(measured: MeasurementSet) -> Iterator[tuple[str, int, float, float, str]]:
+    """Yield each kind of channel that was read, how often, its RMS and largest reading, and their unit."""
+    from ..machine.size import rms
+    from ..measurements.readings import ANGULAR_KINDS, KINDS
+
+    for number, kind in enumerate(KINDS):
+        values = measured.value[measured.kind == number] * 1e6
+        if len(values):
+            unit = "urad" if kind in ANGULAR_KINDS else "um"
+            yield kind, len(values), rms(values), float(abs(values).max()), unit

@@ -1,0 +1,230 @@
+"""The verbs: in which group each stands, what it does in one line, and its help with units and an example."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Verb(NamedTuple):
+    """A verb in ``--help``.
+
+    Attributes
+    ----------
+    group : str
+        Under which heading it is listed.
+    summary : str
+        One line.
+    text : str
+        What stands below its options.
+    """
+
+    group: str
+    summary: str
+    text: str
+
+
+VERBS = {
+    "ik": Verb(
+        "kinematics",
+        "strut lengths (mm) for a tool pose (mm, degrees) or a CSV file",
+        """A file's columns are x_mm, y_mm, z_mm, optionally alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw)
+and sequence or name; other units by their suffix (_m, _um, _in, _rad). CSV in gives CSV out, L1_mm … L6_mm,
+which fk reads. With --model, L1_mm … L6_mm are the lengths to command, nominal_L1_mm … and
+correction_L1_um … (command − nominal) follow. Directions of motion are not known here: a backlash counts
+half either way. Lengths are given for any pose; limits that it breaks are named on stderr (see check).
+
+example:
+  $ hexapod_comp ik --pose 0,0,400,5,0,0
+  machine paper
+    strut  nominal_mm
+  strut_1  519.493721
+  strut_2  519.807869
+  strut_3  509.191843
+  strut_4  509.191843
+  strut_5  499.282327
+  strut_6  498.955256
+  $ hexapod_comp ik config/table1.csv --model paper_machine --out lengths.csv""",
+    ),
+    "fk": Verb(
+        "kinematics",
+        "tool pose (mm, degrees) for six strut lengths (mm) or a CSV file",
+        """A file's columns are L1_mm … L6_mm (or _m, _um, _in), optionally sequence or name; CSV in gives CSV
+out, which ik and check read. With --model the lengths are commands, and the pose is where the real machine
+goes. Newton starts at home, or at --guess; --cold needs no guess: it finds every pose with these lengths
+and picks the one in which the machine can work (6-3 machines).
+
+example:
+  $ hexapod_comp fk --lengths 519.494,519.808,509.192,509.192,499.282,498.955
+  machine paper
+       x_mm      y_mm        z_mm  alpha_deg  beta_deg  gamma_deg
+  -0.000130  0.000034  400.000021   5.000127  0.000074   0.000011
+  $ hexapod_comp ik config/table1.csv | hexapod_comp fk -""",
+    ),
+    "check": Verb(
+        "kinematics",
+        "which pose of a CSV file breaks which limit, with all margins",
+        """By default the rows are targets: the tool moves from one to the next with a rest at each, as `run`
+does, and the whole way is checked. With --stream the rows are consecutive commands at --rate-hz, and their steps
+and strut speeds are checked as they are. Limits hold for nominal and for compensated values (--model).
+Margins: stroke in mm to the nearer end, joint cones in degrees, distance of the struts' axes in mm if the machine
+limits it; condition number, correction (µm), step (mm) and speed (mm/s) are shown as values. Exit code: 0 all
+within, 1 a limit is broken, 2 bad input.
+
+example:
+  $ hexapod_comp check config/table1.csv
+  machine paper, model ideal: 10 poses as targets joined by moves at 250 Hz; 753 poses examined
+
+  margins of stroke and cones, values of the rest, the worst of the move to each pose:
+  row  line  stroke_mm  base_cone_deg  platform_cone_deg  condition  correction_um  step_mm  speed_mm_s
+    1     2    179.192         50.000             75.000      1.166           0.00        –           –
+    2     3    168.955         49.029             69.450      1.169           0.00   0.7646      191.15
+  …
+
+  smallest margin per limit:
+          limit   margin    value  allowed  unit  strut        stage  row  line  of the move
+         stroke  149.137  479.137  330.000    mm      3      nominal    9    10  at the pose
+  …
+  all within limits""",
+    ),
+    "run": Verb(
+        "loop",
+        "send poses through the loop: two simulated nodes, or your own",
+        """The tool moves from pose to pose within the machine's limits and rests at each. Its error is read from
+tool_pose_true. Columns of the file: x_mm, y_mm, z_mm, alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw). Poses in
+the file and in the report are the tool's in the work frame, in mm and degrees. Errors are in µm and µrad. Exit code:
+0 all commands were answered, 1 some were lost or refused, 2 bad input.
+
+example:
+  $ hexapod_comp run config/table1.csv --pictures out
+  $ hexapod_comp run poses.csv --attach --rate-hz 100     (nodes already running in this ROS domain)""",
+    ),
+    "demo": Verb(
+        "loop",
+        "show the loop: a table of poses and a milling path, two real nodes",
+        """The poses are those of Table 1 of Song, Mou & King. Errors are printed in µm and µrad.
+
+Exit code: 0 only when no command was lost or refused, both nodes ended well, and compensation reduced the error.
+With the simulated machine's true model it must leave at most 1 µm at rest and 0.5 µm RMS (10 µm in passing) on the
+path.
+
+example:
+  $ hexapod_comp demo
+  $ hexapod_comp demo --model paper_lines_model     (the scheme of Mou & King 1998 on 1-D lines: exits 1)""",
+    ),
+    "replay": Verb(
+        "loop",
+        "run a recorded bag through the compensator again: the same bits?",
+        """BAG is a folder that `ros2 bag record` has written (MCAP or sqlite3), or one of its files. It must hold
+compensator/journal; with compensator/files the geometry and the model that were in use come along. strut_states and
+tool_pose_estimate are shown in the pictures.
+
+With --model (or --machine) of another file than was in use, the report also says what that would have corrected.
+Exit code 0: the same bits, or within --tolerance-um; 1: not the same; 2: the bag cannot be used.
+
+example:
+  $ ros2 bag record --storage mcap --output run --all
+  $ hexapod_comp replay run --pictures out/replay
+  run: /compensator, machine paper, model shipped example: the virtual machine of the demo
+  from 2026-11-21 20:11:05 UTC, 12.0 s: 3001 commands taken, 3000 answered, 1 refused
+  replayed 3000 of 3000 answers: identical bit for bit
+  …""",
+    ),
+    "plan": Verb(
+        "calibration",
+        "what a measuring campaign will determine, and what it will not",
+        """Takes a campaign file and says without a single reading which parameters the campaign would determine, which
+it leaves open, and what tool error (µm) a fit of --scheme joint will leave on a machine within the tolerances.
+
+example:
+  $ hexapod_comp plan campaign_1d --lead-mm 10 --blocks pitch,wave,backlash""",
+    ),
+    "simulate": Verb(
+        "calibration",
+        "measure the virtual machine: a campaign's readings as a CSV file",
+        """Moves the virtual machine through a campaign (lines, diagonals, scattered poses) and writes what its
+instruments read, noise and unknown zeros included. The CSV file is the one that fit reads: one reading a row, errors
+as measured minus commanded, in um and urad. --model measures the machine with that model's compensation: then the file
+also holds the strut lengths that were commanded. The same seed gives the same file.
+
+example:
+  $ hexapod_comp simulate --campaign campaign_1d --seed 1 --out measured.csv
+  machine paper with the errors of paper_machine.yaml, moved by nominal strut lengths; seed 1
+  channel  readings     rms      max
+   linear      1670  28.603  142.893  um
+  1670 readings of 59 runs at 1670 stations: measured.csv""",
+    ),
+    "fit": Verb(
+        "calibration",
+        "fit a model of the machine's errors to measurements",
+        """Reads tidy CSV (one reading a row, what simulate writes), .rtl and .rtx files of the laser software (each
+with its line file NAME.rtl.yaml beside it), or with --columns the wide CSV files of other labs.
+
+--scheme joint fits structure, struts and field to all readings at once. It keeps only what helps on readings that
+the fit did not see. --scheme lines is that of Mou & King 1998: a polynomial per grid line, direction and channel.
+--truth names the errors of the virtual machine that simulate moved: the report then says what the model is worth.
+Errors are reported in µm and µrad. Exit code: 0 written, 1 the readings do not bear the model out (nothing is
+written without --force), 2 bad input.
+
+example:
+  $ hexapod_comp simulate --campaign campaign_5d --seed 1 --out measured.csv
+  $ hexapod_comp fit measured.csv --lead-mm 10 --out model.yaml --pictures out
+  $ hexapod_comp demo --model model.yaml""",
+    ),
+    "iso230": Verb(
+        "calibration",
+        "the figures of ISO 230-2:2014 (A, E, R, M, B) of measured lines",
+        """Judges every linear run with two cycles or more, all targets read from both sides in each (the standard asks
+for five cycles; a campaign says how many it makes). Figures are in µm. --targets prints each run target by target.
+
+example:
+  $ hexapod_comp iso230 measured.csv""",
+    ),
+    "export": Verb(
+        "calibration",
+        "write a model for LinuxCNC or as a table; check what it leaves",
+        """--linuxcnc writes into a folder: genhexkins.hal (setp lines with the real joints), strut_1.comp …
+strut_6.comp (offset, pitch, screw wave, length map and backlash of each strut, at most 256 points) and comp.ini
+(lines to copy into the ini file). --table writes corrections of struts and of poses on a grid of positions of a level
+tool, forward and backward, as CSV. Files of the same names are replaced.
+
+Every file is then read back, and the machine that the model describes is driven through it along random poses, level
+and tilted, forward and backward: the report gives the tool's 3-D error before and after, and the size of what
+the export cannot carry. The exit code is 1 when it would make the error larger.
+
+example:
+  $ hexapod_comp export --machine paper.yaml --model paper_machine.yaml --linuxcnc linuxcnc --table table.csv""",
+    ),
+    "assess": Verb(
+        "analysis",
+        "what random imperfections within bounds do to lengths and poses",
+        """Draws machines within the bounds (uniform, ±). For the first one it prints the tables of Song, Mou & King:
+the ideal strut lengths (mm), the lengths that the real machine needs for the same poses, their difference (µm), and
+the pose (mm, degrees) that the real machine takes under ideal lengths. With --machines N it also prints percentiles
+over N machines with consecutive seeds. --out writes every machine and pose to a CSV file.
+
+example:
+  $ hexapod_comp assess config/table1.csv --joint-um 10 --strut-um 10 --machines 200 --seed 1
+  machine paper, joints ±10 µm, struts ±10 µm; seed 1…200
+  …
+  real minus ideal (Table 4 − Table 2):
+  sequence  dL1_um  dL2_um  dL3_um  dL4_um  dL5_um  dL6_um
+         1  21.763  -0.247  -2.168  13.330  -3.268  -4.341
+  …
+  largest strut change 34.198 µm (two joints in a corner of their cubes and a strut allow 44.641 µm)""",
+    ),
+    "classify": Verb(
+        "analysis",
+        "rank a machine's errors by what they do to the tool",
+        """Finds what the machine reaches (stroke, joint cones, strut clearance, condition number), and the effect of
+every single error of the budget at every grid point of it, by forward kinematics of the machine with that error.
+Prints the ranked table of v. Daake et al. with their figures beside it (µm, mdeg), what the budget adds up to, and
+with --allow-um what each error may be. --out writes the ranking as CSV. --pictures writes pictures (ranking, causes,
+one of shells for each error type) and, with plotly installed, page.html, which shows every error from all sides.
+
+--tilt-deg says which orientations: every combination of the tilts about x and y.
+
+example:
+  $ hexapod_comp classify --pictures out
+  $ hexapod_comp classify --tilt-deg 0 --allow-um 50 --out ranking.csv""",
+    ),
+}
