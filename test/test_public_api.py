@@ -53,6 +53,12 @@ def test_every_public_name_is_there(name: str):
     assert not (DOOR.parent / f"{name}.py").exists()
 
 
+def test_the_documentation_lists_them_all():
+    table = (ROOT / "doc" / "api.md").read_text(encoding="utf-8").partition("```{eval-rst}")[0]
+    listed = [name for row in table.splitlines() if row.startswith("| ") for name in re.findall(r"`(\w+)`", row)]
+    assert sorted(listed) == sorted(hc.__all__)
+
+
 def test_other_names_are_refused():
     with pytest.raises(AttributeError, match="no attribute 'load_hexapod'"):
         _ = hc.load_hexapod  # type: ignore[attr-defined]
