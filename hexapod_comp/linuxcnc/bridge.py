@@ -212,7 +212,8 @@ class LinuxcncBridgeNode(MachineNode):
         """Publish measured struts; while no corrections come, only when they stand.
 
         A compensator starts from the measured struts, and takes their way to its commands for a correction to be
-        ramped out. Moving struts lag: one that starts while they move is better left without them.
+        ramped out. Moving struts lag: one that starts while they move is better left without them, unless it cannot
+        start where it was told to be last.
         """
         out, since = self._states_out, self._states.age(now)
         self._states.tick(now)
@@ -220,7 +221,8 @@ class LinuxcncBridgeNode(MachineNode):
         out.write(np.array(feedback) * self._metres, since if followed else 0.0)
         if not followed or max(map(abs, out.velocity.tolist())) > STANDING:
             self._moved_at = now
-        if self._silent(now) and now - self._moved_at < self._options["timeout"]:
+        in_vain = self._reset is not None and self._reset.in_vain
+        if self._silent(now) and now - self._moved_at < self._options["timeout"] and not in_vain:
             return
         out.message.header.stamp = stamp
         self._states_pub.publish(out.message)

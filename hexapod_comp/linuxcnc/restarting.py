@@ -43,9 +43,15 @@ class CompensatorReset:
         self._node, self._status, self._patience = node, status, patience
         self._name = f"{node.get_namespace()}/compensator:".lstrip("/")
         self._asked_at = self._complained_at = -math.inf
+        self._in_vain = 0
         self._question: Future | None = None
         self._complaints = node.listen_to(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
         self._client = node.create_client(Trigger, "compensator/reset")
+
+    @property
+    def in_vain(self) -> bool:
+        """Whether it has been asked again, and still nothing was heard."""
+        return self._in_vain > 1
 
     def close(self) -> None:
         """Stop listening."""
@@ -59,6 +65,8 @@ class CompensatorReset:
 
     def ask(self, streaming_since: float, heard_at: float, now: float) -> None:
         """Ask if nothing was heard for too long, though commands have been sent since a while; monotonic times, s."""
+        if heard_at > self._asked_at:
+            self._in_vain = 0
         waited = now - max(streaming_since, heard_at)
         if waited < self._patience + RESET_AFTER or now - self._asked_at < RESET_PERIOD:
             return
@@ -71,4 +79,5 @@ class CompensatorReset:
             self._client.remove_pending_request(self._question)
         self._question = self._client.call_async(Trigger.Request())
         self._status.resets += 1
+        self._in_vain += 1
         self._node.warn_of("reset", "the compensator refuses every command; asked it to start anew")
