@@ -281,10 +281,10 @@ class Estimation:
         size = np.abs(residuals) / self.uncertainty
         weights = np.ones(len(size))
         for k in np.unique(self.measurements.kind):
-            mine = self.measurements.kind == k
-            cut = HUBER * MEDIAN_TO_SIGMA * np.median(size[mine])
+            members = self.measurements.kind == k
+            cut = HUBER * MEDIAN_TO_SIGMA * np.median(size[members])
             if cut > 0.0:
-                weights[mine] = np.minimum(1.0, cut / np.maximum(size[mine], cut))
+                weights[members] = np.minimum(1.0, cut / np.maximum(size[members], cut))
         return weights
 
 
@@ -362,10 +362,10 @@ def _tolerances(space: ParameterSpace, posterior: Posterior, z: np.ndarray) -> n
     """
     result, start = posterior.tolerances.copy(), space.start_tolerances()
     for n, block in enumerate(space.blocks):
-        mine = (posterior.used >= block.part.start) & (posterior.used < block.part.stop)
-        if mine.any():
+        members = (posterior.used >= block.part.start) & (posterior.used < block.part.stop)
+        if members.any():
             first = HYPER * (start[n] / result[n]) ** 2
-            factor = np.sqrt((z[mine] @ z[mine] + first) / (posterior.determined[mine].sum() + HYPER))
+            factor = np.sqrt((z[members] @ z[members] + first) / (posterior.determined[members].sum() + HYPER))
             result[n] = min(result[n] * np.clip(factor, 0.1, 10.0), LARGEST_TOLERANCE.get(block.name, np.inf))
     return result
 

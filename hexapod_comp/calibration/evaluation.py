@@ -142,9 +142,9 @@ def paper_metric(
     errors: list[list[np.ndarray]] = [[], []]
     for axis in range(3):
         passes = _check_lines(truth.geometry, box, axis, step, lines, rng, np.eye(3) if level is None else level)
-        for found, told in zip(errors, (None, model), strict=True):
-            found.append(_laser_readings(truth, passes, told, lines, sensed))
-    before, after = (np.abs(np.concatenate(found)) for found in errors)
+        for readings, applied in zip(errors, (None, model), strict=True):
+            readings.append(_laser_readings(truth, passes, applied, lines, sensed))
+    before, after = (np.abs(np.concatenate(readings)) for readings in errors)
     return PaperMetric(float(before.mean()), float(after.mean()), 3 * lines, len(before))
 
 

@@ -338,9 +338,9 @@ def _channels(estimation: Estimation, solution: Solution) -> list[ChannelFit]:
     readings_of_cell = np.bincount(estimation.cells.of_reading, minlength=len(problem.kind))
     result = []
     for k in np.unique(kinds):
-        mine = problem.kind == k
+        members = problem.kind == k
         stated = estimation.measurements.stated_of(k)
-        mean_square = float((errors[mine] ** 2 / readings_of_cell[mine]).mean())
+        mean_square = float((errors[members] ** 2 / readings_of_cell[members]).mean())
         factor = float(posterior.noise[k])
         result.append(
             ChannelFit(

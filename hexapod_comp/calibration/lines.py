@@ -207,10 +207,10 @@ def _misfit(measurements: MeasurementSet, fits: Sequence[LineFit]) -> str:
     repeated: dict[int, float] = {}
     left: dict[int, float] = {}
     for kind in np.unique(measurements.kind):
-        mine = [fit for fit in fits if _kind(fit) == KINDS[kind]]
+        members = [fit for fit in fits if _kind(fit) == KINDS[kind]]
         for found, values in (
-            (repeated, [fit.repeat_std for fit in mine if np.isfinite(fit.repeat_std)]),
-            (left, [fit.residual_std for fit in mine]),
+            (repeated, [fit.repeat_std for fit in members if np.isfinite(fit.repeat_std)]),
+            (left, [fit.residual_std for fit in members]),
         ):
             if values:
                 found[int(kind)] = rms(values)
@@ -250,9 +250,9 @@ def _fit_families(
     """Return the field and its polynomials: component by component, the family that it belongs to first."""
     field, fits = empty, []
     for component in range(6):
-        mine = readings.select(readings.component == component)
-        for axis in _priority(component, mine):
-            found = _fit_family(mine, component, axis, field, order, datum)
+        members = readings.select(readings.component == component)
+        for axis in _priority(component, members):
+            found = _fit_family(members, component, axis, field, order, datum)
             field = _with_family(field, axis, found)
             fits += found
     return field, fits
@@ -278,9 +278,9 @@ def _fit_family(
     """
     family = readings.select(readings.axis == axis)
     first = _priority(component, readings)[0]
-    # Lines of which the first family has said everything that differs between them share what is left.
+    # Lines of which the first family has predicted everything that differs between them share what is left.
     shared = None if axis == first else first
-    family = family._replace(value=family.value - _said(field, family, component))
+    family = family._replace(value=family.value - _predicted(field, family, component))
     fits = []
     for nodes, group in _groups(family, axis, field.grid, shared):
         name = line_name(field.grid, axis, nodes[0])
@@ -304,16 +304,16 @@ def _fit_notes(fits: Sequence[LineFit], order: OrderRule) -> list[str]:
     return notes
 
 
-def _said(field: GridField, readings: Readings, component: int) -> np.ndarray:
+def _predicted(field: GridField, readings: Readings, component: int) -> np.ndarray:
     """Return what a field says of some readings, shape (N,): an axis that stands still has no direction."""
-    said = np.zeros(len(readings.value))
+    predicted = np.zeros(len(readings.value))
     if not any(family[:, :, :, component].any() for family in field.lines):
-        return said
+        return predicted
     for n, (point, axis, direction) in enumerate(zip(readings.point, readings.axis, readings.direction, strict=True)):
         sense = np.zeros(3)
         sense[axis] = direction
-        said[n] = field.evaluate(point, sense)[0][component]
-    return said
+        predicted[n] = field.evaluate(point, sense)[0][component]
+    return predicted
 
 
 def _groups(

@@ -134,8 +134,8 @@ class SmoothField:
         families = []
         for axis in range(3):
             half = 0.5 * self._family(grid, axis, reversal[axis], self.reversal_powers)
-            mine = self.powers.argmax(axis=1) == axis
-            mean = self._family(grid, axis, coefficients[:, mine], self.powers[mine])
+            members = self.powers.argmax(axis=1) == axis
+            mean = self._family(grid, axis, coefficients[:, members], self.powers[members])
             wide = np.zeros((*mean.shape[:-1], max(mean.shape[-1], half.shape[-1])))
             family = np.stack([wide, wide])
             family[..., : mean.shape[-1]] += mean

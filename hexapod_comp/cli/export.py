@@ -70,9 +70,9 @@ def _linuxcnc(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray) -> 
     from ..export.linuxcnc_files import read_genhexkins, write_genhexkins
 
     machine = trial.machine
-    told = make_genhexkins(machine, box)
-    misfit = table_misfit(machine, told, box)
-    files = write_genhexkins(told, args.linuxcnc, args.units, _titles(machine.model, box), misfit)
+    genhexkins = make_genhexkins(machine, box)
+    misfit = table_misfit(machine, genhexkins, box)
+    files = write_genhexkins(genhexkins, args.linuxcnc, args.units, _titles(machine.model, box), misfit)
     back = read_genhexkins(args.linuxcnc, args.units)
     check = trial.check(back.commands)
     rms, largest = table_misfit(machine, back, box).max(axis=0) * 1e6

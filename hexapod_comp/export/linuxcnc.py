@@ -223,14 +223,14 @@ def exact_trims(machine: RealMachine, strut: int, joints: np.ndarray, sense: flo
     return np.array(commands) - joints
 
 
-def table_misfit(machine: RealMachine, told: Genhexkins, box: np.ndarray) -> np.ndarray:
+def table_misfit(machine: RealMachine, genhexkins: Genhexkins, box: np.ndarray) -> np.ndarray:
     """Return RMS and largest difference between table and model, shape (6, 2), m, over the lengths of the box."""
     misfits = []
-    for strut, (low, high) in enumerate(_joint_ranges(told, box)):
+    for strut, (low, high) in enumerate(_joint_ranges(genhexkins, box)):
         joints = np.linspace(low, high, SAMPLES * MOST_POINTS)
         rest = np.concatenate(
             [
-                told.tables[strut].correction(joints, np.full(len(joints), sense > 0.0))
+                genhexkins.tables[strut].correction(joints, np.full(len(joints), sense > 0.0))
                 - exact_trims(machine, strut, joints, sense)
                 for sense in (1.0, -1.0)
             ]

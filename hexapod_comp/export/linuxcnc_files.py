@@ -39,13 +39,13 @@ SETP = re.compile(r"setp\s+genhexkins\.(\S+)\s+(\S+)\s*")
 
 
 def write_genhexkins(
-    told: Genhexkins, folder: str | Path, unit: str, titles: list[str], misfit: np.ndarray
+    genhexkins: Genhexkins, folder: str | Path, unit: str, titles: list[str], misfit: np.ndarray
 ) -> list[Path]:
     """Write a HAL file, six compensation files and the ini lines; each file whole or not at all.
 
     Parameters
     ----------
-    told : Genhexkins
+    genhexkins : Genhexkins
         What to write.
     folder : str or Path
         Made if missing; files of these names in it are replaced.
@@ -68,8 +68,8 @@ def write_genhexkins(
         raise InputFileError(folder, "", f"cannot be made: {error.strerror}") from error
     size = MACHINE_UNITS[unit]
     titles = [" ".join(title.split()) for title in titles]  # a line break would end the comment
-    bodies = {HAL_FILE: _hal_lines(told, size), INI_FILE: _ini_lines()}
-    bodies |= {name: _comp_lines(table, size) for name, table in zip(COMP_FILES, told.tables, strict=True)}
+    bodies = {HAL_FILE: _hal_lines(genhexkins, size), INI_FILE: _ini_lines()}
+    bodies |= {name: _comp_lines(table, size) for name, table in zip(COMP_FILES, genhexkins.tables, strict=True)}
     mark = hashlib.sha256(repr(sorted(bodies.items())).encode()).hexdigest()[:16]
     titles = [f"set {mark}", *titles, f"machine unit: {unit}"]
     for name, body in bodies.items():
@@ -107,13 +107,13 @@ def _comp_about(misfit: np.ndarray) -> list[str]:
     ]
 
 
-def _hal_lines(told: Genhexkins, size: float) -> list[str]:
-    values: list[tuple[str, float]] = [("screw-lead", told.lead / size)]
+def _hal_lines(genhexkins: Genhexkins, size: float) -> list[str]:
+    values: list[tuple[str, float]] = [("screw-lead", genhexkins.lead / size)]
     for pin, name in PINS.items():
-        if pin.endswith("-n") and told.lead == 0.0:
+        if pin.endswith("-n") and genhexkins.lead == 0.0:
             continue
         scale = 1.0 if pin.endswith("-n") else size
-        for joint, vector in enumerate(getattr(told, name)):
+        for joint, vector in enumerate(getattr(genhexkins, name)):
             values += [(f"{pin}.{joint}.{axis}", v / scale) for axis, v in zip("xyz", vector, strict=True)]
     return [f"setp genhexkins.{pin} {value + 0.0:.12f}" for pin, value in values]
 

@@ -228,9 +228,10 @@ def _pose_corrections(passes: Passes, corrections: np.ndarray) -> np.ndarray:
     starts = map(Pose, *passes.poses)
     lengths = passes.nominal_commands() + corrections
     found = [solve_pose(structure, row, start) for row, start in zip(lengths, starts, strict=True)]
-    told = geometry.tool_poses(np.array([pose.position for pose in found]), np.array([pose.rotation for pose in found]))
+    at, turned = (np.array([getattr(pose, part) for pose in found]) for part in ("position", "rotation"))
+    changed = geometry.tool_poses(at, turned)
     positions, rotations, _ = passes.of_the_tool()
-    return np.hstack([told[0] - positions, attitude_error(told[1], rotations)])
+    return np.hstack([changed[0] - positions, attitude_error(changed[1], rotations)])
 
 
 # Applying

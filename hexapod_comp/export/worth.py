@@ -147,7 +147,7 @@ class ExportTrial:
             The machine has no pose for what the export commands.
         """
         commands = [commands_of(trial.passes) for trial in self._trials]
-        after = [trial.errors(told) for trial, told in zip(self._trials, commands, strict=True)]
+        after = [trial.errors(lengths) for trial, lengths in zip(self._trials, commands, strict=True)]
         level, *tilted = (_comparison(*pair) for pair in zip(self._before, after, strict=True))
         warmer = _warmer(self._trials[0], commands[0], after[0])
         return ExportCheck(level, tilted[0] if tilted else None, Size.of(after[0].field_share), warmer)

@@ -240,8 +240,8 @@ class LinuxcncBridgeNode(MachineNode):
         bad = {name: value for name, value in zip(names, values, strict=True) if not abs(value) <= LARGEST_PIN}
         if not bad:
             return True
-        which, said = ", ".join(bad), ", ".join(f"{name} = {value}" for name, value in bad.items())
-        text = f"pins that are no numbers within ±{LARGEST_PIN:g}: {said}"
+        which, listed = ", ".join(bad), ", ".join(f"{name} = {value}" for name, value in bad.items())
+        text = f"pins that are no numbers within ±{LARGEST_PIN:g}: {listed}"
         self._status.bad_pins.add(which, text, now)
         self.warn_of(which, text)
         return False

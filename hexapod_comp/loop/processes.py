@@ -164,9 +164,9 @@ class NodeProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
             code = self._process.wait()
-        said = self.output()
+        output = self.output()
         self.log.unlink(missing_ok=True)
-        return code, said
+        return code, output
 
 
 def ros_arguments(parameters: Mapping[str, object], remaps: Mapping[str, str] | None = None) -> Sequence[str]:

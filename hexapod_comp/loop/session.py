@@ -52,14 +52,14 @@ def simulated_machine(
         try:
             yield nodes
         except BaseException as error:
-            said = "\n".join(f"{node.name}:\n{node.stop()[1]}" for node in nodes)
+            output = "\n".join(f"{node.name}:\n{node.stop()[1]}" for node in nodes)
             if isinstance(error, NoAnswerError):
-                raise NoAnswerError(f"{error}; the nodes said:").with_lines(said) from error
+                raise NoAnswerError(f"{error}; the nodes said:").with_lines(output) from error
             raise
         for node in nodes:
-            code, said = node.stop()
+            code, output = node.stop()
             if code != 0:
-                raise HexapodError(f"{node.name} ended with code {code}:").with_lines(said)
+                raise HexapodError(f"{node.name} ended with code {code}:").with_lines(output)
 
 
 class Session:
@@ -162,8 +162,8 @@ def connect(client: LoopClient, nodes: Sequence[NodeProcess] = (), timeout: floa
     def ready() -> bool:
         for node in nodes:
             if node.exit_code() is not None:
-                said = node.output()
-                raise HexapodError(f"{node.name} ended with code {node.exit_code()}:").with_lines(said)
+                output = node.output()
+                raise HexapodError(f"{node.name} ended with code {node.exit_code()}:").with_lines(output)
         return client.connected() and (client.has_true_pose or not nodes)
 
     client.spin_until(ready, timeout, "compensator and strut drive to answer")

@@ -127,7 +127,7 @@ def _is_no_field(field: GridField) -> bool:
     nothing = no_field()
     return (
         not any(family.shape[4] for family in field.lines)
-        and all(np.array_equal(mine, its) for mine, its in zip(field.grid, nothing.grid, strict=True))
+        and all(np.array_equal(ours, theirs) for ours, theirs in zip(field.grid, nothing.grid, strict=True))
         and not field.probe.any()
         and field.outside == nothing.outside
         and field.reversal_threshold == nothing.reversal_threshold

@@ -243,8 +243,8 @@ class MeasurementSet:
 
     def stated_of(self, kind: int) -> float:
         """Return the root mean square of :attr:`stated` over a kind's readings, m or rad; 1 where there are none."""
-        mine = self.stated[self.kind == kind]
-        return rms(mine) if len(mine) else 1.0
+        members = self.stated[self.kind == kind]
+        return rms(members) if len(members) else 1.0
 
     def misfit(self, found: Mapping[int, float], times: float) -> str:
         """Return what is wrong when kinds of reading are further off than they may be; empty when none is.
@@ -350,12 +350,12 @@ def refuse_unmoved(measurements: MeasurementSet, left: np.ndarray) -> None:
         Of a kind nothing is left, to :data:`LEAST_NOISE`.
     """
     for k in np.unique(measurements.kind):
-        mine = measurements.kind == k
-        if np.abs(left[mine]).max() <= LEAST_NOISE:
-            zero = not measurements.value[mine].any()
+        members = measurements.kind == k
+        if np.abs(left[members]).max() <= LEAST_NOISE:
+            zero = not measurements.value[members].any()
             problem = "are all zero" if zero else "never change within a run, or are just what the machine was told"
             hint = "was the instrument connected? Such readings tell nothing; leave them out"
-            raise CalibrationError(f"{KINDS[k]}", f"the {mine.sum()} readings {problem}: {hint}")
+            raise CalibrationError(f"{KINDS[k]}", f"the {members.sum()} readings {problem}: {hint}")
 
 
 def spans(points: np.ndarray) -> bool:

@@ -297,10 +297,10 @@ def _readings(
     readings = []
     for n, (line, _) in enumerate(table.rows):
         pose = Pose(commanded.positions[n], commanded.rotations[n])
-        told = None if commands is None else tuple(commands[n].tolist())
+        lengths = None if commands is None else tuple(commands[n].tolist())
         for kind, values, uncertainty in errors:
             for axis, value in zip(AXES, values[n].tolist(), strict=True):
                 place = (run, 1, columns.order, pose, f"{kind}_{axis}")
                 source = FileLine(str(table.path), line)
-                readings.append(Reading(*place, value, uncertainty, commands=told, source=source))
+                readings.append(Reading(*place, value, uncertainty, commands=lengths, source=source))
     return readings

@@ -53,16 +53,16 @@ def _csv_rows(measurements: MeasurementSet) -> Iterator[list[str]]:
     tail = ["uncertainty"] * with_uncertainty + temperature_names
     yield ["run", "direction", "cycle", *pose_names, "channel", "value", "unit", *tail]
     struts = _strut_cells(measurements)
-    told: set[tuple] = set()
+    written: set[tuple] = set()
     before: tuple | None = None
     for n, station in enumerate(measurements.station.tolist()):
         direction, cycle = int(measurements.direction[n]), int(measurements.cycle[n])
         head = [measurements.runs[measurements.run[n]].name, words[direction], str(cycle), *poses[station]]
         visit = (direction, cycle, station)
-        if station in struts and (visit not in told or (direction == FROM_PREVIOUS and visit != before)):
+        if station in struts and (visit not in written or (direction == FROM_PREVIOUS and visit != before)):
             for name, length in zip(STRUT_NAMES, struts[station], strict=True):
                 yield [*head, name, length, "mm", *[""] * with_uncertainty, *temperatures[station]]
-        told.add(visit)
+        written.add(visit)
         before = visit
         channel, value = CHANNELS[measurements.channel[n]], float(measurements.value[n])
         cells = _value_cells(channel, value, float(measurements.uncertainty[n]), commanded[station])

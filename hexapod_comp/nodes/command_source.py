@@ -95,7 +95,7 @@ class Publishers:
         How many there were at the last look, −1 before.
     names : tuple of str
         Full names of their nodes, each once.
-    untold : str
+    unknown : str
         Why the names cannot be told, empty where they can. Who cannot tell who commands must not obey.
     """
 
@@ -103,19 +103,19 @@ class Publishers:
         self._node, self.topic, self._count_now = node, topic, count
         self.count = -1
         self.names: tuple[str, ...] = ()
-        self.untold = ""
+        self.unknown = ""
 
     def look(self) -> None:
         """Look again: at the names only when they may have changed, or when they matter."""
         count = self._count_now()
-        if count != self.count or count > 1 or self.untold or UNKNOWN_NAME in self.names:
+        if count != self.count or count > 1 or self.unknown or UNKNOWN_NAME in self.names:
             self.count = count
-            self.names, self.untold = self._found() if count else ((), "")
+            self.names, self.unknown = self._found() if count else ((), "")
 
     @property
     def reason(self) -> str:
         """Name under which refusals are counted."""
-        return "unknown_publisher" if self.untold else "several_publishers"
+        return "unknown_publisher" if self.unknown else "several_publishers"
 
     def _found(self) -> tuple[tuple[str, ...], str]:
         """Return the names, and why there are none: a node's name may be any bytes, which rclpy cannot give."""
@@ -180,8 +180,8 @@ class CommandSource:
         self.problem = ""
         if self._allowed:
             return
-        if self._publishers.untold:
-            self.problem = f"who publishes {topic} cannot be told: {self._publishers.untold}"
+        if self._publishers.unknown:
+            self.problem = f"who publishes {topic} cannot be told: {self._publishers.unknown}"
         elif len(names) > 1:
             self.problem = f"several publishers of {topic}: {', '.join(names)}"
         elif self._publishers.count > 1 and self.sequence.two_speak(now):
@@ -220,6 +220,6 @@ class OwnTopic:
         """Look who publishes."""
         self._publishers.look()
         self.names = tuple(name for name in self._publishers.names if name != self._own)
-        others = ", ".join(self.names) or self._publishers.untold
-        told = others and not self._allowed
-        self.problem = f"{self._publishers.topic} is also published by {others}" if told else ""
+        others = ", ".join(self.names) or self._publishers.unknown
+        disturbed = others and not self._allowed
+        self.problem = f"{self._publishers.topic} is also published by {others}" if disturbed else ""

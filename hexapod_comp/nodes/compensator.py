@@ -58,7 +58,7 @@ class CompensatorNode(MachineNode):
         self._status = status = CompensatorStatus(self._options, self._stamps)
         self._commands, self._following, self._last_known = status.commands, status.following, status.last_known
         self._fresh_start = self._looks_closer = True
-        self._told = ""
+        self._logged_problem = ""
         self._unestimated: int | None = None
         self._compensator: Compensator | None = None
 
@@ -285,9 +285,9 @@ class CompensatorNode(MachineNode):
         """Log what stops the machine, once."""
         guard = self._status.problem()
         problem = guard.problem if guard is not None and self._active else ""
-        if problem and problem != self._told:
+        if problem and problem != self._logged_problem:
             self.get_logger().error(f"refusing commands: {problem}")
-        self._told = problem
+        self._logged_problem = problem
 
 
 def main(argv: Sequence[str] | None = None) -> int:

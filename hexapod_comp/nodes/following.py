@@ -128,8 +128,8 @@ class LastKnown:
 
     def __init__(self, anywhere_after: float) -> None:
         self._anywhere_after, self._began = anywhere_after, math.inf
-        self._measured, self._told = np.empty(6), np.empty(6)
-        self._measured_at = self._told_at = -math.inf
+        self._measured, self._commanded = np.empty(6), np.empty(6)
+        self._measured_at = self._commanded_at = -math.inf
 
     def begin(self, now: float) -> None:
         """Start, at the monotonic time `now`, s."""
@@ -141,11 +141,11 @@ class LastKnown:
 
     def tell(self, command: np.ndarray, at: float) -> None:
         """Take the last command before all of them are forgotten, shape (6,), m, published at a monotonic time, s."""
-        self._told[:], self._told_at = command, at
+        self._commanded[:], self._commanded_at = command, at
 
     def waits(self, now: float) -> bool:
         """Return whether a start must wait until something is known."""
-        unknown = self._measured_at == self._told_at == -math.inf
+        unknown = self._measured_at == self._commanded_at == -math.inf
         return unknown and not 0.0 < self._anywhere_after <= now - self._began
 
     def struts(self, now: float, fresh: bool) -> np.ndarray | None:
@@ -166,10 +166,10 @@ class LastKnown:
         """
         if self.waits(now):
             raise CommandError("no_feedback", f"no strut_states yet: where the struts stand is not known{self._hint()}")
-        after = self._told_at + (-FOLLOWED_WITHIN if fresh else FOLLOWED_WITHIN)
+        after = self._commanded_at + (-FOLLOWED_WITHIN if fresh else FOLLOWED_WITHIN)
         if self._measured_at > -math.inf and self._measured_at >= after:
             return self._measured
-        return self._told if self._told_at > -math.inf else None
+        return self._commanded if self._commanded_at > -math.inf else None
 
     def _hint(self) -> str:
         if self._anywhere_after:

@@ -77,10 +77,10 @@ def load_elsewhere(source: Source, machine: str) -> MachineModel:
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise LoadingError(f"{source.name}: could not be loaded: {error}") from error
-    said = done.stdout.decode("utf-8", "replace")
+    output = done.stdout.decode("utf-8", "replace")
     if done.returncode == 0:
-        return model_of(said)
-    raise LoadingError(said or f"{source.name}: the loading process ended with {done.returncode}")
+        return model_of(output)
+    raise LoadingError(output or f"{source.name}: the loading process ended with {done.returncode}")
 
 
 class Loading:

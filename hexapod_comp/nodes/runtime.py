@@ -95,13 +95,13 @@ class MachineNode(LifecycleNode):
 
     def warn_of(self, cause: str, text: str) -> None:
         """Log a warning, once per cause and second."""
-        if (told := self._throttle.told(cause, text)) is not None:
-            self.get_logger().warning(told)
+        if (line := self._throttle.allow(cause, text)) is not None:
+            self.get_logger().warning(line)
 
     def complain_of(self, cause: str, text: str) -> None:
         """Log an error, once per cause and second."""
-        if (told := self._throttle.told(cause, text)) is not None:
-            self.get_logger().error(told)
+        if (line := self._throttle.allow(cause, text)) is not None:
+            self.get_logger().error(line)
 
     def open_diagnostics(self, what: str) -> None:
         """Make the publisher of the status of this node; `what` is the machine or component that it serves."""
@@ -247,7 +247,7 @@ class Throttle:
         self._last[cause] = now
         return self._held.pop(cause, 0)
 
-    def told(self, cause: str, text: str) -> str | None:
+    def allow(self, cause: str, text: str) -> str | None:
         """Return the text to be logged, which says what was held back, or None to hold this one back."""
         held = self.passes(cause)
         return None if held is None else text + (f" ({held} more like it)" if held else "")

@@ -256,12 +256,12 @@ def _exact(
         if part == TOOL:
             yield _tool_shift(geometry, rotations, start.ok, vector)
             continue
-        told, base, platform = lengths.copy(), np.zeros((6, 3)), np.zeros((6, 3))
+        commanded, base, platform = lengths.copy(), np.zeros((6, 3)), np.zeros((6, 3))
         if part == LENGTH:
-            told[:, i] += _stretch(vector, lengths[:, i], home[i])
+            commanded[:, i] += _stretch(vector, lengths[:, i], home[i])
         else:
             (base if part == BASE_JOINT else platform)[i] = vector
-        after = solve_poses(structure.moved(base, platform), told, before, threads=1)
+        after = solve_poses(structure.moved(base, platform), commanded, before, threads=1)
         motions = np.empty((6, len(lengths)))
         kernels.motions_many(*before, after.positions, after.rotations, geometry.tool.position, axes, motions)
         yield motions

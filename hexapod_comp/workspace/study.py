@@ -168,8 +168,8 @@ def _random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np
     chosen = np.random.default_rng(seed).choice(first[-1], min(count, first[-1]), replace=False)
     poses = []
     for n, found in enumerate(reaches):  # one after the other: all poses of all reaches may be too many to hold
-        mine = chosen[(chosen >= first[n]) & (chosen < first[n + 1])] - first[n]
-        poses.append(poses_at(found.geometry, found.points()[mine], found.rotation))
+        members = chosen[(chosen >= first[n]) & (chosen < first[n + 1])] - first[n]
+        poses.append(poses_at(found.geometry, found.points()[members], found.rotation))
     positions, rotations = (np.concatenate([pose[k] for pose in poses]) for k in range(2))
     return positions, rotations
 
