@@ -308,7 +308,7 @@ def _rosdep_key(name: str) -> str:
 
 def _imports(folder: Path) -> set[str]:
     """Return the third-party top-level names that the Python files of a folder import, anywhere in them."""
-    own = {"hexapod_comp", "conftest", *(path.stem for path in (ROOT / "test").rglob("*.py"))}
+    own = {"hexapod_comp", "conftest", "data", *(path.stem for path in (ROOT / "test").rglob("*.py"))}
     names = {name for path in folder.rglob("*.py") for name in _imported_names(ast.parse(path.read_bytes()))}
     return names - own - EXEMPT - set(sys.stdlib_module_names)
 
