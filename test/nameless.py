@@ -9,7 +9,9 @@ puts a slash before every topic. ``python nameless.py TOPIC TYPE`` opens a publi
 from __future__ import annotations
 
 import ctypes
+import select
 import sys
+from collections.abc import Callable
 
 import rclpy
 from geometry_msgs.msg import PoseStamped
@@ -77,8 +79,8 @@ def entities(gid: list[int], name: bytes) -> bytes:
     return serialize_message(message).replace(mark.encode(), name)
 
 
-def tell(node: Node, data: bytes) -> None:
-    """Publish a serialised message on ``ros_discovery_info``."""
+def teller(node: Node, data: bytes) -> Callable[[], None]:
+    """Return what publishes a serialised message on ``ros_discovery_info``."""
     rcl, rmw = ctypes.CDLL("librcl.so"), ctypes.CDLL("librmw_fastrtps_cpp.so")
     rcl.rcl_node_get_rmw_handle.restype = rmw.rmw_create_publisher.restype = ctypes.c_void_p
     capsule_pointer = ctypes.pythonapi.PyCapsule_GetPointer
@@ -91,9 +93,13 @@ def tell(node: Node, data: bytes) -> None:
     topic = b"ros_discovery_info"
     publisher = rmw.rmw_create_publisher(handle, support, topic, ctypes.byref(qos), ctypes.byref(options))
     serialized = Serialized(data, len(data), len(data))
-    code = rmw.rmw_publish_serialized_message(ctypes.c_void_p(publisher), ctypes.byref(serialized), None)
-    if code != 0:
-        raise RuntimeError(f"rmw_publish_serialized_message returned {code}")
+
+    def tell() -> None:
+        code = rmw.rmw_publish_serialized_message(ctypes.c_void_p(publisher), ctypes.byref(serialized), None)
+        if code != 0:
+            raise RuntimeError(f"rmw_publish_serialized_message returned {code}")
+
+    return tell
 
 
 def main() -> None:
@@ -103,9 +109,13 @@ def main() -> None:
     node = rclpy.create_node("nameless")
     node.create_publisher(KINDS[kind], topic, 10)
     gids = [i.endpoint_gid for i in node.get_publishers_info_by_topic(topic) if i.node_name == "nameless"]
-    tell(node, entities(list(gids[0]), NAME))
+    tell = teller(node, entities(list(gids[0]), NAME))
+    tell()
     print("ready", flush=True)
-    sys.stdin.read()
+    # rmw itself has told of a node with a good name. Which of the two a listener hears last is chance, so this one goes
+    # on.
+    while not select.select([sys.stdin], [], [], 0.1)[0]:
+        tell()
 
 
 if __name__ == "__main__":
