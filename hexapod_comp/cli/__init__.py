@@ -52,11 +52,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             code = int(importlib.import_module(f".{args.verb}", __name__).run(args))
         sys.stdout.flush()
         return code
-    except HexapodError as error:
-        print(f"{PROGRAM}: error: {error}", file=sys.stderr)
-        return USAGE_ERROR
-    except ImportError as error:
-        if error.name != "numba":
+    except (HexapodError, ImportError) as error:
+        if isinstance(error, ImportError) and error.name != "numba":
             raise
         print(f"{PROGRAM}: error: {error}", file=sys.stderr)
         return USAGE_ERROR
