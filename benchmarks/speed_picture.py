@@ -35,7 +35,7 @@ def speed_picture(speed: Speed) -> Figure:
 
 
 def _kernels(axes: Axes, results: list[Result]) -> None:
-    """Draw time per pose, a group of bars per task and shape."""
+    """Draw time per pose, a group of dots per task and shape: bars would begin nowhere on a logarithmic axis."""
     groups = [("inverse", "batch"), (WIDE, "batch"), (NEAR, "batch"), ("inverse", "single"), (WIDE, "single")]
     groups.append((NEAR, "single"))
     place, places, names = 0.0, [], []
@@ -43,8 +43,8 @@ def _kernels(axes: Axes, results: list[Result]) -> None:
         rows = [r for r in results if (r.task, r.shape) == (task, shape)]
         for r in rows:
             colour = WITH if r.name == OURS else WITHOUT if "genhexkins" in r.name else OTHERS
-            axes.barh(place, r.us_per_pose, 0.8, color=colour)
-            axes.text(1.08 * r.us_per_pose, place, f"{r.us_per_pose:.3g}", va="center", fontsize=7)
+            axes.plot(r.us_per_pose, place, "o", color=colour, markersize=7)
+            axes.text(1.25 * r.us_per_pose, place, f"{r.us_per_pose:.3g}", va="center", fontsize=7)
             places.append(place)
             names.append(r.name)
             place += 1.0
@@ -57,7 +57,7 @@ def _kernels(axes: Axes, results: list[Result]) -> None:
     axes.set(xscale="log", xlabel="processor time, µs a pose", title="Kinematics")
     axes.set_xlim(right=6.0 * axes.get_xlim()[1])
     axes.invert_yaxis()
-    axes.grid(axis="y", visible=False)
+    axes.grid(axis="x", which="major", alpha=0.4)
 
 
 def _convergence(axes: Axes, rows: list[Convergence]) -> None:
@@ -95,5 +95,5 @@ def _latency(axes: Axes, rows: list[Row]) -> None:
         axes.axhline(bar, color=colour, linestyle="--", linewidth=1.0)
     axes.axhline(1.0, color="black", linewidth=0.8)
     axes.set_xticks(places, [row.name if row.name == "flat out" else f"{row.name} Hz" for row in rows])
-    axes.set(title="Latency: compensator ÷ do-nothing relay (dashed: allowed)", ylabel="ratio")
+    axes.set(title="Latency: compensator ÷ idle relay (dashed: bar)", ylabel="ratio")
     axes.legend(loc="upper right", ncols=2)
