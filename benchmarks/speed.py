@@ -17,7 +17,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from hexapod_comp.formats.figures import save
-from hexapod_comp.formats.yaml import write_text_atomically
+from hexapod_comp.formats.outputs import write_text
 
 from . import batches, blocks, convergence, genhexkins, kernels, loop
 from .speed_picture import speed_picture
@@ -161,9 +161,9 @@ def main() -> int:
     speed = load(Path(options.load).read_text(encoding="utf-8")) if options.load else measure(options.quick)
     print(report(speed))
     if options.save:
-        write_text_atomically(Path(options.save), json.dumps(asdict(speed), indent=1) + "\n")
+        write_text(Path(options.save), json.dumps(asdict(speed), indent=1) + "\n")
     if options.doc:
-        write_text_atomically(DOC / "speed.md", page(speed))
+        write_text(DOC / "speed.md", page(speed))
         save(speed_picture(speed), DOC / "pictures" / "speed.png")
     return 1 if speed.problems else 0
 

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..errors import CalibrationError
-from ..formats.figures import WITH, WITHOUT
+from ..formats.figures import WITH, WITHOUT, picture_text
 from ..kernels.struts import smooth_error
 from ..machine.field import COMPONENTS, CROSS_AXES
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
@@ -95,7 +95,7 @@ def strut_error_figure(
         errors = strut_length_errors(geometry, model, along, *line)
         for axes, lengths, letter, way in zip(panels, errors, "ab", ("forward →", "backward ←"), strict=True):
             _strut_curves(axes, along, lengths)
-            axes.set(title=f"{title}, ({letter}) {way}", xlabel="x, mm", ylabel="ΔL = actual − ideal, µm")
+            axes.set(title=f"{picture_text(title)}, ({letter}) {way}", xlabel="x, mm", ylabel="ΔL = actual − ideal, µm")
     rows[0, 0].legend(ncols=2, fontsize=7)
     figure.suptitle(f"Strut length error along x at y = {line[0] * 1e3:g} mm, z = {line[1] * 1e3:g} mm")
     return figure
@@ -168,7 +168,7 @@ def fit_figure(fit: ModelFit) -> Figure:
     _strut_panel(panels[0, 1], fit)
     _sight_panel(panels[1, 0], fit)
     _tool_error_panel(panels[1, 1], fit)
-    figure.suptitle(f"{fit.measurements.geometry.name}: scheme joint, {len(fit.measurements)} readings")
+    figure.suptitle(f"{picture_text(fit.measurements.geometry.name)}: scheme joint, {len(fit.measurements)} readings")
     return figure
 
 

@@ -11,14 +11,14 @@ from collections.abc import Sequence
 
 from ..errors import HexapodError
 from ..formats.outputs import inputs_protected
-from ..formats.texts import accept_any_terminal
+from ..formats.texts import run_with_plain_streams
 from .parsers import PROGRAM, make_parser
 
 NEGATIVE = re.compile(r"-[.\d]")
 """What follows an option and looks like this is its value, not another option."""
 
-USAGE_ERROR, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
-"""Exit codes: bad input; Ctrl-C and a closed pipe as shells count them, 128 + signal."""
+USAGE_ERROR, INTERRUPTED = 2, 130
+"""Exit codes: bad input; Ctrl-C as shells count it, 128 + signal."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,10 +32,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit code: 0 fine, 1 the verb's own "no", 2 bad input, 130 interrupted.
+        Exit code: 0 fine, 1 the verb's own "no", 2 bad input or no room for the output, 130 interrupted, 141 nobody
+        reads the output any more.
     """
     arguments = sys.argv[1:] if argv is None else argv
-    accept_any_terminal()
+    return run_with_plain_streams(lambda: _run(arguments)) or 0
+
+
+def _run(arguments: Sequence[str]) -> int:
     parser = make_parser()
     if "_ARGCOMPLETE" in os.environ:
         from .completion import complete
@@ -49,23 +53,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{PROGRAM}: note: {args.called} is now called {args.verb}", file=sys.stderr)
     try:
         with inputs_protected(args):
-            code = int(importlib.import_module(f".{args.verb}", __name__).run(args))
-        sys.stdout.flush()
-        return code
+            return int(importlib.import_module(f".{args.verb}", __name__).run(args))
     except (HexapodError, ImportError) as error:
         if isinstance(error, ImportError) and error.name != "numba":
             raise
         print(f"{PROGRAM}: error: {error}", file=sys.stderr)
-        return USAGE_ERROR
     except MemoryError as error:
         print(f"{PROGRAM}: error: this needs more memory than there is: {error}", file=sys.stderr)
-        return USAGE_ERROR
     except KeyboardInterrupt:
         return INTERRUPTED
-    except BrokenPipeError:
-        # The reader has gone (| head); the interpreter must not complain when it flushes at its end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return BROKEN_PIPE
+    return USAGE_ERROR
 
 
 def _with_negative_values(arguments: Sequence[str]) -> list[str]:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import csv
-import io
 import math
 import os
 import sys
@@ -13,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from ..formats.texts import number
+from ..formats.texts import CODES, number, own_terminal
 
 if TYPE_CHECKING:
     import numpy as np
@@ -56,14 +54,12 @@ def where(row: Row) -> str:
 
 def csv_text(rows: Iterable[Mapping[str, Any]]) -> str:
     """Return rows of equal columns as CSV; the digits of a number follow from its column's unit."""
+    from ..formats.csv import csv_text
+
     rows = list(rows)
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(rows[0])
     decimals = [DECIMALS.get(name.rpartition("_")[2], 6) for name in rows[0]]
-    for row in rows:
-        writer.writerow([_cell(value, digits) for value, digits in zip(row.values(), decimals, strict=True)])
-    return stream.getvalue()
+    cells = ([_cell(*pair) for pair in zip(row.values(), decimals, strict=True)] for row in rows)
+    return csv_text([list(rows[0]), *cells])
 
 
 def _cell(value: Any, digits: int) -> Any:
@@ -86,10 +82,10 @@ def show(text: str) -> None:
 
 def write_table(args: argparse.Namespace, rows: Iterable[Mapping[str, Any]]) -> None:
     """Write rows to the CSV file that ``--out`` names, if it names one."""
-    from ..formats.yaml import write_text_atomically
+    from ..formats.outputs import write_text
 
     if args.out is not None:
-        write_text_atomically(args.out, csv_text(rows))
+        write_text(args.out, csv_text(rows))
 
 
 def mention(args: argparse.Namespace, text: str) -> None:
@@ -131,7 +127,7 @@ def progress_bar(total: int, unit: str) -> Any:
     """Return a progress bar on stderr that appears after a second, on terminals only."""
     from tqdm import tqdm
 
-    return tqdm(total=total, unit=unit, delay=1.0, disable=None, leave=False)
+    return tqdm(total=total, unit=unit, delay=1.0, disable=None, leave=False, file=own_terminal())
 
 
 def say_notes(notes: Iterable[str]) -> None:
@@ -150,10 +146,10 @@ def stage_line() -> Iterator[Callable[[str], None]]:
 
     def say(text: str) -> None:
         width = os.get_terminal_size(sys.stderr.fileno()).columns - 1
-        line = f"{time.monotonic() - began:5.1f} s  {text}"[:width]
-        print(f"\r\033[K{line}", end="", file=sys.stderr, flush=True)
+        line = CODES.sub("", f"{time.monotonic() - began:5.1f} s  {text}")[:width]
+        print(f"\r\033[K{line}", end="", file=own_terminal(), flush=True)
 
     try:
         yield say
     finally:
-        print("\r\033[K", end="", file=sys.stderr, flush=True)
+        print("\r\033[K", end="", file=own_terminal(), flush=True)

@@ -101,7 +101,7 @@ def _refuse(args: argparse.Namespace, result: _Result) -> None:
 def _write(args: argparse.Namespace, result: _Result, measured: MeasurementSet, worth: Worth | None) -> None:
     """Write the model and what else was asked for, and show it."""
     from ..calibration.lines_report import worth_json, worth_text
-    from ..formats.yaml import write_text_atomically
+    from ..formats.outputs import write_text
     from ..machine.model_file import save_model
     from ..measurements.iso230 import evaluate, iso230_runs, table
 
@@ -120,7 +120,7 @@ def _write(args: argparse.Namespace, result: _Result, measured: MeasurementSet, 
     else:
         print(f"{text}\nmodel: {args.out}")
     if args.report is not None:
-        write_text_atomically(args.report, text)
+        write_text(args.report, text)
     result.save_more()
     common.save_pictures(args, result.pictures)
 
@@ -218,12 +218,7 @@ def _save_arrays(path: str, **arrays: ArrayLike) -> None:
     """Write arrays, without pickles."""
     import numpy as np
 
-    from ..errors import InputFileError
-    from ..formats.outputs import refuse_replacing_input
+    from ..formats.outputs import new_file
 
-    refuse_replacing_input(path)
-    try:
-        with open(path, "wb") as stream:
-            np.savez_compressed(stream, allow_pickle=False, **arrays)
-    except OSError as error:
-        raise InputFileError(path, "", f"cannot be written: {error.strerror}") from error
+    with new_file(path, "wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, **arrays)

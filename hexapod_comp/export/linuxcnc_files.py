@@ -23,7 +23,8 @@ import numpy as np
 
 from ..errors import InputFileError
 from ..formats.csv import number_in
-from ..formats.yaml import UNITS, read_text, write_text_atomically
+from ..formats.outputs import write_text
+from ..formats.yaml import UNITS, read_text
 from ..machine.geometry import STRUT_NAMES
 from .linuxcnc import MOST_POINTS, Genhexkins, ScrewTable
 
@@ -76,7 +77,7 @@ def write_genhexkins(
         about = {HAL_FILE: HAL_ABOUT, INI_FILE: INI_ABOUT}.get(name) or _comp_about(misfit[COMP_FILES.index(name)])
         comments = [f"# {line}" for line in [*titles, *about]]
         lines = [*body, *comments] if name in COMP_FILES else [*comments, *body]
-        write_text_atomically(folder / name, "\n".join(lines) + "\n")
+        write_text(folder / name, "\n".join(lines) + "\n")
     return [folder / name for name in bodies]
 
 

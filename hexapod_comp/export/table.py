@@ -10,8 +10,6 @@ taken from that of one that shrinks. A pose correction cannot carry it.
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,8 +20,8 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputFileError, ModelError, OutsideFieldError
-from ..formats.csv import Table
-from ..formats.yaml import write_text_atomically
+from ..formats.csv import Table, csv_text
+from ..formats.outputs import write_text
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import Structure, solve_pose
 from ..machine.model import MachineModel, RealMachine
@@ -257,18 +255,15 @@ def commands_by_poses(table: GridTable, passes: Passes) -> np.ndarray:
 
 def write_table(table: GridTable, path: str | Path, titles: Sequence[str]) -> None:
     """Write a table as CSV, whole or not at all; `titles` become comment lines."""
-    stream = io.StringIO()
-    for title in titles:
-        stream.write(f"# {' '.join(title.split())}\n")
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    rows: list[Sequence[str]] = [COLUMNS]
     for index in np.ndindex(*table.struts.shape[:4]):
         way, i, j, k = index
         x, y, z = (nodes[n] * 1e3 for nodes, n in zip(table.nodes, (i, j, k), strict=True))
         changes = np.concatenate([table.struts[index], table.backlash[index], table.poses[index]]) * 1e6
         place = [f"{value + 0.0:.9f}" for value in (x, y, z)]
-        writer.writerow([*place, DIRECTIONS[way], *(f"{value:.6f}" for value in np.round(changes, 6) + 0.0)])
-    write_text_atomically(path, stream.getvalue())
+        rows.append([*place, DIRECTIONS[way], *(f"{value:.6f}" for value in np.round(changes, 6) + 0.0)])
+    comments = [f"# {' '.join(title.split())}\n" for title in titles]
+    write_text(path, "".join(comments) + csv_text(rows))
 
 
 def read_table(path: str | Path) -> GridTable:

@@ -6,7 +6,7 @@ import csv
 import hashlib
 import io
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from functools import partial
@@ -39,6 +39,30 @@ MAX_COLUMNS = 1000
 
 MAX_LINE = 1_000_000
 """Longer lines are refused, in characters: a file without line ends would be read into memory whole."""
+
+
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""A spreadsheet takes a cell that begins so for a formula, and runs it."""
+
+MARK = "'"
+"""Set before such a cell when it is written: spreadsheets show the text, and :func:`unmarked` takes it off again."""
+
+
+def csv_text(rows: Iterable[Sequence[Any]]) -> str:
+    """Return rows of numbers and texts as CSV, with line feeds; a text that a spreadsheet would run gets a mark."""
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerows([_marked(cell) for cell in row] for row in rows)
+    return stream.getvalue()
+
+
+def _marked(cell: Any) -> Any:
+    dangerous = isinstance(cell, str) and cell.lstrip(MARK + " ").startswith(FORMULA)
+    return MARK + cell if dangerous and math.isnan(plain_number(cell)) else cell
+
+
+def unmarked(cell: str) -> str:
+    """Return a cell of a file as it was before :func:`csv_text` marked it."""
+    return cell[1:] if cell.startswith(MARK) and _marked(cell[1:]) == cell else cell
 
 
 @dataclass(frozen=True)
@@ -136,7 +160,7 @@ class Table:
     def texts(self, name: str) -> list[str]:
         """Return the cells of a column that must be there, without spaces around them."""
         index = self.required((name,), None)[0][0]
-        return [row[index].strip() for _, row in self.rows]
+        return [unmarked(row[index].strip()) for _, row in self.rows]
 
     def poses(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the poses of the columns that :func:`read_poses` describes, shapes (N, 3), (N, 3, 3)."""
@@ -168,7 +192,8 @@ class Table:
         """Return line and label of every row."""
         columns = [self.header.index(name) for name in LABEL_COLUMNS if name in self.header]
         return [
-            Row(line, row[columns[0]].strip() if columns else str(n + 1)) for n, (line, row) in enumerate(self.rows)
+            Row(line, unmarked(row[columns[0]].strip()) if columns else str(n + 1))
+            for n, (line, row) in enumerate(self.rows)
         ]
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from ..errors import InputFileError
-from .outputs import refuse_replacing_input
+from ..errors import InputFileError, printable
+from .outputs import new_file
 
 WITHOUT, WITH = "#c1432e", "#20639b"
 """Colours of the machine without and with compensation, the same in every picture."""
@@ -15,6 +15,11 @@ WITHOUT, WITH = "#c1432e", "#20639b"
 
 NOTHING = 1e-3
 """Lower end of logarithmic error axes, µm: below a nanometre nothing is claimed."""
+
+
+def picture_text(text: str, limit: int = 200) -> str:
+    """Return a text from outside, as a machine's name, for a picture: on one line, and no formula between its $."""
+    return printable(text, limit).replace("$", r"\$")
 
 
 def save(figure: Figure, path: str | Path) -> None:
@@ -25,10 +30,9 @@ def save(figure: Figure, path: str | Path) -> None:
     InputFileError
         It cannot be written.
     """
-    refuse_replacing_input(path)
-    target = Path(path)
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(target, dpi=140)
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputFileError(path, "", f"cannot be written: {error.strerror}") from error
+        raise InputFileError(path, "", f"its folder cannot be made: {error.strerror}") from error
+    with new_file(path, "wb") as stream:
+        figure.savefig(stream, dpi=140, format="png")

@@ -15,11 +15,13 @@ import numpy as np
 from ..errors import HexapodError
 from ..pose import Pose
 from .csv import pose_values
+from .texts import CODES
 
 
 def json_text(result: Any, indent: int | None = 1) -> str:
     """Return a result as JSON text that ends with a line break; see :func:`plain`."""
-    return json.dumps(plain(result), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json.dumps(plain(result), indent=indent, ensure_ascii=False, allow_nan=False)
+    return CODES.sub(lambda code: f"\\u{ord(code[0]):04x}", text) + "\n"
 
 
 def plain(value: Any) -> Any:

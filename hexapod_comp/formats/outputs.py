@@ -1,13 +1,16 @@
-"""What a command writes never replaces what it reads: neither by name, nor by a link, nor under another name."""
+"""How files are written: whole or not at all, and never in place of one that the same command reads."""
 
 from __future__ import annotations
 
 import argparse
+import errno
 import os
+import secrets
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO, Any
 
 from ..errors import InputFileError
 
@@ -55,6 +58,71 @@ def refuse_replacing_input(path: str | Path) -> None:
     if identity is not None and identity in _protected:
         problem = f"is read by this command, as {_protected[identity]}, and would be replaced; write to another file"
         raise InputFileError(path, "", problem)
+
+
+@contextmanager
+def new_file(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
+    """Give a stream for a file that a reader, or a crash, sees whole or not at all; UTF-8 where it takes text.
+
+    It takes the place of one that is there, with that one's mode and, where this user may give files away, its owner.
+    Into what is no regular file, as a pipe or a device, is just written.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; links are followed.
+    mode : str
+        ``w`` or ``wb``.
+
+    Raises
+    ------
+    InputFileError
+        It is read by this command, protected against writing, or cannot be written.
+    """
+    refuse_replacing_input(path)
+    encoding = None if "b" in mode else "utf-8"
+    try:
+        if os.path.exists(path) and not os.path.isfile(path):
+            with open(path, mode, encoding=encoding) as stream:
+                yield stream
+        else:
+            with _replacement(os.path.realpath(path), mode, encoding) as stream:
+                yield stream
+    except BrokenPipeError:  # the reader wants no more: no fault of the file's
+        raise
+    except OSError as error:
+        raise InputFileError(path, "", f"cannot be written: {error.strerror}") from error
+
+
+@contextmanager
+def _replacement(target: str, mode: str, encoding: str | None) -> Iterator[IO[Any]]:
+    """Give a stream whose file takes the place of `target` when all of it is on the disk."""
+    before = os.stat(target) if os.path.exists(target) else None
+    if before is not None and not os.access(target, os.W_OK):  # renaming alone would not ask
+        raise PermissionError(errno.EACCES, "it is protected against writing")
+    folder, name = os.path.split(target)
+    temporary = os.path.join(folder, f".{name[:50]}.{secrets.token_hex(6)}")
+    try:
+        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        with open(handle, mode, encoding=encoding) as stream:
+            yield stream
+            stream.flush()
+            if before is not None:
+                with suppress(PermissionError):
+                    os.fchown(handle, before.st_uid, before.st_gid)
+                os.fchmod(handle, stat.S_IMODE(before.st_mode))
+            os.fsync(handle)
+        os.replace(temporary, target)
+    except BaseException:
+        with suppress(OSError):
+            os.unlink(temporary)
+        raise
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file as :func:`new_file` does."""
+    with new_file(path) as stream:
+        stream.write(text)
 
 
 def _refuse_no_file(path: str) -> None:

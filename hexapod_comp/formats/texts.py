@@ -4,8 +4,20 @@ from __future__ import annotations
 
 import io
 import math
+import os
+import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from typing import Any, TextIO
+
+from ..errors import InputFileError
+
+CODES = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+"""What a terminal obeys instead of showing it: all control characters but tab and line break, changes of direction."""
+
+UNWRITABLE, BROKEN_PIPE = 2, 141
+"""Exit codes where output cannot be written, and where its reader has gone: 128 + signal, as shells count."""
 
 
 def number(value: float, digits: int) -> str:
@@ -32,8 +44,74 @@ def aligned(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join("  ".join(cells).rstrip() for cells in shown)
 
 
-def accept_any_terminal() -> None:
-    """Write what a terminal's encoding does not have as an escape: no reason to end with a traceback."""
-    for stream in (sys.stdout, sys.stderr):
+class PlainStream:
+    """A text stream that shows codes for the terminal in place of obeying them, in any encoding.
+
+    What is printed may quote files and arguments: names of machines, of runs, labels. When it cannot be written, it
+    goes nowhere from then on, so that nothing complains again at the program's end.
+
+    Parameters
+    ----------
+    stream : TextIO or None
+        Where it goes; None: nowhere, as where a program is started without such a stream.
+    needed : bool
+        Whether a text that cannot be written is an error.
+    """
+
+    def __init__(self, stream: TextIO | None, needed: bool) -> None:
+        self.terminal = stream or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - as long as the process
+        self._needed = needed
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.terminal, name)
+
+    def write(self, text: str) -> int:
+        """Write a text.
+
+        Raises
+        ------
+        BrokenPipeError
+            Nobody reads any more.
+        InputFileError
+            It cannot be written: the disk is full.
+        """
+        try:
+            return self.terminal.write(CODES.sub(lambda code: repr(code[0])[1:-1], text))
+        except OSError as error:
+            return self._fail(error)
+
+    def flush(self) -> None:
+        """Write what is still to be written; errors are those of :meth:`write`."""
+        try:
+            self.terminal.flush()
+        except OSError as error:
+            self._fail(error)
+
+    def _fail(self, error: OSError) -> int:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self.terminal.fileno())
+        if not self._needed:
+            return 0
+        if isinstance(error, BrokenPipeError):
+            raise error
+        raise InputFileError("standard output", "", f"cannot be written: {error.strerror}") from error
+
+
+def own_terminal() -> TextIO:
+    """Return stderr for codes of our own, as those of a progress bar."""
+    return getattr(sys.stderr, "terminal", sys.stderr)
+
+
+def run_with_plain_streams(run: Callable[[], int | None]) -> int | None:
+    """Run a program that prints to a :class:`PlainStream`; return its exit code, or why its output is not there."""
+    with redirect_stdout(PlainStream(sys.stdout, True)), redirect_stderr(PlainStream(sys.stderr, False)):  # type: ignore[type-var]
+        try:
+            code = run()
+            sys.stdout.flush()
+        except BrokenPipeError:
+            return BROKEN_PIPE
+        except InputFileError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return UNWRITABLE
+        return code

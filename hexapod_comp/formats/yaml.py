@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import difflib
 import math
-import os
 import re
-import tempfile
 from collections.abc import Iterator
 from decimal import Decimal
 from itertools import islice
@@ -21,7 +19,6 @@ import numpy as np
 import yaml
 
 from ..errors import InputFileError, shorten
-from .outputs import refuse_replacing_input
 
 MAX_FILE_BYTES = 8_000_000
 """Larger files are refused before they are read: no model comes near it."""
@@ -181,36 +178,6 @@ def _refuse_tricks(text: str) -> None:
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_DEPTH:
             raise _complaint(f"is nested more than {MAX_DEPTH} deep", event)
-
-
-def write_text_atomically(path: str | Path, text: str) -> None:
-    """Write a file so that a reader, or a crash, never sees half of it; into a pipe or device, just write."""
-    refuse_replacing_input(path)
-    target = Path(os.path.realpath(path))
-    if target.exists() and not target.is_file():
-        _write_into(path, text)
-        return
-    try:
-        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
-    except OSError as error:
-        raise InputFileError(path, "", f"cannot be written: {error.strerror}") from error
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, target)
-    except OSError as error:
-        os.unlink(temporary)
-        raise InputFileError(path, "", f"cannot be written: {error.strerror}") from error
-
-
-def _write_into(path: str | Path, text: str) -> None:
-    """Write into what is no regular file: it must not be replaced by one."""
-    try:
-        with open(path, "w", encoding="utf-8") as stream:
-            stream.write(text)
-    except OSError as error:
-        raise InputFileError(path, "", f"cannot be written: {error.strerror}") from error
 
 
 class Section:

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..formats.figures import NOTHING, WITH, WITHOUT
+from ..formats.figures import NOTHING, WITH, WITHOUT, picture_text
 from ..machine.geometry import STRUT_NAMES
 from .records import PathRecord, PoseRecord, SessionResult, Track
 
@@ -25,7 +25,7 @@ def session_figure(result: SessionResult, title: str) -> Figure:
         Machine and model.
     """
     figure = Figure(figsize=(12, 8), layout="constrained")
-    figure.suptitle(title)
+    figure.suptitle(picture_text(title))
     if result.path is None:
         _pose_errors(figure.subplots(1, 1), result.poses)
         return figure

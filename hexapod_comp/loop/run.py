@@ -15,6 +15,7 @@ from ..compensation.checks import check
 from ..errors import GeometryError, HexapodError, InputFileError
 from ..formats.csv import Row, length_values
 from ..formats.paths import config_file
+from ..formats.texts import CODES, own_terminal
 from ..machine.geometry import HexapodGeometry
 from ..machine.model_file import load_model
 from ..machine.size import rms
@@ -117,7 +118,7 @@ def witnessed(
 
 def _announce(text: str) -> None:
     """Say on stderr what happens now, without tearing the progress bar."""
-    tqdm.write(text, file=sys.stderr)
+    tqdm.write(CODES.sub("", text), file=own_terminal())
 
 
 @contextmanager

@@ -75,8 +75,9 @@ import numpy as np
 import yaml
 
 from ..errors import InputFileError, ModelError
+from ..formats.outputs import write_text
 from ..formats.paths import input_file
-from ..formats.yaml import Section, parse_yaml, read_text, write_text_atomically
+from ..formats.yaml import Section, parse_yaml, read_text
 from .field import CROSS_AXES, OUTSIDE_POLICIES, GridField, no_field
 from .geometry import HexapodGeometry
 from .model import MachineModel, ModelOrigin
@@ -190,7 +191,7 @@ def save_model(model: MachineModel, path: str | Path) -> None:
     InputFileError
         The file cannot be written.
     """
-    write_text_atomically(path, model_text(model))
+    write_text(path, model_text(model))
 
 
 def model_text(model: MachineModel) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterator
 from decimal import Decimal
@@ -11,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..formats.csv import ANGLE_COLUMNS, POSITION_COLUMNS
-from ..formats.yaml import write_text_atomically
+from ..formats.csv import ANGLE_COLUMNS, POSITION_COLUMNS, csv_text
+from ..formats.outputs import write_text
 from ..machine.geometry import STRUT_NAMES
 from ..machine.kinematics import Structure, strut_lengths
 from ..machine.model import REFERENCE_TEMPERATURE, Temperatures
@@ -32,13 +30,11 @@ def write_measurements(measurements: MeasurementSet, path: str | Path) -> None:
     InputFileError
         The file cannot be written.
     """
-    stream = io.StringIO()
+    comment = ""
     if not np.array_equal(measurements.probe, measurements.geometry.tool.position):
         point = ", ".join(_scaled(float(value), 3) for value in measurements.probe)
-        stream.write(f"# measured point in the platform frame, mm: {point}\n")
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerows(_csv_rows(measurements))
-    write_text_atomically(path, stream.getvalue())
+        comment = f"# measured point in the platform frame, mm: {point}\n"
+    write_text(path, comment + csv_text(_csv_rows(measurements)))
 
 
 def _csv_rows(measurements: MeasurementSet) -> Iterator[list[str]]:

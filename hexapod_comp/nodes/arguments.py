@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from rclpy.utilities import remove_ros_args
 
 from ..errors import LONGEST_TEXT, printable
-from ..formats.texts import accept_any_terminal
+from ..formats.texts import run_with_plain_streams
 from .parameters import Parameter, described
 
 ROS_ARGUMENTS, END_OF_ROS_ARGUMENTS = "--ros-args", "--"
@@ -52,7 +52,9 @@ class Program:
         0 after ``--help``, 2 where an argument is not understood. What follows ``--ros-args`` is ROS's to read.
         rcl itself would take a stray ``name:=value`` for a rename, and leave everything else unread.
         """
-        accept_any_terminal()
+        return run_with_plain_streams(lambda: self._refusal(arguments))
+
+    def _refusal(self, arguments: Sequence[str]) -> int | None:
         parser = argparse.ArgumentParser(
             self.name,
             usage=f"{self.name} [-h] [--ros-args -p NAME:=VALUE … -r TOPIC:=OTHER … --params-file FILE …]",

@@ -9,8 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..compensation.journal import Entry
-from ..errors import printable
-from ..formats.figures import WITH, WITHOUT, save
+from ..formats.figures import WITH, WITHOUT, picture_text, save
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from .replay import BEFORE, DIFFERENT, LOST
 from .report import LONGEST_GAP, Report, following_error, since, tool_positions
@@ -56,7 +55,7 @@ def write_pictures(report: Report, geometry: HexapodGeometry | None, folder: str
 
 def _figure(report: Report, what: str, height: float = 4.5) -> Figure:
     figure = Figure(figsize=(11, height), layout="constrained")
-    figure.suptitle(f"{what} · {report.recording.node} · {Path(report.recording.path).name}")
+    figure.suptitle(picture_text(f"{what} · {report.recording.node} · {Path(report.recording.path).name}"))
     return figure
 
 
@@ -98,7 +97,7 @@ def _mark_events(report: Report, axes: Axes) -> None:
 def _label(entry: Entry) -> str:
     if entry.what == "enable":
         return "enable" if entry.values["on"] else "disable"
-    return f"{entry.what} {printable(str(entry.values.get('name', '')), 20)}".rstrip()
+    return f"{entry.what} {picture_text(str(entry.values.get('name', '')), 20)}".rstrip()
 
 
 def corrections_figure(report: Report) -> Figure:
@@ -179,7 +178,7 @@ def refused_figure(report: Report) -> Figure:
     for height, reason in enumerate(reasons):
         times = [report.since_first_page(e.time) for e in report.refused if e.entry.values["reason"] == reason]
         axes.plot(times, np.full(len(times), height), "|", ms=14)
-    axes.set_yticks(range(len(reasons)), [printable(reason, 30) for reason in reasons])
+    axes.set_yticks(range(len(reasons)), [picture_text(reason, 30) for reason in reasons])
     axes.set(xlabel="time, s")
     axes.margins(y=0.3)
     return figure
@@ -194,5 +193,5 @@ def difference_figure(report: Report) -> Figure:
     figure = _figure(report, "Corrections compared", 4.5 * max(1, len(shown)))
     for axes, (run, title) in zip(figure.subplots(max(1, len(shown)), 1, squeeze=False)[:, 0], shown, strict=False):
         _struts(axes, report.seconds, run.difference * 1e6)
-        axes.set(title=printable(title), ylabel="µm")
+        axes.set(title=picture_text(title), ylabel="µm")
     return figure

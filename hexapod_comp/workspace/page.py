@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import GeometryError, HexapodError
-from ..formats.yaml import write_text_atomically
+from ..formats.outputs import write_text
 from ..machine.geometry import HexapodGeometry
 from .layers import ROTATION, TRANSLATION, Quantity
 from .pictures import VIEW_AZIMUTH, VIEW_ELEVATION, WEDGE, outline
@@ -121,7 +121,7 @@ def write_page(path: str | Path, geometry: HexapodGeometry, data: PageData) -> N
     InputFileError
         The file cannot be written.
     """
-    write_text_atomically(path, page_text(geometry, data))
+    write_text(path, page_text(geometry, data))
 
 
 def page_text(geometry: HexapodGeometry, data: PageData) -> str:

@@ -22,6 +22,7 @@ from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
 from ..errors import GeometryError
+from ..formats.figures import picture_text
 from ..machine.geometry import HexapodGeometry
 from .layers import ROTATION, TRANSLATION, Layer, Quantity
 from .reach import FINDINGS
@@ -103,7 +104,7 @@ def shells_figure(
     scale = np.array(limits) * quantity.factor if limits else np.array([values.min(), values.max()])
     norm = Normalize(*scale)
     figure = Figure(figsize=(12.0, 6.0), layout="constrained")
-    figure.suptitle(title)
+    figure.suptitle(picture_text(title))
     faces, colours = [], []
     for number, layer in enumerate(layers):
         kept, corners = _faces(layer.points, WEDGE * number / max(1, len(layers) - 1))
@@ -136,7 +137,7 @@ def causes_figure(geometry: HexapodGeometry, points: np.ndarray, findings: np.nd
     area = _areas(faces)
     colours = np.array(CAUSE_COLOURS)[of_face]
     figure = Figure(figsize=(13.0, 5.2), layout=ConstrainedLayoutEngine(rect=(0.0, 0.08, 1.0, 0.92)))
-    figure.suptitle(title)
+    figure.suptitle(picture_text(title))
     places = figure.add_gridspec(1, 3, width_ratios=[2, 3, 3])
     _draw(_space(figure, places[0], "the machine at home"), geometry, faces, colours, machine=True)
     for place, elevation, name in ((places[1], 30.0, "from above"), (places[2], -30.0, "from below")):
@@ -169,7 +170,7 @@ def ranking_figure(rows: Sequence[RankedRow], title: str) -> Figure:
     if not rows:
         raise GeometryError("rows", "of a ranking must be at least one")
     figure = Figure(figsize=(10.0, 1.9 + 0.42 * len(rows)), layout="constrained")
-    figure.suptitle(title)
+    figure.suptitle(picture_text(title))
     left, right = figure.subplots(1, 2, sharey=True)
     _bars(left, [row.translation for row in rows], TRANSLATION, "#20639b")
     _bars(right, [row.rotation for row in rows], ROTATION, "#3c8d5a")

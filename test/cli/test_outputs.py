@@ -129,13 +129,13 @@ def test_other_names_of_an_input_are_refused_too(way: str, folder: Path, capsys)
 
 def test_a_file_in_an_output_folder_that_is_read_is_not_replaced(folder: Path):
     """Which files a folder will get only their writers know: they ask too."""
-    from hexapod_comp.formats.yaml import write_text_atomically
+    from hexapod_comp.formats.outputs import write_text
 
     with outputs.inputs_protected(argparse.Namespace(budget=str(folder / "c.yaml"), pictures=str(folder))):
         with pytest.raises(InputFileError, match="is read by this command"):
-            write_text_atomically(folder / "c.yaml", "new")
-        write_text_atomically(folder / "other.csv", "new")
-    write_text_atomically(folder / "c.yaml", "new")  # a program that uses the package may
+            write_text(folder / "c.yaml", "new")
+        write_text(folder / "other.csv", "new")
+    write_text(folder / "c.yaml", "new")  # a program that uses the package may
     assert (folder / "c.yaml").read_text() == (folder / "other.csv").read_text() == "new"
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import stat
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from hexapod_comp.formats.yaml import (
     Section,
     read_text,
     read_yaml,
-    write_text_atomically,
 )
 
 HEAD = "format: test\nversion: 1\n"
@@ -248,29 +246,3 @@ def test_what_nobody_asked_for_is_an_error():
     left.take("known")
     with pytest.raises(InputFileError, match=r"unknwon: is not a known key here \(found 2\)"):
         left.finish()
-
-
-# Writing.
-
-
-def test_write_replaces_the_whole_file(tmp_path):
-    path = tmp_path / "out.yaml"
-    path.write_text("old and longer")
-    write_text_atomically(path, "né\n")
-    assert path.read_bytes() == "né\n".encode()
-    assert stat.S_IMODE(path.stat().st_mode) == 0o644
-    assert os.listdir(tmp_path) == ["out.yaml"]
-
-
-def test_write_into_nowhere(tmp_path):
-    with pytest.raises(InputFileError, match=r"no/out\.yaml: cannot be written: No such file"):
-        write_text_atomically(tmp_path / "no" / "out.yaml", "x")
-
-
-def test_failed_write_leaves_the_old_file_and_no_litter(tmp_path):
-    folder = tmp_path / "out.yaml"
-    folder.mkdir()
-    (folder / "content").touch()
-    with pytest.raises(InputFileError, match="cannot be written"):
-        write_text_atomically(folder, "x")
-    assert os.listdir(tmp_path) == ["out.yaml"]

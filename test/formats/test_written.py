@@ -1,0 +1,232 @@
+"""How files, tables and lines on a terminal are written: whole, and with nothing that another program would obey."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import re
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from matplotlib.figure import Figure
+
+from hexapod_comp import cli
+from hexapod_comp.errors import InputFileError
+from hexapod_comp.formats import outputs
+from hexapod_comp.formats.csv import Table, csv_text, unmarked
+from hexapod_comp.formats.figures import picture_text, save
+from hexapod_comp.formats.json import json_text
+from hexapod_comp.formats.outputs import new_file, write_text
+from hexapod_comp.formats.texts import PlainStream
+
+ROOT = Path(__file__).resolve().parents[2]
+SENTINEL = "\x1b]0;owned\x07\x1b[2J\x9b31m\u202e"
+"""Sets a terminal's title, clears it, colours it (in one C1 code), turns the direction."""
+
+
+# Files.
+
+
+def test_a_new_file_takes_the_mode_that_the_user_wants(tmp_path):
+    before = os.umask(0o027)
+    try:
+        write_text(tmp_path / "out.yaml", "né\n")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "out.yaml").read_bytes() == "né\n".encode()
+    assert stat.S_IMODE((tmp_path / "out.yaml").stat().st_mode) == 0o640
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o664, 0o755])
+def test_a_file_that_is_replaced_keeps_its_mode(tmp_path, mode):
+    """Before, every file came out as 0644: a secret readable to all, a shared one writable to one."""
+    path = tmp_path / "out.yaml"
+    path.write_text("old and longer")
+    path.chmod(mode)
+    write_text(path, "new")
+    assert path.read_text() == "new"
+    assert stat.S_IMODE(path.stat().st_mode) == mode
+    assert os.listdir(tmp_path) == ["out.yaml"]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="nothing is protected against root")
+def test_a_file_that_is_protected_against_writing_stays(tmp_path):
+    path = tmp_path / "out.yaml"
+    path.write_text("old")
+    path.chmod(0o444)
+    with pytest.raises(InputFileError, match="protected against writing"):
+        write_text(path, "new")
+    assert path.read_text() == "old"
+
+
+def test_a_link_stays_a_link(tmp_path):
+    (tmp_path / "real.yaml").write_text("old")
+    (tmp_path / "link.yaml").symlink_to("real.yaml")
+    write_text(tmp_path / "link.yaml", "new")
+    assert (tmp_path / "link.yaml").is_symlink()
+    assert (tmp_path / "real.yaml").read_text() == "new"
+
+
+def test_a_file_is_on_the_disk_before_it_takes_the_place_of_another(tmp_path, monkeypatch):
+    """Else a power cut may leave the new name with nothing in it (ext4, XFS)."""
+    happened = []
+    real = {name: getattr(os, name) for name in ("fsync", "replace")}
+    monkeypatch.setattr(outputs.os, "fsync", lambda handle: happened.append(os.fstat(handle).st_size))
+    monkeypatch.setattr(outputs.os, "replace", lambda *names: (happened.append("rename"), real["replace"](*names)))
+    write_text(tmp_path / "out.yaml", "12345")
+    assert happened == [5, "rename"]
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt(), ValueError("ours")])
+def test_whatever_interrupts_writing_leaves_the_old_file_and_no_litter(tmp_path, error):
+    path = tmp_path / "out.yaml"
+    path.write_text("old")
+
+    def write_half() -> None:
+        with new_file(path) as stream:
+            stream.write("half of the n")
+            raise error
+
+    with pytest.raises((InputFileError, KeyboardInterrupt, ValueError)):
+        write_half()
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["out.yaml"]
+
+
+def test_write_into_nowhere_and_over_a_folder(tmp_path):
+    with pytest.raises(InputFileError, match=r"no/out\.yaml: cannot be written: No such file"):
+        write_text(tmp_path / "no" / "out.yaml", "x")
+    (tmp_path / "out.yaml").mkdir()
+    with pytest.raises(InputFileError, match="cannot be written"):
+        write_text(tmp_path / "out.yaml", "x")
+    assert os.listdir(tmp_path) == ["out.yaml"]
+
+
+def test_a_file_with_the_longest_name_is_written(tmp_path):
+    """Its temporary one must not have a longer one: names end at 255 byte."""
+    name = "é" * 125 + ".csv"
+    write_text(tmp_path / name, "x")
+    assert os.listdir(tmp_path) == [name]
+
+
+# Tables: what spreadsheets run, after OWASP's list.
+
+HOSTILE = ["=1+1", "+1+1", "-1+1", "@SUM(A1)", "\tx", "'=1", "''+x", " =1", "-", '=HYPERLINK("http://x","y")']
+HARMLESS = ["", "plain", "a=b", "'quoted'", "x-1", "nan", "0", "12.5"]
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_a_text_that_a_spreadsheet_would_run_is_marked_and_read_back(text):
+    ((cell, _),) = csv.reader(io.StringIO(csv_text([[text, "x"]])))
+    assert cell == "'" + text
+    assert unmarked(cell) == text
+
+
+@pytest.mark.parametrize("text", [*HARMLESS, "-1.5", "+2", "-1e-05", -1.5, 3])
+def test_numbers_and_harmless_texts_stay(text):
+    assert next(csv.reader(io.StringIO(csv_text([[text, "x"]]))))[0] == str(text)
+
+
+@pytest.mark.parametrize("text", [text for text in HARMLESS if text])
+def test_harmless_texts_are_read_as_they_are(text):
+    assert unmarked(text) == text
+
+
+def test_labels_come_back_from_a_file_as_they_went_in(tmp_path):
+    labels = [text for text in HOSTILE if text == text.strip()]
+    path = tmp_path / "poses.csv"
+    path.write_text(csv_text([["name", "x_mm"], *([label, -1.0] for label in labels)]))
+    assert [row.label for row in Table(path).labels()] == labels
+
+
+# Terminals and pictures.
+
+
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_codes_are_shown_and_not_obeyed(stream):
+    inner = io.StringIO()
+    print(f"a\tb {SENTINEL}", file=PlainStream(inner, stream == "stdout"))
+    assert inner.getvalue() == "a\tb \\x1b]0;owned\\x07\\x1b[2J\\x9b31m\\u202e\n"
+
+
+def test_json_escapes_codes_in_its_own_way():
+    text = json_text({"name": SENTINEL})
+    assert text.replace("\n", "").isprintable()
+    assert json.loads(text) == {"name": SENTINEL}
+
+
+@pytest.mark.parametrize("name", ["$x^", "a $x_{$ b", r"\$\frac$", "$1 and $2", "\x1b[2J\n"])
+def test_no_name_is_a_formula(name, tmp_path):
+    """Matplotlib takes what stands between two $ for mathematics, and raises where it is none."""
+    figure = Figure(figsize=(2, 1))
+    drawn = figure.suptitle(picture_text(name))
+    save(figure, tmp_path / "title.png")
+    assert (tmp_path / "title.png").stat().st_size > 1000
+    shown, is_formula = drawn._preprocess_math(drawn.get_text())
+    assert not is_formula
+    assert shown.count("$") == name.count("$")
+
+
+def run(command: str, **options: object) -> subprocess.CompletedProcess[str]:
+    """Run shell words with `hc` as the command line, in bash, whose exit code is the verb's own."""
+    words = re.sub(r"\bhc\b", f"{sys.executable} -m hexapod_comp", command)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run(
+        ["bash", "-c", f"{words}; exit ${{PIPESTATUS[0]}}"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        env=environment,
+        **options,
+    )
+
+
+@pytest.mark.parametrize("verb", ["--help", "ik poses.csv"])
+@pytest.mark.parametrize(("to", "code"), [("> /dev/full", 2), ("| true", 141), (">&-", 0)])
+def test_an_output_that_nobody_takes_is_no_traceback(verb, to, code, tmp_path):
+    """Before: tracebacks from `print`, and "Exception ignored" with exit code 120 from the end of Python."""
+    (tmp_path / "poses.csv").write_text("sequence,x_mm,y_mm,z_mm\n" + "".join(f"{n},0,0,400\n" for n in range(3000)))
+    done = run(f"hc {verb} {to}", cwd=tmp_path)
+    assert "Traceback" not in done.stderr
+    assert "Exception ignored" not in done.stderr
+    if to == "| true":  # it may have taken all before it ended
+        assert done.returncode in (0, code)
+        assert done.stderr == ""
+    else:
+        assert done.returncode == code
+        assert ("standard output: cannot be written: No space left" in done.stderr) == (code == 2)
+
+
+def test_messages_that_nobody_takes_do_not_change_the_result(tmp_path):
+    assert run("hc ik --pose 0,0,9999 2> /dev/full").returncode == run("hc ik --pose 0,0,9999").returncode
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["ik", "poses.csv"],
+        ["ik", "poses.csv", "--json"],
+        ["check", "poses.csv", "--machine", "mine.yaml"],
+        ["ik", "--pose", "0,0,400", SENTINEL],
+        [SENTINEL],
+        ["ik", SENTINEL],
+        ["ik", "--pose", SENTINEL],
+    ],
+)
+def test_codes_in_arguments_and_files_do_not_reach_the_terminal(arguments, tmp_path, monkeypatch, capsys):
+    """What `ik` prints quotes the labels of a file; what argparse says quotes what it does not understand."""
+    machine = (ROOT / "config" / "paper.yaml").read_text(encoding="utf-8")
+    named = re.sub(r"(?m)^machine: .*$", r'machine: "\\e[2Jmine"', machine)
+    (tmp_path / "mine.yaml").write_text(named, encoding="utf-8")
+    (tmp_path / "poses.csv").write_text(f"name,x_mm,y_mm,z_mm\n{SENTINEL},0,0,400\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    cli.main(arguments)
+    said = "".join(capsys.readouterr())
+    assert said.strip()
+    assert not re.search("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]", said)
