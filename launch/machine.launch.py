@@ -31,6 +31,7 @@ def generate_launch_description() -> LaunchDescription:
             argument("autostart", default_value="true", choices=FLAG, description="Activate unasked."),
             argument("simulate", default_value="true", choices=FLAG, description="Start strut_drive too."),
             argument("log_level", default_value="info", description="debug, info, warn or error."),
+            argument("enclaves", default_value="/hexapod_comp", description="Folder of the nodes' SROS 2 enclaves."),
             argument(
                 "discovery_range",
                 default_value=LOCAL_UNLESS_SET,
@@ -68,6 +69,6 @@ def _node(executable: str, given: Callable[[str], str], parameters: list) -> Nod
         namespace=given("namespace"),
         parameters=parameters,
         additional_env={"ROS_AUTOMATIC_DISCOVERY_RANGE": given("discovery_range")},
-        ros_arguments=["--log-level", given("log_level")],
+        ros_arguments=["--log-level", given("log_level"), "--enclave", f"{given('enclaves')}/{executable}"],
         output="screen",
     )

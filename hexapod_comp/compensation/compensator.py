@@ -14,27 +14,22 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import HexapodError, ModelError, NotConvergedError, NotFiniteError, OutsideFieldError, PoseError
+from ..errors import HexapodError, ModelError, NotConvergedError, NotFiniteError
 from ..kernels import kinematics as kernels
-from ..kernels.compensation import (
-    NO_POSE,
-    OUTSIDE,
-    UNSOLVED,
-    compensate_one,
-    compensate_quaternion,
-    estimate_one,
-)
-from ..kernels.limits import WITHIN
-from ..kernels.pose import POSE_NOT_FINITE, QUATERNION_NORM_TOLERANCE
+from ..kernels.compensation import OUTSIDE, compensate_one, compensate_quaternion, estimate_one
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import forward_error, strut_lengths
 from ..machine.model import MachineModel, RealMachine, Temperatures
 from ..machine.motion import MotionState
 from ..pose import Pose
+from .findings import refuse
 from .state import CommandState, pack_machine, pack_nominal, pack_pose, read_state
 
 DEFAULT_RAMP_RATE = 1e-3
 """How fast a change of model, temperature or enabling moves a strut, m/s."""
+
+NO_SHIFT = pack_pose(Pose.identity())
+"""Frame of poses that are in ``base`` already."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +164,17 @@ class Compensator:
         return bool(self._last.state.enabled[0])
 
     def set_model(self, model: MachineModel) -> None:
-        """Replace the model; the corrections ramp from the old one's to the new one's."""
+        """Replace the model; the corrections ramp from the old one's to the new one's.
+
+        Raises
+        ------
+        ModelError
+            The model belongs to another machine.
+        LimitError, KinematicsError, OutsideFieldError
+            What it would correct at the last command, before the first one at home, breaks a limit: the ramp would
+            drag the struts there and be refused on its way. The old model stays.
+        """
+        self._check_whole(RealMachine(self.geometry, model, self.temperatures))
         self._renew(model)
         self.on_change("model", model)
 
@@ -183,6 +188,17 @@ class Compensator:
             self.motion.low[:] += after - before
         self._take_machine(machine)
         self._last.state.changed[:] = 1.0
+
+    def _check_whole(self, machine: RealMachine) -> None:
+        """Raise when a machine's whole correction, without ramp or switch, breaks a limit at the last command."""
+        trial, outcome = CommandState(0.0), CommandState(0.0)
+        home = not np.isfinite(self.nominal).all()
+        platform = self.geometry.home if home else self._last.platform
+        trial.motion.copy_from(self.motion)
+        tool = platform @ self.geometry.tool
+        fixed = self._pack(machine)
+        found = compensate_one(tool.position, tool.rotation, math.nan, NO_SHIFT, fixed, trial.numbers, outcome.numbers)
+        refuse(found, outcome, machine)
 
     def _followed(self, machine: RealMachine) -> np.ndarray | None:
         """Return the nine values whose directions are followed, at the last command, under a machine's model.
@@ -201,9 +217,12 @@ class Compensator:
         return np.concatenate([point, strut_lengths(machine.structure, model_pose)])
 
     def _take_machine(self, machine: RealMachine) -> None:
-        self.machine = machine
+        self.machine, self._fixed = machine, self._pack(machine)
+
+    def _pack(self, machine: RealMachine) -> tuple:
+        """Return what the kernels take of a machine."""
         varied = (*machine.strut_arrays[1:], *machine.field_arrays[1:])
-        self._fixed = (pack_machine(machine), self._nominal_numbers, varied)
+        return pack_machine(machine), self._nominal_numbers, varied
 
     def set_temperature(self, name: str, value: float) -> None:
         """Take a temperature, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
@@ -221,8 +240,16 @@ class Compensator:
         self.on_change("temperature", (name, self.temperatures.values[name]))
 
     def enable(self, enabled: bool) -> None:
-        """Switch compensation on or off; the corrections ramp."""
+        """Switch compensation on or off; the corrections ramp.
+
+        Raises
+        ------
+        LimitError, KinematicsError, OutsideFieldError
+            As for :meth:`set_model`, when it is switched on.
+        """
         if enabled != self.enabled:
+            if enabled:
+                self._check_whole(self.machine)
             self._last.state.enabled[:] = float(enabled)
             self._last.must_ramp()
             self.on_change("enable", enabled)
@@ -336,17 +363,9 @@ class Compensator:
 
     def _finish(self, found: tuple, numbers: tuple[float, ...] = ()) -> np.ndarray:
         """Accept the command under way, or raise what was found."""
-        status, finding, strut, stage, value, condition = found
-        if status == NO_POSE:
-            raise _pose_error(finding, numbers)
-        if status == UNSOLVED:
-            raise NotConvergedError("the error field is too steep to be undone at this pose")
-        if status == OUTSIDE and self.model.field.outside == "refuse":
-            raise self._outside_error(self._next)
-        if finding != WITHIN:
-            raise self.geometry.limits.error(finding, strut, stage, value)
+        refuse(found, self._next, self.machine, numbers)
         self._last, self._next = self._next, self._last
-        self.condition, self.outside_field = condition, status == OUTSIDE
+        self.condition, self.outside_field = found[-1], found[0] == OUTSIDE
         return self._last.state.command
 
     def estimate(self, struts: np.ndarray) -> np.ndarray:
@@ -386,14 +405,6 @@ class Compensator:
     def platform_estimate(self) -> tuple[np.ndarray, np.ndarray]:
         """Position (3,) and rotation (3, 3) of the platform in ``base`` by the last estimate, field left out."""
         return self._model_pose[:3], self._model_pose[3:].reshape((3, 3))
-
-    def _outside_error(self, command: CommandState) -> HexapodError:
-        box = self.model.field.box * 1e3
-        platform = command.platform
-        point = (platform.position + platform.rotation @ self.model.field.probe) * 1e3
-        low, high = (", ".join(f"{v:g}" for v in corner) for corner in box)
-        problem = f"the measured point ({point[0]:.3f}, {point[1]:.3f}, {point[2]:.3f}) mm is outside the field's box"
-        return OutsideFieldError(f"{problem} ({low})…({high}) mm", point, box)
 
     def correct(self, tool_pose: Pose, time: float = 0.0) -> Correction:
         """Compensate one commanded tool pose and return the full record.
@@ -459,11 +470,3 @@ class Compensator:
         motion.copy_from(self.motion)
         commands, _, _ = self.machine.commands_for(self._last.platform, motion)
         return commands - self.nominal
-
-
-def _pose_error(outcome: int, numbers: tuple[float, ...]) -> PoseError:
-    if outcome == POSE_NOT_FINITE:
-        return PoseError("pose must be finite", list(numbers), "not_finite")
-    norm = math.hypot(*numbers[3:])
-    problem = f"quaternion must have norm 1 within {QUATERNION_NORM_TOLERANCE:g}, not {norm:.6g}"
-    return PoseError(problem, list(numbers[3:]), "quaternion")

@@ -97,9 +97,12 @@ class Source:
         return cls(name, text, hashlib.sha256(text.encode()).hexdigest())
 
     @classmethod
-    def read(cls, path: str | Path) -> Source:
-        """Return a file as it is now; what is made of it is made of this text, and never of a later one."""
-        return cls.of(str(path), read_text(path))
+    def read(cls, path: str | Path, opener: Callable[[str, int], int] | None = None) -> Source:
+        """Return a file as it is now; what is made of it is made of this text, and never of a later one.
+
+        The opener is that of :func:`~hexapod_comp.formats.yaml.read_text`.
+        """
+        return cls.of(str(path), read_text(path, opener))
 
     def geometry(self) -> HexapodGeometry:
         """Return the machine that it describes; errors as :func:`~hexapod_comp.machine.geometry.load_geometry`."""

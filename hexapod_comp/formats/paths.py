@@ -5,6 +5,8 @@ from __future__ import annotations
 import difflib
 import os
 import re
+import stat
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -87,12 +89,48 @@ def confined_file(name: str | os.PathLike[str], folder: Path | None) -> Path:
     if os.path.exists(own) and not os.path.isfile(own):
         raise InputFileError(own, "", "is not a regular file")
     path = config_file(own).resolve()
+    _refuse_elsewhere(name, path, folder)
+    return path
+
+
+def confined_opener(folder: Path | None) -> Callable[[str, int], int]:
+    """Return what opens a file for Python's ``open`` only where :func:`confined_file` finds it.
+
+    Between the look at a name and its opening the file may be replaced, by a pipe or by a link that leads elsewhere. So
+    nothing is waited for, and what counts is the open file.
+
+    Parameters
+    ----------
+    folder : Path or None
+        As for :func:`confined_file`.
+
+    Returns
+    -------
+    callable
+        Takes path and flags, returns the descriptor; raises InputFileError.
+    """
+
+    def opened(path: str, flags: int) -> int:
+        descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_NOCTTY)
+        try:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise InputFileError(path, "", "is not a regular file")
+            _refuse_elsewhere(path, Path(os.readlink(f"/proc/self/fd/{descriptor}")), folder)
+        except BaseException:
+            os.close(descriptor)
+            raise
+        return descriptor
+
+    return opened
+
+
+def _refuse_elsewhere(name: str | os.PathLike[str], path: Path, folder: Path | None) -> None:
+    """Raise when a file, by its path without links, is neither in a folder nor shipped."""
     folders = [place.resolve() for place in (folder, config_folder()) if place is not None]
     if not any(path.is_relative_to(place) for place in folders):
         places = " and ".join(str(place) for place in folders)
         problem = f"leads to {path}, but files are only read from {places}; see model_folder"
         raise InputFileError(os.fspath(name), "", problem)
-    return path
 
 
 def folder_of(name: str | os.PathLike[str]) -> Path | None:

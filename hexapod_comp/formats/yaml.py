@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from decimal import Decimal
 from itertools import islice
 from pathlib import Path
@@ -91,16 +91,23 @@ for _tag in ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float"):
     _StrictLoader.add_constructor(_tag, _plain_number)
 
 
-def read_text(path: str | Path) -> str:
+def read_text(path: str | Path, opener: Callable[[str, int], int] | None = None) -> str:
     """Read a UTF-8 text file of bounded size.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    opener : callable, optional
+        Opens it and may refuse it, as Python's ``open`` takes one; :func:`~hexapod_comp.formats.paths.confined_opener`.
 
     Raises
     ------
     InputFileError
-        Missing, a folder, unreadable, too large, empty or not UTF-8.
+        Missing, a folder, unreadable, too large, empty or not UTF-8; or refused.
     """
     try:
-        with open(path, "rb") as stream:  # bounded, also where the size is not known: pipes, devices
+        with open(path, "rb", opener=opener) as stream:  # bounded, also where the size is not known: pipes, devices
             content = stream.read(MAX_FILE_BYTES + 1)
         if len(content) > MAX_FILE_BYTES:
             raise InputFileError(path, "", f"larger than the allowed {MAX_FILE_BYTES // 1_000_000} MB")

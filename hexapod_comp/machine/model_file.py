@@ -56,6 +56,9 @@ all six or a list of six. Everything marked optional may be left out and is then
 
     end: true                         # of a closed file: everything above has arrived
 
+What no machine has is refused as an error of units: joints more than 50 mm away, strut lengths more than 100 mm wrong,
+expansions above 1000 ppm/K; a field of more than 50 mm or 100 mrad anywhere on one of its lines.
+
 A family of lines (all along one axis) is whole or absent: every pair of nodes in both directions.
 
 Numbers are written with as many digits as bring back the very same float where the unit's factor allows
@@ -80,6 +83,7 @@ from ..formats.paths import input_file
 from ..formats.yaml import Section, parse_yaml, read_text
 from .field import CROSS_AXES, OUTSIDE_POLICIES, GridField, no_field
 from .geometry import HexapodGeometry
+from .magnitudes import check_magnitudes
 from .model import MachineModel, ModelOrigin
 from .model_blocks import (
     COMPONENT_UNITS,
@@ -169,9 +173,11 @@ def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineM
         if "field" in top:
             values["field"] = _read_field(top.section("field"))
         top.finish()
-        return MachineModel(machine, **values)
+        model = MachineModel(machine, **values)
+        check_magnitudes(model)
     except ModelError as error:
         raise InputFileError(name, error.key, error.problem, error.value) from error
+    return model
 
 
 def save_model(model: MachineModel, path: str | Path) -> None:

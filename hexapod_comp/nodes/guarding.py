@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import os
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters
 from rclpy.impl import rcutils_logger
@@ -28,11 +28,17 @@ class CallbackGuard:
     ----------
     warn, complain : callable
         Log a warning and an error: take its cause, for throttling, and the text.
+
+    Attributes
+    ----------
+    request : str
+        Name of the service that answers at this moment; empty between requests.
     """
 
     def __init__(self, warn: Callable[[str, str], None], complain: Callable[[str, str], None]) -> None:
         self._warn, self._complain = warn, complain
         self._caught, self._requests = Refusals(), Refusals()
+        self.request = ""
 
     def around(self, what: str, callback: Callable[..., Any], otherwise: Any = None) -> Callable[..., Any]:
         """Return a callback that never raises; it returns `otherwise` instead.
@@ -63,8 +69,7 @@ class CallbackGuard:
         """Return a service's callback that refuses a request where the one it has would raise."""
 
         def answer(request: Any, response: Any) -> Any:
-            if isinstance(request, ChangeState.Request):  # rcl logs a label that it does not know
-                request.transition.label = printable(request.transition.label)
+            self.request = name
             try:
                 return callback(request, response)
             except Exception as error:  # rclpy's own errors, Python's where it does not check: of many kinds
@@ -72,6 +77,8 @@ class CallbackGuard:
                 self._requests.add(name, text, time.monotonic())
                 self._warn(name, f"{name} refused: {text}")
                 return refusal(kind, request, text)
+            finally:
+                self.request = ""
 
         return answer
 
@@ -108,12 +115,54 @@ def refusal(kind: Any, request: Any, reason: str) -> Any:
     return response
 
 
-class PlainLogger(rcutils_logger.RcutilsLogger):
-    """A node's logger that writes one printable line for each message, whatever has been quoted in it."""
+class Throttle:
+    """Lets one message per cause and second through, and counts what it held back."""
 
-    def log(self, message: str, severity: Any, **keywords: Any) -> bool:
-        """Log a message; arguments are those of rclpy's logger."""
-        return bool(super().log(printable(str(message), LONGEST_TEXT), severity, **keywords))
+    def __init__(self, period: float = 1.0) -> None:
+        self._period = period
+        self._last: dict[str, float] = {}
+        self._held: dict[str, int] = {}
+
+    def passes(self, cause: str) -> int | None:
+        """Return how many of this cause were held back since the last, or None to hold this one back."""
+        now = time.monotonic()
+        if now - self._last.get(cause, -1e9) < self._period:
+            self._held[cause] = self._held.get(cause, 0) + 1
+            return None
+        self._last[cause] = now
+        return self._held.pop(cause, 0)
+
+    def allow(self, cause: str, text: str) -> str | None:
+        """Return the text to be logged, which says what was held back, or None to hold this one back."""
+        held = self.passes(cause)
+        return None if held is None else text + (f" ({held} more like it)" if held else "")
+
+
+class PlainLogger(rcutils_logger.RcutilsLogger):
+    """A node's logger that writes one printable line for each message, whatever has been quoted in it.
+
+    Anybody may send requests, as fast as he likes. So what is logged while one is answered, by us or by rclpy, is
+    throttled: one line a second from each line of source.
+
+    Parameters
+    ----------
+    name : str
+        As of rclpy's logger.
+    guard : CallbackGuard
+        Knows when a request is answered.
+    """
+
+    def __init__(self, name: str, guard: CallbackGuard) -> None:
+        super().__init__(name)
+        self._guard, self._throttle = guard, Throttle()
+
+    def log(self, message: str, severity: Any, throttled: bool = False, **keywords: Any) -> bool:
+        """Log a message, which the caller may have throttled; other arguments are those of rclpy's logger."""
+        text: str | None = printable(str(message), LONGEST_TEXT)
+        if self._guard.request and not throttled:
+            caller = rcutils_logger._find_caller(inspect.currentframe())
+            text = self._throttle.allow(f"{caller.f_code.co_filename}:{caller.f_lineno}", str(text))
+        return text is not None and bool(super().log(text, severity, **keywords))
 
 
 # rclpy keeps one severity for each line of source that logs; those above call for others.

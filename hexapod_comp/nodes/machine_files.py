@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
 from ..compensation.journal import IDEAL_SOURCE, Source
-from ..formats.paths import confined_file, folder_of
+from ..formats.paths import confined_file, confined_opener, folder_of
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL
-from .model_loading import Loading
+from .model_loading import Loading, ModelName
 from .parameters import ParameterError
 
 
@@ -40,18 +41,19 @@ class MachineFiles:
 
     def geometry(self) -> HexapodGeometry:
         """Read the geometry."""
-        self.sources["geometry"] = Source.read(self._path(self._geometry_file))
+        self.sources["geometry"] = self._read(self._geometry_file)
         return self.sources["geometry"].geometry()
 
     def model(self, geometry: HexapodGeometry) -> MachineModel:
-        """Read the model."""
-        path = self._model_path()
-        self.sources["model"] = IDEAL_SOURCE if path is None else Source.read(path)
+        """Read the model; the ideal one has no file."""
+        ideal = self._model_file == IDEAL
+        self.sources["model"] = IDEAL_SOURCE if ideal else self._read(self._model_file)
         return self.sources["model"].model(geometry.name)
 
     def begin_loading(self, machine: str) -> Loading:
         """Begin to read the model of a machine again, elsewhere."""
-        return Loading(self._model_path(), machine)
+        name = self._model_file
+        return Loading(None if name == IDEAL else ModelName(name, _place(), self._folders[name]), machine)
 
     def described(self, model: MachineModel) -> str:
         """Return what to say of the model at the start."""
@@ -59,12 +61,17 @@ class MachineFiles:
             return "the ideal model, which corrects nothing (parameter model_file)"
         return f"model {model.name!r}"
 
-    def _model_path(self) -> Path | None:
-        """Return the model's file; None for the ideal model, which has none."""
-        return None if self._model_file == IDEAL else self._path(self._model_file)
+    def _read(self, name: str) -> Source:
+        folder = self._folders[name]
+        return Source.read(confined_file(name, folder), confined_opener(folder))
 
-    def _path(self, name: str) -> Path:
-        return confined_file(name, self._folders[name])
+
+def _place() -> str:
+    """Return the folder that relative paths start from; where it was deleted, only absolute ones are found."""
+    try:
+        return os.getcwd()
+    except FileNotFoundError:
+        return os.sep
 
 
 def _folder(name: str, options: dict[str, Any]) -> Path | None:

@@ -1,29 +1,36 @@
-"""Loading a model while the machine moves: a process of its own reads and checks the file.
+"""Loading a model while the machine moves: a process of its own finds, reads and checks the file.
 
 Parsing YAML keeps Python's lock for tens of milliseconds, a large model's for hundreds, in which no command would
-be answered. The process is given the file's text and hands back checked numbers as JSON, which is read within a
-millisecond. It is ``python -m hexapod_comp.nodes.model_loading NAME MACHINE < TEXT``.
+be answered; and a file on a dead network mount is waited for without end. So the node only gives the file's name. The
+process hands back the text and checked numbers as two lines of JSON, which are read within a millisecond; when it has
+not done so in time, it is given up. It is ``python -m hexapod_comp.nodes.model_loading NAME MACHINE PLACE [FOLDER]``.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import subprocess
 import sys
 import threading
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
-from ..compensation.journal import IDEAL_SOURCE, Source
+from ..compensation.journal import IDEAL_SOURCE, LARGEST_SOURCE, Source
 from ..errors import HexapodError
 from ..formats.json import json_text
+from ..formats.paths import confined_file, confined_opener
 from ..machine.field import GridField
 from ..machine.model import MachineModel, ModelOrigin
-from ..machine.model_file import parse_model
 from ..machine.struts import StrutErrors
 
 LOADED_WITHIN = 30.0
 """A file that takes longer to read is given up, s; the shipped ones take one second, nearly all of it imports."""
+
+ENDED_WITHIN = 0.5
+"""How long an end of the process is waited for, s: who waits for a dead mount cannot even be killed."""
 
 PACKAGE_ROOT = Path(__file__).resolve().parents[2]
 """Where the process runs: Python also imports from the folder it runs in, which must not be just any."""
@@ -57,30 +64,64 @@ def model_of(text: str) -> MachineModel:
     return MachineModel(**data)
 
 
-def load_elsewhere(source: Source, machine: str) -> MachineModel:
-    """Read a model file's text for a machine in a process of its own, and wait for it without keeping Python's lock.
+class ModelName(NamedTuple):
+    """Where a model is to be looked for: nothing of it is looked at here.
+
+    Attributes
+    ----------
+    name : str
+        Path of the file, or the name of a shipped one.
+    place : str
+        Folder that relative paths start from.
+    folder : Path or None
+        As for :func:`~hexapod_comp.formats.paths.confined_file`.
+    """
+
+    name: str
+    place: str
+    folder: Path | None
+
+
+def load_elsewhere(wanted: ModelName, machine: str) -> tuple[MachineModel, Source]:
+    """Find and read a machine's model file in a process of its own; wait for it without keeping Python's lock.
+
+    Returns
+    -------
+    MachineModel
+    Source
+        What it was made of; without its text where that is too long for the journal.
 
     Raises
     ------
     LoadingError
-        As :func:`~hexapod_comp.machine.model_file.parse_model`, or the process failed.
+        As :func:`~hexapod_comp.formats.paths.confined_file` and
+        :func:`~hexapod_comp.machine.model_file.parse_model`, or the process failed, or did not end in time.
     """
-    command = [sys.executable, "-m", __name__, source.name, machine]
+    command = [sys.executable, "-m", __name__, wanted.name, machine, wanted.place]
+    command += [] if wanted.folder is None else [str(wanted.folder)]
     try:
-        done = subprocess.run(
-            command,
-            cwd=PACKAGE_ROOT,
-            input=(source.text or "").encode(),
-            stdout=subprocess.PIPE,
-            timeout=LOADED_WITHIN,
-            check=False,
-        )
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise LoadingError(f"{source.name}: could not be loaded: {error}") from error
-    output = done.stdout.decode("utf-8", "replace")
-    if done.returncode == 0:
-        return model_of(output)
-    raise LoadingError(output or f"{source.name}: the loading process ended with {done.returncode}")
+        process = subprocess.Popen(command, cwd=PACKAGE_ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE)
+    except (OSError, ValueError) as error:
+        raise LoadingError(f"{wanted.name}: could not be loaded: {error}") from error
+    output = _output(process, wanted.name)
+    if process.returncode == 0:
+        source, _, model = output.partition("\n")
+        return model_of(model), Source(**json.loads(source))
+    raise LoadingError(output or f"{wanted.name}: the loading process ended with {process.returncode}")
+
+
+def _output(process: subprocess.Popen[bytes], name: str) -> str:
+    """Return all that a process says, or give it up."""
+    try:
+        return process.communicate(timeout=LOADED_WITHIN)[0].decode("utf-8", "replace")
+    except subprocess.TimeoutExpired as error:
+        process.kill()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(ENDED_WITHIN)
+        if process.stdout is not None:
+            process.stdout.close()
+        problem = f"could not be read within {LOADED_WITHIN:g} s; is the disk or the network behind it there?"
+        raise LoadingError(f"{name}: {problem}") from error
 
 
 class Loading:
@@ -88,16 +129,16 @@ class Loading:
 
     Parameters
     ----------
-    path : Path or None
+    wanted : ModelName or None
         The file; None: the ideal model.
     machine : str
         Name of the machine that it must belong to.
     """
 
-    def __init__(self, path: Path | None, machine: str) -> None:
+    def __init__(self, wanted: ModelName | None, machine: str) -> None:
         self._loaded: tuple[MachineModel, Source] | None = None
         self._error: HexapodError | None = None
-        self._thread = threading.Thread(target=self._run, args=(path, machine), name="model loading", daemon=True)
+        self._thread = threading.Thread(target=self._run, args=(wanted, machine), name="model loading", daemon=True)
         self._thread.start()
 
     @property
@@ -106,7 +147,7 @@ class Loading:
         return not self._thread.is_alive()
 
     def result(self) -> tuple[MachineModel, Source]:
-        """Return the model and the text that it was read from.
+        """Return the model and what it was made of.
 
         Raises
         ------
@@ -117,28 +158,31 @@ class Loading:
             raise self._error or LoadingError("the model has not been loaded yet")
         return self._loaded
 
-    def _run(self, path: Path | None, machine: str) -> None:
+    def _run(self, wanted: ModelName | None, machine: str) -> None:
         try:
-            if path is None:
-                self._loaded = MachineModel(machine), IDEAL_SOURCE
-            else:
-                source = Source.read(path)
-                self._loaded = load_elsewhere(source, machine), source
+            ideal = MachineModel(machine), IDEAL_SOURCE
+            self._loaded = ideal if wanted is None else load_elsewhere(wanted, machine)
         except HexapodError as error:
             self._error = error
         except Exception as error:  # a thread's error would be lost, and the service never answer
-            self._error = LoadingError(f"{path}: {type(error).__name__}: {error}")
+            name = "" if wanted is None else wanted.name
+            self._error = LoadingError(f"{name}: {type(error).__name__}: {error}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Read a model file's text, called as given, for the machine given and print it; or print why not, return 1."""
-    name, machine = sys.argv[1:] if argv is None else argv
+    """Read a model file for a machine and print text and numbers; or print why not, and return 1."""
+    name, machine, place, *folders = sys.argv[1:] if argv is None else argv
+    folder = Path(folders[0]) if folders else None
     try:
-        model = parse_model(sys.stdin.buffer.read().decode(), machine, name)
-    except HexapodError as error:
-        sys.stdout.buffer.write(str(error).encode())
+        os.chdir(place)
+        source = Source.read(confined_file(name, folder), confined_opener(folder))
+        model = source.model(machine)
+    except (HexapodError, OSError) as error:
+        sys.stdout.buffer.write(str(error).encode("utf-8", "replace"))
         return 1
-    sys.stdout.write(model_json(model))
+    text = source.text if len(source.text or "") <= LARGEST_SOURCE else None
+    head = json.dumps({"name": source.name, "text": text, "sha256": source.sha256})
+    sys.stdout.write(f"{head}\n{model_json(model)}")
     return 0
 
 

@@ -50,10 +50,7 @@ class ReloadService:
     def _on_request(self, _: Trigger.Request) -> Trigger.Response | None:
         if self._loading is not None:
             return Trigger.Response(success=False, message="the model is being loaded already")
-        try:
-            self._loading = self._files.begin_loading(self._compensator.geometry.name)
-        except HexapodError as error:
-            return self._failed(error)
+        self._loading = self._files.begin_loading(self._compensator.geometry.name)
         return None
 
     def look(self) -> None:
@@ -62,11 +59,13 @@ class ReloadService:
         if loading is None or not loading.done:
             return
         self._loading = None
+        sources = self._files.sources
+        before = sources["model"]
         try:
-            model, source = loading.result()
-            self._files.sources["model"] = source  # first: the journal notes it with the change
+            model, sources["model"] = loading.result()  # the source first: the journal notes it with the change
             self._compensator.set_model(model)
         except HexapodError as error:
+            sources["model"] = before
             self._late.answer(self._failed(error))
             return
         self._late.answer(Trigger.Response(success=True, message=f"model {model.name!r} ramps in"))

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.srv import ChangeState
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
@@ -21,7 +22,8 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from .guarding import CallbackGuard, PlainLogger
+from ..errors import CommandError, shorten
+from .guarding import CallbackGuard, PlainLogger, Throttle
 from .health import HealthReport, joined
 
 COMMAND_QOS = QoSProfile(depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
@@ -52,10 +54,24 @@ class MachineNode(LifecycleNode):
         self._throttle = Throttle()
         self.guard = CallbackGuard(self.warn_of, self.complain_of)
         super().__init__(name, **options)
-        self._logger = PlainLogger(self.get_logger().name)
+        self._logger = PlainLogger(self.get_logger().name, self.guard)
         for service in self.services:  # the lifecycle's are not made by create_service
-            service.callback = self.guard.answering(service.srv_name, service.srv_type, service.callback)
+            callback = self._if_possible(service.callback) if service.srv_type is ChangeState else service.callback
+            service.callback = self.guard.answering(service.srv_name, service.srv_type, callback)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+
+    def _if_possible(self, change: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        """Return the callback of ``change_state`` for possible transitions only: of others rcl logs each request."""
+
+        def checked(request: Any, response: Any) -> Any:
+            wanted, machine = request.transition, self._state_machine
+            possible = {t[1] if wanted.label else t[0] for t in machine.available_transitions}
+            if (wanted.label or wanted.id) not in possible:
+                name, state = shorten(wanted.label) if wanted.label else wanted.id, machine.current_state[1]
+                raise CommandError("transition", f"there is no transition {name} from state {state}")
+            return change(request, response)
+
+        return checked
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., Any], *arguments: Any, **options: Any
@@ -96,12 +112,12 @@ class MachineNode(LifecycleNode):
     def warn_of(self, cause: str, text: str) -> None:
         """Log a warning, once per cause and second."""
         if (line := self._throttle.allow(cause, text)) is not None:
-            self.get_logger().warning(line)
+            self.get_logger().warning(line, throttled=True)
 
     def complain_of(self, cause: str, text: str) -> None:
         """Log an error, once per cause and second."""
         if (line := self._throttle.allow(cause, text)) is not None:
-            self.get_logger().error(line)
+            self.get_logger().error(line, throttled=True)
 
     def open_diagnostics(self, what: str) -> None:
         """Make the publisher of the status of this node; `what` is the machine or component that it serves."""
@@ -228,26 +244,3 @@ class LateService:
         header, self._header = self._header, None
         if header is not None:
             self._send(response, header)
-
-
-class Throttle:
-    """Lets one message per cause and second through, and counts what it held back."""
-
-    def __init__(self, period: float = 1.0) -> None:
-        self._period = period
-        self._last: dict[str, float] = {}
-        self._held: dict[str, int] = {}
-
-    def passes(self, cause: str) -> int | None:
-        """Return how many of this cause were held back since the last, or None to hold this one back."""
-        now = time.monotonic()
-        if now - self._last.get(cause, -1e9) < self._period:
-            self._held[cause] = self._held.get(cause, 0) + 1
-            return None
-        self._last[cause] = now
-        return self._held.pop(cause, 0)
-
-    def allow(self, cause: str, text: str) -> str | None:
-        """Return the text to be logged, which says what was held back, or None to hold this one back."""
-        held = self.passes(cause)
-        return None if held is None else text + (f" ({held} more like it)" if held else "")

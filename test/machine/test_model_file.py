@@ -338,6 +338,13 @@ LAST_LINE = "  - {axis: z, at: [1, 1], direction: both, dx_um: []}\n"
         ("dx_um: []", "rx_um: [1]", ["field.lines[4].rx_um", "not a known key"]),
         ("dx_um: []", "dx_um: 1", ["field.lines[4].dx_um", "shape n"]),
         ("dz_um: [1, 2, 3]", "dz_um: [1, .nan, 3]", ["field.lines[0].dz_um[1]", "finite", "nan"]),
+        # Largest on −1…1: of 60u mm at its end; 40 + 40 − 40u² mm in the middle, below its coefficients' sum.
+        ("dz_um: [1, 2, 3]", "dz_mm: [0, 60]", ["field.lines_z.dz", "±50 mm", "unit", "0.06"]),
+        ("dz_um: [1, 2, 3]", "dz_mm: [80, 0, -40]", ["field.lines_z.dz", "±50 mm", "0.08"]),
+        ("rx_urad: [7]", "rx_rad: [-0.2]", ["field.lines_z.rx", "±100 mrad", "0.2"]),
+        ("dz_um: [1, 2, 3]", "dz_um: [1.0e+300, 1.0e+300]", ["field.lines_z.dz", "±50 mm"]),
+        ("[10, 20, 30, 40, 50, 60]", "[10, 200000, 0, 0, 0, 0]", ["struts.offset", "±100 mm", "unit", "0.2"]),
+        ("expansion_ppm_per_K: 11.7", "expansion_ppm_per_K: 11700", ["struts.expansion", "±1000 ppm per K", "0.0117"]),
         (LAST_LINE, "", ["field.lines", "the forward line along z at [1, 1] is missing"]),
         (
             "at: [0, 1], direction: backward",
@@ -362,6 +369,12 @@ def test_refused(tmp_path, old, new, said):
     assert message.startswith(str(tmp_path / "model.yaml"))
     for part in said:
         assert part in message[len(str(tmp_path)) :]
+
+
+def test_a_polynomial_is_judged_by_its_values(tmp_path):
+    """Coefficients may be larger than any value: 40 − 80u² mm lies within ±40 mm."""
+    field = load(tmp_path, BY_HAND.replace("dz_um: [1, 2, 3]", "dz_mm: [40, 0, -80]")).field
+    assert field.lines[2][0, 0, 0, 2, 2] == pytest.approx(-0.08)
 
 
 def test_one_missing_line_of_a_family_is_named(tmp_path):

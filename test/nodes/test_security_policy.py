@@ -8,16 +8,25 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import runpy
+import sys
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import pytest
+import rclpy
 from hal_stand_in import StandInHal
+from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 from node_helpers import Bench
 from rclpy.context import Context
 from rclpy.node import Node
+from rclpy.parameter_client import AsyncParameterClient
+from std_srvs.srv import SetBool, Trigger
 
 from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
 from hexapod_comp.nodes.client import LoopClient
@@ -28,6 +37,9 @@ PACKAGE = Path(__file__).resolve().parents[2] / "hexapod_comp"
 POLICY = Path(__file__).resolve().parents[2] / "config" / "security" / "policy.xml"
 
 RIGHTS = ("publish", "subscribe", "reply", "request")
+
+TOOLS = "_ros2cli_*"
+"""Names of the nodes that the ``ros2`` tools make; permissions of DDS take patterns (POSIX fnmatch)."""
 
 COMMANDS = {"/tool_pose_command": {"commander", "linuxcnc_bridge"}, "/strut_commands": {"compensator"}}
 """Who alone may move the machine."""
@@ -47,13 +59,15 @@ def read_policy(namespace: str = "") -> dict[str, Enclave]:
     root = ET.parse(POLICY, ET.XMLParser(target=builder)).getroot()
     found = {}
     for enclave in root.find("enclaves"):
-        (profile,) = enclave.findall("profiles/profile")
-        entry = Enclave(profile.get("node"))
-        for group in profile:
-            rights = [right for right in group.attrib if group.get(right) == "ALLOW"]
-            for name in group:
-                for right in rights:
-                    entry.allowed[right].add(absolute(name.text, entry.node, namespace))
+        profiles = enclave.findall("profiles/profile")
+        entry = Enclave(profiles[0].get("node"))
+        for profile in profiles:
+            node = profile.get("node")
+            place = "" if node == TOOLS else namespace
+            for group in profile:
+                rights = [right for right in group.attrib if group.get(right) == "ALLOW"]
+                for name, right in product(group, rights):
+                    entry.allowed[right].add(absolute(name.text, node, place))
         found[enclave.get("path").rpartition("/")[2]] = entry
     return found
 
@@ -101,7 +115,7 @@ def test_operators_and_thermometers_hear_and_ask_only_what_there_is() -> None:
         allowed = policy[name].allowed
         assert allowed["publish"] | allowed["subscribe"] <= heard
         assert allowed["request"] <= answered
-        assert not allowed["reply"]
+        assert all(reply.startswith(f"/{TOOLS}/") for reply in allowed["reply"])
 
 
 @pytest.mark.parametrize("name", ["compensator", "strut_drive", "linuxcnc_bridge"])
@@ -129,6 +143,77 @@ def test_the_client_opens_what_the_policy_allows() -> None:
         assert found == enclave.allowed
     finally:
         client.close()
+
+
+LIFECYCLE = ("change_state", "get_state", "get_available_transitions", "get_transition_graph")
+"""What ``ros2 lifecycle`` (ros2cli 0.32, Jazzy) asks nodes for: ``list`` the third, with -a the last; ``set`` the
+third, then the first; ``get`` the second."""
+
+
+def tool_nodes(context: Context, machines: tuple[str, ...]) -> Iterator[Node]:
+    """Make what the tools of Jazzy make: its name, its services, and its clients.
+
+    ``ros2 topic``, ``node``, ``lifecycle`` and ``param``: ros2cli/node/direct.py; ``ros2 param``'s client is rclpy's
+    own. ``ros2 service call``: ros2service/verb/call.py, named after the service's type.
+    """
+    direct = rclpy.create_node(TOOLS.replace("*", "4711"), context=context, start_parameter_services=False)
+    for machine in machines:
+        AsyncParameterClient(direct, machine)
+        for name in LIFECYCLE:
+            kind = {"change_state": ChangeState, "get_state": GetState}.get(name, GetAvailableTransitions)
+            direct.create_client(kind, f"{machine}/{name}")
+    yield direct
+    for kind in (SetBool, Trigger):
+        yield rclpy.create_node(TOOLS.replace("*", f"requester_std_srvs_{kind.__name__}"), context=context)
+
+
+def test_the_operator_may_all_that_the_ros2_tools_open(
+    ros_context: Context, spin_until: Callable[..., None], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing less: a tool ends when one of its clients cannot be made. Nothing more: what else nobody asks for."""
+    operator = read_policy()["operator"].allowed
+    machines = ("compensator", "strut_drive", "linuxcnc_bridge")
+    wanted: dict[str, set[str]] = {right: set() for right in RIGHTS}
+    with Bench(ros_context, spin_until, capfd) as bench:
+        for node in tool_nodes(ros_context, machines):
+            bench.until(lambda node=node: "/rosout" in opened(bench.witness, node.get_name(), "")["publish"], "a tool")
+            for right, names in opened(bench.witness, node.get_name(), "").items():
+                wanted[right] |= {name.replace(f"/{node.get_name()}/", f"/{TOOLS}/") for name in names}
+            node.destroy_node()
+    own = {f"/compensator/{name}" for name in ("enable_compensation", "reload_model", "reset")}
+    assert wanted["request"] == operator["request"] - own
+    assert wanted["publish"] == operator["publish"]
+    assert wanted["reply"] == operator["reply"]
+
+
+def test_the_launch_file_names_the_enclaves_of_the_policy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each node's ``--enclave`` is in the policy, by default. Stand-ins for launch, which PyPI has not."""
+    defaults: dict[str, Any] = {}
+    parts = {
+        "launch": {"LaunchContext": dict, "LaunchDescription": list},
+        "launch.actions": {
+            "DeclareLaunchArgument": lambda name, default_value, **_: defaults.update({name: default_value}),
+            "OpaqueFunction": lambda function: function,
+        },
+        "launch.substitutions": {
+            "EnvironmentVariable": lambda _, default_value: default_value,
+            "LaunchConfiguration": lambda name: SimpleNamespace(perform=lambda context: context[name]),
+        },
+        "launch_ros": {},
+        "launch_ros.actions": {"Node": lambda **options: options},
+    }
+    for name, content in parts.items():
+        module = ModuleType(name)
+        module.__dict__.update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+    nodes = runpy.run_path(str(PACKAGE.parent / "launch" / "machine.launch.py"))["generate_launch_description"]()[-1]
+    root = ET.parse(POLICY).getroot()
+    paths = {enclave.get("path") for enclave in root.iter("enclave")}
+    for folder, known in ((defaults["enclaves"], True), ("/mine", False)):
+        arguments = [node["ros_arguments"] for node in nodes({**defaults, "enclaves": folder})]
+        asked = [words[words.index("--enclave") + 1] for words in arguments]
+        assert asked == [f"{folder}/compensator", f"{folder}/strut_drive"]
+        assert paths.issuperset(asked) is known
 
 
 def test_nothing_is_unpickled_or_executed() -> None:

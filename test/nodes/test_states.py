@@ -672,19 +672,3 @@ def test_shipped_models_survive_the_way_through_the_loading_process():
             np.testing.assert_array_equal(one, other)
         np.testing.assert_array_equal(again.struts.map_values, model.struts.map_values)
         assert again.origin == model.origin
-
-
-def test_a_model_on_its_way_is_read_once(tmp_path):
-    """From a pipe, which gives its text once: the model, and the text that the journal keeps, are of one moment."""
-    from hexapod_comp.compensation.journal import Source
-    from hexapod_comp.nodes.model_loading import Loading
-
-    text = (CONFIG / "paper_machine.yaml").read_text(encoding="utf-8")
-    path = tmp_path / "pipe"
-    os.mkfifo(path)
-    loading = Loading(path, "paper")
-    path.write_text(text, encoding="utf-8")
-    loading._thread.join(timeout=60)
-    model, source = loading.result()
-    assert model.name == "virtual machine"
-    assert source == Source.of(str(path), text)

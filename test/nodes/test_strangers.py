@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -279,6 +280,38 @@ def test_text_in_a_request_neither_forges_a_line_nor_is_shown_whole(bench):
         answer = bench.call(SetParameters, "strut_drive/set_parameters", SetParameters.Request(parameters=[parameter]))
         assert not answer.results[0].successful
     assert_harmless(bench)
+
+
+def test_a_flood_of_refused_requests_gives_a_line_a_second(bench):
+    """Ours, rclpy's and rcl's lines alike: a transition that is not possible now or never, a parameter's wrong type."""
+    bench.compensator()
+    wrong = ParameterMessage(name="use_sim_time")
+    wrong.value.type, wrong.value.string_value = 4, "yes"
+    untyped = ParameterMessage(name="use_sim_time")
+    untyped.value.type = 255
+    possible, unknown = ChangeState.Request(), ChangeState.Request()
+    possible.transition.id, unknown.transition.label = 1, "fly"  # configure: it is active
+    floods = [
+        *((ChangeState, "compensator/change_state", request) for request in (possible, unknown)),
+        *(
+            (SetParameters, "compensator/set_parameters", SetParameters.Request(parameters=[p]))
+            for p in (wrong, untyped)
+        ),
+    ]
+    bench.logged("")
+    lines, began = len(bench._log.splitlines()), time.monotonic()
+    for kind, name, request in 13 * floods:
+        client = bench._client(kind, name)
+        futures = [client.call_async(request) for _ in range(8)]  # a service's queue holds ten
+        bench.until(lambda futures=futures: all(future.done() for future in futures), "all answers")
+        answers = [future.result() for future in futures]
+        assert not any(a.success if kind is ChangeState else a.results[0].successful for a in answers)
+    bench.logged("")
+    said = bench._log.splitlines()[lines:]
+    assert len(said) <= 2 * len(floods) * (2.0 + time.monotonic() - began), said[:9]
+    assert len(said) < 50
+    assert any("there is no transition" in line for line in said)
+    assert int(bench.nodes[0].guard.values()["refused_requests"]) >= 300
 
 
 @pytest.mark.parametrize("parameter", ["geometry_file", "model_file"])

@@ -1,0 +1,60 @@
+"""What the kernel found wrong with a command, as errors in words."""
+
+from __future__ import annotations
+
+import math
+
+from ..errors import NotConvergedError, OutsideFieldError, PoseError
+from ..kernels.compensation import NO_POSE, OUTSIDE, UNSOLVED
+from ..kernels.limits import WITHIN
+from ..kernels.pose import POSE_NOT_FINITE, QUATERNION_NORM_TOLERANCE
+from ..machine.field import GridField
+from ..machine.model import RealMachine
+from .state import CommandState
+
+
+def refuse(found: tuple, command: CommandState, machine: RealMachine, numbers: tuple[float, ...] = ()) -> None:
+    """Raise what was found wrong with a command; return when nothing was.
+
+    Parameters
+    ----------
+    found : tuple
+        As :func:`~hexapod_comp.kernels.compensation.compensate_one` returns it.
+    command : CommandState
+        What it wrote.
+    machine : RealMachine
+        For which.
+    numbers : tuple of seven float
+        Position and quaternion, where the command was given so.
+
+    Raises
+    ------
+    PoseError, NotConvergedError, OutsideFieldError, LimitError, NotFiniteError
+        What was found.
+    """
+    status, finding, strut, stage, value, _ = found
+    if status == NO_POSE:
+        raise _pose_error(finding, numbers)
+    if status == UNSOLVED:
+        raise NotConvergedError("the error field is too steep to be undone at this pose")
+    if status == OUTSIDE and machine.model.field.outside == "refuse":
+        raise _outside_error(command, machine.model.field)
+    if finding != WITHIN:
+        raise machine.geometry.limits.error(finding, strut, stage, value)
+
+
+def _pose_error(outcome: int, numbers: tuple[float, ...]) -> PoseError:
+    if outcome == POSE_NOT_FINITE:
+        return PoseError("pose must be finite", list(numbers), "not_finite")
+    norm = math.hypot(*numbers[3:])
+    problem = f"quaternion must have norm 1 within {QUATERNION_NORM_TOLERANCE:g}, not {norm:.6g}"
+    return PoseError(problem, list(numbers[3:]), "quaternion")
+
+
+def _outside_error(command: CommandState, field: GridField) -> OutsideFieldError:
+    box = field.box * 1e3
+    platform = command.platform
+    point = (platform.position + platform.rotation @ field.probe) * 1e3
+    low, high = (", ".join(f"{v:g}" for v in corner) for corner in box)
+    problem = f"the measured point ({point[0]:.3f}, {point[1]:.3f}, {point[2]:.3f}) mm is outside the field's box"
+    return OutsideFieldError(f"{problem} ({low})…({high}) mm", point, box)
