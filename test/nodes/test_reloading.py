@@ -87,7 +87,7 @@ def test_a_field_that_refuses_extrapolation_is_refused_outside_its_box(bench, tm
 
 
 def test_compensation_is_not_switched_on_where_it_breaks_a_limit(bench, tmp_path):
-    """Fine at home, beyond 2 mm further up, where it went while compensation was off: the ramp would drag the struts."""
+    """Fine at home, not further up, where it went while compensation was off: the ramp would drag the struts there."""
     steep = field(0.0)
     for line in steep["lines"]:
         line["dz_um"] = [2000.0, 4000.0]  # −2 mm at z = 350 mm, 0 at 400 mm, 6 mm at 550 mm
