@@ -23,18 +23,14 @@ from hexapod_comp.calibration.pictures import fit_figure, strut_error_figure
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
-from hexapod_comp.machine.pictures import direction_figure, machine_figure, weights_figure
+from hexapod_comp.machine.pictures import direction_figure, weights_figure
 from hexapod_comp.measurements.campaign import load_campaign, template
 from hexapod_comp.measurements.readings import MeasurementSet
+from hexapod_comp.papers import daake
+from hexapod_comp.papers.mou_king import LINE_Y
+from hexapod_comp.papers.pictures import configuration_figure
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.instruments import measure
-from hexapod_comp.workspace.effects import effects
-from hexapod_comp.workspace.layers import TRANSLATION, Layer
-from hexapod_comp.workspace.pictures import shells_figure
-from hexapod_comp.workspace.reach import reach
-from hexapod_comp.workspace.shells import shell
-from hexapod_comp.workspace.sources import load_budget
-from hexapod_comp.workspace.study import LAYERS, RINGS, SECTORS
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -45,22 +41,10 @@ EXAMPLE_WORK = Pose.from_angles([0.15, -0.12, 0.0], np.deg2rad([0.0, 0.0, 20.0])
 SEED, LEAD = 1, 0.01
 """Of the calibrations shown, as doc/calibration.md has them: the virtual instruments' seed; the screws' lead, m."""
 
-LINE_Y = 0.1016
-"""Where the line along x stands on which strut length errors are shown, m: one that was measured."""
-
 
 def machine_picture(geometry: HexapodGeometry) -> Figure:
     """Return the paper's machine with its three dimensions and the four frames."""
-    figure = machine_figure(replace(geometry, tool=EXAMPLE_TOOL, work=EXAMPLE_WORK))
-    base, platform = geometry.base_joints * 1e3, geometry.platform_joints * 1e3
-    above = figure.axes[1]
-    sides = ("b", base[2], base[3]), ("d", base[1], base[2]), ("a", platform[0], platform[4])
-    for name, first, second in sides:
-        x, y = 0.5 * (first + second)[:2]
-        side = np.linalg.norm(first - second)
-        box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
-        above.text(x, y, f"{name} = {side:g} mm", ha="center", va="center", bbox=box)
-    return figure
+    return configuration_figure(replace(geometry, tool=EXAMPLE_TOOL, work=EXAMPLE_WORK))
 
 
 def measured(geometry: HexapodGeometry, name: str) -> MeasurementSet:
@@ -83,16 +67,8 @@ def strut_error_picture(fit: ModelFit, one_d: MeasurementSet) -> Figure:
 
 def shells_picture() -> Figure:
     """Show what an error of the first screw's pitch does to the unit's tool (v. Daake et al., Figure 2)."""
-    geometry = load_geometry(ROOT / "config" / "positioning_unit.yaml")
-    errors = load_budget(ROOT / "config" / "error_budget.yaml").single_errors(geometry)
-    first = errors.select((errors.kind == errors.kinds.index("screw pitch")) & (errors.strut == 0))
-    body = shell(reach(geometry), RINGS, SECTORS)
-    layers = []
-    for share in LAYERS:
-        moved = effects(geometry, first, *body.platform_poses(share))[:, 0, 0]
-        layers.append(Layer(body.scaled(share), moved.reshape(body.points.shape[:2])))
-    title = "positioning unit, screw pitch of strut 1 off by 20 µm, tool level"
-    return shells_figure(geometry, layers, TRANSLATION, title)
+    (figure,) = daake.shells(load_geometry(daake.MACHINE)).figures.values()
+    return figure
 
 
 def main(arguments: list[str] | None = None) -> int:

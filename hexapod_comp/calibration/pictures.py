@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..errors import CalibrationError
-from ..formats.figures import WITH, WITHOUT, picture_text
+from ..formats.figures import SIX_COLOURS, WITH, WITHOUT, picture_text
 from ..kernels.struts import smooth_error
 from ..machine.field import COMPONENTS, CROSS_AXES
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
@@ -96,14 +96,14 @@ def strut_error_figure(
         for axes, lengths, letter, way in zip(panels, errors, "ab", ("forward →", "backward ←"), strict=True):
             _strut_curves(axes, along, lengths)
             axes.set(title=f"{picture_text(title)}, ({letter}) {way}", xlabel="x, mm", ylabel="ΔL = actual − ideal, µm")
-    rows[0, 0].legend(ncols=2, fontsize=7)
+    figure.legend(*rows[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
     figure.suptitle(f"Strut length error along x at y = {line[0] * 1e3:g} mm, z = {line[1] * 1e3:g} mm")
     return figure
 
 
 def _strut_curves(axes: Axes, along: np.ndarray, lengths: np.ndarray) -> None:
-    for name, values in zip(STRUT_NAMES, lengths.T, strict=True):
-        axes.plot(along * 1e3, values * 1e6, lw=1.0, label=name)
+    for name, colour, values in zip(STRUT_NAMES, SIX_COLOURS, lengths.T, strict=True):
+        axes.plot(along * 1e3, values * 1e6, color=colour, lw=1.3, label=name)
 
 
 def fitted_lines_figure(fit: LinesFit, axis: int = 0, component: int | None = None) -> Figure:

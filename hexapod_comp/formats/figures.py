@@ -6,12 +6,14 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from ..errors import InputFileError, printable
-from .outputs import new_file
+from ..errors import printable
+from .outputs import make_folder, new_file
 
 WITHOUT, WITH = "#c1432e", "#20639b"
 """Colours of the machine without and with compensation, the same in every picture."""
 
+SIX_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#000000")
+"""Of the six struts: Okabe and Ito's, which the colour-blind can tell apart too."""
 
 NOTHING = 1e-3
 """Lower end of logarithmic error axes, µm: below a nanometre nothing is claimed."""
@@ -30,9 +32,6 @@ def save(figure: Figure, path: str | Path) -> None:
     InputFileError
         It cannot be written.
     """
-    try:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputFileError(path, "", f"its folder cannot be made: {error.strerror}") from error
+    make_folder(Path(path).parent)
     with new_file(path, "wb") as stream:
         figure.savefig(stream, dpi=140, format="png")

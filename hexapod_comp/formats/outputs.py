@@ -20,7 +20,7 @@ READ = ("bag", "budget", "campaign", "columns", "files", "lengths_file", "machin
 WRITTEN = ("covariance", "out", "report", "table")
 """Arguments that name files to write."""
 
-FOLDERS = ("linuxcnc", "pictures")
+FOLDERS = ("folder", "linuxcnc", "pictures")
 """Arguments that name folders to write into; they are made."""
 
 _protected: dict[tuple[int, int], str] = {}
@@ -123,6 +123,20 @@ def write_text(path: str | Path, text: str) -> None:
     """Write a text file as :func:`new_file` does."""
     with new_file(path) as stream:
         stream.write(text)
+
+
+def make_folder(path: str | Path) -> None:
+    """Make a folder that is missing, with those above it.
+
+    Raises
+    ------
+    InputFileError
+        It cannot be made.
+    """
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputFileError(path, "", f"this folder cannot be made: {error.strerror}") from error
 
 
 def _refuse_no_file(path: str) -> None:

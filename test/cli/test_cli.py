@@ -76,7 +76,7 @@ def test_help_is_fast_and_needs_no_compiler() -> None:
     listed = re.findall(r"^ +(\w+):$|^    (\w+)  ", done.stdout, re.MULTILINE)
     assert " ".join(group + ":" if group else verb for group, verb in listed) == (
         "kinematics: ik fk check loop: run demo replay calibration: plan simulate fit iso230 export "
-        "analysis: assess classify"
+        "analysis: assess classify paper"
     )
     assert all(len(line) <= 80 for line in done.stdout.splitlines() if line.startswith("    ")), "one line a verb"
 
@@ -135,7 +135,7 @@ def test_json_is_printed_and_out_stays_csv(hexapod, tmp_path: Path) -> None:
         ("ik --model ", {"ideal", "paper_machine.yaml", "paper_lines_model.yaml", "mine.csv", "deep/"}),
         ("plan campaign_", {"campaign_1d.yaml", "campaign_5d.yaml", "campaign_full.yaml"}),
         ("classify --budget e", {"error_budget.yaml"}),
-        ("check ", {"table1.csv", "mine.csv", "deep/"}),
+        ("check ", {*(f"table{n}.csv" for n in range(1, 6)), "mine.csv", "deep/"}),
         ("fit --scheme ", {"joint", "lines"}),
         ("demo --pictures d", {"deep/"}),
         ("ik --x-mm ", set()),

@@ -1,0 +1,291 @@
+"""The misprints in the formulas of Song, Mou & King: each as printed and as mended, on the poses of their Table 1.
+
+All of it by NumPy from the paper's own drawing (its Figure 3), in its letters, mm and degrees: nothing of the package
+is asked, so that a mended formula proves itself by closing the machine's loops.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from .printed import values
+
+A, B, D = 300.0, 572.0, 243.0
+"""Side of the platform's triangle, long and short sides of the base, mm; they follow from Table 2."""
+
+S3 = np.sqrt(3.0)
+TOP = np.array([[np.cos(angle), np.sin(angle), 0.0] for angle in np.radians([60.0, 180.0, -60.0])]) * A / S3
+
+MENDS = ("Xp3", "4", "Yp3")
+"""What the second of the three combined equations needs."""
+
+SIGNS = np.array([[1, 1, 1]] * 2 + [[-1, 1, 1]] + [[-1, -1, 1]] * 2 + [[1, -1, 1]], dtype=float)
+"""Of δX_B, δY_B and δZ_B as they are printed."""
+
+DEVIATION = 0.01
+"""Error of a joint's coordinate with which formulas of the real structure are tried, mm."""
+
+
+class Case(NamedTuple):
+    """A pose of Table 1: angles, °; rotation; top joints and what the paper calls L, p, h, X_p, Y_p, mm."""
+
+    angles: np.ndarray
+    rotation: np.ndarray
+    top: np.ndarray
+    lengths: np.ndarray
+    p: np.ndarray
+    h: np.ndarray
+    xp: np.ndarray
+    yp: np.ndarray
+
+
+class Misprint(NamedTuple):
+    """A misprint.
+
+    Attributes
+    ----------
+    name : str
+        Where it stands.
+    printed, mended : str
+        The part that matters, as printed and as it must be.
+    unit : str
+        Of what is off.
+    off, left : callable
+        How far the printed and the mended form are off at a :class:`Case`.
+    """
+
+    name: str
+    printed: str
+    mended: str
+    unit: str
+    off: Callable[[Case], float]
+    left: Callable[[Case], float]
+
+    def worst(self) -> tuple[float, float]:
+        """Return how far the printed and the mended form are off at the worst of the ten poses."""
+        off, left = (max(abs(float(form(at))) for at in cases()) for form in (self.off, self.left))
+        return off, left
+
+
+def base_joints(b5: float = B - D) -> np.ndarray:
+    """Return the base joints, mm; `b5` is the bracket in X_B5."""
+    x = S3 / 6.0 * np.array([2 * B + D, -(B - D), -(B + 2 * D), -(B + 2 * D), -b5, 2 * B + D])
+    return np.column_stack([x, np.array([D, B + D, B, -B, -(B + D), -D]) / 2.0, np.zeros(6)])
+
+
+def printed_rotation(alpha: float, beta: float, gamma: float) -> np.ndarray:
+    """Return the rotation as the paper prints it, entry by entry; angles in degrees."""
+    (ca, cb, cg), (sa, sb, sg) = (f(np.radians([alpha, beta, gamma])) for f in (np.cos, np.sin))
+    return np.array(
+        [
+            [cb * cg + sa * sb * sg, -cb * sg + sa * sb * cg, ca * sb],
+            [ca * sg, ca * cg, -sa],
+            [-sb * cg + sa * cb * sg, sb * sg + sa * cb * cg, ca * cb],
+        ]
+    )
+
+
+def distances(top: np.ndarray, base: np.ndarray) -> np.ndarray:
+    """Return the six distances between three top joints and six base joints, mm."""
+    return np.linalg.norm(np.repeat(top, 2, axis=0) - base, axis=1)
+
+
+@cache
+def cases() -> tuple[Case, ...]:
+    """Return the ten poses of Table 1."""
+    return tuple(_case(row[:3], row[3:]) for row in values(1))
+
+
+def _case(angles: np.ndarray, position: np.ndarray) -> Case:
+    rotation = printed_rotation(*angles)
+    top = position + TOP @ rotation.T
+    lengths = distances(top, base_joints())
+    p = (B**2 + lengths[::2] ** 2 - lengths[1::2] ** 2) / (2 * B)
+    xp = S3 / 6.0 * np.array([2 * B + D - 3 * p[0], -(B + 2 * D), -(B - D - 3 * p[2])])
+    yp = np.array([D + p[0], B - 2 * p[1], -(B + D - p[2])]) / 2.0
+    return Case(angles, rotation, top, lengths, p, np.sqrt(lengths[::2] ** 2 - p**2), xp, yp)
+
+
+def second_equation(at: Case, *mends: str) -> float:
+    """Return what the second combined equation (joints 1 and 3) leaves, divided by a: mm."""
+    x, xp, yp, h2 = at.top[:, 0], at.xp, at.yp, at.h**2
+    subtracted = xp[2] if "Xp3" in mends else xp[0]
+    other = yp[2] if "Yp3" in mends else yp[1]
+    factor = 4.0 if "4" in mends else 1.0
+    root = np.sqrt((h2[0] - 4 * (x[0] - xp[0]) ** 2) * (h2[2] - factor * (x[2] - xp[2]) ** 2))
+    linear = 2 * x[0] * (xp[0] - 3 * subtracted + S3 * (yp[0] - other))
+    linear += 2 * x[2] * (-3 * xp[0] + xp[2] + S3 * (yp[0] - yp[2]))
+    square = (S3 * (xp[0] + xp[2]) - yp[0] + yp[2]) ** 2 + h2[0] + h2[2] - 4 * xp[0] ** 2 - 4 * xp[2] ** 2
+    return float(A**2 - 4 * x[0] * x[2] - linear - square + 2 * root) / A
+
+
+def equations_with_2(at: Case, k: int) -> float:
+    """Return what the first (joints 1 and 2, k = 0) or third (3 and 2, k = 2) leaves as printed: mm."""
+    x, xp, yp, h2 = at.top[:, 0], at.xp, at.yp, at.h**2
+    across = yp[0] - yp[1] if k == 0 else yp[1] - yp[2]
+    root = np.sqrt((h2[k] - 4 * (x[k] - xp[k]) ** 2) * (h2[1] - (x[1] - xp[1]) ** 2))
+    linear = 2 * x[k] * (xp[k] + S3 * across) + 2 * xp[1] * x[1]
+    square = (S3 * xp[k] - across) ** 2 + h2[k] + h2[1] - 4 * xp[k] ** 2 - xp[1] ** 2
+    return float(A**2 + 2 * x[k] * x[1] - linear - square + 2 * root) / A
+
+
+def fifth_length(at: Case, b5: float) -> float:
+    """Return L_5 with a bracket in X_B5, less the length that closes the loop, mm."""
+    return float(distances(at.top, base_joints(b5))[4] - at.lengths[4])
+
+
+def last_lengths(at: Case, joint: int) -> float:
+    """Return how far L'_5 or L'_6 to a top joint is from the lengths that close the loops, mm: the worse one."""
+    top = at.top[[0, 1, joint - 1]]
+    return float(np.abs(distances(top, base_joints()) - at.lengths)[4:].max())
+
+
+def base_errors(at: Case, signs: np.ndarray) -> float:
+    """Return how much too long or short a strut gets by one error of its base joint, entered with a sign, µm."""
+    right, entered = base_joints(), base_joints()
+    worst = 0.0
+    for axis in range(3):
+        shift = DEVIATION * np.eye(3)[axis]
+        off = distances(at.top, entered + signs[:, axis, None] * shift) - distances(at.top, right + shift)
+        worst = max(worst, float(np.abs(off).max()))
+    return worst * 1e3
+
+
+def top_errors(at: Case, printed: bool) -> float:
+    """Return how much too long or short a strut gets by one error of its top joint, µm.
+
+    The printed form multiplies a/√3 + 2δ by a bracket, one coordinate at a time.
+    """
+    brackets = (at.top - _position(at)) / (A / S3)
+    worst = 0.0
+    for axis in range(3):
+        along = np.zeros((3, 3))
+        along[:, axis] = 2.0 * DEVIATION * brackets[:, axis]
+        right = DEVIATION * at.rotation[:, axis]
+        entered = along if printed else np.tile(right, (3, 1))
+        off = distances(at.top + entered, base_joints()) - distances(at.top + right, base_joints())
+        worst = max(worst, float(np.abs(off).max()))
+    return worst * 1e3
+
+
+def _position(at: Case) -> np.ndarray:
+    return at.top.mean(axis=0)
+
+
+def y_t1(at: Case, sign: float) -> float:
+    """Return Y'_T1 less the joint's y, mm; `sign` is that of the last term."""
+    return float(S3 * at.top[0, 0] + sign / B * (at.lengths[0] ** 2 - at.lengths[1] ** 2) - at.top[0, 1])
+
+
+def y_t2(at: Case, sign: float) -> float:
+    """Return Y'_T2 less the joint's y, mm."""
+    return float(sign / (2 * B) * (at.lengths[3] ** 2 - at.lengths[2] ** 2) - at.top[1, 1])
+
+
+def y_t3(at: Case, sign: float) -> float:
+    """Return Y_T3 less the joint's y, mm; `sign` is that of X_p3 and Y_p3."""
+    return float(-S3 * at.top[2, 0] + sign * (S3 * at.xp[2] + sign * at.yp[2]) - at.top[2, 1])
+
+
+def z_t2(at: Case, factor: float) -> float:
+    """Return Z'_T2 less the joint's z, mm; `factor` is that under the root."""
+    return float(np.sqrt(at.h[1] ** 2 - factor * (at.top[1, 0] - at.xp[1]) ** 2) - at.top[1, 2])
+
+
+def heights(at: Case, back: bool) -> float:
+    """Return Z'_T less the joints' z when the base joints stand 10, −4 and 7 µm high, µm.
+
+    h' is measured from the mean height of two base joints; as printed, Z'_T does not go back to it.
+    """
+    lifted = np.array([0.010, -0.004, 0.007])
+    along = at.top - np.column_stack([at.xp, at.yp, lifted])
+    found = np.sqrt((along**2).sum(axis=1) - np.array([4.0, 1.0, 4.0]) * along[:, 0] ** 2)
+    return float(np.abs(found + (lifted if back else 0.0) - at.top[:, 2]).max() * 1e3)
+
+
+def alpha(at: Case, sign: float) -> float:
+    """Return α' less the pose's α, °; `sign` is that of X'_T3 (Z'_T1 − Z'_T2)."""
+    (x1, x2, x3), (y1, y2, y3), (z1, z2, z3) = at.top.T
+    gamma = np.radians(at.angles[2])
+    over = -2 * (x1 * (z3 - z2) + x2 * (z1 - z3) + sign * x3 * (z1 - z2))
+    under = A * (y1 - 2 * y2 + y3) * np.sin(gamma) + S3 * A * (y1 - y3) * np.cos(gamma)
+    return float(np.degrees(np.arctan(over / under))) - at.angles[0]
+
+
+MISPRINTS = (
+    Misprint(
+        *("X_B5", "−√3/6 (b + d)", "−√3/6 (b − d)", "mm"),
+        lambda at: fifth_length(at, B + D),
+        lambda at: fifth_length(at, B - D),
+    ),
+    Misprint(*("L′5, L′6", "to T2", "to T3", "mm"), lambda at: last_lengths(at, 2), lambda at: last_lengths(at, 3)),
+    Misprint(
+        *("Y_p2", "½ (d − 2 p1)", "½ (b − 2 p2)", "mm"),
+        lambda at: float((D - 2 * at.p[0]) / 2.0 - at.top[1, 1]),
+        lambda at: float(at.yp[1] - at.top[1, 1]),
+    ),
+    Misprint(
+        *("Y_T3", "−√3 X_T3 − (√3 X_p3 − Y_p3)", "−√3 X_T3 + (√3 X_p3 + Y_p3)", "mm"),
+        lambda at: y_t3(at, -1.0),
+        lambda at: y_t3(at, 1.0),
+    ),
+    Misprint(
+        "second combined equation",
+        "X_p1 − 3 X_p1; h3² − (X_T3 − X_p3)²; √3 (Y_p1 − Y_p2) beside X_T1",
+        "X_p1 − 3 X_p3; h3² − 4 (X_T3 − X_p3)²; √3 (Y_p1 − Y_p3)",
+        "mm",
+        second_equation,
+        lambda at: second_equation(at, *MENDS),
+    ),
+    Misprint(
+        *("the same, its third misprint alone", "√3 (Y_p1 − Y_p2) beside X_T1", "√3 (Y_p1 − Y_p3)", "mm"),
+        lambda at: second_equation(at, "Xp3", "4"),
+        lambda at: second_equation(at, *MENDS),
+    ),
+    Misprint(
+        "X′_B, Y′_B from joint 3 on",
+        "X_Bi − δX_Bi (i = 3, 4, 5), Y_Bi − δY_Bi (i = 4, 5, 6)",
+        "+ δ throughout",
+        "µm for an error of 10",
+        lambda at: base_errors(at, SIGNS),
+        lambda at: base_errors(at, np.ones((6, 3))),
+    ),
+    Misprint(
+        *("X′_T, Y′_T, Z′_T", "P + (a/√3 + 2 δ) [bracket]", "P + R (t + δt)", "µm for an error of 10"),
+        lambda at: top_errors(at, printed=True),
+        lambda at: top_errors(at, printed=False),
+    ),
+    Misprint(
+        *("Y′_T1", "√3 X′_T1 − (L″1² − L″2²)/b′1", "√3 X′_T1 + (L″1² − L″2²)/b′1", "mm"),
+        lambda at: y_t1(at, -1.0),
+        lambda at: y_t1(at, 1.0),
+    ),
+    Misprint(
+        *("Y′_T2", "−(L″4² − L″3²)/(2 b′2)", "+(L″4² − L″3²)/(2 b′2)", "mm"),
+        lambda at: y_t2(at, -1.0),
+        lambda at: y_t2(at, 1.0),
+    ),
+    Misprint(
+        *("Z′_T2", "√(h′2² − 4 (X′_T2 − X′_P2)²)", "√(h′2² − (X′_T2 − X′_P2)²)", "mm"),
+        lambda at: z_t2(at, 4.0),
+        lambda at: z_t2(at, 1.0),
+    ),
+    Misprint(
+        "Z′_T",
+        "√(h′² − …)",
+        "+ ½ (Z′_B,2i−1 + Z′_B,2i), the height from which h′ is measured",
+        "µm for heights of up to 10",
+        lambda at: heights(at, back=False),
+        lambda at: heights(at, back=True),
+    ),
+    Misprint(
+        *("α′", "… + X′_T3 (Z′_T1 − Z′_T2)", "… + X′_T3 (Z′_T2 − Z′_T1)", "°"),
+        lambda at: alpha(at, 1.0),
+        lambda at: alpha(at, -1.0),
+    ),
+)
+"""In the paper's order."""

@@ -1,0 +1,177 @@
+"""One HTML page with all tables and figures of the papers; it loads nothing, so it opens anywhere, offline."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from ..formats.outputs import write_text
+from ..formats.texts import number
+from .comparing import MET, MISSED, OPEN, SHOWN, VERDICTS, WRONG, Exhibit, NumberTable, Paper, Statement
+from .report import difference_text, headline, summary
+
+RESOLUTION = 110
+"""Of embedded pictures, dots per inch."""
+
+MARKS = {MET: ("✓", "met"), WRONG: ("≠", "wrong"), OPEN: ("?", "open"), MISSED: ("✗", "missed"), SHOWN: ("·", "shown")}
+"""Sign and style of each verdict: told apart without colours too."""
+
+MEANINGS = {
+    MET: "within what the printed digits, or the paper's own words, allow",
+    WRONG: "the paper's number or formula is a misprint or an approximation; the right one stands beside it",
+    OPEN: "what would be needed is not printed; the difference is given all the same",
+    MISSED: "could be met and is not: a fault of this package",
+    SHOWN: "computed; the paper prints no number to compare it with",
+}
+
+
+def write_page(path: str | Path, papers: Sequence[Paper], note: str) -> None:
+    """Write the page, all or nothing.
+
+    Parameters
+    ----------
+    path : str or Path
+        HTML file.
+    papers : sequence of Paper
+        What it shows.
+    note : str
+        How it was made: version, seeds.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be written.
+    """
+    write_text(path, page_text(papers, note))
+
+
+def page_text(papers: Sequence[Paper], note: str) -> str:
+    """Return the page; see :func:`write_page`."""
+    contents = "".join(
+        f'<li><a href="#p{p}">{escape(paper.short)}</a>: {escape(headline(paper))}<ol>'
+        + "".join(
+            f'<li><a href="#p{p}s{s}">{escape(exhibit.title)}</a></li>' for s, exhibit in enumerate(paper.exhibits)
+        )
+        + "</ol></li>"
+        for p, paper in enumerate(papers)
+    )
+    legend = "".join(
+        f"<li>{_mark(verdict)} {escape(verdict)}: {escape(MEANINGS[verdict])}</li>" for verdict in VERDICTS
+    )
+    body = "".join(_paper(p, paper) for p, paper in enumerate(papers))
+    return (
+        f"{HEAD}<h1>{TITLE}</h1><p>{escape(note)}</p><ul class=legend>{legend}</ul>"
+        f"<nav><ol>{contents}</ol></nav>{body}</main></body></html>\n"
+    )
+
+
+def _paper(p: int, paper: Paper) -> str:
+    exhibits = "".join(
+        f'<section id="p{p}s{s}">{exhibit_html(exhibit)}</section>' for s, exhibit in enumerate(paper.exhibits)
+    )
+    return f'<h2 id="p{p}">{escape(paper.short)}</h2><p><i>{escape(paper.title)}</i></p>{exhibits}'
+
+
+def exhibit_html(exhibit: Exhibit) -> str:
+    """Return a table or figure of a paper as HTML with all its pictures."""
+    parts = [f"<h3>{escape(exhibit.title)}</h3><p>{escape(exhibit.text)}</p>"]
+    parts += [_table(table) for table in exhibit.tables]
+    if exhibit.statements:
+        parts.append(_statements(exhibit.statements))
+    parts += [_figure(title, figure) for title, figure in exhibit.figures.items()]
+    return "".join(parts)
+
+
+def _table(table: NumberTable) -> str:
+    """Return a table whose cells hold the printed number, the computed one and the difference."""
+    head = "".join(
+        f"<th scope=col>{escape(c.name)}<small>{escape(c.unit)}<br>Δ {escape(c.difference_unit)}</small></th>"
+        for c in table.columns
+    )
+    rows = []
+    for r, name in enumerate(table.rows):
+        cells = "".join(_cell(table, r, c) for c in range(len(table.columns)))
+        rows.append(f"<tr><th scope=row>{escape(name)}</th>{cells}</tr>")
+    caption = escape(summary(table))
+    return (
+        f"<p>{escape(table.note)}</p><p class=caption>{caption}. In each cell: printed, computed, difference Δ.</p>"
+        f"<div class=wide tabindex=0><table><thead><tr><th></th>{head}</tr></thead>"
+        f"<tbody>{''.join(rows)}</tbody></table></div>"
+    )
+
+
+def _cell(table: NumberTable, r: int, c: int) -> str:
+    column, verdict = table.columns[c], table.verdicts[r, c]
+    computed = number(float(table.computed[r, c]), column.digits)
+    difference = difference_text(table, r, c)
+    return (
+        f"<td class={MARKS[verdict][1]}><b>{escape(table.printed[r][c])}</b><br>{computed}<br>"
+        f"<small>{escape(difference)} {_mark(verdict)}</small></td>"
+    )
+
+
+def _statements(statements: Sequence[Statement]) -> str:
+    rows = "".join(
+        f"<tr class={MARKS[one.verdict][1]}><td>{_mark(one.verdict)}</td><th scope=row>{escape(one.what)}</th>"
+        f"<td>{escape(one.printed)}</td><td>{escape(one.computed)}</td><td>{escape(one.why)}</td></tr>"
+        for one in statements
+    )
+    head = "".join(f"<th scope=col>{name}</th>" for name in ("", "what", "paper", "found", "why"))
+    table = f"<table class=text><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+    return f"<div class=wide tabindex=0>{table}</div>"
+
+
+def _mark(verdict: str) -> str:
+    sign, style = MARKS[verdict]
+    return f'<span class="mark {style}" title="{escape(verdict)}">{sign}</span>'
+
+
+def _figure(title: str, figure: Figure) -> str:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=RESOLUTION, metadata={"Software": None})
+    picture = base64.b64encode(stream.getvalue()).decode("ascii")
+    text = escape(title)
+    return f'<figure><img alt="{text}" src="data:image/png;base64,{picture}"><figcaption>{text}</figcaption></figure>'
+
+
+TITLE = "The papers' tables and figures, computed"
+
+HEAD = f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'; img-src data:">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{TITLE}</title>
+<style>
+ body {{ font: 16px/1.45 sans-serif; margin: 0; color: #1b1b1b; background: #fff }}
+ main {{ max-width: 1180px; margin: 0 auto; padding: 12px 16px 48px }}
+ h1 {{ font-size: 24px; line-height: 1.2 }} h2 {{ font-size: 21px; margin-top: 48px; border-top: 2px solid #1b1b1b;
+  padding-top: 12px }} h3 {{ font-size: 17px; margin: 32px 0 4px }} p {{ max-width: 80ch; margin: 6px 0 }}
+ .legend {{ list-style: none; padding: 0 }} nav ol ol {{ padding-left: 20px }} nav li {{ margin: 2px 0 }}
+ .wide {{ overflow-x: auto; margin: 8px 0 16px }} table {{ border-collapse: collapse; font-size: 14px }}
+ .caption {{ font-size: 14px }}
+ th, td {{ border: 1px solid #c8c8c8; padding: 3px 8px; text-align: right; vertical-align: top; white-space: nowrap }}
+ td {{ font-variant-numeric: tabular-nums }} th small, td small {{ display: block; font-weight: normal; color: #444 }}
+ .text th, .text td {{ text-align: left; white-space: normal; min-width: 9em }}
+ .text td:first-child, .text th:first-child {{ min-width: 0 }}
+ td.wrong, tr.wrong {{ background: #fdf1d8 }} td.open, tr.open {{ background: #eef1f6 }}
+ td.missed, tr.missed {{ background: #f8d7d7 }} .mark {{ font-weight: bold }} .mark.met {{ color: #1f6b3a }}
+ .mark.wrong {{ color: #8a5a00 }} .mark.open {{ color: #35507c }} .mark.missed {{ color: #a01515 }}
+ figure {{ margin: 16px 0 }} img {{ max-width: 100%; height: auto }} figcaption {{ font-size: 14px; color: #444 }}
+ th[scope=row] {{ background: #fafafa }}
+ @media (max-width: 700px) {{
+  .text thead {{ display: none }} .text tr {{ display: block; border: 1px solid #c8c8c8; margin-bottom: 8px }}
+  .text td, .text th {{ display: block; border: 0; background: none }} .text td:first-child {{ float: left }}
+  .text td:nth-child(3):not(:empty)::before {{ content: "paper: " }}
+  .text td:nth-child(4):not(:empty)::before {{ content: "found: " }}
+ }}
+</style>
+</head>
+<body><main>
+"""

@@ -1,0 +1,109 @@
+"""The misprints of Song, Mou and King: each formula as printed and as mended, on the poses of their Table 1.
+
+Truth: the mended formulas close the loops of the paper's own drawing (its Figure 3) to rounding, and give its Table 2.
+The figures that come of the printed ones are those that stand in section 21 of doc/theory.md.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import table_lengths
+from scipy.spatial.transform import Rotation
+
+from hexapod_comp.papers.misprints import (
+    MENDS,
+    MISPRINTS,
+    A,
+    B,
+    D,
+    base_joints,
+    cases,
+    distances,
+    equations_with_2,
+    second_equation,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+CASES = cases()
+ROUNDING = 1e-11  # mm or degrees: some hundred roundings of squares of 600 mm, divided by lengths of 300 mm
+IN_THE_TEXT = {
+    "Y_p2": "off by 172 mm",
+    "Y_T3": "off by 595 mm",
+    "second combined equation": "residual of 542 mm",
+    "the same, its third misprint alone": "without the last mend 378 mm",
+    "Y′_T1": "off by 113 mm",
+    "Y′_T2": "off by 50 mm",
+    "Z′_T2": "off by 93 mm",
+    "α′": "off by 4.1°",
+}
+"""How section 21 says it."""
+
+
+@pytest.fixture(scope="module")
+def section() -> str:
+    """Return section 21 of doc/theory.md."""
+    text = (ROOT / "doc" / "theory.md").read_text(encoding="utf-8")
+    return text.partition("## 21. Misprints")[2].partition("### The other two papers")[0]
+
+
+def test_the_poses_are_the_papers_machine():
+    """Its drawing: an equilateral top of side a; the printed matrix is SciPy's; the lengths are Table 2's."""
+    for at, printed in zip(CASES, table_lengths() * 1e3, strict=True):
+        sides = np.linalg.norm(at.top - np.roll(at.top, 1, axis=0), axis=1)
+        np.testing.assert_allclose(sides, A, rtol=0, atol=ROUNDING)
+        alpha, beta, gamma = at.angles
+        turned = Rotation.from_euler("YXZ", [beta, alpha, gamma], degrees=True).as_matrix()
+        np.testing.assert_allclose(at.rotation, turned, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(at.lengths, printed, rtol=0, atol=5e-4)  # three digits are printed
+
+
+@pytest.mark.parametrize("misprint", MISPRINTS, ids=lambda misprint: misprint.name)
+def test_a_printed_formula_is_off_by_what_the_documentation_says_and_the_mended_one_is_exact(misprint, section: str):
+    off, left = misprint.worst()
+    assert left < (ROUNDING if misprint.unit in ("mm", "°") else 1e3 * ROUNDING)  # others are µm
+    assert off > 1.0
+    words = IN_THE_TEXT.get(misprint.name)
+    if words is not None:
+        figure = next(word.rstrip("°") for word in words.split() if word[0].isdigit())
+        assert f"{off:.{len(figure.partition('.')[2])}f}" == figure
+        assert words in section
+
+
+def test_every_mend_of_the_closure_is_needed():
+    for missing in MENDS:
+        left = [name for name in MENDS if name != missing]
+        assert max(abs(second_equation(at, *left)) for at in CASES) > 40.0, missing  # mm
+    for k in (0, 2):
+        assert max(abs(equations_with_2(at, k)) for at in CASES) < ROUNDING
+
+
+def test_base_joint_5_as_printed_breaks_the_hexagon_and_table_2(section: str):
+    right, printed = base_joints(), base_joints(B + D)
+    sides = [np.linalg.norm(joints[i] - joints[i + 1]) for joints in (right, printed) for i in (3, 4)]
+    np.testing.assert_allclose(sides[:2], [D, B], rtol=0, atol=ROUNDING)
+    assert f"{sides[2]:.1f}" == "140.3"
+    assert f"{sides[3]:.1f}" == "697.0"
+    assert "becomes 140.3 mm" in section
+    assert "697.0 instead" in section
+    off = [abs(distances(at.top, printed)[4] - at.lengths[4]) for at in CASES]
+    assert f"{min(off):.0f} to {max(off):.0f} mm" == "59 to 70 mm"
+    assert "59 to 70 mm" in section
+
+
+def test_struts_5_and_6_do_not_meet_top_joint_2(section: str):
+    wrong = [distances(at.top[[0, 1, 1]], base_joints())[4:] for at in CASES]
+    assert "{:.1f} and {:.1f} mm".format(*wrong[0]) == "576.3 and 709.8 mm"
+    assert "576.3 and 709.8 mm" in section
+    nearest = min(np.abs(lengths - at.lengths[4:]).min() for lengths, at in zip(wrong, CASES, strict=True))
+    assert 28.0 <= nearest < 29.0
+    assert "nearer than 28 mm" in section
+
+
+def test_heights_of_the_base_joints_are_lost_on_the_way_to_the_real_structure(section: str):
+    """Z'_T as printed is off by the very heights from which h' is measured."""
+    (heights,) = (misprint for misprint in MISPRINTS if misprint.name == "Z′_T")
+    assert heights.worst()[0] == pytest.approx(10.0, abs=1e-6)  # µm, as the joints were lifted
+    assert r"$+\frac12(Z'_{B,2i-1}+Z'_{B,2i})$" in section
