@@ -112,10 +112,10 @@ setup(
     entry_points={
         "console_scripts": [
             f"hexapod_comp = {NAME}.cli:main",
-            f"compensator = {NAME}.nodes.compensator:main",
-            f"strut_drive = {NAME}.nodes.strut_drive:main",
-            f"linuxcnc_bridge = {NAME}.linuxcnc.bridge:main",
-            f"linuxcnc_machine = {NAME}.linuxcnc.watch:main",
+            f"compensator = {NAME}.nodes:start_compensator",
+            f"strut_drive = {NAME}.nodes:start_strut_drive",
+            f"linuxcnc_bridge = {NAME}.linuxcnc:start_bridge",
+            f"linuxcnc_machine = {NAME}.linuxcnc:start_machine",
             f"hal_sweep = {NAME}.linuxcnc.hal_sweep:main",
         ],
     },

@@ -75,8 +75,8 @@ class InputFileError(HexapodError):
         self.path, self.key, self.value, self.problem = str(path), key, value, problem
         file = printable(str(path), LONGEST_PATH)
         where = f"{file}: {printable(key)}" if key else file
-        found = "" if value is None else f" (found {shorten(value)})"
-        super().__init__(f"{where}: {problem}{found}")
+        suffix = "" if value is None else f" (found {shorten(value)})"
+        super().__init__(f"{where}: {problem}{suffix}")
 
 
 class GeometryError(HexapodError):
@@ -86,8 +86,8 @@ class GeometryError(HexapodError):
 
     def __init__(self, key: str, problem: str, value: Any = None):
         self.key, self.problem, self.value = key, problem, value
-        found = "" if value is None else f" (found {shorten(value)})"
-        super().__init__(f"{key}: {problem}{found}")
+        suffix = "" if value is None else f" (found {shorten(value)})"
+        super().__init__(f"{key}: {problem}{suffix}")
 
 
 class ModelError(GeometryError):
@@ -129,8 +129,8 @@ class PoseError(HexapodError):
 
     def __init__(self, problem: str, value: Any = None, reason: str = "bad_pose"):
         self.value, self.reason = value, reason
-        found = "" if value is None else f" (found {shorten(value)})"
-        super().__init__(f"{problem}{found}")
+        suffix = "" if value is None else f" (found {shorten(value)})"
+        super().__init__(f"{problem}{suffix}")
 
 
 class KinematicsError(HexapodError):

@@ -262,20 +262,36 @@ def test_rosdep_is_asked_for_numba_only_where_ubuntu_packages_it(distribution: s
     assert {"python3-numpy", "rclpy"} <= kept
 
 
+def _without_numba(words: tuple[str, ...], folder: Path) -> subprocess.CompletedProcess[str]:
+    (folder / "numba.py").write_text("raise ImportError(\"No module named 'numba'\")\n")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT), *sys.path])}
+    return subprocess.run([sys.executable, *words], env=environment, capture_output=True, text=True, check=False)
+
+
 @pytest.mark.parametrize(
-    "words", [("hexapod_comp", "ik", "--pose", "0,0,400"), ("hexapod_comp.nodes.compensator",)], ids=["ik", "node"]
+    "program", ["hexapod_comp", "compensator", "strut_drive", "linuxcnc_bridge", "linuxcnc_machine"]
 )
-def test_missing_numba_is_said_in_one_line_that_tells_where_to_get_it(words: tuple[str, ...], tmp_path: Path):
-    (tmp_path / "numba.py").write_text("raise ImportError(\"No module named 'numba'\")\n")
-    path = os.pathsep.join([str(tmp_path), str(ROOT), *sys.path])
-    environment = os.environ | {"PYTHONPATH": path}
-    run = subprocess.run([sys.executable, "-m", *words], env=environment, capture_output=True, text=True, check=False)
-    assert run.returncode != 0
+def test_missing_numba_is_said_in_one_line_that_tells_where_to_get_it(
+    program: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(ROOT)
+    lines = [line.split(" = ") for line in _setup_arguments()["entry_points"]["console_scripts"]]
+    module, function = dict(lines)[program].split(":")  # started as the script that pip writes does
+    script = f"import sys; from {module} import {function}; sys.exit({function}())"
+    words = ("ik", "--pose", "0,0,400") if program == "hexapod_comp" else ()
+    run = _without_numba(("-c", script, *words), tmp_path)
+    assert run.returncode in (1, 2)
     assert run.stdout == ""
     line = run.stderr.removesuffix("\n")
     assert "\n" not in line
     assert "No module named 'numba'" in line
     assert "pip install numba" in line
+
+
+def test_who_only_imports_a_node_without_numba_goes_on(tmp_path: Path):
+    script = "try:\n    import hexapod_comp.nodes.compensator\nexcept ImportError as error:\n    print(error.name)"
+    run = _without_numba(("-c", script), tmp_path)
+    assert (run.returncode, run.stdout) == (0, "numba\n"), run.stderr
 
 
 def test_package_xml_lists_what_the_tests_import():

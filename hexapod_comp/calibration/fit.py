@@ -48,7 +48,7 @@ class ChannelFit:
         Of :data:`hexapod_comp.measurements.readings.KINDS`.
     readings : int
         How many.
-    stated, found : float
+    stated, estimated : float
         Standard deviation of a reading: as the file or the default says (root mean square), and as fitted.
     chi_square : float
         Squared residuals over the stated variance, per degree of freedom.
@@ -59,7 +59,7 @@ class ChannelFit:
     kind: str
     readings: int
     stated: float
-    found: float
+    estimated: float
     chi_square: float
     held_out: float
 
@@ -132,7 +132,7 @@ class ModelFit:
     @property
     def misfit(self) -> str:
         """Why the model is not to be trusted: readings further off than :data:`MISFIT` allows; empty if none is."""
-        return self.measurements.misfit({KINDS.index(c.kind): c.found for c in self.channels}, MISFIT)
+        return self.measurements.misfit({KINDS.index(c.kind): c.estimated for c in self.channels}, MISFIT)
 
     @property
     def covariance(self) -> np.ndarray:
@@ -287,8 +287,8 @@ def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
     sigmas = values / np.sqrt(np.diag(physical_covariance(space, solution.posterior))[block.part])
     negative = np.flatnonzero(sigmas < -SURE)
     if len(negative) > 3:
-        found = ", ".join(f"{v * 1e6:.2f}" for v in values)
-        problem = f"forward and backward look swapped: the struts would have a backlash of {found} µm"
+        listed = ", ".join(f"{v * 1e6:.2f}" for v in values)
+        problem = f"forward and backward look swapped: the struts would have a backlash of {listed} µm"
         raise CalibrationError("direction", problem)
     return [f"strut_{i + 1}: backlash of {values[i] * 1e6:.2f} µm found, taken as none" for i in negative]
 
@@ -320,11 +320,13 @@ def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:
         What is left of a kind of reading is larger than any machine's error.
     """
     for c in channels:
-        if c.found > LARGEST_NOISE:
+        if c.estimated > LARGEST_NOISE:
             unit = "rad" if c.kind in ANGULAR_KINDS else "m"
-            problem = f"{c.kind} readings are off by {c.found:.3g} {unit} (allowed {LARGEST_NOISE:g}); do units fit?"
+            problem = (
+                f"{c.kind} readings are off by {c.estimated:.3g} {unit} (allowed {LARGEST_NOISE:g}); do units fit?"
+            )
             raise CalibrationError("measurements", problem)
-    noisy = [f"{c.kind} {c.found / c.stated:.1f} times" for c in channels if c.found > SCATTERED * c.stated]
+    noisy = [f"{c.kind} {c.estimated / c.stated:.1f} times" for c in channels if c.estimated > SCATTERED * c.stated]
     if not noisy:
         return []
     problem = "readings scatter more than stated: something of the machine, or of an instrument, is not in the model"
@@ -347,7 +349,7 @@ def _channels(estimation: Estimation, solution: Solution) -> list[ChannelFit]:
                 kind=KINDS[k],
                 readings=int((kinds == k).sum()),
                 stated=stated,
-                found=factor * stated,
+                estimated=factor * stated,
                 chi_square=factor**2,
                 held_out=stated * float(np.sqrt(mean_square)),
             )

@@ -208,12 +208,12 @@ def _misfit(measurements: MeasurementSet, fits: Sequence[LineFit]) -> str:
     left: dict[int, float] = {}
     for kind in np.unique(measurements.kind):
         members = [fit for fit in fits if _kind(fit) == KINDS[kind]]
-        for found, values in (
+        for spread, values in (
             (repeated, [fit.repeat_std for fit in members if np.isfinite(fit.repeat_std)]),
             (left, [fit.residual_std for fit in members]),
         ):
             if values:
-                found[int(kind)] = rms(values)
+                spread[int(kind)] = rms(values)
     return measurements.misfit(repeated, MISFIT) or measurements.misfit(left, LINES_MISFIT)
 
 
@@ -252,9 +252,9 @@ def _fit_families(
     for component in range(6):
         members = readings.select(readings.component == component)
         for axis in _priority(component, members):
-            found = _fit_family(members, component, axis, field, order, datum)
-            field = _with_family(field, axis, found)
-            fits += found
+            fitted = _fit_family(members, component, axis, field, order, datum)
+            field = _with_family(field, axis, fitted)
+            fits += fitted
     return field, fits
 
 
@@ -383,8 +383,8 @@ def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> n
     unknown = (run[:, None] == np.arange(len(runs))).astype(float)
     if group.sloping.any():
         unknown = np.concatenate([unknown, unknown * u[:, None]], axis=1)
-    found = np.linalg.lstsq(np.concatenate([smooth, unknown], axis=1), group.value, rcond=None)[0]
-    return group.value - unknown @ found[smooth.shape[1] :]
+    solution = np.linalg.lstsq(np.concatenate([smooth, unknown], axis=1), group.value, rcond=None)[0]
+    return group.value - unknown @ solution[smooth.shape[1] :]
 
 
 def _averaged(values: np.ndarray, number: np.ndarray, places: int) -> tuple[np.ndarray, float]:

@@ -170,11 +170,11 @@ def _weak(space: ParameterSpace, singular: np.ndarray, vectors: np.ndarray) -> l
     """Return strength and main parameters of the weakest seen directions, at most five."""
     labels = [label for block in space.blocks for label in block.labels]
     chosen = np.flatnonzero((singular > SEEN) & (singular < WEAK))[::-1][:5]
-    found = []
+    weak = []
     for n in chosen:
         main = np.argsort(-np.abs(vectors[:, n]))[:3]
-        found.append((float(singular[n]), ", ".join(f"{vectors[i, n]:+.2f} {labels[i]}" for i in main)))
-    return found
+        weak.append((float(singular[n]), ", ".join(f"{vectors[i, n]:+.2f} {labels[i]}" for i in main)))
+    return weak
 
 
 def without_trace(space: ParameterSpace, problem: LinearProblem) -> tuple[str, ...]:
@@ -189,13 +189,13 @@ def without_trace(space: ParameterSpace, problem: LinearProblem) -> tuple[str, .
     """
     index = {label: n for n, label in enumerate(label for block in space.blocks for label in block.labels)}
     scale = space.spread(space.start_tolerances())
-    found = []
+    names = []
     for name, parts in MACHINE_ERRORS.items():
         wanted = [index[label] for label in (f"{c} {term}" for c, term in parts) if label in index]
         trace = np.sqrt(np.einsum("i,kij,j->", scale[wanted], problem.normal[:, wanted][:, :, wanted], scale[wanted]))
         if len(wanted) == len(parts) and trace <= SEEN:
-            found.append(name)
-    return tuple(found)
+            names.append(name)
+    return tuple(names)
 
 
 @dataclass(frozen=True)

@@ -347,8 +347,8 @@ def _check_commands(geometry: HexapodGeometry, commands: np.ndarray) -> None:
     """Refuse strut readings that are no lengths of this machine's struts."""
     low, high = geometry.limits.stroke.min() - MOST_BEYOND, geometry.limits.stroke.max() + MOST_BEYOND
     if not (low <= commands.min() and commands.max() <= high):
-        found = f"{commands.min():.4g}…{commands.max():.4g} m"
-        problem = f"run over {found}, the struts over {low:.4g}…{high:.4g} m; do units fit?"
+        span = f"{commands.min():.4g}…{commands.max():.4g} m"
+        problem = f"run over {span}, the struts over {low:.4g}…{high:.4g} m; do units fit?"
         raise CalibrationError("strut readings", problem)
 
 

@@ -177,7 +177,7 @@ def _residual_panel(axes: Axes, fit: ModelFit) -> None:
     kinds = fit.measurements.kind
     edges = np.linspace(-5.0, 5.0, 51)
     for channel in fit.channels:
-        residuals = fit.solution.residuals[kinds == KINDS.index(channel.kind)] / channel.found
+        residuals = fit.solution.residuals[kinds == KINDS.index(channel.kind)] / channel.estimated
         label = f"{channel.kind}, {channel.readings}"
         axes.hist(np.clip(residuals, -5.0, 5.0), edges.tolist(), density=True, histtype="step", label=label)
     axes.plot(edges, np.exp(-0.5 * edges**2) / np.sqrt(2.0 * np.pi), "k:", lw=1.0, label="normal")

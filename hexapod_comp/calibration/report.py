@@ -73,7 +73,7 @@ def _channel_table(fit: ModelFit) -> str:
     rows = []
     for c in fit.channels:
         unit = "urad" if c.kind in ANGULAR_KINDS else "um"
-        cells = (number(c.stated * 1e6, 2), number(c.found * 1e6, 2), number(c.chi_square, 3))
+        cells = (number(c.stated * 1e6, 2), number(c.estimated * 1e6, 2), number(c.chi_square, 3))
         rows.append((c.kind, str(c.readings), *cells, number(c.held_out * 1e6, 2), unit))
     return "residuals; held out: a line or a pose at a time, noise included\n" + aligned(header, rows)
 
@@ -145,7 +145,8 @@ def as_json(fit: ModelFit) -> dict:
 
 def _channel_json(channel: ChannelFit) -> dict:
     unit = _unit(channel.kind)
-    sizes = {f"{name}_{unit}": getattr(channel, name) for name in ("stated", "found", "held_out")}
+    sizes = {"stated": channel.stated, "found": channel.estimated, "held_out": channel.held_out}
+    sizes = {f"{name}_{unit}": value for name, value in sizes.items()}
     return {"kind": channel.kind, "readings": channel.readings, "chi_square": channel.chi_square, **sizes}
 
 
@@ -164,10 +165,10 @@ def _expected_json(
 ) -> dict:
     """Return what a fit and a plan for one both say."""
 
-    def error(found: ToolError | None) -> dict | None:
-        if found is None:
+    def error(tool: ToolError | None) -> dict | None:
+        if tool is None:
             return None
-        return {f"{name}_{'rad' if 'rotation' in name else 'm'}": value for name, value in vars(found).items()}
+        return {f"{name}_{'rad' if 'rotation' in name else 'm'}": value for name, value in vars(tool).items()}
 
     return {
         "expected_tool_error": error(level),

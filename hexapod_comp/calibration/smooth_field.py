@@ -121,8 +121,8 @@ class SmoothField:
         nodes = 2
         while True:
             field = self._on_lines(coefficients, reversal, nodes)
-            found = np.array([field.evaluate(p, s)[0] for p, s in zip(points, sense, strict=True)])
-            if nodes >= MOST_NODES or (np.abs(found - wanted).max(axis=0) <= GRID_TOLERANCE).all():
+            values = np.array([field.evaluate(p, s)[0] for p, s in zip(points, sense, strict=True)])
+            if nodes >= MOST_NODES or (np.abs(values - wanted).max(axis=0) <= GRID_TOLERANCE).all():
                 return field
             nodes = 2 * nodes - 1
 

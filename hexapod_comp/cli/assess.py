@@ -52,8 +52,9 @@ def run(args: argparse.Namespace) -> int:
     with common.progress_bar(args.machines, " machines") as bar:
         result = assess(geometry, poses, bounds, args.seed, args.machines, names, bar.update)
     common.write_table(args, _records(rows, result) if args.out is not None else ())
-    as_json = common.json_text(_as_json(args, geometry, rows, poses, result)) if args.json else ""
-    common.show(as_json or _report(args, geometry, rows, poses, result))
+    common.show(
+        _as_json(args, geometry, rows, poses, result) if args.json else _report(args, geometry, rows, poses, result)
+    )
     return 0
 
 
@@ -119,7 +120,7 @@ def _lengths(rows: list[Row], lengths: np.ndarray) -> str:
 
 def _statistics(rows: list[Row], result: Assessment) -> list[str]:
     """Return the table of percentiles over the machines."""
-    found = result.statistics(PERCENTILES)
+    statistics = result.statistics(PERCENTILES)
     header, columns = [], []
     for name, title, unit, factor in (
         ("strut_change", "|dL|", "um", 1e6),
@@ -127,7 +128,7 @@ def _statistics(rows: list[Row], result: Assessment) -> list[str]:
         ("rotation", "angle", "deg", 180.0 / math.pi),
     ):
         header += [f"{title} {percentile} {unit}" for percentile in NAMES]
-        columns.append((found[name] * factor, 3 if unit == "um" else 6))
+        columns.append((statistics[name] * factor, 3 if unit == "um" else 6))
     body = []
     for n, row in enumerate(rows):
         cells = [texts.number(float(v), digits) for values, digits in columns for v in values[n]]
@@ -185,12 +186,12 @@ def _as_json(
     poses: list[Pose],
     result: Assessment,
 ) -> dict[str, Any]:
-    found = result.statistics(PERCENTILES)
+    percentiles = result.statistics(PERCENTILES)
     statistics = [
         {
             "sequence": row.label,
-            **{f"{name}_um": found[name][n] * 1e6 for name in ("strut_change", "displacement")},
-            "rotation_deg": found["rotation"][n] * (180.0 / math.pi),
+            **{f"{name}_um": percentiles[name][n] * 1e6 for name in ("strut_change", "displacement")},
+            "rotation_deg": percentiles["rotation"][n] * (180.0 / math.pi),
         }
         for n, row in enumerate(rows)
     ]

@@ -46,8 +46,7 @@ def run(args: argparse.Namespace) -> int:
     with common.progress_bar(len(rows), " poses") as bar:
         result = check(geometry, model, (positions, rotations), mode, args.rate_hz, bar.update)
     common.write_table(args, (_row_values(rows[n], n, result) for n in range(len(rows))))
-    as_json = common.json_text(_as_json(geometry, model, rows, result)) if args.json else ""
-    common.show(as_json or _report(args, geometry, model, rows, result))
+    common.show(_as_json(geometry, model, rows, result) if args.json else _report(args, geometry, model, rows, result))
     return 0 if result.ok else 1
 
 
@@ -151,7 +150,7 @@ def _allowed(limits: Limits, name: str, strut: int, value: float) -> float:
 
 def _smallest(limits: Limits, rows: list[Row], result: CheckResult) -> list[dict[str, Any]]:
     """Return, for each limit, the smallest margin and where it is; units as shown."""
-    found = []
+    listed = []
     for name, summary in result.limits.items():
         _, unit, factor, *_ = LIMITS_SHOWN[name]
         place = summary.smallest()
@@ -159,7 +158,7 @@ def _smallest(limits: Limits, rows: list[Row], result: CheckResult) -> list[dict
             continue
         row, stage = place
         strut, value = int(summary.strut[place]), float(summary.value[place])
-        found.append(
+        listed.append(
             {
                 "limit": name,
                 "unit": unit,
@@ -174,7 +173,7 @@ def _smallest(limits: Limits, rows: list[Row], result: CheckResult) -> list[dict
                 "share_of_move": float(summary.share[place]),
             }
         )
-    return found
+    return listed
 
 
 def _smallest_table(limits: Limits, rows: list[Row], result: CheckResult) -> str:

@@ -13,39 +13,33 @@ from . import common
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from ..machine.geometry import HexapodGeometry
     from ..workspace.shells import Shell
+    from ..workspace.sources import Budget
     from ..workspace.study import Study
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
-    from ..errors import InputFileError, ModelError
-    from ..formats.paths import config_file
     from ..machine.geometry import load_geometry
     from ..workspace.ranking import ranking_rows
     from ..workspace.reach import orientations, reaches
     from ..workspace.report import as_json, report
-    from ..workspace.sources import load_budget
     from ..workspace.study import classify, shells_of
 
     geometry = load_geometry(args.machine)
     if args.clearance_mm is not None:
         geometry = replace(geometry, limits=replace(geometry.limits, clearance=args.clearance_mm * 1e-3))
-    budget_file = config_file(args.budget)
-    budget = load_budget(budget_file)
-    try:
-        budget.single_errors(geometry)
-    except ModelError as error:  # refused before the work starts
-        raise InputFileError(budget_file, error.key, error.problem, error.value) from error
+    budget = _budget(args.budget, geometry)
     common.mention_compiling("kinematics.solve_pose_many")
     turned = orientations(geometry, (args.tilt_deg, args.tilt_deg, (0.0,)))
-    found = reaches(geometry, turned, args.cells)
+    reached = reaches(geometry, turned, args.cells)
     names = _names(args.tilt_deg)
-    with common.progress_bar(sum(int(one.within.sum()) for one in found), " poses") as bar:
+    with common.progress_bar(sum(int(one.within.sum()) for one in reached), " poses") as bar:
         study = classify(
             geometry,
             budget,
-            found,
+            reached,
             method=args.method,
             allowed=None if args.allow_um is None else args.allow_um * 1e-6,
             compare=args.compare or 0,
@@ -54,16 +48,31 @@ def run(args: argparse.Namespace) -> int:
             seed=args.seed,
             progress=bar.update,
         )
-    common.show(common.json_text(as_json(study)) if args.json else report(study, names))
+    common.show(as_json(study) if args.json else report(study, names))
     common.write_table(args, ranking_rows(study.rows))
     if args.pictures is not None or args.publish:
-        bodies = shells_of(found)
+        bodies = shells_of(reached)
         common.save_pictures(args, lambda: _figures(study, bodies, names))
         if args.pictures is not None and not args.no_page:
             _page(args, study, bodies, names)
         if args.publish:
             _publish(study, bodies, names)
     return 0
+
+
+def _budget(file: str, geometry: HexapodGeometry) -> Budget:
+    """Return the budget of a file; what does not fit the machine is refused before the work starts."""
+    from ..errors import InputFileError, ModelError
+    from ..formats.paths import config_file
+    from ..workspace.sources import load_budget
+
+    path = config_file(file)
+    budget = load_budget(path)
+    try:
+        budget.single_errors(geometry)
+    except ModelError as error:
+        raise InputFileError(path, error.key, error.problem, error.value) from error
+    return budget
 
 
 def _names(tilts: tuple[float, ...]) -> tuple[str, ...]:

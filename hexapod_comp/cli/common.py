@@ -68,16 +68,13 @@ def _cell(value: Any, digits: int) -> Any:
     return number(value, digits) if math.isfinite(value) else ""
 
 
-def json_text(content: Any) -> str:
-    """Return a result as JSON, as :func:`hexapod_comp.formats.json.json_text`, which takes its time to import."""
-    from ..formats.json import json_text
+def show(result: Any) -> None:
+    """Print a report, which may end with a line break or not; what is no text is printed as JSON."""
+    if not isinstance(result, str):
+        from ..formats.json import json_text
 
-    return json_text(content)
-
-
-def show(text: str) -> None:
-    """Print a result that may end with a line break or not."""
-    print(text, end="" if text.endswith("\n") else "\n")
+        result = json_text(result)
+    print(result, end="" if result.endswith("\n") else "\n")
 
 
 def write_table(args: argparse.Namespace, rows: Iterable[Mapping[str, Any]]) -> None:

@@ -25,7 +25,7 @@ def run(args: argparse.Namespace) -> int:
     draw(args, result, f"{geometry.name}: Table 1 and a milled pocket")
     complaints = loop.complaints(result, loop.Bars() if args.model == args.truth else None)
     if args.json:
-        common.show(common.json_text({**loop.as_json(rows, result), "complaints": complaints}))
+        common.show({**loop.as_json(rows, result), "complaints": complaints})
     else:
         print("\n".join(f"NOT AS IT SHOULD BE: {complaint}" for complaint in complaints) or "all as it should be")
     return 1 if complaints else 0

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         written.append(args.table)
         checks += _table(args, trial, box)
     if args.json:
-        print(common.json_text(_as_json(args, model, box, written, checks)), end="")
+        common.show(_as_json(args, model, box, written, checks))
     else:
         print(_report(args, model, box, written, checks))
     worse = [c for _, c, _ in checks if c.level.after.rms > c.level.before.rms + HARMLESS]
@@ -123,13 +123,13 @@ def _report(
     return "\n".join(lines)
 
 
-def _change(found: Comparison) -> str:
+def _change(comparison: Comparison) -> str:
     """Return a comparison as text."""
-    (a, b), (c, d) = [(s.rms * 1e6, s.largest * 1e6) for s in (found.before, found.after)]
+    (a, b), (c, d) = [(s.rms * 1e6, s.largest * 1e6) for s in (comparison.before, comparison.after)]
     text = f"{a:.3f} → {c:.3f} µm RMS"
     if a > 0.0:
         text += f" ({texts.number(100.0 * abs(1.0 - c / a), 1)} % {'more' if c > a + HARMLESS * 1e6 else 'less'})"
-    turned = f"{found.before_rotation.rms * 1e6:.2f} → {found.after_rotation.rms * 1e6:.2f} µrad RMS"
+    turned = f"{comparison.before_rotation.rms * 1e6:.2f} → {comparison.after_rotation.rms * 1e6:.2f} µrad RMS"
     return f"{text}, {b:.3f} → {d:.3f} µm at most, {turned}"
 
 
@@ -166,10 +166,10 @@ def _as_json(
     }
 
 
-def _numbers(found: Comparison) -> dict[str, float]:
-    numbers: dict[str, float] = {"passes": found.passes}
+def _numbers(comparison: Comparison) -> dict[str, float]:
+    numbers: dict[str, float] = {"passes": comparison.passes}
     for name in ("before", "after"):
-        moved, turned = getattr(found, name), getattr(found, f"{name}_rotation")
+        moved, turned = getattr(comparison, name), getattr(comparison, f"{name}_rotation")
         numbers |= {f"{name}_rms_um": moved.rms * 1e6, f"{name}_max_um": moved.largest * 1e6}
         numbers |= {f"{name}_rms_urad": turned.rms * 1e6, f"{name}_max_urad": turned.largest * 1e6}
     return numbers

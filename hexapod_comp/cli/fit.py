@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
 def _refuse(args: argparse.Namespace, result: _Result) -> None:
     """Show a model that is not written."""
     if args.json:
-        common.show(common.json_text({**result.content(), "misfit": result.misfit, "written": None}))
+        common.show({**result.content(), "misfit": result.misfit, "written": None})
     else:
         common.show(f"{REFUSED}: {result.misfit}. {ADVICE}\n\n{result.text}")
     print("hexapod_comp: error: nothing was written; the report says why, --force writes it", file=sys.stderr)
@@ -116,7 +116,7 @@ def _write(args: argparse.Namespace, result: _Result, measured: MeasurementSet, 
     if args.json:
         figures = {name: with_units(test.figures()) for name, test in tests.items()}
         more = {"iso230": figures, "worth": worth_json(worth) if worth else None}
-        common.show(common.json_text({**result.content(), **more, "misfit": result.misfit, "written": args.out}))
+        common.show({**result.content(), **more, "misfit": result.misfit, "written": args.out})
     else:
         print(f"{text}\nmodel: {args.out}")
     if args.report is not None:

@@ -63,7 +63,7 @@ def _poses(
     ]
     common.write_table(args, table)
     if args.json:
-        common.show(common.json_text({"machine": geometry.name, "model": model.name, "rows": table}))
+        common.show({"machine": geometry.name, "model": model.name, "rows": table})
     elif args.out is None and args.lengths is None:
         common.show(common.csv_text(table))
     elif args.out is None:
@@ -145,7 +145,7 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
     joined = [{**m, "working": int(m["working"]), "objections": "; ".join(m["objections"])} for m in listed]
     common.write_table(args, joined)
     if args.json:
-        common.show(common.json_text({"machine": geometry.name, "modes": listed, "no_working_mode": reason}))
+        common.show({"machine": geometry.name, "modes": listed, "no_working_mode": reason})
     elif args.out is None:
         numbers = MODE_COLUMNS[1:7]
         body = [[str(m["mode"]), *(texts.number(m[name], 6) for name in numbers), _verdict(m)] for m in listed]

@@ -76,7 +76,7 @@ def _show(
     table = [_columns(row, lengths, with_model) for row, lengths in zip(rows, result.lengths, strict=True)]
     common.write_table(args, table)
     if args.json:
-        common.show(common.json_text({"machine": geometry.name, "model": model.name, "rows": table}))
+        common.show({"machine": geometry.name, "model": model.name, "rows": table})
     elif args.out is None:
         one = args.poses is None
         common.show(_one_pose(geometry, model, result.lengths[0], with_model) if one else common.csv_text(table))

@@ -24,12 +24,11 @@ def run(args: argparse.Namespace) -> int:
         problem = "no linear run has two cycles or more with every target read from both sides in each"
         raise CalibrationError("measurements", problem)
     if args.json:
-        text = common.json_text({name: with_units(test.figures()) for name, test in tests.items()})
+        common.show({name: with_units(test.figures()) for name, test in tests.items()})
     elif args.targets:
-        text = "\n\n".join(f"{name}\n{report(test)}" for name, test in tests.items())
+        common.show("\n\n".join(f"{name}\n{report(test)}" for name, test in tests.items()))
     else:
-        text = table(tests)
-    common.show(text)
+        common.show(table(tests))
     return 0
 
 

@@ -19,5 +19,5 @@ def run(args: argparse.Namespace) -> int:
     campaign = load_campaign(args.campaign)
     common.mention_compiling("model.actual_pose_one")
     result = plan(template(campaign, geometry, args.seed, args.campaign), campaign, fit_settings(args))
-    common.show(common.json_text(plan_json(result)) if args.json else plan_report(result))
+    common.show(plan_json(result) if args.json else plan_report(result))
     return 0

@@ -47,7 +47,7 @@ def _replayed(args: argparse.Namespace, recording: Recording) -> tuple[Report, H
     other = _other(args, recording, files)
     as_it_was = other is None or files.missing() is None
     report = Report(recording, None, tolerance=args.tolerance_um * 1e-6)
-    with common.progress_bar(len(recording.answers) * (as_it_was + bool(other)), " answers") as bar:
+    with common.progress_bar(len(recording.commands) * (as_it_was + bool(other)), " answers") as bar:
         if as_it_was:
             report.replayed = replay_recording(recording, files, bar.update)
             if other is None and not report.replayed.compared:
@@ -62,7 +62,7 @@ def _show(args: argparse.Namespace, report: Report) -> None:
     from ..replay.report import as_json, rows_of, text
 
     common.write_table(args, rows_of(report) if args.out is not None else ())
-    common.show(common.json_text(as_json(report)) if args.json else text(report))
+    common.show(as_json(report) if args.json else text(report))
 
 
 def _given(args: argparse.Namespace) -> dict[str, Source]:

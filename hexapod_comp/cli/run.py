@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
         show(rows, result, "pose")
     draw(args, result, f"{geometry.name}: {args.poses}")
     if args.json:
-        common.show(common.json_text(loop.as_json(rows, result)))
+        common.show(loop.as_json(rows, result))
     return 0 if result.lost == 0 and result.refused == 0 else 1
 
 

@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
         read = measure(plan, campaign, RealMachine(geometry, truth), args.seed, bar.update)
     measured = read.with_values(read.value.round(RESOLUTION))
     write_measurements(measured, args.out)
-    common.show(common.json_text(_as_json(measured, args)) if args.json else _report(measured, args))
+    common.show(_as_json(measured, args) if args.json else _report(measured, args))
     return 0
 
 

@@ -219,9 +219,9 @@ class _Worst:
         new[1:] = (np.diff(owner[pose]) != 0) | (np.diff(strut) != 0)
         for p, s, k in zip(pose[new], stage[new], strut[new], strict=True):
             key = int(owner[p]), int(k)
-            found = float(margin[p, s, k]), float(value[p, s, k]), int(s), float(share[p])
-            if key not in self.broken or found[0] < self.broken[key][0]:
-                self.broken[key] = found
+            breach = float(margin[p, s, k]), float(value[p, s, k]), int(s), float(share[p])
+            if key not in self.broken or breach[0] < self.broken[key][0]:
+                self.broken[key] = breach
 
 
 class _PathCheck:
@@ -289,15 +289,15 @@ class _PathCheck:
         in_sequence: bool,
     ) -> None:
         """Examine tool poses, (n, …), of the rows `owner`; `in_sequence`: after the ones before."""
-        found, flags = self._examine(*self.geometry.platform_poses(positions, rotations), in_sequence)
-        lengths = found.lengths
+        quantities, flags = self._examine(*self.geometry.platform_poses(positions, rotations), in_sequence)
+        lengths = quantities.lengths
         at_rows = share == 1.0
         self.lengths[owner[at_rows]] = lengths[at_rows]
         self.examined += len(owner)
         self.outside_field[owner[flags == OUTSIDE]] = True
         solved = flags != UNSOLVED
         with np.errstate(invalid="ignore", over="ignore"):
-            measured = {**self._static(found, solved), **self._other(found.sign[:, :, None], flags)}
+            measured = {**self._static(quantities, solved), **self._other(quantities.sign[:, :, None], flags)}
             if in_sequence:
                 changes = np.diff(np.concatenate([self.previous, lengths]), axis=0)
                 measured |= self._changes(changes)
@@ -309,7 +309,7 @@ class _PathCheck:
         self, positions: np.ndarray, rotations: np.ndarray, in_sequence: bool
     ) -> tuple[Quantities, np.ndarray]:
         machine, geometry = self.machine, self.geometry
-        found = Quantities.empty(len(positions), 2)
+        quantities = Quantities.empty(len(positions), 2)
         flags = np.empty(len(positions), np.int64)
         examine_many(
             np.ascontiguousarray(positions),
@@ -323,18 +323,18 @@ class _PathCheck:
             machine.body,
             machine.strut_arrays,
             machine.field_arrays,
-            found,
+            quantities,
             flags,
         )
-        for quantity in found:
+        for quantity in quantities:
             quantity[flags == UNSOLVED, 1] = np.nan
-        return found, flags
+        return quantities, flags
 
-    def _static(self, found: Quantities, solved: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    def _static(self, quantities: Quantities, solved: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Return margin and value, (n, 2, k), of the limits of single poses."""
-        limits, correction = self.geometry.limits, np.zeros_like(found.lengths)
-        correction[:, 1] = found.lengths[:, 1] - found.lengths[:, 0]
-        measured = {**limits.margins(found), "correction": (limits.correction - np.abs(correction), correction)}
+        limits, correction = self.geometry.limits, np.zeros_like(quantities.lengths)
+        correction[:, 1] = quantities.lengths[:, 1] - quantities.lengths[:, 0]
+        measured = {**limits.margins(quantities), "correction": (limits.correction - np.abs(correction), correction)}
         for margin, _ in measured.values():
             margin[~solved, 1] = np.inf  # said once, as not converged
         measured["correction"][0][:, 0] = np.inf
@@ -355,12 +355,12 @@ class _PathCheck:
         """Return what is so or not as margins of −1 or ∞, with the value that matters."""
         refusing = self.machine.model.field.outside == "refuse"
         never = np.zeros(len(flags), dtype=bool)
-        found = {
+        broken = {
             "not_converged": np.stack([never, flags == UNSOLVED], axis=1)[:, :, None],
             "outside_field": np.stack([never, (flags == OUTSIDE) & refusing], axis=1)[:, :, None],
             "assembly": (sign != self.geometry.home_sign) & ~np.isnan(sign),
         }
-        return {name: (np.where(is_so, -1.0, np.inf), sign) for name, is_so in found.items()}
+        return {name: (np.where(is_so, -1.0, np.inf), sign) for name, is_so in broken.items()}
 
     def result(self, mode: str, platform_positions: np.ndarray) -> CheckResult:
         """Return what was found."""

@@ -361,11 +361,11 @@ class Compensator:
             last.correction[:], last.changed[:] = before
             raise
 
-    def _finish(self, found: tuple, numbers: tuple[float, ...] = ()) -> np.ndarray:
+    def _finish(self, outcome: tuple, numbers: tuple[float, ...] = ()) -> np.ndarray:
         """Accept the command under way, or raise what was found."""
-        refuse(found, self._next, self.machine, numbers)
+        refuse(outcome, self._next, self.machine, numbers)
         self._last, self._next = self._next, self._last
-        self.condition, self.outside_field = found[-1], found[0] == OUTSIDE
+        self.condition, self.outside_field = outcome[-1], outcome[0] == OUTSIDE
         return self._last.state.command
 
     def estimate(self, struts: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ can go on, so a recording may begin in the middle of a motion.
 
 A page is JSON: people read it with ``ros2 topic echo``, and its numbers come back as the very same floats, as
 Python writes the shortest digits that do. NaN, for which JSON has no word, is null. Commands and answers come a
-thousand times a second: they are the bytes of an array of :data:`ANSWER`, in base64.
+thousand times a second: they are the bytes of an array of :data:`COMMAND`, in base64.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ newest pages; at one every 50 ms a snapshot is among them."""
 ROLES = ("base", "work")
 """Frames of commanded poses; an answer names its frame by its place here."""
 
-ANSWER = np.dtype([("stamp", "<i8"), ("frame", "u1"), ("pose", "<f8", 7), ("lengths", "<f8", (2, 6))])
+COMMAND = np.dtype([("stamp", "<i8"), ("frame", "u1"), ("pose", "<f8", 7), ("lengths", "<f8", (2, 6))])
 """One answered command: the time that the compensator was given, ns; frame; position, m, and quaternion x, y, z, w;
 strut commands and corrections that it answered, m."""
 
-_ASKED = struct.Struct("<qB7d")
-"""The first three fields of an ANSWER: packed so in a fifth of the time."""
+_HEAD = struct.Struct("<qB7d")
+"""The first three fields of an COMMAND: packed so in a fifth of the time."""
 
 REFUSALS_PER_PAGE = 20
 """A page names no more refused commands than this; it counts the others."""
@@ -179,7 +179,7 @@ class Page:
         Of this page in its session, from 1.
     begins : int
         Commands answered before this page since the session began.
-    answers : ndarray of ANSWER
+    commands : ndarray of COMMAND
         Commands answered since the page before, and the answers.
     entries : tuple of Entry
         What else happened since then.
@@ -192,7 +192,7 @@ class Page:
     session: str
     number: int
     begins: int
-    answers: np.ndarray
+    commands: np.ndarray
     entries: tuple[Entry, ...]
     refused_more: int
     snapshot: Snapshot | None
@@ -201,11 +201,11 @@ class Page:
         """Yield what happened, in its order: entries, and None for each answered command."""
         entries = iter(self.entries)
         upcoming = next(entries, None)
-        for number in range(len(self.answers) + 1):
+        for number in range(len(self.commands) + 1):
             while upcoming is not None and upcoming.after <= self.begins + number:
                 yield upcoming
                 upcoming = next(entries, None)
-            if number < len(self.answers):
+            if number < len(self.commands):
                 yield None
 
 
@@ -227,7 +227,7 @@ class Journal:
         self._always = {"frames": frames, "made_with": made_with()}
         self._places = {frames[role]: place for place, role in enumerate(ROLES)}
         self._session, self._number, self._count = secrets.token_hex(4), 0, 0
-        self._answers, self._begins = bytearray(), 0
+        self._commands, self._begins = bytearray(), 0
         self._entries: list[dict[str, Any]] = []
         self._refused = 0
         self._last = -math.inf
@@ -235,8 +235,8 @@ class Journal:
 
     def answered(self, stamp: int, frame_id: str, numbers: tuple[float, ...]) -> None:
         """Write down a command just answered: its time, ns, frame, position, m, and quaternion."""
-        self._answers += _ASKED.pack(stamp, self._places[frame_id], *numbers)
-        self._answers += self._compensator.command.tobytes() + self._compensator.correction.tobytes()
+        self._commands += _HEAD.pack(stamp, self._places[frame_id], *numbers)
+        self._commands += self._compensator.command.tobytes() + self._compensator.correction.tobytes()
         self._count += 1
 
     def note(self, what: str, value: Any) -> None:
@@ -258,7 +258,7 @@ class Journal:
 
     def due(self, now: float) -> bool:
         """Return whether a page should be written at the monotonic time `now`, s."""
-        return bool(self._answers or self._entries) or self._snapshot_due(now)
+        return bool(self._commands or self._entries) or self._snapshot_due(now)
 
     def _snapshot_due(self, now: float) -> bool:
         return now - self._last >= SNAPSHOT_PERIOD
@@ -275,11 +275,11 @@ class Journal:
             "refused_more": max(0, self._refused - REFUSALS_PER_PAGE),
             "snapshot": self._snapshot(now) if self._snapshot_due(now) else None,
         }
-        answers = base64.b64encode(self._answers).decode()
-        self._answers, self._begins = bytearray(), self._count
+        commands = base64.b64encode(self._commands).decode()
+        self._commands, self._begins = bytearray(), self._count
         self._entries, self._refused = [], 0
         # Put in by hand: looking for what must be escaped in so long a string takes longer than all the rest.
-        return f'{json.dumps(content, ensure_ascii=False)[:-1]}, "answers": "{answers}"}}'
+        return f'{json.dumps(content, ensure_ascii=False)[:-1]}, "answers": "{commands}"}}'
 
     def _snapshot(self, now: float) -> dict[str, Any]:
         self._last = now
@@ -388,15 +388,15 @@ def read_page(text: str) -> Page:
             session=str(content["session"]),
             number=int(content["number"]),
             begins=int(content["begins"]),
-            answers=np.frombuffer(base64.b64decode(content["answers"], validate=True), ANSWER),
+            commands=np.frombuffer(base64.b64decode(content["answers"], validate=True), COMMAND),
             entries=tuple(_read_entry(entry) for entry in content["entries"]),
             refused_more=int(content["refused_more"]),
             snapshot=None if content["snapshot"] is None else _read_snapshot(content["snapshot"]),
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, binascii.Error) as error:
         raise JournalError(f"not a page of the journal: {error!r}") from error
-    places = [page.begins, *(entry.after for entry in page.entries), page.begins + len(page.answers)]
-    if places != sorted(places) or (page.answers["frame"] >= len(ROLES)).any():
+    places = [page.begins, *(entry.after for entry in page.entries), page.begins + len(page.commands)]
+    if places != sorted(places) or (page.commands["frame"] >= len(ROLES)).any():
         raise JournalError("its entries and answers are not in an order that a journal can have")
     return page
 
@@ -406,12 +406,12 @@ def _content(text: str) -> dict[str, Any]:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise JournalError(f"not JSON: {error}") from error
-    found = content.get("journal") if isinstance(content, dict) else content
-    if isinstance(found, int) and found in OLDER:
+    version = content.get("journal") if isinstance(content, dict) else content
+    if isinstance(version, int) and version in OLDER:
         advice = f"this release reads version {FORMAT}. Replay the recording with the release that made it"
-        raise JournalError(f"is of version {int(found)}, which {OLDER[found]}; {advice}")
-    if not isinstance(content, dict) or found != FORMAT:
-        raise JournalError(f"must be of version {FORMAT}, not {str(found)[:40]}")
+        raise JournalError(f"is of version {int(version)}, which {OLDER[version]}; {advice}")
+    if not isinstance(content, dict) or version != FORMAT:
+        raise JournalError(f"must be of version {FORMAT}, not {str(version)[:40]}")
     return content
 
 

@@ -165,9 +165,9 @@ def read_genhexkins(folder: str | Path, unit: str) -> Genhexkins:
 def _refuse_mixed(folder: Path, texts: dict[str, str]) -> None:
     """Raise when the files do not all carry the same mark."""
     marks = {name: re.findall(r"^# set ([0-9a-f]{16})$", text, re.MULTILINE) for name, text in texts.items()}
-    for name, found in marks.items():
-        if not found or found != marks[HAL_FILE]:
-            raise InputFileError(folder / name, "# set", f"must be that of {HAL_FILE}: files of two exports", found)
+    for name, mark in marks.items():
+        if not mark or mark != marks[HAL_FILE]:
+            raise InputFileError(folder / name, "# set", f"must be that of {HAL_FILE}: files of two exports", mark)
 
 
 def _read_pins(path: Path, text: str) -> dict[str, float]:
@@ -176,12 +176,12 @@ def _read_pins(path: Path, text: str) -> dict[str, float]:
     for number, line in enumerate(text.split("\n"), 1):
         if not line or line.startswith("#"):
             continue
-        found = SETP.fullmatch(line)
-        if not found:
+        match = SETP.fullmatch(line)
+        if not match:
             raise InputFileError(path, f"line {number}", "is not setp of a genhexkins pin", line)
-        if found[1] in pins:
+        if match[1] in pins:
             raise InputFileError(path, f"line {number}", "sets a pin again", line)
-        pins[found[1]] = number_in(path, f"line {number}", found[2])
+        pins[match[1]] = number_in(path, f"line {number}", match[2])
     return {"screw-lead": 0.0} | pins
 
 

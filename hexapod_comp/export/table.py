@@ -213,11 +213,11 @@ def _outside_field(machine: RealMachine, passes: Passes) -> int:
 
 def _strut_corrections(machine: RealMachine, passes: Passes) -> tuple[np.ndarray, np.ndarray]:
     """Return corrections without backlash, shape (N, 6), and backlash, shape (N, 6), m."""
-    found = []
+    commands = []
     for sense in (0.0, 1.0, -1.0):
         senses = np.hstack([np.sign(passes.directions), np.full((len(passes), 6), sense)])
-        found.append(model_commands([machine] * len(passes), passes.poses, senses)[0])
-    return found[0] - passes.nominal_commands(), found[1] - found[2]
+        commands.append(model_commands([machine] * len(passes), passes.poses, senses)[0])
+    return commands[0] - passes.nominal_commands(), commands[1] - commands[2]
 
 
 def _pose_corrections(passes: Passes, corrections: np.ndarray) -> np.ndarray:
@@ -225,8 +225,8 @@ def _pose_corrections(passes: Passes, corrections: np.ndarray) -> np.ndarray:
     geometry, structure = passes.geometry, Structure.of(passes.geometry)
     starts = map(Pose, *passes.poses)
     lengths = passes.nominal_commands() + corrections
-    found = [solve_pose(structure, row, start) for row, start in zip(lengths, starts, strict=True)]
-    at, turned = (np.array([getattr(pose, part) for pose in found]) for part in ("position", "rotation"))
+    poses = [solve_pose(structure, row, start) for row, start in zip(lengths, starts, strict=True)]
+    at, turned = (np.array([getattr(pose, part) for pose in poses]) for part in ("position", "rotation"))
     changed = geometry.tool_poses(at, turned)
     positions, rotations, _ = passes.of_the_tool()
     return np.hstack([changed[0] - positions, attitude_error(changed[1], rotations)])
@@ -286,9 +286,9 @@ def read_table(path: str | Path) -> GridTable:
     lines = [line for line, _ in table.rows]
     ways = [_direction(path, line, row[column].strip()) for line, row in table.rows]
     nodes, places = zip(*(_grid_axis(values) for values in positions.T), strict=True)
-    for axis, found in zip(POSITION, nodes, strict=True):
-        if len(found) < 2:
-            raise InputFileError(path, "", f"needs at least two positions along {axis}", found.tolist())
+    for axis, coordinates in zip(POSITION, nodes, strict=True):
+        if len(coordinates) < 2:
+            raise InputFileError(path, "", f"needs at least two positions along {axis}", coordinates.tolist())
     shape = (2, *(len(n) for n in nodes))
     where = np.ravel_multi_index((np.array(ways), *places), shape)
     _refuse_gaps(path, lines, where, math.prod(shape))
@@ -305,8 +305,8 @@ def _direction(path: str | Path, line: int, text: str) -> int:
 
 def _grid_axis(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the nodes among coordinates (N,), and each coordinate's node."""
-    found = np.unique(values)
-    nodes = found[np.append(True, np.diff(found) > SAME_NODE)]
+    coordinates = np.unique(values)
+    nodes = coordinates[np.append(True, np.diff(coordinates) > SAME_NODE)]
     return nodes, np.searchsorted(nodes, values + SAME_NODE, side="right") - 1
 
 

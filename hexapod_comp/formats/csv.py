@@ -118,30 +118,30 @@ class Table:
     def column(self, name: str, dimension: str | None) -> tuple[int, float] | None:
         """Return index and unit of a column, or None when there is none of that name."""
         wanted = {name: 1.0} if dimension is None else {f"{name}_{u}": s for u, s in UNITS[dimension].items()}
-        found = [key for key in wanted if key in self.header]
-        if len(found) > 1:
-            raise InputFileError(self.path, "header", f"{name} is given twice", found)
-        if not found:
+        keys = [key for key in wanted if key in self.header]
+        if len(keys) > 1:
+            raise InputFileError(self.path, "header", f"{name} is given twice", keys)
+        if not keys:
             return None
-        self._known.add(found[0])
-        return self.header.index(found[0]), wanted[found[0]]
+        self._known.add(keys[0])
+        return self.header.index(keys[0]), wanted[keys[0]]
 
     def columns(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]] | None:
         """Return all columns of a group, None when the whole group is absent."""
-        found = [self.column(name, dimension) for name in names]
-        if all(entry is None for entry in found):
+        columns = [self.column(name, dimension) for name in names]
+        if all(entry is None for entry in columns):
             return None
-        for name, entry in zip(names, found, strict=True):
+        for name, entry in zip(names, columns, strict=True):
             if entry is None:
                 raise InputFileError(self.path, "header", f"column {_column_names(name, dimension)} is missing")
-        return [entry for entry in found if entry is not None]
+        return [entry for entry in columns if entry is not None]
 
     def required(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]]:
         """Return all columns of a group that must be there."""
-        found = self.columns(names, dimension)
-        if found is None:
+        columns = self.columns(names, dimension)
+        if columns is None:
             raise InputFileError(self.path, "header", f"column {_column_names(names[0], dimension)} is missing")
-        return found
+        return columns
 
     def refuse_unknown(self) -> None:
         """Raise on a column that nobody asked for."""

@@ -170,7 +170,7 @@ def _identities(name: str) -> list[tuple[int, int]]:
 def _identity(path: str | Path) -> tuple[int, int] | None:
     """Return device and inode of a regular file, links followed; None for anything else."""
     try:
-        found = os.stat(os.path.expanduser(path))
+        status = os.stat(os.path.expanduser(path))
     except (OSError, ValueError):
         return None
-    return (found.st_dev, found.st_ino) if stat.S_ISREG(found.st_mode) else None
+    return (status.st_dev, status.st_ino) if stat.S_ISREG(status.st_mode) else None

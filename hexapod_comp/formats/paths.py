@@ -41,7 +41,7 @@ def config_file(name: str | os.PathLike[str]) -> Path:
     for candidate in (os.fspath(name), f"{os.fspath(name)}.yaml"):
         if candidate in shipped:
             return config_folder() / candidate
-    raise InputFileError(os.fspath(name) or "''", "", _not_found(os.fspath(name), shipped))
+    raise InputFileError(os.fspath(name) or "''", "", _no_such_file(os.fspath(name), shipped))
 
 
 def input_file(name: str | os.PathLike[str]) -> Path:
@@ -178,11 +178,11 @@ def version() -> str:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise InputFileError(path, "", f"cannot be read: {error.strerror}; install it anew") from error
-    found = re.search(r"<version>\s*(.*?)\s*</version>", text)
-    return found.group(1) if found else "unknown"
+    match = re.search(r"<version>\s*(.*?)\s*</version>", text)
+    return match.group(1) if match else "unknown"
 
 
-def _not_found(name: str, shipped: list[str]) -> str:
+def _no_such_file(name: str, shipped: list[str]) -> str:
     """Say that `name` is neither a file nor shipped, and what is."""
     near = difflib.get_close_matches(name, shipped, 1)
     hint = f"; did you mean {near[0]}?" if near else ""

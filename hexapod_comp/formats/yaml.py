@@ -161,12 +161,12 @@ def parse_yaml(text: str, name: str | Path, file_format: str, version: int) -> S
     if not isinstance(content, dict):
         raise InputFileError(name, "", "must hold keys and values at its top level", content)
     section = Section(name, "", content)
-    found = section.text("format")
-    if found != file_format:
-        raise section.error("format", f"must be {file_format!r}", found)
-    found_version = section.take("version")
-    if type(found_version) is not int or found_version != version:
-        raise section.error("version", f"only version {version} is understood", found_version)
+    given = section.text("format")
+    if given != file_format:
+        raise section.error("format", f"must be {file_format!r}", given)
+    given_version = section.take("version")
+    if type(given_version) is not int or given_version != version:
+        raise section.error("version", f"only version {version} is understood", given_version)
     return section
 
 
@@ -283,13 +283,13 @@ class Section:
 
     def quantity_key(self, name: str, dimension: str) -> str | None:
         """Return the key that carries `name` with a unit of `dimension`, or None when there is none."""
-        found = [f"{name}_{unit}" for unit in UNITS[dimension] if f"{name}_{unit}" in self._left]
+        keys = [f"{name}_{unit}" for unit in UNITS[dimension] if f"{name}_{unit}" in self._left]
         if name in self._left:
             units = ", ".join(f"{name}_{unit}" for unit in UNITS[dimension])
             raise self.error(name, f"has no unit; write one of {units}", self._left[name])
-        if len(found) > 1:
-            raise self.error(found[0], f"is given twice, also as {found[1]}")
-        return found[0] if found else None
+        if len(keys) > 1:
+            raise self.error(keys[0], f"is given twice, also as {keys[1]}")
+        return keys[0] if keys else None
 
     def quantity(
         self,

@@ -49,17 +49,17 @@ def closed_triangles(
     angles, points, errors = _settled(circles, sides, starts)
     left = errors.argsort()
     left = left[: int((errors <= allowed).sum())]
-    found = []
+    corners = []
     while len(left):
         best, left = left[0], left[1:]
-        found.append(points[best])
+        corners.append(points[best])
         apart = np.abs(points[left] - points[best]).max(axis=(1, 2))
         new = apart >= distinct
         near = new & (apart < NEAR * sides.sum())
         if near.any():
             new[near] = ~_closed_between(circles, sides, angles[left[near]], angles[best], allowed)
         left = left[new]
-    return np.array(found).reshape(-1, 3, 3)
+    return np.array(corners).reshape(-1, 3, 3)
 
 
 def _closed_between(

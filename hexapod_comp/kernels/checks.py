@@ -15,7 +15,7 @@ NOTHING, UNSOLVED, OUTSIDE = range(3)
 
 @compiled
 def examine_many(
-    positions, rotations, independent, nominal, limits, thresholds, low, sense, body, struts, field, found, flags
+    positions, rotations, independent, nominal, limits, thresholds, low, sense, body, struts, field, quantities, flags
 ):
     """Write the limited quantities of N platform poses in both stages, and a flag each.
 
@@ -29,8 +29,8 @@ def examine_many(
             low[:] = np.nan
             sense[:] = 0.0
         position, rotation = positions[n], rotations[n]
-        strut_lengths_one(nominal[0], nominal[1], position, rotation, found.lengths[n, 0])
-        examine(nominal[0], nominal[1], position, rotation, limits, found, n, 0)
+        strut_lengths_one(nominal[0], nominal[1], position, rotation, quantities.lengths[n, 0])
+        examine(nominal[0], nominal[1], position, rotation, limits, quantities, n, 0)
         solved, outside = command_one(
             position, rotation, thresholds, low, sense, body, struts, field, q_position, q_rotation, commands
         )
@@ -38,5 +38,5 @@ def examine_many(
         if not solved:
             flags[n] = UNSOLVED
             continue
-        found.lengths[n, 1] = commands
-        examine(body[0], body[1], q_position, q_rotation, limits, found, n, 1)
+        quantities.lengths[n, 1] = commands
+        examine(body[0], body[1], q_position, q_rotation, limits, quantities, n, 1)

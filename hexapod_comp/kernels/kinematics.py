@@ -330,7 +330,7 @@ def _closes(base, platform, lengths, p, r):
 
 @compiled
 def strut_lengths_many(base, platform, positions, rotations, lengths):
-    """Batch of :func:`strut_lengths_one`: (N, 3), (N, 3, 3) → (N, 6); in lockstep, with the same bits."""
+    """Batch of :func:`strut_lengths_one`: (N, 3), (N, 3, 3) → (N, 6); eight at once, with the same bits."""
     count = positions.shape[0]
     whole = count - count % LANES
     flat_positions, flat_rotations, flat_lengths = positions.reshape(-1), rotations.reshape(-1), lengths.reshape(-1)

@@ -1,10 +1,9 @@
-"""Forward kinematics of a few poses in lockstep: Newton without a branch, compiled to SIMD instructions.
+"""Forward kinematics of a few poses at once: Newton without a branch, compiled to SIMD instructions.
 
 Every quantity of a pose is a scalar or a tuple that the compiler keeps in registers; the loops over lanes at
 the end are what it vectorises. The arithmetic is IEEE either way, so that a pose alone in the first lane gets
 the same bits as one among others. A lane that fails any test is only marked: :mod:`hexapod_comp.kernels.kinematics`
-then
-solves it with pivoting and finds the reason.
+then solves it with pivoting and finds the reason.
 
 Rotations `r` are passed as three tuples, the rows of R; joints, strut vectors and moments as six.
 """
@@ -35,7 +34,7 @@ COPLANAR = 1e-3
 """Below this volume of three unit strut vectors elimination by blocks loses digits, and pivoting decides."""
 
 LANES = 8
-"""Poses solved in lockstep: two AVX2 registers, or one of AVX-512."""
+"""Poses solved at once: two AVX2 registers, or one of AVX-512."""
 
 POSITION, ROTATION, LENGTHS, STEP, COUNT, CONDITION, PASSED, ROWS = 0, 3, 12, 18, 19, 20, 21, 22
 """Where each quantity begins in the lanes array; entry (row, lane) stands at row·LANES + lane. The array is
@@ -286,12 +285,12 @@ def measure_lanes(base, platform, lanes):
         p, r, _ = _read_pose(lanes, lane)
         for half in range(2):
             i = 3 * half
-            found = (
+            lengths = (
                 norm(strut_between(base[i], platform[i], p, r)),
                 norm(strut_between(base[i + 1], platform[i + 1], p, r)),
                 norm(strut_between(base[i + 2], platform[i + 2], p, r)),
             )
-            _write(lanes, LENGTHS + i, lane, found)
+            _write(lanes, LENGTHS + i, lane, lengths)
 
 
 @internal

@@ -31,9 +31,6 @@ from .kinematics import condition_one, strut_lengths_one, strut_vector
 ) = range(11)
 """What a check found."""
 
-LIMIT_NUMBERS = 102
-"""Length of a vector of :class:`LimitNumbers`."""
-
 
 class LimitNumbers(NamedTuple):
     """Every limit of a machine, and what its quantities are measured against; SI units.
@@ -71,7 +68,7 @@ class LimitNumbers(NamedTuple):
 
 @compiled
 def limits_of(numbers):
-    """Return the limits that stand one after the other in a vector, (LIMIT_NUMBERS,); its parts, not copies."""
+    """Return the limits that stand one after the other in a vector, (102,); its parts, not copies."""
     return LimitNumbers(
         stroke=numbers[:12].reshape((6, 2)),
         cone_axes=numbers[12:48].reshape((2, 6, 3)),
@@ -195,17 +192,17 @@ def _share(part, whole):
 
 
 @compiled
-def examine(base, platform, position, rotation, limits, found, n, stage):
-    """Write all quantities of one pose into `found` at `n` and `stage`, beside its lengths, which are there."""
+def examine(base, platform, position, rotation, limits, quantities, n, stage):
+    """Write all quantities of one pose into `quantities` at `n` and `stage`, beside its lengths, which are there."""
     for i in range(6):
         at_base, at_platform = joint_cosines(base, platform, position, rotation, limits.cone_axes, i)
-        found.cosines[n, stage, 0, i], found.cosines[n, stage, 1, i] = at_base, at_platform
-        found.distances[n, stage, i], found.nearest[n, stage, i] = math.inf, -1.0
+        quantities.cosines[n, stage, 0, i], quantities.cosines[n, stage, 1, i] = at_base, at_platform
+        quantities.distances[n, stage, i], quantities.nearest[n, stage, i] = math.inf, -1.0
     if limits.clearance > 0.0:
         ends = strut_ends(base, platform, position, rotation)
-        nearest_struts(base, ends, limits.apart, found.distances[n, stage], found.nearest[n, stage])
+        nearest_struts(base, ends, limits.apart, quantities.distances[n, stage], quantities.nearest[n, stage])
     condition, sign = condition_one(base, platform, position, rotation, limits.characteristic_length)
-    found.condition[n, stage], found.sign[n, stage] = condition, sign
+    quantities.condition[n, stage], quantities.sign[n, stage] = condition, sign
 
 
 @compiled

@@ -62,10 +62,10 @@ def refuse_broken_limits(path: str, geometry: HexapodGeometry, model: str, rows:
         A limit is broken; names the first pose and says how to see them all.
     """
     known = load_model(model, geometry)
-    found = check(geometry, known, poses).breaches
-    if found:
-        row = rows[found[0].row]
-        problem = f"pose {row.label}: {found[0].error}; `hexapod_comp check` lists all {len(found)} breaches"
+    breaches = check(geometry, known, poses).breaches
+    if breaches:
+        row = rows[breaches[0].row]
+        problem = f"pose {row.label}: {breaches[0].error}; `hexapod_comp check` lists all {len(breaches)} breaches"
         raise InputFileError(path, f"line {row.line}", problem)
 
 
@@ -168,20 +168,20 @@ def complaints(result: SessionResult, bars: Bars | None) -> list[str]:
     bars : Bars or None
         What may be left; None asks only that compensation reduces the RMS error.
     """
-    found = []
+    listed = []
     if result.lost:
-        found.append(f"{result.lost} commands were lost")
+        listed.append(f"{result.lost} commands were lost")
     if result.refused:
-        found.append(f"{result.refused} commands were refused: {result.refusals}")
+        listed.append(f"{result.refused} commands were refused: {result.refusals}")
     pairs = [record.errors() for record in result.poses]
     before = np.array([pair[0][0] for pair in pairs if pair[0]])
     after = np.array([pair[1][0] for pair in pairs if pair[1]])
-    found += _left("poses", before, after, None if bars is None else (bars.rest, bars.rest))
+    listed += _left("poses", before, after, None if bars is None else (bars.rest, bars.rest))
     if result.path is not None:
         tracks = (result.path.without, result.path.compensated)
         before, after = (np.zeros(0) if track is None else track.deviation for track in tracks)
-        found += _left("path", before, after, None if bars is None else (bars.path, bars.passing))
-    return found
+        listed += _left("path", before, after, None if bars is None else (bars.path, bars.passing))
+    return listed
 
 
 def _left(name: str, before: np.ndarray, after: np.ndarray, bars: tuple[float, float] | None) -> list[str]:
@@ -212,8 +212,8 @@ def as_json(rows: list[Row], result: SessionResult) -> dict[str, object]:
 
 def _path_json(record: PathRecord) -> dict[str, object]:
     def distance(track: Track | None) -> dict[str, float] | None:
-        found = None if track is None else track.deviation * 1e6
-        return None if found is None else {"rms_um": rms(found), "max_um": float(found.max())}
+        deviation = None if track is None else track.deviation * 1e6
+        return None if deviation is None else {"rms_um": rms(deviation), "max_um": float(deviation.max())}
 
     without, compensated = distance(record.without), distance(record.compensated)
     sent = {"poses": len(record.path), "rate_hz": record.path.rate}

@@ -88,7 +88,7 @@ class Session:
         self._progress = progress
         self._base = commanded_in_base(geometry)
         self._at = client.estimate
-        self._answers: list[Sent] = []
+        self._sent: list[Sent] = []
 
     def go(self, target: Pose) -> None:
         """Move smoothly to a tool pose in ``base``."""
@@ -118,10 +118,10 @@ class Session:
         """Go to every pose, rest, and write down what is seen there."""
         for record in records:
             self.go(record.target)
-            answer = self.rest()
+            last = self.rest()
             true = self._client.true_pose if self._client.has_true_pose else None
             if compensated:
-                record.command, record.correction = answer.command, answer.correction
+                record.command, record.correction = last.command, last.correction
                 record.estimate, record.true_with = self._client.estimate, true
             else:
                 record.true_without = true
@@ -130,23 +130,23 @@ class Session:
         """Run a path; return the true track and the corrections sent, shape (N, 6)."""
         self.go(path.pose(0))
         self.rest()
-        answers = self._stream(path)
+        streamed = self._stream(path)
         self._at = path.pose(len(path) - 1)
         positions = np.array([position for position, _ in self._client.track])
         sent = np.array([count for _, count in self._client.track])
         track = track_along(path, positions, sent)
-        return track, np.array([answer.correction for answer in answers])
+        return track, np.array([entry.correction for entry in streamed])
 
     def _stream(self, path: Path) -> list[Sent]:
         progress = self._progress
-        answers = self._client.stream(path, None if progress is None else (lambda _: progress(1)))
-        self._answers += answers
-        return answers
+        sent = self._client.stream(path, None if progress is None else (lambda _: progress(1)))
+        self._sent += sent
+        return sent
 
     def latencies(self) -> np.ndarray:
         """Return and forget the latencies of the streamed commands, s."""
-        values = np.array([answer.answered_at - answer.sent_at for answer in self._answers])
-        self._answers = []
+        values = np.array([entry.answered_at - entry.sent_at for entry in self._sent])
+        self._sent = []
         return values[np.isfinite(values)]
 
 

@@ -125,9 +125,9 @@ def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.nd
     if not modes:
         raise UnreachableError("no pose of the machine has these strut lengths", 0)
     objections = [mode_objections(geometry, structure, mode) for mode in modes]
-    fit = [mode for mode, found in zip(modes, objections, strict=True) if not found]
+    fit = [mode for mode, reasons in zip(modes, objections, strict=True) if not reasons]
     if not fit:
-        listed = "; ".join(f"mode {i}: {', '.join(found)}" for i, found in enumerate(objections, start=1))
+        listed = "; ".join(f"mode {i}: {', '.join(reasons)}" for i, reasons in enumerate(objections, start=1))
         problem = f"none of the {len(modes)} poses with these strut lengths can be the working one: {listed}"
         raise OtherAssemblyModeError(problem, len(modes))
     return _nearest_to_home(geometry, structure, fit)
@@ -161,23 +161,23 @@ def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose)
         for name, (margin, value) in limits.margins(measured).items()
         if not (margin >= 0.0).all()
     }
-    found = ["det J of the other sign"] if measured.sign[0, 0] != structure.home_sign else []
+    objections = ["det J of the other sign"] if measured.sign[0, 0] != structure.home_sign else []
     if "condition" in broken:
-        found.append(f"condition number {broken['condition'][1]:.4g} above {limits.condition:.4g}")
+        objections.append(f"condition number {broken['condition'][1]:.4g} above {limits.condition:.4g}")
     centre, homewards = _home_side(geometry, structure)
     if homewards @ (pose.position + pose.rotation @ structure.platform_joints.mean(axis=0) - centre) < 0.0:
-        found.append("platform on the other side of the base")
+        objections.append("platform on the other side of the base")
     for body, allowed in (("base", limits.base_cone), ("platform", limits.platform_cone)):
         if f"{body}_cone" in broken:
             joint, angle = broken[f"{body}_cone"]
             degrees = f"{np.rad2deg(angle):.1f}°, allowed {np.rad2deg(allowed[joint]):.1f}°"
-            found.append(f"{body} joint {joint + 1} at {degrees}")
+            objections.append(f"{body} joint {joint + 1} at {degrees}")
     if "clearance" in broken:
         strut, distance = broken["clearance"]
         one, other = sorted((strut + 1, int(measured.nearest[0, 0, strut]) + 1))
         millimetres = f"{distance * 1e3:.1f} mm apart, allowed {limits.clearance * 1e3:.1f} mm"
-        found.append(f"struts {one} and {other} {millimetres}")
-    return found
+        objections.append(f"struts {one} and {other} {millimetres}")
+    return objections
 
 
 def platform_pair_gap(structure: Structure) -> float:
@@ -280,13 +280,13 @@ def _continued_poses(structure: Structure, lengths: np.ndarray) -> list[Pose]:
     gap = platform_pair_gap(structure)
     # The wide tolerance takes in pairs of modes that the deviations have parted or joined.
     triangles = _closed_triangles(structure, lengths, NEARLY_CLOSED * gap, gap)
-    found: list[Pose] = []
+    poses: list[Pose] = []
     for pose_of_pairs in _poses_at(structure, triangles):
         for start in _starts_near(structure, pose_of_pairs, gap):
             pose = _newton(structure, lengths, start)
-            if pose is not None and not any(_same(structure, pose, other, lengths) for other in found):
-                found.append(pose)
-    return found
+            if pose is not None and not any(_same(structure, pose, other, lengths) for other in poses):
+                poses.append(pose)
+    return poses
 
 
 def _poses_at(structure: Structure, triangles: np.ndarray) -> list[Pose]:

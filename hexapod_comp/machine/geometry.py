@@ -143,8 +143,8 @@ class HexapodGeometry:
         self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray
     ) -> LimitError | KinematicsError | None:
         """Return why the nominal machine may not stand in a platform pose with its strut lengths, None if it may."""
-        found = check_stage(*self.kernel_joints, position, rotation, lengths, self.limit_numbers)
-        finding, strut, value, _, _ = found
+        outcome = check_stage(*self.kernel_joints, position, rotation, lengths, self.limit_numbers)
+        finding, strut, value, _, _ = outcome
         return None if finding == WITHIN else self.limits.error(finding, strut, 0, value)
 
     def platform_pose(self, tool_pose: Pose) -> Pose:

@@ -295,8 +295,8 @@ def solve_poses(
     def run(rows: slice) -> None:
         positions[rows], rotations[rows] = guesses[0][rows], guesses[1][rows]
         given = lengths[rows], positions[rows], rotations[rows]
-        found = outcomes[rows], iterations[rows], conditions[rows]
-        kernels.solve_pose_many(*structure.joints, *given, *structure.solver, *found)
+        results = outcomes[rows], iterations[rows], conditions[rows]
+        kernels.solve_pose_many(*structure.joints, *given, *structure.solver, *results)
 
     over_chunks(run, count, threads)
     failed = outcomes != kernels.OK
@@ -411,9 +411,9 @@ def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tup
         return guess.position + x[:3], rotation
 
     def misfit(x: np.ndarray) -> np.ndarray:
-        found = np.empty(6)
-        kernels.strut_lengths_one(*structure.joints, *pose_at(x), found)
-        return found - lengths
+        trial = np.empty(6)
+        kernels.strut_lengths_one(*structure.joints, *pose_at(x), trial)
+        return trial - lengths
 
     first = misfit(np.zeros(6))
     if not np.isfinite(first @ first):

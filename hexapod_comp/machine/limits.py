@@ -115,7 +115,7 @@ class Limits:
             home_sign=home_sign,
         )
 
-    def margins(self, found: Quantities) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    def margins(self, quantities: Quantities) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Return what is left of each limit of single poses, and the values, by the limit's name.
 
         Parameters
@@ -130,19 +130,19 @@ class Limits:
             or NaN, exactly where :func:`~hexapod_comp.kernels.limits.check_stage` refuses. Without ``clearance``
             where it is not limited.
         """
-        angles, condition = np.arccos(np.clip(found.cosines, -1.0, 1.0)), found.condition[..., None]
+        angles, condition = np.arccos(np.clip(quantities.cosines, -1.0, 1.0)), quantities.condition[..., None]
         cones = np.array([self.base_cone, self.platform_cone]) - angles
         # An angle rounds where its cosine does not: the cosine says on which side of its limit it is.
-        cones = np.where(found.cosines >= self.cone_cosines, np.maximum(cones, 0.0), np.minimum(cones, -TINY))
-        stroke = np.minimum(found.lengths - self.stroke[:, 0], self.stroke[:, 1] - found.lengths)
+        cones = np.where(quantities.cosines >= self.cone_cosines, np.maximum(cones, 0.0), np.minimum(cones, -TINY))
+        stroke = np.minimum(quantities.lengths - self.stroke[:, 0], self.stroke[:, 1] - quantities.lengths)
         margins = {
-            "stroke": (stroke, found.lengths),
+            "stroke": (stroke, quantities.lengths),
             "base_cone": (cones[..., 0, :], angles[..., 0, :]),
             "platform_cone": (cones[..., 1, :], angles[..., 1, :]),
             "condition": (self.condition - condition, condition),
         }
         if self.clearance:
-            margins["clearance"] = (found.distances - self.clearance, found.distances)
+            margins["clearance"] = (quantities.distances - self.clearance, quantities.distances)
         return margins
 
     def error(self, code: int, strut: int, stage: int, value: float) -> LimitError | KinematicsError:

@@ -157,9 +157,9 @@ def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineM
     """
     top = parse_yaml(text, name, MODEL_FORMAT, MODEL_VERSION)
     _refuse_cut_off(top)
-    found = top.text("machine")
-    if found != machine:
-        raise top.error("machine", f"the model is for another machine, must be {machine!r}", found)
+    given = top.text("machine")
+    if given != machine:
+        raise top.error("machine", f"the model is for another machine, must be {machine!r}", given)
     try:
         values = {
             "name": top.text("name"),
@@ -357,16 +357,16 @@ def _read_line(entry: Section, grid: tuple[np.ndarray, ...], families: dict[str,
 
 
 def _node_indices(entry: Section, counts: list[int]) -> tuple[int, int]:
-    found = entry.take("at")
+    indices = entry.take("at")
     inside = (
-        isinstance(found, list)
-        and len(found) == 2
-        and all(type(index) is int and 0 <= index < count for index, count in zip(found, counts, strict=True))
+        isinstance(indices, list)
+        and len(indices) == 2
+        and all(type(index) is int and 0 <= index < count for index, count in zip(indices, counts, strict=True))
     )
     if not inside:
         problem = f"must be two node indices within 0…{counts[0] - 1} and 0…{counts[1] - 1}"
-        raise entry.error("at", problem, found)
-    return found[0], found[1]
+        raise entry.error("at", problem, indices)
+    return indices[0], indices[1]
 
 
 def _family_array(

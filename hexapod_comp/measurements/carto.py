@@ -173,8 +173,8 @@ def read_carto(
     files: list[tuple[str, str]] = []
     notes: list[str] = []
     for path, line_path in pairs:
-        found, sha256, remarks = _file_readings(path, load_line(line_path), line_path)
-        readings += found
+        own, sha256, remarks = _file_readings(path, load_line(line_path), line_path)
+        readings += own
         notes += remarks
         files.append((Path(path).name, sha256))
     _refuse_duplicates(readings)
@@ -185,8 +185,8 @@ def _file_readings(path: str | Path, line: LineFile, line_path: str | Path) -> t
     """Return the readings, the SHA-256 and the notes of one file."""
     if not is_capture(path):
         static = read_rtl(path)
-        found, remarks = _static_readings(path, static, line)
-        return found, static.sha256, (*static.notes, *remarks)
+        readings, remarks = _static_readings(path, static, line)
+        return readings, static.sha256, (*static.notes, *remarks)
     dynamic = read_rtx(path)
     if line.capture is None:
         problem = "is needed for an .rtx file: it does not say where the machine was commanded to be"

@@ -142,15 +142,15 @@ def read_rtx(path: str | Path) -> Dynamic:
     content = _read_bytes(path)
     if not content.startswith(b"HEADER::"):
         raise InputFileError(path, "byte 0", "an .rtx file starts with HEADER::", content[:16])
-    found = DATA_LINE.search(content, 0, MAX_HEADER_BYTES)
-    if not found:
+    match = DATA_LINE.search(content, 0, MAX_HEADER_BYTES)
+    if not match:
         raise InputFileError(path, "", f"has no line Data: within its first {MAX_HEADER_BYTES} bytes")
     header: dict[str, str] = {}
-    for line in content[: found.start()].decode("utf-8", "replace").splitlines():
+    for line in content[: match.start()].decode("utf-8", "replace").splitlines():
         entry = _entry(line)
         if entry and not TITLE.fullmatch(line.strip()):
             header.setdefault(*entry)
-    samples = _samples(path, content, found.end(), _header_number(path, header, "Sample no", whole=True))
+    samples = _samples(path, content, match.end(), _header_number(path, header, "Sample no", whole=True))
     rate = _header_number(path, header, "Actual sample rate", whole=False)
     return Dynamic(header, rate, samples, hashlib.sha256(content).hexdigest())
 

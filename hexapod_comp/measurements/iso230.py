@@ -179,16 +179,16 @@ class PositioningTest:
 
         What the test cannot tell is left out.
         """
-        found: dict[str, float] = {}
+        values: dict[str, float] = {}
         parts = {"": self.both, **{f"_{name}": one for name, one in self.directions.items()}}
         for suffix, part in parts.items():
             if part is not None:
-                found[f"A{suffix}"] = part.accuracy
-                found[f"E{suffix}"] = part.systematic_deviation
-                found[f"R{suffix}"] = part.repeatability
+                values[f"A{suffix}"] = part.accuracy
+                values[f"E{suffix}"] = part.systematic_deviation
+                values[f"R{suffix}"] = part.repeatability
         if self.both is not None:
-            found |= {"M": self.both.mean_deviation, "B": self.both.reversal, "B_mean": self.both.mean_reversal}
-        return found
+            values |= {"M": self.both.mean_deviation, "B": self.both.reversal, "B_mean": self.both.mean_reversal}
+        return values
 
 
 def evaluate(targets: np.ndarray, deviations: np.ndarray, directions: Sequence[str] = DIRECTIONS) -> PositioningTest:
@@ -216,8 +216,8 @@ def evaluate(targets: np.ndarray, deviations: np.ndarray, directions: Sequence[s
     names = _checked_directions(directions)
     positions = _checked_targets(targets)
     readings = _checked_deviations(deviations, names, len(positions))
-    found = {name: _one_direction(readings[k]) for k, name in enumerate(names)}
-    up, down = found.get("up"), found.get("down")
+    of_direction = {name: _one_direction(readings[k]) for k, name in enumerate(names)}
+    up, down = of_direction.get("up"), of_direction.get("down")
     cycles = readings.shape[1]
     notes = _design_notes(positions, cycles)
     if up is not None and down is not None:
@@ -388,7 +388,7 @@ def iso230_runs(measurements: MeasurementSet) -> list[Iso230Run]:
     Runs with fewer cycles, gaps or without both directions are left out.
     """
     points = measurements.points()[measurements.station]
-    found = []
+    runs = []
     for number, run in enumerate(measurements.runs):
         chosen = np.flatnonzero((measurements.run == number) & (measurements.channel == 0))
         table: dict[tuple[int, int], dict[float, float]] = {}
@@ -398,8 +398,8 @@ def iso230_runs(measurements: MeasurementSet) -> list[Iso230Run]:
             table.setdefault(pass_of, {})[target] = float(measurements.value[n])
         complete = _complete_run(run.name, table)
         if complete is not None:
-            found.append(complete)
-    return found
+            runs.append(complete)
+    return runs
 
 
 def _complete_run(name: str, table: dict[tuple[int, int], dict[float, float]]) -> Iso230Run | None:

@@ -246,7 +246,7 @@ class MeasurementSet:
         members = self.stated[self.kind == kind]
         return rms(members) if len(members) else 1.0
 
-    def misfit(self, found: Mapping[int, float], times: float) -> str:
+    def misfit(self, noise: Mapping[int, float], times: float) -> str:
         """Return what is wrong when kinds of reading are further off than they may be; empty when none is.
 
         Parameters
@@ -257,7 +257,7 @@ class MeasurementSet:
             How many times the stated one it may be.
         """
         far = []
-        for kind, value in found.items():
+        for kind, value in noise.items():
             stated = self.stated_of(kind)
             if value > times * stated:
                 unit = "µrad" if KINDS[kind] in ANGULAR_KINDS else "µm"

@@ -148,8 +148,8 @@ def read_tidy(
     _refuse_twice(tables)
     of_files = [_read_rows(table) for table in tables]
     for table, rows, names in zip(tables, of_files, _run_names(tables, of_files), strict=True):
-        found, corrected = _file_readings(table, rows, names, geometry, probe)
-        readings += found
+        own, corrected = _file_readings(table, rows, names, geometry, probe)
+        readings += own
         files.append((Path(table.path).name, table.sha256))
         if corrected:
             notes.append(f"{table.path}: {corrected} readings corrected to the air of their rows (Ciddor)")
@@ -413,13 +413,13 @@ def _lines(rows: Sequence[_Row], points: np.ndarray) -> dict[str, _Line]:
 
 def _commands(file: str, rows: Sequence[_Row], visits: Sequence[tuple]) -> dict[tuple, tuple[float, ...]]:
     """Return the strut commands of the visits that have them, m."""
-    found: dict[tuple, dict[str, _Row]] = {}
+    by_visit: dict[tuple, dict[str, _Row]] = {}
     for row, visit in zip(rows, visits, strict=True):
         if row.channel in STRUT_NAMES:
             if not math.isnan(row.uncertainty):
                 raise InputFileError(file, f"line {row.line}, column uncertainty", "must be empty for a strut")
-            found.setdefault(visit, {})[row.channel] = row
-    return {visit: _whole(file, group, STRUT_NAMES) for visit, group in found.items()}
+            by_visit.setdefault(visit, {})[row.channel] = row
+    return {visit: _whole(file, group, STRUT_NAMES) for visit, group in by_visit.items()}
 
 
 def _whole(file: str, group: dict[str, _Row], channels: Sequence[str]) -> tuple[float, ...]:
@@ -434,15 +434,15 @@ def _whole(file: str, group: dict[str, _Row], channels: Sequence[str]) -> tuple[
 
 def _attitudes(file: str, rows: Sequence[_Row], visits: Sequence[tuple]) -> dict[tuple, list[tuple[str, float]]]:
     """Return attitude errors from measured quaternions, rad along the work frame's axes."""
-    found: dict[tuple, dict[str, _Row]] = {}
+    by_visit: dict[tuple, dict[str, _Row]] = {}
     for row, visit in zip(rows, visits, strict=True):
         if row.channel in QUATERNION_CHANNELS:
             if not math.isnan(row.uncertainty):
                 wrong = "must be empty for a quaternion; give attitude_x, attitude_y, attitude_z instead"
                 raise InputFileError(file, f"line {row.line}, column uncertainty", wrong)
-            found.setdefault(visit, {})[row.channel] = row
+            by_visit.setdefault(visit, {})[row.channel] = row
     errors = {}
-    for visit, group in found.items():
+    for visit, group in by_visit.items():
         first = next(iter(group.values()))
         try:
             measured = Pose.from_quaternion(np.zeros(3), np.array(_whole(file, group, QUATERNION_CHANNELS)))

@@ -153,7 +153,7 @@ def _pose_columns(section: Section) -> PoseColumns:
     elif "angles" in section:
         turn = _names(section, "angles", 3)
         angle_unit = UNITS["angle"][section.choice("angle_unit", tuple(UNITS["angle"]))]
-    found = PoseColumns(
+    columns = PoseColumns(
         position=_names(section, "position", 3),
         unit=UNITS["length"][section.choice("unit", tuple(UNITS["length"]))],
         offset=section.quantity("offset", "length", (3,), np.zeros(3)),
@@ -165,19 +165,19 @@ def _pose_columns(section: Section) -> PoseColumns:
         ),
     )
     section.finish()
-    return found
+    return columns
 
 
 def _strut_columns(section: Section) -> StrutColumns:
     zero = section.choice("zero", ZEROS, "home")
-    found = StrutColumns(
+    columns = StrutColumns(
         readings=_names(section, "readings", 6),
         length_per_unit=section.per_strut("length_per_unit", "length"),
         zero=zero,
         zero_length=section.per_strut("zero_length", "length") if zero == "given" else np.full(6, np.nan),
     )
     section.finish()
-    return found
+    return columns
 
 
 @dataclass(frozen=True)

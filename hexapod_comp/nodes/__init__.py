@@ -1,8 +1,34 @@
-"""The ROS side: nodes and what they share. Started without Numba, a program ends with one line that says so."""
+"""The ROS side: nodes and what they share."""
 
+from __future__ import annotations
+
+import importlib
 import sys
 
-try:
-    from ..kernels import compiling  # noqa: F401
-except ImportError as error:
-    sys.exit(f"cannot start: {error}")
+
+def start(module: str) -> int:
+    """Run a program's module; without Numba it ends with one line that says where to get that.
+
+    Parameters
+    ----------
+    module : str
+        Full name of a module with a function ``main``.
+    """
+    try:
+        main = importlib.import_module(module).main
+    except ImportError as error:
+        if error.name != "numba":
+            raise
+        print(f"cannot start: {error}", file=sys.stderr)
+        return 1
+    return int(main())
+
+
+def start_compensator() -> int:
+    """Run the executable ``compensator``."""
+    return start("hexapod_comp.nodes.compensator")
+
+
+def start_strut_drive() -> int:
+    """Run the executable ``strut_drive``."""
+    return start("hexapod_comp.nodes.strut_drive")

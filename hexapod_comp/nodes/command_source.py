@@ -110,18 +110,18 @@ class Publishers:
         count = self._count_now()
         if count != self.count or count > 1 or self.unknown or UNKNOWN_NAME in self.names:
             self.count = count
-            self.names, self.unknown = self._found() if count else ((), "")
+            self.names, self.unknown = self._publishers() if count else ((), "")
 
     @property
     def reason(self) -> str:
         """Name under which refusals are counted."""
         return "unknown_publisher" if self.unknown else "several_publishers"
 
-    def _found(self) -> tuple[tuple[str, ...], str]:
+    def _publishers(self) -> tuple[tuple[str, ...], str]:
         """Return the names, and why there are none: a node's name may be any bytes, which rclpy cannot give."""
         try:
-            found = self._node.get_publishers_info_by_topic(self.topic)
-            return tuple(sorted({_full_name(info) for info in found})), ""
+            infos = self._node.get_publishers_info_by_topic(self.topic)
+            return tuple(sorted({_full_name(info) for info in infos})), ""
         except UnicodeDecodeError as error:
             return (), f"a node's name is not UTF-8: {shorten(error.object)}"
         except Exception as error:  # of many kinds: what the graph holds is others' doing

@@ -114,8 +114,8 @@ class HealthReport:
 
 def joined(findings: Iterable[tuple[bytes, str]]) -> tuple[bytes, str]:
     """Return level and text of all findings that are not well, worst first; of the first when all are well."""
-    found = list(findings)
-    bad = [finding for finding in found if finding[0] != OK] or found[:1]
+    listed = list(findings)
+    bad = [finding for finding in listed if finding[0] != OK] or listed[:1]
     return bad[0][0], "; ".join(text for _, text in bad)
 
 

@@ -33,11 +33,11 @@ class LogSpace:
         """Look again; takes a few microseconds on a local file system."""
         self.problem = ""
         try:
-            found = os.statvfs(self._folder)
+            usage = os.statvfs(self._folder)
         except FileNotFoundError:
             return  # nothing is logged to files
         except OSError as error:
             self.problem = f"log folder lost: {error.strerror}"
             return
-        full = found.f_bavail * found.f_frsize < LEAST_ROOM
+        full = usage.f_bavail * usage.f_frsize < LEAST_ROOM
         self.problem = f"log disk full: {self._folder}" if full else ""

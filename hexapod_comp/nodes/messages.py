@@ -119,11 +119,11 @@ def strut_order(names: Sequence[str]) -> np.ndarray:
     CommandError
         ``strut_names``: one is missing, or there twice.
     """
-    found: dict[str, list[int]] = {name: [] for name in STRUT_NAMES}
+    places_of: dict[str, list[int]] = {name: [] for name in STRUT_NAMES}
     for place, name in enumerate(names):
-        if name in found:
-            found[name].append(place)
-    wrong = [f"{name} {'twice' if places else 'missing'}" for name, places in found.items() if len(places) != 1]
+        if name in places_of:
+            places_of[name].append(place)
+    wrong = [f"{name} {'twice' if places else 'missing'}" for name, places in places_of.items() if len(places) != 1]
     if wrong:
         raise CommandError("strut_names", f"each strut must be named once: {', '.join(wrong)}")
-    return np.array([places[0] for places in found.values()])
+    return np.array([places[0] for places in places_of.values()])

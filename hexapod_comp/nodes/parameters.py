@@ -63,10 +63,10 @@ def declare(node: LifecycleNode, parameters: Sequence[Parameter]) -> dict[str, A
             bounds = FloatingPointRange(from_value=float(parameter.low), to_value=float(parameter.high or 1e9))
             descriptor.floating_point_range = [bounds]
         try:
-            found = node.declare_parameter(parameter.name, parameter.default, descriptor).value
+            value = node.declare_parameter(parameter.name, parameter.default, descriptor).value
         except rclpy.exceptions.InvalidParameterValueException as error:
             raise ParameterError(f"parameter {parameter.name}: {error}") from error
-        values[parameter.name] = checked(parameter, found)
+        values[parameter.name] = checked(parameter, value)
     _warn_of_strangers(node)
     return values
 

@@ -108,9 +108,9 @@ def triangles(points: np.ndarray) -> np.ndarray:
     """
     number = np.arange(points.shape[0] * points.shape[1]).reshape(points.shape[:2])
     a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
-    found = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    corners = points.reshape(-1, 3)[found]
-    return found[(corners != np.roll(corners, 1, axis=1)).any(axis=2).all(axis=1)]
+    facets = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    corners = points.reshape(-1, 3)[facets]
+    return facets[(corners != np.roll(corners, 1, axis=1)).any(axis=2).all(axis=1)]
 
 
 def _fill(marker: Marker, layer: Layer, limits: tuple[float, float], opacity: float) -> None:

@@ -91,7 +91,7 @@ class Recording:
         By the names in :data:`TOPICS`; empty where the bag has none.
     pages : list of (int, Page)
         The journal with the recorder's times, ns; session by session, in the pages' own order.
-    answers : ndarray of ANSWER
+    commands : ndarray of COMMAND
         Those of all pages, one after the other.
     sources : dict of str to Source
         Geometries and models by their hash.
@@ -105,7 +105,7 @@ class Recording:
     node: str
     topics: dict[str, Series]
     pages: list[tuple[int, Page]]
-    answers: np.ndarray
+    commands: np.ndarray
     sources: dict[str, Source]
     heard: int
     notes: list[str]
@@ -202,10 +202,10 @@ def _files(path: Path) -> tuple[list[Path], list[str]]:
         return [path], []
     if (path / "metadata.yaml").is_file():
         return [path], []
-    found = sorted(file for file in path.iterdir() if file.suffix in STORAGE)
-    if not found:
+    files = sorted(file for file in path.iterdir() if file.suffix in STORAGE)
+    if not files:
         raise InputFileError(path, "", "is no bag: it has neither metadata.yaml nor a .mcap or .db3 file")
-    return found, ["metadata.yaml is missing, as when the recorder is killed; all files of the folder were read"]
+    return files, ["metadata.yaml is missing, as when the recorder is killed; all files of the folder were read"]
 
 
 def _unreadable(path: str | Path, file: Path, key: str, error: Exception) -> InputFileError:
@@ -216,8 +216,8 @@ def _unreadable(path: str | Path, file: Path, key: str, error: Exception) -> Inp
     """
     if isinstance(error, UnpackingError):
         return InputFileError(path, key, str(error))
-    said = " ".join(str(part) for part in error.args) or type(error).__name__
-    problem = f"cannot be read as a bag: {printable(said)}"
+    text = " ".join(str(part) for part in error.args) or type(error).__name__
+    problem = f"cannot be read as a bag: {printable(text)}"
     if any(_cut_off(one) for one in (file, *file.glob("*.mcap"))):
         problem += f"; {CUT_OFF}"
     return InputFileError(path, key, problem)
@@ -246,9 +246,9 @@ def _choose(path: str | Path, connections: Iterable[Any], namespace: str | None)
     if len(here) == 1:
         return here[0]
     if not nodes:
-        found = ", ".join(sorted({c.topic for c in connections})) or "none"
+        topics = ", ".join(sorted({c.topic for c in connections})) or "none"
         problem = f"holds no journal of a compensator, without which nothing can be replayed; {RECORD}"
-        raise InputFileError(path, "", f"{problem}. Its topics: {printable(found, 500)}")
+        raise InputFileError(path, "", f"{problem}. Its topics: {printable(topics, 500)}")
     names = ", ".join(_namespace(node) or "/" for node in nodes)
     problem = "holds several machines; choose one with --namespace" if here else f"has no machine in {namespace}"
     raise InputFileError(path, "", f"{problem}: {names}")
@@ -360,15 +360,15 @@ class _Collected:
         if not any(page.snapshot for _, page in pages):
             problem = "holds no snapshot of the compensator's state: record for longer than half a second"
             raise InputFileError(self._path, self._node + JOURNAL, problem)
-        answers, pages = _gathered(pages)
-        if not len(answers):
+        commands, pages = _joined(pages)
+        if not len(commands):
             raise InputFileError(self._path, self._node + JOURNAL, "holds not a single answer of the compensator")
         topics = {name: columns.series(3 if TOPICS[name] == POSE else 6) for name, columns in self._columns.items()}
         notes = notes + [
             f"{count} messages of {name} left out: not a position for each of {', '.join(STRUT_NAMES)}"
             for name, count in self._odd.items()
         ]
-        return Recording(str(self._path), self._node, topics, pages, answers, self._sources, heard, notes)
+        return Recording(str(self._path), self._node, topics, pages, commands, self._sources, heard, notes)
 
 
 def _in_order(pages: list[tuple[int, Page]]) -> list[tuple[int, Page]]:
@@ -379,12 +379,12 @@ def _in_order(pages: list[tuple[int, Page]]) -> list[tuple[int, Page]]:
     return [once[key] for key in sorted(once)]
 
 
-def _gathered(pages: list[tuple[int, Page]]) -> tuple[np.ndarray, list[tuple[int, Page]]]:
+def _joined(pages: list[tuple[int, Page]]) -> tuple[np.ndarray, list[tuple[int, Page]]]:
     """Return all answers in one array, and the pages with views of it."""
-    answers = np.concatenate([page.answers for _, page in pages])
-    ends = np.cumsum([len(page.answers) for _, page in pages])
-    views = np.split(answers, ends[:-1])
-    return answers, [(time, replace(page, answers=view)) for (time, page), view in zip(pages, views, strict=True)]
+    commands = np.concatenate([page.commands for _, page in pages])
+    ends = np.cumsum([len(page.commands) for _, page in pages])
+    views = np.split(commands, ends[:-1])
+    return commands, [(time, replace(page, commands=view)) for (time, page), view in zip(pages, views, strict=True)]
 
 
 def _lengths(message: Any) -> tuple[float, ...] | None:

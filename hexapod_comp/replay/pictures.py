@@ -104,7 +104,7 @@ def corrections_figure(report: Report) -> Figure:
     """Show the recorded corrections over time; changes are marked, what was not replayed is grey."""
     figure = _figure(report, "Strut corrections: command − nominal")
     axes = figure.subplots()
-    _struts(axes, report.seconds, report.corrections * 1e6)
+    _struts(axes, report.seconds, report.strut_corrections * 1e6)
     axes.set(ylabel="µm")
     _mark_events(report, axes)
     return figure
@@ -114,10 +114,10 @@ def commands_figure(report: Report) -> Figure:
     """Show the commanded lengths, strut by strut, and the measured ones where there are any."""
     figure = _figure(report, "Strut lengths", 6.5)
     panels = figure.subplots(2, 3, sharex=True)
-    commands, states = report.commands * 1e3, report.recording.topics["strut_states"]
+    commands, states = report.strut_commands * 1e3, report.recording.topics["strut_states"]
     for n, axes in enumerate(panels.ravel()):
         if len(states) and states.stamps.all():
-            measured = since(states.stamps, report.recording.answers["stamp"])
+            measured = since(states.stamps, report.recording.commands["stamp"])
             axes.plot(*_broken(measured, states.values[:, n] * 1e3), color=WITHOUT, lw=1.6, label="measured")
         axes.plot(*_broken(report.seconds, commands[:, n]), color=WITH, lw=0.8, label="command")
         axes.set(title=STRUT_NAMES[n])
@@ -155,7 +155,7 @@ def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
         axes.axis("equal")
     panels[0].legend(fontsize=7)
     if both:
-        at = since(estimates.stamps, report.recording.answers["stamp"])
+        at = since(estimates.stamps, report.recording.commands["stamp"])
         _off(panels[2], report.seconds, positions, at, estimates.values[:, :3])
     return figure
 

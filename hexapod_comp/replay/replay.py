@@ -54,7 +54,7 @@ class Replay:
 
     Attributes
     ----------
-    answers : ndarray of ANSWER
+    commands : ndarray of COMMAND
         The recorded ones, n of them.
     outcome : ndarray of int, shape (n,)
         One of the module's four constants.
@@ -70,7 +70,7 @@ class Replay:
         Answers that the journal counts, and whose pages the recorder has lost.
     """
 
-    answers: np.ndarray
+    commands: np.ndarray
     outcome: np.ndarray
     lengths: np.ndarray
     refused_now: dict[int, str] = field(default_factory=dict)
@@ -92,11 +92,11 @@ class Replay:
     @property
     def difference(self) -> np.ndarray:
         """Replayed minus recorded corrections, shape (n, 6), m."""
-        return self.lengths[:, 1] - self.answers["lengths"][:, 1]
+        return self.lengths[:, 1] - self.commands["lengths"][:, 1]
 
 
 def replay_recording(
-    recording: Recording, files: Files | None = None, progress: Progress = lambda answers: None
+    recording: Recording, files: Files | None = None, progress: Progress = lambda commands: None
 ) -> Replay:
     """Run a recording through the compensator again.
 
@@ -118,7 +118,7 @@ def replay_recording(
 
 
 def what_if(
-    recording: Recording, geometry: HexapodGeometry, model: MachineModel, progress: Progress = lambda answers: None
+    recording: Recording, geometry: HexapodGeometry, model: MachineModel, progress: Progress = lambda commands: None
 ) -> Replay:
     """Run the recorded commands through another model, or another geometry.
 
@@ -146,8 +146,8 @@ class _Run:
 
     def __init__(self, recording: Recording, progress: Progress) -> None:
         self._recording, self._progress = recording, progress
-        self._answers, count = recording.answers, len(recording.answers)
-        self.result = Replay(self._answers, np.full(count, BEFORE), np.full((count, 2, 6), np.nan))
+        self._commands, count = recording.commands, len(recording.commands)
+        self.result = Replay(self._commands, np.full(count, BEFORE), np.full((count, 2, 6), np.nan))
 
     def take(self, compensator: Compensator) -> None:
         """Give the commands from now on to a compensator."""
@@ -161,7 +161,7 @@ class _Run:
             self.begin(page)
             for entry in page.steps():
                 if entry is None:
-                    result.outcome[row] = self.answer(row)
+                    result.outcome[row] = self.step(row)
                     row += 1
                     self._progress(1)
                 elif entry.what == "refused":
@@ -190,9 +190,9 @@ class _Run:
             measured = values["measured"]
             self.compensator.reset(None if measured is None else np.array(measured, dtype=float))
 
-    def answer(self, row: int) -> int:
+    def step(self, row: int) -> int:
         """Give the command that was answered, as the node did; return what comes of it."""
-        asked, given = self._answers[row], self.result.lengths[row]
+        asked, given = self._commands[row], self.result.lengths[row]
         try:
             frame = self._frames[asked["frame"]]
             self.compensator.step(tuple(asked["pose"].tolist()), int(asked["stamp"]) * 1e-9, frame)
@@ -219,7 +219,7 @@ class _AsItWas(_Run):
         self._known &= self._next == (page.session, page.number, page.begins)
         if session == page.session:
             self.result.lost += max(0, page.begins - begins)
-        self._next = page.session, page.number + 1, page.begins + len(page.answers)
+        self._next = page.session, page.number + 1, page.begins + len(page.commands)
 
     def change(self, entry: Entry) -> None:
         """Make a change that the journal tells of."""
@@ -230,9 +230,9 @@ class _AsItWas(_Run):
             self._in_use = self._in_use[0], entry.values["sha256"]
         super().change(entry)
 
-    def answer(self, row: int) -> int:
+    def step(self, row: int) -> int:
         """Compare an answer, if the state before it is known."""
-        return super().answer(row) if self._known else self._otherwise
+        return super().step(row) if self._known else self._otherwise
 
     def check(self, snapshot: Snapshot, row: int) -> None:
         """Compare states, and go on from the recorded one."""

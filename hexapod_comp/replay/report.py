@@ -59,18 +59,18 @@ class Report:
     @property
     def seconds(self) -> np.ndarray:
         """Time of each answer since the first, s, by their stamps."""
-        stamps = self.recording.answers["stamp"]
+        stamps = self.recording.commands["stamp"]
         return since(stamps, stamps)
 
     @property
-    def commands(self) -> np.ndarray:
+    def strut_commands(self) -> np.ndarray:
         """Recorded strut commands, shape (n, 6), m."""
-        return self.recording.answers["lengths"][:, 0]
+        return self.recording.commands["lengths"][:, 0]
 
     @property
-    def corrections(self) -> np.ndarray:
+    def strut_corrections(self) -> np.ndarray:
         """Recorded corrections, shape (n, 6), m."""
-        return self.recording.answers["lengths"][:, 1]
+        return self.recording.commands["lengths"][:, 1]
 
     @property
     def refused(self) -> list[Event]:
@@ -85,7 +85,7 @@ class Report:
 
     def since_first_page(self, time: int) -> float:
         """Return a recorder's time, ns, as seconds since the recorder's first page with answers."""
-        return (time - next(at for at, page in self.recording.pages if len(page.answers))) * 1e-9
+        return (time - next(at for at, page in self.recording.pages if len(page.commands))) * 1e-9
 
     @property
     def same(self) -> bool:
@@ -110,7 +110,7 @@ def text(report: Report) -> str:
 
 
 def _heading(report: Report) -> Iterator[str]:
-    recording, stamps = report.recording, report.recording.answers["stamp"]
+    recording, stamps = report.recording, report.recording.commands["stamp"]
     machine, model = (printable(one["name"]) for one in (recording.first.geometry, recording.first.model))
     yield f"{recording.path}: {printable(recording.node)}, machine {machine}, model {model}"
     began = datetime.fromtimestamp(stamps[0] * 1e-9, timezone.utc)
@@ -126,21 +126,21 @@ def _verdict(report: Report) -> Iterator[str]:
     if replayed is None:
         yield "not replayed as it was: geometry and model that were in use are not at hand"
         return
-    found = Counter(replayed.outcome.tolist())
-    compared = found[IDENTICAL] + found[DIFFERENT]
-    word = "identical bit for bit" if not found[DIFFERENT] else f"{found[IDENTICAL]} identical bit for bit"
-    yield f"replayed {compared} of {len(replayed.answers)} answers: {word}" + (
-        f", {found[DIFFERENT]} different" if found[DIFFERENT] else ""
+    counts = Counter(replayed.outcome.tolist())
+    compared = counts[IDENTICAL] + counts[DIFFERENT]
+    word = "identical bit for bit" if not counts[DIFFERENT] else f"{counts[IDENTICAL]} identical bit for bit"
+    yield f"replayed {compared} of {len(replayed.commands)} answers: {word}" + (
+        f", {counts[DIFFERENT]} different" if counts[DIFFERENT] else ""
     )
     if replayed.lost:
         yield f"the recorder has lost answers that the journal counts: {replayed.lost}"
-    if found[LOST]:
-        yield f"left out: {found[LOST]} answers after lost pages of the journal, up to its next snapshot"
-    if found[BEFORE]:
-        yield f"left out: {found[BEFORE]} answers before the journal's first snapshot"
+    if counts[LOST]:
+        yield f"left out: {counts[LOST]} answers after lost pages of the journal, up to its next snapshot"
+    if counts[BEFORE]:
+        yield f"left out: {counts[BEFORE]} answers before the journal's first snapshot"
     changes = Counter(event.entry.what for event in replayed.changes)
-    told = ", ".join(f"{count} × {what}" for what, count in sorted(changes.items())) or "none"
-    yield f"changes between commands: {told}; {len(report.recording.pages)} pages of the journal"
+    listed = ", ".join(f"{count} × {what}" for what, count in sorted(changes.items())) or "none"
+    yield f"changes between commands: {listed}; {len(report.recording.pages)} pages of the journal"
 
 
 def _difference(report: Report) -> Iterator[str]:
@@ -165,7 +165,7 @@ def _first(replayed: Replay, row: int) -> str:
     """Say how the first different answer differs."""
     if row in replayed.refused_now:
         return f"the replay refuses the command ({replayed.refused_now[row]})"
-    recorded, now = replayed.answers["lengths"][row], replayed.lengths[row]
+    recorded, now = replayed.commands["lengths"][row], replayed.lengths[row]
     places = ((kind, n) for kind in (1, 0) for n in range(6))
     kind, n = next(place for place in places if recorded[place].tobytes() != now[place].tobytes())
     was, is_now = (float(one[kind, n]) * 1e6 for one in (recorded, now))
@@ -173,9 +173,9 @@ def _first(replayed: Replay, row: int) -> str:
 
 
 def _place(report: Report, row: int) -> str:
-    if row >= len(report.recording.answers):
+    if row >= len(report.recording.commands):
         return "the end"
-    stamp = int(report.recording.answers["stamp"][row])
+    stamp = int(report.recording.commands["stamp"][row])
     return f"answer {row + 1} (stamp {stamp // 10**9}.{stamp % 10**9:09d}, {report.seconds[row]:.3f} s)"
 
 
@@ -217,7 +217,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _figures(report: Report) -> Iterator[str]:
-    corrections = report.corrections
+    corrections = report.strut_corrections
     if np.isfinite(corrections).any():
         largest = int(np.nanargmax(np.abs(corrections)))
         row, strut = divmod(largest, 6)
@@ -256,29 +256,29 @@ def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
     if len(when) < 2 or not len(states):
         return np.zeros(0), np.zeros((0, 6))
     # Drives that do not stamp are taken by the recorder's clock.
-    at = since(states.stamps if states.stamps.all() else states.times, report.recording.answers["stamp"])
+    at = since(states.stamps if states.stamps.all() else states.times, report.recording.commands["stamp"])
     after = np.clip(np.searchsorted(when, at), 1, len(when) - 1)
     inside = (at >= when[0]) & (at <= when[-1]) & (when[after] - when[after - 1] <= LONGEST_GAP)
-    wanted = np.stack([np.interp(at[inside], when, column) for column in report.commands.T], axis=1)
+    wanted = np.stack([np.interp(at[inside], when, column) for column in report.strut_commands.T], axis=1)
     return at[inside], states.values[inside] - wanted
 
 
 def tool_positions(recording: Recording, work: Pose) -> np.ndarray:
     """Return where the tool was commanded in ``base``, (n, 3), m, with the work frame seen from ``base``."""
-    positions = recording.answers["pose"][:, :3].copy()
-    in_work = recording.answers["frame"] == ROLES.index("work")
+    positions = recording.commands["pose"][:, :3].copy()
+    in_work = recording.commands["frame"] == ROLES.index("work")
     positions[in_work] = work.position + positions[in_work] @ work.rotation.T
     return positions
 
 
 def rows_of(report: Report) -> list[dict[str, Any]]:
     """Return one CSV row per answer: stamps, commands (mm), corrections (µm) recorded, replayed and with the other."""
-    stamps, replayed, other = report.recording.answers["stamp"], report.replayed, report.other
+    stamps, replayed, other = report.recording.commands["stamp"], report.replayed, report.other
     rows = []
     for n, (stamp, time) in enumerate(zip(stamps.tolist(), report.seconds.tolist(), strict=True)):
         row: dict[str, Any] = {"stamp_ns": stamp, "time_s": time}
-        row |= {f"L{i + 1}_mm": v * 1e3 for i, v in enumerate(report.commands[n].tolist())}
-        row |= _micrometres("recorded", report.corrections[n])
+        row |= {f"L{i + 1}_mm": v * 1e3 for i, v in enumerate(report.strut_commands[n].tolist())}
+        row |= _micrometres("recorded", report.strut_corrections[n])
         if replayed is not None:
             row |= _micrometres("replayed", replayed.lengths[n, 1])
             row["outcome"] = OUTCOMES[int(replayed.outcome[n])]
@@ -300,9 +300,9 @@ def as_json(report: Report) -> dict[str, Any]:
         "node": recording.node,
         "geometry": recording.first.geometry,
         "model": recording.first.model,
-        "commands": len(recording.answers) + report.refusals,
+        "commands": len(recording.commands) + report.refusals,
         "commands_heard_by_recorder": recording.heard,
-        "answers": len(recording.answers),
+        "answers": len(recording.commands),
         "answers_lost": replayed.lost if replayed is not None else None,
         "same": report.same if replayed is not None else None,
         "made_with": recording.first.made_with,
@@ -323,18 +323,18 @@ def as_json(report: Report) -> dict[str, Any]:
 
 def _replay_json(replayed: Replay) -> dict[str, Any]:
     different = np.flatnonzero(replayed.outcome == DIFFERENT)
-    found = Counter(replayed.outcome.tolist())
+    counts = Counter(replayed.outcome.tolist())
     first = None
     if len(different):
         row = int(different[0])
         first = {
             "stamp_ns": _stamp(replayed, row),
-            "recorded_correction_m": replayed.answers["lengths"][row, 1],
+            "recorded_correction_m": replayed.commands["lengths"][row, 1],
             "replayed_correction_m": replayed.lengths[row, 1],
             "refused_now": replayed.refused_now.get(row),
         }
     return {
-        "outcomes": {name: found[outcome] for outcome, name in OUTCOMES.items()},
+        "outcomes": {name: counts[outcome] for outcome, name in OUTCOMES.items()},
         "first_difference": first,
         "largest_difference_m": np.nanmax(np.abs(replayed.difference[different]), initial=0.0),
         "states_differ": len(replayed.states_differ),
@@ -353,4 +353,4 @@ def _replay_json(replayed: Replay) -> dict[str, Any]:
 
 def _stamp(replayed: Replay, row: int) -> int | None:
     """Return the stamp of the answer that an event precedes; None after the last."""
-    return int(replayed.answers["stamp"][row]) if row < len(replayed.answers) else None
+    return int(replayed.commands["stamp"][row]) if row < len(replayed.commands) else None

@@ -167,13 +167,13 @@ def monte_carlo(
     ranks = np.array([_ranks(draws, percentile, confidence) for percentile in percentiles])
     deviates = _deviates(vectors.shape[1], draws, distribution, seed)
     worst = np.zeros((2, draws))
-    found = np.empty((len(vectors), 2, *ranks.shape))
+    drawn = np.empty((len(vectors), 2, *ranks.shape))
     for n, effects in enumerate(vectors):
         errors = effects.T @ deviates
         sizes = np.stack([np.sqrt((errors[:3] ** 2).sum(axis=0)), np.abs(errors[3:]).max(axis=0)])
         np.maximum(worst, sizes, out=worst)
-        found[n] = np.partition(sizes, np.unique(ranks), axis=1)[:, ranks]
-    values, low, high = np.transpose(found, (3, 2, 0, 1))
+        drawn[n] = np.partition(sizes, np.unique(ranks), axis=1)[:, ranks]
+    values, low, high = np.transpose(drawn, (3, 2, 0, 1))
     of_worst = np.transpose(np.sort(worst, axis=1)[:, ranks], (2, 1, 0))
     return MonteCarlo(tuple(percentiles), values, low, high, of_worst[0], of_worst[1], of_worst[2], draws, confidence)
 

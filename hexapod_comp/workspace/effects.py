@@ -21,16 +21,15 @@ from .sources import BASE_JOINT, LENGTH, TOOL, SingleErrors
 EXACT, LINEAR = "exact", "linear"
 METHODS = (EXACT, LINEAR)
 
-COLUMNS = ("translation max", "translation min", "rotation max", "rotation min")
-"""Columns of :class:`Extremes`."""
-
 BLOCK = 4096
 """Poses handled together: long beside what an error costs once, small enough for a processor's own memory."""
 
 
 @dataclass(frozen=True)
 class Extremes:
-    """Largest and smallest effect of each error type, and where they happen; columns as in :data:`COLUMNS`.
+    """Largest and smallest effect of each error type, and where they happen.
+
+    Columns: largest and smallest translation, largest and smallest rotation.
 
     Attributes
     ----------
@@ -161,14 +160,14 @@ def extremes(
     over_chunks(run, len(positions), threads, BLOCK)
     slices = [of_slice[start] for start in sorted(of_slice)]
     best, at_pose, at_error = _best_of_kinds(errors, slices)
-    found = np.isfinite(best)
+    exists = np.isfinite(best)
     return Extremes(
         errors=errors,
-        values=np.where(found, best * _SIGNS, np.nan),
-        at_pose=np.where(found, at_pose + first, -1),
-        at_error=np.where(found, at_error, -1),
-        positions=_picked(positions, at_pose, found),
-        rotations=_picked(rotations, at_pose, found),
+        values=np.where(exists, best * _SIGNS, np.nan),
+        at_pose=np.where(exists, at_pose + first, -1),
+        at_error=np.where(exists, at_error, -1),
+        positions=_picked(positions, at_pose, exists),
+        rotations=_picked(rotations, at_pose, exists),
         failed=sum((part[2] for part in slices), np.zeros(len(errors.kinds), int)),
         poses=len(positions),
     )
@@ -237,10 +236,10 @@ def _best_of_kinds(
     return np.take_along_axis(best, chosen, 0), np.take_along_axis(pose, chosen, 0), error[chosen]
 
 
-def _picked(rows: np.ndarray, at: np.ndarray, found: np.ndarray) -> np.ndarray:
+def _picked(rows: np.ndarray, at: np.ndarray, exists: np.ndarray) -> np.ndarray:
     """Return the rows at some indices, NaN where nothing was found."""
     picked = np.full((*at.shape, *rows.shape[1:]), np.nan)
-    picked[found] = rows[at[found]]
+    picked[exists] = rows[at[exists]]
     return picked
 
 

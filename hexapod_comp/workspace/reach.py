@@ -105,10 +105,10 @@ class Examiner:
         findings, struts = self.findings(outside, rotations)
         for _ in range(HALVINGS):
             middle = 0.5 * (inside + outside)
-            found, who = self.findings(middle, rotations)
-            beyond = found != WITHIN
+            at_middle, who = self.findings(middle, rotations)
+            beyond = at_middle != WITHIN
             inside[~beyond], outside[beyond] = middle[~beyond], middle[beyond]
-            findings[beyond], struts[beyond] = found[beyond], who[beyond]
+            findings[beyond], struts[beyond] = at_middle[beyond], who[beyond]
         return inside, findings, struts
 
 
@@ -177,9 +177,9 @@ class Reach:
 
         Each grid line stands for a column; what lies between its crossings of the boundary is within reach.
         """
-        found = self.boundary
-        here = found.positions[np.arange(len(found.axis)), found.axis]
-        return np.bincount(found.axis, found.outward * here, 3) * self.spacing**2
+        edge = self.boundary
+        here = edge.positions[np.arange(len(edge.axis)), edge.axis]
+        return np.bincount(edge.axis, edge.outward * here, 3) * self.spacing**2
 
     @property
     def volume(self) -> float:
@@ -384,8 +384,8 @@ def _crossings(
             outside.append(second if way > 0 else first)
             axis.append(np.full(len(start), k))
             outward.append(np.full(len(start), way))
-    found = examiner.boundary(np.concatenate(inside), np.concatenate(outside), rotation)
-    return Boundary(*found, np.concatenate(axis), np.concatenate(outward))
+    boundary = examiner.boundary(np.concatenate(inside), np.concatenate(outside), rotation)
+    return Boundary(*boundary, np.concatenate(axis), np.concatenate(outward))
 
 
 def _grid_points(axes: tuple[np.ndarray, ...]) -> np.ndarray:

@@ -32,10 +32,10 @@ def _headline(study: Study) -> str:
 def _reach_table(study: Study, names: Sequence[str]) -> str:
     """Return volume, size and limits of the workspace at each orientation."""
     rows = []
-    for name, found in zip(names, study.reaches, strict=True):
-        size = " × ".join(f"{side * 1e3:.0f}" for side in np.ptp(found.box, axis=0))
-        limits = ", ".join(f"{cause} {100.0 * share:.0f} %" for cause, share in found.shares().items())
-        rows.append((name, number(found.volume * 1e6, 1), size, str(found.parts), limits))
+    for name, reach in zip(names, study.reaches, strict=True):
+        size = " × ".join(f"{side * 1e3:.0f}" for side in np.ptp(reach.box, axis=0))
+        limits = ", ".join(f"{cause} {100.0 * share:.0f} %" for cause, share in reach.shares().items())
+        rows.append((name, number(reach.volume * 1e6, 1), size, str(reach.parts), limits))
     return aligned(("orientation", "volume cm³", "box mm", "pieces", "limited by (share of the boundary)"), rows)
 
 
@@ -93,8 +93,8 @@ def as_json(study: Study) -> dict[str, Any]:
         "poses": study.extremes.poses,
         "ranking": ranking_rows(study.rows),
         "reach": [
-            {"volume_m3": found.volume, "box_m": found.box, "limits": found.shares(), "regions": found.regions()}
-            for found in study.reaches
+            {"volume_m3": item.volume, "box_m": item.box, "limits": item.shares(), "regions": item.regions()}
+            for item in study.reaches
         ],
         "combined_m_rad": {
             "worst_case": study.combined.worst_case,
@@ -102,8 +102,8 @@ def as_json(study: Study) -> dict[str, Any]:
             "percentiles": dict(zip(drawn.percentiles, drawn.worst_values, strict=True)),
         },
         "allocations_m": [
-            {**vars(found), "alone": dict(zip(study.errors.kinds, found.alone, strict=True))}
-            for found in study.allocations
+            {**vars(item), "alone": dict(zip(study.errors.kinds, item.alone, strict=True))}
+            for item in study.allocations
         ],
         "agreement": study.agreement,
     }

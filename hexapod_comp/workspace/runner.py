@@ -100,12 +100,12 @@ def survey(
     alone = workers <= 1 and scheduler is None
     parts = _parts(reaches, errors, method, None if alone else 1)
     if scheduler is not None:
-        found = _on_cluster(parts, scheduler)
+        extremes = _on_cluster(parts, scheduler)
     elif alone:
-        found = map(look_at, parts)
+        extremes = map(look_at, parts)
     else:
-        found = _in_processes(parts, workers)
-    return merged(_counted(found, progress))
+        extremes = _in_processes(parts, workers)
+    return merged(_counted(extremes, progress))
 
 
 def _parts(reaches: Iterable[Reach], errors: SingleErrors, method: str, threads: int | None) -> Iterator[Part]:
@@ -118,8 +118,8 @@ def _parts(reaches: Iterable[Reach], errors: SingleErrors, method: str, threads:
             first += len(chosen)
 
 
-def _counted(found: Iterable[Extremes], progress: Callable[[int], object]) -> Iterator[Extremes]:
-    for part in found:
+def _counted(extremes: Iterable[Extremes], progress: Callable[[int], object]) -> Iterator[Extremes]:
+    for part in extremes:
         progress(part.poses)
         yield part
 

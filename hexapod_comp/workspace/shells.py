@@ -83,33 +83,6 @@ class Shell:
         return poses_at(self.geometry, self.scaled(fraction).reshape(-1, 3), self.rotation)
 
 
-@dataclass(frozen=True)
-class CrossSection:
-    """A horizontal cut through a reach: rings about the axis through its centre.
-
-    Attributes
-    ----------
-    geometry, rotation
-        As in :class:`Shell`.
-    points : ndarray, shape (K, A, 3)
-        Tool tips, m in the work frame, from the axis (first ring) to the boundary (last ring).
-    findings : ndarray of int8, shape (A,)
-        What limits at the last ring.
-    folded : ndarray of bool, shape (A,)
-        As in :class:`Shell`.
-    """
-
-    geometry: HexapodGeometry
-    rotation: np.ndarray
-    points: np.ndarray
-    findings: np.ndarray
-    folded: np.ndarray
-
-    def platform_poses(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return ``pose_platform_in_base`` of the points, shape (K·A, 3) m and (K·A, 3, 3)."""
-        return poses_at(self.geometry, self.points.reshape(-1, 3), self.rotation)
-
-
 def shell(reach: Reach, rings: int = 37, sectors: int = 72) -> Shell:
     """Find the boundary of a reach along rays from its centre.
 
@@ -138,44 +111,6 @@ def shell(reach: Reach, rings: int = 37, sectors: int = 72) -> Shell:
         folded.reshape(rings, -1),
         mesh_volume(points) / reach.volume,
     )
-
-
-def section(reach: Reach, height: float, rings: int = 13, sectors: int = 72) -> CrossSection:
-    """Cut a reach horizontally, by rays from the axis through its centre.
-
-    Parameters
-    ----------
-    reach : Reach
-        What the machine reaches at one orientation.
-    height : float
-        z of the tool tip in the work frame, m.
-    rings, sectors : int
-        Points from the axis outwards, and around.
-
-    Raises
-    ------
-    GeometryError
-        At this height the axis is not within reach, or too coarse a mesh.
-    """
-    _check_mesh(rings, sectors)
-    origin = np.array([*reach.centre[:2], height])
-    finding, _ = Examiner(reach.geometry).findings(origin[None], reach.rotation[None])
-    if finding[0] != WITHIN:
-        low, high = axis_range(reach) * 1e3
-        raise GeometryError("height", f"must lie in {low:.1f}…{high:.1f} mm, where the axis is within reach", height)
-    azimuth = np.linspace(0.0, 2.0 * np.pi, sectors + 1)
-    directions = np.stack([np.cos(azimuth), np.sin(azimuth), 0.0 * azimuth], axis=-1)
-    ends, findings, _, folded = _cast(reach, origin, directions)
-    ends[-1] = ends[0]
-    shares = np.linspace(0.0, 1.0, rings)[:, None, None]
-    points = origin + shares * (ends - origin)
-    return CrossSection(reach.geometry, reach.rotation, points, findings, folded)
-
-
-def axis_range(reach: Reach) -> np.ndarray:
-    """Return lowest and highest z of the tool tip on the axis through the centre, m, shape (2,)."""
-    directions = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
-    return _cast(reach, reach.centre, directions)[0][:, 2]
 
 
 def mesh_volume(points: np.ndarray) -> float:
@@ -216,8 +151,8 @@ def _cast(
     farthest = np.linalg.norm(np.abs(corners - origin[:, None]).max(axis=1))  # all of the grid, hence of the reach
     shares = np.linspace(0.0, farthest, SAMPLES)
     samples = origin + shares[:, None] * directions[:, None]
-    found, _ = examiner.findings(samples.reshape(-1, 3), reach.rotation[None])
-    within = (found == WITHIN).reshape(len(directions), SAMPLES)
+    at_samples, _ = examiner.findings(samples.reshape(-1, 3), reach.rotation[None])
+    within = (at_samples == WITHIN).reshape(len(directions), SAMPLES)
     within[:, 0] = True
     exits = within.argmin(axis=1)
     ray = np.arange(len(directions))

@@ -163,13 +163,13 @@ def _combined(errors: SingleErrors, vectors: np.ndarray, seed: int) -> Combined:
 
 def _random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return platform poses picked from all reaches alike, (n, 3) and (n, 3, 3); all of them where there are few."""
-    sizes = np.array([int(found.within.sum()) for found in reaches])
+    sizes = np.array([int(one.within.sum()) for one in reaches])
     first = np.cumsum([0, *sizes])
     chosen = np.random.default_rng(seed).choice(first[-1], min(count, first[-1]), replace=False)
     poses = []
-    for n, found in enumerate(reaches):  # one after the other: all poses of all reaches may be too many to hold
+    for n, one in enumerate(reaches):  # one after the other: all poses of all reaches may be too many to hold
         members = chosen[(chosen >= first[n]) & (chosen < first[n + 1])] - first[n]
-        poses.append(poses_at(found.geometry, found.points()[members], found.rotation))
+        poses.append(poses_at(one.geometry, one.points()[members], one.rotation))
     positions, rotations = (np.concatenate([pose[k] for pose in poses]) for k in range(2))
     return positions, rotations
 
@@ -211,7 +211,7 @@ def compared(
 
 def shells_of(reaches: tuple[Reach, ...]) -> tuple[Shell, ...]:
     """Return the boundary meshes of some reaches."""
-    return tuple(shell(found, RINGS, SECTORS) for found in reaches)
+    return tuple(shell(one, RINGS, SECTORS) for one in reaches)
 
 
 def mesh_effects(study: Study, body: Shell) -> tuple[np.ndarray, np.ndarray]:
@@ -227,5 +227,5 @@ def mesh_effects(study: Study, body: Shell) -> tuple[np.ndarray, np.ndarray]:
     points = np.stack([body.scaled(fraction) for fraction in LAYERS])
     poses = [body.platform_poses(fraction) for fraction in LAYERS]
     positions, rotations = (np.concatenate([pose[k] for pose in poses]) for k in range(2))
-    found = effects(study.geometry, study.errors, positions, rotations, EXACT)
-    return points, np.moveaxis(found.reshape(*points.shape[:3], len(study.errors), 2), (3, 4), (0, 1))
+    values = effects(study.geometry, study.errors, positions, rotations, EXACT)
+    return points, np.moveaxis(values.reshape(*points.shape[:3], len(study.errors), 2), (3, 4), (0, 1))

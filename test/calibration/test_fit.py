@@ -327,9 +327,9 @@ def test_noise_twice_and_three_times_as_stated_is_found():
     plan = small.campaign(noise=(2e-6, 1e-6, 3e-6, 1e-5, 1e-5))
     ours = small.measured(small.virtual_machine(1), plan, 1)
     fit = fit_model(replace(ours, uncertainty=np.full(len(ours), 1e-6)), FEW)
-    found = {channel.kind: channel.found / channel.stated for channel in fit.channels}
+    found = {channel.kind: channel.estimated / channel.stated for channel in fit.channels}
     assert found == {kind: pytest.approx(n, rel=0.16) for kind, n in zip(KINDS[:3], (2.0, 1.0, 3.0), strict=True)}
-    assert all(c.chi_square == pytest.approx((c.found / c.stated) ** 2) for c in fit.channels)
+    assert all(c.chi_square == pytest.approx((c.estimated / c.stated) ** 2) for c in fit.channels)
     assert sum(c.readings for c in fit.channels) == len(ours)
 
 

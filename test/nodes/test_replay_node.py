@@ -172,7 +172,7 @@ def test_recording_may_begin_in_motion_and_two_machines_share_a_bag(ros_context,
         assert begun <= count - 60, "a snapshot is among the pages that are kept"
         assert (result.outcome[:begun] == BEFORE).all()
         assert (result.outcome[begun:] == IDENTICAL).all()
-        np.testing.assert_array_equal(result.answers["pose"][-1, :3], along(199).position)
+        np.testing.assert_array_equal(result.commands["pose"][-1, :3], along(199).position)
 
 
 def later(seconds: float) -> Callable[[], bool]:

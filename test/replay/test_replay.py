@@ -47,7 +47,7 @@ from hexapod_comp.cli import replay as verb
 from hexapod_comp.cli.parsers import make_parser
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.compensation.journal import (
-    ANSWER,
+    COMMAND,
     FORMAT,
     REFUSALS_PER_PAGE,
     SNAPSHOT_PERIOD,
@@ -166,7 +166,7 @@ def altered(messages: Messages, number: int, change: Callable[[dict], None]) -> 
 
 def answers_of(page: dict) -> np.ndarray:
     """Return a copy of the answers of a page's content."""
-    return np.frombuffer(base64.b64decode(page["answers"]), ANSWER).copy()
+    return np.frombuffer(base64.b64decode(page["answers"]), COMMAND).copy()
 
 
 @pytest.mark.parametrize(("kind", "name"), [(0, "command"), (1, "correction")])
@@ -185,7 +185,7 @@ def test_replay_sees_a_difference_of_one_bit(run, tmp_path, capsys, kind, name):
     assert result.outcome[707] == DIFFERENT
     assert call(bag) == 1
     said = capsys.readouterr().out
-    stamp = int(recording.answers["stamp"][707])
+    stamp = int(recording.commands["stamp"][707])
     assert f"stamp {stamp // 10**9}.{stamp % 10**9:09d}" in said
     assert f"strut_4, {name} recorded" in said
     assert call(bag, "--tolerance-um", "1e-6") == 0
@@ -246,9 +246,9 @@ def test_pages_carry_numbers_exactly():
     for name, numbers in snapshot.items():
         np.testing.assert_array_equal(page.snapshot.state[name], np.array(numbers))
     assert page.entries[0].values == {"name": "strut_2", "value": 20.1}
-    assert page.answers["lengths"].tobytes() == np.array(machine.answers).tobytes()
-    assert page.answers["stamp"].tolist() == [BEGAN + n * MILLISECOND for n in (1, 2, 3)]
-    np.testing.assert_array_equal(page.answers["pose"][2, :3], wave_pose(2).position)
+    assert page.commands["lengths"].tobytes() == np.array(machine.answers).tobytes()
+    assert page.commands["stamp"].tolist() == [BEGAN + n * MILLISECOND for n in (1, 2, 3)]
+    np.testing.assert_array_equal(page.commands["pose"][2, :3], wave_pose(2).position)
     fresh = read_page(RecordedMachine().journal.page(9.0))
     assert fresh.snapshot is not None
     assert np.isnan(fresh.snapshot.state["command"]).all(), "NaN is null on the way"
@@ -613,7 +613,7 @@ def test_messages_that_are_damaged_are_named(run, tmp_path):
         (page_text(answers="AAAA"), "not a page of the journal"),
         (page_text(answers="?"), "not a page of the journal"),
         (page_text(entries=[{"after": 3, "what": "enable", "on": True}]), "not in an order"),
-        (page_text(answers=base64.b64encode(b"\xff" * ANSWER.itemsize).decode()), "not in an order"),
+        (page_text(answers=base64.b64encode(b"\xff" * COMMAND.itemsize).decode()), "not in an order"),
     ]
     for n, (text, message) in enumerate(pages):
         messages = [*run.messages[:10], (BEGAN, "/compensator/journal", TEXT, serialized(TEXT, TYPES[TEXT](text)))]

@@ -10,7 +10,7 @@ from hexapod_comp.errors import GeometryError
 from hexapod_comp.kernels import limits as codes
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.workspace.reach import Examiner, Reach, reach
-from hexapod_comp.workspace.shells import Shell, axis_range, mesh_volume, section, shell
+from hexapod_comp.workspace.shells import Shell, mesh_volume, shell
 
 
 def unit_reach() -> Reach:
@@ -102,39 +102,7 @@ def test_what_rays_do_not_see_is_said():
     assert again[found.folded].all()
 
 
-def test_a_section_is_level_and_reaches_the_boundary():
-    """Truth: the limits a micrometre within and beyond the last ring; rings evenly spaced from the axis."""
-    found = unit_reach()
-    cut = section(found, 0.185, 5, 24)
-    assert cut.points.shape == (5, 25, 3)
-    np.testing.assert_allclose(cut.points[..., 2], 0.185, atol=1e-15)
-    rays = cut.points[-1] - cut.points[0]
-    np.testing.assert_allclose(cut.points[2], cut.points[0] + 0.5 * rays, atol=1e-15)
-    step = 1e-6 * rays / np.linalg.norm(rays, axis=1)[:, None]
-    examiner = Examiner(unit())
-    assert (examiner.findings(cut.points[-1] - step, LEVEL[None])[0] == codes.WITHIN).all()
-    assert (examiner.findings(cut.points[-1] + step, LEVEL[None])[0] != codes.WITHIN).all()
-    assert not cut.folded.any()
-    assert cut.platform_poses()[0].shape == (125, 3)
-
-
-def test_heights_of_the_axis():
-    """Truth: Pythagoras, as in test_reach; the centre is a fraction of a millimetre off the axis, where the
-    cusps above and below fall by less than half of that."""
-    found = unit_reach()
-    across = 0.15**2 + 0.06**2 - 2.0 * 0.15 * 0.06 * np.cos(np.deg2rad(25.0))
-    expected = [np.sqrt(0.158**2 - across) + 0.025, np.sqrt(0.218**2 - across) + 0.025]
-    off = np.linalg.norm(found.centre[:2])
-    assert off < 1e-3
-    np.testing.assert_allclose(axis_range(found), expected, atol=0.6 * off + 1e-6)
-
-
 # Refused.
-
-
-def test_a_height_out_of_reach():
-    with pytest.raises(GeometryError, match=r"height: must lie in 14\d\.\d…21\d\.\d mm.*0\.35"):
-        section(unit_reach(), 0.35)
 
 
 @pytest.mark.parametrize("fraction", [0.0, 1.01, np.nan])
@@ -147,5 +115,3 @@ def test_a_fraction_that_is_none(fraction):
 def test_a_mesh_that_is_no_picture(rings, sectors, said):
     with pytest.raises(GeometryError, match=f"{said}: must be at least"):
         shell(unit_reach(), rings, sectors)
-    with pytest.raises(GeometryError, match=f"{said}: must be at least"):
-        section(unit_reach(), 0.185, rings, sectors)

@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.polynomial import polynomial
 
-from ..errors import ModelError
-from ..machine.field import GridField
-from ..machine.geometry import HexapodGeometry
-from ..machine.model import MachineModel
+from hexapod_comp.errors import ModelError
+from hexapod_comp.machine.field import GridField
+from hexapod_comp.machine.geometry import HexapodGeometry
+from hexapod_comp.machine.model import MachineModel
 
 MAP_WAVES, FIELD_WAVES = 8, 6
 """Waves added up in each strut, and in each component of a field."""
