@@ -191,14 +191,14 @@ class Compensator:
 
     def _check_whole(self, machine: RealMachine) -> None:
         """Raise when a machine's whole correction, without ramp or switch, breaks a limit at the last command."""
-        trial, outcome = CommandState(0.0), CommandState(0.0)
+        trial, tried = CommandState(0.0), CommandState(0.0)
         home = not np.isfinite(self.nominal).all()
         platform = self.geometry.home if home else self._last.platform
         trial.motion.copy_from(self.motion)
         tool = platform @ self.geometry.tool
         fixed = self._pack(machine)
-        found = compensate_one(tool.position, tool.rotation, math.nan, NO_SHIFT, fixed, trial.numbers, outcome.numbers)
-        refuse(found, outcome, machine)
+        outcome = compensate_one(tool.position, tool.rotation, math.nan, NO_SHIFT, fixed, trial.numbers, tried.numbers)
+        refuse(outcome, tried, machine)
 
     def _followed(self, machine: RealMachine) -> np.ndarray | None:
         """Return the nine values whose directions are followed, at the last command, under a machine's model.

@@ -13,12 +13,12 @@ from ..machine.model import RealMachine
 from .state import CommandState
 
 
-def refuse(found: tuple, command: CommandState, machine: RealMachine, numbers: tuple[float, ...] = ()) -> None:
+def refuse(outcome: tuple, command: CommandState, machine: RealMachine, numbers: tuple[float, ...] = ()) -> None:
     """Raise what was found wrong with a command; return when nothing was.
 
     Parameters
     ----------
-    found : tuple
+    outcome : tuple
         As :func:`~hexapod_comp.kernels.compensation.compensate_one` returns it.
     command : CommandState
         What it wrote.
@@ -32,7 +32,7 @@ def refuse(found: tuple, command: CommandState, machine: RealMachine, numbers: t
     PoseError, NotConvergedError, OutsideFieldError, LimitError, NotFiniteError
         What was found.
     """
-    status, finding, strut, stage, value, _ = found
+    status, finding, strut, stage, value, _ = outcome
     if status == NO_POSE:
         raise _pose_error(finding, numbers)
     if status == UNSOLVED:

@@ -37,16 +37,16 @@ def check_magnitudes(model: MachineModel) -> None:
     for name, value in {"struts.expansion": model.struts.expansion, **expansions}.items():
         _check(name, np.asarray(value), EXPANSION, f"{EXPANSION * 1e6:g} ppm per K")
     for axis, family in zip("xyz", model.field.lines, strict=True):
-        for component, found in zip(COMPONENTS, _largest(family), strict=True):
+        for component, largest in zip(COMPONENTS, _largest(family), strict=True):
             length = component.startswith("d")
             allowed, unit = (LARGEST_DEVIATION, "mm") if length else (ROTATION, "mrad")
-            _check(f"field.lines_{axis}.{component}", found, allowed, f"{allowed * 1e3:g} {unit} along every line")
+            _check(f"field.lines_{axis}.{component}", largest, allowed, f"{allowed * 1e3:g} {unit} along every line")
 
 
 def _check(key: str, values: np.ndarray, allowed: float, bound: str) -> None:
-    found = float(np.abs(values).max(initial=0.0))
-    if not found <= allowed:
-        raise ModelError(key, f"must stay within ±{bound}; is the unit right?", found)
+    largest = float(np.abs(values).max(initial=0.0))
+    if not largest <= allowed:
+        raise ModelError(key, f"must stay within ±{bound}; is the unit right?", largest)
 
 
 def _largest(family: np.ndarray) -> np.ndarray:
