@@ -33,6 +33,6 @@ def run(args: argparse.Namespace) -> int:
         note = f"Made by hexapod_comp {version()} paper --machines {args.machines} --seed {args.seed}."
         write_page(page, papers, note)
         write_text(table, common.csv_text(records(papers)))
-    common.show(common.json_text(as_json(papers)) if args.json else report(papers))
+    common.show(as_json(papers) if args.json else report(papers))
     common.mention(args, f"page: {page}\nnumbers: {table}")
     return 1 if any(paper.count()[MISSED] for paper in papers) else 0
