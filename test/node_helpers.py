@@ -169,7 +169,8 @@ class Bench:
         return self.add(CompensatorNode, start, {**defaults, **parameters})
 
     def drive(self, start: bool = True, **parameters: object) -> StrutDriveNode:
-        """Add a strut drive, which the witness commands unless there is a compensator to do it."""
+        """Add a strut drive, which the witness commands unless there is a compensator to do it; it alone measures."""
+        self.hush("strut_states")
         if not self.nodes:
             self.speak("strut_commands")
         return self.add(StrutDriveNode, start, parameters)
@@ -312,10 +313,13 @@ class Bench:
         self.until(find, "a pose estimate")
         return find()[0]
 
-    def feed(self, lengths: np.ndarray, names: tuple[str, ...] = STRUT_NAMES) -> JointState:
-        """Publish measured struts, stamped now, and return the message."""
+    def feed(self, lengths: np.ndarray, names: tuple[str, ...] = STRUT_NAMES, later: float = 0.0) -> JointState:
+        """Publish measured struts, stamped now, or so many seconds from now, and return the message.
+
+        By a later stamp struts may have moved further since the last reading.
+        """
         message = JointState(name=list(names), position=[float(v) for v in lengths], velocity=[0.0] * 6)
-        message.header.stamp = self.now()
+        message.header.stamp = self.stamp(later)
         self.publish("strut_states", message)
         return message
 

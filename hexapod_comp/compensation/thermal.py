@@ -1,15 +1,17 @@
-"""Temperature readings made smooth: a machine warms over minutes, a sensor jitters from one second to the next.
+"""Temperature readings judged and made smooth: a machine warms over minutes, a sensor jitters within a second.
 
-Unfiltered, a sensor that reads ±0.05 K moves a steel strut of 0.5 m by ±0.3 µm at every reading.
+Unfiltered, a sensor that reads ±0.05 K moves a steel strut of 0.5 m by ±0.3 µm at every reading; one that reads 119 °C
+once moves it by 0.6 mm.
 """
 
 from __future__ import annotations
 
 import math
+import statistics
 from dataclasses import dataclass
 
 from ..errors import ModelError
-from ..machine.model import Temperatures
+from ..machine.model import REFERENCE_TEMPERATURE, Temperatures
 
 DEFAULT_TIME_CONSTANT = 30.0
 """Time constant of the filter, s: of a reading a second an eighth of the noise is left, and the drift is
@@ -80,3 +82,85 @@ class TemperatureFilter:
         mean.value += (reading - mean.value) * share / mean.weight
         mean.newest = max(mean.newest, time)
         return mean.value
+
+
+JITTER = 1.0
+"""Two readings of a sensor may differ by this at once, K: noise, and the last digit of a coarse one."""
+
+
+@dataclass(frozen=True)
+class Plausibility:
+    """What counts as a machine's temperature; 0 switches a rule off.
+
+    Parameters
+    ----------
+    rate : float
+        Fastest change of one part, K/s, beyond :data:`JITTER`. What is further from the part's last good reading is
+        refused until so much time has passed that the part may have got there.
+    spread : float
+        Largest difference, K, to the median of all other parts' readings; to 20 °C where none is known: that is
+        where parts that nobody has measured count as being.
+    timeout : float
+        A part without a good reading for longer, s, is stale: its last one stays in use, but is no neighbour's measure.
+    """
+
+    rate: float
+    spread: float
+    timeout: float
+
+
+class Thermometers:
+    """The temperatures of a machine's parts: readings that are plausible, smoothed.
+
+    Parameters
+    ----------
+    rules : Plausibility
+        What is taken.
+    time_constant : float
+        Of the :class:`TemperatureFilter`, s.
+    """
+
+    def __init__(self, rules: Plausibility, time_constant: float = DEFAULT_TIME_CONSTANT) -> None:
+        self._rules, self._filter = rules, TemperatureFilter(time_constant)
+        self._last: dict[str, tuple[float, float]] = {}
+
+    def take(self, name: str, value: float, time: float) -> float:
+        """Take a reading and return what counts from now on, °C; arguments and errors as those of the filter.
+
+        Raises
+        ------
+        ModelError
+            Also where it has jumped, or does not fit the other parts; nothing was taken.
+        """
+        reading = Temperatures({name: value}).values[name]
+        self._check_rate(name, reading, time)
+        self._check_spread(name, reading, time)
+        mean = self._filter.take(name, reading, time)
+        self._last[name] = reading, time
+        return mean
+
+    def stale(self, time: float) -> tuple[str, ...]:
+        """Return the parts that no longer tell, at a time, s."""
+        return tuple(name for name in Temperatures.NAMES if name in self._last and self._is_stale(name, time))
+
+    def _is_stale(self, name: str, time: float) -> bool:
+        return 0.0 < self._rules.timeout < time - self._last[name][1]
+
+    def _check_rate(self, name: str, reading: float, time: float) -> None:
+        if name not in self._last or not self._rules.rate:
+            return
+        last, then = self._last[name]
+        allowed = JITTER + self._rules.rate * max(0.0, time - then)
+        if abs(reading - last) > allowed:
+            problem = f"has jumped from {last:.2f} to {reading:.2f} °C in {time - then:.1f} s, allowed {allowed:.1f} K"
+            raise ModelError(f"temperature of {name}", problem)
+
+    def _check_spread(self, name: str, reading: float, time: float) -> None:
+        others = [last for other, (last, _) in self._last.items() if other != name and not self._is_stale(other, time)]
+        middle = statistics.median(others or [REFERENCE_TEMPERATURE])
+        if 0.0 < self._rules.spread < abs(reading - middle):
+            whose = f"the other parts' {middle:.2f} °C" if others else f"{middle:g} °C, and no other part is known"
+            problem = (
+                f"reads {reading:.2f} °C, {abs(reading - middle):.1f} K from {whose}; allowed {self._rules.spread:g} K"
+            )
+            raise ModelError(f"temperature of {name}", problem)

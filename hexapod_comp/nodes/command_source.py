@@ -1,4 +1,4 @@
-"""Who commands: only one node may publish on a topic of commands, and none of its messages goes missing unseen.
+"""Who speaks: only one node may publish on a topic of commands or of readings, and no command goes missing unseen.
 
 The graph tells the publishers' names, but keeps a node that was killed for up to 20 s; two of the same name may
 therefore be one and its ghost. Sequence numbers tell them apart: every publisher counts its messages from 1, and
@@ -134,7 +134,7 @@ def _full_name(info: Any) -> str:
 
 
 class CommandSource:
-    """Guards a subscription of commands: refuses while several nodes publish.
+    """Guards a subscription of what only one node may say, commands or readings: refuses while several nodes publish.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ class CommandSource:
     count : callable
         Returns how many publishers the subscription has.
     allowed : bool
-        Several may command; they are named all the same.
+        Several may speak; they are named all the same.
     """
 
     def __init__(self, node: LifecycleNode, topic: str, count: Callable[[], int], allowed: bool) -> None:

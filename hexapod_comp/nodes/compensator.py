@@ -127,7 +127,7 @@ class CompensatorNode(MachineNode):
         self.open_diagnostics(self.compensator.geometry.name)
         self._outputs = outputs = CompensatorOutputs(self, self.compensator, self._options)
         inputs = (self.compensator, self._status, self._options)
-        self._feedback = Feedback(self, *inputs, outputs.estimate, self._look_closer)
+        self._feedback = Feedback(self, *inputs, outputs.estimate, self._look_at_publishers)
         commands = self.obey(PoseStamped, "tool_pose_command", self._on_command, self._look_at_publishers, raw=True)
         self._subscription = commands
         allowed = self._options["allow_several_publishers"]
@@ -216,9 +216,7 @@ class CompensatorNode(MachineNode):
 
     def _look_at_publishers(self) -> None:
         """Look who publishes what only one may: now and then, and when somebody comes or goes."""
-        now = time.monotonic()
-        self._status.source.look(now)
-        self._status.own_topic.look(now)
+        self._status.look(time.monotonic())
         self._look_closer()
 
     # ---- services ----

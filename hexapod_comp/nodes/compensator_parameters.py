@@ -16,6 +16,7 @@ PARAMETERS = (
     Parameter("command_timeout", 0.1, "without a command for this long the state is stale, s; 0 = off", 0.0, 3600.0),
     Parameter("max_command_age", 0.5, "older (or newer) stamps are refused, s; 0 = off", 0.0, 3600.0),
     Parameter("feedback_timeout", 0.1, "without measured struts for this long there is no feedback, s", 1e-3, 3600.0),
+    Parameter("max_reading_age", 0.5, "measured struts stamped older (or newer) are refused, s; 0 = off", 0.0, 3600.0),
     Parameter("require_feedback", False, "refuse commands while there is no feedback"),
     Parameter(
         "start_without_feedback_after",
@@ -31,11 +32,25 @@ PARAMETERS = (
         0.0,
         1.0,
     ),
-    Parameter("allow_several_publishers", False, "obey though several nodes publish commands"),
+    Parameter("allow_several_publishers", False, "obey though several nodes publish commands or readings"),
+    Parameter("allow_several_thermometers", False, "take temperatures though several nodes publish them"),
     Parameter("ramp_rate", 1e-3, "strut speed at which a change of model or enabling is taken up, m/s", 1e-6, 1.0),
     Parameter("enable_compensation", True, "compensate from the start"),
     Parameter(
         "temperature_time_constant_s", DEFAULT_TIME_CONSTANT, "low pass of temperatures, s; 0 = off", 0.0, 3600.0
+    ),
+    Parameter(
+        "temperature_rate_limit", 0.2, "a part's temperature that jumps faster is refused, K/s; 0 = off", 0.0, 1000.0
+    ),
+    Parameter(
+        "temperature_spread_limit",
+        40.0,
+        "a temperature further than this from the other parts' is refused, K; 0 = off",
+        0.0,
+        1000.0,
+    ),
+    Parameter(
+        "temperature_timeout", 60.0, "without a temperature for this long a part's is stale, s; 0 = off", 0.0, 86400.0
     ),
     Parameter("marker_rate", 10.0, "markers per second, Hz; 0 = none", 0.0, 10.0),
     Parameter("publish_array", False, "also publish strut_commands_array for ros2_controllers"),

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..compensation.compensator import Compensator
+from ..compensation.thermal import Thermometers
 from .command_source import CommandSource, OwnTopic
 from .following import Following, LastKnown
 from .health import ERROR, OK, WARN, Flow, Refusals, joined, seconds
@@ -50,6 +51,12 @@ class CompensatorStatus:
         Who commands.
     own_topic : OwnTopic
         Who else publishes strut commands.
+    measuring, warming : CommandSource
+        Who publishes measured struts and temperatures.
+    thermometers : Thermometers
+        Which of them no longer tell.
+    reading_stamps : StampCheck
+        Of the measured struts.
     following : Following
         Whether the struts go where they are told.
     last_known : LastKnown
@@ -60,6 +67,7 @@ class CompensatorStatus:
 
     def __init__(self, options: dict[str, Any], stamps: StampCheck) -> None:
         self._options, self._stamps = options, stamps
+        self.reading_stamps = stamps.for_readings(options["max_reading_age"])
         self.commands, self.feedback = Flow(), Flow()
         self.refusals, self.bad_feedback, self.failed_reloads = Refusals(), Refusals(), Refusals()
         self.following = Following(options["following_error_limit"])
@@ -70,9 +78,18 @@ class CompensatorStatus:
         """Take the guards of the topics of a configured node."""
         self.source, self.own_topic = source, own_topic
 
+    def watch_readings(self, measuring: CommandSource, warming: CommandSource, thermometers: Thermometers) -> None:
+        """Take the guards of the readings of a configured node."""
+        self.measuring, self.warming, self.thermometers = measuring, warming, thermometers
+
+    def look(self, now: float) -> None:
+        """Look who publishes, at the monotonic time `now`, s."""
+        for topic in (self.source, self.own_topic, self.measuring, self.warming):
+            topic.look(now)
+
     def problem(self) -> Guard | None:
         """Return the guard that stops the machine at present, if any."""
-        guards: tuple[Guard, ...] = (self.source, self.own_topic, self.following)
+        guards: tuple[Guard, ...] = (self.source, self.own_topic, self.measuring, self.following)
         return next((guard for guard in guards if guard.problem), None)
 
     def fed(self, now: float) -> bool:
@@ -90,8 +107,11 @@ class CompensatorStatus:
             yield ERROR, f"refusing commands: {guard.reason}: {guard.problem}"
         if reasons := self.refusals.reasons(now, guard.reason if guard is not None else ""):
             yield ERROR, f"refusing commands: {reasons}"
-        if reasons := self.bad_feedback.reasons(now):
+        disputed = next((owner.reason for owner in (self.measuring, self.warming) if owner.problem), "")
+        if reasons := self.bad_feedback.reasons(now, disputed):
             yield ERROR, f"bad feedback: {reasons}"
+        if self.warming.problem:
+            yield ERROR, f"temperatures ignored: {self.warming.reason}: {self.warming.problem}"
         if self.failed_reloads.recent(now):
             yield WARN, "the old model stays"
         yield from self._lost(now)
@@ -114,6 +134,8 @@ class CompensatorStatus:
             yield WARN, "no new command"
         if self.feedback.count and not self.fed(now):
             yield WARN, "feedback lost, pose estimated from own commands"
+        if stale := ", ".join(self.thermometers.stale(now)):
+            yield WARN, f"temperatures stale: {stale}"
         if not silent and self.source.sequence.missing(now):
             yield WARN, "running, commands are being missed"
 
@@ -126,6 +148,9 @@ class CompensatorStatus:
             "ramping": str(compensator.ramping).lower(),
             "pose_estimated_from": "strut_states" if self.fed(now) else "own commands",
             "commanded_by": ", ".join(self.source.names),
+            "measured_by": ", ".join(self.measuring.names),
+            "temperatures_by": ", ".join(self.warming.names),
+            "stale_temperatures": ", ".join(self.thermometers.stale(now)),
             **self._flows(now),
             "largest_correction_m": f"{correction:.9f}",
             "condition_number": f"{compensator.condition:.3f}",

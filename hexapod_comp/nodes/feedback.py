@@ -1,4 +1,4 @@
-"""What a machine tells a compensator: measured struts and temperatures."""
+"""What a machine tells a compensator: measured struts and temperatures, each by one node, and only what can be."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from builtin_interfaces.msg import Time
 from sensor_msgs.msg import JointState, Temperature
 
 from ..compensation.compensator import Compensator
-from ..compensation.thermal import TemperatureFilter
-from ..errors import HexapodError
+from ..compensation.thermal import Plausibility, Thermometers
+from ..errors import CommandError, HexapodError
+from .command_source import CommandSource
 from .compensator_status import CompensatorStatus
 from .following import StrokeRange
 from .messages import StrutReader
-from .order import InOrder
+from .plausible import NoJump
 from .runtime import EVENT_QOS, STATE_QOS, MachineNode
 from .stamps import nanoseconds_of
 
@@ -39,8 +40,9 @@ class Feedback:
         The node's parameters.
     publish : callable
         Publishes a pose estimate, given the pose and the reading's stamp.
-    stopped : callable
-        Called when the struts are found not to follow.
+    look : callable
+        Looks again who publishes and whether commands may be obeyed: called when a publisher comes or goes, when a
+        second one is heard, and when the struts are found not to follow.
     """
 
     def __init__(
@@ -50,56 +52,78 @@ class Feedback:
         status: CompensatorStatus,
         options: dict[str, Any],
         publish: Callable[[np.ndarray, Time], None],
-        stopped: Callable[[], None],
+        look: Callable[[], None],
     ) -> None:
         self._node, self._compensator, self._status = node, compensator, status
-        self._publish, self._stopped = publish, stopped
-        self._order, self._reader = InOrder("strut_states"), StrutReader()
-        self._range = StrokeRange(compensator.geometry)
-        self._filter = TemperatureFilter(options["temperature_time_constant_s"])
-        self._subscriptions = (
-            node.listen_to(JointState, "strut_states", self._on_states, STATE_QOS),
-            node.listen_to(Temperature, "temperatures", self._on_temperature, EVENT_QOS),
-        )
+        self._publish, self._look = publish, look
+        self._reader, self._range = StrutReader(), StrokeRange(compensator.geometry)
+        self._stamps, self._jumps = status.reading_stamps, NoJump(compensator.geometry)
+        rules = (options[f"temperature_{name}"] for name in ("rate_limit", "spread_limit", "timeout"))
+        self._thermometers = Thermometers(Plausibility(*rules), options["temperature_time_constant_s"])
+        several = options["allow_several_publishers"]
+        states = node.obey(JointState, "strut_states", self._on_states, look, qos=STATE_QOS)
+        warm = node.obey(Temperature, "temperatures", self._on_temperature, look, qos=EVENT_QOS)
+        self._subscriptions = states, warm
+        self._measuring = CommandSource(node, states.topic_name, states.get_publisher_count, several)
+        several = several or options["allow_several_thermometers"]
+        self._warming = CommandSource(node, warm.topic_name, warm.get_publisher_count, several)
+        status.watch_readings(self._measuring, self._warming, self._thermometers)
 
     def close(self) -> None:
         """Destroy the subscriptions."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
 
-    def _on_states(self, message: JointState) -> None:
+    def _on_states(self, message: JointState, number: int | None) -> None:
         now, stamp = time.monotonic(), nanoseconds_of(message.header.stamp)
         struts = self._reader.lengths
         try:
-            self._order.check(stamp, now)
+            self._hear(self._measuring, number, now)
+            if stamp:
+                self._stamps.check(stamp, now)
             self._reader.read(message)
             self._range.check(struts)
+            self._watch_following(struts, now)  # also of what cannot be: then the strut or its encoder is broken
+            self._jumps.check(struts, stamp, now)
             pose = self._compensator.estimate(struts)
         except HexapodError as error:
             self._ignore("feedback " + error.reason, error.reason, f"strut_states ignored: {error}", str(error), now)
             return
         self._status.last_known.measure(struts, now)
-        self._order.passed(stamp, now)
+        self._jumps.passed(struts, stamp, now)
+        if stamp:
+            self._stamps.accept(stamp, now)
         self._status.feedback.tick(now)
         if self._node.active:
-            self._watch_following(struts, now)
             self._publish(pose, message.header.stamp)
+
+    def _hear(self, owner: CommandSource, number: int | None, now: float) -> None:
+        """Take a reading's sequence number; refuse the reading while it is not clear whose it is."""
+        if owner.hear(number, now):
+            self._look()
+        if owner.problem:
+            raise CommandError(owner.reason, owner.problem)
 
     def _watch_following(self, measured: np.ndarray, now: float) -> None:
         """Hold the measured struts against their commands; even one reading that is off is said."""
+        if not self._node.active:
+            return
         following = self._status.following
         known = following.problem
         following.check(measured, now)
         if following.problem and not known:
-            self._stopped()
+            self._look()
             self._status.bad_feedback.add(following.reason, following.problem, now)
 
-    def _on_temperature(self, message: Temperature) -> None:
+    def _on_temperature(self, message: Temperature, number: int | None) -> None:
         # Dated by arrival: sensors need not stamp, clocks may be set, and what a transport delays a drift does not
         # notice.
         name, now = message.header.frame_id, time.monotonic()
         try:
-            self._compensator.set_temperature(name, self._filter.take(name, message.temperature, now))
+            self._hear(self._warming, number, now)
+            self._compensator.set_temperature(name, self._thermometers.take(name, message.temperature, now))
+        except CommandError as error:
+            self._ignore("temperatures", error.reason, f"temperature ignored: {error}", str(error), now)
         except HexapodError as error:
             self._ignore("temperature", "temperature", f"temperature ignored: {error}", str(error), now)
 

@@ -156,8 +156,9 @@ class MachineNode(LifecycleNode):
         callback: Callable[[Any, int | None], None],
         matched: Callable[[], None],
         raw: bool = False,
+        qos: QoSProfile = COMMAND_QOS,
     ) -> Subscription:
-        """Return a subscription of commands.
+        """Return a subscription of what only one node may say.
 
         Its callback gets the message, or with `raw` its bytes, and the message's sequence number; `matched` is called
         when a publisher comes or goes, where the middleware tells (who wants to be sure also looks now and then).
@@ -167,7 +168,7 @@ class MachineNode(LifecycleNode):
             message_type,
             topic,
             numbered(callback),
-            copy.copy(COMMAND_QOS),
+            copy.copy(qos),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             raw=raw,
         )

@@ -1,4 +1,4 @@
-"""Stamps of commands: neither too old nor from the future, never out of order, and clocks may be set."""
+"""Stamps of commands and readings: neither too old nor from the future, never out of order, and clocks may be set."""
 
 from __future__ import annotations
 
@@ -53,6 +53,8 @@ class StampCheck:
         Allowed difference to this node's clock either way, s; 0: any.
     simulated : callable or None
         Reads simulated time, ns; None: the system's clock.
+    capped : bool
+        A stamp from the future counts as now in the order of stamps, so that it does not shut out those that follow.
 
     Attributes
     ----------
@@ -60,13 +62,17 @@ class StampCheck:
         How often this node's clock was found set back.
     """
 
-    def __init__(self, largest_age: float, simulated: Callable[[], int] | None = None) -> None:
+    def __init__(self, largest_age: float, simulated: Callable[[], int] | None = None, capped: bool = False) -> None:
         # ROS reads the system's clock too, but takes a dozen microseconds longer.
         self._clock = time.time_ns if simulated is None else simulated
-        self._simulated, self._largest_age = simulated is not None, largest_age
+        self._simulated, self._largest_age, self._capped = simulated is not None, largest_age, capped
         self._last = self._clock_now = self._clock_then = 0
         self._then = -float("inf")
         self.clock_set_back = 0
+
+    def for_readings(self, largest_age: float) -> StampCheck:
+        """Return a check of readings' stamps by the same clock."""
+        return StampCheck(largest_age, self._clock if self._simulated else None, capped=True)
 
     def check(self, nanoseconds: int, now: float) -> None:
         """Check a stamp at the monotonic time `now`, s.
@@ -82,11 +88,12 @@ class StampCheck:
             reason, word = ("stamp_past", "old") if age > 0.0 else ("stamp_future", "in the future")
             raise CommandError(reason, f"stamp is {abs(age):.3f} s {word}, allowed {self._largest_age:g} s")
         if nanoseconds < self._last and now - self._then < FORGET_ORDER_AFTER and not self._was_set_back(clock, now):
-            raise CommandError("stamp_order", "stamp is earlier than the last command's")
+            raise CommandError("stamp_order", "stamp is earlier than the last one's")
 
     def accept(self, nanoseconds: int, now: float) -> None:
-        """Remember the stamp that was just checked as that of the last command accepted."""
-        self._last, self._then, self._clock_then = nanoseconds, now, self._clock_now
+        """Remember the stamp that was just checked as that of the last message accepted."""
+        self._last = min(nanoseconds, self._clock_now) if self._capped else nanoseconds
+        self._then, self._clock_then = now, self._clock_now
 
     def forget(self) -> None:
         """Forget the order: the next stamp may be any."""

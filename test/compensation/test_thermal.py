@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from hexapod_comp.compensation.thermal import DEFAULT_TIME_CONSTANT, TemperatureFilter
+from hexapod_comp.compensation.thermal import DEFAULT_TIME_CONSTANT, Plausibility, TemperatureFilter, Thermometers
 from hexapod_comp.errors import ModelError
 from hexapod_comp.machine.model import Temperatures
 
@@ -163,3 +163,69 @@ def test_what_is_refused_leaves_no_trace(name: str, value: float, time: float, t
 def test_time_constants_that_are_none_are_refused(time_constant: float) -> None:
     with pytest.raises(ModelError, match="temperature_time_constant: must be finite and not negative"):
         TemperatureFilter(time_constant)
+
+
+# ---- which readings count ----
+
+
+def thermometers(rate: float = 0.2, spread: float = 40.0, timeout: float = 60.0) -> Thermometers:
+    return Thermometers(Plausibility(rate, spread, timeout), time_constant=0.0)
+
+
+@pytest.mark.parametrize(
+    ("value", "seconds", "taken"),
+    [
+        (21.9, 0.0, True),
+        (22.1, 0.0, False),
+        (22.9, 5.0, True),
+        (23.1, 5.0, False),
+        (18.1, 5.0, False),
+        (40.0, 95.0, True),
+    ],
+)
+def test_a_part_warms_no_faster_than_its_rate(value: float, seconds: float, taken: bool) -> None:
+    """From 20.9 °C: 1 K at once, and 0.2 K/s."""
+    made = thermometers()
+    made.take("base", 20.9, 100.0)
+    if taken:
+        assert made.take("base", value, 100.0 + seconds) == value
+        return
+    with pytest.raises(ModelError, match=r"temperature of base: has jumped from 20\.90 to"):
+        made.take("base", value, 100.0 + seconds)
+    assert made.take("base", 20.9, 100.0 + seconds) == 20.9, "what is refused shuts nothing out"
+
+
+def test_a_part_is_judged_by_the_median_of_the_others() -> None:
+    """23 °C is the middle of 70, 22 and 23, 46.5 °C that of 70, 22, 23 and 82."""
+    made = thermometers(rate=0.0, spread=60.0)
+    for part, value in (("base", 70.0), ("strut_1", 22.0), ("strut_2", 23.0)):
+        made.take(part, value, 0.0)
+    assert made.take("strut_3", 82.0, 1.0) == 82.0
+    with pytest.raises(ModelError, match=r"63\.5 K from the other parts' 46\.50 °C; allowed 60 K"):
+        made.take("strut_4", 110.0, 1.0)
+
+
+def test_what_is_stale_is_no_measure_for_others() -> None:
+    """Yesterday's 0 °C in the yard: after 60 s the reference of 20 °C counts again."""
+    made = thermometers(rate=0.0)
+    made.take("base", 0.0, 0.0)
+    with pytest.raises(ModelError, match=r"the other parts' 0\.00 °C"):
+        made.take("platform", 45.0, 59.0)
+    assert made.stale(59.0) == ()
+    assert made.stale(61.0) == ("base",)
+    assert made.take("platform", 45.0, 61.0) == 45.0
+
+
+def test_a_rule_of_zero_is_none() -> None:
+    made = thermometers(0.0, 0.0, 0.0)
+    for value in (-40.0, 120.0):
+        assert made.take("base", value, 0.0) == value
+    assert made.stale(1e9) == ()
+
+
+@pytest.mark.parametrize(("name", "value"), [("spindle", 20.0), ("base", math.nan), ("base", 121.0)])
+def test_what_is_no_temperature_is_refused_before_all(name: str, value: float) -> None:
+    made = thermometers(0.0, 0.0, 0.0)
+    with pytest.raises(ModelError):
+        made.take(name, value, 0.0)
+    assert made.stale(0.0) == ()

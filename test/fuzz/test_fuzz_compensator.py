@@ -145,6 +145,7 @@ class CompensatorRig(Rig):
         self.activate()
         assert self.serve("reset", Trigger.Request()).success
         self.last = None
+        self.node._feedback._jumps._at -= 10.0  # struts that were elsewhere have had the time to come back
         self.deliver("strut_states", struts(("struts", list(STRUT_NAMES), HOME_LENGTHS.tolist(), [0.0] * 6, 0.0)))
         for move in ([0.0, 0.0, 0.0], [1e-4, 0.0, 0.0]):
             self.pose(("pose", move, [], "base", 0.0))

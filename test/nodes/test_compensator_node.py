@@ -545,7 +545,7 @@ def test_first_command_after_every_activation_starts_from_the_measured_struts(be
     bench.ask(HOME)
     assert bench.change("deactivate")
     elsewhere = near(HOME, (0.0, 0.0, 0.05))
-    bench.feed(closed_form_lengths(elsewhere))
+    bench.feed(closed_form_lengths(elsewhere), later=0.3)  # 45 mm take the struts a while
     bench.barrier()
     assert bench.change("activate")
     bench.send(HOME)
@@ -735,7 +735,7 @@ def test_body_temperature_changes_all_corrections(bench, tmp_path, part, sides):
 def test_temperatures_ramp(bench, tmp_path):
     """60 K · 12e-6/K · 0.5 m = 367 µm at 5 mm/s."""
     path = model_file(tmp_path, struts={"expansion_ppm_per_K": 12.0})
-    bench.compensator(model_file=path, ramp_rate=0.005)
+    bench.compensator(model_file=path, ramp_rate=0.005, temperature_spread_limit=0.0)
     before = bench.ask(HOME)
     bench.warm("strut_1", 80.0)
     nominal = closed_form_lengths(HOME)[0]
@@ -749,7 +749,9 @@ def test_temperatures_ramp(bench, tmp_path):
 def test_readings_are_filtered(bench, tmp_path, time_constant, taken):
     """Two readings within a few seconds count alike in an hour's mean; 1 nm is 0.6 s out of that."""
     path = model_file(tmp_path, struts={"expansion_ppm_per_K": 12.0})
-    bench.compensator(model_file=path, ramp_rate=1.0, temperature_time_constant_s=time_constant)
+    bench.compensator(
+        model_file=path, ramp_rate=1.0, temperature_time_constant_s=time_constant, temperature_rate_limit=0.0
+    )
     bench.warm("strut_3", 25.0)
     bench.warm("strut_3", 27.0)
     values_of(bench, "temperature.strut_3_degC", f"{taken:.2f}")
@@ -762,6 +764,7 @@ def test_temperatures_of_an_inactive_node_act_on_activation(bench, tmp_path):
     """The first command after it finds the strut as warm as it is; one that has moved before ramps to it."""
     path = model_file(tmp_path, struts={"expansion_ppm_per_K": 12.0})
     settings = {"ramp_rate": 0.005, "max_command_age": 0.0, "temperature_time_constant_s": 0.0}
+    settings |= {"temperature_rate_limit": 0.0, "temperature_spread_limit": 0.0}
     bench.compensator(start=False, model_file=path, **settings)
     assert bench.change("configure")
     bench.until(bench.matched, "discovery")

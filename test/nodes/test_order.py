@@ -117,7 +117,7 @@ def test_a_strut_that_is_away_for_one_reading_is_said(bench):
     bench.compensator()
     answer = bench.ask(HOME)
     for off in (0.0, 3e-3, 0.0):
-        bench.feed(answer.lengths + off * (np.arange(6) == 3))
+        bench.feed(answer.lengths + off * (np.arange(6) == 3), later=10.0 * off)  # in 30 ms a strut may move 17 mm
         bench.barrier()
     bench.until_status(ERROR, "bad feedback: following_error")
     assert "strut_4" in bench.values()["last_bad_feedback"]
