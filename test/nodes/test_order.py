@@ -116,8 +116,8 @@ def test_a_strut_that_is_away_for_one_reading_is_said(bench):
     """One reading 3 mm off among good ones, between two looks of the diagnostics: the limit is 2 mm."""
     bench.compensator()
     answer = bench.ask(HOME)
-    for off in (0.0, 3e-3, 0.0):
-        bench.feed(answer.lengths + off * (np.arange(6) == 3), later=10.0 * off)  # in 30 ms a strut may move 17 mm
+    for n, off in enumerate((0.0, 3e-3, 0.0)):  # 30 ms apart: a strut may move by 17 mm
+        bench.feed(answer.lengths + off * (np.arange(6) == 3), later=0.03 * n)
         bench.barrier()
     bench.until_status(ERROR, "bad feedback: following_error")
     assert "strut_4" in bench.values()["last_bad_feedback"]
