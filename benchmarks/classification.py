@@ -25,10 +25,9 @@ import numpy as np
 from tqdm import tqdm
 
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.pose import Pose, rotation_from_angles
-from hexapod_comp.workspace.effects import Extremes, effect_vectors, extremes, merged
+from hexapod_comp.pose import rotation_from_angles
+from hexapod_comp.workspace.effects import ITERATION, Extremes, effect_vectors, extremes, merged
 from hexapod_comp.workspace.sources import BASE_JOINT, LENGTH, PLATFORM_JOINT, Budget, SingleErrors
-from hexapod_comp.workspace.tangential import tangential_effect
 
 CONFIG = Path(__file__).resolve().parents[1] / "config"
 
@@ -97,8 +96,7 @@ def by_iteration(
     geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray
 ) -> np.ndarray:
     """Return the effects by the paper's iteration, shape (N, E, 6)."""
-    poses = [Pose(*pose) for pose in zip(positions, rotations, strict=True)]
-    return np.array([[tangential_effect(geometry, errors, e, p).vector for e in range(len(errors))] for p in poses])
+    return effect_vectors(geometry, errors, positions, rotations, ITERATION)
 
 
 def by_numpy(
@@ -110,7 +108,7 @@ def by_numpy(
     result = np.empty((len(positions), len(errors), 6))
     for e in range(len(errors)):
         base, platform, lengths = geometry.base_joints.copy(), geometry.platform_joints.copy(), nominal.copy()
-        strut, vector = errors.strut[e], errors.vector[e]
+        strut, vector = errors.struts[e], errors.vector[e]
         if errors.part[e] == LENGTH:
             lengths[:, strut] += vector[0]
         elif errors.part[e] == BASE_JOINT:

@@ -168,7 +168,7 @@ def _indices(seen: np.ndarray, readings: int) -> dict[str, float]:
 
 def _weak(space: ParameterSpace, singular: np.ndarray, vectors: np.ndarray) -> list[tuple[float, str]]:
     """Return strength and main parameters of the weakest seen directions, at most five."""
-    labels = [label for block in space.blocks for label in block.labels]
+    labels = space.labels
     chosen = np.flatnonzero((singular > SEEN) & (singular < WEAK))[::-1][:5]
     weak = []
     for n in chosen:
@@ -187,7 +187,7 @@ def without_trace(space: ParameterSpace, problem: LinearProblem) -> tuple[str, .
     problem : LinearProblem
         The data's derivatives.
     """
-    index = {label: n for n, label in enumerate(label for block in space.blocks for label in block.labels)}
+    index = {label: n for n, label in enumerate(space.labels)}
     scale = space.spread(space.start_tolerances())
     names = []
     for name, parts in MACHINE_ERRORS.items():

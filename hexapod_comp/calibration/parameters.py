@@ -103,6 +103,49 @@ class FitSettings:
 
 
 @dataclass(frozen=True)
+class Region:
+    """What was measured, as far as parameters depend on it: all that is left of readings once they are fitted.
+
+    Attributes
+    ----------
+    commands : ndarray, shape (2,)
+        Lowest and highest strut command, m.
+    box : ndarray, shape (2, 3)
+        Lowest and highest commanded place of the measured point, m in ``base``: where the field is.
+    platform_box : ndarray, shape (2, 3)
+        The same of the platform's positions, m in ``base``: where the model holds.
+    work_box : ndarray, shape (2, 3)
+        The same of the measured point, m in the work frame, in which campaigns are boxes.
+    level : ndarray, shape (3, 3)
+        Attitude of the platform, in ``base``, with a level tool (:meth:`MeasurementSet.level`).
+    probe : ndarray, shape (3,)
+        The measured point in ``platform``, m.
+    """
+
+    commands: np.ndarray
+    box: np.ndarray
+    platform_box: np.ndarray
+    work_box: np.ndarray
+    level: np.ndarray
+    probe: np.ndarray
+
+    @staticmethod
+    def of(measurements: MeasurementSet) -> Region:
+        """Return where a set was measured."""
+        commands, points, work = measurements.stations.commands, measurements.points(), measurements.geometry.work
+        _check_commands(measurements.geometry, commands)
+        in_work = (points - work.position) @ work.rotation
+        return Region(
+            commands=np.array([commands.min(), commands.max()]),
+            box=np.array([points.min(axis=0), points.max(axis=0)]),
+            platform_box=measurements.platform_box(),
+            work_box=np.array([in_work.min(axis=0), in_work.max(axis=0)]),
+            level=measurements.level(),
+            probe=measurements.probe,
+        )
+
+
+@dataclass(frozen=True)
 class Block:
     """A block of parameters x = root · y; the prior of every y is N(0, tolerance²).
 
@@ -132,13 +175,15 @@ class ParameterSpace:
 
     Parameters
     ----------
-    measurements : MeasurementSet
+    measurements : MeasurementSet or (HexapodGeometry, Region)
         Tells which commands the length map, and which box the field must cover.
     settings : FitSettings
         Which blocks.
 
     Attributes
     ----------
+    region : Region
+        What was measured; its boxes, ``level`` and ``probe`` are here too.
     blocks : tuple of Block
         In the order of the vector.
     size : int
@@ -151,32 +196,20 @@ class ParameterSpace:
         Commands of the length map's knots, m.
     field : SmoothField
         The field's basis.
-    box : ndarray, shape (2, 3)
-        Lowest and highest commanded place of the measured point, m in ``base``: where the field is.
-    platform_box : ndarray, shape (2, 3)
-        The same of the platform's positions, m in ``base``: where the model holds.
-    work_box : ndarray, shape (2, 3)
-        The same of the measured point, m in the work frame, in which campaigns are boxes.
-    level : ndarray, shape (3, 3)
-        Attitude of the platform, in ``base``, with a level tool (:meth:`MeasurementSet.level`).
     """
 
-    def __init__(self, measurements: MeasurementSet, settings: FitSettings) -> None:
-        geometry = measurements.geometry
-        self.geometry, self.settings = geometry, settings
+    def __init__(self, measurements: MeasurementSet | tuple[HexapodGeometry, Region], settings: FitSettings) -> None:
+        if isinstance(measurements, MeasurementSet):
+            measurements = measurements.geometry, Region.of(measurements)
+        self.geometry, self.region = geometry, region = measurements
+        self.settings = settings
         self.home_lengths = strut_lengths(Structure.of(geometry), geometry.home)
         self.platform_groups = _groups(geometry, settings.shared_platform_joints)
         self.periods = _periods(geometry, settings.lead)
-        commands = measurements.stations.commands
-        _check_commands(geometry, commands)
-        self.knots = _knots(commands.min(), commands.max())
-        points = measurements.points()
-        self.box = np.array([points.min(axis=0), points.max(axis=0)])
-        self.platform_box, self.level = measurements.platform_box(), measurements.level()
-        in_work = (points - geometry.work.position) @ geometry.work.rotation
-        self.work_box = np.array([in_work.min(axis=0), in_work.max(axis=0)])
+        self.knots = _knots(*region.commands)
+        self.box, self.platform_box, self.work_box = region.box, region.platform_box, region.work_box
+        self.level, self.probe = region.level, region.probe
         self.field = SmoothField(self.box, settings.field_degree)
-        self.probe = measurements.probe
         self.blocks = tuple(self._make_blocks())
         self.size = self.blocks[-1].part.stop
         self._cardinal = CubicSpline(self.knots, np.eye(len(self.knots)), bc_type="natural")
@@ -227,6 +260,11 @@ class ParameterSpace:
             return np.diag(np.tile(self.field.prior, 3)), tuple(labels), "m" if which == 0 else "rad"
         labels = [f"{s} {name}" for s in STRUT_NAMES]
         return np.eye(6), tuple(labels), "m/m" if name == "pitch" else "m"
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of all parameters."""
+        return tuple(label for block in self.blocks for label in block.labels)
 
     def block(self, name: str) -> Block | None:
         """Return a block by name, None when this fit has none."""

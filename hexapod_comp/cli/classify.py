@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
     from ..machine.geometry import load_geometry
-    from ..workspace.ranking import ranking_rows
+    from ..workspace.ranking import beside, ranking_rows
     from ..workspace.reach import orientations, reaches
     from ..workspace.report import as_json, report
     from ..workspace.study import classify, shells_of
@@ -47,9 +47,10 @@ def run(args: argparse.Namespace) -> int:
             scheduler=args.scheduler,
             seed=args.seed,
             progress=bar.update,
+            shared_platform_joints=not args.separate_joints,
         )
     common.show(as_json(study) if args.json else report(study, names))
-    common.write_table(args, ranking_rows(study.rows))
+    common.write_table(args, ranking_rows(study.rows, beside(geometry, study.errors)))
     if args.pictures is not None or args.publish:
         bodies = shells_of(reached)
         common.save_pictures(args, lambda: _figures(study, bodies, names))

@@ -14,10 +14,10 @@ from .iso230 import with_units
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from numpy.typing import ArrayLike
 
     from ..calibration.evaluation import Worth
     from ..calibration.parameters import FitSettings
+    from ..calibration.posterior import FittedParameters
     from ..machine.model import MachineModel, RealMachine
     from ..measurements.readings import MeasurementSet
 
@@ -101,8 +101,8 @@ def _refuse(args: argparse.Namespace, result: _Result) -> None:
 def _write(args: argparse.Namespace, result: _Result, measured: MeasurementSet, worth: Worth | None) -> None:
     """Write the model and what else was asked for, and show it."""
     from ..calibration.lines_report import worth_json, worth_text
+    from ..calibration.posterior import save_with_posterior
     from ..formats.outputs import write_text
-    from ..machine.model_file import save_model
     from ..measurements.iso230 import evaluate, iso230_runs, table
 
     tests = {run.name: evaluate(run.targets, run.deviations) for run in iso230_runs(measured)}
@@ -112,16 +112,17 @@ def _write(args: argparse.Namespace, result: _Result, measured: MeasurementSet, 
     text = "\n".join(parts)
     if result.misfit:
         text = f"{FORCED}: {result.misfit}. {ADVICE}\n\n{text}"
-    save_model(result.saved, args.out)
+    beside = save_with_posterior(result.saved, result.fitted, args.out)
     if args.json:
         figures = {name: with_units(test.figures()) for name, test in tests.items()}
         more = {"iso230": figures, "worth": worth_json(worth) if worth else None}
-        common.show({**result.content(), **more, "misfit": result.misfit, "written": args.out})
+        files = {"written": args.out, "written_beside": beside}
+        common.show({**result.content(), **more, "misfit": result.misfit, **files})
     else:
         print(f"{text}\nmodel: {args.out}")
+        print("".join(f"its parameters' covariance, to be kept beside it: {path}\n" for path in beside), end="")
     if args.report is not None:
         write_text(args.report, text)
-    result.save_more()
     common.save_pictures(args, result.pictures)
 
 
@@ -129,7 +130,7 @@ def _refuse_options_of_the_other_scheme(args: argparse.Namespace) -> None:
     """Raise on an option that the scheme would not listen to."""
     from ..errors import CalibrationError
 
-    of_joint = ("lead_mm", "blocks", "tolerance_um", "field_degree", "expansion_ppm", "covariance")
+    of_joint = ("lead_mm", "blocks", "tolerance_um", "field_degree", "expansion_ppm")
     others = ("order", "every_line") if args.scheme == "joint" else (*of_joint, "separate_joints", "not_robust")
     for name in others:
         if getattr(args, name) not in (None, False):
@@ -138,14 +139,14 @@ def _refuse_options_of_the_other_scheme(args: argparse.Namespace) -> None:
 
 @dataclass(frozen=True)
 class _Result:
-    """What a scheme gives: the model, its report as text and for JSON, its pictures, and what else to save."""
+    """What a scheme gives: the model, its report as text and for JSON, its pictures, and what it knows how well."""
 
     model: MachineModel
     text: str
     content: Callable[[], dict[str, Any]]
     pictures: Callable[[], dict[str, Figure]]
     misfit: str
-    save_more: Callable[[], None] = lambda: None
+    fitted: FittedParameters | None = None
 
     @property
     def saved(self) -> MachineModel:
@@ -159,15 +160,11 @@ class _Result:
 def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSettings) -> _Result:
     """Fit with scheme joint."""
     from ..calibration.fit import fit_model
+    from ..calibration.posterior import FittedParameters
     from ..calibration.report import as_json, fit_report
 
     with common.stage_line() as say:
         fit = fit_model(measured, settings, say)
-
-    def save_more() -> None:
-        if args.covariance is not None:
-            labels = [label for block in fit.space.blocks for label in block.labels]
-            _save_arrays(args.covariance, labels=labels, values=fit.solution.x, covariance=fit.covariance)
 
     def pictures() -> dict[str, Figure]:
         from ..calibration.pictures import fit_figure, left_error_figure, strut_error_figure
@@ -179,7 +176,7 @@ def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSett
         return made
 
     model = fit.model if args.name is None else replace(fit.model, name=args.name)
-    return _Result(model, fit_report(fit), lambda: as_json(fit), pictures, fit.misfit, save_more)
+    return _Result(model, fit_report(fit), lambda: as_json(fit), pictures, fit.misfit, FittedParameters.of(fit))
 
 
 def _lines(args: argparse.Namespace, measured: MeasurementSet) -> _Result:
@@ -212,13 +209,3 @@ def _worth(truth: RealMachine | None, model: MachineModel, measured: Measurement
         raise CalibrationError("--truth", "the readings span no box in which the model could be judged")
     level = geometry.work.rotation.T @ measured.level() @ geometry.tool.rotation
     return worth(truth, model, box, level=level)
-
-
-def _save_arrays(path: str, **arrays: ArrayLike) -> None:
-    """Write arrays, without pickles."""
-    import numpy as np
-
-    from ..formats.outputs import new_file
-
-    with new_file(path, "wb") as stream:
-        np.savez_compressed(stream, allow_pickle=False, **arrays)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from ..formats import texts
@@ -12,23 +13,31 @@ from . import arguments, common
 if TYPE_CHECKING:
     import numpy as np
 
+    from ..calibration.prediction import PredictedError
     from ..compensation.checks import CheckResult
     from ..formats.csv import Row
     from ..machine.geometry import HexapodGeometry
-    from ..machine.model import MachineModel
+    from ..machine.model import MachineModel, RealMachine
+    from ..machine.passes import Poses
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
     from ..compensation.checks import check
     from ..formats.csv import read_pose_arrays
+    from ..machine.model import RealMachine
 
     rows, positions, rotations = _given_pose(args) or read_pose_arrays(args.poses)
     geometry, model = common.load_machine(args)
     common.mention_compiling("checks.examine_many")
     result = check(geometry, model, (positions, rotations), "poses")
     _refuse_lengthless(result, rows)
-    _show(args, geometry, model, rows, result)
+    found = None
+    if args.model != "ideal":
+        platforms = geometry.platform_poses(positions, rotations)
+        found = _Predicted.of(RealMachine(geometry, model), args.model, platforms)
+        _mention_outside(int(result.outside_box.sum()), len(rows))
+    _show(args, geometry, model, rows, result, found)
     for breach in result.breaches:
         print(f"hexapod_comp: note: {common.where(rows[breach.row])}: {breach.error}", file=sys.stderr)
     return 0
@@ -68,18 +77,87 @@ def _refuse_lengthless(result: CheckResult, rows: list[Row]) -> None:
     raise NotFiniteError(f"{common.where(rows[row])}: strut lengths are not finite")
 
 
+@dataclass(frozen=True)
+class _Predicted:
+    """What the tool would do without compensation: as the machine stands, and with the datum aligned."""
+
+    standing: PredictedError
+    aligned: PredictedError | None
+    unknown: str
+
+    @staticmethod
+    def of(machine: RealMachine, model_file: str, poses: Poses) -> _Predicted:
+        """Predict for platform poses; what the model file says of its fit is read."""
+        from ..calibration.posterior import load_posterior
+        from ..calibration.prediction import ErrorPredictor
+
+        fitted, unknown = load_posterior(machine.model, machine.geometry, model_file)
+        standing, aligned = ErrorPredictor(machine, fitted).predict(poses)
+        return _Predicted(standing, aligned, unknown)
+
+    def columns(self, row: int) -> dict[str, Any]:
+        """Return one row's errors and their standard deviations, units in the names."""
+        from ..calibration.prediction import COMPONENTS
+        from ..formats.csv import PREDICTED_ERRORS
+
+        numbers = [part for found in (self.standing, self.aligned) for part in _parts(found)]
+        columns: dict[str, Any] = {}
+        for name, values in zip(PREDICTED_ERRORS, numbers, strict=True):
+            for n, component in enumerate(COMPONENTS):
+                key = f"{name.format(component)}_{'urad' if component[0] == 'r' else 'um'}"
+                columns[key] = None if values is None else float(values[row, n]) * 1e6
+        return columns
+
+    def text(self) -> str:
+        """Return the first pose's errors as a table for people."""
+        from ..calibration.prediction import COMPONENTS
+
+        cells = ["not known" if value is None else texts.number(value, 2) for value in self.columns(0).values()]
+        rows = zip(*(cells[start : start + 6] for start in range(0, 24, 6)), strict=True)
+        body = [[c, *row, "µrad" if c[0] == "r" else "µm"] for c, row in zip(COMPONENTS, rows, strict=True)]
+        header = ["in work", "as it stands", "±", "datum aligned", "±", ""]
+        title = (
+            "predicted error of the tool without compensation, actual − commanded, along and about the axes of work;\n"
+        )
+        title += "direction of motion not known: midway; ± is one standard deviation"
+        title += f", not known: {self.unknown}" if self.unknown else " of the fit"
+        return f"{title}\n{texts.aligned(header, body)}\n"
+
+
+def _parts(found: PredictedError | None) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Return values and standard deviations, None for what is not known."""
+    return (None, None) if found is None else (found.values, found.deviations)
+
+
+def _mention_outside(outside: int, count: int) -> None:
+    """Say on stderr that predictions go beyond what was measured."""
+    if outside:
+        poses = "the pose lies" if count == 1 else f"{outside} of {count} poses lie"
+        text = f"{poses} outside the box for which the model was measured; the predicted error there is extrapolated"
+        print(f"hexapod_comp: note: {text}", file=sys.stderr)
+
+
 def _show(
-    args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel, rows: list[Row], result: CheckResult
+    args: argparse.Namespace,
+    geometry: HexapodGeometry,
+    model: MachineModel,
+    rows: list[Row],
+    result: CheckResult,
+    found: _Predicted | None,
 ) -> None:
     """Write the CSV file; print JSON or, where no file was written, CSV or a table of one pose."""
-    with_model = args.model != "ideal"
-    table = [_columns(row, lengths, with_model) for row, lengths in zip(rows, result.lengths, strict=True)]
+    table = [_columns(row, lengths, found is not None) for row, lengths in zip(rows, result.lengths, strict=True)]
+    if found is not None:
+        table = [{**columns, **found.columns(n)} for n, columns in enumerate(table)]
     common.write_table(args, table)
     if args.json:
-        common.show({"machine": geometry.name, "model": model.name, "rows": table})
+        content: dict[str, Any] = {"machine": geometry.name, "model": model.name}
+        if found is not None:
+            content |= {"error_frame": "work", "error_sd_not_known": found.unknown or None}
+        common.show({**content, "rows": table})
     elif args.out is None:
         one = args.poses is None
-        common.show(_one_pose(geometry, model, result.lengths[0], with_model) if one else common.csv_text(table))
+        common.show(_one_pose(geometry, model, result.lengths[0], found) if one else common.csv_text(table))
 
 
 def _columns(row: Row, lengths: np.ndarray, with_model: bool) -> dict[str, Any]:
@@ -97,13 +175,13 @@ def _columns(row: Row, lengths: np.ndarray, with_model: bool) -> dict[str, Any]:
     return columns
 
 
-def _one_pose(geometry: HexapodGeometry, model: MachineModel, lengths: np.ndarray, with_model: bool) -> str:
-    """Return one pose's lengths as a table for people."""
+def _one_pose(geometry: HexapodGeometry, model: MachineModel, lengths: np.ndarray, found: _Predicted | None) -> str:
+    """Return one pose's lengths, and with a model the error that they take out, as tables for people."""
     from ..machine.geometry import STRUT_NAMES
 
     nominal, command = lengths
     header, columns = ["strut", "nominal_mm"], [nominal * 1e3]
-    if with_model:
+    if found is not None:
         header += ["command_mm", "correction_um"]
         columns += [command * 1e3, (command - nominal) * 1e6]
     digits = [6, 6, 3]
@@ -111,5 +189,5 @@ def _one_pose(geometry: HexapodGeometry, model: MachineModel, lengths: np.ndarra
         [name, *(texts.number(float(c[i]), d) for c, d in zip(columns, digits, strict=False))]
         for i, name in enumerate(STRUT_NAMES)
     ]
-    title = f"machine {geometry.name}" + (f", model {model.name}" if with_model else "")
-    return f"{title}\n{texts.aligned(header, body)}\n"
+    title = f"machine {geometry.name}" + (f", model {model.name}" if found is not None else "")
+    return f"{title}\n{texts.aligned(header, body)}\n" + (f"\n{found.text()}" if found is not None else "")

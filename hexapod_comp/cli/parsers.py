@@ -214,7 +214,8 @@ def _fit(parser: argparse.ArgumentParser) -> None:
     add("--out", metavar="MODEL", required=True, help="write the model to a YAML file")
     add("--name", metavar="TEXT", help="name of the model")
     add("--report", metavar="FILE", help="write the report to a file too")
-    add("--covariance", metavar="FILE.npz", help="write the parameters' covariance (scheme joint)")
+    now = "always written, beside the model, as MODEL.posterior.npz"
+    add("--covariance", action=_Renamed, const=now, metavar="FILE.npz", help=argparse.SUPPRESS)
     _pictures(add)
     _json(add)
     add("--truth", metavar="FILE", help="model of the virtual machine that was measured")
@@ -237,6 +238,11 @@ def _readings(add: Add) -> None:
     add("--probe-mm", type=arguments.point, metavar="X,Y,Z", help=text)
 
 
+def _separate_joints(add: Add) -> None:
+    text = "platform joints at the same place are two joints, not one"
+    add("--separate-joints", action="store_true", help=text)
+
+
 def _estimation(parser: argparse.ArgumentParser) -> None:
     """Add what a fit of scheme joint, or a plan for one, can be given."""
     add = parser.add_argument_group("scheme joint").add_argument
@@ -244,8 +250,7 @@ def _estimation(parser: argparse.ArgumentParser) -> None:
     add("--lead-mm", type=arguments.bound, metavar="MM", help=text)
     text = "what may be fitted: pitch, wave, backlash, map, field (default all)"
     add("--blocks", metavar="A,B,…", help=text)
-    text = "platform joints at the same place are two joints, not one"
-    add("--separate-joints", action="store_true", help=text)
+    _separate_joints(add)
     text = "how well joints are built, to start from, µm (default 100)"
     add("--tolerance-um", type=arguments.bound, metavar="UM", help=text)
     add("--field-degree", type=arguments.count, metavar="N", help="degree of the field (default 6)")
@@ -319,13 +324,15 @@ def _classify(parser: argparse.ArgumentParser) -> None:
     _table_out(add, "the ranking")
     _pictures(add)
     _json(add)
+    _separate_joints(add)
     text = "cells along the grid's longest edge (default 30)"
     add("--cells", type=arguments.count, default=30, metavar="N", help=text)
     text = "smallest distance between the axes of two struts, mm; 0: not limited (default: the geometry's)"
     add("--clearance-mm", type=arguments.bound, metavar="MM", help=text)
     text = "tilts about x and y (default -4,0,4)"
     add("--tilt-deg", type=arguments.tilts, default=arguments.tilts("-4,0,4"), metavar="A,B,…", help=text)
-    add("--method", choices=("exact", "linear"), default="exact", help="of the ranking (default exact)")
+    text = "of the ranking: exact (default), linear, or iteration, which is v. Daake et al.'s own"
+    add("--method", choices=("exact", "linear", "iteration"), default="exact", help=text)
     text = "compare exact, linear and the iteration of v. Daake et al. at N poses"
     add("--compare", type=arguments.count, metavar="N", help=text)
     text = "allowed error of the tool: says what the errors may be"

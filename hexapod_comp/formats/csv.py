@@ -30,6 +30,8 @@ QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
 LENGTH_COLUMNS = tuple(f"L{i}" for i in range(1, 7))
 NOMINAL_COLUMNS = tuple(f"nominal_L{i}" for i in range(1, 7))
 CORRECTION_COLUMNS = tuple(f"correction_L{i}" for i in range(1, 7))
+PREDICTED_ERRORS = tuple(f"{error}_{{}}{known}" for error in ("error", "error_aligned") for known in ("", "_sd"))
+"""What ``ik --model`` says of the tool's error, each for x, y, z and rx, ry, rz."""
 
 MAX_ROWS = 2_000_000
 """Longer files are refused: an hour's path at 500 Hz fits, a device that never ends does not."""
@@ -349,7 +351,7 @@ def _rotations_from_quaternions(path: str | Path, rows: list[Row], quaternions: 
 def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
     """Read strut lengths from a CSV file (or ``-``) with the columns ``L1_mm`` … ``L6_mm`` (or ``_m``, …).
 
-    The columns ``nominal_L…`` and ``correction_L…`` that ``ik --model`` adds are known and passed over.
+    The columns ``nominal_L…``, ``correction_L…`` and ``error_…`` that ``ik --model`` adds are known and passed over.
 
     Returns
     -------
@@ -365,8 +367,12 @@ def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
     """
     table = Table(input_file(path))
     lengths = table.numbers(table.required(LENGTH_COLUMNS, "length"))
-    for group in (NOMINAL_COLUMNS, CORRECTION_COLUMNS):
+    shifts, turns = (
+        tuple(n.format(axis) for n in PREDICTED_ERRORS for axis in axes) for axes in ("xyz", ("rx", "ry", "rz"))
+    )
+    for group in (NOMINAL_COLUMNS, CORRECTION_COLUMNS, shifts):
         table.columns(group, "length")
+    table.columns(turns, "angle")
     table.refuse_unknown()
     return table.labels(), lengths
 

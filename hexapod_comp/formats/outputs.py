@@ -17,7 +17,7 @@ from ..errors import InputFileError
 READ = ("bag", "budget", "campaign", "columns", "files", "lengths_file", "machine", "model", "poses", "truth")
 """Arguments of all verbs that name what is read: files, shipped files, or a bag's folder."""
 
-WRITTEN = ("covariance", "out", "report", "table")
+WRITTEN = ("out", "report", "table")
 """Arguments that name files to write."""
 
 FOLDERS = ("folder", "linuxcnc", "pictures")

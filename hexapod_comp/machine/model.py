@@ -48,12 +48,16 @@ class ModelOrigin:
         RMS tool error that the model left on data it was not fitted to, m; None when nobody measured it.
     note : str
         One line for people.
+    posterior : (str, str) or None
+        Name, beside the model file, and SHA-256 of the file that says how well the fit knows its parameters; None
+        when nobody says.
     """
 
     date: str = ""
     sources: tuple[tuple[str, str], ...] = ()
     held_out_residual: float | None = None
     note: str = ""
+    posterior: tuple[str, str] | None = None
 
 
 @dataclass(frozen=True)
@@ -160,9 +164,13 @@ class Temperatures:
             raise ModelError(f"temperature of {name}", f"must lie within {low:g}…{high:g} °C", value)
         self.values[name] = float(value)
 
+    def at(self, name: str) -> float:
+        """Return a temperature, °C."""
+        return self.values.get(name, REFERENCE_TEMPERATURE)
+
     def above_reference(self, name: str) -> float:
         """Return the difference to 20 °C, K."""
-        return self.values.get(name, REFERENCE_TEMPERATURE) - REFERENCE_TEMPERATURE
+        return self.at(name) - REFERENCE_TEMPERATURE
 
 
 class RealMachine:
@@ -340,6 +348,17 @@ class MachinesByTemperature:
         return [self.at(values) for values in temperatures]
 
 
+def platform_box(model: MachineModel, level: np.ndarray) -> np.ndarray | None:
+    """Return the box of platform positions in ``base`` for which a model was measured, shape (2, 3), m, or None.
+
+    It is the model's valid box, or where its field's box of measured points lets the platform be at the attitude
+    `level`, shape (3, 3).
+    """
+    if model.valid_box is None and any(family.shape[4] for family in model.field.lines):
+        return model.field.box - level @ model.field.probe
+    return model.valid_box
+
+
 def commanded_box(geometry: HexapodGeometry, model: MachineModel) -> np.ndarray:
     """Return the box of level tool positions in ``work`` for which a model was measured, shape (2, 3), m.
 
@@ -353,9 +372,7 @@ def commanded_box(geometry: HexapodGeometry, model: MachineModel) -> np.ndarray:
         The model has neither.
     """
     level = geometry.work.rotation @ geometry.tool.rotation.T  # of the platform, when the tool is level
-    box = model.valid_box
-    if box is None and any(family.shape[4] for family in model.field.lines):
-        box = model.field.box - level @ model.field.probe
+    box = platform_box(model, level)
     if box is None:
         raise ModelError("valid_box", "the model has neither a valid box nor a field; give a box of tool positions")
     centre, half = geometry.tool_pose(Pose(box.mean(axis=0), level)).position, 0.5 * np.ptp(box, axis=0)

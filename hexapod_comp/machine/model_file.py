@@ -16,6 +16,9 @@ all six or a list of six. Everything marked optional may be left out and is then
     valid_box_mm: [[-200, -200, 350], [200, 200, 550]]  # optional: lowest, highest platform position, base
     held_out_residual_um: 4.2         # optional: RMS tool error left on data not used for the fit
     note: one line for people         # optional
+    posterior:                        # optional: how well the fit knows its parameters, in a file beside this one
+      file: crash.posterior.npz
+      sha256: 64 lower-case hexadecimal digits
     reversal_threshold_um: 0.2        # optional (0.2): way back until a strut's direction counts as reversed
 
     structure:                        # optional: real − nominal joint position
@@ -212,6 +215,8 @@ def model_text(model: MachineModel) -> str:
         content["held_out_residual_um"] = written(model.origin.held_out_residual, "length", "um")
     if model.origin.note:
         content["note"] = model.origin.note
+    if model.origin.posterior is not None:
+        content["posterior"] = dict(zip(("file", "sha256"), model.origin.posterior, strict=True))
     content["reversal_threshold_um"] = written(model.reversal_threshold, "length", "um")
     blocks = {
         "structure": structure_block(model),
@@ -251,7 +256,12 @@ def _read_origin(top: Section) -> ModelOrigin:
         sources.append((entry.text("file"), entry.take("sha256")))
         entry.finish()
     note = top.text("note") if "note" in top else ""
-    origin = ModelOrigin(given, tuple(sources), residual, note)
+    posterior = None
+    if "posterior" in top:
+        section = top.section("posterior")
+        posterior = section.text("file"), section.take("sha256")
+        section.finish()
+    origin = ModelOrigin(given, tuple(sources), residual, note, posterior)
     _check_origin(origin)
     return origin
 
@@ -264,13 +274,21 @@ def _check_origin(origin: ModelOrigin) -> None:
         datetime.fromisoformat(origin.date.replace("Z", "+00:00"))
     except (TypeError, ValueError) as error:
         raise ModelError("date", "must be ISO 8601, like 2026-01-31", origin.date) from error
-    for index, (name, digest) in enumerate(origin.sources):
-        if not (isinstance(digest, str) and SHA_256.fullmatch(digest)):
-            problem = f"must be the 64 lower-case hexadecimal digits of the SHA-256 of {name!r}"
-            raise ModelError(f"sources[{index}].sha256", problem, digest)
+    for index, source in enumerate(origin.sources):
+        _check_hash(f"sources[{index}]", *source)
+    if origin.posterior is not None:
+        _check_hash("posterior", *origin.posterior)
+        if Path(origin.posterior[0]).name != origin.posterior[0]:
+            raise ModelError("posterior.file", "must be a file's name, without a folder", origin.posterior[0])
     residual = origin.held_out_residual
     if residual is not None and not (math.isfinite(residual) and residual >= 0.0):
         raise ModelError("held_out_residual", "must be finite and not negative, m", residual)
+
+
+def _check_hash(key: str, name: str, digest: object) -> None:
+    if not (isinstance(digest, str) and SHA_256.fullmatch(digest)):
+        problem = f"must be the 64 lower-case hexadecimal digits of the SHA-256 of {name!r}"
+        raise ModelError(f"{key}.sha256", problem, digest)
 
 
 def _read_scalars(top: Section) -> dict[str, Any]:

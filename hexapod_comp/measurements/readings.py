@@ -14,7 +14,7 @@ direction, under the same temperatures share a *station*.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -176,6 +176,10 @@ class Stations:
 
     def __len__(self) -> int:
         return len(self.positions)
+
+    def select(self, chosen: np.ndarray) -> Stations:
+        """Return those in a mask or at indices."""
+        return Stations(**{entry.name: getattr(self, entry.name)[chosen] for entry in fields(self)})
 
     def pose(self, index: int) -> Pose:
         """Return a commanded ``pose_platform_in_base``."""

@@ -115,7 +115,7 @@ def _scaling(computed: dict[str, RankingRow]) -> tuple[Statement, ...]:
 def shells(geometry: HexapodGeometry) -> Exhibit:
     """Return Figure 2: shells of the workspace, coloured by what one screw's pitch error does to the tool."""
     errors = load_budget(BUDGET).single_errors(geometry)
-    first = errors.select((errors.kind == errors.kinds.index("screw pitch")) & (errors.strut == 0))
+    first = errors.select((errors.kind == errors.kinds.index("screw pitch")) & errors.struts[:, 0])
     body = shell(reach(geometry), RINGS, SECTORS)
     layers = []
     for share in LAYERS:

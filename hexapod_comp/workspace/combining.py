@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 from scipy.stats import binom
 
 from ..errors import CalibrationError, ModelError
-from .sources import TOOL, SingleErrors
+from .sources import SingleErrors
 
 DISPLACEMENT, ROTATION = 0, 1
 """Columns of every result."""
@@ -37,9 +37,9 @@ LARGEST_FACTOR = 1e9
 def worst_case(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
     """Return the largest effect that errors within their bounds can have together, shape (N, 2).
 
-    max |Σ u_e·v_e| over all u in ±1: not bounded, but found. The maximum of a convex function over a box lies in
-    a corner, and all errors of one strut push the tool to and fro in one direction, so that the corners of six
-    struts and the tool's axes are all that there are: at most 256 sums.
+    max |Σ u_e·v_e| over all u in ±1: not bounded, but found. All errors of one strut push the tool to and fro in one
+    direction and count as one; those of a joint that several struts share, and of the tool, have directions of
+    their own. The sums fill a body in space whose corner farthest out is sought (:func:`_farthest`).
 
     Parameters
     ----------
@@ -226,6 +226,12 @@ class Allocation:
     alone : ndarray, shape (K,)
         Largest factor of each type when all others stay: ∞ where it has no effect, NaN where the others alone are
         too much.
+    only, without : ndarray, shape (K,)
+        What each type adds up to when there is no other, and what all others add up to without it, m or rad, each
+        at its own worst pose.
+    equal : ndarray, shape (K,)
+        Factors with which every type uses up the same part of what is allowed, and all together no more than that;
+        ∞ where a type has no effect.
     """
 
     method: str
@@ -234,6 +240,9 @@ class Allocation:
     pose: int
     scale: float
     alone: np.ndarray
+    only: np.ndarray
+    without: np.ndarray
+    equal: np.ndarray
 
 
 def allocate(
@@ -277,7 +286,11 @@ def allocate(
     pose = int(np.argmax(now))
     alone = np.array([_alone(combined, types, k, allowed) for k in range(types)])
     scale = allowed / float(now[pose]) if now[pose] > 0.0 else np.inf
-    return Allocation(method, allowed, float(now[pose]), pose, scale, alone)
+    only, without = (np.array([combined(row).max() for row in rows]) for rows in (np.eye(types), 1.0 - np.eye(types)))
+    acting = only > 0.0
+    part = allowed / (np.sqrt(acting.sum()) if method == RSS else acting.sum())
+    equal = np.where(acting, part / np.where(acting, only, 1.0), np.inf)
+    return Allocation(method, allowed, float(now[pose]), pose, scale, alone, only, without, equal)
 
 
 def _check_allocation(vectors: np.ndarray, allowed: float, method: str) -> None:
@@ -318,11 +331,12 @@ def _squares(errors: SingleErrors, vectors: np.ndarray, quantity: int) -> np.nda
 def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
     """Return what the errors of one direction do together, type by type, shape (N, G, 6, K).
 
-    The errors of a strut all have one direction at a pose; those of the tool have one each.
+    The errors of a strut all have one direction at a pose; those of the tool, and of a joint of several struts, have
+    one each.
     """
-    tools = np.flatnonzero(errors.part == TOOL)
-    members = [np.flatnonzero((errors.strut == strut) & (errors.part != TOOL)) for strut in range(6)]
-    members = [chosen for chosen in members if len(chosen)] + [tools[[n]] for n in range(len(tools))]
+    count = errors.struts.sum(axis=1)
+    members = [np.flatnonzero(errors.struts[:, strut] & (count == 1)) for strut in range(6)]
+    members = [chosen for chosen in members if len(chosen)] + [np.array([n]) for n in np.flatnonzero(count != 1)]
     result = np.zeros((len(vectors), len(members), 6, len(errors.kinds)))
     for group, chosen in enumerate(members):
         one = vectors[:, chosen]
@@ -336,15 +350,32 @@ def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
 
 def _worst(groups: np.ndarray) -> np.ndarray:
     """Return the largest |Σ ± w| over all signs, (N, G, 6) → (N, 2)."""
-    count = groups.shape[1]
-    signs = 1.0 - 2.0 * ((np.arange(2 ** max(count - 1, 0))[:, None] >> np.arange(count)) & 1)
-    result = np.empty((len(groups), 2))
-    result[:, ROTATION] = _turns(groups)
-    for start in range(0, len(groups), CHUNK):
-        rows = slice(start, start + CHUNK)
-        sums = signs @ groups[rows, :, :3]
-        result[rows, DISPLACEMENT] = np.sqrt((sums**2).sum(axis=2).max(axis=1))
-    return result
+    parts = [groups[start : start + CHUNK] for start in range(0, len(groups), CHUNK)]
+    farthest = np.concatenate([_farthest(part[..., :3]) for part in parts])
+    return np.stack([farthest, _turns(groups)], axis=1)
+
+
+def _farthest(ways: np.ndarray) -> np.ndarray:
+    """Return the largest |Σ ± w| of vectors in space over all signs, (N, G, 3) → (N,).
+
+    The sums' convex hull is a zonotope. Each corner lies on a face that two vectors span, and all others have there
+    the sign that leads outwards: G²·2 sums instead of 2^G. Vectors in one plane would leave that sign open: a
+    billionth of their length, each its own way, decides.
+    """
+    count = ways.shape[1]
+    if count < 2:
+        return np.linalg.norm(ways.sum(axis=1), axis=1)
+    one, other = np.triu_indices(count, 1)
+    aside = np.sin(np.arange(1.0, 3 * count + 1.0)).reshape(count, 3)
+    split = ways + 1e-9 * np.linalg.norm(ways, axis=2).max(axis=1)[:, None, None] * aside
+    normals = np.cross(split[:, one], split[:, other])
+    signs = np.where(normals @ split.swapaxes(1, 2) < 0.0, -1.0, 1.0)  # (N, faces, G)
+    pairs = np.arange(len(one))
+    signs[:, pairs, one] = signs[:, pairs, other] = 0.0
+    rest = signs @ ways
+    corners = [rest + ways[:, one] + turn * ways[:, other] for turn in (1.0, -1.0)]
+    corners += [rest - ways[:, one] + turn * ways[:, other] for turn in (1.0, -1.0)]
+    return np.sqrt(np.max([(corner**2).sum(axis=2).max(axis=1) for corner in corners], axis=0))
 
 
 def _turns(vectors: np.ndarray) -> np.ndarray:

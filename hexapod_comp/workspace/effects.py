@@ -17,9 +17,10 @@ from ..kernels import kinematics as kernels
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import ForwardBatch, Structure, jacobian_batch, over_chunks, solve_poses, strut_lengths
 from .sources import BASE_JOINT, LENGTH, TOOL, SingleErrors
+from .tangential import tangential_effects
 
-EXACT, LINEAR = "exact", "linear"
-METHODS = (EXACT, LINEAR)
+EXACT, LINEAR, ITERATION = "exact", "linear", "iteration"
+METHODS = (EXACT, LINEAR, ITERATION)
 
 BLOCK = 4096
 """Poses handled together: long beside what an error costs once, small enough for a processor's own memory."""
@@ -77,7 +78,7 @@ def effect_vectors(
         Nominal ``pose_platform_in_base``, m.
     method : str
         ``exact``: forward kinematics of the machine with the error, loops closed to rounding. ``linear``: by the
-        nominal machine's Jacobian.
+        nominal machine's Jacobian. ``iteration``: by v. Daake et al.'s own, in small steps along tangents.
     threads : int, optional
         Threads to use; all cores by default.
 
@@ -251,15 +252,15 @@ def _exact(
     home = strut_lengths(structure, geometry.home)
     lengths, start = _nominal(structure, positions, rotations)
     before, axes = (start.positions, start.rotations), np.array(geometry.work.rotation)
-    for part, i, vector in zip(errors.part, errors.strut, errors.vector, strict=True):
+    for part, struts, vector in zip(errors.part, errors.struts, errors.vector, strict=True):
         if part == TOOL:
             yield _tool_shift(geometry, rotations, start.ok, vector)
             continue
         commanded, base, platform = lengths.copy(), np.zeros((6, 3)), np.zeros((6, 3))
         if part == LENGTH:
-            commanded[:, i] += _stretch(vector, lengths[:, i], home[i])
+            commanded[:, struts] += _stretch(vector, lengths[:, struts], home[struts])
         else:
-            (base if part == BASE_JOINT else platform)[i] = vector
+            (base if part == BASE_JOINT else platform)[struts] = vector
         after = solve_poses(structure.moved(base, platform), commanded, before, threads=1)
         motions = np.empty((6, len(lengths)))
         kernels.motions_many(*before, after.positions, after.rotations, geometry.tool.position, axes, motions)
@@ -276,15 +277,29 @@ def _linear(
     rows = jacobian_batch(structure, start.positions, start.rotations)
     in_platform = np.einsum("nij,nki->nkj", start.rotations, rows[..., :3])
     per_length = _per_length(geometry, rows, start)
-    for part, i, vector in zip(errors.part, errors.strut, errors.vector, strict=True):
+    for part, struts, vector in zip(errors.part, errors.struts, errors.vector, strict=True):
         if part == TOOL:
             yield _tool_shift(geometry, rotations, start.ok, vector)
-        elif part == LENGTH:
-            yield per_length[i] * _stretch(vector, lengths[:, i], home[i])
+            continue
+        if part == LENGTH:
+            change = _stretch(vector, lengths[:, struts], home[struts])
         elif part == BASE_JOINT:
-            yield per_length[i] * np.einsum("nj,j->n", rows[:, i, :3], vector)
+            change = rows[:, struts, :3] @ vector
         else:
-            yield per_length[i] * -np.einsum("nj,j->n", in_platform[:, i], vector)
+            change = -in_platform[:, struts] @ vector
+        yield np.einsum("skn,ns->kn", per_length[struts], change)
+
+
+def _iterated(
+    geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray
+) -> Iterator[np.ndarray]:
+    """Yield the effects of one error after the other by v. Daake et al.'s iteration, shape (6, N)."""
+    certified = _nominal(Structure.of(geometry), positions, rotations)[1].ok
+    for error in range(len(errors)):
+        vectors = np.full((6, len(positions)), np.nan)
+        walked = tangential_effects(geometry, errors, error, positions[certified], rotations[certified])
+        vectors[:, certified] = walked.vectors.T
+        yield vectors
 
 
 def _way(method: str) -> Callable[..., Iterator[np.ndarray]]:
@@ -297,7 +312,7 @@ def _way(method: str) -> Callable[..., Iterator[np.ndarray]]:
     """
     if method not in METHODS:
         raise KinematicsError(f"method must be one of {', '.join(METHODS)}, not {method!r}", method)
-    return _exact if method == EXACT else _linear
+    return {EXACT: _exact, LINEAR: _linear, ITERATION: _iterated}[method]
 
 
 def _nominal(structure: Structure, positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, ForwardBatch]:
@@ -307,8 +322,8 @@ def _nominal(structure: Structure, positions: np.ndarray, rotations: np.ndarray)
     return lengths, solve_poses(structure, lengths, (positions, rotations), threads=1)
 
 
-def _stretch(coefficients: np.ndarray, lengths: np.ndarray, home: float) -> np.ndarray:
-    """Return a strut's length error at its lengths, shape (N,), m: a + b·(L − L_home) + c·L."""
+def _stretch(coefficients: np.ndarray, lengths: np.ndarray, home: np.ndarray) -> np.ndarray:
+    """Return struts' length errors at their lengths, shape (N, struts), m: a + b·(L − L_home) + c·L."""
     a, b, c = coefficients
     return a + b * (lengths - home) + c * lengths
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,12 +10,17 @@ import numpy as np
 
 from ..errors import KinematicsError
 from ..formats.texts import aligned, number
-from ..machine.geometry import HexapodGeometry
+from ..machine.geometry import HexapodGeometry, first_of_same
+from ..machine.kinematics import Structure, strut_lengths
 from ..pose import angles_from_rotation
 from .effects import Extremes
+from .sources import SingleErrors
 
 MICRO = 1e6
 MILLIDEGREE = np.pi / 180e3
+
+LONGEST_OF_UNIT = 0.4
+"""A machine with longer struts at home, m, is no positioning unit of the kind that v. Daake et al. classify."""
 
 JOINED = {
     "base-/platform joint (x/y)": ("base joint x/y", "platform joint x/y"),
@@ -131,13 +136,13 @@ def ranked(
     KinematicsError
         A type has no effect that could be had at any pose.
     """
-    rows = [_row(extremes, geometry, title, kinds) for title, kinds in _groups(extremes, joined)]
+    rows = [_row(extremes, geometry, title, kinds) for title, kinds in _groups(extremes.errors, joined)]
     return sorted(rows, key=lambda row: -row.translation_max.value)
 
 
-def _groups(extremes: Extremes, joined: dict[str, tuple[str, ...]] | None) -> list[tuple[str, list[int]]]:
+def _groups(errors: SingleErrors, joined: dict[str, tuple[str, ...]] | None) -> list[tuple[str, list[int]]]:
     """Return title and type numbers of each row."""
-    titles = extremes.errors.kinds
+    titles = errors.kinds
     rest, groups = list(range(len(titles))), []
     for title, members in (JOINED if joined is None else joined).items():
         kinds = [k for k in rest if titles[k] in members]
@@ -175,18 +180,34 @@ def paper_row(title: str) -> PaperRow | None:
     return next((row for row in PAPER_TABLE if row.title == wanted), None)
 
 
-def ranking_text(rows: Sequence[RankingRow], with_paper: bool = True) -> str:
-    """Return the ranking as tables: Table 1's figures, with the paper's in brackets, and where each happens."""
+def beside(geometry: HexapodGeometry, errors: SingleErrors) -> dict[str, PaperRow]:
+    """Return the rows of v. Daake et al., Table 1, that say something about a machine, by the rows' own titles here.
+
+    Theirs is a positioning unit whose legs each have joints of their own. Its figures are laid beside those of such
+    a unit, type by type, where the errors are as large as theirs; beside another machine they would mislead.
+    """
+    longest = strut_lengths(Structure.of(geometry), geometry.home).max()
+    if longest > LONGEST_OF_UNIT or (first_of_same(geometry.platform_joints) != np.arange(6)).any():
+        return {}
+    rows = {}
+    for title, kinds in _groups(errors, None):
+        row, members = paper_row(title), np.isin(errors.kind, kinds)
+        sizes = np.linalg.norm(errors.vector[members], axis=1)
+        if row is not None and np.allclose(sizes, row.size, rtol=1e-9, atol=0.0):
+            rows[title] = row
+    return rows
+
+
+def ranking_text(rows: Sequence[RankingRow], printed: Mapping[str, PaperRow] | None = None) -> str:
+    """Return the ranking as tables: Table 1's figures, those of `printed` in brackets, and where each happens."""
     head = ["error type", "transl. max µm", "transl. min µm", "rot. max m°", "rot. min m°"]
-    lines = []
-    for row in rows:
-        printed = paper_row(row.title) if with_paper else None
-        lines.append([row.title, *(_cell(row, printed, column) for column in range(4))])
+    printed = printed or {}
+    lines = [[row.title, *(_cell(row, printed.get(row.title), column) for column in range(4))] for row in rows]
     parts = [aligned(head, lines)]
-    if with_paper:
+    if printed:
         source = "v. Daake et al., Table 1, of a machine whose geometry is not printed, so not to be met"
         parts.append(f"In brackets: {source}.")
-    parts.append(aligned(["error type", "figure", "by", "tool x, y, z mm", "α, β, γ °"], _places(rows)))
+    parts.append(aligned(["error type", "figure", "by", "tool in work: x, y, z mm", "α, β, γ °"], _places(rows)))
     failed = sum(row.failed for row in rows)
     if failed:
         parts.append(f"{failed} effects have no certified solution and were left out.")
@@ -215,17 +236,17 @@ def _places(rows: Sequence[RankingRow]) -> list[list[str]]:
     return lines
 
 
-def ranking_rows(rows: Sequence[RankingRow]) -> list[dict[str, Any]]:
-    """Return the ranking for CSV or JSON: a record per row, units in the keys; the paper's figures beside, or None."""
+def ranking_rows(rows: Sequence[RankingRow], printed: Mapping[str, PaperRow] | None = None) -> list[dict[str, Any]]:
+    """Return the ranking for CSV or JSON: a record per row, units in the keys; figures of `printed` beside, or None."""
     records = []
     for rank, row in enumerate(rows, start=1):
-        printed = paper_row(row.title)
-        record: dict[str, Any] = {"rank": rank, "error_type": row.title}
+        paper = (printed or {}).get(row.title)
+        record: dict[str, Any] = {"rank": rank, "error_type": row.title, "frame": "work"}
         for column, name in enumerate(QUANTITIES):
             extreme = getattr(row, name)
             factor, unit = (MICRO, "um") if column < 2 else (1.0 / MILLIDEGREE, "mdeg")
             record[f"{name}_{unit}"] = extreme.value * factor
-            record[f"{name}_paper_{unit}"] = None if printed is None else float(printed.figures[column] * factor)
+            record[f"{name}_paper_{unit}"] = None if paper is None else float(paper.figures[column] * factor)
             record[f"{name}_error"] = extreme.error
             for axis, value in zip("xyz", extreme.position, strict=True):
                 record[f"{name}_{axis}_mm"] = float(value * 1e3)

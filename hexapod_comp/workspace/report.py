@@ -9,13 +9,18 @@ import numpy as np
 
 from ..formats.texts import aligned, number
 from .combining import Allocation
-from .ranking import ranking_rows, ranking_text
+from .ranking import beside, ranking_rows, ranking_text
+from .sources import BY_NAME
 from .study import Study
+
+EACH = ("alone", "only", "without", "equal")
+"""What an allocation says of each type."""
 
 
 def report(study: Study, names: Sequence[str]) -> str:
     """Return the report of a study; `names` are those of its orientations."""
-    parts = [_headline(study), _reach_table(study, names), ranking_text(study.rows), _combined_text(study)]
+    ranking = ranking_text(study.rows, beside(study.geometry, study.errors))
+    parts = [_headline(study), _reach_table(study, names), ranking, _combined_text(study)]
     parts += [_allocation_text(study, allocation) for allocation in study.allocations]
     if study.agreement is not None:
         parts.append(_agreement_text(study))
@@ -64,13 +69,23 @@ def _allocation_text(study: Study, allocation: Allocation) -> str:
     how = {"rss": "root sum of squares", "worst_case": "worst case"}[allocation.method]
     head = (
         f"allowed {allocation.allowed * 1e6:g} µm, {how}: the budget adds up to {allocation.combined * 1e6:.2f} µm; "
-        f"all errors may be {allocation.scale:.3g} times as large"
+        f"all errors may be {allocation.scale:.3g} times as large.\nWhat each type adds up to alone, and the others "
+        "without it; and what its size may be, when the others stay or when all use up equal parts:"
     )
+    header = ("type", "now ±", "alone µm", "the others µm", "may be, the others as now", "may be, equal parts", "")
     rows = []
-    for title, factor in zip(study.errors.kinds, allocation.alone, strict=True):
-        text = "the others alone are too much" if np.isnan(factor) else f"{factor:.3g} times as large"
-        rows.append((title, text))
-    return head + "\n" + aligned(("type, when the others stay", "may be"), rows)
+    for n, (name, size) in enumerate(study.budget.sizes.items()):
+        unit, factor = {"length": ("µm", 1e6), "ratio": ("ppm", 1e6)}[BY_NAME[name].dimension]
+        now = size * factor
+        sums = (number(value * 1e6, 2) for value in (allocation.only[n], allocation.without[n]))
+        left = _may_be(now, allocation.alone[n], "nothing is left")
+        rows.append((study.errors.kinds[n], number(now, 2), *sums, left, _may_be(now, allocation.equal[n]), unit))
+    return head + "\n" + aligned(header, rows)
+
+
+def _may_be(now: float, factor: float, none: str = "") -> str:
+    """Return what a size may grow or must shrink to."""
+    return none if np.isnan(factor) else "anything" if np.isinf(factor) else number(now * factor, 2)
 
 
 def _agreement_text(study: Study) -> str:
@@ -91,7 +106,7 @@ def as_json(study: Study) -> dict[str, Any]:
         "machine": study.geometry.name,
         "budget_si": study.budget.sizes,
         "poses": study.extremes.poses,
-        "ranking": ranking_rows(study.rows),
+        "ranking": ranking_rows(study.rows, beside(study.geometry, study.errors)),
         "reach": [
             {"volume_m3": item.volume, "box_m": item.box, "limits": item.shares(), "regions": item.regions()}
             for item in study.reaches
@@ -102,7 +117,7 @@ def as_json(study: Study) -> dict[str, Any]:
             "percentiles": dict(zip(drawn.percentiles, drawn.worst_values, strict=True)),
         },
         "allocations_m": [
-            {**vars(item), "alone": dict(zip(study.errors.kinds, item.alone, strict=True))}
+            {**vars(item), **{name: dict(zip(study.errors.kinds, getattr(item, name), strict=True)) for name in EACH}}
             for item in study.allocations
         ],
         "agreement": study.agreement,

@@ -84,7 +84,7 @@ def survey(
     errors : SingleErrors
         Errors.
     method : str
-        ``exact`` or ``linear``.
+        ``exact``, ``linear`` or ``iteration``.
     workers : int
         Local processes; 1 stays in this one, with all its threads.
     scheduler : str, optional

@@ -16,7 +16,7 @@ import numpy as np
 from ..errors import InputFileError, ModelError
 from ..formats.paths import input_file
 from ..formats.yaml import Section, read_yaml
-from ..machine.geometry import HexapodGeometry
+from ..machine.geometry import HexapodGeometry, first_of_same
 
 BUDGET_FORMAT = "hexapod_comp/error_budget"
 BUDGET_VERSION = 1
@@ -40,8 +40,8 @@ class SingleErrors:
         Index into `kinds`.
     part : ndarray of int, shape (E,)
         LENGTH, BASE_JOINT, PLATFORM_JOINT or TOOL.
-    strut : ndarray of int, shape (E,)
-        0…5; −1 for the tool.
+    struts : ndarray of bool, shape (E, 6)
+        Whose length, or whose end, it changes: a ball joint that two struts share moves both. None for the tool.
     vector : ndarray, shape (E, 3)
         For joints and tool the displacement in their body's frame, m. For lengths the coefficients a, b, c of
         δL = a + b·(L − L_home) + c·L.
@@ -53,7 +53,7 @@ class SingleErrors:
 
     kind: np.ndarray
     part: np.ndarray
-    strut: np.ndarray
+    struts: np.ndarray
     vector: np.ndarray
     kinds: tuple[str, ...]
     labels: tuple[str, ...]
@@ -66,13 +66,17 @@ class SingleErrors:
         chosen = np.flatnonzero(mask)
         labels = tuple(self.labels[i] for i in chosen)
         return SingleErrors(
-            self.kind[chosen], self.part[chosen], self.strut[chosen], self.vector[chosen], self.kinds, labels
+            self.kind[chosen], self.part[chosen], self.struts[chosen], self.vector[chosen], self.kinds, labels
         )
 
     def scaled(self, factors: np.ndarray) -> SingleErrors:
         """Return the errors with each type's size multiplied by a factor, shape (kinds,)."""
         vector = self.vector * np.asarray(factors)[self.kind][:, None]
-        return SingleErrors(self.kind, self.part, self.strut, vector, self.kinds, self.labels)
+        return SingleErrors(self.kind, self.part, self.struts, vector, self.kinds, self.labels)
+
+
+Row = tuple[int, np.ndarray, tuple[float, ...], str]
+"""Part, struts (6,), vector and label of one single error."""
 
 
 @dataclass(frozen=True)
@@ -88,49 +92,47 @@ class SourceType:
     title : str
         What people read.
     make : callable
-        From a size in SI and the geometry to (part, strut, vector, label) of each single error.
+        From a size in SI and the struts that end in each platform joint, shape (joints, 6), to the single errors.
     """
 
     name: str
     dimension: str
     title: str
-    make: Callable[[float, HexapodGeometry], Iterable[tuple[int, int, tuple[float, float, float], str]]]
+    make: Callable[[float, np.ndarray], Iterable[Row]]
 
 
-def _lengths(coefficient: int, factor: float = 1.0) -> Callable:
+EACH = np.eye(6, dtype=bool)
+"""Every strut for itself."""
+
+
+def _lengths(coefficient: int, factor: float = 1.0) -> Callable[[float, np.ndarray], Iterable[Row]]:
     """Return a maker of one length error per strut."""
 
-    def make(size: float, geometry: HexapodGeometry) -> Iterable[tuple[int, int, tuple, str]]:
-        del geometry
-        vector = [0.0, 0.0, 0.0]
-        vector[coefficient] = factor * size
-        for strut in range(6):
-            yield LENGTH, strut, tuple(vector), f"strut_{strut + 1}"
+    def make(size: float, joints: np.ndarray) -> Iterable[Row]:
+        del joints
+        for number, struts in enumerate(EACH, start=1):
+            yield LENGTH, struts, tuple(factor * size * np.eye(3)[coefficient]), f"strut_{number}"
 
     return make
 
 
-def _joints(part: int, axes: tuple[int, ...]) -> Callable:
-    """Return a maker of one displacement per strut and axis."""
+def _joints(part: int, axes: tuple[int, ...]) -> Callable[[float, np.ndarray], Iterable[Row]]:
+    """Return a maker of one displacement per joint and axis."""
     body = "base" if part == BASE_JOINT else "platform"
 
-    def make(size: float, geometry: HexapodGeometry) -> Iterable[tuple[int, int, tuple, str]]:
-        del geometry
-        for strut in range(6):
+    def make(size: float, joints: np.ndarray) -> Iterable[Row]:
+        for struts in EACH if part == BASE_JOINT else joints:
+            numbers = "/".join(str(strut + 1) for strut in np.flatnonzero(struts))
             for axis in axes:
-                yield part, strut, tuple(size * np.eye(3)[axis]), f"{body} joint {strut + 1} {AXES[axis]}"
+                yield part, struts, tuple(size * np.eye(3)[axis]), f"{body} joint {numbers} {AXES[axis]}"
 
     return make
 
 
-def _tool(size: float, geometry: HexapodGeometry) -> Iterable[tuple[int, int, tuple, str]]:
-    del geometry
+def _tool(size: float, joints: np.ndarray) -> Iterable[Row]:
+    del joints
     for axis in range(3):
-        yield TOOL, -1, tuple(size * np.eye(3)[axis]), f"tool {AXES[axis]}"
-
-
-def _temperature(size: float, geometry: HexapodGeometry) -> Iterable[tuple[int, int, tuple, str]]:
-    return _lengths(2)(size, geometry)
+        yield TOOL, np.zeros(6, dtype=bool), tuple(size * np.eye(3)[axis]), f"tool {AXES[axis]}"
 
 
 SOURCE_TYPES = (
@@ -143,12 +145,14 @@ SOURCE_TYPES = (
     SourceType("platform_joint_xy", "length", "platform joint x/y", _joints(PLATFORM_JOINT, (0, 1))),
     SourceType("platform_joint_z", "length", "platform joint z", _joints(PLATFORM_JOINT, (2,))),
     SourceType("backlash", "length", "backlash", _lengths(0, 0.5)),
-    SourceType("thermal_growth", "ratio", "thermal growth", _temperature),
+    SourceType("thermal_growth", "ratio", "thermal growth", _lengths(2)),
     SourceType("tool_offset", "length", "tool offset", _tool),
 )
 """Types that a budget may have. Screw pitch as v. Daake et al. have it, a bound of the length error; as a slope it
 grows with the way from home. A strut is off by half its backlash. Thermal growth is relative: expansion
 times kelvins."""
+
+BY_NAME = {source.name: source for source in SOURCE_TYPES}
 
 
 @dataclass(frozen=True)
@@ -167,17 +171,25 @@ class Budget:
     sizes: dict[str, float]
 
     def __post_init__(self) -> None:
-        known = {source.name for source in SOURCE_TYPES}
         if not self.sizes:
             raise ModelError("errors", "must name at least one error type")
         for name, size in self.sizes.items():
-            if name not in known:
-                raise ModelError(f"errors.{name}", f"must be one of {', '.join(sorted(known))}")
+            if name not in BY_NAME:
+                raise ModelError(f"errors.{name}", f"must be one of {', '.join(sorted(BY_NAME))}")
             if not 0.0 < size < LARGEST:
                 raise ModelError(f"errors.{name}", f"must be above zero and below {LARGEST:g} (m, or relative)", size)
 
-    def single_errors(self, geometry: HexapodGeometry) -> SingleErrors:
+    def single_errors(self, geometry: HexapodGeometry, shared_platform_joints: bool = True) -> SingleErrors:
         """Return every single error of the budget.
+
+        Parameters
+        ----------
+        geometry : HexapodGeometry
+            The machine.
+        shared_platform_joints : bool
+            Platform joints that coincide nominally are one ball joint: one error moves the ends of all its struts,
+            as in :class:`~hexapod_comp.virtual.imperfections.ImperfectionBounds`. False: each strut has a joint of its
+            own, as in v. Daake et al.'s error model of one leg.
 
         Raises
         ------
@@ -186,16 +198,17 @@ class Budget:
         """
         if self.machine != geometry.name:
             raise ModelError("machine", f"the budget is for {self.machine!r}, the geometry is {geometry.name!r}")
-        types = {source.name: source for source in SOURCE_TYPES}
+        first = first_of_same(geometry.platform_joints) if shared_platform_joints else np.arange(6)
+        joints = np.array([first == joint for joint in np.unique(first)])
         rows = [
             (number, *row)
             for number, (name, size) in enumerate(self.sizes.items())
-            for row in types[name].make(size, geometry)
+            for row in BY_NAME[name].make(size, joints)
         ]
-        kind, part, strut, vector, labels = zip(*rows, strict=True)
-        titles = tuple(types[name].title for name in self.sizes)
+        kind, part, struts, vector, labels = zip(*rows, strict=True)
+        titles = tuple(BY_NAME[name].title for name in self.sizes)
         return SingleErrors(
-            np.array(kind), np.array(part), np.array(strut), np.array(vector, dtype=float), titles, tuple(labels)
+            np.array(kind), np.array(part), np.array(struts), np.array(vector, dtype=float), titles, tuple(labels)
         )
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..machine.geometry import HexapodGeometry
-from ..pose import Pose
 from .combining import RSS, WORST_CASE, Allocation, MonteCarlo, allocate, monte_carlo, root_sum_of_squares, worst_case
 from .effects import EXACT, LINEAR, Extremes, effect_vectors, effects
 from .ranking import RankingRow, ranked
@@ -16,7 +15,7 @@ from .reach import Reach, poses_at, reach
 from .runner import survey
 from .shells import Shell, shell
 from .sources import LENGTH, TOOL, Budget, SingleErrors
-from .tangential import tangential_effect
+from .tangential import tangential_effects
 
 COMBINED_POSES = 500
 """Random poses of the workspace at which budgets are combined."""
@@ -116,6 +115,7 @@ def classify(
     scheduler: str | None = None,
     seed: int = 0,
     progress: Callable[[int], object] = lambda count: None,
+    shared_platform_joints: bool = True,
 ) -> Study:
     """Classify a machine's errors over its workspace.
 
@@ -126,18 +126,20 @@ def classify(
     reaches : tuple of Reach, optional
         From :func:`~hexapod_comp.workspace.reach.reaches`; by default what is reached with the tool as at home.
     method, allowed : str, float, optional
-        ``exact`` or ``linear``, for the ranking; displacement of the tool to allocate tolerances for, m.
+        ``exact``, ``linear`` or ``iteration``, for the ranking; displacement of the tool to allocate tolerances for, m.
     compare, seed : int
         Poses at which exact, linear and tangential effects are compared, 0 for none; the seed picks them.
     workers, scheduler, progress
         As for :func:`~hexapod_comp.workspace.runner.survey`.
+    shared_platform_joints : bool
+        As for :meth:`~hexapod_comp.workspace.sources.Budget.single_errors`.
 
     Raises
     ------
     ModelError
         The budget is another machine's, or the allowed error is not above zero.
     """
-    errors = budget.single_errors(geometry)
+    errors = budget.single_errors(geometry, shared_platform_joints)
     reaches = (reach(geometry),) if reaches is None else reaches
     extremes = survey(reaches, errors, method, workers, scheduler, progress)
     vectors = effect_vectors(geometry, errors, *_random_poses(reaches, COMBINED_POSES, seed), LINEAR)
@@ -193,12 +195,12 @@ def compared(
     exact = effects(geometry, moved, positions, rotations, EXACT)[..., 0]
     linear = effects(geometry, moved, positions, rotations, LINEAR)[..., 0]
     walked, drift = np.empty_like(exact), 0.0
-    for n, pose in enumerate(zip(positions, rotations, strict=True)):
-        for e in range(len(moved)):
-            result = tangential_effect(geometry, moved, e, Pose(*pose))
-            walked[n, e] = np.linalg.norm(result.vector[:3])
-            if moved.part[e] == LENGTH and result.travel > 0.0:
-                drift = max(drift, result.drift / result.travel)
+    for e in range(len(moved)):
+        result = tangential_effects(geometry, moved, e, positions, rotations)
+        walked[:, e] = np.linalg.norm(result.vectors[:, :3], axis=1)
+        travelled = result.travel > 0.0
+        if moved.part[e] == LENGTH and travelled.any():
+            drift = max(drift, float((result.drift[travelled] / result.travel[travelled]).max()))
     largest = np.array([exact[:, moved.kind == kind].max(initial=0.0) for kind in range(len(moved.kinds))])
     scale = np.where(largest > 0.0, largest, np.inf)[moved.kind]
     return Agreement(

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..errors import KinematicsError, NotConvergedError, SingularError
+from ..errors import KinematicsError, SingularError
 from ..machine.geometry import HexapodGeometry
-from ..pose import Pose
 from .sources import BASE_JOINT, LENGTH, PLATFORM_JOINT, TOOL, SingleErrors
 
 STEP = 1e-5
@@ -33,77 +32,86 @@ MOST_CORRECTIONS = 20
 
 @dataclass(frozen=True)
 class TangentialResult:
-    """Where the iteration ends.
+    """Where the iteration ends at each of N poses.
 
     Attributes
     ----------
-    vector : ndarray, shape (6,)
+    vectors : ndarray, shape (N, 6)
         Displacement of the tool and its rotation vector, actual minus nominal, along the axes of the work frame;
-        m, rad.
-    drift : float
+        m, rad. NaN where the legs could not be brought back within the tolerance.
+    drift : ndarray, shape (N,)
         Largest length error of a passive leg that any step left before correction, m.
-    active : float
-        Largest length error of the active leg likewise, m.
-    travel : float
-        How far the active leg went, m.
-    steps, corrections : int
-        How many of each.
+    travel : ndarray, shape (N,)
+        How far the active legs went, m.
+    steps : int
+        How many steps.
+    corrections : ndarray of int, shape (N,)
+        How many corrections.
     """
 
-    vector: np.ndarray
-    drift: float
-    active: float
-    travel: float
+    vectors: np.ndarray
+    drift: np.ndarray
+    travel: np.ndarray
     steps: int
-    corrections: int
+    corrections: np.ndarray
 
 
 @dataclass
 class _State:
-    """Tool tip and platform orientation in ``base``, and the machine as it is in this step."""
+    """Tool tips (N, 3) and platform orientations (N, 3, 3) in ``base``, and the machine as it is in this step."""
 
     base: np.ndarray
     platform: np.ndarray
     tool: np.ndarray
-    tip: np.ndarray
-    rotation: np.ndarray
+    tips: np.ndarray
+    rotations: np.ndarray
 
-    def lengths(self, motion: np.ndarray | None = None) -> np.ndarray:
-        """Return the leg lengths after a motion (x, y, z, a, b, c) of the tool, shape (6,), m."""
-        tip, rotation = self.moved(np.zeros(6) if motion is None else motion)
-        return np.linalg.norm(tip + (self.platform - self.tool) @ rotation.T - self.base, axis=1)
+    def select(self, chosen: np.ndarray) -> _State:
+        """Return the same machine at some of the poses."""
+        return _State(self.base, self.platform, self.tool, self.tips[chosen], self.rotations[chosen])
 
-    def moved(self, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return tip and orientation after a motion about the tip."""
-        return self.tip + motion[:3], Rotation.from_rotvec(motion[3:]).as_matrix() @ self.rotation
+    def lengths(self, motions: np.ndarray | None = None) -> np.ndarray:
+        """Return the leg lengths, shape (N, 6), m, after motions (x, y, z, a, b, c) of the tool, shape (6,)."""
+        tips, rotations = self.moved(np.zeros(6) if motions is None else motions)
+        arms = (self.platform - self.tool) @ np.swapaxes(rotations, 1, 2)
+        return np.linalg.norm(tips[:, None] + arms - self.base, axis=2)
 
-    def motion_matrix(self) -> np.ndarray:
+    def moved(self, motions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return tips and orientations after motions, shape (6,) or (N, 6), about the tips."""
+        turns = Rotation.from_rotvec(motions[..., 3:]).as_matrix()
+        return self.tips + motions[..., :3], turns @ self.rotations
+
+    def motion_matrices(self) -> np.ndarray:
         """Return V: leg lengths per virtual displacement of the tool, one after another (v. Daake et al., eq. 1–2)."""
         here = self.lengths()
         columns = [(self.lengths(VIRTUAL * axis) - here) / VIRTUAL for axis in np.eye(6)]
-        return np.stack(columns, axis=1)
+        return np.stack(columns, axis=2)
 
     def follow(self, change: np.ndarray) -> None:
-        """Move the tool along the tangent on which the legs change by so much (v. Daake et al., eq. 3–4: V·R = A)."""
+        """Move the tools along the tangents on which the legs change by so much, shape (N, 6).
+
+        v. Daake et al., eq. 3–4: V·R = A.
+        """
         try:
-            motion = np.linalg.solve(self.motion_matrix(), change)
+            motions = np.linalg.solve(self.motion_matrices(), change[:, :, None])[:, :, 0]
         except np.linalg.LinAlgError:
             raise SingularError("the motion matrix is singular: no leg can move alone") from None
-        self.tip, self.rotation = self.moved(motion)
+        self.tips, self.rotations = self.moved(motions)
 
 
-def tangential_effect(
+def tangential_effects(
     geometry: HexapodGeometry,
     errors: SingleErrors,
     index: int,
-    pose: Pose,
+    positions: np.ndarray,
+    rotations: np.ndarray,
     step: float = STEP,
     tolerance: float = TOLERANCE,
 ) -> TangentialResult:
-    """Return the effect of one single error at one pose by the paper's iteration.
+    """Return the effect of one single error at some poses by the paper's iteration.
 
     A leg of wrong length travels to it in steps, all other legs held. A joint travels to its wrong place in
-    steps; its leg is active and takes back the length that the joint's travel gives it.
+    steps; its legs are active and take back the length that the joint's travel gives them.
 
     Parameters
     ----------
@@ -113,8 +121,8 @@ def tangential_effect(
         Errors.
     index : int
         Which of them.
-    pose : Pose
-        Nominal ``pose_platform_in_base``.
+    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
+        Nominal ``pose_platform_in_base``, m.
     step : float
         Largest travel of leg or joint per step, m.
     tolerance : float
@@ -123,74 +131,83 @@ def tangential_effect(
     Raises
     ------
     KinematicsError
-        Step or tolerance not above zero; SingularError, NotConvergedError.
+        Step or tolerance not above zero; SingularError.
     """
     for name, value in (("step", step), ("tolerance", tolerance)):
         if not 0.0 < value < math.inf:
             raise KinematicsError(f"{name} must be above zero, m, not {value}", value)
+    count, none = len(positions), np.zeros(len(positions))
     if errors.part[index] == TOOL:
-        shift = geometry.work.rotation.T @ pose.rotation @ errors.vector[index]
-        return TangentialResult(np.concatenate([shift, np.zeros(3)]), 0.0, 0.0, 0.0, 0, 0)
-    tip = pose.position + pose.rotation @ geometry.tool.position
+        shifts = rotations @ errors.vector[index] @ geometry.work.rotation
+        return TangentialResult(np.hstack([shifts, np.zeros((count, 3))]), none, none, 0, none.astype(int))
     joints = geometry.base_joints.copy(), geometry.platform_joints.copy()
-    state = _State(*joints, geometry.tool.position, tip, pose.rotation)
+    tips = positions + rotations @ geometry.tool.position
+    state = _State(*joints, geometry.tool.position, tips, rotations)
     path = _path(geometry, errors, index, state.lengths(), step)
-    return _walk(geometry.work.rotation, state, int(errors.strut[index]), path, tolerance)
+    return _walk(geometry.work.rotation, state, errors.struts[index], path, tolerance)
 
 
 Waypoint = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Leg lengths to hold, and the base and platform joints of the active leg."""
+"""Leg lengths to hold, shape (N, 6), and the base and platform joints."""
 
 
 def _path(
     geometry: HexapodGeometry, errors: SingleErrors, index: int, nominal: np.ndarray, step: float
 ) -> list[Waypoint]:
-    """Return how the error grows from nothing to its size."""
-    part, strut, vector = errors.part[index], int(errors.strut[index]), errors.vector[index]
-    stretch = _length_error(geometry, vector, strut, nominal[strut]) if part == LENGTH else 0.0
-    size = abs(stretch) if part == LENGTH else float(np.linalg.norm(vector))
-    leg = np.eye(6)[strut]
+    """Return how the error grows from nothing to its size, in as many steps wherever the machine stands."""
+    part, struts, vector = errors.part[index], errors.struts[index], errors.vector[index]
+    stretch, size, shift = np.zeros_like(nominal), float(np.linalg.norm(vector)), {}
+    if part == LENGTH:
+        home = _State(
+            geometry.base_joints,
+            geometry.platform_joints,
+            geometry.tool.position,
+            geometry.home.position[None] + geometry.home.rotation @ geometry.tool.position,
+            geometry.home.rotation[None],
+        ).lengths()[0]
+        stretch[:, struts] = vector[0] + vector[1] * (nominal - home)[:, struts] + vector[2] * nominal[:, struts]
+        longest = geometry.limits.stroke.max()
+        size = abs(vector[0]) + (abs(vector[1]) + abs(vector[2])) * longest
+    else:
+        shift[part] = struts[:, None] * vector
     path = []
     for share in np.linspace(0.0, 1.0, max(1, math.ceil(size / step - 1e-9)) + 1)[1:]:
-        base = geometry.base_joints[strut] + (share * vector if part == BASE_JOINT else 0.0)
-        platform = geometry.platform_joints[strut] + (share * vector if part == PLATFORM_JOINT else 0.0)
-        path.append((nominal + share * stretch * leg, base, platform))
+        base = geometry.base_joints + share * shift.get(BASE_JOINT, 0.0)
+        platform = geometry.platform_joints + share * shift.get(PLATFORM_JOINT, 0.0)
+        path.append((nominal + share * stretch, base, platform))
     return path
 
 
 def _walk(
-    work_rotation: np.ndarray, state: _State, strut: int, path: list[Waypoint], tolerance: float
+    work_rotation: np.ndarray, state: _State, struts: np.ndarray, path: list[Waypoint], tolerance: float
 ) -> TangentialResult:
-    """Follow a path with one active leg and see where the tool gets to."""
-    start_tip, start_rotation, leg = state.tip, state.rotation, np.eye(6)[strut]
-    drift = active = travel = 0.0
-    corrections = 0
-    for target, base, platform in path:
-        state.base[strut], state.platform[strut] = base, platform
-        wanted = (target - state.lengths()) * leg
+    """Follow a path with the active legs and see where the tool gets to."""
+    start_tips, start_rotations = state.tips, state.rotations
+    drift, travel = np.zeros((2, len(start_tips)))
+    corrections = np.zeros(len(start_tips), dtype=int)
+    for target, state.base, state.platform in path:
+        wanted = (target - state.lengths()) * struts
         state.follow(wanted)
         off = np.abs(state.lengths() - target)
-        drift, active = max(drift, float(np.delete(off, strut).max())), max(active, float(off[strut]))
-        travel += abs(float(wanted[strut]))
+        drift = np.maximum(drift, off[:, ~struts].max(axis=1, initial=0.0))
+        travel += np.abs(wanted).max(axis=1)
         corrections += _correct(state, target, tolerance)
-    turn = Rotation.from_matrix(state.rotation @ start_rotation.T).as_rotvec()
-    vector = np.concatenate([work_rotation.T @ (state.tip - start_tip), work_rotation.T @ turn])
-    return TangentialResult(vector, drift, active, travel, len(path), corrections)
+    turns = Rotation.from_matrix(state.rotations @ np.swapaxes(start_rotations, 1, 2)).as_rotvec()
+    vectors = np.hstack([(state.tips - start_tips) @ work_rotation, turns @ work_rotation])
+    vectors[(np.abs(state.lengths() - path[-1][0]) > tolerance).any(axis=1)] = np.nan
+    return TangentialResult(vectors, drift, travel, len(path), corrections)
 
 
-def _length_error(geometry: HexapodGeometry, vector: np.ndarray, strut: int, length: float) -> float:
-    """Return a strut's length error at a length, m: a + b·(L − L_home) + c·L."""
-    arms = geometry.platform_joints[strut] @ geometry.home.rotation.T
-    home = float(np.linalg.norm(geometry.home.position + arms - geometry.base_joints[strut]))
-    return float(vector[0] + vector[1] * (length - home) + vector[2] * length)
-
-
-def _correct(state: _State, target: np.ndarray, tolerance: float) -> int:
-    """Bring the legs that are off by more than ε back by the same algorithm; return how often it took."""
-    for count in range(MOST_CORRECTIONS):
-        off = target - state.lengths()
-        outside = np.abs(off) > tolerance
-        if not outside.any():
-            return count
-        state.follow(np.where(outside, off, 0.0))
-    raise NotConvergedError(f"legs stay off by more than {tolerance:g} m", limit=tolerance)
+def _correct(state: _State, target: np.ndarray, tolerance: float) -> np.ndarray:
+    """Bring the legs that are off by more than ε back by the same algorithm; return how often it took, shape (N,)."""
+    counts, off = np.zeros(len(target), dtype=int), target - state.lengths()
+    for _ in range(MOST_CORRECTIONS):
+        poses = np.flatnonzero((np.abs(off) > tolerance).any(axis=1))
+        if not len(poses):
+            return counts
+        some = state.select(poses)
+        some.follow(np.where(np.abs(off[poses]) > tolerance, off[poses], 0.0))
+        state.tips[poses], state.rotations[poses] = some.tips, some.rotations
+        off[poses] = target[poses] - some.lengths()
+        counts[poses] += 1
+    return counts

@@ -18,8 +18,11 @@ import yaml
 from foreign_machines import UM, Errors, Machine, aligned_rms, machines, tool_errors
 
 from hexapod_comp import cli
+from hexapod_comp.calibration.posterior import load_posterior
+from hexapod_comp.calibration.prediction import ErrorPredictor
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.pose import Pose
 
@@ -112,6 +115,26 @@ def test_the_model_is_good(fitted: Fitted) -> None:
     before = aligned_rms(tips, tool_errors(fitted.machine, fitted.truth, Errors.none(), tips))
     after = aligned_rms(tips, tool_errors(fitted.machine, fitted.truth, Errors.read(fitted.model), tips))
     assert after < 0.05 * before
+
+
+def test_the_predicted_error_is_as_well_known_as_it_says(fitted: Fitted) -> None:
+    """The truth's error by kinematics that are not ours, at 200 places, the datum aligned over them in both.
+
+    Places of one machine are not independent: the RMS may be two and a half times what is said, and ten times less.
+    """
+    geometry = load_geometry(fitted.geometry)
+    model = load_model(fitted.model, geometry)
+    parameters, why = load_posterior(model, geometry, fitted.model)
+    assert why == ""
+    tips = somewhere(fitted.machine, 200)
+    poses = fitted.machine.platforms(tips), np.tile(fitted.machine.level(), (200, 1, 1))
+    aligned = ErrorPredictor(RealMachine(geometry, model), parameters).predict(poses)[1]
+    assert aligned is not None
+    assert aligned.deviations is not None
+    truth = tool_errors(fitted.machine, fitted.truth, Errors.none(), tips)
+    sigma = np.sqrt((aligned.deviations[:, :3] ** 2).sum(axis=1).mean())
+    assert sigma < 0.05 * aligned_rms(tips, truth)
+    assert 0.1 * sigma < aligned_rms(tips, truth - aligned.values[:, :3]) < 2.5 * sigma
 
 
 def test_the_valid_box_is_of_platform_positions_in_base(fitted: Fitted) -> None:

@@ -311,6 +311,34 @@ def test_ik_with_a_model_prints_commands_and_corrections(hexapod) -> None:
     assert code == 0
 
 
+def test_ik_predicts_the_error_without_compensation_in_the_work_frame(hexapod, tmp_path: Path) -> None:
+    """Told nominal lengths, the machine is where ``fk`` says. The shipped model carries no covariance: never a zero."""
+    pose = "10,20,420,2,-3,4"
+    lengths = json.loads(hexapod("ik", "--pose", pose, "--json")[1])["rows"][0]
+    told = ",".join(repr(lengths[f"L{n}_mm"]) for n in range(1, 7))
+    went = json.loads(hexapod("fk", "--lengths", told, "--model", "paper_machine", "--guess", pose, "--json")[1])[
+        "rows"
+    ][0]
+    content = json.loads(hexapod("ik", "--pose", pose, "--model", "paper_machine", "--json")[1])
+    assert content["error_frame"] == "work"
+    assert content["error_sd_not_known"] == "model 'virtual machine' carries no covariance of a fit"
+    row = content["rows"][0]
+    for axis, commanded in zip("xyz", (10.0, 20.0, 420.0), strict=True):
+        assert row[f"error_{axis}_um"] == pytest.approx((went[f"{axis}_mm"] - commanded) * 1e3, abs=1e-6)
+    assert all(row[name] is None for name in row if "_sd_" in name)
+    assert abs(row["error_aligned_x_um"]) < abs(row["error_x_um"])  # 80 µm of the datum
+    text = hexapod("ik", "--pose", pose, "--model", "paper_machine")[1]
+    assert text.count("not known") == 1 + 1 + 12  # the direction, the reason, six components twice
+    poses, table = tmp_path / "poses.csv", tmp_path / "table.csv"
+    poses.write_text(f"x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg\n{pose}\n")
+    assert hexapod("ik", str(poses), "--model", "paper_machine", "--out", str(table))[0] == 0
+    header, values = (line.split(",") for line in table.read_text().splitlines())
+    cells = dict(zip(header, values, strict=True))
+    assert float(cells["error_z_um"]) == pytest.approx(row["error_z_um"], abs=1e-5)
+    assert cells["error_z_sd_um"] == ""
+    assert "error_z_um" not in hexapod("ik", str(poses))[1]
+
+
 def test_ik_out_of_limits_answers_and_says_so(hexapod) -> None:
     code, out, err = hexapod("ik", "--pose", "0,0,950")
     assert code == 0

@@ -22,6 +22,7 @@ from hexapod_comp import cli
 from hexapod_comp.calibration import fit as fit_module
 from hexapod_comp.calibration.fit import ModelFit
 from hexapod_comp.calibration.parameters import FitSettings
+from hexapod_comp.calibration.posterior import load_posterior
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import load_model
@@ -93,7 +94,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fit_module, "fit_model", lambda *arguments: fits.append(real(*arguments)) or fits[-1])  # type: ignore[func-returns-value]
         simulate_said = said_by("simulate", "--campaign", campaign, "--seed", 1, "--out", measured)
-        files = {"--out": "model.yaml", "--covariance": "fit.npz", "--report": "report.txt"}
+        files = {"--out": "model.yaml", "--report": "report.txt"}
         written = [word for option, name in files.items() for word in (option, folder / name)]
         shown = ("--pictures", folder / "pictures", "--truth", "paper_machine", "--name", "Tuesday's")
         fit_said = said_by("fit", measured, *JOINT, *written, *shown)
@@ -215,14 +216,16 @@ def test_json_holds_every_parameter_with_its_error(done: Calibration) -> None:
 
 def test_covariance_is_one(done: Calibration) -> None:
     """Symmetric, positive semidefinite to rounding, its diagonal the squared standard errors of the JSON file."""
-    with np.load(done.file("fit.npz"), allow_pickle=False) as stored:
-        labels, values, covariance = stored["labels"], stored["values"], stored["covariance"]
+    geometry = load_geometry(config_file("paper"))
+    stored, _ = load_posterior(load_model(done.file("model.yaml"), geometry), geometry, done.file("model.yaml"))
+    assert stored is not None
+    labels, values, covariance = stored.space.labels, stored.x, stored.covariance
     assert covariance.shape == (len(labels), len(labels)) == (len(values),) * 2
     np.testing.assert_allclose(covariance, covariance.T, rtol=0.0, atol=1e-12 * np.abs(covariance).max())
     eigenvalues = np.linalg.eigvalsh(covariance)
     assert eigenvalues.min() > -1e-12 * eigenvalues.max()
     parameters = json.loads(done.file("fit.json").read_text())["parameters"]
-    assert [entry["name"] for entry in parameters] == labels.tolist()
+    assert [entry["name"] for entry in parameters] == list(labels)
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [p["standard_error"] for p in parameters], rtol=1e-9)
     np.testing.assert_allclose(values, [p["value"] for p in parameters], rtol=1e-12)
 
@@ -238,14 +241,16 @@ def test_pictures_are_pictures(done: Calibration) -> None:
 
 def test_nothing_else_is_written(done: Calibration) -> None:
     """No half-written or temporary file beside the ones that were asked for."""
-    names = {"campaign.yaml", "measured.csv", "model.yaml", "fit.json", "fit.npz", "report.txt", "pictures"}
+    names = {"campaign.yaml", "measured.csv", "model.yaml", "model.posterior.npz", "fit.json", "report.txt", "pictures"}
     assert {path.name for path in done.folder.iterdir()} - {"five.yaml", "noisy"} == names
 
 
-def test_without_options_only_the_model_is_written(hexapod: Program, fitted: Calibration) -> None:
+def test_without_options_only_the_model_and_what_is_known_of_it_are_written(
+    hexapod: Program, fitted: Calibration
+) -> None:
     code, out, err = hexapod("fit", fitted.measured, "--out", "model.yaml")
     assert (code, err) == (0, "")
-    assert [path.name for path in Path.cwd().iterdir()] == ["model.yaml"]
+    assert {path.name for path in Path.cwd().iterdir()} == {"model.yaml", "model.posterior.npz"}
     assert "On the virtual machine" not in out
     assert load_model("model.yaml", load_geometry(config_file("paper"))).name == "joint calibration"
 
@@ -296,11 +301,13 @@ def test_scheme_lines(hexapod: Program, done: Calibration, tmp_path: Path) -> No
     assert (tmp_path / "pictures" / "lines.png").read_bytes().startswith(PNG)
 
 
-def test_scheme_lines_has_no_covariance(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
-    written = ("--out", tmp_path / "m.yaml", "--covariance", tmp_path / "other")
-    outcome = hexapod("fit", done.measured, "--scheme", "lines", *written)
-    assert_refused(outcome, "--covariance: has no meaning for scheme lines")
-    assert not list(tmp_path.iterdir())
+def test_scheme_lines_knows_no_covariance(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
+    """So nothing stands beside its model, and the option of older versions says where a covariance is now."""
+    assert hexapod("fit", done.measured, "--scheme", "lines", "--out", tmp_path / "m.yaml")[0] == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["m.yaml"]
+    code, _, err = hexapod("fit", done.measured, "--out", tmp_path / "m.yaml", "--covariance", tmp_path / "c.npz")
+    assert code == 2
+    assert "argument --covariance: is now always written, beside the model, as MODEL.posterior.npz" in err
 
 
 def test_json_of_scheme_lines(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
@@ -318,7 +325,7 @@ def test_json_of_scheme_lines(hexapod: Program, done: Calibration, tmp_path: Pat
 
 # Readings that do not bear the model out.
 
-ALL = ("--out", "m.yaml", "--covariance", "c.npz", "--report", "r.txt", "--pictures", "p")
+ALL = ("--out", "m.yaml", "--report", "r.txt", "--pictures", "p")
 
 
 @pytest.fixture(scope="module")
@@ -361,7 +368,7 @@ def test_a_forced_model_says_so(hexapod: Program, noisy: Path, monkeypatch: pyte
     assert out.startswith(Path("r.txt").read_text())
     model = load_model("m.yaml", load_geometry(config_file("paper")))
     assert model.origin.note.startswith("FORCED: readings are off by more than 10 times their noise: linear by ")
-    assert {path.name for path in tmp_path.iterdir()} == {"m.yaml", "c.npz", "r.txt"}
+    assert {path.name for path in tmp_path.iterdir()} == {"m.yaml", "m.posterior.npz", "r.txt"}
 
 
 def test_noise_that_is_stated_is_welcome(hexapod: Program, noisy: Path, tmp_path: Path) -> None:
@@ -504,7 +511,6 @@ def test_a_wrong_option_shows_the_usage(hexapod: Program, arguments: str, compla
     ("option", "path"),
     [
         ("--out", "nowhere/m.yaml"),
-        ("--covariance", "nowhere/c.npz"),
         ("--report", "nowhere/r.txt"),
         ("--out", "."),
     ],
@@ -523,7 +529,7 @@ def test_a_file_where_the_pictures_should_go_is_named(hexapod: Program, fitted: 
 
 
 def test_no_output_without_its_model(hexapod: Program, fitted: Calibration) -> None:
-    words = ("--out", "nowhere/m.yaml", "--covariance", "c.npz", "--report", "r.txt")
+    words = ("--out", "nowhere/m.yaml", "--report", "r.txt")
     assert_refused(hexapod("fit", fitted.measured, *words), "nowhere/m.yaml: cannot be written")
     assert not list(Path.cwd().iterdir())
 

@@ -69,7 +69,6 @@ COMMANDS = [
     ("simulate --campaign {in}/campaign_5d.yaml --out {in}/campaign_5d.yaml", "campaign_5d.yaml"),
     ("fit {in}/m.csv --out {in}/m.csv", "m.csv"),
     ("fit {in}/other.csv {in}/m.csv --out {in}/new --report {in}/m.csv", "m.csv"),
-    ("fit {in}/m.csv --out {in}/new --covariance {in}/m.csv", "m.csv"),
     ("fit {in}/m.csv --out {in}/new --columns {in}/c.yaml --report {in}/c.yaml", "c.yaml"),
     ("fit {in}/m.csv --truth {in}/paper_machine.yaml --out {in}/paper_machine.yaml", "paper_machine.yaml"),
     ("export --model {in}/paper_machine.yaml --table {in}/paper_machine.yaml", "paper_machine.yaml"),

@@ -15,9 +15,9 @@ from hexapod_comp.machine import kinematics
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import Structure, solve_pose, strut_lengths
 from hexapod_comp.pose import Pose
-from hexapod_comp.workspace.effects import EXACT, LINEAR, effect_vectors, effects, extremes, merged
+from hexapod_comp.workspace.effects import EXACT, ITERATION, LINEAR, effect_vectors, effects, extremes, merged
 from hexapod_comp.workspace.sources import BASE_JOINT, LENGTH, PLATFORM_JOINT, TOOL, Budget, SingleErrors
-from hexapod_comp.workspace.tangential import STEP, tangential_effect
+from hexapod_comp.workspace.tangential import STEP, tangential_effects
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 
@@ -48,7 +48,8 @@ def tooled(geometry: HexapodGeometry) -> HexapodGeometry:
 
 
 def one_error(part: int, strut: int, vector: list[float]) -> SingleErrors:
-    return SingleErrors(np.array([0]), np.array([part]), np.array([strut]), np.array([vector]), ("a",), ("a",))
+    struts = np.arange(6)[None] == strut
+    return SingleErrors(np.array([0]), np.array([part]), struts, np.array([vector]), ("a",), ("a",))
 
 
 def by_least_squares(
@@ -56,7 +57,7 @@ def by_least_squares(
 ) -> np.ndarray:
     """Return the effect of one error from the loop closures alone, solved by SciPy with differences."""
     base, platform = geometry.base_joints.copy(), geometry.platform_joints.copy()
-    tool, i, v = geometry.tool.position.copy(), errors.strut[e], errors.vector[e]
+    tool, i, v = geometry.tool.position.copy(), errors.struts[e], errors.vector[e]
 
     def lengths(b: np.ndarray, t: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
         return np.array([np.linalg.norm(position + rotation @ t[k] - b[k]) for k in range(6)])
@@ -115,6 +116,24 @@ def test_six_equal_strut_errors_lift_the_platform_straight_up():
     np.testing.assert_allclose(vectors.sum(axis=0), expected, rtol=0.0, atol=1e-18)
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_shared_ball_joint_moves_a_level_platform_by_a_third(axis):
+    # Closed forms: three balls that are all off by d are a platform that stands by d off in its own frame, whatever the
+    # struts' directions, so the three first-order effects add up to -d. Off along z, one ball of the level platform
+    # stays where it is in space, and the middle of the three sinks by d/3.
+    geometry = paper()
+    names = ("platform_joint_xy", "platform_joint_xy", "platform_joint_z")
+    errors = every_error(geometry, {names[axis]: 10e-6})
+    home = geometry.home
+    vectors = effect_vectors(geometry, errors, home.position[None], home.rotation)[0]
+    along = [n for n, label in enumerate(errors.labels) if label.endswith("xyz"[axis])]
+    assert len(along) == 3
+    # second order: (10 µm)² over the platform's 0.17 m, some 1e-9
+    np.testing.assert_allclose(vectors[along, :3].sum(axis=0), -10e-6 * np.eye(3)[axis], rtol=0.0, atol=2e-9)
+    if axis == 2:
+        np.testing.assert_allclose(np.linalg.norm(vectors[along, :3], axis=1), 10e-6 / 3.0, rtol=1e-3)
+
+
 def test_a_joint_off_across_its_strut_acts_like_a_strut_too_short():
     # Moved across by c, the strut would have to be √(L² + c²): to first order in that difference, the same effect.
     geometry = paper()
@@ -154,7 +173,7 @@ def test_mirrored_struts_have_mirrored_effects_at_mirrored_poses():
     found = effects(geometry, errors, positions, rotations)
     image = effects(geometry, errors, positions @ mirror, mirror @ rotations @ mirror)
     for kind, axes in ((0, 1), (1, 2), (2, 1)):
-        one, other = (array[:, errors.kind == kind].reshape(3, 6, axes, 2) for array in (found, image))
+        one, other = (array[:, errors.kind == kind].reshape(3, -1, axes, 2) for array in (found, image))
         if kind == 1:  # a base joint off to +y has its image off to −y, which is not the same beyond first order
             np.testing.assert_allclose(other[:, ::-1], one, rtol=5e-3, atol=2e-9)
         else:
@@ -266,13 +285,13 @@ def test_a_strut_error_longer_than_the_strut_is_nan():
     assert np.isnan(far).all()
 
 
-@pytest.mark.parametrize("method", [EXACT, LINEAR])
-def test_extremes_are_those_of_all_effects_however_they_are_parted(method, monkeypatch):
+@pytest.mark.parametrize(("method", "poses", "block"), [(EXACT, 5000, 1024), (LINEAR, 5000, 1024), (ITERATION, 40, 16)])
+def test_extremes_are_those_of_all_effects_however_they_are_parted(method, poses, block, monkeypatch):
     monkeypatch.setattr(kinematics, "ALONE", -1.0)  # others help from the second slice on
     geometry = tooled(paper())
     errors = every_error(geometry)
-    positions, rotations = poses_about(geometry.home, 5000, seed=9)
-    monkeypatch.setattr("hexapod_comp.workspace.effects.BLOCK", 1024)
+    positions, rotations = poses_about(geometry.home, poses, seed=9)
+    monkeypatch.setattr("hexapod_comp.workspace.effects.BLOCK", block)
     whole = extremes(geometry, errors, positions, rotations, method, threads=3)
     sizes = effects(geometry, errors, positions, rotations, method)
     for kind in range(len(errors.kinds)):
@@ -283,7 +302,7 @@ def test_extremes_are_those_of_all_effects_however_they_are_parted(method, monke
             assert whole.at_error[kind, column] == of_kind[error]
             assert whole.values[kind, column] == sizes[pose, of_kind[error], quantity]
             np.testing.assert_array_equal(whole.positions[kind, column], positions[pose])
-    cuts = [0, 1, 1500, 4097, 5000]
+    cuts = poses * np.array([0, 1, 1500, 4097, 5000]) // 5000
     parts = merged(
         extremes(geometry, errors, positions[a:b], rotations[a:b], method, first=a, threads=1)
         for a, b in pairwise(cuts)
@@ -302,7 +321,7 @@ def test_wrong_arguments_are_refused():
     with pytest.raises(KinematicsError, match="empty"):
         merged([])
     with pytest.raises(KinematicsError, match="step must be above zero"):
-        tangential_effect(geometry, errors, 0, home, step=0.0)
+        tangential_effects(geometry, errors, 0, home.position[None], home.rotation[None], step=0.0)
 
 
 def test_no_poses_have_no_effects():
@@ -320,16 +339,15 @@ def test_the_papers_iteration_agrees_to_a_thousandth(make):
     geometry = tooled(make())
     errors = every_error(geometry)
     positions, rotations = poses_about(geometry.home, 2, seed=10, tilt_deg=12.0)
-    exact = effect_vectors(geometry, errors, positions, rotations)
-    for n, (p, r) in enumerate(zip(positions, rotations, strict=True)):
-        smallest = 0.01 * np.abs(exact[n]).max(axis=0)
-        for e in range(len(errors)):
-            result = tangential_effect(geometry, errors, e, Pose(p, r))
-            for part in (slice(0, 3), slice(3, 6)):
-                apart = np.linalg.norm(result.vector[part] - exact[n, e, part])
-                size = max(np.linalg.norm(exact[n, e, part]), np.linalg.norm(smallest[part]))
-                assert apart <= 1e-3 * size, errors.labels[e]
-            assert result.drift <= 1e-3 * max(result.travel, STEP), errors.labels[e]
+    exact, walked = (effect_vectors(geometry, errors, positions, rotations, way) for way in (EXACT, ITERATION))
+    for e in range(len(errors)):
+        for part in (slice(0, 3), slice(3, 6)):
+            smallest = 0.01 * np.linalg.norm(np.abs(exact[:, :, part]).max(axis=1), axis=1)
+            apart = np.linalg.norm((walked - exact)[:, e, part], axis=1)
+            size = np.maximum(np.linalg.norm(exact[:, e, part], axis=1), smallest)
+            assert (apart <= 1e-3 * size).all(), errors.labels[e]
+        result = tangential_effects(geometry, errors, e, positions, rotations)
+        assert (result.drift <= 1e-3 * np.maximum(result.travel, STEP)).all(), errors.labels[e]
 
 
 def test_the_iteration_corrects_passive_legs_on_a_long_way():
@@ -337,15 +355,15 @@ def test_the_iteration_corrects_passive_legs_on_a_long_way():
     geometry = paper()
     errors = one_error(LENGTH, 3, [5e-3, 0.0, 0.0])
     positions, rotations = poses_about(geometry.home, 1, seed=11, tilt_deg=10.0)
-    pose, tolerance = Pose(positions[0], rotations[0]), 5e-9
-    result = tangential_effect(geometry, errors, 0, pose, tolerance=tolerance)
+    tolerance = 5e-9
+    result = tangential_effects(geometry, errors, 0, positions, rotations, tolerance=tolerance)
     assert result.steps == 500
-    assert 0 < result.corrections < 250
-    assert result.travel == pytest.approx(5e-3, rel=1e-4)  # the rest was corrected
-    assert tolerance < result.drift < 1e-3 * STEP
+    assert 0 < result.corrections[0] < 250
+    assert result.travel == pytest.approx([5e-3], rel=1e-4)  # the rest was corrected
+    assert tolerance < result.drift[0] < 1e-3 * STEP
     exact = effect_vectors(geometry, errors, positions, rotations)[0, 0]
     # ε in every leg, times a gain of about one
-    np.testing.assert_allclose(result.vector, exact, rtol=0.0, atol=10.0 * tolerance)
-    loose = tangential_effect(geometry, errors, 0, pose, tolerance=1.0)
-    assert loose.corrections == 0
-    assert loose.drift < 1e-3 * loose.travel  # even uncorrected, as 004 reports
+    np.testing.assert_allclose(result.vectors[0], exact, rtol=0.0, atol=10.0 * tolerance)
+    loose = tangential_effects(geometry, errors, 0, positions, rotations, tolerance=1.0)
+    assert loose.corrections[0] == 0
+    assert loose.drift[0] < 1e-3 * loose.travel[0]  # even uncorrected, as 004 reports

@@ -29,7 +29,7 @@ from hexapod_comp.workspace.combining import (
     worst_case,
 )
 from hexapod_comp.workspace.effects import LINEAR, Extremes, effect_vectors, extremes
-from hexapod_comp.workspace.ranking import PAPER_TABLE, paper_row, ranked, ranking_rows, ranking_text
+from hexapod_comp.workspace.ranking import PAPER_TABLE, beside, paper_row, ranked, ranking_rows, ranking_text
 from hexapod_comp.workspace.sources import Budget, SingleErrors
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
@@ -133,18 +133,37 @@ def test_joined_rows_hold_the_larger_and_the_smaller_of_their_types():
 
 def test_text_shows_the_paper_in_brackets_and_records_carry_units():
     geometry = unit()
-    rows = ranked(over(geometry, PAPER_SIZES, count=20), geometry)
-    text = ranking_text(rows)
+    found = over(geometry, PAPER_SIZES, count=20)
+    rows, printed = ranked(found, geometry), beside(geometry, found.errors)
+    text = ranking_text(rows, printed)
     for expected in ("(34.40)", "(15.41)", "screw pitch", "strut_", "transl. max µm", "rot. max m°", "not to be met"):
         assert expected in text
-    assert "(34.40)" not in ranking_text(rows, with_paper=False)
-    records = json.loads(json.dumps(ranking_rows(rows)))
+    records = json.loads(json.dumps(ranking_rows(rows, printed)))
     assert [record["rank"] for record in records] == [1, 2, 3, 4]
     assert records[0]["translation_max_um"] == pytest.approx(rows[0].translation_max.value * 1e6)
     assert records[0]["rotation_max_paper_mdeg"] == pytest.approx(15.41)
     assert len({tuple(record) for record in records}) == 1
     other = ranking_rows(ranked(over(geometry, {"thermal_growth": 1e-5}, count=5), geometry))
     assert other[0]["translation_max_paper_um"] is None
+
+
+def test_the_papers_figures_stand_only_beside_such_a_machine_with_such_errors():
+    # 004: a positioning unit; pitch ±20 µm, joints ±10 µm, quantisation 7 µm.
+    geometry, paper = unit(), small.paper()
+    sizes = {**PAPER_SIZES, "quantisation": 8e-6, "backlash": 7e-6}
+    found = over(geometry, sizes, count=5)
+    printed = beside(geometry, found.errors)
+    assert set(printed) == {"screw pitch", "base-/platform joint (x/y)", "base-/platform joint (z)"}
+    text = ranking_text(ranked(found, geometry), printed)
+    assert text.count("(34.40)") == 1
+    assert "(10.85)" not in text
+    of_paper = over(paper, PAPER_SIZES, count=5)  # a machine tool of three ball joints
+    assert beside(paper, of_paper.errors) == {}
+    assert "v. Daake" not in ranking_text(ranked(of_paper, paper), {})
+    large = replace(geometry, base_joints=3 * geometry.base_joints, platform_joints=3 * geometry.platform_joints,
+                    home=Pose(3 * geometry.home.position, np.eye(3)),
+                    limits=replace(geometry.limits, stroke=3 * geometry.limits.stroke))  # fmt: skip
+    assert beside(large, found.errors) == {}
 
 
 def test_an_unreachable_workspace_is_refused():
@@ -169,6 +188,22 @@ def test_the_worst_case_is_the_largest_over_all_signs():
     expected = np.stack([np.linalg.norm(sums[..., :3], axis=2).max(axis=1), np.abs(sums[..., 3:]).max(axis=(1, 2))])
     np.testing.assert_allclose(worst_case(some, vectors), expected.T, rtol=1e-12)
     assert {int(part) for part in some.part} == {0, 1, 2, 3}
+
+
+def test_the_worst_case_of_shared_joints_is_the_largest_over_all_signs():
+    # All 2^12 combinations; a shared joint's three errors have directions of their own. At home the paper's machine is
+    # as symmetrical as can be: directions lie in common planes.
+    geometry = small.paper()
+    sizes = {"platform_joint_xy": 10e-6, "platform_joint_z": 8e-6, "strut_length": 5e-6}
+    errors = Budget("paper", sizes).single_errors(geometry)
+    errors = errors.select(np.arange(len(errors)) < 12)
+    positions, rotations = poses_about(geometry.home, 4, seed=2, reach=0.05, tilt_deg=10.0)
+    positions[0], rotations[0] = geometry.home.position, np.eye(3)
+    vectors = effect_vectors(geometry, errors, positions, rotations, LINEAR)
+    signs = np.array(list(product([-1.0, 1.0], repeat=len(errors))))
+    sums = np.einsum("se,nec->nsc", signs, vectors)
+    expected = np.stack([np.linalg.norm(sums[..., :3], axis=2).max(axis=1), np.abs(sums[..., 3:]).max(axis=(1, 2))])
+    np.testing.assert_allclose(worst_case(errors, vectors), expected.T, rtol=1e-9)
 
 
 def test_the_ways_of_adding_up_keep_their_order():
@@ -271,6 +306,12 @@ def test_allocated_errors_use_up_what_is_allowed(method, quantity):
         alone[kind] = factor
         assert factor > found.scale
         assert largest(alone) == pytest.approx(allowed, rel=1e-8)
+        assert found.only[kind] == pytest.approx(largest(np.eye(len(ones))[kind]), rel=1e-12)
+        assert found.without[kind] == pytest.approx(largest(ones - np.eye(len(ones))[kind]), rel=1e-12)
+    acting = np.isfinite(found.equal)
+    assert largest(np.where(acting, found.equal, 0.0)) <= allowed * (1 + 1e-9)  # equal parts, together no more
+    used = [largest(np.where(np.arange(len(ones)) == kind, found.equal, 0.0)) for kind in np.flatnonzero(acting)]
+    np.testing.assert_allclose(used, used[0], rtol=1e-9)
 
 
 def test_nothing_is_left_for_a_source_when_the_others_are_too_much():

@@ -71,7 +71,9 @@ def test_every_type_names_what_it_moves() -> None:
     """Lengths by strut, joints by strut and axis, the tool by axis; a coordinate's error is along its own axis."""
     errors = made(**{source.name: 1e-5 for source in SOURCE_TYPES})
     assert len(errors) == 6 * 6 + 12 + 6 + 12 + 6 + 3
-    for part, strut, vector, label in zip(errors.part, errors.strut, errors.vector, errors.labels, strict=True):
+    for part, struts, vector, label in zip(errors.part, errors.struts, errors.vector, errors.labels, strict=True):
+        strut = int(struts.argmax())
+        assert struts.sum() == (part != TOOL)
         if part == LENGTH:
             assert label == f"strut_{strut + 1}"
             continue
@@ -79,7 +81,21 @@ def test_every_type_names_what_it_moves() -> None:
         np.testing.assert_allclose(np.sort(vector), [0.0, 0.0, 1e-5], rtol=1e-12)
         body = {BASE_JOINT: f"base joint {strut + 1}", PLATFORM_JOINT: f"platform joint {strut + 1}", TOOL: "tool"}
         assert label == f"{body[part]} {axis}"
-    np.testing.assert_array_equal(errors.strut[errors.part == TOOL], -1)
+
+
+def test_a_ball_joint_that_two_struts_share_is_one_joint() -> None:
+    """As in ``assess`` and ``fit``: three platform joints of the papers' machine, unless they are asked for apart."""
+    paper, sizes = load_geometry(PAPER_FILE), {"platform_joint_xy": 1e-5, "base_joint_z": 1e-5}
+    shared = Budget("paper", sizes).single_errors(paper)
+    platform = shared.part == PLATFORM_JOINT
+    along_x = [label for label in shared.labels if label.endswith("x")]
+    assert along_x == [f"platform joint {pair} x" for pair in ("1/2", "3/4", "5/6")]
+    assert (shared.struts[platform].sum(axis=1) == 2).all()
+    assert (shared.struts.sum(axis=1)[~platform] == 1).all()
+    assert len(shared) == 3 * 2 + 6
+    apart = Budget("paper", sizes).single_errors(paper, shared_platform_joints=False)
+    assert len(apart) == 6 * 2 + 6
+    assert (apart.struts.sum(axis=1) == 1).all()
 
 
 def test_a_strut_is_off_by_half_its_backlash() -> None:

@@ -1,0 +1,189 @@
+"""What a fit knows of its parameters and how well, kept in a file beside the model file.
+
+The model file names it with its hash, so that one model's figures are never taken for another's. The file holds all
+that the readings left behind: parameters, covariance, tolerances and noise, and what they mean. New readings can be
+added to it without the old ones.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import HexapodError, InputFileError, ModelError
+from ..formats.outputs import new_file
+from ..formats.paths import input_file
+from ..machine.geometry import HexapodGeometry
+from ..machine.model import MachineModel
+from ..machine.model_file import save_model
+from ..measurements.readings import KINDS
+from .fit import ModelFit
+from .parameters import FitSettings, ParameterSpace, Region
+
+FORMAT = "hexapod_comp/posterior"
+VERSION = 1
+
+SUFFIX = ".posterior.npz"
+
+MOST_BYTES = 200_000_000
+"""Larger arrays are no fit's: some 5000 parameters."""
+
+
+@dataclass(frozen=True)
+class FittedParameters:
+    """The parameters of a joint fit and how well they are known.
+
+    Attributes
+    ----------
+    space : ParameterSpace
+        What they mean.
+    x : ndarray, shape (size,)
+        The most probable ones, SI.
+    covariance : ndarray, shape (size, size)
+        Theirs.
+    tolerances : ndarray, shape (blocks,)
+        Size of each block's prior.
+    noise : ndarray, shape (kinds,)
+        Factor on the stated standard deviation of each kind's readings.
+    """
+
+    space: ParameterSpace
+    x: np.ndarray
+    covariance: np.ndarray
+    tolerances: np.ndarray
+    noise: np.ndarray
+
+    @staticmethod
+    def of(fit: ModelFit) -> FittedParameters:
+        """Return what a fit knows."""
+        found = fit.solution.posterior
+        return FittedParameters(fit.space, fit.solution.x, fit.covariance, found.tolerances, found.noise)
+
+
+def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, path: str | Path) -> list[Path]:
+    """Write a model file, and beside it what its fit knows; return what was written beside.
+
+    Parameters
+    ----------
+    model : MachineModel
+        The model.
+    fitted : FittedParameters or None
+        What the fit knows; None where nobody knows, as after scheme lines.
+    path : str or Path
+        The model file. Into a pipe only the model is written.
+
+    Raises
+    ------
+    InputFileError
+        A file cannot be written.
+    """
+    file = Path(path)
+    if fitted is None or (file.exists() and not file.is_file()):
+        save_model(model, path)
+        return []
+    beside, content = file.with_name(file.stem + SUFFIX), _content(fitted)
+    with new_file(beside, "wb") as stream:  # first: a model file never names what is not there yet
+        stream.write(content)
+    posterior = beside.name, hashlib.sha256(content).hexdigest()
+    save_model(replace(model, origin=replace(model.origin, posterior=posterior)), path)
+    return [beside]
+
+
+def _content(fitted: FittedParameters) -> bytes:
+    space, stream = fitted.space, io.BytesIO()
+    head = {"format": FORMAT, "version": VERSION, "machine": space.geometry.name, "settings": asdict(space.settings)}
+    arrays = {name: getattr(fitted, name) for name in ("x", "tolerances", "noise")}
+    arrays["covariance"] = fitted.covariance[np.tril_indices(space.size)]  # it is symmetric
+    arrays |= {f"region_{name}": value for name, value in vars(space.region).items()}
+    np.savez_compressed(stream, head=np.array(json.dumps(head)), labels=np.array(space.labels), **arrays)
+    return stream.getvalue()
+
+
+def load_posterior(
+    model: MachineModel, geometry: HexapodGeometry, path: str | Path
+) -> tuple[FittedParameters | None, str]:
+    """Return what a model's fit knows of its parameters, or why that is not known.
+
+    Parameters
+    ----------
+    model, geometry : MachineModel, HexapodGeometry
+        The model and its machine.
+    path : str or Path
+        The model's file, as :func:`~hexapod_comp.machine.model_file.load_model` takes it.
+
+    Returns
+    -------
+    FittedParameters or None, str
+        None: not known, for the reason given.
+    """
+    if model.origin.posterior is None:
+        return None, f"model {model.name!r} carries no covariance of a fit"
+    name, digest = model.origin.posterior
+    try:
+        file = input_file(path).with_name(name)
+        content = _read(file)
+        if hashlib.sha256(content).hexdigest() != digest:
+            return None, f"{name} is not the file that was written with model {model.name!r}"
+        return _parsed(content, file, geometry), ""
+    except HexapodError as error:
+        return None, str(error)
+
+
+def _read(path: Path) -> bytes:
+    try:
+        with open(path, "rb") as stream:
+            content = stream.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise InputFileError(path, "", f"cannot be read: {error.strerror}") from error
+    if len(content) > MOST_BYTES:
+        raise InputFileError(path, "", f"larger than the allowed {MOST_BYTES // 1_000_000} MB")
+    return content
+
+
+def _parsed(content: bytes, path: Path, geometry: HexapodGeometry) -> FittedParameters:
+    """Return the parameters of a file's content.
+
+    Raises
+    ------
+    InputFileError
+        It is no such file, of another version or machine, or its parts do not belong together.
+    """
+    try:
+        if sum(part.file_size for part in zipfile.ZipFile(io.BytesIO(content)).infolist()) > MOST_BYTES:
+            raise InputFileError(path, "", f"unpacks to more than {MOST_BYTES // 1_000_000} MB")
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            arrays = dict(archive)
+        head = json.loads(str(arrays["head"]))
+        known = FORMAT, VERSION, geometry.name
+        if (head["format"], head["version"], head["machine"]) != known:
+            raise InputFileError(path, "head", f"must be {known}", [head["format"], head["version"], head["machine"]])
+        region = Region(**{entry.name: arrays[f"region_{entry.name}"] for entry in fields(Region)})
+        space = ParameterSpace((geometry, region), _settings(head["settings"]))
+        if tuple(arrays["labels"].tolist()) != space.labels:
+            problem = "are not those of this geometry's parameters; was the geometry changed?"
+            raise InputFileError(path, "labels", problem)
+        covariance = np.zeros((space.size, space.size))
+        covariance[np.tril_indices(space.size)] = arrays["covariance"]
+        covariance += np.tril(covariance, -1).T
+        found = FittedParameters(space, arrays["x"], covariance, arrays["tolerances"], arrays["noise"])
+    except (KeyError, TypeError, ValueError, zipfile.BadZipFile, ModelError) as error:
+        raise InputFileError(path, "", f"is no file of a fit's posterior: {error}") from error
+    shapes = {"x": (space.size,), "covariance": (space.size,) * 2}
+    shapes |= {"tolerances": (len(space.blocks),), "noise": (len(KINDS),)}
+    for name, shape in shapes.items():
+        array = getattr(found, name)
+        if array.shape != shape or not np.isfinite(array).all():
+            raise InputFileError(path, name, f"must be finite, of shape {shape}", list(array.shape))
+    return found
+
+
+def _settings(given: dict[str, Any]) -> FitSettings:
+    tolerances = tuple((name, value) for name, value in given.pop("tolerances"))
+    return FitSettings(blocks=tuple(given.pop("blocks")), tolerances=tolerances, **given)

@@ -1,0 +1,243 @@
+"""The error that the tool would make without compensation, at any pose, and how well it is known.
+
+Mou & King (1998): "predict the linear displacement errors of any point within designated machine workspace". Here all
+six components, from any model, with the covariance that a joint fit's parameters give them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ..kernels.kinematics import OK
+from ..machine.kinematics import Structure, strut_lengths_batch
+from ..machine.model import RealMachine, Temperatures, platform_box
+from ..machine.motion import FOLLOWED
+from ..machine.passes import Poses
+from ..measurements.readings import Stations, attitude_error
+from .parameters import ParameterSpace
+from .posterior import FittedParameters
+from .sensitivity import Prediction, derivatives
+
+CHUNK = 256
+"""Poses handled together: bounds the memory of their derivatives."""
+
+COMPONENTS = ("x", "y", "z", "rx", "ry", "rz")
+"""Displacement along, and rotation about, the axes of the work frame."""
+
+
+@dataclass(frozen=True)
+class PredictedError:
+    """What the tool does at N poses when the struts are told nominal lengths, beside what it should do.
+
+    Attributes
+    ----------
+    values : ndarray, shape (N, 6)
+        Displacement of the tool's tip, m, and rotation vector, rad, actual minus commanded, along and about the axes of
+        ``work``; NaN where the machine has no pose.
+    covariance : ndarray, shape (N, 6, 6) or None
+        How well they are known; None: nobody knows.
+    """
+
+    values: np.ndarray
+    covariance: np.ndarray | None
+
+    @property
+    def deviations(self) -> np.ndarray | None:
+        """Standard deviations of `values`, shape (N, 6); None where they are not known."""
+        if self.covariance is None:
+            return None
+        return np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0))
+
+
+class _FirstOrder(NamedTuple):
+    """Tips in ``work``, (N, 3), errors there, (N, 6), and how parameters move them, (N, 6, size); m and rad."""
+
+    tips: np.ndarray
+    values: np.ndarray
+    slopes: np.ndarray
+
+    def without(self, datum: _Datum) -> _FirstOrder:
+        """Return the same with a datum aligned."""
+        arms = self.tips - datum.centre
+        return _FirstOrder(self.tips, self.values - datum.at(arms, 0), self.slopes - datum.at(arms, 1))
+
+
+class ErrorPredictor:
+    """Predicts the tool's error without compensation, by a model, at any pose.
+
+    Parameters
+    ----------
+    machine : RealMachine
+        Geometry and model, at their temperatures.
+    fitted : FittedParameters or None
+        What the model's fit knows; None: no covariance is known.
+
+    Notes
+    -----
+    The covariance is J·Σ·Jᵀ, J the derivatives of the error by the fit's parameters and Σ their covariance: to first
+    order, and of what the fit's blocks describe.
+    """
+
+    def __init__(self, machine: RealMachine, fitted: FittedParameters | None) -> None:
+        self._machine, self._fitted = machine, fitted
+        self._datum = self._find_datum()
+
+    def predict(self, poses: Poses, senses: np.ndarray | None = None) -> tuple[PredictedError, PredictedError | None]:
+        """Return the errors as the machine stands, and with the datum aligned.
+
+        As it stands, an error holds where the machine is as a whole, which lines of a laser do not see. Aligned, it
+        loses the shift and the turn that best explain the displacements in the box for which the model was measured,
+        and the mean rotation there: what a shop takes out that sets its zero and squares its work. None for a model
+        that tells of no box.
+
+        Parameters
+        ----------
+        poses : Poses
+            ``pose_platform_in_base``, shapes (N, 3), m, and (N, 3, 3).
+        senses : ndarray, shape (N, 9), optional
+            Directions of motion as in :class:`~hexapod_comp.machine.motion.MotionState`; by default not known, which is
+            midway between both: a backlash and a reversal of the field then add nothing.
+
+        Raises
+        ------
+        NotFiniteError
+            A pose is not finite.
+        """
+        count = len(poses[0])
+        stations = _stations(self._machine, poses, np.zeros((count, FOLLOWED)) if senses is None else senses)
+        standing: list[PredictedError] = []
+        aligned: list[PredictedError] = []
+        for start in range(0, max(count, 1), CHUNK):
+            chosen = np.arange(start, min(start + CHUNK, count))
+            found = _first_order(self._machine, self._fitted, stations.select(chosen))
+            standing.append(self._with_covariance(found))
+            if self._datum is not None:
+                aligned.append(self._with_covariance(found.without(self._datum)))
+        return _joined(standing), _joined(aligned) if aligned else None
+
+    def _with_covariance(self, found: _FirstOrder) -> PredictedError:
+        if self._fitted is None:
+            return PredictedError(found.values, None)
+        return PredictedError(found.values, found.slopes @ self._fitted.covariance @ np.swapaxes(found.slopes, 1, 2))
+
+    def _find_datum(self) -> _Datum | None:
+        """Return the motion of the whole machine that is no error once the datum is set."""
+        geometry, fitted = self._machine.geometry, self._fitted
+        level = geometry.work.rotation @ geometry.tool.rotation.T if fitted is None else fitted.space.level
+        box = platform_box(self._machine.model, level)
+        if box is None:
+            return None
+        nodes = [np.linspace(low, high, 3) for low, high in box.T]
+        positions = np.stack(np.meshgrid(*nodes), axis=-1).reshape(-1, 3)
+        poses = positions, np.tile(level, (len(positions), 1, 1))
+        found = _first_order(
+            self._machine, fitted, _stations(self._machine, poses, np.zeros((len(positions), FOLLOWED)))
+        )
+        reached = np.isfinite(found.values).all(axis=1)
+        if reached.sum() < 3:
+            return None
+        return _Datum.of(_FirstOrder(*(part[reached] for part in found)))
+
+
+@dataclass(frozen=True)
+class _Datum:
+    """A small motion of the whole machine about a centre, and the mean rotation of its tool.
+
+    Attributes
+    ----------
+    centre : ndarray, shape (3,)
+        m in ``work``.
+    motion : tuple of ndarray, shape (6,) and (6, size)
+        Shift, m, and turn, rad, and how a fit's parameters move them.
+    rotation : tuple of ndarray, shape (3,) and (3, size)
+        The same of the tool's mean rotation.
+    """
+
+    centre: np.ndarray
+    motion: tuple[np.ndarray, np.ndarray]
+    rotation: tuple[np.ndarray, np.ndarray]
+
+    @staticmethod
+    def of(found: _FirstOrder) -> _Datum:
+        """Return what explains the errors at some places best, by least squares of the displacements."""
+        centre = found.tips.mean(axis=0)
+        unit = np.tile(np.eye(6)[None], (len(found.tips), 1, 1))
+        explain = np.linalg.pinv(_carried(unit, found.tips - centre)[:, :3].reshape(-1, 6))
+        parts = found.values[:, :, None], found.slopes
+        motion, slopes = (explain @ part[:, :3].reshape(len(explain[0]), -1) for part in parts)
+        means = found.values[:, 3:].mean(axis=0), found.slopes[:, 3:].mean(axis=0)
+        return _Datum(centre, (motion[:, 0], slopes), means)
+
+    def at(self, arms: np.ndarray, which: int) -> np.ndarray:
+        """Return what the datum is at points beside its centre, arms (N, 3): values (N, 6), or slopes (N, 6, size)."""
+        motion, rotation = self.motion[which], self.rotation[which]
+        whole = _carried(motion.reshape(1, 6, -1), arms)
+        whole[:, 3:] = rotation.reshape(1, 3, -1)
+        return whole if which else whole[:, :, 0]
+
+
+def _joined(parts: list[PredictedError]) -> PredictedError:
+    """Return the errors of several parts of a list of poses."""
+    covariances = [part.covariance for part in parts if part.covariance is not None]
+    return PredictedError(
+        np.concatenate([part.values for part in parts]), np.concatenate(covariances) if covariances else None
+    )
+
+
+def _stations(machine: RealMachine, poses: Poses, senses: np.ndarray) -> Stations:
+    """Return poses at which the struts are told nominal lengths."""
+    positions, rotations = (np.ascontiguousarray(part, dtype=float) for part in poses)
+    nominal = strut_lengths_batch(Structure.of(machine.geometry), positions, rotations)
+    warmth = np.array([machine.temperatures.at(name) for name in Temperatures.NAMES])
+    return Stations(positions, rotations, nominal, senses, np.tile(warmth, (len(positions), 1)))
+
+
+def _first_order(machine: RealMachine, fitted: FittedParameters | None, stations: Stations) -> _FirstOrder:
+    """Return the error at stations, and its derivatives, none without a fit; NaN where the machine has no pose."""
+    geometry, count = machine.geometry, len(stations)
+    modelled = stations.positions.copy(), stations.rotations.copy()
+    actual = np.empty_like(modelled[0]), np.empty_like(modelled[1])
+    solved = np.zeros(count, dtype=bool)
+    for n in range(count):
+        arrays = modelled[0][n], modelled[1][n], actual[0][n], actual[1][n]
+        solved[n] = machine.forward(stations.commands[n], stations.sense[n], *arrays)[0] == OK
+    displacements = actual[0] - stations.positions + (actual[1] - stations.rotations) @ geometry.tool.position
+    values = np.full((count, 6), np.nan)
+    values[solved, :3] = displacements[solved] @ geometry.work.rotation
+    values[solved, 3:] = attitude_error(actual[1][solved], stations.rotations[solved]) @ geometry.work.rotation
+    slopes = np.full((count, 6, 0 if fitted is None else fitted.space.size), np.nan)
+    if fitted is not None and solved.any():
+        there = modelled[0][solved], modelled[1][solved]
+        slopes[solved] = tool_derivatives(machine, fitted.space, stations.select(solved), there)
+    return _FirstOrder(geometry.tool_poses(stations.positions, stations.rotations)[0], values, slopes)
+
+
+def tool_derivatives(machine: RealMachine, space: ParameterSpace, stations: Stations, modelled: Poses) -> np.ndarray:
+    """Return how a fit's parameters move the tool, along and about the axes of ``work``, shape (N, 6, size).
+
+    Parameters
+    ----------
+    machine : RealMachine
+        What the parameters describe.
+    space : ParameterSpace
+        The parameters.
+    stations : Stations
+        Commands, directions and temperatures.
+    modelled : Poses
+        The structure's ``pose_platform_in_base`` under these commands, m.
+    """
+    count, structure = len(stations), machine.structure
+    base, platform = (np.tile(array, (count, 1, 1)) for array in (structure.base_joints, structure.platform_joints))
+    rows = derivatives(space, Prediction(np.zeros((count, 6)), *modelled, base, platform), stations)
+    rows = _carried(rows, modelled[1] @ (machine.geometry.tool.position - space.probe))
+    work = machine.geometry.work.rotation.T
+    return np.concatenate([work @ rows[:, :3], work @ rows[:, 3:]], axis=1)
+
+
+def _carried(motions: np.ndarray, arms: np.ndarray) -> np.ndarray:
+    """Return small motions (N or 1, 6, K) of a body, known at one point, at points that are arms (N, 3) away."""
+    displacements = motions[:, :3] + np.cross(motions[:, 3:], arms[:, :, None], axis=1)
+    return np.concatenate([displacements, np.broadcast_to(motions[:, 3:], displacements.shape)], axis=1)

@@ -1,0 +1,219 @@
+"""The predicted error of the tool, and how well it is known, against machines drawn from the covariance.
+
+Where the drawn machines go is said by :mod:`foreign_machines`, whose kinematics are not the package's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from pathlib import Path
+
+import calibration_helpers as small
+import numpy as np
+import pytest
+from foreign_machines import UM, Errors, Machine, goes_to, machines
+from scipy.spatial.transform import Rotation
+
+from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
+from hexapod_comp.calibration.posterior import FittedParameters, load_posterior, save_with_posterior
+from hexapod_comp.calibration.prediction import ErrorPredictor, PredictedError
+from hexapod_comp.errors import InputFileError
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.pose import Pose
+
+DRAWS = 1500
+
+
+def known(machine: Machine, folder: Path) -> FittedParameters:
+    """Return parameters of structure and pitch, known to about 5 µm and 5 ppm, with correlations."""
+    geometry = load_geometry(machine.write(folder / "machine.yaml"))
+    tips = np.random.default_rng(1).uniform(*machine.box, (12, 3))
+    commanded = [Pose(p, geometry.work.rotation.T @ machine.level() @ geometry.tool.rotation) for p in tips]
+    probe = geometry.tool.position + np.array([0.01, -0.02, 0.03])  # the laser's target is not the tool
+    space = ParameterSpace(small.scattered(geometry, commanded, None, probe), FitSettings(blocks=("pitch",)))
+    rng = np.random.default_rng(2)
+    mixing = np.eye(space.size) + 0.3 * rng.standard_normal((space.size, space.size)) / np.sqrt(space.size)
+    x, covariance = 50 * UM * rng.uniform(-1.0, 1.0, space.size), (5 * UM) ** 2 * mixing @ mixing.T
+    return FittedParameters(space, x, 0.5 * (covariance + covariance.T), np.full(2, 100 * UM), np.ones(5))
+
+
+def errors_of(space: ParameterSpace, x: np.ndarray) -> Errors:
+    """Return what a parameter vector means, in the words of the tests' own machines."""
+    base, rest = x[:18].reshape(6, 3), x[18:]
+    groups = space.platform_groups
+    joints, offset, pitch = np.split(rest, [3 * (groups.max() + 1), 3 * (groups.max() + 1) + 6])
+    return Errors(base, joints.reshape(-1, 3)[groups], offset, pitch, space.home_lengths)
+
+
+def tool_motion(machine: Machine, errors: Errors, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Return how tips move and turn, (N, 6) in work, when the struts are told the nominal machine's lengths."""
+    ends = positions[:, None] + machine.platform @ np.swapaxes(rotations, 1, 2)
+    told = np.linalg.norm(ends - machine.base, axis=2)
+    went = goes_to(machine, errors, told, positions, rotations)
+    turns = Rotation.from_matrix(went[1] @ np.swapaxes(rotations, 1, 2)).as_rotvec() @ machine.work.matrix
+    return np.hstack([machine.tips(*went) - machine.tips(positions, rotations), turns])
+
+
+@pytest.mark.parametrize("name", ["framed 6-6", "hanging", "inches"])
+def test_errors_spread_as_those_of_machines_that_are_drawn(name: str, tmp_path: Path) -> None:
+    """1500 machines: a standard deviation is known to 1/√3000, 1.8 %; 8 % is beyond four of these.
+
+    First order is off by the spread over the machine's size, 1e-5. Poses are tilted and beside the box, too.
+    """
+    machine = machines()[name]
+    fitted = known(machine, tmp_path)
+    space, rng = fitted.space, np.random.default_rng(3)
+    real = RealMachine(space.geometry, space.model(fitted.x))
+    positions = machine.platforms(machine.middle + 1.2 * np.array(machine.half) * rng.uniform(-1.0, 1.0, (3, 3)))
+    rotations = Rotation.from_rotvec(0.1 * rng.standard_normal((3, 3))).as_matrix() @ machine.level()
+    standing, aligned = ErrorPredictor(real, fitted).predict((positions, rotations))
+    expected = tool_motion(machine, errors_of(space, fitted.x), positions, rotations)
+    np.testing.assert_allclose(standing.values, expected, rtol=0.0, atol=1e-12)
+
+    drawn = rng.multivariate_normal(fitted.x, fitted.covariance, DRAWS)
+    spread = np.array([tool_motion(machine, errors_of(space, x), positions, rotations) for x in drawn])
+    assert standing.deviations is not None
+    np.testing.assert_allclose(standing.deviations, spread.std(axis=0), rtol=0.08)
+    assert standing.covariance is not None
+    for n, found in enumerate(standing.covariance):
+        sigma = standing.deviations[n]
+        ours, theirs = found / np.outer(sigma, sigma), np.corrcoef(spread[:, n].T)
+        np.testing.assert_allclose(ours, theirs, atol=0.11)  # 1/√1500, four times
+
+    assert aligned is not None
+    told = np.stack(np.meshgrid(*(np.linspace(*side, 3) for side in space.platform_box.T)), -1).reshape(-1, 3)
+    level = np.tile(machine.level(), (len(told), 1, 1))
+    sets = [
+        aligned_by_kabsch(machine, errors_of(space, x), (told, level), (positions, rotations)) for x in drawn[:1000]
+    ]
+    assert aligned.deviations is not None
+    np.testing.assert_allclose(aligned.deviations, np.std(sets, axis=0), rtol=0.17)  # 300 machines, four times 4.1 %
+    at_x = aligned_by_kabsch(machine, errors_of(space, fitted.x), (told, level), (positions, rotations))
+    np.testing.assert_allclose(aligned.values, at_x, rtol=0.0, atol=0.1 * UM)  # 100 µm squared over 0.1 m
+    assert aligned.deviations[:, :3].mean() < 0.5 * standing.deviations[:, :3].mean()
+
+
+def aligned_by_kabsch(machine: Machine, errors: Errors, reference: tuple, poses: tuple) -> np.ndarray:
+    """Return errors at poses, (N, 6), less the rigid motion that best maps reference tips to where they went."""
+    before = machine.tips(*reference)
+    moved = tool_motion(machine, errors, *reference)
+    after = before + moved[:, :3]
+    centre, mean = before.mean(axis=0), after.mean(axis=0)
+    turn, _ = Rotation.align_vectors(after - mean, before - centre)
+    found, tips = tool_motion(machine, errors, *poses), machine.tips(*poses)
+    displacements = tips + found[:, :3] - (turn.apply(tips - centre) + mean)
+    return np.hstack([displacements, found[:, 3:] - moved[:, 3:].mean(axis=0)])
+
+
+def test_a_pose_that_the_machine_cannot_take_has_no_error_and_spoils_no_other(tmp_path: Path) -> None:
+    fitted = known(machines()["hanging"], tmp_path)
+    geometry = fitted.space.geometry
+    predictor = ErrorPredictor(RealMachine(geometry, fitted.space.model(fitted.x)), fitted)
+    positions = geometry.home.position + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.04]])  # mirrored: assembled otherwise
+    found = predictor.predict((positions, np.tile(geometry.home.rotation, (2, 1, 1))))
+    for errors in found:
+        assert errors is not None
+        assert errors.deviations is not None
+        assert np.isfinite(errors.values[0]).all()
+        assert np.isfinite(errors.deviations[0]).all()
+        assert np.isnan(errors.values[1]).all()
+        assert np.isnan(errors.deviations[1]).all()
+
+
+def test_without_a_fit_errors_are_there_but_nobody_knows_how_well() -> None:
+    """A model of no box has no place over which a datum could be aligned."""
+    geometry = small.paper()
+    machine = RealMachine(geometry, MachineModel("paper", base_deviation=1e-5 * np.ones((6, 3))))
+    standing, aligned = ErrorPredictor(machine, None).predict((geometry.home.position[None], np.eye(3)[None]))
+    assert aligned is None
+    assert standing.covariance is None
+    assert standing.deviations is None
+    # A base that stands aside by (d, d, d) takes all of the machine along.
+    np.testing.assert_allclose(standing.values[0], [1e-5] * 3 + [0.0] * 3, rtol=0.0, atol=1e-14)
+
+
+def test_many_poses_are_as_each_alone(tmp_path: Path) -> None:
+    fitted = known(machines()["framed 6-6"], tmp_path)
+    predictor = ErrorPredictor(RealMachine(fitted.space.geometry, fitted.space.model(fitted.x)), fitted)
+    rng, home = np.random.default_rng(5), fitted.space.geometry.home
+    positions = home.position + 0.02 * rng.uniform(-1.0, 1.0, (600, 3))  # three parts
+    rotations = np.tile(home.rotation, (600, 1, 1))
+    whole = predictor.predict((positions, rotations))
+    for n in (0, 255, 256, 599):
+        for one, many in zip(predictor.predict((positions[n : n + 1], rotations[:1])), whole, strict=True):
+            assert isinstance(one, PredictedError)
+            assert isinstance(many, PredictedError)
+            np.testing.assert_allclose(one.values[0], many.values[n], rtol=1e-12)
+            np.testing.assert_allclose(one.covariance[0], many.covariance[n], rtol=1e-9, atol=1e-30)  # type: ignore[index]
+    for none in predictor.predict((positions[:0], rotations[:0])):
+        assert none is not None
+        assert none.values.shape == (0, 6)
+
+
+# The file beside the model.
+
+
+def saved(folder: Path) -> tuple[FittedParameters, Path]:
+    """Write a model and what its fit knows."""
+    fitted, path = known(machines()["framed 6-6"], folder), folder / "after the crash.yaml"
+    model = fitted.space.model(fitted.x)
+    model = dataclasses.replace(model, origin=dataclasses.replace(model.origin, date="2026-01-31"))
+    assert save_with_posterior(model, fitted, path) == [folder / "after the crash.posterior.npz"]
+    return fitted, path
+
+
+def test_what_a_fit_knows_comes_back_from_its_file(tmp_path: Path) -> None:
+    """All of it, to the last bit: new readings are to be added to it some day."""
+    fitted, path = saved(tmp_path)
+    geometry = fitted.space.geometry
+    model = load_model(path, geometry)
+    found, why = load_posterior(model, geometry, path)
+    assert why == ""
+    assert found is not None
+    for name in ("x", "tolerances", "noise"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(fitted, name))
+    np.testing.assert_array_equal(found.covariance, fitted.covariance)
+    assert found.space.labels == fitted.space.labels
+    assert found.space.settings == fitted.space.settings
+    again, first = found.space.model(found.x), fitted.space.model(fitted.x)
+    np.testing.assert_array_equal(again.platform_deviation, first.platform_deviation)
+    np.testing.assert_array_equal(again.struts.pitch, first.struts.pitch)
+
+
+def test_what_is_not_the_models_own_is_not_known(tmp_path: Path) -> None:
+    """Moved away, of another fit, cut off, of another geometry: a reason, never another machine's figures."""
+    fitted, path = saved(tmp_path)
+    geometry, beside = fitted.space.geometry, tmp_path / "after the crash.posterior.npz"
+    model, content = load_model(path, geometry), beside.read_bytes()
+    beside.write_bytes(content[:-100])
+    assert "is not the file that was written with model" in load_posterior(model, geometry, path)[1]
+    beside.unlink()
+    assert load_posterior(model, geometry, path) == (None, f"{beside}: cannot be read: No such file or directory")
+    beside.write_bytes(content)
+    other = dataclasses.replace(geometry, platform_joints=np.repeat(geometry.platform_joints[::2], 2, axis=0))
+    assert "labels: are not those of this geometry's parameters" in load_posterior(model, other, path)[1]
+    assert "carries no covariance" in load_posterior(MachineModel(geometry.name), geometry, "ideal")[1]
+
+
+@pytest.mark.parametrize("name", ["../outside.npz", "/etc/passwd", "a/b.npz"])
+def test_a_model_names_no_file_elsewhere(tmp_path: Path, name: str) -> None:
+    fitted, path = saved(tmp_path)
+    path.write_text(path.read_text().replace("after the crash.posterior.npz", name))
+    with pytest.raises(InputFileError, match=r"posterior\.file: must be a file's name, without a folder"):
+        load_model(path, fitted.space.geometry)
+
+
+def test_a_file_that_is_no_posterior_is_refused_with_its_name(tmp_path: Path) -> None:
+    """Even one whose hash the model has."""
+    fitted, path = saved(tmp_path)
+    geometry, beside = fitted.space.geometry, tmp_path / "after the crash.posterior.npz"
+    for content in (b"", b"PK\x03\x04 nothing", b"x" * 1000):
+        beside.write_bytes(content)
+        model = load_model(path, geometry)
+        origin = dataclasses.replace(model.origin, posterior=(beside.name, hashlib.sha256(content).hexdigest()))
+        found, why = load_posterior(dataclasses.replace(model, origin=origin), geometry, path)
+        assert found is None
+        assert why.startswith(f"{beside}: is no file of a fit's posterior")
