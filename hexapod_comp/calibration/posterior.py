@@ -11,6 +11,7 @@ import hashlib
 import io
 import json
 import zipfile
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -107,7 +108,10 @@ def _content(fitted: FittedParameters) -> bytes:
 
 
 def load_posterior(
-    model: MachineModel, geometry: HexapodGeometry, path: str | Path
+    model: MachineModel,
+    geometry: HexapodGeometry,
+    path: str | Path,
+    opener: Callable[[str, int], int] | None = None,
 ) -> tuple[FittedParameters | None, str]:
     """Return what a model's fit knows of its parameters, or why that is not known.
 
@@ -117,6 +121,8 @@ def load_posterior(
         The model and its machine.
     path : str or Path
         The model's file, as :func:`~hexapod_comp.machine.model_file.load_model` takes it.
+    opener : callable, optional
+        As Python's ``open`` takes it, such as :func:`~hexapod_comp.formats.paths.confined_opener`.
 
     Returns
     -------
@@ -128,7 +134,7 @@ def load_posterior(
     name, digest = model.origin.posterior
     try:
         file = input_file(path).with_name(name)
-        content = _read(file)
+        content = _read(file, opener)
         if hashlib.sha256(content).hexdigest() != digest:
             return None, f"{name} is not the file that was written with model {model.name!r}"
         return _parsed(content, file, geometry), ""
@@ -136,9 +142,9 @@ def load_posterior(
         return None, str(error)
 
 
-def _read(path: Path) -> bytes:
+def _read(path: Path, opener: Callable[[str, int], int] | None) -> bytes:
     try:
-        with open(path, "rb") as stream:
+        with open(path, "rb", opener=opener) as stream:
             content = stream.read(MOST_BYTES + 1)
     except OSError as error:
         raise InputFileError(path, "", f"cannot be read: {error.strerror}") from error

@@ -144,6 +144,11 @@ class Compensator:
         return self._last.state.correction
 
     @property
+    def platform(self) -> Pose:
+        """``pose_platform_in_base`` of the last command; not finite before the first."""
+        return self._last.platform
+
+    @property
     def motion(self) -> MotionState:
         """Directions of motion after the last command."""
         return self._last.motion

@@ -125,7 +125,7 @@ class CompensatorNode(MachineNode):
 
     def _open_topics(self) -> None:
         self.open_diagnostics(self.compensator.geometry.name)
-        self._outputs = outputs = CompensatorOutputs(self, self.compensator, self._options)
+        self._outputs = outputs = CompensatorOutputs(self, self.compensator, self._options, self._files)
         inputs = (self.compensator, self._status, self._options)
         self._feedback = Feedback(self, *inputs, outputs.estimate, self._look_at_publishers)
         commands = self.obey(PoseStamped, "tool_pose_command", self._on_command, self._look_at_publishers, raw=True)

@@ -1,4 +1,4 @@
-"""What a compensator publishes: strut commands and corrections, pose estimates, markers."""
+"""What a compensator publishes: strut commands and corrections, pose estimates, predicted errors, markers."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from std_msgs.msg import Float64MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from ..compensation.compensator import Compensator
+from .machine_files import MachineFiles
 from .markers import machine_markers
 from .messages import write_pose
+from .predicted_error import PredictedErrorTopics
 from .runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, STATE_QOS, MachineNode
 from .stamps import period
 from .wire import StrutBytes, read_pose_bytes
@@ -32,9 +34,13 @@ class CompensatorOutputs:
         What is published.
     options : dict
         The node's parameters.
+    files : MachineFiles
+        What the compensator's model was made of.
     """
 
-    def __init__(self, node: MachineNode, compensator: Compensator, options: dict[str, Any]) -> None:
+    def __init__(
+        self, node: MachineNode, compensator: Compensator, options: dict[str, Any], files: MachineFiles
+    ) -> None:
         self._node, self._compensator, self._frame = node, compensator, options["base_frame"]
         self._commands = node.publish_on(JointState, "strut_commands", COMMAND_QOS)
         self._corrections = node.publish_on(JointState, "strut_corrections", COMMAND_QOS)
@@ -49,6 +55,7 @@ class CompensatorOutputs:
         self._estimate_out = PoseStamped()
         self._estimate_out.header.frame_id = self._frame
         self._answered = 0
+        self._predicted = PredictedErrorTopics(node, compensator, files, options["work_frame"], lambda: self._answered)
 
     @property
     def command_topic(self) -> str:
@@ -90,6 +97,7 @@ class CompensatorOutputs:
 
     def close(self) -> None:
         """Destroy the publishers."""
+        self._predicted.close()
         for publisher in (self._commands, self._corrections, self._estimates, self._markers, self._array):
             if publisher is not None:
                 self._node.destroy_publisher(publisher)

@@ -63,6 +63,8 @@ in   tool_pose_command       PoseStamped: commanded tool pose, frame_id base or 
 out  strut_commands          JointState: compensated strut lengths, m
      strut_corrections       JointState: command − nominal, m
      tool_pose_estimate      PoseStamped: from measured struts, in base
+     ~/predicted_error       PoseWithCovarianceStamped: the tool's error without compensation, in work;
+     ~/predicted_error_aligned  the same with the datum aligned
      /diagnostics, ~/markers, ~/journal, ~/files
 ask  ~/enable_compensation   SetBool
      ~/reload_model, ~/reset Trigger

@@ -55,6 +55,11 @@ class MachineFiles:
         name = self._model_file
         return Loading(None if name == IDEAL else ModelName(name, _place(), self._folders[name]), machine)
 
+    def handed_on(self) -> dict[str, Any]:
+        """Return what another process needs to make geometry and model of the same texts, for JSON."""
+        folder = self._folders[self._model_file]
+        return {**{name: vars(source) for name, source in self.sources.items()}, "folder": folder and str(folder)}
+
     def described(self, model: MachineModel) -> str:
         """Return what to say of the model at the start."""
         if self._model_file == IDEAL:

@@ -58,6 +58,7 @@ def model_of(text: str) -> MachineModel:
     data = json.loads(text)
     field, origin = data["field"], data["origin"]
     origin["sources"] = tuple(tuple(source) for source in origin["sources"])
+    origin["posterior"] = None if origin["posterior"] is None else tuple(origin["posterior"])
     data["struts"] = StrutErrors(**data["struts"])
     data["field"] = GridField(**{**field, "grid": tuple(field["grid"]), "lines": tuple(field["lines"])})
     data["origin"] = ModelOrigin(**origin)

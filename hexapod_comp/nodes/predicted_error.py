@@ -1,0 +1,215 @@
+"""The topics of the tool's predicted error: what it would be at the last command without compensation.
+
+It is worked out in a process of its own (:mod:`.predicting`), and only while somebody listens: its derivatives take
+milliseconds and their libraries a second to import, in which no command would be answered.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import queue
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from typing import IO, Any
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from scipy.spatial.transform import Rotation
+
+from ..compensation.compensator import Compensator
+from ..compensation.journal import Source
+from ..errors import HexapodError
+from .machine_files import MachineFiles
+from .model_loading import PACKAGE_ROOT
+from .runtime import EVENT_QOS, MachineNode
+from .stamps import stamp_of
+
+PERIOD = 0.2
+"""How often a prediction is asked for and published, s."""
+
+
+class PredictionError(HexapodError):
+    """The process that predicts failed; the message is its own."""
+
+    reason = "prediction"
+
+
+class PredictionProcess:
+    """The process, and a thread that waits for it.
+
+    Parameters
+    ----------
+    setup : dict
+        Its first line of input.
+    """
+
+    def __init__(self, setup: dict[str, Any]) -> None:
+        self._asked: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self._process: subprocess.Popen[str] | None = None
+        self.busy = False
+        threading.Thread(target=self._run, args=(setup,), name="predicted error", daemon=True).start()
+
+    def ask(self, request: dict[str, Any]) -> None:
+        """Hand over a pose; the process must not be busy."""
+        self.busy = True
+        self._asked.put(json.dumps(request) + "\n")
+
+    def answer(self) -> dict[str, Any] | None:
+        """Return the answer that has come, None if there is none yet.
+
+        Raises
+        ------
+        PredictionError
+            The process failed: it answers no more.
+        """
+        try:
+            found = self._answers.get_nowait()
+        except queue.Empty:
+            return None
+        if "problem" in found:
+            raise PredictionError(found["problem"])
+        self.busy = False
+        return found
+
+    def close(self) -> None:
+        """Let the process end, by force where it is at work."""
+        self._asked.put(None)
+        if self.busy and self._process is not None:
+            self._process.kill()
+
+    def _run(self, setup: dict[str, Any]) -> None:
+        """Start the process, pass on questions and answers, and wait for its end."""
+        command, pipe = [sys.executable, "-m", "hexapod_comp.nodes.predicting"], subprocess.PIPE
+        alone = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # the other cores are the loop's
+        try:
+            with subprocess.Popen(
+                command, cwd=PACKAGE_ROOT, env=alone, stdin=pipe, stdout=pipe, text=True, start_new_session=True
+            ) as process:  # of a session of its own, so that Ctrl-C does not interrupt it: its input ends with the node
+                self._process = process
+                self._talk(process.stdin, process.stdout, setup)  # type: ignore[arg-type]
+        except (OSError, ValueError) as error:
+            self._answers.put({"problem": f"the process that predicts failed: {error}"})
+
+    def _talk(self, into: IO[str], out: IO[str], setup: dict[str, Any]) -> None:
+        """Pass on questions and answers until there are no more."""
+        into.write(json.dumps(setup) + "\n")
+        while (line := self._asked.get()) is not None:
+            into.write(line)
+            into.flush()
+            answer = out.readline()
+            found = json.loads(answer) if answer else {"problem": "the process that predicts ended"}
+            self._answers.put(found)
+            if "problem" in found:
+                return
+
+
+class PredictedErrorTopics:
+    """``~/predicted_error`` and ``~/predicted_error_aligned``: see :class:`..calibration.prediction.ErrorPredictor`.
+
+    Parameters
+    ----------
+    node : MachineNode
+        Publishes.
+    compensator : Compensator
+        Says where the machine was sent last, and how it moved.
+    files : MachineFiles
+        What its model was made of.
+    frame : str
+        ``frame_id``: of the work frame, along whose axes errors are.
+    stamp : callable
+        Returns the last command's stamp, ns.
+    """
+
+    def __init__(
+        self, node: MachineNode, compensator: Compensator, files: MachineFiles, frame: str, stamp: Callable[[], int]
+    ) -> None:
+        self._node, self._compensator, self._files, self._frame, self._stamp = node, compensator, files, frame, stamp
+        self._topics = {
+            "standing": node.create_publisher(PoseWithCovarianceStamped, "~/predicted_error", EVENT_QOS),
+            "aligned": node.create_publisher(PoseWithCovarianceStamped, "~/predicted_error_aligned", EVENT_QOS),
+        }
+        self._process: PredictionProcess | None = None
+        self._source: Source | None = None
+        self._asked_for = 0
+        self._failed = False
+        self._timer = node.every(PERIOD, self._look)
+
+    def close(self) -> None:
+        """Destroy the topics and end the process."""
+        self._node.destroy_timer(self._timer)
+        self._stop()
+        for publisher in self._topics.values():
+            self._node.destroy_publisher(publisher)
+
+    def _look(self) -> None:
+        """Publish what has been worked out, and ask for the newest pose, while somebody listens."""
+        wanted = any(publisher.get_subscription_count() for publisher in self._topics.values())
+        if not wanted or self._source is not self._files.sources["model"]:
+            self._stop()
+            self._source, self._failed = self._files.sources["model"], False
+        if not wanted or self._failed or not np.isfinite(self._compensator.nominal).all():
+            return
+        if self._process is None:
+            self._process = PredictionProcess(self._files.handed_on())
+        try:
+            found = self._process.answer()
+        except PredictionError as error:
+            self._node.warn_of("predicted error", f"no predicted error: {error}")
+            self._stop()
+            self._failed = True
+            return
+        if found is not None:
+            self._publish(found)
+        if not self._process.busy:
+            self._ask(self._process)
+
+    def _ask(self, process: PredictionProcess) -> None:
+        compensator, self._asked_for = self._compensator, self._stamp()
+        request = {
+            "position": compensator.platform.position.tolist(),
+            "rotation": compensator.platform.rotation.tolist(),
+            "sense": compensator.motion.sense.tolist(),
+            "temperatures": dict(compensator.temperatures.values),
+        }
+        process.ask(request)
+
+    def _publish(self, found: dict[str, Any]) -> None:
+        """Publish both errors; of a pose that the machine with its errors cannot take there is none."""
+        for name, publisher in self._topics.items():
+            error = found[name]
+            if error is not None and None not in error["values"]:
+                publisher.publish(error_message(error["values"], error["covariance"], self._frame, self._asked_for))
+
+    def _stop(self) -> None:
+        if self._process is not None:
+            self._process.close()
+        self._process = None
+
+
+def error_message(
+    values: list[float], covariance: list[float] | None, frame: str, stamp: int
+) -> PoseWithCovarianceStamped:
+    """Return an error as a message: where the tool would be and how it would stand, seen from where it should.
+
+    Parameters
+    ----------
+    values : list of float
+        Displacement, m, and rotation vector, rad.
+    covariance : list of float or None
+        Its 36 numbers, row by row; None: not known, which is NaN in the message, never zero.
+    frame, stamp : str, int
+        ``frame_id``, and the command's stamp, ns.
+    """
+    message = PoseWithCovarianceStamped()
+    message.header.frame_id, message.header.stamp = frame, stamp_of(stamp)
+    position, orientation = message.pose.pose.position, message.pose.pose.orientation
+    position.x, position.y, position.z = values[:3]
+    turn = Rotation.from_rotvec(values[3:]).as_quat()
+    orientation.x, orientation.y, orientation.z, orientation.w = turn.tolist()
+    message.pose.covariance = [math.nan] * 36 if covariance is None else covariance
+    return message
