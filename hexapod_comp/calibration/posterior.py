@@ -64,8 +64,8 @@ class FittedParameters:
     @staticmethod
     def of(fit: ModelFit) -> FittedParameters:
         """Return what a fit knows."""
-        found = fit.solution.posterior
-        return FittedParameters(fit.space, fit.solution.x, fit.covariance, found.tolerances, found.noise)
+        posterior = fit.solution.posterior
+        return FittedParameters(fit.space, fit.solution.x, fit.covariance, posterior.tolerances, posterior.noise)
 
 
 def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, path: str | Path) -> list[Path]:
@@ -178,16 +178,16 @@ def _parsed(content: bytes, path: Path, geometry: HexapodGeometry) -> FittedPara
         covariance = np.zeros((space.size, space.size))
         covariance[np.tril_indices(space.size)] = arrays["covariance"]
         covariance += np.tril(covariance, -1).T
-        found = FittedParameters(space, arrays["x"], covariance, arrays["tolerances"], arrays["noise"])
+        fitted = FittedParameters(space, arrays["x"], covariance, arrays["tolerances"], arrays["noise"])
     except (KeyError, TypeError, ValueError, zipfile.BadZipFile, ModelError) as error:
         raise InputFileError(path, "", f"is no file of a fit's posterior: {error}") from error
     shapes = {"x": (space.size,), "covariance": (space.size,) * 2}
     shapes |= {"tolerances": (len(space.blocks),), "noise": (len(KINDS),)}
     for name, shape in shapes.items():
-        array = getattr(found, name)
+        array = getattr(fitted, name)
         if array.shape != shape or not np.isfinite(array).all():
             raise InputFileError(path, name, f"must be finite, of shape {shape}", list(array.shape))
-    return found
+    return fitted
 
 
 def _settings(given: dict[str, Any]) -> FitSettings:

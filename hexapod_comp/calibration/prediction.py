@@ -112,16 +112,16 @@ class ErrorPredictor:
         aligned: list[PredictedError] = []
         for start in range(0, max(count, 1), CHUNK):
             chosen = np.arange(start, min(start + CHUNK, count))
-            found = _first_order(self._machine, self._fitted, stations.select(chosen))
-            standing.append(self._with_covariance(found))
+            errors = _first_order(self._machine, self._fitted, stations.select(chosen))
+            standing.append(self._with_covariance(errors))
             if self._datum is not None:
-                aligned.append(self._with_covariance(found.without(self._datum)))
+                aligned.append(self._with_covariance(errors.without(self._datum)))
         return _joined(standing), _joined(aligned) if aligned else None
 
-    def _with_covariance(self, found: _FirstOrder) -> PredictedError:
+    def _with_covariance(self, errors: _FirstOrder) -> PredictedError:
         if self._fitted is None:
-            return PredictedError(found.values, None)
-        return PredictedError(found.values, found.slopes @ self._fitted.covariance @ np.swapaxes(found.slopes, 1, 2))
+            return PredictedError(errors.values, None)
+        return PredictedError(errors.values, errors.slopes @ self._fitted.covariance @ np.swapaxes(errors.slopes, 1, 2))
 
     def _find_datum(self) -> _Datum | None:
         """Return the motion of the whole machine that is no error once the datum is set."""
@@ -133,13 +133,13 @@ class ErrorPredictor:
         nodes = [np.linspace(low, high, 3) for low, high in box.T]
         positions = np.stack(np.meshgrid(*nodes), axis=-1).reshape(-1, 3)
         poses = positions, np.tile(level, (len(positions), 1, 1))
-        found = _first_order(
+        errors = _first_order(
             self._machine, fitted, _stations(self._machine, poses, np.zeros((len(positions), FOLLOWED)))
         )
-        reached = np.isfinite(found.values).all(axis=1)
+        reached = np.isfinite(errors.values).all(axis=1)
         if reached.sum() < 3:
             return None
-        return _Datum.of(_FirstOrder(*(part[reached] for part in found)))
+        return _Datum.of(_FirstOrder(*(part[reached] for part in errors)))
 
 
 @dataclass(frozen=True)
@@ -161,14 +161,14 @@ class _Datum:
     rotation: tuple[np.ndarray, np.ndarray]
 
     @staticmethod
-    def of(found: _FirstOrder) -> _Datum:
+    def of(errors: _FirstOrder) -> _Datum:
         """Return what explains the errors at some places best, by least squares of the displacements."""
-        centre = found.tips.mean(axis=0)
-        unit = np.tile(np.eye(6)[None], (len(found.tips), 1, 1))
-        explain = np.linalg.pinv(_carried(unit, found.tips - centre)[:, :3].reshape(-1, 6))
-        parts = found.values[:, :, None], found.slopes
+        centre = errors.tips.mean(axis=0)
+        unit = np.tile(np.eye(6)[None], (len(errors.tips), 1, 1))
+        explain = np.linalg.pinv(_carried(unit, errors.tips - centre)[:, :3].reshape(-1, 6))
+        parts = errors.values[:, :, None], errors.slopes
         motion, slopes = (explain @ part[:, :3].reshape(len(explain[0]), -1) for part in parts)
-        means = found.values[:, 3:].mean(axis=0), found.slopes[:, 3:].mean(axis=0)
+        means = errors.values[:, 3:].mean(axis=0), errors.slopes[:, 3:].mean(axis=0)
         return _Datum(centre, (motion[:, 0], slopes), means)
 
     def at(self, arms: np.ndarray, which: int) -> np.ndarray:

@@ -32,12 +32,12 @@ def run(args: argparse.Namespace) -> int:
     common.mention_compiling("checks.examine_many")
     result = check(geometry, model, (positions, rotations), "poses")
     _refuse_lengthless(result, rows)
-    found = None
+    predicted = None
     if args.model != "ideal":
         platforms = geometry.platform_poses(positions, rotations)
-        found = _Predicted.of(RealMachine(geometry, model), args.model, platforms)
+        predicted = _Predicted.of(RealMachine(geometry, model), args.model, platforms)
         _mention_outside(int(result.outside_box.sum()), len(rows))
-    _show(args, geometry, model, rows, result, found)
+    _show(args, geometry, model, rows, result, predicted)
     for breach in result.breaches:
         print(f"hexapod_comp: note: {common.where(rows[breach.row])}: {breach.error}", file=sys.stderr)
     return 0
@@ -100,7 +100,7 @@ class _Predicted:
         from ..calibration.prediction import COMPONENTS
         from ..formats.csv import PREDICTED_ERRORS
 
-        numbers = [part for found in (self.standing, self.aligned) for part in _parts(found)]
+        numbers = [part for predicted in (self.standing, self.aligned) for part in _parts(predicted)]
         columns: dict[str, Any] = {}
         for name, values in zip(PREDICTED_ERRORS, numbers, strict=True):
             for n, component in enumerate(COMPONENTS):
@@ -124,9 +124,9 @@ class _Predicted:
         return f"{title}\n{texts.aligned(header, body)}\n"
 
 
-def _parts(found: PredictedError | None) -> tuple[np.ndarray | None, np.ndarray | None]:
+def _parts(predicted: PredictedError | None) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Return values and standard deviations, None for what is not known."""
-    return (None, None) if found is None else (found.values, found.deviations)
+    return (None, None) if predicted is None else (predicted.values, predicted.deviations)
 
 
 def _mention_outside(outside: int, count: int) -> None:
@@ -143,21 +143,21 @@ def _show(
     model: MachineModel,
     rows: list[Row],
     result: CheckResult,
-    found: _Predicted | None,
+    predicted: _Predicted | None,
 ) -> None:
     """Write the CSV file; print JSON or, where no file was written, CSV or a table of one pose."""
-    table = [_columns(row, lengths, found is not None) for row, lengths in zip(rows, result.lengths, strict=True)]
-    if found is not None:
-        table = [{**columns, **found.columns(n)} for n, columns in enumerate(table)]
+    table = [_columns(row, lengths, predicted is not None) for row, lengths in zip(rows, result.lengths, strict=True)]
+    if predicted is not None:
+        table = [{**columns, **predicted.columns(n)} for n, columns in enumerate(table)]
     common.write_table(args, table)
     if args.json:
         content: dict[str, Any] = {"machine": geometry.name, "model": model.name}
-        if found is not None:
-            content |= {"error_frame": "work", "error_sd_not_known": found.unknown or None}
+        if predicted is not None:
+            content |= {"error_frame": "work", "error_sd_not_known": predicted.unknown or None}
         common.show({**content, "rows": table})
     elif args.out is None:
         one = args.poses is None
-        common.show(_one_pose(geometry, model, result.lengths[0], found) if one else common.csv_text(table))
+        common.show(_one_pose(geometry, model, result.lengths[0], predicted) if one else common.csv_text(table))
 
 
 def _columns(row: Row, lengths: np.ndarray, with_model: bool) -> dict[str, Any]:
@@ -175,13 +175,13 @@ def _columns(row: Row, lengths: np.ndarray, with_model: bool) -> dict[str, Any]:
     return columns
 
 
-def _one_pose(geometry: HexapodGeometry, model: MachineModel, lengths: np.ndarray, found: _Predicted | None) -> str:
+def _one_pose(geometry: HexapodGeometry, model: MachineModel, lengths: np.ndarray, predicted: _Predicted | None) -> str:
     """Return one pose's lengths, and with a model the error that they take out, as tables for people."""
     from ..machine.geometry import STRUT_NAMES
 
     nominal, command = lengths
     header, columns = ["strut", "nominal_mm"], [nominal * 1e3]
-    if found is not None:
+    if predicted is not None:
         header += ["command_mm", "correction_um"]
         columns += [command * 1e3, (command - nominal) * 1e6]
     digits = [6, 6, 3]
@@ -189,5 +189,5 @@ def _one_pose(geometry: HexapodGeometry, model: MachineModel, lengths: np.ndarra
         [name, *(texts.number(float(c[i]), d) for c, d in zip(columns, digits, strict=False))]
         for i, name in enumerate(STRUT_NAMES)
     ]
-    title = f"machine {geometry.name}" + (f", model {model.name}" if found is not None else "")
-    return f"{title}\n{texts.aligned(header, body)}\n" + (f"\n{found.text()}" if found is not None else "")
+    title = f"machine {geometry.name}" + (f", model {model.name}" if predicted is not None else "")
+    return f"{title}\n{texts.aligned(header, body)}\n" + (f"\n{predicted.text()}" if predicted is not None else "")

@@ -49,7 +49,7 @@ class PredictionProcess:
 
     def __init__(self, setup: dict[str, Any]) -> None:
         self._asked: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-        self._answers: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self._results: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._process: subprocess.Popen[str] | None = None
         self.busy = False
         threading.Thread(target=self._run, args=(setup,), name="predicted error", daemon=True).start()
@@ -59,22 +59,22 @@ class PredictionProcess:
         self.busy = True
         self._asked.put(json.dumps(request) + "\n")
 
-    def answer(self) -> dict[str, Any] | None:
-        """Return the answer that has come, None if there is none yet.
+    def result(self) -> dict[str, Any] | None:
+        """Return the result that has come, None if there is none yet.
 
         Raises
         ------
         PredictionError
-            The process failed: it answers no more.
+            The process failed: it gives no more.
         """
         try:
-            found = self._answers.get_nowait()
+            result = self._results.get_nowait()
         except queue.Empty:
             return None
-        if "problem" in found:
-            raise PredictionError(found["problem"])
+        if "problem" in result:
+            raise PredictionError(result["problem"])
         self.busy = False
-        return found
+        return result
 
     def close(self) -> None:
         """Let the process end, by force where it is at work."""
@@ -93,7 +93,7 @@ class PredictionProcess:
                 self._process = process
                 self._talk(process.stdin, process.stdout, setup)  # type: ignore[arg-type]
         except (OSError, ValueError) as error:
-            self._answers.put({"problem": f"the process that predicts failed: {error}"})
+            self._results.put({"problem": f"the process that predicts failed: {error}"})
 
     def _talk(self, into: IO[str], out: IO[str], setup: dict[str, Any]) -> None:
         """Pass on questions and answers until there are no more."""
@@ -101,10 +101,10 @@ class PredictionProcess:
         while (line := self._asked.get()) is not None:
             into.write(line)
             into.flush()
-            answer = out.readline()
-            found = json.loads(answer) if answer else {"problem": "the process that predicts ended"}
-            self._answers.put(found)
-            if "problem" in found:
+            line_out = out.readline()
+            result = json.loads(line_out) if line_out else {"problem": "the process that predicts ended"}
+            self._results.put(result)
+            if "problem" in result:
                 return
 
 
@@ -157,14 +157,14 @@ class PredictedErrorTopics:
         if self._process is None:
             self._process = PredictionProcess(self._files.handed_on())
         try:
-            found = self._process.answer()
+            result = self._process.result()
         except PredictionError as error:
             self._node.warn_of("predicted error", f"no predicted error: {error}")
             self._stop()
             self._failed = True
             return
-        if found is not None:
-            self._publish(found)
+        if result is not None:
+            self._publish(result)
         if not self._process.busy:
             self._ask(self._process)
 
@@ -178,10 +178,10 @@ class PredictedErrorTopics:
         }
         process.ask(request)
 
-    def _publish(self, found: dict[str, Any]) -> None:
+    def _publish(self, result: dict[str, Any]) -> None:
         """Publish both errors; of a pose that the machine with its errors cannot take there is none."""
         for name, publisher in self._topics.items():
-            error = found[name]
+            error = result[name]
             if error is not None and None not in error["values"]:
                 publisher.publish(error_message(error["values"], error["covariance"], self._frame, self._asked_for))
 

@@ -46,20 +46,20 @@ class Predicting:
         self.fitted, self.unknown = load_posterior(self.model, self.geometry, sources[1].name, opener)
         self._at: dict[str, float] | None = None
 
-    def answer(self, asked: dict[str, Any]) -> dict[str, Any]:
+    def result(self, asked: dict[str, Any]) -> dict[str, Any]:
         """Return the errors at a pose: ``position``, ``rotation``, ``sense`` and ``temperatures``."""
         if asked["temperatures"] != self._at:
             machine = RealMachine(self.geometry, self.model, Temperatures(asked["temperatures"]))
             self._predictor, self._at = ErrorPredictor(machine, self.fitted), asked["temperatures"]
         pose = np.array([asked["position"]]), np.array([asked["rotation"]])
         standing, aligned = self._predictor.predict(pose, np.array([asked["sense"]]))
-        found = {"standing": _numbers(standing), "aligned": None if aligned is None else _numbers(aligned)}
-        return {**found, "unknown": self.unknown}
+        result = {"standing": _numbers(standing), "aligned": None if aligned is None else _numbers(aligned)}
+        return {**result, "unknown": self.unknown}
 
 
-def _numbers(found: PredictedError) -> dict[str, Any]:
-    covariance = None if found.covariance is None else found.covariance[0].ravel()
-    return {"values": found.values[0], "covariance": covariance}
+def _numbers(result: PredictedError) -> dict[str, Any]:
+    covariance = None if result.covariance is None else result.covariance[0].ravel()
+    return {"values": result.values[0], "covariance": covariance}
 
 
 def main() -> int:
@@ -68,7 +68,7 @@ def main() -> int:
     try:
         predicting = Predicting(json.loads(sys.stdin.readline()))
         for line in sys.stdin:
-            sys.stdout.write(json_text(predicting.answer(json.loads(line)), indent=None))
+            sys.stdout.write(json_text(predicting.result(json.loads(line)), indent=None))
             sys.stdout.flush()
     except HexapodError as error:
         sys.stdout.write(json_text({"problem": str(error)}, indent=None))
