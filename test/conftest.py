@@ -14,7 +14,6 @@ import pytest
 
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.loop.processes import reserve_domain
-from hexapod_comp.machine.geometry import load_geometry
 
 if TYPE_CHECKING:
     from rclpy.context import Context
@@ -28,9 +27,9 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     """Compile what nodes need before the first test with one: on a busy machine that outlasts a test's time limit."""
     if session.config.option.collectonly or not any(_has_nodes(item) for item in session.items):
         return
-    from hexapod_comp.loop.session import prepare
+    from hexapod_comp.nodes.warming import warm
 
-    prepare(load_geometry(config_file("paper.yaml")))
+    warm()
 
 
 def _has_nodes(item: pytest.Item) -> bool:

@@ -30,11 +30,11 @@ from std_srvs.srv import Trigger
 
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.loop.processes import NodeProcess, PrivateDomain
-from hexapod_comp.loop.session import prepare
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.nodes.client import LISTENER_QOS, TRACK_QOS
 from hexapod_comp.nodes.messages import message_pose, pose_message
 from hexapod_comp.nodes.runtime import COMMAND_QOS, STATE_QOS
+from hexapod_comp.nodes.warming import warm
 from hexapod_comp.pose import Pose
 
 from .controller import Controller, Mode
@@ -92,7 +92,7 @@ class Rig:
     # ---- coming and going ----
 
     def __enter__(self) -> Rig:
-        prepare(self.geometry)
+        warm()
         self.folder = Path(tempfile.mkdtemp(prefix="hexapod_comp_faults_"))
         self.model = Path(shutil.copy(config_file(MODEL), self.folder / "model.yaml"))
         self._geometry_file = shutil.copy(config_file(GEOMETRY), self.folder / "geometry.yaml")

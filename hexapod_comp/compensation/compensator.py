@@ -28,7 +28,7 @@ from .state import CommandState, pack_machine, pack_nominal, pack_pose, read_sta
 DEFAULT_RAMP_RATE = 1e-3
 """How fast a change of model, temperature or enabling moves a strut, m/s."""
 
-NO_SHIFT = pack_pose(Pose.identity())
+NO_SHIFT = np.concatenate([np.zeros(3), np.eye(3).ravel()])  # as pack_pose, but nothing compiles while modules load
 """Frame of poses that are in ``base`` already."""
 
 

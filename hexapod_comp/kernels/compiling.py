@@ -11,13 +11,15 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 try:
     import numba
+    from numba.core import event
 except ImportError as error:
     raise ImportError(
         f"needs Numba, which compiles the kinematics ({error}): apt install python3-numba, or where there is none "
@@ -26,6 +28,27 @@ except ImportError as error:
     ) from error
 
 FOLDER_PREFIX = "kernels-"
+
+
+class NotCompiledError(Exception):
+    """A kernel is not in the cache."""
+
+
+class _Refusal(event.Listener):
+    """Hears of kernels that are about to be compiled, in any thread, and stops that."""
+
+    def on_start(self, event: event.Event) -> None:
+        raise NotCompiledError(event.data["dispatcher"].py_func.__qualname__)
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+@contextmanager
+def from_cache_only() -> Iterator[None]:
+    """Raise NotCompiledError, as long as this context is open, where a kernel would have to be compiled."""
+    with event.install_listener("numba:compile", _Refusal()):
+        yield
 
 
 def compiled(function: Callable[..., Any]) -> Any:
@@ -60,7 +83,9 @@ def cache_folder(configured: str = "") -> Path:
         except OSError:
             continue
         return folder
-    return Path(tempfile.mkdtemp(prefix="hexapod_comp_"))
+    folder = Path(tempfile.mkdtemp(prefix="hexapod_comp_")) / name
+    folder.mkdir()
+    return folder
 
 
 def _make(folder: Path) -> None:

@@ -107,7 +107,6 @@ class LinuxcncBridgeNode(MachineNode):
     def _make_messages(self) -> None:
         self._pose_out, self._states_out = PoseStamped(), StrutMessage()
         self._pose_out.header.frame_id = self._options["frame_id"]
-        self._states_out.write(np.zeros(6))
 
     # ---- lifecycle ----
 
@@ -115,7 +114,7 @@ class LinuxcncBridgeNode(MachineNode):
         """Open topics."""
         self._pose_pub = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS)
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
-        self.open_diagnostics(self._options["component"])
+        self.speak_for(self._options["component"])
         self._subscription = self.obey(JointState, "strut_corrections", self._on_correction, self._look_at_publishers)
         topic, count = self._subscription.topic_name, self._subscription.get_publisher_count
         self._source = CommandSource(self, topic, count, self._options["allow_several_publishers"])
@@ -137,7 +136,7 @@ class LinuxcncBridgeNode(MachineNode):
             self._reset.close()
             self._reset = None
         self.destroy_subscription(self._subscription)
-        for publisher in (self._pose_pub, self._states_pub, self._diagnostics_pub):
+        for publisher in (self._pose_pub, self._states_pub):
             self.destroy_publisher(publisher)
         return super().on_cleanup(state)
 

@@ -161,9 +161,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except HexapodError as error:
         print(f"cannot start: {error}", file=sys.stderr)
         return 1
+    shown.cycle()  # compiles the kernels before LinuxCNC goes on; until then a signal ends the process at once
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    shown.cycle()  # compiles the kernels before LinuxCNC goes on
     shown.component.ready()
     period, due = 1.0 / options.rate, time.monotonic()
     while not stop.wait(max(0.0, due - time.monotonic())):

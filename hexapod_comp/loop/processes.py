@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import socket
@@ -13,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 
+from ..nodes.children import end_with_parent
 from ..nodes.middleware import avoid_shared_memory
 
 # DDS derives its UDP ports from the domain: 7400 + 250 · domain + offset. Offsets 0 and 1 are multicast,
@@ -20,11 +20,6 @@ from ..nodes.middleware import avoid_shared_memory
 DOMAINS = range(1, 102)
 RESERVED_OFFSET = 5
 FIRST_PARTICIPANT_OFFSET = 10
-
-LIBC = ctypes.CDLL(None)
-
-PR_SET_PDEATHSIG = 1
-"""From Linux's <sys/prctl.h>."""
 
 STOP_TIMEOUT = 5.0
 """A process that has not ended this long after SIGTERM is killed, s."""
@@ -90,14 +85,6 @@ class PrivateDomain:
         self._reservation.close()
 
 
-def _end_with_parent() -> None:
-    """Ask the system to end this process when its parent dies, however it dies.
-
-    A session of its own keeps a terminal's Ctrl-C away from the nodes; nobody but the parent ends them.
-    """
-    LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
-
-
 class NodeProcess:
     """One node as an operating-system process; its output goes to a log file, and it ends with its parent.
 
@@ -131,8 +118,8 @@ class NodeProcess:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
-                start_new_session=True,
-                preexec_fn=_end_with_parent,
+                start_new_session=True,  # keeps a terminal's Ctrl-C away: nobody but the parent ends them
+                preexec_fn=end_with_parent,
             )
 
     @property

@@ -83,8 +83,10 @@ def simulated(
 
     geometry_file = str(config_file(machine).resolve())
     model_file, truth_file = checked(model, "ideal"), checked(truth, "ideal", "random")
+    from ..nodes.warming import warm
+
     print("preparing; the first run on a machine compiles its kernels, which takes up to a minute", file=sys.stderr)
-    session.prepare(geometry)
+    warm()
     return session.simulated_machine(
         {"geometry_file": geometry_file, "model_file": model_file},
         {"geometry_file": geometry_file, "truth_file": truth_file},

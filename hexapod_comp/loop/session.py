@@ -8,13 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..compensation.compensator import Compensator
 from ..errors import HexapodError, NoAnswerError
 from ..machine.geometry import HexapodGeometry
-from ..machine.model import MachineModel, RealMachine
 from ..machine.trajectory import Path, commanded_in_base, move
 from ..pose import Pose
-from ..virtual.machine import StrutDrive
 from .processes import NodeProcess, PrivateDomain
 from .records import PathRecord, PoseRecord, SessionResult, Track, track_along
 
@@ -28,12 +25,6 @@ SETTLE_TIMEOUT = 5.0
 
 MOVE_FEED = 0.1
 """Tool speed between poses, m/s."""
-
-
-def prepare(geometry: HexapodGeometry) -> None:
-    """Compile, or load from the cache, what the nodes need, so that they do not both compile at once."""
-    Compensator(geometry, MachineModel(geometry.name)).correct(geometry.tool_pose(geometry.home))
-    StrutDrive(RealMachine(geometry, MachineModel(geometry.name))).advance(0.01)
 
 
 @contextmanager

@@ -21,7 +21,7 @@ from ..compensation.state import pack_pose
 from ..errors import CommandError, HexapodError, shorten
 from ..pose import Pose
 from .command_source import CommandSource, OwnTopic
-from .compensator_outputs import CompensatorOutputs, warm_up
+from .compensator_outputs import CompensatorOutputs
 from .compensator_parameters import PARAMETERS, PROGRAM
 from .compensator_status import CompensatorStatus
 from .feedback import Feedback
@@ -33,6 +33,7 @@ from .reloading import ReloadService
 from .running import keep_discovery_local, run
 from .runtime import ACKNOWLEDGED_WITHIN, MachineNode
 from .stamps import StampCheck, stamp_of
+from .warming import warm_up
 from .wire import read_pose_bytes
 
 CHECK_PERIOD = 0.05
@@ -74,7 +75,6 @@ class CompensatorNode(MachineNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load geometry and model, compile, open topics."""
         began = time.perf_counter()
-        self.get_logger().info("loading; the first start on a machine compiles its kernels, which takes up to a minute")
         try:
             geometry = self._files.geometry()
             self._compensator = Compensator(geometry, self._files.model(geometry), self._options["ramp_rate"])
@@ -124,7 +124,7 @@ class CompensatorNode(MachineNode):
         self._outputs.wait()
 
     def _open_topics(self) -> None:
-        self.open_diagnostics(self.compensator.geometry.name)
+        self.speak_for(self.compensator.geometry.name)
         self._outputs = outputs = CompensatorOutputs(self, self.compensator, self._options, self._files)
         inputs = (self.compensator, self._status, self._options)
         self._feedback = Feedback(self, *inputs, outputs.estimate, self._look_at_publishers)
@@ -157,7 +157,7 @@ class CompensatorNode(MachineNode):
         self.destroy_subscription(self._subscription)
         self._feedback.close()
         self._outputs.close()
-        for publisher in (self._diagnostics_pub, *self._journal.publishers):
+        for publisher in self._journal.publishers:
             self.destroy_publisher(publisher)
 
     # ---- messages in ----

@@ -8,7 +8,6 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
 from rclpy.publisher import Publisher
-from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from visualization_msgs.msg import MarkerArray
@@ -20,7 +19,7 @@ from .messages import write_pose
 from .predicted_error import PredictedErrorTopics
 from .runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, STATE_QOS, MachineNode
 from .stamps import period
-from .wire import StrutBytes, read_pose_bytes
+from .wire import StrutBytes
 
 
 class CompensatorOutputs:
@@ -101,15 +100,3 @@ class CompensatorOutputs:
         for publisher in (self._commands, self._corrections, self._estimates, self._markers, self._array):
             if publisher is not None:
                 self._node.destroy_publisher(publisher)
-
-
-def warm_up(compensator: Compensator) -> None:
-    """Run every kernel of the loop once, so that none compiles while the machine moves."""
-    trial = Compensator(compensator.geometry, compensator.model)
-    home = trial.geometry.tool_pose(trial.geometry.home)
-    message = PoseStamped()
-    write_pose(message, home.position, home.rotation)
-    _, _, numbers = read_pose_bytes(serialize_message(message))
-    trial.step(numbers, 0.0)
-    trial.estimate(trial.command)
-    StrutBytes().write(trial.command)

@@ -71,7 +71,6 @@ class Following:
         self._limit = limit
         self._kept: deque[tuple[float, bytes]] = deque(maxlen=KEPT)  # bytes: six times faster than array rows
         self.problem = ""
-        within(np.zeros(6), np.frombuffer(bytes(48)), 0.0)  # compiles now, not while the machine moves
 
     def note(self, command: np.ndarray, now: float) -> None:
         """Remember a command, shape (6,), m, accepted at the monotonic time `now`, s."""

@@ -13,7 +13,7 @@ from ..errors import HexapodError
 from .health import Refusals
 from .machine_files import MachineFiles
 from .model_loading import Loading
-from .runtime import LateService
+from .runtime import LateAnswer
 
 
 class ReloadService:
@@ -40,14 +40,14 @@ class ReloadService:
     ) -> None:
         self._node, self._files, self._compensator, self._failures = node, files, compensator, failures
         self._loading: Loading | None = None
-        self._late = LateService(node, Trigger, "~/reload_model", self._on_request)
+        self._late = LateAnswer(node.create_service(Trigger, "~/reload_model", self._on_request))
 
     @property
     def service(self) -> Service:
         """The service, to be destroyed with the node's own."""
         return self._late.service
 
-    def _on_request(self, _: Trigger.Request) -> Trigger.Response | None:
+    def _on_request(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response | None:
         if self._loading is not None:
             return Trigger.Response(success=False, message="the model is being loaded already")
         self._loading = self._files.begin_loading(self._compensator.geometry.name)

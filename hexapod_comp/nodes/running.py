@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import functools
 import gc
 import os
@@ -9,6 +10,8 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from typing import TextIO
 
 import rclpy
 from rclpy.experimental import EventsExecutor
@@ -20,15 +23,25 @@ from .arguments import Program
 from .log_relay import LogRelay
 from .middleware import avoid_shared_memory
 from .runtime import MachineNode
+from .starting import Starting
+from .warming import Warming
 
 SPIN_PERIOD = 0.1
 """Longest wait of one spin, s: how soon a signal is noticed (EventsExecutor.spin itself never returns)."""
 
 
-def autostart(node: LifecycleNode) -> bool:
-    """Configure and activate a node; return whether both went well."""
-    done = TransitionCallbackReturn.SUCCESS
-    return node.trigger_configure() == done and node.trigger_activate() == done
+ENDED_WITHIN = 4.0
+"""What the end of a process may take from its signal on, s; usually it is a fraction of a second."""
+
+
+def autostart(node: LifecycleNode, stop: threading.Event | None = None) -> bool:
+    """Configure and activate a node, unless `stop` is set meanwhile; return whether what was done went well."""
+    for step in (node.trigger_configure, node.trigger_activate):
+        if stop is not None and stop.is_set():
+            break
+        if step() != TransitionCallbackReturn.SUCCESS:
+            return False
+    return True
 
 
 def keep_discovery_local() -> None:
@@ -65,39 +78,69 @@ def run(make_node: Callable[[], MachineNode], program: Program, argv: Sequence[s
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    with LogRelay():
-        return _run_until(stop, make_node, arguments)
+    with _own_stderr() as stderr:
+        with LogRelay():
+            code = _run_until(stop, make_node, arguments, stderr)
+        if argv is None:
+            # Python's own end waits for threads of DDS, which now and then never end, though all has been closed.
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+        faulthandler.cancel_dump_traceback_later()
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+    return code
 
 
-def _run_until(stop: threading.Event, make_node: Callable[[], MachineNode], arguments: list[str]) -> int:
+def _own_stderr() -> TextIO:
+    """Return stderr as it is now, whatever will stand in its place."""
+    try:
+        return open(os.dup(sys.stderr.fileno()), "w")
+    except (AttributeError, OSError):  # closed, or a test's
+        return open(os.devnull, "w")
+
+
+def _run_until(
+    stop: threading.Event, make_node: Callable[[], MachineNode], arguments: list[str], stderr: TextIO
+) -> int:
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except (rclpy.exceptions.ROSInterruptException, RuntimeError, ValueError) as error:
         print(printable(f"cannot start ROS: {error}", LONGEST_TEXT), file=sys.stderr)
         return 1
+    warming = Warming()
     try:
         node = make_node()
     except HexapodError as error:
         print(f"cannot start: {error}", file=sys.stderr)
+        warming.give_up()
         rclpy.try_shutdown()
         return 1
+    starting = Starting(node, warming)
     executor = EventsExecutor()
     executor.add_node(node)
-    try:
-        if node.wants_autostart and not autostart(node):
+    spin = node.guard.around("spinning", functools.partial(executor.spin_once, timeout_sec=SPIN_PERIOD))
+    with ExitStack() as ending:  # the last is called first
+        for end in (rclpy.try_shutdown, node.destroy_node, executor.shutdown, node.say_goodbye, starting.close):
+            ending.callback(end)
+        ending.callback(_end_within, ENDED_WITHIN, stderr)
+        while not (stop.is_set() or starting.look()) and rclpy.ok():
+            spin()
+        if node.wants_autostart and node.unconfigured and not autostart(node, stop):
             return 1
         # What is loaded by now stays; the collector need not look at it again while the machine moves.
         gc.collect()
         gc.freeze()
-        spin = node.guard.around("spinning", functools.partial(executor.spin_once, timeout_sec=SPIN_PERIOD))
         while not stop.is_set() and rclpy.ok():
             spin()
-        node.say_goodbye()
-        return 0
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown()
-        # Python puts its own handlers back while it shuts down; a second Ctrl-C would then end us with -2.
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.SIG_IGN)
+    return 0
+
+
+def _end_within(seconds: float, stderr: TextIO) -> None:
+    """End this process by force in so many seconds, saying where every thread hangs: DDS may wait for ever.
+
+    Python's lock is not needed for either: whoever hangs may hold it. Where nobody takes what is said, the system's
+    alarm ends the process a second later.
+    """
+    faulthandler.dump_traceback_later(seconds, exit=True, file=stderr)
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.setitimer(signal.ITIMER_REAL, seconds + 1.0)

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import ChangeState
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
@@ -59,6 +60,8 @@ class MachineNode(LifecycleNode):
             callback = self._if_possible(service.callback) if service.srv_type is ChangeState else service.callback
             service.callback = self.guard.answering(service.srv_name, service.srv_type, callback)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", EVENT_QOS)
+        self.speak_for("starting")
 
     def _if_possible(self, change: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
         """Return the callback of ``change_state`` for possible transitions only: of others rcl logs each request."""
@@ -95,6 +98,11 @@ class MachineNode(LifecycleNode):
         return super().create_service(srv_type, srv_name, guarded, *arguments, **options)
 
     @property
+    def unconfigured(self) -> bool:
+        """Whether the node may be configured."""
+        return bool(self._state_machine.current_state[0] == State.PRIMARY_STATE_UNCONFIGURED)
+
+    @property
     def active(self) -> bool:
         """Whether the node acts."""
         return self._active
@@ -119,9 +127,8 @@ class MachineNode(LifecycleNode):
         if (line := self._throttle.allow(cause, text)) is not None:
             self.get_logger().error(line, throttled=True)
 
-    def open_diagnostics(self, what: str) -> None:
-        """Make the publisher of the status of this node; `what` is the machine or component that it serves."""
-        self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", EVENT_QOS)
+    def speak_for(self, what: str) -> None:
+        """Name the machine or component that this node serves from now on in its status."""
         self._report = HealthReport(f"{self.get_fully_qualified_name()[1:]}: {what}", what)
 
     def tell(self, level: bytes, text: str, values: Callable[[], dict[str, str]]) -> None:
@@ -212,27 +219,20 @@ def numbered(callback: Callable[[Any, int | None], None]) -> Callable[..., None]
     return called
 
 
-class LateService:
-    """A service whose answer may come after its callback has returned: the node goes on in between.
+class LateAnswer:
+    """What lets a service's callback return None: its answer then comes later, and the node goes on in between.
 
     Parameters
     ----------
-    node : LifecycleNode
-        Where it is.
-    kind : type
-        Service type.
-    name : str
-        Its name.
-    callback : callable
-        Takes the request; returns the response, or None: then :meth:`answer` gives it later. Only one request
-        at a time may be left without an answer.
+    service : Service
+        Only one of its requests at a time may be left without an answer.
     """
 
-    def __init__(self, node: LifecycleNode, kind: type, name: str, callback: Callable[[Any], Any]) -> None:
-        self.service = node.create_service(kind, name, lambda request, _: callback(request))
-        self._send, self._header = self.service.send_response, cast(Any, None)
+    def __init__(self, service: Service) -> None:
+        self.service = service
+        self._send, self._header = service.send_response, cast(Any, None)
         # Executors call it with what the callback returns.
-        self.service.send_response = self._send_or_keep  # type: ignore[method-assign]
+        service.send_response = self._send_or_keep  # type: ignore[method-assign]
 
     def _send_or_keep(self, response: Any, header: Any) -> None:
         if response is None:

@@ -69,7 +69,6 @@ class StrutDriveNode(MachineNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Build the machine and open topics."""
         options = self._options
-        self.get_logger().info("loading; the first start on a machine compiles its kernels, which takes up to a minute")
         try:
             geometry = load_geometry(config_file(options["geometry_file"]))
             machine = RealMachine(geometry, self._truth(geometry))
@@ -99,7 +98,7 @@ class StrutDriveNode(MachineNode):
         for timer in self._own_timers:
             self.destroy_timer(timer)
         self.destroy_subscription(self._subscription)
-        for publisher in (self._states_pub, self._true_pub, self._diagnostics_pub):
+        for publisher in (self._states_pub, self._true_pub):
             self.destroy_publisher(publisher)
         self._drive = None
         return super().on_cleanup(state)
@@ -126,7 +125,7 @@ class StrutDriveNode(MachineNode):
     def _open_topics(self) -> None:
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
         self._true_pub = self.publish_on(PoseStamped, "tool_pose_true", STATE_QOS)
-        self.open_diagnostics(self.drive.machine.geometry.name)
+        self.speak_for(self.drive.machine.geometry.name)
         self._subscription = self.obey(JointState, "strut_commands", self._on_commands, self._look_at_publishers)
         topic, count = self._subscription.topic_name, self._subscription.get_publisher_count
         self._source = CommandSource(self, topic, count, self._options["allow_several_publishers"])

@@ -1,0 +1,148 @@
+"""Kernels before they are needed: loaded from their cache, or compiled into it by a process of its own.
+
+Compiling takes up to a minute, once after an installation or an update, and keeps Python's lock for most of it. A node
+that did it itself would hear neither a request nor a signal. So the node goes on, in a thread beside it waits for
+``python -m hexapod_comp.nodes.warming``, and then takes the kernels from the cache within a fraction of a second.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from contextlib import ExitStack, suppress
+
+import numba
+from geometry_msgs.msg import PoseStamped
+from rclpy.serialization import serialize_message
+
+from ..compensation.compensator import Compensator
+from ..errors import LONGEST_TEXT, printable
+from ..formats.paths import config_file
+from ..kernels.compiling import NotCompiledError, cache_folder, from_cache_only
+from ..machine.geometry import load_geometry
+from ..machine.model import RealMachine
+from ..machine.model_file import load_model
+from ..virtual.machine import StrutDrive
+from .children import end_with_parent
+from .following import Following
+from .messages import write_pose
+from .wire import StrutBytes, read_pose_bytes
+
+LOCK = "compiling.lock"
+"""In the cache's folder: of two nodes that start at once one compiles, the other waits and finds all there."""
+
+
+def warm() -> None:
+    """Run every kernel that the nodes use, on a machine of every block, so that none compiles later."""
+    geometry = load_geometry(config_file("paper.yaml"))
+    model = load_model(config_file("paper_machine.yaml"), geometry)
+    warm_up(Compensator(geometry, model))
+    drive = StrutDrive(RealMachine(geometry, model))
+    drive.advance(0.01)
+    drive.tracker_pose()
+    following = Following(1.0)
+    following.note(drive.commands, 0.0)
+    following.check(drive.encoder_lengths(), 0.0)
+
+
+def warm_up(compensator: Compensator) -> None:
+    """Run every kernel of a compensator's loop once."""
+    trial = Compensator(compensator.geometry, compensator.model)
+    home = trial.geometry.tool_pose(trial.geometry.home)
+    message = PoseStamped()
+    write_pose(message, home.position, home.rotation)
+    _, _, numbers = read_pose_bytes(serialize_message(message))
+    trial.step(numbers, 0.0)
+    trial.estimate(trial.command)
+    trial.set_model(trial.model)
+    StrutBytes().write(trial.command)
+
+
+class Warming:
+    """Kernels on their way, in a thread that waits for the process which compiles them where that is needed.
+
+    Attributes
+    ----------
+    compiling : bool
+        Whether kernels are missing in the cache, and are being compiled.
+    problem : str
+        Why the process could not do it, empty otherwise: the kernels were then compiled here.
+    """
+
+    def __init__(self) -> None:
+        self.compiling, self.problem = False, ""
+        self._began = time.monotonic()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._given_up = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="kernels", daemon=True)
+        self._thread.start()
+
+    @property
+    def done(self) -> bool:
+        """Whether the kernels are there."""
+        return not self._thread.is_alive()
+
+    @property
+    def seconds(self) -> float:
+        """Time since the beginning, s."""
+        return time.monotonic() - self._began
+
+    def give_up(self) -> None:
+        """End the process, if there is one."""
+        self._given_up.set()
+        if self._process is not None:
+            self._process.kill()
+
+    def _run(self) -> None:
+        try:
+            with from_cache_only():
+                warm()
+            return
+        except NotCompiledError:
+            self.compiling = True
+        try:
+            self._compile()
+        except OSError as error:
+            self.problem = f"no process to compile in: {error}"
+        if not self._given_up.is_set():
+            warm()
+
+    def _compile(self) -> None:
+        root = str(cache_folder(numba.config.CACHE_DIR).parent.absolute())
+        begin = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; sys.exit(main())"
+        with tempfile.TemporaryFile() as output:
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", begin],
+                env={**os.environ, "NUMBA_CACHE_DIR": root},
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+            )
+            if self._given_up.is_set():
+                self._process.kill()
+            if code := self._process.wait():
+                output.seek(0)
+                last = output.read().decode(errors="replace").strip().rpartition("\n")[2]
+                self.problem = printable(f"the compiling process ended with {code}: {last}", LONGEST_TEXT)
+
+
+def main() -> int:
+    """Compile what is not in the cache; the process that :class:`Warming` starts."""
+    end_with_parent(signal.SIGKILL)
+    with ExitStack() as stack, suppress(OSError):  # a file system without locks: two processes compile the same
+        lock = stack.enter_context(open(cache_folder(numba.config.CACHE_DIR) / LOCK, "w"))
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        warm()
+        return 0
+    warm()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
