@@ -188,7 +188,7 @@ class LimitError(HexapodError):
     ----------
     reason : str
         Which limit: ``stroke``, ``base_cone``, ``platform_cone``, ``clearance``, ``condition``,
-        ``correction``, ``step``, ``speed`` or ``assembly``.
+        ``correction``, ``step``, ``speed``, ``acceleration`` or ``assembly``.
     problem : str
         Sentence with value, limit and units.
     value, limit : float
@@ -202,6 +202,26 @@ class LimitError(HexapodError):
     def __init__(self, reason: str, problem: str, value: float, limit: float, strut: int | None, stage: str):
         self.reason, self.value, self.limit, self.strut, self.stage = reason, value, limit, strut, stage
         super().__init__(problem)
+
+
+class TooEarlyError(LimitError):
+    """A command may not come yet: the struts would have to be faster than they may. Later it may.
+
+    Parameters
+    ----------
+    problem : str
+        Sentence with value, limit and units.
+    wait : float
+        After which time, s.
+    limit : float
+        Largest strut speed, m/s.
+    strut : int
+        Index 0..5 of the strut concerned.
+    """
+
+    def __init__(self, problem: str, wait: float, limit: float, strut: int):
+        self.wait = wait
+        super().__init__("speed", problem, wait, limit, strut, "compensated")
 
 
 class OutsideFieldError(HexapodError):

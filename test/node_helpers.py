@@ -259,6 +259,13 @@ class Bench:
         request = SetParameters.Request(parameters=[parameter])
         return self.call(SetParameters, f"{node}/set_parameters", request).results[0].successful
 
+    def set_bool(self, node: str, name: str, value: bool) -> Any:
+        """Set a parameter of a node; return the result."""
+        parameter = ParameterMessage(name=name)
+        parameter.value.type, parameter.value.bool_value = ParameterType.PARAMETER_BOOL, value
+        request = SetParameters.Request(parameters=[parameter])
+        return self.call(SetParameters, f"{node}/set_parameters", request).results[0]
+
     # ---- messages ----
 
     def speak(self, topic: str) -> None:

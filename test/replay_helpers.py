@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.compensation.journal import SNAPSHOT_PERIOD, Journal, Source, sources_text
+from hexapod_comp.compensation.journal import SNAPSHOT_PERIOD, Journal, Source, sources_text, time_of
 from hexapod_comp.compensation.state import pack_pose
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.machine.geometry import STRUT_NAMES
@@ -41,6 +41,9 @@ FOREVER = QosTime(9223372036, 854775807)
 
 BEGAN = 1_795_000_000_000_000_000
 """When recordings made here begin, ns."""
+
+UP_SINCE = 4321.0987
+"""Their first command came when the computer had been up for so long, s."""
 
 MILLISECOND = 1_000_000
 
@@ -145,7 +148,7 @@ class RecordedMachine:
         A command that is not `stamped` is answered with the time at which it came.
         """
         self.now += MILLISECOND
-        stamp = self.now if stamped else 0
+        stamp, received = self.now if stamped else 0, UP_SINCE + (self.now - BEGAN) * 1e-9
         quaternion = Rotation.from_matrix(pose.rotation).as_quat().tolist()
         numbers = (*pose.position.tolist(), *quaternion)
         point = TYPES["geometry_msgs/msg/Point"](*numbers[:3])
@@ -153,11 +156,12 @@ class RecordedMachine:
         posed = TYPES["geometry_msgs/msg/Pose"](point, turn)
         self.keep("tool_pose_command", TYPES["geometry_msgs/msg/PoseStamped"](self.header(stamp, frame), posed))
         try:
-            self.compensator.step(numbers, self.now * 1e-9, self.frames[frame])
+            self.compensator.step(numbers, time_of(self.now, stamped), self.frames[frame], received)
         except HexapodError as error:
             self.journal.refused(stamp, error.reason, str(error))
             return False
-        self.journal.answered(self.now, frame, numbers)
+        self.compensator.published(received + 2e-4)
+        self.journal.answered(self.now, frame, numbers, (received, received + 2e-4), stamped)
         self.answers.append(np.array([self.compensator.command, self.compensator.correction]))
         self.keep_struts("strut_commands", self.now, self.compensator.command)
         self.keep_struts("strut_corrections", self.now, self.compensator.correction)

@@ -202,7 +202,8 @@ class Compensator:
         trial.motion.copy_from(self.motion)
         tool = platform @ self.geometry.tool
         fixed = self._pack(machine)
-        outcome = compensate_one(tool.position, tool.rotation, math.nan, NO_SHIFT, fixed, trial.numbers, tried.numbers)
+        pose, times = (tool.position, tool.rotation), (math.nan, math.nan)
+        outcome = compensate_one(*pose, *times, NO_SHIFT, fixed, trial.numbers, tried.numbers)
         refuse(outcome, tried, machine)
 
     def _followed(self, machine: RealMachine) -> np.ndarray | None:
@@ -313,7 +314,9 @@ class Compensator:
         self._last.clear()
         self._model_pose[:3], self._model_pose[3:] = home.position, home.rotation.ravel()
 
-    def step(self, numbers: tuple[float, ...], time: float, frame: np.ndarray | None = None) -> np.ndarray:
+    def step(
+        self, numbers: tuple[float, ...], time: float, frame: np.ndarray | None = None, received: float = math.nan
+    ) -> np.ndarray:
         """Compensate one commanded tool pose: the loop's entry.
 
         Parameters
@@ -322,11 +325,15 @@ class Compensator:
             Position x, y, z, m, and quaternion x, y, z, w of the tool in `frame`.
         time : float
             When the command was made, s: the node gives its stamp in nanoseconds × 1e-9. Only differences
-            matter, for ramps, and of them no more than 20 ms forwards; so the same commands with the same
-            stamps give the same answers bit for bit, and no jump of a clock can step.
+            matter: for the struts' speed, and for ramps, there no more than 20 ms forwards; so the same commands
+            with the same times give the same answers bit for bit, and no jump of a clock can step. NaN: not
+            known, then the time of receipt counts.
         frame : ndarray, shape (12,), optional
             Frame of the commanded pose seen from ``base``, packed by
             :func:`~hexapod_comp.compensation.state.pack_pose`; the geometry's work frame by default.
+        received : float, optional
+            When the command came, s, on a clock that nobody sets; NaN: not known, the speed is then limited by
+            `time` alone.
 
         Returns
         -------
@@ -336,16 +343,25 @@ class Compensator:
         Raises
         ------
         PoseError, LimitError, KinematicsError, OutsideFieldError
-            The command is refused and nothing has changed.
+            The command is refused and nothing has changed. Of a
+            :class:`~hexapod_comp.errors.TooEarlyError` the same command may be tried again later.
         """
         if self._last.state.resumes[0]:
-            return self._resume(lambda: self._run_numbers(numbers, time, frame), numbers)
-        return self._finish(self._run_numbers(numbers, time, frame), numbers)
+            return self._resume(lambda: self._run_numbers(numbers, time, frame, received), numbers)
+        return self._finish(self._run_numbers(numbers, time, frame, received), numbers)
 
-    def _run_numbers(self, numbers: tuple[float, ...], time: float, frame: np.ndarray | None) -> tuple:
+    def published(self, time: float) -> None:
+        """Take notice that the last command had gone out at a time, s, on the clock of its receipt.
+
+        The struts' speed is limited between publications: after one that was held up, the next must not come sooner.
+        """
+        self._last.state.published[0] = time
+
+    def _run_numbers(self, numbers: tuple[float, ...], time: float, frame: np.ndarray | None, received: float) -> tuple:
         """Work out the next command from a message's numbers; what it is worth, :meth:`_finish` says."""
         frame = self._work if frame is None else frame
-        return compensate_quaternion(*numbers, time, frame, self._fixed, self._last.numbers, self._next.numbers)
+        states = self._last.numbers, self._next.numbers
+        return compensate_quaternion(*numbers, time, received, frame, self._fixed, *states)
 
     def _resume(self, run: Callable[[], tuple], numbers: tuple[float, ...] = ()) -> np.ndarray:
         """Take the first command after a reset to measured struts, starting from where they stand.
@@ -411,7 +427,7 @@ class Compensator:
         """Position (3,) and rotation (3, 3) of the platform in ``base`` by the last estimate, field left out."""
         return self._model_pose[:3], self._model_pose[3:].reshape((3, 3))
 
-    def correct(self, tool_pose: Pose, time: float = 0.0) -> Correction:
+    def correct(self, tool_pose: Pose, time: float = math.nan) -> Correction:
         """Compensate one commanded tool pose and return the full record.
 
         Parameters
@@ -419,7 +435,7 @@ class Compensator:
         tool_pose : Pose
             ``pose_tool_in_work``.
         time : float, optional
-            When the command was made, s, for ramps, as in :meth:`step`.
+            When the command was made, s, for ramps and speeds, as in :meth:`step`; without it neither counts.
 
         Raises
         ------
@@ -435,7 +451,8 @@ class Compensator:
     def _run_pose(self, tool_pose: Pose, time: float) -> tuple:
         """Work out the next command from a pose."""
         pose = tool_pose.position, tool_pose.rotation
-        return compensate_one(*pose, time, self._work, self._fixed, self._last.numbers, self._next.numbers)
+        states = self._last.numbers, self._next.numbers
+        return compensate_one(*pose, time, math.nan, self._work, self._fixed, *states)
 
     def record(self, tool_pose: Pose) -> Correction:
         """Return the record of the command just accepted for `tool_pose`."""

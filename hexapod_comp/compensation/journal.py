@@ -35,12 +35,13 @@ from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL, parse_model
 from .compensator import Compensator
 
-FORMAT = 3
+FORMAT = 4
 """Version of pages."""
 
 OLDER = {
     1: "does not hold what the compensator consumed, in its order",
     2: "holds the compensator's state as numbers without names, which another release may order differently",
+    3: "does not hold when each command was received, by which the struts' speed is limited",
 }
 """Why older versions cannot be replayed."""
 
@@ -51,12 +52,20 @@ newest pages; at one every 50 ms a snapshot is among them."""
 ROLES = ("base", "work")
 """Frames of commanded poses; an answer names its frame by its place here."""
 
-COMMAND = np.dtype([("stamp", "<i8"), ("frame", "u1"), ("pose", "<f8", 7), ("lengths", "<f8", (2, 6))])
-"""One answered command: the time that the compensator was given, ns; frame; position, m, and quaternion x, y, z, w;
-strut commands and corrections that it answered, m."""
+_TIMES = [("stamp", "<i8"), ("stamped", "u1"), ("received", "<f8"), ("published", "<f8")]
+COMMAND = np.dtype([*_TIMES, ("frame", "u1"), ("pose", "<f8", 7), ("lengths", "<f8", (2, 6))])
+"""One answered command: its answer's stamp, ns; whether that was the command's own, or else its time is not known; when
+it was received and its answer had gone out, s, as the compensator was told; frame; position, m, and quaternion x, y, z,
+w; strut commands and corrections that it answered, m."""
 
-_HEAD = struct.Struct("<qB7d")
-"""The first three fields of an COMMAND: packed so in a fifth of the time."""
+_HEAD = struct.Struct("<qBddB7d")
+"""The first six fields of a COMMAND: packed so in a fifth of the time."""
+
+
+def time_of(stamp: int, stamped: bool) -> float:
+    """Return the time of a command as the compensator is told, s; NaN where it had no stamp."""
+    return stamp * 1e-9 if stamped else math.nan
+
 
 REFUSALS_PER_PAGE = 20
 """A page names no more refused commands than this; it counts the others."""
@@ -233,9 +242,11 @@ class Journal:
         self._last = -math.inf
         compensator.on_change = self.note
 
-    def answered(self, stamp: int, frame_id: str, numbers: tuple[float, ...]) -> None:
-        """Write down a command just answered: its time, ns, frame, position, m, and quaternion."""
-        self._commands += _HEAD.pack(stamp, self._places[frame_id], *numbers)
+    def answered(
+        self, stamp: int, frame_id: str, numbers: tuple[float, ...], times: tuple[float, float], stamped: bool = True
+    ) -> None:
+        """Write down a command just answered; the times are of its receipt and its publication. See :data:`COMMAND`."""
+        self._commands += _HEAD.pack(stamp, stamped, *times, self._places[frame_id], *numbers)
         self._commands += self._compensator.command.tobytes() + self._compensator.correction.tobytes()
         self._count += 1
 

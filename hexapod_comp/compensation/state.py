@@ -61,7 +61,7 @@ class CommandState:
         self.state = state_of(self.numbers)
         self.motion = MotionState(self.state.motion_low, self.state.motion_sense)
         self.state.ramp[:], self.state.ramp_rate[:] = 0.0, ramp_rate
-        self.state.enabled[:], self.state.changed[:] = 1.0, 0.0
+        self.state.enabled[:], self.state.changed[:], self.state.ahead_by_receipt[:] = 1.0, 0.0, 0.0
         self.clear()
 
     @property
@@ -75,10 +75,15 @@ class CommandState:
         return Pose(self.state.model_position, self.state.model_rotation.reshape((3, 3)))
 
     def clear(self) -> None:
-        """Forget lengths and motion; the correction stays, as what the struts stand at."""
+        """Forget lengths and motion.
+
+        The correction stays, as what the struts stand at, and so does when they were told so, and how far ahead of
+        their largest speed: a reset must not make them faster.
+        """
         state = self.state
         state.motion_low[:], state.motion_sense[:] = math.nan, 0.0
         state.nominal[:], state.command[:], state.time[:], state.resumes[:] = math.nan, math.nan, math.nan, 0.0
+        state.ahead_by_stamp[:], state.smooth_speed[:] = 0.0, 0.0
         self.must_ramp()
 
     def must_ramp(self) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from . import kinematics as kernels
 from .compiling import compiled
-from .limits import CORRECTION, STEP, WITHIN, check_change, check_stage, limits_of
+from .limits import ACCELERATION, CORRECTION, EARLY, SPEED, STEP, WITHIN, check_change, check_stage, limits_of
 from .model import actual_pose_one, command_one
 from .pose import POSE_OK, read_pose
 from .struts import PARAMETERS
@@ -26,6 +26,20 @@ SOLVED, UNSOLVED, OUTSIDE, NO_POSE = range(4)
 
 LONGEST_RAMP_STEP = 0.02
 """A pause between commands counts as no more than this in a ramp, s: a late command must not step."""
+
+AHEAD_BY_STAMP = 5e-3
+"""By its stamp a command may be so much motion at the largest speed ahead, s: a controller whose loop was late by a
+period catches it up at once, and periods of 4 ms are usual."""
+
+AHEAD_BY_RECEIPT = 8e-4
+"""By its receipt it may be only so much ahead, s, and waits otherwise: over 20 ms no strut is then sent faster than at
+1.04 times the limit."""
+
+SHORTEST_PERIOD = 1e-4
+"""Two commands count as no closer than this when an acceleration is made of them, s."""
+
+SMOOTHED_OVER = 0.02
+"""Time constant over which a speed is smoothed before its change counts as an acceleration, s: stamps jitter."""
 
 TABLE_END = 72 + 6 * PARAMETERS
 
@@ -53,6 +67,13 @@ class State(NamedTuple):
         command starts from measured struts.
     ramp_rate : 1 number
         Largest speed of the ramp, m/s.
+    received, published : 1 number each
+        When the command was taken, and when what was answered had gone out, s on a clock that nobody sets; a reset does
+        not forget them.
+    ahead_by_stamp, ahead_by_receipt : 6 numbers each
+        How far each strut is ahead of what the speed limit allows by the one clock and by the other, m.
+    smooth_speed : 6 numbers
+        Of the struts, m/s, where the acceleration is limited.
     """
 
     motion_low: Any
@@ -70,9 +91,14 @@ class State(NamedTuple):
     changed: Any
     resumes: Any
     ramp_rate: Any
+    received: Any
+    published: Any
+    ahead_by_stamp: Any
+    ahead_by_receipt: Any
+    smooth_speed: Any
 
 
-SIZES = State(9, 9, 6, 6, 6, 6, 1, 3, 9, 3, 9, 1, 1, 1, 1)
+SIZES = State(9, 9, 6, 6, 6, 6, 1, 3, 9, 3, 9, 1, 1, 1, 1, 1, 1, 6, 6, 6)
 """How many numbers each part is."""
 
 AT = State(*accumulate(SIZES[:-1], initial=0))
@@ -132,11 +158,12 @@ def compose(p1, r1, p2, r2, position, rotation):
 
 
 @compiled
-def compensate_one(position, rotation, time, frame, fixed, last, new):
+def compensate_one(position, rotation, time, received, frame, fixed, last, new):
     """Run the whole chain for one command; return (status, finding, strut, stage, value, condition number).
 
     `fixed` holds the machine's numbers, the nominal ones, and the arrays whose size varies. The state in `last`
-    stays as it is; the one in `new` is written, and counts only when nothing was found.
+    stays as it is; the one in `new` is written, and counts only when nothing was found. `time` is the command's stamp
+    and `received` when it came, s; either may be NaN: not known.
     """
     machine_numbers, nominal_numbers, varied = fixed
     body, table, probe, thresholds, _ = machine_views(machine_numbers)
@@ -159,7 +186,8 @@ def compensate_one(position, rotation, time, frame, fixed, last, new):
         return UNSOLVED, WITHIN, -1, 1, math.nan, condition
     for i in range(6):
         new[AT.correction + i] = last[AT.enabled] * (command[i] - nominal[i])
-    new[AT.time], new[AT.changed], new[AT.resumes] = time, 0.0, 0.0
+    new[AT.time], new[AT.received], new[AT.published] = time, received, math.nan
+    new[AT.changed], new[AT.resumes] = 0.0, 0.0
     shrink_ramp(last, new)
     for i in range(6):
         new[AT.correction + i] += new[AT.ramp + i]
@@ -178,7 +206,7 @@ def pose_at(numbers, position, rotation):
 
 
 @compiled
-def compensate_quaternion(x, y, z, qx, qy, qz, qw, time, frame, fixed, last, new):
+def compensate_quaternion(x, y, z, qx, qy, qz, qw, time, received, frame, fixed, last, new):
     """Run :func:`compensate_one` on a position and a quaternion, as messages carry them.
 
     When the status is NO_POSE, the finding is the outcome of :func:`hexapod_comp.kernels.kinematics.pose.read_pose`.
@@ -187,12 +215,12 @@ def compensate_quaternion(x, y, z, qx, qy, qz, qw, time, frame, fixed, last, new
     outcome = read_pose(x, y, z, qx, qy, qz, qw, position, rotation)
     if outcome != POSE_OK:
         return NO_POSE, outcome, -1, 0, math.nan, math.nan
-    return compensate_one(position, rotation, time, frame, fixed, last, new)
+    return compensate_one(position, rotation, time, received, frame, fixed, last, new)
 
 
 @compiled
 def check_command(last, new, limits):
-    """Check correction and steps; return (finding, strut, value, stage)."""
+    """Check correction, steps, speed and acceleration; return (finding, strut, value, stage)."""
     for i in range(6):
         if not abs(new[AT.correction + i]) <= limits.correction:
             return CORRECTION, i, new[AT.correction + i], 1
@@ -200,7 +228,76 @@ def check_command(last, new, limits):
     if finding != WITHIN:
         return finding, strut, value, 0
     finding, strut, value = check_change(new[AT.command :], last[AT.command :], limits.step, STEP)
+    if finding == WITHIN:
+        finding, strut, value = check_speed(last, new, limits)
+    if finding == WITHIN and limits.acceleration > 0.0:
+        finding, strut, value = check_acceleration(last, new, limits)
     return finding, strut, value, 1
+
+
+@compiled
+def elapsed(last, new):
+    """Return the time since the last command by the stamps and by the receipt, s; −1: not known.
+
+    A stamp earlier than the last one's comes from a clock that was set back: it tells nothing.
+    """
+    by_stamp, by_receipt = new[AT.time] - last[AT.time], new[AT.received] - last[AT.received]
+    return by_stamp if by_stamp >= 0.0 else -1.0, by_receipt if by_receipt >= 0.0 else -1.0
+
+
+@compiled
+def check_speed(last, new, limits):
+    """Check the struts' speed by both clocks, and write how far they are ahead; return (finding, strut, value).
+
+    What the limit would have allowed since the last command, and was not used, is lost: but for the small allowance, a
+    pause gives no right to hurry. What counts is when commands go out; this one goes out now at the earliest, and how
+    late the last one was is known. The value is a speed, m/s, or for EARLY the time after which the command may come.
+    """
+    by_stamp, by_receipt = elapsed(last, new)
+    held_up = last[AT.published] - last[AT.received]
+    if math.isnan(held_up):
+        held_up = 0.0
+    hurried, early, speed, wait = -1, -1, 0.0, 0.0
+    for i in range(6):
+        change = abs(new[AT.command + i] - last[AT.command + i])
+        if math.isnan(change):  # there is no last command
+            change = 0.0
+        if by_stamp >= 0.0:
+            ahead = max(0.0, last[AT.ahead_by_stamp + i] + change - limits.speed * by_stamp)
+            new[AT.ahead_by_stamp + i] = ahead
+            if ahead > limits.speed * AHEAD_BY_STAMP and change > speed * by_stamp:
+                hurried, speed = i, change / max(by_stamp, 1e-9)
+        if by_receipt >= 0.0:
+            ahead = max(0.0, last[AT.ahead_by_receipt + i] - limits.speed * held_up)
+            ahead = max(0.0, ahead + change - limits.speed * (by_receipt - held_up))
+            new[AT.ahead_by_receipt + i] = ahead
+            late = ahead / limits.speed - AHEAD_BY_RECEIPT
+            if late > wait:
+                early, wait = i, late
+    if hurried >= 0:
+        return SPEED, hurried, speed
+    return (EARLY, early, wait) if early >= 0 else (WITHIN, -1, 0.0)
+
+
+@compiled
+def check_acceleration(last, new, limits):
+    """Check how fast the struts' smoothed speeds change, and write them; return (finding, strut, m/s²).
+
+    By the stamps, or where there are none by the receipt. Smoothing is u' = u·k + (1 − k)·Δl/Δt with
+    k = exp(−Δt/SMOOTHED_OVER): a constant acceleration passes as what it is, a jump Δv as Δv/SMOOTHED_OVER.
+    """
+    by_stamp, by_receipt = elapsed(last, new)
+    period = max(by_stamp if by_stamp >= 0.0 else by_receipt, SHORTEST_PERIOD)
+    keep = math.exp(-period / SMOOTHED_OVER)
+    finding, strut, worst = WITHIN, -1, limits.acceleration
+    for i in range(6):
+        before = last[AT.smooth_speed + i]
+        speed = (new[AT.command + i] - last[AT.command + i]) / period
+        new[AT.smooth_speed + i] = 0.0 if math.isnan(speed) else keep * before + (1.0 - keep) * speed
+        acceleration = abs(new[AT.smooth_speed + i] - before) / period
+        if acceleration > worst:
+            finding, strut, worst = ACCELERATION, i, acceleration
+    return finding, strut, worst
 
 
 @compiled
@@ -212,7 +309,11 @@ def shrink_ramp(last, new):
     more than the ramp rate.
     """
     pause = new[AT.time] - last[AT.time]
-    step = 0.0 if math.isnan(pause) else last[AT.ramp_rate] * min(max(pause, 0.0), LONGEST_RAMP_STEP)
+    if math.isnan(pause):  # one of the two has no stamp
+        pause = new[AT.received] - last[AT.received]
+    step = last[AT.ramp_rate] * min(max(pause, 0.0), LONGEST_RAMP_STEP)
+    if math.isnan(pause) or math.isnan(last[AT.nominal]):  # the first command stands where the struts are
+        step = 0.0
     largest = 0.0
     for i in range(6):
         if last[AT.changed] != 0.0 and not math.isnan(last[AT.correction + i]):

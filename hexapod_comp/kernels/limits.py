@@ -28,7 +28,10 @@ from .kinematics import condition_one, strut_lengths_one, strut_vector
     NOT_FINITE,
     CORRECTION,
     STEP,
-) = range(11)
+    SPEED,
+    EARLY,
+    ACCELERATION,
+) = range(14)
 """What a check found."""
 
 
@@ -52,6 +55,8 @@ class LimitNumbers(NamedTuple):
         See :func:`~hexapod_comp.kernels.kinematics.condition_one`, m.
     home_sign : float
         Sign of det J in the working assembly mode.
+    speed, acceleration : float
+        Largest speed and acceleration of a strut, m/s, m/s²; the acceleration 0 when it is not limited.
     """
 
     stroke: np.ndarray
@@ -64,11 +69,13 @@ class LimitNumbers(NamedTuple):
     clearance: float
     characteristic_length: float
     home_sign: float
+    speed: float
+    acceleration: float
 
 
 @compiled
 def limits_of(numbers):
-    """Return the limits that stand one after the other in a vector, (102,); its parts, not copies."""
+    """Return the limits that stand one after the other in a vector, (104,); its parts, not copies."""
     return LimitNumbers(
         stroke=numbers[:12].reshape((6, 2)),
         cone_axes=numbers[12:48].reshape((2, 6, 3)),
@@ -80,6 +87,8 @@ def limits_of(numbers):
         clearance=numbers[99],
         characteristic_length=numbers[100],
         home_sign=numbers[101],
+        speed=numbers[102],
+        acceleration=numbers[103],
     )
 
 

@@ -95,8 +95,11 @@ def command_for_length(length, sense, shift, table, knots, pieces, i):
 
 
 @compiled
-def write_lengths(lengths, period, position, velocity):
-    """Write six lengths and their speeds in place."""
+def write_lengths(lengths, period, fastest, position, velocity):
+    """Write six lengths and their speeds in place; these are at most `fastest`: jitter in stamps is no speed."""
+    if period > 0.0:
+        for i in range(6):
+            period = max(period, abs(lengths[i] - position[i]) / fastest)
     for i in range(6):
         velocity[i] = (lengths[i] - position[i]) / period if period > 0.0 else 0.0
         position[i] = lengths[i]

@@ -296,6 +296,7 @@ def _read_limits(section: Section) -> Limits:
         "step": float(section.quantity("step", "length")),
         "speed": float(section.quantity("speed", "speed")),
         "clearance": float(section.quantity("clearance", "length", default=0.0)),
+        "acceleration": float(section.quantity("acceleration", "acceleration", default=0.0)),
     }
     section.finish()
     try:

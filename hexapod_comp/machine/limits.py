@@ -7,15 +7,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..errors import GeometryError, KinematicsError, LimitError, NotFiniteError
+from ..errors import GeometryError, KinematicsError, LimitError, NotFiniteError, TooEarlyError
 from ..kernels.limits import (
+    ACCELERATION,
     ASSEMBLY,
     BASE_CONE,
     CLEARANCE,
     CONDITION,
     CORRECTION,
+    EARLY,
     NOT_FINITE,
     PLATFORM_CONE,
+    SPEED,
     STEP,
     STROKE_LONG,
     STROKE_SHORT,
@@ -38,6 +41,9 @@ REASONS = (
     "not_finite",
     "correction",
     "step",
+    "speed",
+    "speed",
+    "acceleration",
 )
 """Names of the findings, as counted in diagnostics."""
 
@@ -63,9 +69,12 @@ class Limits:
     step : float
         Largest change of a strut command between two commands, m.
     speed : float
-        Largest strut speed, m/s; used by ``check`` and by the trajectories that this package makes.
+        Largest strut speed, m/s.
     clearance : float, optional
         Smallest distance between the axes of two struts, m; 0: not limited. Struts that share a joint do not count.
+    acceleration : float, optional
+        Largest strut acceleration, m/s²; 0: not limited. Of the speed smoothed over
+        :data:`~hexapod_comp.kernels.compensation.SMOOTHED_OVER`.
     """
 
     stroke: np.ndarray
@@ -76,6 +85,7 @@ class Limits:
     step: float
     speed: float
     clearance: float = 0.0
+    acceleration: float = 0.0
     cone_cosines: np.ndarray = field(init=False, repr=False)
     """Of the cones' angles, at the base and at the platform, shape (2, 6): what the angles themselves are judged by."""
 
@@ -94,8 +104,9 @@ class Limits:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > least):
                 raise GeometryError(f"limits.{name}", f"must be finite and above {least:g}", value)
-        if not 0.0 <= self.clearance < np.inf:
-            raise GeometryError("limits.clearance", "must be finite and not negative, m", self.clearance)
+        for name, unit in (("clearance", "m"), ("acceleration", "m/s²")):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise GeometryError(f"limits.{name}", f"must be finite and not negative, {unit}", getattr(self, name))
         object.__setattr__(self, "cone_cosines", np.cos(np.array([self.base_cone, self.platform_cone])))
 
     def numbers(
@@ -113,6 +124,8 @@ class Limits:
             clearance=float(self.clearance),
             characteristic_length=characteristic_length,
             home_sign=home_sign,
+            speed=float(self.speed),
+            acceleration=float(self.acceleration),
         )
 
     def margins(self, quantities: Quantities) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -147,6 +160,8 @@ class Limits:
 
     def error(self, code: int, strut: int, stage: int, value: float) -> LimitError | KinematicsError:
         """Return the error for a finding: which limit, which strut, found and allowed value with units."""
+        if code in (SPEED, EARLY, ACCELERATION):
+            return self._motion_error(code, strut, value)
         which = STAGES[stage]
         if code == NOT_FINITE:
             return NotFiniteError(f"the {which} values at this pose are not finite")
@@ -183,6 +198,17 @@ class Limits:
             ),
         }[code]
         return LimitError(REASONS[code], text, value, float(allowed), strut if strut >= 0 else None, which)
+
+    def _motion_error(self, code: int, strut: int, value: float) -> LimitError:
+        """Return the error for a motion that is too fast; `value` is m/s, m/s², or s too early."""
+        name = STRUT_NAMES[strut]
+        if code == EARLY:
+            text = f"{name} cannot be there yet: {value * 1e3:.3g} ms too early for {self.speed * 1e3:g} mm/s"
+            return TooEarlyError(text, value, self.speed, strut)
+        quantity, unit = ("speed", "mm/s") if code == SPEED else ("acceleration", "mm/s²")
+        allowed = getattr(self, quantity)
+        text = f"{name}: {quantity} {value * 1e3:.4g} {unit} by the stamps, allowed {allowed * 1e3:g} {unit}"
+        return LimitError(REASONS[code], text, value, allowed, strut, "compensated")
 
 
 def _cone_text(name: str, which: str, body: str, value: float, limit: float) -> str:

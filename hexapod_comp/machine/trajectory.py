@@ -18,6 +18,9 @@ SHARE_OF_LIMIT = 0.8
 PEAK_OF_QUINTIC = 1.875
 """Largest slope of the quintic 10t³ − 15t⁴ + 6t⁵."""
 
+BEND_OF_QUINTIC = 10.0 / 3.0**0.5
+"""Its largest second derivative."""
+
 COARSE = 20
 """Sections of a move over which the struts' slopes are taken."""
 
@@ -57,7 +60,7 @@ def move(geometry: HexapodGeometry, start: Pose, end: Pose, rate: float, feed: f
     Parameters
     ----------
     geometry : HexapodGeometry
-        Its limits of step and speed set the duration.
+        Its limits of step, speed and acceleration set the duration.
     start, end : Pose
         ``pose_tool_in_work``; the start is not part of the path, the end is.
     rate : float
@@ -81,7 +84,7 @@ def moves(
     Parameters
     ----------
     geometry : HexapodGeometry
-        Its limits of step and speed set each move's duration.
+        Its limits of step, speed and acceleration set each move's duration.
     positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
         Tool poses in the work frame, m; the first is not part of the path.
     rate : float
@@ -103,6 +106,11 @@ def moves(
     changes = np.abs(np.diff(lengths.reshape(len(legs), COARSE + 1, 6), axis=1))
     allowed = SHARE_OF_LIMIT * min(geometry.limits.speed, geometry.limits.step * rate)
     duration = PEAK_OF_QUINTIC * COARSE * changes.max(axis=(1, 2)) / allowed
+    if geometry.limits.acceleration:
+        # l'' = l_s s'' + l_ss s'², s the share: each at its largest.
+        bends = np.abs(np.diff(lengths.reshape(len(legs), COARSE + 1, 6), 2, axis=1)).max(axis=(1, 2), initial=0.0)
+        worst = BEND_OF_QUINTIC * COARSE * changes.max(axis=(1, 2)) + (PEAK_OF_QUINTIC * COARSE) ** 2 * bends
+        duration = np.maximum(duration, np.sqrt(worst / (SHARE_OF_LIMIT * geometry.limits.acceleration)))
     if feed is not None:
         travel = np.linalg.norm(np.diff(positions, axis=0), axis=1)
         duration = np.maximum(duration, PEAK_OF_QUINTIC * travel / feed)

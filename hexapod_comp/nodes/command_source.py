@@ -121,14 +121,15 @@ class Publishers:
         """Return the names, and why there are none: a node's name may be any bytes, which rclpy cannot give."""
         try:
             infos = self._node.get_publishers_info_by_topic(self.topic)
-            return tuple(sorted({_full_name(info) for info in infos})), ""
+            return tuple(sorted({full_name(info) for info in infos})), ""
         except UnicodeDecodeError as error:
             return (), f"a node's name is not UTF-8: {shorten(error.object)}"
         except Exception as error:  # of many kinds: what the graph holds is others' doing
             return (), described(error)
 
 
-def _full_name(info: Any) -> str:
+def full_name(info: Any) -> str:
+    """Return the full name of the node at an end of a topic, as the graph tells it."""
     name = info.node_name
     return name if name == UNKNOWN_NAME else f"{info.node_namespace.rstrip('/')}/{name}"
 

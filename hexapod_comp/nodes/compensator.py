@@ -14,11 +14,11 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
-from std_srvs.srv import SetBool, Trigger
 
 from ..compensation.compensator import Compensator
+from ..compensation.journal import time_of
 from ..compensation.state import pack_pose
-from ..errors import CommandError, HexapodError, shorten
+from ..errors import CommandError, HexapodError, TooEarlyError, shorten
 from ..pose import Pose
 from .command_source import CommandSource, OwnTopic
 from .compensator_outputs import CompensatorOutputs
@@ -28,13 +28,15 @@ from .feedback import Feedback
 from .health import WARN, seconds
 from .journal import JournalTopics
 from .machine_files import MachineFiles
+from .operating import OperatorServices
+from .pacing import Pacing
 from .parameters import ParameterError, declare
 from .reloading import ReloadService
 from .running import keep_discovery_local, run
 from .runtime import ACKNOWLEDGED_WITHIN, MachineNode
 from .stamps import StampCheck, stamp_of
 from .warming import warm_up
-from .wire import read_pose_bytes
+from .wire import read_pose_bytes, stamp_in
 
 CHECK_PERIOD = 0.05
 """How often the node looks whether its state has changed, s."""
@@ -107,6 +109,7 @@ class CompensatorNode(MachineNode):
         """Close topics and forget the machine."""
         self._active = False
         self._reload.close()
+        self._operator.close()
         self._journal.close(time.monotonic())
         self._forget()
         self._close_topics()
@@ -131,17 +134,15 @@ class CompensatorNode(MachineNode):
         commands = self.obey(PoseStamped, "tool_pose_command", self._on_command, self._look_at_publishers, raw=True)
         self._subscription = commands
         allowed = self._options["allow_several_publishers"]
-        self._status.watch_topics(
+        self._pacing = Pacing(self, self._options["catch_up_within"], self._take, self._refuse_waiting)
+        self._status.watch(
             CommandSource(self, commands.topic_name, commands.get_publisher_count, allowed),
             OwnTopic(self, outputs.command_topic, allowed),
+            self._pacing,
         )
         self._hear = self._status.source.hear
         self._reload = ReloadService(self, self._files, self.compensator, self._status.failed_reloads)
-        self._own_services = [
-            self.create_service(SetBool, "~/enable_compensation", self._on_enable),
-            self._reload.service,
-            self.create_service(Trigger, "~/reset", self._on_reset),
-        ]
+        self._operator = OperatorServices(self, self.compensator, self._status, self._forget)
         self._timers_open = [
             self.every(CHECK_PERIOD, self._check_state),
             self.every(ESTIMATE_PERIOD, self._estimate_from_commands),
@@ -152,8 +153,8 @@ class CompensatorNode(MachineNode):
     def _close_topics(self) -> None:
         for timer in self._timers_open:
             self.destroy_timer(timer)
-        for service in self._own_services:
-            self.destroy_service(service)
+        self.destroy_service(self._reload.service)
+        self._pacing.close()
         self.destroy_subscription(self._subscription)
         self._feedback.close()
         self._outputs.close()
@@ -168,6 +169,10 @@ class CompensatorNode(MachineNode):
         now = time.monotonic()
         if self._hear(number, now):
             self._look_closer()
+        self._pacing.command(data, now)
+
+    def _take(self, data: bytes, now: float) -> float:
+        """Answer or refuse a command at the monotonic time `now`, s; return how long it must wait instead, s."""
         stamp = 0
         try:
             stamp, frame_id, numbers = read_pose_bytes(data)
@@ -177,13 +182,15 @@ class CompensatorNode(MachineNode):
             if stamp:
                 self._stamps.check(stamp, now)
             when = stamp or self.get_clock().now().nanoseconds  # zero means now
-            self.compensator.step(numbers, when * 1e-9, frame)
+            self.compensator.step(numbers, time_of(stamp, bool(stamp)), frame, now)
+        except TooEarlyError as error:
+            return error.wait
         except HexapodError as error:
-            self._journal.refused(stamp, error.reason, str(error))
-            self._refuse(error, now)
-            return
+            self._refuse(stamp, error, now)
+            return 0.0
         self._outputs.command(when)
-        self._journal.answered(when, frame_id, numbers)
+        self.compensator.published(out := time.monotonic())
+        self._journal.answered(when, frame_id, numbers, (now, out), bool(stamp))
         if self._fresh_start:
             self._fresh_start = False
             self._look_closer()
@@ -192,6 +199,7 @@ class CompensatorNode(MachineNode):
         self._following.note(self.compensator.command, now)
         self._commands.tick(now)
         self._unestimated = when
+        return 0.0
 
     def _examine(self, frame_id: str, now: float) -> None:
         """Refuse an unknown frame, while a guard has a problem, or missing feedback; start from what there is."""
@@ -219,20 +227,6 @@ class CompensatorNode(MachineNode):
         self._status.look(time.monotonic())
         self._look_closer()
 
-    # ---- services ----
-
-    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self.compensator.enable(request.data)
-        response.success = True
-        response.message = f"compensation ramps {'in' if request.data else 'out'}"
-        return response
-
-    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._forget()
-        response.success = True
-        response.message = "the next command may be one allowed step from where the struts were known to be last"
-        return response
-
     # ---- messages out ----
 
     def _estimate_from_commands(self) -> None:
@@ -258,13 +252,18 @@ class CompensatorNode(MachineNode):
         if not self._fresh_start:
             self._last_known.tell(self.compensator.command, self._commands.last)
         self.compensator.reset()
+        self._pacing.clear()
         self._unestimated = None
         self._fresh_start = self._looks_closer = True
         self._outputs.forget()
         self._stamps.forget()
         self._following.forget()
 
-    def _refuse(self, error: HexapodError, now: float) -> None:
+    def _refuse_waiting(self, data: bytes, error: HexapodError, now: float) -> None:
+        self._refuse(stamp_in(data), error, now)
+
+    def _refuse(self, stamp: int, error: HexapodError, now: float) -> None:
+        self._journal.refused(stamp, error.reason, str(error))
         self._status.refusals.add(error.reason, str(error), now)
         self.warn_of(error.reason, f"command refused ({error.reason}): {error}")
 

@@ -53,7 +53,7 @@ class CompensatorOutputs:
         self._command_out, self._correction_out = StrutBytes(), StrutBytes()
         self._estimate_out = PoseStamped()
         self._estimate_out.header.frame_id = self._frame
-        self._answered = 0
+        self._answered, self._fastest = 0, compensator.geometry.limits.speed
         self._predicted = PredictedErrorTopics(node, compensator, files, options["work_frame"], lambda: self._answered)
 
     @property
@@ -63,7 +63,7 @@ class CompensatorOutputs:
 
     def command(self, when: int) -> None:
         """Publish the compensator's command and correction, stamped `when`, ns."""
-        self._command_out.write(self._compensator.command, period(self._answered, when))
+        self._command_out.write(self._compensator.command, period(self._answered, when), self._fastest)
         self._answered = when
         self._commands.publish(self._command_out.stamped(when))
         self._correction_out.write(self._compensator.correction)

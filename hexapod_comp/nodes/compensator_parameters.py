@@ -32,6 +32,13 @@ PARAMETERS = (
         0.0,
         1.0,
     ),
+    Parameter(
+        "catch_up_within",
+        0.1,
+        "commands that come sooner than the struts may move wait so long, s, in order; 0 = only the newest waits",
+        0.0,
+        3600.0,
+    ),
     Parameter("allow_several_publishers", False, "obey though several nodes publish commands or readings"),
     Parameter("allow_several_thermometers", False, "take temperatures though several nodes publish them"),
     Parameter("ramp_rate", 1e-3, "strut speed at which a change of model or enabling is taken up, m/s", 1e-6, 1.0),

@@ -10,9 +10,10 @@ import numpy as np
 from ..compensation.compensator import Compensator
 from ..compensation.thermal import Thermometers
 from .command_source import CommandSource, OwnTopic
-from .following import Following, LastKnown
+from .following import Following, LastKnown, Standing
 from .health import ERROR, OK, WARN, Flow, Refusals, joined, seconds
 from .log_space import LogSpace
+from .pacing import Pacing
 from .stamps import StampCheck
 
 NEAR_SINGULAR = 0.9
@@ -45,7 +46,7 @@ class CompensatorStatus:
     ----------
     commands, feedback : Flow
         Accepted commands and usable measured struts.
-    refusals, bad_feedback, failed_reloads : Refusals
+    refusals, bad_feedback, failed_reloads, refused_resets : Refusals
         What was refused.
     source : CommandSource
         Who commands.
@@ -59,6 +60,10 @@ class CompensatorStatus:
         Of the measured struts.
     following : Following
         Whether the struts go where they are told.
+    standing : Standing
+        Whether they stand.
+    pacing : Pacing
+        Commands that wait.
     last_known : LastKnown
         Where a start begins.
     log_space : LogSpace
@@ -69,14 +74,16 @@ class CompensatorStatus:
         self._options, self._stamps = options, stamps
         self.reading_stamps = stamps.for_readings(options["max_reading_age"])
         self.commands, self.feedback = Flow(), Flow()
-        self.refusals, self.bad_feedback, self.failed_reloads = Refusals(), Refusals(), Refusals()
+        self.refusals, self.bad_feedback = Refusals(), Refusals()
+        self.failed_reloads, self.refused_resets = Refusals(), Refusals()
         self.following = Following(options["following_error_limit"])
+        self.standing = Standing(self.following.commands)
         self.last_known = LastKnown(options["start_without_feedback_after"])
         self.log_space = LogSpace()
 
-    def watch_topics(self, source: CommandSource, own_topic: OwnTopic) -> None:
-        """Take the guards of the topics of a configured node."""
-        self.source, self.own_topic = source, own_topic
+    def watch(self, source: CommandSource, own_topic: OwnTopic, pacing: Pacing) -> None:
+        """Take the guards of the topics of a configured node, and what lets its commands wait."""
+        self.source, self.own_topic, self.pacing = source, own_topic, pacing
 
     def watch_readings(self, measuring: CommandSource, warming: CommandSource, thermometers: Thermometers) -> None:
         """Take the guards of the readings of a configured node."""
@@ -114,6 +121,8 @@ class CompensatorStatus:
             yield ERROR, f"temperatures ignored: {self.warming.reason}: {self.warming.problem}"
         if self.failed_reloads.recent(now):
             yield WARN, "the old model stays"
+        if self.refused_resets.recent(now):
+            yield WARN, "reset refused while the machine moves"
         yield from self._lost(now)
         if self.log_space.problem:
             yield WARN, self.log_space.problem
@@ -138,6 +147,8 @@ class CompensatorStatus:
             yield WARN, f"temperatures stale: {stale}"
         if not silent and self.source.sequence.missing(now):
             yield WARN, "running, commands are being missed"
+        if self.pacing.behind(now):
+            yield WARN, "running, catching up with commands that came late"
 
     def values(self, compensator: Compensator, fresh_start: bool, now: float) -> dict[str, str]:
         """Return everything else as key and value; before the first command nothing is corrected."""
@@ -160,6 +171,7 @@ class CompensatorStatus:
             "bad_feedback": str(sum(self.bad_feedback.counts.values())),
             "failed_reloads": str(sum(self.failed_reloads.counts.values())),
             "last_failed_reload": self.failed_reloads.last_text,
+            "refused_resets": str(sum(self.refused_resets.counts.values())),
         }
         values.update({f"temperature.{k}_degC": f"{v:.2f}" for k, v in compensator.temperatures.values.items()})
         values.update(self.refusals.values())
@@ -169,6 +181,8 @@ class CompensatorStatus:
         return {
             "commands": str(self.commands.count),
             "commands_missed": str(self.source.sequence.missed),
+            "commands_waited": str(self.pacing.waited),
+            "commands_dropped": str(self.pacing.dropped),
             "command_rate_hz": f"{self.commands.rate(now):.1f}",
             "command_age_s": seconds(self.commands.age(now)),
             "feedback_rate_hz": f"{self.feedback.rate(now):.1f}",

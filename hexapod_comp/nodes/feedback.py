@@ -90,6 +90,7 @@ class Feedback:
             self._ignore("feedback " + error.reason, error.reason, f"strut_states ignored: {error}", str(error), now)
             return
         self._status.last_known.measure(struts, now)
+        self._status.standing.measure(struts, now)
         self._jumps.passed(struts, stamp, now)
         if stamp:
             self._stamps.accept(stamp, now)

@@ -17,6 +17,9 @@ KEPT = 512
 FOLLOWED_WITHIN = 0.1
 """A drive follows and tells within this time, s: a strut is right where any command of that time wants it."""
 
+STANDS_WITHIN = 50e-6
+"""A strut that moves by no more than this in that time stands, m: encoders and servos are never quite still."""
+
 
 class StrokeRange:
     """The lengths that struts can have, with the largest correction to spare at either end.
@@ -48,11 +51,46 @@ class StrokeRange:
         raise LimitError("stroke", text, length, float(low if length < low else high), strut, "measured")
 
 
+class Recent:
+    """The struts of the last half second or so, told or measured."""
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[float, bytes]] = deque(maxlen=KEPT)  # bytes: six times faster than array rows
+
+    def __bool__(self) -> bool:
+        return bool(self._kept)
+
+    @property
+    def last(self) -> np.ndarray:
+        """The newest struts, shape (6,), m."""
+        return np.frombuffer(self._kept[-1][1])
+
+    def note(self, struts: np.ndarray, now: float) -> None:
+        """Remember struts, shape (6,), m, at the monotonic time `now`, s."""
+        self._kept.append((now, struts.tobytes()))
+
+    def clear(self) -> None:
+        """Forget them all."""
+        self._kept.clear()
+
+    def range(self, since: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the least and the most since a monotonic time, s, with what was in force then; all of it (6,), m."""
+        recent = []
+        for at, struts in reversed(self._kept):
+            recent.append(struts)
+            if at < since:
+                break
+        rows = np.frombuffer(b"".join(recent)).reshape((-1, 6))
+        return rows.min(axis=0), rows.max(axis=0)
+
+
 class Following:
     """Guards the difference of measured and commanded struts.
 
     Drives lag, and readings are on their way for a while, so a reading is compared with all that was commanded
-    in the last :data:`FOLLOWED_WITHIN`: it must lie between the least and the most of it, or within the limit.
+    in the last :data:`FOLLOWED_WITHIN`: it must lie between the least and the most of it, or within the limit. Once it
+    does not, the problem stays until it is released, as on servo drives and in LinuxCNC: a strut that comes back by
+    itself has all the same been where nobody told it to be.
 
     Parameters
     ----------
@@ -63,53 +101,70 @@ class Following:
     ----------
     problem : str
         Which strut, where, how far off and what is allowed, as it was first found; empty while all is well.
+    commands : Recent
+        What was commanded.
     """
 
     reason = "following_error"
 
     def __init__(self, limit: float) -> None:
         self._limit = limit
-        self._kept: deque[tuple[float, bytes]] = deque(maxlen=KEPT)  # bytes: six times faster than array rows
+        self.commands = Recent()
         self.problem = ""
 
     def note(self, command: np.ndarray, now: float) -> None:
         """Remember a command, shape (6,), m, accepted at the monotonic time `now`, s."""
-        self._kept.append((now, command.tobytes()))
+        self.commands.note(command, now)
 
     def forget(self) -> None:
-        """No command is in force any more."""
-        self._kept.clear()
+        """No command is in force any more; what was found stays."""
+        self.commands.clear()
+
+    def release(self) -> None:
+        """Take what was found as settled."""
         self.problem = ""
 
     def check(self, measured: np.ndarray, arrived: float) -> None:
         """Compare measured struts, shape (6,), m, that arrived at the monotonic time `arrived`, s."""
-        if not (self._kept and self._limit) or self._at_last_command(measured):
-            self.problem = ""
+        if self.problem or not (self.commands and self._limit):
             return
-        low, high = self._range(arrived - FOLLOWED_WITHIN)
+        if within(measured, self.commands.last, self._limit):  # as they nearly always are
+            return
+        low, high = self.commands.range(arrived - FOLLOWED_WITHIN)
         off = np.maximum(low - measured, measured - high)
         strut = int(off.argmax())
-        if off[strut] <= self._limit:
-            self.problem = ""
-        elif not self.problem:
+        if off[strut] > self._limit:
             self.problem = (
                 f"{STRUT_NAMES[strut]} is at {measured[strut] * 1e3:.3f} mm, {off[strut] * 1e3:.3f} mm from its "
-                f"command, allowed {self._limit * 1e3:g} mm"
+                f"command, allowed {self._limit * 1e3:g} mm; until ~/reset"
             )
 
-    def _at_last_command(self, measured: np.ndarray) -> bool:
-        """Return whether all struts are within the limit of the last command, as they nearly always are."""
-        return within(measured, np.frombuffer(self._kept[-1][1]), self._limit)
 
-    def _range(self, since: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the least and the most commanded after a time, and by the command then in force."""
-        recent = []
-        for accepted, command in reversed(self._kept):
-            recent.append(command)
-            if accepted < since:
-                break
-        commands = np.frombuffer(b"".join(recent)).reshape((-1, 6))
-        return commands.min(axis=0), commands.max(axis=0)
+class Standing:
+    """Whether the machine stands: struts that were neither told nor measured to go anywhere of late.
+
+    Parameters
+    ----------
+    commands : Recent
+        What was commanded.
+    """
+
+    def __init__(self, commands: Recent) -> None:
+        self._commands, self._readings = commands, Recent()
+
+    def measure(self, struts: np.ndarray, now: float) -> None:
+        """Take a good reading, shape (6,), m, that came at the monotonic time `now`, s."""
+        self._readings.note(struts, now)
+
+    def moving(self, now: float) -> str:
+        """Return which strut moves and how far in the last :data:`FOLLOWED_WITHIN`; empty when all stand."""
+        for recent, how in ((self._commands, "was told to go"), (self._readings, "went")):
+            if recent:
+                low, high = recent.range(now - FOLLOWED_WITHIN)
+                strut = int((high - low).argmax())
+                if (way := float(high[strut] - low[strut])) > STANDS_WITHIN:
+                    return f"{STRUT_NAMES[strut]} {how} {way * 1e3:.3f} mm in the last {FOLLOWED_WITHIN:g} s"
+        return ""
 
 
 class LastKnown:

@@ -69,7 +69,7 @@ class StrutMessage:
 
     def write(self, lengths: np.ndarray, period: float = 0.0) -> None:
         """Write lengths, m, and as velocities their change since the last ones over `period` s; 0: at rest."""
-        write_lengths(lengths, period, self.position, self.velocity)
+        write_lengths(lengths, period, np.inf, self.position, self.velocity)
 
 
 LARGEST_LENGTH = 1e150

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import time
 
-from rclpy.lifecycle import LifecycleNode
 from rclpy.service import Service
 from std_srvs.srv import Trigger
 
 from ..compensation.compensator import Compensator
 from ..errors import HexapodError
+from .callers import callers
 from .health import Refusals
 from .machine_files import MachineFiles
 from .model_loading import Loading
-from .runtime import LateAnswer
+from .runtime import LateAnswer, MachineNode
 
 
 class ReloadService:
@@ -21,7 +21,7 @@ class ReloadService:
 
     Parameters
     ----------
-    node : LifecycleNode
+    node : MachineNode
         Where the service is.
     files : MachineFiles
         Where the model is read.
@@ -33,7 +33,7 @@ class ReloadService:
 
     def __init__(
         self,
-        node: LifecycleNode,
+        node: MachineNode,
         files: MachineFiles,
         compensator: Compensator,
         failures: Refusals,
@@ -48,6 +48,7 @@ class ReloadService:
         return self._late.service
 
     def _on_request(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response | None:
+        self._node.note("reload", f"reload: asked for by {callers(self._node, self.service)}")
         if self._loading is not None:
             return Trigger.Response(success=False, message="the model is being loaded already")
         self._loading = self._files.begin_loading(self._compensator.geometry.name)

@@ -12,10 +12,12 @@ from typing import Any, cast
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -26,6 +28,8 @@ from rclpy.timer import Timer
 from ..errors import CommandError, shorten
 from .guarding import CallbackGuard, PlainLogger, Throttle
 from .health import HealthReport, joined
+
+USE_SIM_TIME = "use_sim_time"
 
 COMMAND_QOS = QoSProfile(depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 """Commands: each must arrive. A hundred wait while a busy processor pauses for 0.1 s at 1 kHz, or a cable repeats."""
@@ -62,6 +66,16 @@ class MachineNode(LifecycleNode):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", EVENT_QOS)
         self.speak_for("starting")
+        self.add_on_set_parameters_callback(self._keep_clock)  # asked before rclpy's own, which switches at once
+
+    def _keep_clock(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Refuse another clock: stamps, ramps and the order of commands hang on the one that the node began with."""
+        now = self.get_parameter(USE_SIM_TIME).value
+        wanted = [parameter.value for parameter in parameters if parameter.name == USE_SIM_TIME]
+        if all(value is now for value in wanted):
+            return SetParametersResult(successful=True)
+        reason = f"parameter {USE_SIM_TIME}: is {str(now).lower()} for as long as the node runs; set it at the start"
+        return SetParametersResult(successful=False, reason=reason)
 
     def _if_possible(self, change: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
         """Return the callback of ``change_state`` for possible transitions only: of others rcl logs each request."""
@@ -126,6 +140,11 @@ class MachineNode(LifecycleNode):
         """Log an error, once per cause and second."""
         if (line := self._throttle.allow(cause, text)) is not None:
             self.get_logger().error(line, throttled=True)
+
+    def note(self, cause: str, text: str) -> None:
+        """Log what was done, once per cause and second."""
+        if (line := self._throttle.allow(f"note {cause}", text)) is not None:
+            self.get_logger().info(line)
 
     def speak_for(self, what: str) -> None:
         """Name the machine or component that this node serves from now on in its status."""

@@ -86,7 +86,8 @@ class StrutDriveNode(MachineNode):
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Start to move and to measure."""
+        """Start to move, from where the struts stand, and to measure."""
+        self._no_step.start(self.drive.motor_lengths())
         self._last_run = time.monotonic()
         self._active = True
         self.get_logger().info("ready")

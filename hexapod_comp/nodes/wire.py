@@ -62,6 +62,14 @@ def read_pose_bytes(data: bytes) -> tuple[int, str, tuple[float, ...]]:
     return _read_unusual(data)
 
 
+def stamp_in(data: bytes) -> int:
+    """Return the stamp of a serialised PoseStamped, ns; 0 where there is none to be read."""
+    try:
+        return read_pose_bytes(data)[0]
+    except CommandError:
+        return 0
+
+
 def _read_unusual(data: bytes) -> tuple[int, str, tuple[float, ...]]:
     """Read a PoseStamped of another encoding as rclpy does."""
     try:
@@ -115,9 +123,12 @@ class StrutBytes:
         self.velocity = self._bytes[velocity : velocity + 48].view(float)
         self.position[:], self.velocity[:] = 0.0, 0.0
 
-    def write(self, lengths: np.ndarray, period: float = 0.0) -> None:
-        """Write lengths, m, and as velocities their change since the last ones over `period` s; 0: at rest."""
-        write_lengths(lengths, period, self.position, self.velocity)
+    def write(self, lengths: np.ndarray, period: float = 0.0, fastest: float = np.inf) -> None:
+        """Write lengths, m, and as velocities their change since the last ones over `period` s; 0: at rest.
+
+        Stamps jitter, and velocities that are larger than `fastest`, m/s, are none: then all are smaller in proportion.
+        """
+        write_lengths(lengths, period, fastest, self.position, self.velocity)
 
     def stamped(self, stamp: int) -> bytes | JointState:
         """Return what to publish, with a stamp in ns: bytes, or a message where the layout is not known."""

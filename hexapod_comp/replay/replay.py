@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..compensation.compensator import Compensator
-from ..compensation.journal import Entry, Page, Snapshot
+from ..compensation.journal import Entry, Page, Snapshot, time_of
 from ..compensation.state import pack_pose
 from ..errors import HexapodError
 from ..machine.geometry import HexapodGeometry
@@ -195,10 +195,12 @@ class _Run:
         asked, given = self._commands[row], self.result.lengths[row]
         try:
             frame = self._frames[asked["frame"]]
-            self.compensator.step(tuple(asked["pose"].tolist()), int(asked["stamp"]) * 1e-9, frame)
+            time = time_of(int(asked["stamp"]), bool(asked["stamped"]))
+            self.compensator.step(tuple(asked["pose"].tolist()), time, frame, float(asked["received"]))
         except HexapodError as error:
             self.result.refused_now[row] = f"{error.reason}: {error}"
             return DIFFERENT
+        self.compensator.published(float(asked["published"]))
         given[0], given[1] = self.compensator.command, self.compensator.correction
         return IDENTICAL if given.tobytes() == asked["lengths"].tobytes() else DIFFERENT
 

@@ -30,7 +30,7 @@ from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.pose import Pose
 
 PAPER = paper_geometry()
-WIDE = Limits(np.tile([0.1, 2.0], (6, 1)), np.full(6, np.pi), np.full(6, np.pi), 100.0, 0.02, 1.0, 1.0)
+WIDE = Limits(np.tile([0.1, 2.0], (6, 1)), np.full(6, np.pi), np.full(6, np.pi), 100.0, 0.02, 1.0, 1e3)
 TOOL = Pose.from_angles([0.02, -0.01, -0.15], np.deg2rad([4.0, -7.0, 25.0]))
 WORK = Pose.from_angles([0.05, 0.04, 0.1], np.deg2rad([2.0, 3.0, 40.0]))
 FREE = replace(PAPER, limits=WIDE)

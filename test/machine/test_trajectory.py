@@ -63,6 +63,18 @@ def test_moves_keep_steps_and_strut_speeds(geometry: HexapodGeometry, rate: floa
         assert steps >= 0.5 * allowed  # and it does not crawl: 0.8 less the coarse count of poses
 
 
+@MACHINES
+@pytest.mark.parametrize("rate", [250.0, 1000.0])
+def test_moves_keep_the_acceleration_where_it_is_limited(geometry: HexapodGeometry, rate: float) -> None:
+    """Of the struts, by second differences; 0.8 of it are meant to be used, and a third is where moves are short."""
+    limited = replace(geometry, limits=replace(geometry.limits, acceleration=1.0))
+    for start, end in pairwise(tool_targets(geometry)):
+        path = move(limited, start, end, rate)
+        lengths = lengths_by_numpy(geometry, *with_start(start, path))
+        acceleration = np.abs(np.diff(lengths, 2, axis=0)).max() * rate**2
+        assert 0.25 < acceleration <= 0.8 * (1.0 + 1e-3)
+
+
 def test_moves_start_and_end_at_rest() -> None:
     """The quintic's ends: velocity and acceleration zero, so the first step is 10·t³ of the way."""
     start, end = table_poses()[0], table_poses()[4]

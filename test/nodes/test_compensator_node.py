@@ -82,7 +82,7 @@ def values_of(bench: Bench, key: str, value: str) -> dict[str, str]:
 
 def test_commands_are_the_papers_table_2(bench, tmp_path):
     """Table 1 in, Table 2 out at its printed digits (0.001 mm), with no model; the truth is the paper's."""
-    wide = geometry_file(tmp_path, {"step_mm": 500.0})
+    wide = geometry_file(tmp_path, {"step_mm": 500.0, "speed_mm_s": 1e6})
     bench.compensator(geometry_file=wide, model_file="ideal")
     sent = np.array([bench.ask(pose).lengths for pose in table_poses()])
     np.testing.assert_allclose(sent, table_lengths(), rtol=0.0, atol=0.5001e-6)

@@ -119,7 +119,8 @@ def test_a_strut_that_is_away_for_one_reading_is_said(bench):
     for n, off in enumerate((0.0, 3e-3, 0.0)):  # 30 ms apart: a strut may move by 17 mm
         bench.feed(answer.lengths + off * (np.arange(6) == 3), later=0.03 * n)
         bench.barrier()
-    bench.until_status(ERROR, "bad feedback: following_error")
+    bench.until_status(ERROR, "refusing commands: following_error: strut_4")
+    assert bench.status().message.endswith("bad feedback: following_error")
     assert "strut_4" in bench.values()["last_bad_feedback"]
 
 

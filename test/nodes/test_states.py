@@ -152,7 +152,7 @@ def test_first_command_has_no_direction_of_motion(bench, tmp_path):
     assert not bench.ask(HOME).corrections.any()
     up = bench.ask(near(HOME, (0.0, 0.0, 1e-4)))
     np.testing.assert_allclose(up.corrections, 5e-6, rtol=0.0, atol=ROUNDING)
-    bench.trigger("reset")
+    bench.until(lambda: bench.trigger("reset").success, "the machine to stand")
     bench.ask(near(HOME, (0.0, 0.0, 1e-4)))
     again = bench.ask(near(HOME, (0.0, 0.0, 1e-4)))
     assert not again.corrections.any(), "forgotten with the reset"
@@ -451,7 +451,7 @@ def test_feedback_lost(bench):
 
 
 def test_following_error(bench):
-    """Strut 3 stands 3 mm from its command, 2 mm are allowed: refused until it is back."""
+    """Strut 3 stands 3 mm from its command, 2 mm are allowed: refused until a reset, also when it is back."""
     bench.compensator(command_timeout=0.0, feedback_timeout=60.0)
     last = bench.ask(HOME)
     bench.feed(last.lengths)
@@ -463,9 +463,15 @@ def test_following_error(bench):
     bench.send(HOME)
     bench.until(lambda: bench.values()["refused"] == "1", "the refusal")
     assert len(bench.seen["strut_commands"]) == 2
-    bench.feed(last.lengths + np.array([0.0, 0.0, 1.9e-3, 0.0, 0.0, 0.0]))
-    bench.until_status(OK, "running")
+    for _ in range(2):
+        bench.feed(last.lengths)
+    bench.barrier()
+    bench.send(HOME)
+    bench.until(lambda: bench.values()["refused"] == "2", "the refusal of a second command")
+    assert bench.status().message.endswith("until ~/reset")
+    bench.until(lambda: bench.trigger("reset").success, "the machine to stand")
     bench.ask(HOME)
+    bench.until_status(OK, "running")
 
 
 def test_following_error_ends_with_a_reset(bench):
@@ -494,9 +500,11 @@ def test_lag_is_no_following_error():
         following.note(np.full(6, 0.5 + 1e-4 * n), 1e-3 * n)
     now = 0.2
     for behind, wrong in ((0.0, False), (5e-3, False), (10e-3, False), (12e-3, True), (-2e-3, True)):
-        following.problem = ""
         following.check(np.full(6, 0.5199 - behind), now)
         assert bool(following.problem) == wrong, behind
+        following.check(np.full(6, 0.5199), now)
+        assert bool(following.problem) == wrong, "what has happened stays"
+        following.release()
     following.check(np.full(6, 0.5199), now)
     assert not following.problem
     following.forget()

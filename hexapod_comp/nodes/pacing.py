@@ -1,0 +1,118 @@
+"""Commands that come sooner than the struts may go there: they wait, in their order, as long as a parameter says."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+
+from ..errors import HexapodError, LimitError
+from .runtime import COMMAND_QOS, MachineNode
+
+NEVER = 3600.0
+"""Period of the timer while nothing waits, s: it is stopped then."""
+
+SHOWN_FOR = 1.0
+"""That commands are taken late is spoken of for this long, s."""
+
+JITTER = 0.02
+"""A wait up to this, s, is nothing to speak of."""
+
+
+class Pacing:
+    """The queue of commands that came too early: bunched on their way, or in a burst after a pause.
+
+    Parameters
+    ----------
+    node : MachineNode
+        Whose timer it is.
+    longest : float
+        How long a command may wait, s: all that wait are refused when one has waited longer. 0: only the newest
+        waits, and those that it replaces are dropped.
+    take : callable
+        Takes a message at a monotonic time, s; returns how long it must wait still, s, 0 when it is settled.
+    refuse : callable
+        Refuses a message with an error, at a monotonic time, s.
+
+    Attributes
+    ----------
+    waited, dropped : int
+        Commands that have waited, and those that a newer one has replaced.
+    """
+
+    def __init__(
+        self,
+        node: MachineNode,
+        longest: float,
+        take: Callable[[bytes, float], float],
+        refuse: Callable[[bytes, HexapodError, float], None],
+    ) -> None:
+        self._node, self._longest, self._take, self._refuse = node, longest, take, refuse
+        self._waiting: deque[tuple[float, bytes]] = deque()
+        self._most = COMMAND_QOS.depth if longest else 1
+        self._behind_at = -float("inf")
+        self.waited = self.dropped = 0
+        self._timer = node.every(NEVER, self._go_on)
+        self._timer.cancel()
+
+    def command(self, message: bytes, now: float) -> None:
+        """Take a command that comes at the monotonic time `now`, s, now or in its turn."""
+        if not self._waiting:
+            if (wait := self._take(message, now)) > 0.0:
+                self._waiting.append((now, message))
+                self.waited += 1
+                self._wait(wait)
+            return
+        if len(self._waiting) == self._most:
+            if self._longest:
+                self._refuse_all(now)
+            else:
+                self._waiting.clear()
+                self.dropped += 1
+                self._behind_at = now
+        self._waiting.append((now, message))
+        self.waited += 1
+
+    def behind(self, now: float) -> bool:
+        """Return whether commands were taken late, or dropped, of late: jitter is nothing to speak of."""
+        return now - self._behind_at < SHOWN_FOR
+
+    def clear(self) -> None:
+        """Forget what waits."""
+        self._waiting.clear()
+        self._timer.cancel()
+
+    def close(self) -> None:
+        """Destroy the timer."""
+        self.clear()
+        self._node.destroy_timer(self._timer)
+
+    def _wait(self, seconds: float) -> None:
+        self._timer.timer_period_ns = int(seconds * 1e9) + 1
+        self._timer.reset()
+
+    def _go_on(self) -> None:
+        """Take what waits, as far as the struts may go by now."""
+        self._timer.cancel()
+        if not self._node.active:
+            self._waiting.clear()
+        while self._waiting:
+            now = time.monotonic()
+            came, message = self._waiting[0]
+            if 0.0 < self._longest < now - came:
+                self._refuse_all(now)
+                return
+            if (wait := self._take(message, now)) > 0.0:
+                self._wait(wait)
+                return
+            if now - came > JITTER:
+                self._behind_at = now
+            if self._waiting:  # else what was taken has cleared it
+                self._waiting.popleft()
+
+    def _refuse_all(self, now: float) -> None:
+        waited = now - self._waiting[0][0]
+        text = f"commands come faster than the struts may move: {waited:.3f} s behind, allowed {self._longest:g} s"
+        while self._waiting:
+            error = LimitError("speed", text, waited, self._longest, None, "compensated")
+            self._refuse(self._waiting.popleft()[1], error, now)
