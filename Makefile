@@ -25,7 +25,7 @@ BESIDE_LINUXCNC = $(MAKE) --no-print-directory VENV=.venv-linuxcnc PYTHON='$(LIN
 # Which versions of Python `make test-all` takes, of those that are here.
 VERSIONS ?= 3.10 3.11 3.12 3.13
 
-.PHONY: help demo test test-all docs constraints test-linuxcnc linuxcnc bench fuzz clean run-linuxcnc-tests ros
+.PHONY: help demo test test-all docs constraints test-linuxcnc linuxcnc linuxcnc-rt bench fuzz clean run-linuxcnc-tests ros
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
@@ -38,6 +38,7 @@ help:
 	@echo 'make bench   speed beside NumPy, SciPy, MuJoCo, Pinocchio, LinuxCNC and a relay node'
 	@echo 'make fuzz    a nightly run of the fuzzing tests: 100,000 cases and more'
 	@echo 'make linuxcnc       .venv-linuxcnc, to run beside LinuxCNC'
+	@echo 'make linuxcnc-rt MODEL=mine.yaml  the compensator as a realtime component of LinuxCNC (MACHINE=paper)'
 	@echo 'make test-linuxcnc  the tests with a real LinuxCNC; root installs the package first'
 	@echo 'make clean   remove .venv, .venv-…, build folders and caches (out/ stays)'
 	@echo 'PYTHON=...   the Python (3.10 to 3.13) from which .venv is made; make clean before a change'
@@ -51,7 +52,8 @@ test: $(VENV)/with-ros,test
 	$(BIN)/mypy
 	@# Two processes, each with a ROS domain of its own. The matrices of the tests are small: more threads of OpenBLAS
 	@# would only wait for each other.
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile --ignore=test/linuxcnc/test_linuxcnc.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile --ignore=test/linuxcnc/test_linuxcnc.py \
+	    --ignore=test/linuxcnc/test_linuxcnc_rt.py
 
 test-all:
 	@PYTHON='$(PYTHON)' tools/pythons | { passed=; failed=; while read -r version python; do \
@@ -85,6 +87,17 @@ linuxcnc:
 
 ros: $(VENV)/with-ros
 
+# halcompile copies the source elsewhere before it compiles: -I finds the core again. Root installs, or gets the file.
+MACHINE ?= paper
+RT = build/linuxcnc-rt
+linuxcnc-rt: $(VENV)/with-ros
+	@[ -n '$(MODEL)' ] || { echo 'make linuxcnc-rt: which model? MODEL=mine.yaml, or MODEL=ideal' >&2; exit 2; }
+	@command -v halcompile >/dev/null || { echo 'halcompile is missing; Debian: apt install linuxcnc-uspace-dev' >&2; exit 1; }
+	@mkdir -p $(RT)
+	$(BIN)/hexapod_comp export --machine '$(MACHINE)' --model '$(MODEL)' --c $(RT)
+	cd $(RT) && EXTRA_CFLAGS=-I$(CURDIR)/$(RT) halcompile --$$([ "$$(id -u)" -eq 0 ] && echo install || echo compile) hexapod_rt.comp
+	@[ "$$(id -u)" -eq 0 ] || echo 'Install it: sudo cp $(RT)/hexapod_rt.so /usr/lib/linuxcnc/modules/'
+
 # Where .venv has the Python of LinuxCNC's modules it serves, else an environment of that Python does.
 test-linuxcnc: $(VENV)/with-ros,test
 	@$(INSTALL_LINUXCNC)
@@ -93,7 +106,7 @@ test-linuxcnc: $(VENV)/with-ros,test
 	else $(BESIDE_LINUXCNC) run-linuxcnc-tests; fi
 
 run-linuxcnc-tests: $(VENV)/with-ros,test
-	LINUXCNC_TESTS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -s test/linuxcnc/test_linuxcnc.py
+	LINUXCNC_TESTS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -s test/linuxcnc/test_linuxcnc.py test/linuxcnc/test_linuxcnc_rt.py
 
 clean:
 	rm -rf .venv .venv-* build install log doc/api *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
@@ -114,7 +127,7 @@ $(VENV)/with-%: setup.py constraints.txt $(VENV)/made-in
 define INSTALL_LINUXCNC
 if ! command -v linuxcnc >/dev/null && [ "$$(id -u)" -eq 0 ] && command -v apt-get >/dev/null; then \
     export DEBIAN_FRONTEND=noninteractive; echo "Installing linuxcnc-uspace ..."; apt-get update -qq; \
-    apt-get install -qq -y --no-install-recommends linuxcnc-uspace util-linux bsdutils >/dev/null || true; fi
+    apt-get install -qq -y --no-install-recommends linuxcnc-uspace linuxcnc-uspace-dev gcc util-linux bsdutils >/dev/null || true; fi
 endef
 
 define HAS_HAL

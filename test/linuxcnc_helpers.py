@@ -387,7 +387,7 @@ class Linuxcnc:
     def enable(self, on: bool) -> None:
         """Switch compensation, and wait until it is in, or out."""
         self.halcmd("sets", "comp-enable", str(int(on)))
-        self.until_pin("hexapod_comp.status", 2 if on else 0)
+        self.until_pin("comp-status", 2 if on else 0)
         time.sleep(0.05)  # the chain's own ramp may be a few cycles behind
 
     def until_pin(self, name: str, value: Any, timeout: float = 10.0) -> None:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ..export.worth import Comparison, ExportCheck, ExportTrial, Size
+    from ..machine.geometry import HexapodGeometry
     from ..machine.model import MachineModel
 
 HARMLESS = 10e-9
@@ -28,13 +29,16 @@ def run(args: argparse.Namespace) -> int:
     from ..export.worth import ExportTrial
     from ..machine.model import commanded_box
 
-    if args.linuxcnc is None and args.table is None:
-        raise InputFileError("export", "--linuxcnc, --table", "at least one is needed: nothing to write")
+    if args.linuxcnc is None and args.table is None and args.c is None:
+        raise InputFileError("export", "--linuxcnc, --table, --c", "at least one is needed: nothing to write")
     geometry, model = common.load_machine(args)
     common.mention_compiling("model.actual_pose_one")
+    core = [] if args.c is None else _c(args, geometry, model)
+    if args.linuxcnc is None and args.table is None:
+        return _show_core(args, model, core)
     box = commanded_box(geometry, model) if args.box is None else np.array(args.box)
     trial = ExportTrial(geometry, model, box, args.poses, args.seed, math.radians(args.tilt_deg))
-    written, checks = [], []
+    written, checks = core, []
     if args.linuxcnc is not None:
         files, result = _linuxcnc(args, trial, box)
         written += files
@@ -48,6 +52,27 @@ def run(args: argparse.Namespace) -> int:
         print(_report(args, model, box, written, checks))
     worse = [c for _, c, _ in checks if c.level.after.rms > c.level.before.rms + HARMLESS]
     return 1 if worse else 0
+
+
+def _c(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
+    """Write the C core with this machine's constants; return the files."""
+    from ..compensation.journal import IDEAL_SOURCE, Source
+    from ..export.c_code import write_c
+    from ..formats.paths import input_file
+    from ..machine.model_file import IDEAL
+
+    made_of = [IDEAL_SOURCE if name == IDEAL else Source.read(input_file(name)) for name in (args.machine, args.model)]
+    return [str(file) for file in write_c(args.c, geometry, model, (made_of[0].sha256, made_of[1].sha256))]
+
+
+def _show_core(args: argparse.Namespace, model: MachineModel, written: list[str]) -> int:
+    """Say what was written when that is the C core alone: it gives the very numbers, so nothing is judged."""
+    if args.json:
+        print(common.json_text({"machine": model.machine, "model": model.name, "written": written}), end="")
+    else:
+        print(f"machine {model.machine}, model {model.name}\nwritten: {', '.join(written)}")
+        print("build the self-test and run it on the target: see hexapod_selftest.c")
+    return 0
 
 
 Result = tuple[str, "ExportCheck", list[str]]

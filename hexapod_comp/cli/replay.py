@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from . import common
 
@@ -49,13 +50,36 @@ def _replayed(args: argparse.Namespace, recording: Recording) -> tuple[Report, H
     report = Report(recording, None, tolerance=args.tolerance_um * 1e-6)
     with common.progress_bar(len(recording.commands) * (as_it_was + bool(other)), " answers") as bar:
         if as_it_was:
-            report.replayed = replay_recording(recording, files, bar.update)
+            report.replayed = replay_recording(recording, files, bar.update, _maker(args, recording))
             if other is None and not report.replayed.compared:
                 raise InputFileError(args.bag, "", NOTHING)
         if other is not None:
             report.other = what_if(recording, *other, bar.update)
             report.other_name = f"machine {other[0].name}, model {other[1].name}"
     return report, files.geometry(recording.first.geometry) if as_it_was or other is None else other[0]
+
+
+def _maker(args: argparse.Namespace, recording: Recording) -> Callable[[HexapodGeometry, MachineModel], Any]:
+    """Return what makes the compensator: the Python one, or the C core of ``--c``, if it is of the same files."""
+    from ..compensation.compensator import Compensator
+    from ..errors import InputFileError
+    from ..export.c_library import CCompensator
+
+    if args.c is None:
+        return Compensator
+    first = recording.first
+    wanted = first.geometry["sha256"], first.model["sha256"]
+
+    def make(geometry: HexapodGeometry, model: MachineModel) -> CCompensator:
+        core = CCompensator(args.c, geometry, model)
+        for what, made_of, used in zip(("geometry", "model"), core.hashes, wanted, strict=True):
+            if made_of != used:
+                raise InputFileError(
+                    args.c, "", f"is made of another {what} file than the recording's (SHA-256 {made_of})"
+                )
+        return core
+
+    return make
 
 
 def _show(args: argparse.Namespace, report: Report) -> None:

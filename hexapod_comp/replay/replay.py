@@ -96,7 +96,10 @@ class Replay:
 
 
 def replay_recording(
-    recording: Recording, files: Files | None = None, progress: Progress = lambda commands: None
+    recording: Recording,
+    files: Files | None = None,
+    progress: Progress = lambda commands: None,
+    make: Callable[[HexapodGeometry, MachineModel], Any] = Compensator,
 ) -> Replay:
     """Run a recording through the compensator again.
 
@@ -108,13 +111,15 @@ def replay_recording(
         Geometry and model in use; by default as the recording carries them.
     progress : callable, optional
         Called with the number of answers just compared.
+    make : callable, optional
+        Makes what is replayed on, of a geometry and a model: something with the face of a :class:`Compensator`.
 
     Raises
     ------
     InputFileError
         Geometry or model in use are not at hand.
     """
-    return _AsItWas(recording, progress, files or Files(recording, {})).run()
+    return _AsItWas(recording, progress, files or Files(recording, {}), make).run()
 
 
 def what_if(
@@ -208,9 +213,15 @@ class _Run:
 class _AsItWas(_Run):
     """A replay with what was in use."""
 
-    def __init__(self, recording: Recording, progress: Progress, files: Files) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        progress: Progress,
+        files: Files,
+        make: Callable[[HexapodGeometry, MachineModel], Any],
+    ) -> None:
         super().__init__(recording, progress)
-        self._files = files
+        self._files, self._make = files, make
         self._known, self._otherwise = False, BEFORE
         self._in_use = "", ""
         self._next = "", 0, 0
@@ -242,7 +253,7 @@ class _AsItWas(_Run):
         same = in_use == self._in_use
         if not same:
             geometry = self._files.geometry(snapshot.geometry)
-            self.take(Compensator(geometry, self._files.model(snapshot.model, geometry)))
+            self.take(self._make(geometry, self._files.model(snapshot.model, geometry)))
         if not same or not _same_state(self.compensator.snapshot(), snapshot.state):
             self.compensator.restore(snapshot.state)
             if self._known:

@@ -65,6 +65,20 @@ class Console:
         self._wait(timeout)
         self._until(lambda: self._stat.interp_state == linuxcnc.INTERP_IDLE and self._stat.inpos, timeout, "idle")
 
+    def abort(self) -> None:
+        """End what has begun."""
+        self._command.abort()
+        self._wait()
+
+    def jog(self, axis: int, speed: float, distance: float) -> None:
+        """Jog an axis by a distance, in world coordinates."""
+        self._mode(linuxcnc.MODE_MANUAL)
+        self._command.teleop_enable(True)
+        self._wait()
+        self._command.jog(linuxcnc.JOG_INCREMENT, False, axis, speed, distance)
+        self._wait()
+        self._until(lambda: self._stat.inpos, 20.0, "there")
+
     def program(self, path: str) -> None:
         """Begin a file of G-code."""
         self._mode(linuxcnc.MODE_AUTO)

@@ -1,0 +1,143 @@
+component hexapod_rt """Strut corrections of a hexapod in the servo thread: see doc/linuxcnc.md of hexapod_comp.
+
+The corrections belong to the nominal strut lengths of the same cycle. They ramp when compensation is switched, when a
+temperature changes, and after a refusal; while a command is refused they ramp to zero.""";
+
+pin in float joint-pos-cmd-#[6] "Nominal strut lengths: joint.N.pos-cmd, machine units";
+pin in float joint-pos-fb-#[6] "Measured strut lengths, corrections included, machine units; for the function estimate";
+pin in float temperature-#[8] = 20 "Of struts 1-6, base and platform, degrees Celsius; filtered";
+pin in bit machine-on "On and homed: the joints mean something. False: corrections ramp to zero";
+pin in bit enable "Compensate";
+pin out float correction-#[6] "To offset.N.offset, machine units";
+pin out bit ok "The last command was not refused";
+pin out s32 reason "Why it was: hc_status of hexapod_comp.h, 0 for none";
+pin out s32 status "0 off, at zero; 1 ramping in; 2 compensating; 4 ramping to zero; 5 enabled, at zero, refused or not homed";
+pin out bit compensating "status 2";
+pin out bit heartbeat "Toggles every cycle";
+pin out u32 updates "Corrections worked out";
+pin out u32 refused "Commands refused";
+pin out float largest "Largest correction now, machine units";
+pin out float tool-x "Where the tool is by the measured struts, in base, machine units";
+pin out float tool-y;
+pin out float tool-z;
+pin out bit tool-valid "The estimate holds";
+param rw float unit = 0.001 "Metres per machine unit: 0.001 or 0.0254";
+param rw float temperature-step = 0.01 "A temperature that has changed by less is the same, K";
+
+include "hexapod_comp.c";
+include "hexapod_model.h";
+variable hc_state core;
+variable double elapsed;
+variable double temperature_now[8];
+variable int started;
+variable int begun;
+
+option singleton yes;
+function correct fp "Work out the corrections: after motion-controller, before they are added";
+function estimate fp "Work out where the tool is: costs as much again, leave it out if nobody looks";
+
+license "Apache-2.0 AND GPL";
+author "The hexapod_comp maintainers";
+;;
+
+#define RAMP_RATE 1e-3 /* m/s */
+
+static void begin_once(hc_state *state, int *has_begun, double temperatures[8])
+{
+    int i;
+    if (*has_begun) {
+        return;
+    }
+    hc_init(state, &hexapod_model, RAMP_RATE);
+    for (i = 0; i < 8; i++) {
+        temperatures[i] = state->temperatures[i];
+    }
+    *has_begun = 1;
+}
+
+/* Take what the corrections are now for what the struts stand at: the next command ramps from there. */
+static void start_from(hc_state *state, const double standing[6])
+{
+    int i;
+    for (i = 0; i < 6; i++) {
+        state->last.correction[i] = standing[i];
+    }
+    hc_reset(state, 0);
+}
+
+static double largest_of(const double values[6])
+{
+    double most = 0.0;
+    int i;
+    for (i = 0; i < 6; i++) {
+        most = fmax(most, fabs(values[i]));
+    }
+    return most;
+}
+
+FUNCTION(correct)
+{
+    double nominal[6], standing[6], most, keep;
+    const double seconds = (double)period * 1e-9;
+    int i, good = 0;
+    begin_once(&core, &begun, temperature_now);
+    elapsed += seconds;
+    for (i = 0; i < 6; i++) {
+        nominal[i] = joint_pos_cmd(i) * unit;
+        standing[i] = correction(i) * unit;
+    }
+    for (i = 0; i < 8; i++) {
+        if (fabs(temperature(i) - temperature_now[i]) >= temperature_step
+            && hc_set_temperature(&core, i, temperature(i)) == HC_OK) {
+            temperature_now[i] = temperature(i);
+        }
+    }
+    hc_enable(&core, enable);
+    if (machine_on) {
+        hc_answer answer;
+        if (!started) {
+            start_from(&core, standing);
+        }
+        reason = (int)hc_command_lengths(&core, nominal, elapsed, &answer);
+        good = reason == HC_OK;
+        for (i = 0; i < 6 && good; i++) {
+            standing[i] = answer.correction[i];
+        }
+        updates += (unsigned)good;
+        refused += (unsigned)!good;
+    } else {
+        reason = 0;
+    }
+    ok = good || !machine_on;
+    started = good;
+    most = largest_of(standing);
+    keep = good || most == 0.0 ? 1.0 : fmax(0.0, 1.0 - RAMP_RATE * seconds / most);
+    for (i = 0; i < 6; i++) {
+        correction(i) = keep * standing[i] / unit;
+    }
+    largest = keep * most / unit;
+    heartbeat = !heartbeat;
+    if (good && enable) {
+        status = largest_of(core.last.ramp) > 0.0 ? 1 : 2;
+    } else {
+        status = largest > 0.0 ? 4 : enable ? 5 : 0;
+    }
+    compensating = status == 2;
+}
+
+FUNCTION(estimate)
+{
+    double lengths[6];
+    hc_estimated where;
+    int i;
+    begin_once(&core, &begun, temperature_now);
+    for (i = 0; i < 6; i++) {
+        lengths[i] = joint_pos_fb(i) * unit;
+    }
+    tool_valid = hc_estimate(&core, lengths, &where) == HC_OK;
+    if (tool_valid) {
+        tool_x = where.tool.position[0] / unit;
+        tool_y = where.tool.position[1] / unit;
+        tool_z = where.tool.position[2] / unit;
+    }
+}

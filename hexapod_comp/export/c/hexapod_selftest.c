@@ -1,0 +1,90 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Runs the vectors of hexapod_vectors.h, which the Python compensator has answered, and compares. Build it with your
+ * target's compiler and run it there once:
+ *
+ *     cc -std=c99 -O2 hexapod_comp.c hexapod_selftest.c -lm -o selftest && ./selftest
+ *
+ * Ends with 0 when every length agrees to 2 units in its last place and every refusal is the same.
+ */
+#include <math.h>
+#include <stdio.h>
+
+#include "hexapod_comp.h"
+#include "hexapod_model.h"
+#include "hexapod_vectors.h"
+
+#define ALLOWED 2.0
+
+/* Difference in units of the last place of a double near `expected`. */
+static double last_places(double got, double expected)
+{
+    int exponent;
+    if (got != got || expected != expected) {
+        return got != got && expected != expected ? 0.0 : HUGE_VAL;
+    }
+    (void)frexp(expected, &exponent);
+    return fabs(got - expected) / ldexp(1.0, exponent - 53);
+}
+
+static hc_status take(hc_state *state, const hexapod_vector *vector, double lengths[6])
+{
+    hc_answer answer;
+    hc_estimated estimated;
+    hc_status status = HC_OK;
+    int i;
+    switch (vector->kind) {
+    case 't': return hc_set_temperature(state, (int)vector->input[0], vector->input[1]);
+    case 'e': hc_enable(state, (int)vector->input[0]); return HC_OK;
+    case 'f': return hc_reset(state, NULL);
+    case 'r': return hc_reset(state, vector->input);
+    case 'p':
+        status = hc_estimate(state, vector->input, &estimated);
+        for (i = 0; i < 3; i++) {
+            lengths[i] = status == HC_OK ? estimated.tool.position[i] : NAN;
+            lengths[3 + i] = status == HC_OK ? estimated.tool.rotation[2][i] : NAN;
+        }
+        return status;
+    default:
+        status = hc_command(state, vector->input, vector->time, NULL, &answer);
+        for (i = 0; i < 6; i++) {
+            lengths[i] = answer.command[i];
+        }
+        return status;
+    }
+}
+
+int main(void)
+{
+    const int count = (int)(sizeof hexapod_vectors / sizeof hexapod_vectors[0]);
+    hc_state state;
+    double worst_length = 0.0, worst_pose = 0.0;
+    int wrong = 0, n, i;
+    hc_init(&state, &hexapod_model, hexapod_ramp_rate);
+    for (n = 0; n < count; n++) {
+        const hexapod_vector *vector = &hexapod_vectors[n];
+        double got[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
+        const hc_status status = take(&state, vector, got);
+        if ((int)status != vector->status) {
+            printf("vector %d: %s instead of %s\n", n, hc_reason(status), hc_reason((hc_status)vector->status));
+            wrong++;
+            continue;
+        }
+        for (i = 0; i < 6; i++) {
+            if (vector->kind == 'p') {
+                /* a pose: m and 1, judged absolutely, since Newton ends within rounding of the lengths */
+                const double off = fabs(got[i] - vector->expected[i]);
+                worst_pose = off > worst_pose ? off : worst_pose;
+                wrong += off > 1e-12;
+            } else {
+                const double off = last_places(got[i], vector->expected[i]);
+                worst_length = off > worst_length ? off : worst_length;
+                wrong += !(off <= ALLOWED);
+            }
+        }
+    }
+    printf("%s, model %s of %s: %d vectors, lengths within %g units in the last place, poses within %.1e: %s\n",
+           hexapod_model.machine, hexapod_model.model, hexapod_model.date, count, worst_length, worst_pose,
+           wrong ? "WRONG" : "as they should be");
+    return wrong != 0;
+}
