@@ -112,7 +112,7 @@ def model_header(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[s
     _, knots, pieces = machine.strut_arrays
     arrays = {"hexapod_knots": knots, "hexapod_pieces": pieces}
     for axis, nodes, family in zip("xyz", model.field.grid, model.field.lines, strict=True):
-        arrays |= {f"hexapod_nodes_{axis}": nodes, f"hexapod_lines_{axis}": family}
+        arrays |= {f"hexapod_nodes_{axis}": nodes, f"hexapod_lines_{axis}": family.swapaxes(3, 4)}
     lines = [
         "/* Written by hexapod_comp export --c. Constants of one machine, for hexapod_comp.c; include it once.",
         " * m, rad, 1/K; frames and meanings as in hexapod_comp.h. You may use and ship this file as you like. */",

@@ -163,7 +163,8 @@ def in_c(geometry: HexapodGeometry, model: MachineModel) -> tuple[CModel, list[n
     real = RealMachine(geometry, model)
     table, knots, pieces = real.strut_arrays
     table[:, 9] = model.struts.expansion
-    made, kept = CModel(), [np.ascontiguousarray(a) for a in (knots, pieces, *model.field.grid, *model.field.lines)]
+    lines = [family.swapaxes(3, 4) for family in model.field.lines]
+    made, kept = CModel(), [np.ascontiguousarray(a) for a in (knots, pieces, *model.field.grid, *lines)]
     for name, joints, axes in zip(("base", "platform"), geometry.kernel_joints, geometry.kernel_axes, strict=True):
         deviation, expansion = getattr(model, f"{name}_deviation"), getattr(model, f"{name}_expansion")
         setattr(made, name, CBody(*(tuple(np.ravel(a)) for a in (joints, deviation, axes)), expansion))

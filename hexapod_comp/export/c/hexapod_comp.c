@@ -38,7 +38,7 @@ typedef struct {
     vec row[3];
 } mat;
 
-static vec vector(double x, double y, double z)
+static inline vec vector(double x, double y, double z)
 {
     vec v;
     v.x = x;
@@ -47,12 +47,12 @@ static vec vector(double x, double y, double z)
     return v;
 }
 
-static vec row_of(const double a[3])
+static inline vec row_of(const double a[3])
 {
     return vector(a[0], a[1], a[2]);
 }
 
-static mat three_rows(const double r[3][3])
+static inline mat three_rows(const double r[3][3])
 {
     mat m;
     m.row[0] = row_of(r[0]);
@@ -61,49 +61,49 @@ static mat three_rows(const double r[3][3])
     return m;
 }
 
-static double dot(vec a, vec b)
+static inline double dot(vec a, vec b)
 {
     return a.x * b.x + a.y * b.y + a.z * b.z;
 }
 
-static double norm(vec a)
+static inline double norm(vec a)
 {
     return sqrt(dot(a, a));
 }
 
-static vec cross(vec a, vec b)
+static inline vec cross(vec a, vec b)
 {
     return vector(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x);
 }
 
-static vec add(vec a, vec b)
+static inline vec add(vec a, vec b)
 {
     return vector(a.x + b.x, a.y + b.y, a.z + b.z);
 }
 
-static vec subtract(vec a, vec b)
+static inline vec subtract(vec a, vec b)
 {
     return vector(a.x - b.x, a.y - b.y, a.z - b.z);
 }
 
-static vec scale(double factor, vec a)
+static inline vec scale(double factor, vec a)
 {
     return vector(factor * a.x, factor * a.y, factor * a.z);
 }
 
 /* k.x a + k.y b + k.z c */
-static vec combine(vec k, vec a, vec b, vec c)
+static inline vec combine(vec k, vec a, vec b, vec c)
 {
     return vector(k.x * a.x + k.y * b.x + k.z * c.x, k.x * a.y + k.y * b.y + k.z * c.y,
                   k.x * a.z + k.y * b.z + k.z * c.z);
 }
 
-static vec combine_rows(vec k, const vec rows[3])
+static inline vec combine_rows(vec k, const vec rows[3])
 {
     return combine(k, rows[0], rows[1], rows[2]);
 }
 
-static void store(vec v, double to[3])
+static inline void store(vec v, double to[3])
 {
     to[0] = v.x;
     to[1] = v.y;
@@ -131,7 +131,7 @@ typedef struct {
     double determinant_upper, determinant_lower;
 } blocks;
 
-static vec strut_between(vec b, vec t, vec p, const mat *r)
+static inline vec strut_between(vec b, vec t, vec p, const mat *r)
 {
     return vector(p.x + r->row[0].x * t.x + r->row[0].y * t.y + r->row[0].z * t.z - b.x,
                   p.y + r->row[1].x * t.x + r->row[1].y * t.y + r->row[1].z * t.z - b.y,
@@ -151,7 +151,7 @@ static six_struts struts_at(const double base[6][3], const double platform[6][3]
     return all;
 }
 
-static double inverse_columns(vec a, vec b, vec c, vec columns[3])
+static inline double inverse_columns(vec a, vec b, vec c, vec columns[3])
 {
     const vec first = cross(b, c);
     const double determinant = dot(a, first);
@@ -190,7 +190,7 @@ static void substitute(const vec m[6], const blocks *f, const double right[6], v
 }
 
 /* _column_square: one column of the inverse, squared, its sign left aside */
-static double column_square(const vec m[6], const blocks *f, vec v, vec w, double square)
+static inline double column_square(const vec m[6], const blocks *f, vec v, vec w, double square)
 {
     const vec rest = combine_rows(vector(dot(m[0], w), dot(m[2], w), dot(m[4], w)), f->upper);
     v = add(v, rest);
@@ -272,14 +272,6 @@ static vec strut_vector(const double base[6][3], const double platform[6][3], co
 {
     const mat r = three_rows(pose->rotation);
     return strut_between(row_of(base[i]), row_of(platform[i]), row_of(pose->position), &r);
-}
-
-static void strut_lengths(const double base[6][3], const double platform[6][3], const hc_pose *pose, double lengths[6])
-{
-    int i;
-    for (i = 0; i < 6; i++) {
-        lengths[i] = norm(strut_vector(base, platform, pose, i));
-    }
 }
 
 /* Replace R by exp(w) R. */
@@ -408,20 +400,24 @@ static double frobenius_condition(double a[6][6], double *sign)
     return sqrt(square * inverse_square) / 6.0;
 }
 
-/* condition_one: Frobenius condition number at a pose, rotations scaled by the characteristic length */
-static double condition_at(const double base[6][3], const double platform[6][3], const hc_pose *pose,
-                           double characteristic_length, double *sign)
+static six_struts struts_of(const double base[6][3], const double platform[6][3], const hc_pose *pose)
 {
     const mat r = three_rows(pose->rotation);
-    const six_struts now = struts_at(base, platform, row_of(pose->position), &r);
-    const double condition = block_condition(&now, characteristic_length, sign);
+    return struts_at(base, platform, row_of(pose->position), &r);
+}
+
+/* condition_one: Frobenius condition number at a pose, rotations scaled by the characteristic length */
+static double condition_at(const double base[6][3], const hc_pose *pose, const six_struts *now,
+                           double characteristic_length, double *sign)
+{
+    const double condition = block_condition(now, characteristic_length, sign);
     double jacobian[6][6];
     int i, j;
     if (*sign != 0.0) {
         return condition;
     }
     for (i = 0; i < 6; i++) {
-        jacobian_row(base[i], pose->position, strut_vector(base, platform, pose, i), jacobian[i]);
+        jacobian_row(base[i], pose->position, now->strut[i], jacobian[i]);
         for (j = 3; j < 6; j++) {
             jacobian[i][j] /= characteristic_length;
         }
@@ -517,6 +513,7 @@ static hc_status solve_carefully(const double base[6][3], const double platform[
                                  const hc_limits *limits, hc_pose *pose, double *condition)
 {
     hc_pose trial = *pose;
+    six_struts now;
     hc_status outcome;
     double sign;
     *condition = NAN;
@@ -531,7 +528,8 @@ static hc_status solve_carefully(const double base[6][3], const double platform[
     if (outcome != HC_OK) {
         return outcome;
     }
-    *condition = condition_at(base, platform, &trial, limits->characteristic_length, &sign);
+    now = struts_of(base, platform, &trial);
+    *condition = condition_at(base, &trial, &now, limits->characteristic_length, &sign);
     if (!(*condition <= limits->condition)) {
         return HC_SINGULAR;
     }
@@ -660,13 +658,12 @@ static double segment_distance(const double a[3], const double b[3], const doubl
     return sqrt(square);
 }
 
-static finding check_clearance(const double base[6][3], const double platform[6][3], const hc_pose *pose,
-                               const hc_limits *limits)
+static finding check_clearance(const double base[6][3], const six_struts *now, const hc_limits *limits)
 {
     double ends[6][3];
     int i, j;
     for (i = 0; i < 6; i++) {
-        store(add(row_of(base[i]), strut_vector(base, platform, pose, i)), ends[i]);
+        store(add(row_of(base[i]), now->strut[i]), ends[i]);
     }
     for (i = 0; i < 6; i++) {
         double least = HUGE_VAL;
@@ -687,13 +684,13 @@ static finding check_clearance(const double base[6][3], const double platform[6]
     return found(HC_OK, -1, 0.0);
 }
 
-static finding check_joints(const double base[6][3], const double platform[6][3], const hc_pose *pose,
+static finding check_joints(const double base[6][3], const hc_pose *pose, const six_struts *now,
                             const hc_limits *limits)
 {
     int i, k;
     for (i = 0; i < 6; i++) {
-        const vec s = strut_vector(base, platform, pose, i);
-        const double length = norm(s);
+        const vec s = now->strut[i];
+        const double length = now->length[i];
         const double at_base = dot(s, row_of(limits->cone_axes[0][i])) / length;
         double at_platform = 0.0;
         for (k = 0; k < 3; k++) {
@@ -708,10 +705,11 @@ static finding check_joints(const double base[6][3], const double platform[6][3]
             return found(HC_PLATFORM_CONE, i, acos(held(at_platform, -1.0, 1.0)));
         }
     }
-    return limits->clearance > 0.0 ? check_clearance(base, platform, pose, limits) : found(HC_OK, -1, 0.0);
+    return limits->clearance > 0.0 ? check_clearance(base, now, limits) : found(HC_OK, -1, 0.0);
 }
 
-static finding check_stage(const double base[6][3], const double platform[6][3], const hc_pose *pose,
+/* `now` are the struts at the pose: whoever asks has needed them already */
+static finding check_stage(const double base[6][3], const hc_pose *pose, const six_struts *now,
                            const double lengths[6], const hc_limits *limits, double *condition)
 {
     finding f;
@@ -729,11 +727,11 @@ static finding check_stage(const double base[6][3], const double platform[6][3],
             return found(HC_STROKE_LONG, i, lengths[i]);
         }
     }
-    f = check_joints(base, platform, pose, limits);
+    f = check_joints(base, pose, now, limits);
     if (f.status != HC_OK) {
         return f;
     }
-    *condition = condition_at(base, platform, pose, limits->characteristic_length, &sign);
+    *condition = condition_at(base, pose, now, limits->characteristic_length, &sign);
     if (!(*condition <= limits->condition)) {
         return found(HC_CONDITION, -1, *condition);
     }
@@ -794,26 +792,29 @@ static double along(double value, const double *nodes, int count)
 static void add_family(const hc_field *field, int axis, double u, double sense, const place *first,
                        const place *second, double error[6])
 {
-    const int across = field->node_count[axis == 2 ? 1 : 2], powers = field->powers[axis];
+    const int across = field->node_count[axis == 2 ? 1 : 2], size = 6 * field->powers[axis];
     const int upper = field->node_count[axis == 0 ? 1 : 0];
     const double s = first->weight, t = second->weight;
-    int direction, component, power;
+    int direction, k, power;
     for (direction = 0; direction < 2; direction++) {
         const double share = direction == 0 ? 0.5 * (1.0 + sense) : 0.5 * (1.0 - sense);
+        const int cell = (direction * upper + first->index) * across + second->index;
+        const double *c00 = field->lines[axis] + cell * size, *c01 = c00 + size;
+        const double *c10 = c00 + across * size, *c11 = c10 + size;
         const double w00 = share * (1.0 - s) * (1.0 - t), w01 = share * (1.0 - s) * t;
         const double w10 = share * s * (1.0 - t), w11 = share * s * t;
-        const double *line = field->lines[axis] + ((direction * upper + first->index) * across + second->index) * 6 * powers;
+        double value[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
         if (share == 0.0) {
             continue;
         }
-        for (component = 0; component < 6; component++) {
-            const double *c00 = line + component * powers, *c01 = c00 + 6 * powers;
-            const double *c10 = c00 + across * 6 * powers, *c11 = c10 + 6 * powers;
-            double value = 0.0;
-            for (power = powers - 1; power >= 0; power--) {
-                value = value * u + (w00 * c00[power] + w01 * c01[power] + w10 * c10[power] + w11 * c11[power]);
+        for (power = size - 6; power >= 0; power -= 6) {
+            for (k = 0; k < 6; k++) { /* side by side in memory, for the compiler to take two or four at once */
+                const int at = power + k;
+                value[k] = value[k] * u + (w00 * c00[at] + w01 * c01[at] + w10 * c10[at] + w11 * c11[at]);
             }
-            error[component] += value;
+        }
+        for (k = 0; k < 6; k++) {
+            error[k] += value[k];
         }
     }
 }
@@ -986,7 +987,7 @@ static double command_for_length(const hc_state *state, int i, double length, do
 
 /* command_one: the model backwards for one platform pose */
 static int run_backwards(const hc_state *state, const hc_pose *platform, double low[9], double sense[9], hc_pose *q,
-                         double commands[6], int *outside)
+                         six_struts *now, double commands[6], int *outside)
 {
     const hc_model *model = state->model;
     const vec point = add(row_of(platform->position), lever(platform, model->field.probe));
@@ -995,10 +996,10 @@ static int run_backwards(const hc_state *state, const hc_pose *platform, double 
     follow(point.y, model->axis_threshold, low, sense, 1);
     follow(point.z, model->axis_threshold, low, sense, 2);
     solved = undo_field(&model->field, platform, sense, q, outside);
+    *now = struts_of(state->base_joints, state->platform_joints, q);
     for (i = 0; i < 6; i++) {
-        const double length = norm(strut_vector(state->base_joints, state->platform_joints, q, i));
-        const double direction = follow(length, model->strut_threshold, low, sense, 3 + i);
-        commands[i] = command_for_length(state, i, length, direction, screw_shift(state, q, i));
+        const double direction = follow(now->length[i], model->strut_threshold, low, sense, 3 + i);
+        commands[i] = command_for_length(state, i, now->length[i], direction, screw_shift(state, q, i));
     }
     return solved;
 }
@@ -1066,6 +1067,7 @@ static finding work_out(const hc_state *state, const hc_pose *platform, double t
     const hc_model *model = state->model;
     const hc_last *last = &state->last;
     const hc_limits *limits = &model->limits;
+    six_struts now = struts_of(model->base.joints, model->platform.joints, platform);
     finding f;
     double unused;
     int i;
@@ -1073,14 +1075,15 @@ static finding work_out(const hc_state *state, const hc_pose *platform, double t
     answer->compensated = 0;
     answer->outside_field = 0;
     next->platform = *platform;
-    strut_lengths(model->base.joints, model->platform.joints, &next->platform, next->nominal);
-    f = check_stage(model->base.joints, model->platform.joints, &next->platform, next->nominal, limits,
-                    &answer->condition);
+    for (i = 0; i < 6; i++) {
+        next->nominal[i] = now.length[i];
+    }
+    f = check_stage(model->base.joints, platform, &now, next->nominal, limits, &answer->condition);
     if (f.status != HC_OK) {
         return f;
     }
     answer->compensated = 1;
-    if (!run_backwards(state, &next->platform, next->motion_low, next->motion_sense, &next->model, next->command,
+    if (!run_backwards(state, platform, next->motion_low, next->motion_sense, &next->model, &now, next->command,
                        &answer->outside_field)) {
         return found(HC_NOT_CONVERGED, -1, NAN);
     }
@@ -1103,7 +1106,7 @@ static finding work_out(const hc_state *state, const hc_pose *platform, double t
         return f;
     }
     answer->compensated = 1;
-    return check_stage(state->base_joints, state->platform_joints, &next->model, next->command, limits, &unused);
+    return check_stage(state->base_joints, &next->model, &now, next->command, limits, &unused);
 }
 
 /* Compensator._resume: take what measured struts differ from nominal lengths for the correction that they stand at */
@@ -1140,7 +1143,6 @@ static void fill_answer(const hc_last *last, finding f, hc_answer *answer)
 static hc_status command_platform(hc_state *state, hc_status status, const hc_pose *platform, double time,
                                   hc_answer *answer)
 {
-    const hc_last before = state->last;
     hc_last next;
     finding f = found(status, -1, NAN);
     answer->condition = NAN;
@@ -1148,11 +1150,15 @@ static hc_status command_platform(hc_state *state, hc_status status, const hc_po
     answer->outside_field = 0;
     if (status == HC_OK) {
         f = work_out(state, platform, time, &next, answer);
-        if (before.resumes) {
+        if (state->last.resumes) {
+            const hc_last before = state->last;
             take_standing(state, &next, &state->last);
             f = work_out(state, platform, time, &next, answer);
+            state->last = before;
         }
-        state->last = f.status == HC_OK ? next : before;
+        if (f.status == HC_OK) {
+            state->last = next;
+        }
     }
     fill_answer(&state->last, f, answer);
     return f.status;
@@ -1252,6 +1258,7 @@ static void place_machine(hc_state *state)
 static int followed(const hc_state *state, double lengths[6])
 {
     hc_last copy = state->last;
+    six_struts now;
     double commands[6];
     int outside, i;
     for (i = 0; i < 6; i++) {
@@ -1259,10 +1266,12 @@ static int followed(const hc_state *state, double lengths[6])
             return 0;
         }
     }
-    if (!run_backwards(state, &copy.platform, copy.motion_low, copy.motion_sense, &copy.model, commands, &outside)) {
+    if (!run_backwards(state, &copy.platform, copy.motion_low, copy.motion_sense, &copy.model, &now, commands, &outside)) {
         return 0;
     }
-    strut_lengths(state->base_joints, state->platform_joints, &copy.model, lengths);
+    for (i = 0; i < 6; i++) {
+        lengths[i] = now.length[i];
+    }
     return 1;
 }
 

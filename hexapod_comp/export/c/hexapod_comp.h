@@ -82,7 +82,7 @@ typedef struct {
     int node_count[3];
     const double *nodes[3]; /* in `base`, m */
     int powers[3];          /* coefficients per polynomial; 0: this family was not measured */
-    const double *lines[3]; /* direction x cross node x cross node x 6 x powers */
+    const double *lines[3]; /* direction x cross node x cross node x power x 6 */
     int refuse_outside;     /* 1: poses outside the box are refused; 0: the value at the boundary is held */
 } hc_field;
 
