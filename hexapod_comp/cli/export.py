@@ -68,7 +68,7 @@ def _c(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel)
 def _show_core(args: argparse.Namespace, model: MachineModel, written: list[str]) -> int:
     """Say what was written when that is the C core alone: it gives the very numbers, so nothing is judged."""
     if args.json:
-        print(common.json_text({"machine": model.machine, "model": model.name, "written": written}), end="")
+        common.show({"machine": model.machine, "model": model.name, "written": written})
     else:
         print(f"machine {model.machine}, model {model.name}\nwritten: {', '.join(written)}")
         print("build the self-test and run it on the target: see hexapod_selftest.c")

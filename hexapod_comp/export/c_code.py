@@ -16,7 +16,7 @@ import numpy as np
 
 from ..compensation.compensator import DEFAULT_RAMP_RATE, Compensator
 from ..errors import HexapodError
-from ..formats.yaml import write_text_atomically
+from ..formats.outputs import write_text
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel, RealMachine, Temperatures
 from ..machine.trajectory import moves
@@ -102,7 +102,7 @@ def write_c(folder: str | Path, geometry: HexapodGeometry, model: MachineModel, 
     files[MODEL_FILE] = model_header(geometry, model, hashes)
     files[VECTORS_FILE] = vectors_header(self_test(geometry, model))
     for name, text in files.items():
-        write_text_atomically(folder / name, text)
+        write_text(folder / name, text)
     return [folder / name for name in files]
 
 
