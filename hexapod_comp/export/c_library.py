@@ -168,7 +168,7 @@ class CCompensator:
 
     def enable(self, enabled: bool) -> None:
         """Switch compensation on or off."""
-        self._library.hc_enable(byref(self.state), int(enabled))
+        self._check(self._library.hc_enable(byref(self.state), int(enabled)))
 
     def set_temperature(self, name: str, value: float) -> None:
         """Take a temperature, °C."""
@@ -234,8 +234,7 @@ def load_library(path: str | Path) -> Any:
         library.hc_machine.restype = library.hc_reason.restype = c_void_p
         size = library.hc_state_size()
         library.hc_reason.restype = c_char_p
-        for name in ("hc_init", "hc_enable"):
-            getattr(library, name).restype = None
+        library.hc_init.restype = None
         library.hc_init.argtypes = (c_void_p, c_void_p, c_double)
     except (OSError, AttributeError) as error:
         raise InputFileError(str(path), "", f"is no library made of an export --c: {error}") from error

@@ -1299,13 +1299,38 @@ static void must_ramp(hc_last *last)
     last->changed = last->correction[0] == last->correction[0];
 }
 
-void hc_enable(hc_state *state, int enabled)
+/* Compensator._check_whole: whether the whole correction, without ramp or switch, is allowed at the last command */
+static hc_status check_whole(const hc_state *state)
+{
+    hc_state trial = *state;
+    hc_last unused;
+    hc_answer answer;
+    int i, home = 0;
+    for (i = 0; i < 6; i++) {
+        home = home || !finite_number(state->last.nominal[i]);
+        trial.last.nominal[i] = NAN;
+        trial.last.correction[i] = NAN;
+        trial.last.command[i] = NAN;
+        trial.last.ramp[i] = 0.0;
+    }
+    trial.last.time = NAN;
+    trial.last.enabled = 1;
+    trial.last.changed = 0;
+    return work_out(&trial, home ? &state->model->home : &state->last.platform, NAN, &unused, &answer).status;
+}
+
+hc_status hc_enable(hc_state *state, int enabled)
 {
     const int wanted = enabled != 0;
     if (wanted != state->last.enabled) {
+        const hc_status status = wanted ? check_whole(state) : HC_OK;
+        if (status != HC_OK) {
+            return status;
+        }
         state->last.enabled = wanted;
         must_ramp(&state->last);
     }
+    return HC_OK;
 }
 
 /* CommandState.clear: the correction stays, as what the struts stand at */

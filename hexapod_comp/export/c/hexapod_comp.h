@@ -184,8 +184,9 @@ hc_status hc_command_lengths(hc_state *state, const double nominal[6], double ti
 /* Say where the tool is when the struts read these lengths, m. A refusal leaves the state as it was. */
 hc_status hc_estimate(hc_state *state, const double lengths[6], hc_estimated *estimated);
 
-/* Switch compensation on (1) or off (0); corrections ramp. */
-void hc_enable(hc_state *state, int enabled);
+/* Switch compensation on (1) or off (0); corrections ramp. It stays off, with the reason, when what the model would correct
+ * at the last command, before the first one at home, breaks a limit. */
+hc_status hc_enable(hc_state *state, int enabled);
 
 /* Take a temperature, degrees Celsius: index 0-5 struts, 6 base, 7 platform. Its effect ramps in. HC_TEMPERATURE for
  * an unknown index or a value outside -40...120: nothing changes then. */
