@@ -31,6 +31,8 @@ from hexapod_comp.papers.mou_king import LINE_Y
 from hexapod_comp.papers.pictures import configuration_figure
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.instruments import measure
+from hexapod_comp.workspace.overview import overview
+from hexapod_comp.workspace.pictures import overview_figure
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -87,6 +89,7 @@ def main(arguments: list[str] | None = None) -> int:
         "direction.svg": direction_figure(),
         "joint_fit.svg": fit_figure(fit),
         "strut_errors.svg": strut_error_picture(fit, measured(geometry, "campaign_1d")),
+        "example_6_6.png": overview_figure(overview(load_geometry("example_6_6"))),  # a point for every face
         "shells_screw_pitch.png": shells_picture(),  # thousands of faces: a large file as SVG
     }
     for name, figure in pictures.items():

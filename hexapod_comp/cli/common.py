@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ..formats.csv import Row
     from ..machine.geometry import HexapodGeometry
     from ..machine.model import MachineModel
+    from ..measurements.campaign import Campaign
 
 DECIMALS = {"mm": 9, "deg": 9, "um": 6, "urad": 6}
 """Digits after the point in CSV files: a picometre, and less than that at the platform's edge."""
@@ -32,6 +33,23 @@ def load_machine(args: argparse.Namespace) -> tuple[HexapodGeometry, MachineMode
 
     geometry = load_geometry(args.machine)
     return geometry, load_model(getattr(args, "model", "ideal"), geometry)
+
+
+def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campaign:
+    """Return the campaign that the options name; one without a box gets the largest that the machine reaches."""
+    from ..measurements.campaign import load_campaign
+    from ..workspace.box import machine_box
+    from ..workspace.overview import corners
+
+    if args.campaign is None:
+        args.campaign = "campaign_5d.yaml" if geometry.name == "paper" else "campaign.yaml"
+
+    def own_box() -> tuple[np.ndarray, np.ndarray]:
+        largest = machine_box(geometry)
+        say_notes([f"{args.campaign} gives no box: the largest that {geometry.name} reaches, {corners(largest.box)}"])
+        return largest.box, largest.rotation
+
+    return load_campaign(args.campaign, own_box)
 
 
 def one_row(

@@ -107,6 +107,13 @@ def _seed(add: Add, what: str) -> None:
     add("--seed", type=arguments.seed, default=0, metavar="N", help=f"of {what} (default 0)")
 
 
+def _show(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("machine", metavar="MACHINE", help="geometry file, or the name of a shipped one")
+    _pictures(add, "out")
+    _json(add)
+
+
 def _ik(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("poses", nargs="?", metavar="POSES.csv", help="CSV file of poses; - for standard input")
@@ -201,8 +208,8 @@ def _simulate(parser: argparse.ArgumentParser) -> None:
     _machine_and_model(add)
     text = "model of the virtual machine's real errors (default paper_machine.yaml)"
     add("--truth", metavar="FILE", default="paper_machine.yaml", help=text)
-    text = "campaign file, or the name of a shipped one (default campaign_5d.yaml)"
-    add("--campaign", metavar="FILE", default="campaign_5d.yaml", help=text)
+    text = "campaign file, or the name of a shipped one (default campaign_5d.yaml for the machine paper, else campaign)"
+    add("--campaign", metavar="FILE", help=text)
     _seed(add, "all that is random")
     add("--out", type=arguments.csv_file, metavar="FILE", required=True, help="write the readings to a CSV file")
     _json(add)
@@ -349,6 +356,7 @@ def _classify(parser: argparse.ArgumentParser) -> None:
 
 
 OPTIONS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
+    "show": _show,
     "ik": _ik,
     "fk": _fk,
     "check": _check,

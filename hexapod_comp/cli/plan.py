@@ -13,10 +13,10 @@ def run(args: argparse.Namespace) -> int:
     from ..calibration.plan import plan
     from ..calibration.report import plan_json, plan_report
     from ..machine.geometry import load_geometry
-    from ..measurements.campaign import load_campaign, template
+    from ..measurements.campaign import template
 
     geometry = load_geometry(args.machine)
-    campaign = load_campaign(args.campaign)
+    campaign = common.load_campaign(args, geometry)
     common.mention_compiling("model.actual_pose_one")
     result = plan(template(campaign, geometry, args.seed, args.campaign), campaign, fit_settings(args))
     common.show(plan_json(result) if args.json else plan_report(result))

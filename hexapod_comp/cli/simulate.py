@@ -20,13 +20,13 @@ def run(args: argparse.Namespace) -> int:
     """Run the verb."""
     from ..machine.model import RealMachine
     from ..machine.model_file import load_model
-    from ..measurements.campaign import load_campaign, template
+    from ..measurements.campaign import template
     from ..measurements.writing import write_measurements
     from ..virtual.instruments import compensated, measure
 
     geometry, model = common.load_machine(args)
     truth = load_model(args.truth, geometry)
-    campaign = load_campaign(args.campaign)
+    campaign = common.load_campaign(args, geometry)
     common.mention_compiling("model.actual_pose_one")
     plan = template(campaign, geometry, args.seed, args.campaign)
     if args.model != "ideal":

@@ -24,6 +24,23 @@ class Verb(NamedTuple):
 
 
 VERBS = {
+    "show": Verb(
+        "kinematics",
+        "a machine at a glance: frames, joints, reach, largest box",
+        """Prints where joints and frames are (mm, degrees), how far the tool tilts at home, what the machine reaches
+and which limit stops it, and the largest box that fits into the reach. Campaigns without a box take that one. What
+looks wrong in the file is said at the end: a mirrored or turned home, swapped joints, a wrong unit, missing
+joint_axes. The folder of --pictures gets machine.png.
+
+example:
+  $ hexapod_comp show mine.yaml
+  machine mine
+  …
+  largest box in it: 283.0 × 258.0 × 99.0 mm, work frame x -173.0 … 110.0, y -98.0 … 160.0, z 318.0 … 417.0 mm
+    −x stops at stroke, longest, strut 1
+  …
+  picture: out/machine.png""",
+    ),
     "ik": Verb(
         "kinematics",
         "strut lengths (mm) for a tool pose (mm, degrees) or a CSV file",

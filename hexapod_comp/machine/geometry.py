@@ -137,7 +137,12 @@ class HexapodGeometry:
         put("limit_numbers", self.limits.numbers(cone_axes, apart, self.characteristic_length, self.home_sign))
         refusal = self.refusal(*pose, lengths)
         if refusal is not None:
-            raise GeometryError("home", f"breaks a limit: {refusal}")
+            from .doubts import joint_doubts
+
+            platform = self.home.position + self.platform_joints @ self.home.rotation.T
+            raise GeometryError(
+                "home", "; ".join([f"breaks a limit: {refusal}", *joint_doubts(self.base_joints, platform)])
+            )
 
     def refusal(
         self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray

@@ -13,6 +13,12 @@ from ..kernels.motion import follow
 from ..pose import Pose
 from .geometry import HexapodGeometry
 
+AXIS_COLOURS = ("#b22222", "#2e8b57", "#4169e1")
+"""Of x, y and z; their letters stand beside them."""
+
+CARDAN = "#007f7f"
+"""Colour of the cardan axes that are fixed to a body."""
+
 
 def machine_figure(geometry: HexapodGeometry) -> Figure:
     """Draw a machine at home: joints, struts and frames in space, joints and struts from above.
@@ -23,33 +29,70 @@ def machine_figure(geometry: HexapodGeometry) -> Figure:
         Its tool and work frames are drawn where they differ from those that carry them.
     """
     figure = Figure(figsize=(12, 6), layout="constrained")
-    space = figure.add_subplot(1, 2, 1, projection="3d")
+    space: Any = figure.add_subplot(1, 2, 1, projection="3d")
     above = figure.add_subplot(1, 2, 2)
-    base = geometry.base_joints * 1e3
-    platform = (geometry.home.position + geometry.platform_joints @ geometry.home.rotation.T) * 1e3
-    for axes, shown in ((space, 3), (above, 2)):
-        _bodies(axes, base[:, :shown], platform[:, :shown])
-    for name, pose in _frames(geometry).items():
-        _frame(space, name, pose)
-    space.set_box_aspect(None, zoom=1.15)  # type: ignore[attr-defined]
-    space.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm", aspect="equal")  # type: ignore[call-arg]
-    space.view_init(elev=22.0, azim=-62.0)  # type: ignore[attr-defined]
-    above.set(xlabel="x, mm", ylabel="y, mm", aspect="equal", title="from above")
-    above.margins(0.12)
+    draw_in_space(space, geometry)
+    space.set_box_aspect(None, zoom=1.15)
+    space.set(aspect="equal")
+    draw_flat(above, geometry, (0, 1))
+    above.set_title("from above")
     return figure
 
 
-def _bodies(axes: Any, base: np.ndarray, platform: np.ndarray) -> None:
+def draw_in_space(axes: Any, geometry: HexapodGeometry) -> None:
+    """Draw a machine at home on 3-D axes, seen from ``base``, mm: bodies, struts, frames, and cardan axes if given."""
+    base, platform = _joints(geometry)
+    _bodies(axes, base, platform)
+    reach = float(np.linalg.norm(base - base.mean(axis=0), axis=1).max())
+    for name, pose in _frames(geometry).items():
+        _frame(axes, name, pose, 0.17 * reach)
+    given = (base, geometry.base_axes, np.eye(3)), (platform, geometry.platform_axes, geometry.home.rotation)
+    label: str | None = "cardan axis fixed to the body"
+    for joints, directions, turn in given:
+        if directions is not None:
+            for joint, direction in zip(joints, directions @ turn.T, strict=True):
+                ends = joint + 0.1 * reach * np.outer([-1.0, 1.0], direction)
+                axes.plot(*ends.T, color=CARDAN, lw=2.5, label=label)
+                label = None
+    axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm")
+    axes.view_init(elev=22.0, azim=-62.0)
+
+
+def draw_flat(axes: Any, geometry: HexapodGeometry, plane: tuple[int, int], labels: bool = True) -> None:
+    """Draw bodies and struts at home on flat axes, those two coordinates of ``base``, mm; with numbers or without."""
+    base, platform = _joints(geometry)
+    _bodies(axes, base[:, plane], platform[:, plane], labels)
+    axes.set(xlabel=f"{'xyz'[plane[0]]}, mm", ylabel=f"{'xyz'[plane[1]]}, mm", aspect="equal")
+    axes.margins(0.12)
+
+
+def _joints(geometry: HexapodGeometry) -> tuple[np.ndarray, np.ndarray]:
+    """Return base and platform joints at home, seen from ``base``, mm."""
+    platform = geometry.home.position + geometry.platform_joints @ geometry.home.rotation.T
+    return geometry.base_joints * 1e3, platform * 1e3
+
+
+def _bodies(axes: Any, base: np.ndarray, platform: np.ndarray, labels: bool = True) -> None:
     """Draw both bodies and the six struts on flat or 3-D axes; joints (6, 2) or (6, 3), mm."""
     for joints, colour in ((base, "black"), (platform, WITH)):
         axes.plot(*np.vstack([joints, joints[:1]]).T, color=colour, lw=2.0, marker="o", ms=4)
-    for index, (start, end) in enumerate(zip(base, platform, strict=True)):
+    for start, end in zip(base, platform, strict=True):
         axes.plot(*np.stack([start, end]).T, color=WITHOUT, lw=1.2)
-        axes.text(*(0.5 * (start + end)), str(index + 1), color=WITHOUT, weight="bold")
-        axes.text(*(start * 1.08), f"$b_{index + 1}$", ha="center", va="center")
-    for joint in np.unique(platform.round(6), axis=0):
-        here = np.flatnonzero(np.abs(platform - joint).max(axis=1) < 1e-3) + 1
-        axes.text(*joint, " = ".join(f"$t_{i}$" for i in here), color=WITH, va="bottom")
+    if not labels:
+        return
+    for index, middle in enumerate(0.5 * (base + platform)):
+        axes.text(*middle, str(index + 1), color=WITHOUT, weight="bold")
+    middle = base.mean(axis=0)
+    _labels(axes, base, "b", {"color": "black"}, lambda joint: middle + 1.08 * (joint - middle))
+    inside = platform.mean(axis=0)
+    _labels(axes, platform, "t", {"color": WITH, "va": "bottom"}, lambda joint: inside + 1.05 * (joint - inside))
+
+
+def _labels(axes: Any, joints: np.ndarray, letter: str, style: dict[str, str], place: Any) -> None:
+    """Write the numbers of joints, those that lie in one place together."""
+    for joint in np.unique(joints.round(6), axis=0):
+        here = np.flatnonzero(np.abs(joints - joint).max(axis=1) < 1e-3) + 1
+        axes.text(*place(joint), " = ".join(f"${letter}_{i}$" for i in here), ha="center", **style)
 
 
 def _frames(geometry: HexapodGeometry) -> dict[str, Pose]:
@@ -62,14 +105,14 @@ def _frames(geometry: HexapodGeometry) -> dict[str, Pose]:
     return frames
 
 
-def _frame(axes: Any, name: str, pose: Pose) -> None:
-    """Draw the axes of a frame, 70 mm long, and its name on 3-D axes."""
+def _frame(axes: Any, name: str, pose: Pose, length: float) -> None:
+    """Draw the axes of a frame, so many mm long, and its name on 3-D axes."""
     origin = pose.position * 1e3
-    for axis, colour, letter in zip(pose.rotation.T, ("#b22222", "#2e8b57", "#4169e1"), "xyz", strict=True):
-        tip = origin + 70.0 * axis
+    for axis, colour, letter in zip(pose.rotation.T, AXIS_COLOURS, "xyz", strict=True):
+        tip = origin + length * axis
         axes.plot(*np.stack([origin, tip]).T, color=colour, lw=1.5)
         axes.text(*tip, letter, color=colour, fontsize=7)
-    axes.text(*(origin - 12.0), name, style="italic", ha="right", va="top")
+    axes.text(*(origin - 0.17 * length), name, style="italic", ha="right", va="top")
 
 
 def weights_figure() -> Figure:

@@ -7,8 +7,8 @@ A campaign is a plan: :func:`template` lists its readings as a :class:`Measureme
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +63,8 @@ class Campaign:
         Standard deviation of a straightness beam's unknown slope, rad.
     repeatability : float
         Standard deviation of where the machine really stops, along each axis, m.
+    level : ndarray, shape (3, 3)
+        Attitude of the tool in the work frame on lines; scattered poses tilt from there.
 
     Raises
     ------
@@ -81,6 +83,7 @@ class Campaign:
     noise: tuple[float, ...] = (1e-6, 1e-6, 1e-6, 10e-6, 10e-6)
     beam_slope: float = 100e-6
     repeatability: float = 0.0
+    level: np.ndarray = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
         box = np.array(self.box, dtype=float)
@@ -130,8 +133,22 @@ class Campaign:
         return {"1-D": five[:1], "5-D": five, "6-D": (*five, f"rotation_{AXES[axis]}")}[self.instrument or "1-D"]
 
 
-def load_campaign(path: str | Path) -> Campaign:
+CELLS_OF_A_BOX, STEPS_OF_A_CELL = 4, 4
+"""How many cells the longest edge of a machine's own box has, and how many steps a cell, where a file does not say."""
+
+OwnBox = Callable[[], tuple[np.ndarray, np.ndarray]]
+"""Gives a machine's own box, (2, 3), m in the work frame, and the tool's attitude there, (3, 3)."""
+
+
+def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
     """Read a campaign file (YAML, see config/campaign_5d.yaml), or a shipped one by its name.
+
+    Parameters
+    ----------
+    path : str or Path
+        File, or the name of a shipped one.
+    own_box : callable, optional
+        Asked where the file gives no box: see :func:`hexapod_comp.workspace.box.machine_box`.
 
     Raises
     ------
@@ -140,12 +157,14 @@ def load_campaign(path: str | Path) -> Campaign:
     """
     path = input_file(path)
     top = read_yaml(path, CAMPAIGN_FORMAT, CAMPAIGN_VERSION)
+    box, level, cell, step = _read_grid(top, own_box)
     instrument = top.choice("instrument", (*INSTRUMENTS, "none"), "none")
     try:
         campaign = Campaign(
-            box=top.quantity("box", "length", (2, 3)),
-            cell=float(top.quantity("cell", "length")),
-            step=float(top.quantity("step", "length")),
+            box=box,
+            cell=cell,
+            step=step,
+            level=level,
             instrument=None if instrument == "none" else instrument,
             diagonals=top.integer("diagonals", 0),
             cycles=top.integer("cycles", 1),
@@ -161,6 +180,18 @@ def load_campaign(path: str | Path) -> Campaign:
         raise InputFileError(path, error.key, error.problem, error.value) from error
     top.finish()
     return campaign
+
+
+def _read_grid(top: Section, own_box: OwnBox | None) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Return the box, m, the tool's attitude in it, and the distances of lines and of readings, m."""
+    if own_box is None or top.quantity_key("box", "length") is not None:
+        box, level, cells = top.quantity("box", "length", (2, 3)), np.eye(3), None
+    else:
+        box, level = own_box()
+        cells = float(np.ptp(box, axis=0).max()) / CELLS_OF_A_BOX
+    cell = float(top.quantity("cell", "length", default=cells))
+    step = float(top.quantity("step", "length", default=None if cells is None else cell / STEPS_OF_A_CELL))
+    return box, level, cell, step
 
 
 def _read_noise(section: Section) -> tuple[float, ...]:
@@ -239,7 +270,7 @@ def _line(campaign: Campaign, name: str, ends: np.ndarray, channels: tuple[str, 
     if way[np.flatnonzero(np.abs(way) > 1e-9)[0]] < 0.0:
         ends = ends[::-1]  # forward is along the first of x, y, z that moves
     count = max(2, round(length / campaign.step) + 1)
-    poses = [Pose(p, np.eye(3)) for p in np.linspace(ends[0], ends[1], count).round(12)]
+    poses = [Pose(p, campaign.level) for p in np.linspace(ends[0], ends[1], count).round(12)]
     for cycle in range(1, campaign.cycles + 1):
         for direction in (FORWARD, BACKWARD):
             for pose in poses[::direction]:
@@ -254,6 +285,6 @@ def _scattered(campaign: Campaign, seed: int) -> Iterator[Reading]:
     for number in range(campaign.poses):
         position = rng.uniform(campaign.box[0], campaign.box[1]).round(6)
         angles = np.append(rng.uniform(-campaign.tilt, campaign.tilt, 2), 0.0).round(6)
-        pose = Pose(position, rotation_from_angles(angles))
+        pose = Pose(position, rotation_from_angles(angles) @ campaign.level)
         for channel in channels:
             yield Reading("poses", number + 1, UNKNOWN, pose, channel, 0.0)

@@ -14,18 +14,24 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
 from ..errors import GeometryError
 from ..formats.figures import picture_text
 from ..machine.geometry import HexapodGeometry
+from ..machine.pictures import draw_flat, draw_in_space
 from .layers import ROTATION, TRANSLATION, Layer, Quantity
+from .overview import Overview
 from .reach import FINDINGS
+from .shells import shell
+from .study import RINGS, SECTORS
 
 COLOURS = "viridis"
 """Colour map of effects: even steps for the eye, also in grey and to the colour-blind."""
@@ -35,6 +41,12 @@ CAUSE_COLOURS = ("#ffffff", "#20639b", "#c1432e", "#e3a72f", "#3c8d5a", "#7b4ea3
 
 VIEW_AZIMUTH, VIEW_ELEVATION = -60.0, 20.0
 """Where the eye stands, degrees."""
+
+BOX = "#d77f00"
+"""Colour of the largest box."""
+
+SHADOW = "#dbe4ee"
+"""Colour of a reach that a machine stands in."""
 
 WEDGE = 130.0
 """How far the outermost of several shells is cut open towards the eye, degrees; inner ones less, the innermost not."""
@@ -150,6 +162,65 @@ def causes_figure(geometry: HexapodGeometry, points: np.ndarray, findings: np.nd
     ]
     figure.legend(handles=handles, loc="lower center", ncols=min(4, len(handles)))
     return figure
+
+
+def overview_figure(found: Overview) -> Figure:
+    """Show a machine at home with its frames, and in it what it reaches, by what limits it, and the largest box.
+
+    Parameters
+    ----------
+    found : Overview
+        The machine looked over.
+    """
+    geometry, body = found.geometry, shell(found.reach, RINGS, SECTORS)
+    faces, corners = _faces(_in_base(geometry, body.points), 0.0)
+    box = _in_base(geometry, _box_edges(found.box.box))
+    figure = Figure(figsize=(14.0, 8.0), layout=ConstrainedLayoutEngine(rect=(0.0, 0.08, 1.0, 0.92)))
+    figure.suptitle(_overview_title(found))
+    places = figure.add_gridspec(2, 2, width_ratios=[3, 2])
+    space: Any = figure.add_subplot(places[:, 0], projection="3d")
+    draw_in_space(space, geometry)
+    colours = np.array(CAUSE_COLOURS)[body.findings[corners]]
+    space.add_collection3d(Poly3DCollection(faces, facecolors=colours, alpha=0.13, lw=0.0))
+    for line in box:
+        space.plot(*line.T, color=BOX, lw=1.4)
+    everything = np.concatenate([*(_in_base(geometry, line) for line in outline(geometry)), faces.reshape(-1, 3)])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    space.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    space.set_box_aspect(high - low, zoom=1.0)
+    for place, plane, title in ((places[0, 1], (0, 1), "from above"), (places[1, 1], (0, 2), "from the side")):
+        flat = figure.add_subplot(place)
+        flat.add_collection(PolyCollection(list(faces[..., plane]), facecolors=SHADOW, edgecolors=SHADOW))
+        for line in box:
+            flat.plot(*line[:, plane].T, color=BOX, lw=1.4)
+        draw_flat(flat, geometry, plane, labels=plane == (0, 1))
+        flat.set_title(f"{title}, base frame")
+    handles = [
+        Patch(color=CAUSE_COLOURS[FINDINGS.index(name)], label=f"{name}: {share:.0%}")
+        for name, share in found.reach.shares().items()
+    ]
+    shadow, cardan = Patch(color=SHADOW, label="reach of the tool's tip"), space.get_legend_handles_labels()[0]
+    lines = [Line2D([], [], color=BOX, label="largest box"), *cardan, shadow]
+    figure.legend(handles=[*lines, *handles], loc="lower center", ncols=4)
+    return figure
+
+
+def _overview_title(found: Overview) -> str:
+    size = " × ".join(f"{edge * 1e3:.0f}" for edge in np.ptp(found.box.box, axis=0))
+    name = picture_text(found.geometry.name)
+    return f"{name} at home; reach of the tool's tip {found.reach.volume * 1e3:.3g} litres, largest box {size} mm"
+
+
+def _in_base(geometry: HexapodGeometry, points: np.ndarray) -> np.ndarray:
+    """Return points of the work frame, m, seen from ``base``, mm."""
+    return np.asarray(1e3 * (geometry.work.position + points @ geometry.work.rotation.T))
+
+
+def _box_edges(box: np.ndarray) -> np.ndarray:
+    """Return the twelve edges of a box, shape (12, 2, 3)."""
+    corners = np.array([np.where(pick, box[1], box[0]) for pick in np.ndindex(2, 2, 2)])
+    pairs = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
+    return corners[np.array(pairs)]
 
 
 def ranking_figure(rows: Sequence[RankedRow], title: str) -> Figure:

@@ -35,6 +35,7 @@ ROOT = Path(__file__).resolve().parents[2]
 TABLE_1 = str(ROOT / "config" / "table1.csv")
 PAPER = paper_geometry()
 IDEAL = MachineModel("paper")
+MACHINES = ("example_6_6.yaml", "jugglebot.yaml", "paper.yaml", "positioning_unit.yaml")
 POSE_HEADER = "name,x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg"
 
 Run = tuple[int, str, str]
@@ -75,7 +76,7 @@ def test_help_is_fast_and_needs_no_compiler() -> None:
     assert done.returncode == 0, done.stderr
     listed = re.findall(r"^ +(\w+):$|^    (\w+)  ", done.stdout, re.MULTILINE)
     assert " ".join(group + ":" if group else verb for group, verb in listed) == (
-        "kinematics: ik fk check loop: run demo replay calibration: plan simulate fit iso230 export "
+        "kinematics: show ik fk check loop: run demo replay calibration: plan simulate fit iso230 export "
         "analysis: assess classify paper"
     )
     assert all(len(line) <= 80 for line in done.stdout.splitlines() if line.startswith("    ")), "one line a verb"
@@ -131,7 +132,7 @@ def test_json_is_printed_and_out_stays_csv(hexapod, tmp_path: Path) -> None:
         ("re", {"replay"}),
         ("ik --m", {"--machine", "--model"}),
         ("ik --machine pap", {"paper.yaml"}),
-        ("ik --machine ", {"paper.yaml", "jugglebot.yaml", "positioning_unit.yaml", "mine.csv", "deep/"}),
+        ("ik --machine ", {*MACHINES, "mine.csv", "deep/"}),
         ("ik --model ", {"ideal", "paper_machine.yaml", "paper_lines_model.yaml", "mine.csv", "deep/"}),
         ("plan campaign_", {"campaign_1d.yaml", "campaign_5d.yaml", "campaign_full.yaml"}),
         ("classify --budget e", {"error_budget.yaml"}),

@@ -1,0 +1,212 @@
+"""A machine at a glance: where everything is, how far it reaches, the largest box in it, and what looks wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..formats.texts import aligned, number
+from ..kernels.limits import WITHIN
+from ..machine.doubts import doubts, twist_per_lead
+from ..machine.geometry import HexapodGeometry
+from ..machine.kinematics import condition_number, strut_lengths
+from ..pose import Pose, angles_from_rotation, rotation_from_angles
+from .box import CELLS, ReachedBox, largest_box, machine_box
+from .reach import Examiner, Reach, home_orientation, orientations, reach
+
+MOST_TILT = np.radians(90.0)
+"""Beyond this no tilt is looked for, rad."""
+
+TILT_STEPS = 361
+"""Steps from zero to there."""
+
+TURN = np.radians(5.0)
+"""By which a tool turns about x, y or z, rad."""
+
+USUAL_LEAD = 0.01
+"""Of a screw, m, where the file gives none."""
+
+
+@dataclass(frozen=True)
+class Overview:
+    """What is worth knowing of a machine before anything else.
+
+    Attributes
+    ----------
+    geometry : HexapodGeometry
+        The machine.
+    reach : Reach
+        What it reaches with the tool as at home.
+    box : ReachedBox
+        The largest box in that.
+    campaign : ReachedBox
+        The box that campaigns take which give none: with the tool parallel to the work frame where it can be.
+    tilts : ndarray, shape (3, 2)
+        How far the tool tilts at home about x, y and z of the work frame, each alone, backward and forward, rad.
+    lengths : ndarray, shape (6,)
+        Strut lengths at home, m.
+    condition : float
+        Condition number at home.
+    doubts : tuple of str
+        What looks wrong.
+    """
+
+    geometry: HexapodGeometry
+    reach: Reach
+    box: ReachedBox
+    campaign: ReachedBox
+    tilts: np.ndarray
+    lengths: np.ndarray
+    condition: float
+    doubts: tuple[str, ...]
+
+
+def overview(geometry: HexapodGeometry, cells: int = CELLS) -> Overview:
+    """Look a machine over.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        The machine.
+    cells : int
+        Of the reach's grid along its longest edge.
+
+    Raises
+    ------
+    GeometryError
+        Nothing is within the limits.
+    """
+    found = reach(geometry, home_orientation(geometry), cells)
+    box = largest_box(found)
+    level = np.array_equal(found.rotation.round(12), np.eye(3))
+    return Overview(
+        geometry=geometry,
+        reach=found,
+        box=box,
+        campaign=box if level else machine_box(geometry, cells),
+        tilts=_tilts(geometry),
+        lengths=strut_lengths(geometry, geometry.home),
+        condition=condition_number(geometry, geometry.home)[0],
+        doubts=(*doubts(geometry), *_screws(geometry)),
+    )
+
+
+def _tilts(geometry: HexapodGeometry) -> np.ndarray:
+    """Return how far the tool tilts at home about each axis alone, shape (3, 2), rad."""
+    tip, examiner = geometry.tool_pose(geometry.home).position, Examiner(geometry)
+    angles = np.linspace(0.0, MOST_TILT, TILT_STEPS)
+    tilts = np.zeros((3, 2))
+    for axis in range(3):
+        for side, way in enumerate((-1.0, 1.0)):
+            sets = [way * angles if a == axis else np.zeros(1) for a in range(3)]
+            turned = orientations(geometry, [values.tolist() for values in sets])
+            findings, _ = examiner.findings(np.tile(tip, (len(turned), 1)), turned)
+            out = np.flatnonzero(findings != WITHIN)
+            tilts[axis, side] = way * angles[out[0] - 1 if len(out) else -1]
+    return tilts
+
+
+def _screws(geometry: HexapodGeometry) -> tuple[str, ...]:
+    """Say what missing axes of cardan joints would cost where the tool turns."""
+    if geometry.screw_lead.any() or geometry.base_axes is not None:
+        return ()
+    turned = rotation_from_angles(TURN * np.concatenate([np.eye(3), -np.eye(3)])) @ geometry.home.rotation
+    share = twist_per_lead(geometry, np.tile(geometry.home.position, (6, 1)), turned)
+    return (
+        "screw.lead, base.joint_axes and platform.joint_axes are missing: screws that turn with cardan joints are off "
+        f"by up to about {share * USUAL_LEAD * 1e6:.0f} µm where the tool turns by {np.degrees(TURN):g}°, at a lead of "
+        f"{USUAL_LEAD * 1e3:g} mm",
+    )
+
+
+def report(found: Overview) -> str:
+    """Return the overview as text."""
+    geometry, machine = found.geometry, found.reach
+    size = " × ".join(f"{edge * 1e3:.1f}" for edge in np.ptp(found.box.box, axis=0))
+    lines = [f"machine {geometry.name}", "", "frames, position mm and α, β, γ °:", _frames(geometry)]
+    lines += ["", "joints, mm; strut at home, mm, and its limits:", _joints(found)]
+    lines += ["", f"condition number at home {found.condition:.3f}, allowed {geometry.limits.condition:g}"]
+    lines += ["tool tilts at home, each axis of the work frame alone: " + _tilt_text(found.tilts)]
+    shares = ", ".join(f"{cause} {100.0 * share:.0f} %" for cause, share in machine.shares().items())
+    lines += ["", f"reach with the tool as at home: {machine.volume * 1e3:.4g} litres, {corners(machine.box)}"]
+    lines += [f"  limited by {shares}"]
+    lines += [f"  in {machine.parts} pieces; no way leads from one to another"] * (machine.parts > 1)
+    lines += [f"largest box in it: {size} mm, {corners(found.box.box)}"]
+    lines += [f"  {face} stops at {cause}" for face, cause in found.box.causes.items()]
+    if found.campaign is not found.box:
+        lines += [f"box for campaigns, tool {_level_text(found)}: {corners(found.campaign.box)}"]
+    lines += ["", *(f"look again: {doubt}" for doubt in found.doubts)] if found.doubts else []
+    return "\n".join(lines)
+
+
+def _level_text(found: Overview) -> str:
+    level = np.array_equal(found.campaign.rotation.round(12), np.eye(3))
+    return "parallel to the work frame" if level else "as at home"
+
+
+def corners(box: np.ndarray) -> str:
+    """Return a box of the work frame, shape (2, 3) m, as text."""
+    ends = [f"{axis} {low:.1f} … {high:.1f}" for axis, low, high in zip("xyz", *(box * 1e3), strict=True)]
+    return f"work frame {', '.join(ends)} mm"
+
+
+def _tilt_text(tilts: np.ndarray) -> str:
+    """Return the tilts; at 90° nobody looked on."""
+    texts = []
+    for axis, pair in zip("xyz", np.degrees(tilts), strict=True):
+        low, high = (f"{value:+.1f}" + ("" if abs(value) < 90.0 else " or more") for value in pair)
+        texts.append(f"{axis} {low} … {high}°")
+    return ", ".join(texts)
+
+
+def named_frames(geometry: HexapodGeometry) -> dict[str, tuple[str, Pose]]:
+    """Return platform and tool at home, and the work frame, by name: in which frame each is given, and its pose."""
+    return {
+        "platform, at home": ("base", geometry.home),
+        "tool": ("platform", geometry.tool),
+        "work": ("base", geometry.work),
+        "tool, at home": ("work", geometry.tool_pose(geometry.home)),
+    }
+
+
+def _frames(geometry: HexapodGeometry) -> str:
+    rows = []
+    for name, (outer, pose) in named_frames(geometry).items():
+        values = [*(pose.position * 1e3), *np.degrees(angles_from_rotation(pose.rotation))]
+        rows.append([name, outer, *(number(value, 3) for value in values)])
+    return aligned(["frame", "in", "x", "y", "z", "α", "β", "γ"], rows)
+
+
+def _joints(found: Overview) -> str:
+    geometry, limits = found.geometry, found.geometry.limits
+    rows = []
+    for n in range(6):
+        places = [*geometry.base_joints[n], *geometry.platform_joints[n], found.lengths[n], *limits.stroke[n]]
+        cones = np.degrees([limits.base_cone[n], limits.platform_cone[n]])
+        rows.append([str(n + 1), *(number(value * 1e3, 3) for value in places), *(f"{cone:g}" for cone in cones)])
+    head = ["strut", "base x", "y", "z", "platform x", "y", "z", "home", "shortest", "longest", "base °", "platform °"]
+    return aligned(head, rows)
+
+
+def as_json(found: Overview) -> dict[str, Any]:
+    """Return the overview for programs; units are in the keys, poses in mm and degrees."""
+    geometry, machine = found.geometry, found.reach
+    return {
+        "machine": geometry.name,
+        "frames": {name: {"in": outer, "pose": pose} for name, (outer, pose) in named_frames(geometry).items()},
+        "base_joints_m": geometry.base_joints,
+        "platform_joints_m": geometry.platform_joints,
+        "home_lengths_m": found.lengths,
+        "home_condition": found.condition,
+        "home_tilts_rad": found.tilts,
+        "reach": {"volume_m3": machine.volume, "box_m": machine.box, "frame": "work", "limits": machine.shares()},
+        "largest_box": _box_json(found.box),
+        "campaign_box": _box_json(found.campaign),
+        "look_again": found.doubts,
+    }
+
+
+def _box_json(box: ReachedBox) -> dict[str, Any]:
+    return {"box_m": box.box, "frame": "work", "rotation": box.rotation, "stops_at": box.causes}
