@@ -1,4 +1,8 @@
-"""The pages of this folder as a site: ``make docs``, or rosdoc2, which finds this file where ROS packages keep it."""
+"""The pages of this folder as a site: ``make docs``, or rosdoc2, which finds this file where ROS packages keep it.
+
+rosdoc2 runs it from a copy of this folder, says itself what project and version are, and has neither notebooks nor
+MathML: there the notebooks show what is written, not what is computed, and formulas are MathJax's.
+"""
 
 from __future__ import annotations
 
@@ -9,19 +13,23 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from docutils import nodes
-from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 from sphinx.writers.html5 import HTML5Translator
 
-ROOT = Path(__file__).resolve().parents[1]
-# Where the package is not installed, and for the notebooks, which run in processes of their own.
-sys.path.insert(0, str(ROOT))
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+try:
+    from latex2mathml.converter import convert
+except ImportError:
+    convert = None
 
-project = "hexapod_comp"
-author = "The hexapod_comp maintainers"
-copyright = author
-release = version = ElementTree.parse(ROOT / "package.xml").findtext("version") or ""
+ROOT = Path(__file__).resolve().parents[1]
+if (ROOT / "package.xml").is_file():
+    # Where the package is not installed, and for the notebooks, which run in processes of their own.
+    sys.path.insert(0, str(ROOT))
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    project = "hexapod_comp"
+    author = "The hexapod_comp maintainers"
+    copyright = author
+    release = version = ElementTree.parse(ROOT / "package.xml").findtext("version") or ""
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 exclude_patterns = ["_build", "templates"]
@@ -31,7 +39,8 @@ html_theme = "furo"
 html_title = f"hexapod_comp {release}"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
-html_math_renderer = "mathml"  # drawn by the browser itself: no script, no network
+if convert:
+    html_math_renderer = "mathml"  # drawn by the browser itself: no script, no network
 
 # Every heading is a target, as where the pages are read without being built.
 myst_heading_anchors = 3
@@ -74,5 +83,6 @@ def keep_bars(_app: Sphinx, _what: str, _name: str, _thing: object, _options: ob
 
 def setup(app: Sphinx) -> None:
     """Let formulas be written as MathML, and docstrings be read as they are meant."""
-    app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))
+    if convert:
+        app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))
     app.connect("autodoc-process-docstring", keep_bars)
