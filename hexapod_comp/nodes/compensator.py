@@ -265,6 +265,7 @@ class CompensatorNode(MachineNode):
     def _refuse(self, stamp: int, error: HexapodError, now: float) -> None:
         self._journal.refused(stamp, error.reason, str(error))
         self._status.refusals.add(error.reason, str(error), now)
+        self._outputs.signs.stop(True)
         self.warn_of(error.reason, f"command refused ({error.reason}): {error}")
 
     def _check_state(self) -> None:
@@ -275,6 +276,7 @@ class CompensatorNode(MachineNode):
         self._tell_problem()
         self._reload.look()
         self._journal.tick(now)
+        self._outputs.signs.stop(not self._active or self._status.stops(now))
         level, text = self._status.judged(self.compensator, now) if self._active else (WARN, "not active")
         self.tell(level, text, lambda: self._status.values(self.compensator, self._fresh_start, now))
 

@@ -19,6 +19,7 @@ from .messages import write_pose
 from .predicted_error import PredictedErrorTopics
 from .runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, STATE_QOS, MachineNode
 from .stamps import period
+from .vital_signs import VitalSigns
 from .wire import StrutBytes
 
 
@@ -41,19 +42,21 @@ class CompensatorOutputs:
         self, node: MachineNode, compensator: Compensator, options: dict[str, Any], files: MachineFiles
     ) -> None:
         self._node, self._compensator, self._frame = node, compensator, options["base_frame"]
-        self._commands = node.publish_on(JointState, "strut_commands", COMMAND_QOS)
-        self._corrections = node.publish_on(JointState, "strut_corrections", COMMAND_QOS)
+        deadline = options["command_timeout"]
+        self._commands = node.publish_on(JointState, "strut_commands", COMMAND_QOS, deadline)
+        self._corrections = node.publish_on(JointState, "strut_corrections", COMMAND_QOS, deadline)
         self._estimates = node.publish_on(PoseStamped, "tool_pose_estimate", STATE_QOS)
         self._markers = node.create_publisher(MarkerArray, "~/markers", EVENT_QOS)
         self._array: Publisher | None = None
         if options["publish_array"]:
-            self._array = node.publish_on(Float64MultiArray, "strut_commands_array", COMMAND_QOS)
+            self._array = node.publish_on(Float64MultiArray, "strut_commands_array", COMMAND_QOS, deadline)
         self._array_out = Float64MultiArray(data=[0.0] * 6)
         self._array_view = np.frombuffer(self._array_out.data, dtype=float)
         self._command_out, self._correction_out = StrutBytes(), StrutBytes()
         self._estimate_out = PoseStamped()
         self._estimate_out.header.frame_id = self._frame
         self._answered, self._fastest = 0, compensator.geometry.limits.speed
+        self.signs = VitalSigns(node, options, self.command_topic, lambda: self._answered)
         self._predicted = PredictedErrorTopics(node, compensator, files, options["work_frame"], lambda: self._answered)
 
     @property
@@ -93,10 +96,12 @@ class CompensatorOutputs:
     def wait(self) -> None:
         """Wait until the last command has arrived."""
         self._commands.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+        self.signs.wait()
 
     def close(self) -> None:
         """Destroy the publishers."""
         self._predicted.close()
+        self.signs.close()
         for publisher in (self._commands, self._corrections, self._estimates, self._markers, self._array):
             if publisher is not None:
                 self._node.destroy_publisher(publisher)

@@ -59,6 +59,7 @@ PARAMETERS = (
     Parameter(
         "temperature_timeout", 60.0, "without a temperature for this long a part's is stale, s; 0 = off", 0.0, 86400.0
     ),
+    Parameter("heartbeat_rate", 50.0, "heartbeats per second, Hz; 0 = none", 0.0, 1000.0),
     Parameter("marker_rate", 10.0, "markers per second, Hz; 0 = none", 0.0, 10.0),
     Parameter("publish_array", False, "also publish strut_commands_array for ros2_controllers"),
 )
@@ -72,6 +73,8 @@ out  strut_commands          JointState: compensated strut lengths, m
      tool_pose_estimate      PoseStamped: from measured struts, in base
      ~/predicted_error       PoseWithCovarianceStamped: the tool's error without compensation, in work;
      ~/predicted_error_aligned  the same with the datum aligned
+     ~/stopped               Bool, latched: commands are refused
+     ~/heartbeat, ~/validity UInt64, TimeReference: until when the newest command is valid
      /diagnostics, ~/markers, ~/journal, ~/files
 ask  ~/enable_compensation   SetBool
      ~/reload_model, ~/reset Trigger

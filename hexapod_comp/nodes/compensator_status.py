@@ -99,6 +99,10 @@ class CompensatorStatus:
         guards: tuple[Guard, ...] = (self.source, self.own_topic, self.measuring, self.following)
         return next((guard for guard in guards if guard.problem), None)
 
+    def stops(self, now: float) -> bool:
+        """Return whether an active node refuses commands: by a guard, for want of readings, or as of late."""
+        return self.problem() is not None or self.refusals.recent(now) or self.last_known.waits(now)
+
     def fed(self, now: float) -> bool:
         """Return whether measured struts are fresh."""
         return self.feedback.age(now) <= self._options["feedback_timeout"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 
 import numpy as np
 
@@ -21,10 +22,12 @@ class InOrder:
     ----------
     what : str
         Of what, for the text.
+    valid_for : float
+        Refused as well is what is older than this by this computer's clock, s; 0: nothing.
     """
 
-    def __init__(self, what: str) -> None:
-        self._what = what
+    def __init__(self, what: str, valid_for: float = 0.0) -> None:
+        self._what, self._valid_for = what, valid_for
         self._last, self._at = 0, -float("inf")
 
     def check(self, stamp: int, now: float) -> None:
@@ -33,8 +36,10 @@ class InOrder:
         Raises
         ------
         CommandError
-            ``stamp_order``.
+            ``stamp_order``, ``stamp_past``.
         """
+        if stamp and 0.0 < self._valid_for < (age := (time.time_ns() - stamp) * 1e-9):
+            raise CommandError("stamp_past", f"{self._what} is {age:.3f} s old, valid for {self._valid_for:g} s")
         late = self._last - stamp
         if stamp and 0 < late < OVERTAKEN_BY and now - self._at < FORGET_ORDER_AFTER:
             raise CommandError("stamp_order", f"{self._what} is {late * 1e-6:.1f} ms older than the one before")

@@ -19,7 +19,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.subscription import Subscription
@@ -39,6 +39,17 @@ STATE_QOS = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=Rel
 
 EVENT_QOS = QoSProfile(depth=10, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 """Rare messages, each of which counts: temperatures, diagnostics, markers."""
+
+OVERRIDES = QoSOverridingOptions(
+    (
+        QoSPolicyKind.HISTORY,
+        QoSPolicyKind.DEPTH,
+        QoSPolicyKind.RELIABILITY,
+        QoSPolicyKind.DEADLINE,
+        QoSPolicyKind.LIFESPAN,
+    )
+)
+"""What of a topic's QoS a user may override by parameters; subscriptions have no lifespan."""
 
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.4)
 """How long the last message waits to be acknowledged: that may take DDS 3 s, and the dead never do it."""
@@ -159,10 +170,11 @@ class MachineNode(LifecycleNode):
             everything = {**values(), **self.guard.values()}
             self._diagnostics_pub.publish(self._report.message(level, text, everything, stamp))
 
-    def publish_on(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
-        """Return a publisher."""
-        options = QoSOverridingOptions.with_default_policies()
-        return self.create_publisher(message_type, topic, copy.copy(qos), qos_overriding_options=options)
+    def publish_on(self, message_type: type, topic: str, qos: QoSProfile, deadline: float = 0.0) -> Publisher:
+        """Return a publisher; it offers to publish every `deadline` s at least, 0: it offers nothing."""
+        qos = copy.copy(qos)
+        qos.deadline = Duration(seconds=deadline)
+        return self.create_publisher(message_type, topic, qos, qos_overriding_options=OVERRIDES)
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
         """Return a timer on a clock that nobody can set: the node's own stops for as long as it is set back."""
@@ -172,8 +184,7 @@ class MachineNode(LifecycleNode):
         self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
     ) -> Subscription:
         """Return a subscription."""
-        options = QoSOverridingOptions.with_default_policies()
-        return self.create_subscription(message_type, topic, callback, copy.copy(qos), qos_overriding_options=options)
+        return self.create_subscription(message_type, topic, callback, copy.copy(qos), qos_overriding_options=OVERRIDES)
 
     def obey(
         self,
@@ -195,7 +206,7 @@ class MachineNode(LifecycleNode):
             topic,
             numbered(callback),
             copy.copy(qos),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            qos_overriding_options=OVERRIDES,
             raw=raw,
         )
 

@@ -81,7 +81,8 @@ class StrutDriveNode(MachineNode):
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
         self._open_topics()
-        self._order, self._no_step, self._log_space = InOrder("strut_commands"), NoStep(geometry), LogSpace()
+        self._order = InOrder("strut_commands", options["command_validity"])
+        self._no_step, self._log_space = NoStep(geometry), LogSpace()
         self.get_logger().info(f"configured machine {geometry.name!r} with hidden truth {machine.model.name!r}")
         return super().on_configure(state)
 

@@ -17,6 +17,7 @@ PARAMETERS = (
     Parameter("noise_seed", 0, "seed of the noise", 0, 2**31),
     Parameter("base_frame", "base", "frame_id of the true tool pose"),
     Parameter("command_timeout", 0.1, "without a command for this long diagnostics warn, s; 0 = off", 0.0, 3600.0),
+    Parameter("command_validity", 0.0, "commands stamped earlier than this are refused, s; 0 = off", 0.0, 3600.0),
     Parameter("allow_several_publishers", False, "obey though several nodes publish strut commands"),
     Parameter("rate", 500.0, "readings published per second, Hz", 1.0, 2000.0),
     Parameter("step", 0.1e-6, "length of one motor step, m; 0 = none", 0.0, 1e-3),

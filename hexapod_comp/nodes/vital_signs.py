@@ -1,0 +1,78 @@
+"""What a machine's own safety watches: a heartbeat, how long a command holds, and whether commands are refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import TimeReference
+from std_msgs.msg import Bool, UInt64
+
+from .runtime import ACKNOWLEDGED_WITHIN, EVENT_QOS, MachineNode
+from .stamps import stamp_of
+
+LATCHED_QOS = QoSProfile(
+    depth=1,
+    history=HistoryPolicy.KEEP_LAST,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""A state that who comes late must know too."""
+
+LAST_STAMP = 2**31 * 10**9 - 1
+"""The largest time that a message can hold, ns: what is valid until later is valid until then."""
+
+
+class VitalSigns:
+    """Publishes ``~/heartbeat``, ``~/validity`` and ``~/stopped`` of a configured node.
+
+    Parameters
+    ----------
+    node : MachineNode
+        Publishes.
+    options : dict
+        Its parameters ``heartbeat_rate``, Hz, and ``command_timeout``, s.
+    topic : str
+        Of the commands.
+    newest : callable
+        Returns the newest command's stamp, ns; 0: there is none.
+    """
+
+    def __init__(self, node: MachineNode, options: dict[str, Any], topic: str, newest: Callable[[], int]) -> None:
+        self._node, self._newest = node, newest
+        self._heartbeats = node.create_publisher(UInt64, "~/heartbeat", EVENT_QOS)
+        self._validities = node.create_publisher(TimeReference, "~/validity", EVENT_QOS)
+        self._stops = node.create_publisher(Bool, "~/stopped", LATCHED_QOS)
+        self._beat, self._validity = UInt64(), TimeReference(source=topic)
+        self._lasting = round(options["command_timeout"] * 1e9)
+        self._stopped: bool | None = None
+        self.stop(True)
+        rate = options["heartbeat_rate"]
+        self._timer = node.every(1.0 / rate, self._beats) if rate else None
+
+    def stop(self, stopped: bool) -> None:
+        """Say whether the node stops the machine, where that has changed."""
+        if stopped != self._stopped:
+            self._stopped = stopped
+            self._stops.publish(Bool(data=stopped))
+
+    def wait(self) -> None:
+        """Wait until it has arrived that the node stops the machine."""
+        self._stops.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+
+    def close(self) -> None:
+        """Stop beating."""
+        if self._timer is not None:
+            self._node.destroy_timer(self._timer)
+        for publisher in (self._heartbeats, self._validities, self._stops):
+            self._node.destroy_publisher(publisher)
+
+    def _beats(self) -> None:
+        self._beat.data = (self._beat.data + 1) % 2**64
+        self._heartbeats.publish(self._beat)
+        stamp = self._newest()
+        if stamp and self._lasting:
+            self._validity.header.stamp = stamp_of(stamp)
+            self._validity.time_ref = stamp_of(min(stamp + self._lasting, LAST_STAMP))
+            self._validities.publish(self._validity)
