@@ -8,11 +8,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
+from hexapod_comp.calibration.posterior import FittedParameters, save_with_posterior
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -129,3 +131,17 @@ def scattered(
         for axis in AXES
     ]
     return assemble(geometry, readings, probe)
+
+
+def fitted_model(folder: Path, offset: float = 30e-6) -> Path:
+    """Write a model with all struts too long by as much, every parameter known to 2 µm, and its posterior."""
+    grid = np.stack(np.meshgrid([-0.1, 0.1], [-0.1, 0.1], [0.38, 0.45]), axis=-1).reshape(-1, 3)
+    readings = scattered(paper(), [Pose(p, np.eye(3)) for p in grid])
+    space = ParameterSpace(readings, FitSettings(blocks=()))
+    x = np.zeros(space.size)
+    x[-6:] = offset
+    model = space.model(x, "fitted")
+    model = replace(model, origin=replace(model.origin, date="2026-01-31"))
+    covariance = 2e-6**2 * np.eye(space.size)
+    save_with_posterior(model, FittedParameters(space, x, covariance, np.ones(1), np.ones(5)), folder / "fitted.yaml")
+    return folder / "fitted.yaml"

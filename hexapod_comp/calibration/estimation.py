@@ -173,6 +173,8 @@ class Estimation:
         The readings.
     space : ParameterSpace
         The parameters.
+    alone : bool
+        Nothing else is known of the machine: the readings must be enough.
 
     Raises
     ------
@@ -180,14 +182,14 @@ class Estimation:
         Fewer readings than unknowns: nothing would be determined.
     """
 
-    def __init__(self, measurements: MeasurementSet, space: ParameterSpace) -> None:
+    def __init__(self, measurements: MeasurementSet, space: ParameterSpace, alone: bool = True) -> None:
         self.measurements, self.space = measurements, space
         self.cells = Cells.of(measurements)
         self.uncertainty = measurements.stated
         self._unknowns = self._make_unknowns()
         needed = len(space.blocks[0].labels)
         free = len(self.cells.station) - sum(q.shape[1] for _, q in self._unknowns)
-        if free < needed:
+        if alone and free < needed:
             problem = f"{len(measurements)} readings at {len(self.cells.station)} distinct places leave {free} "
             raise CalibrationError("measurements", problem + f"numbers for the structure's {needed} parameters")
 

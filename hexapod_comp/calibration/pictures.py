@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..errors import CalibrationError
+from ..errors import CalibrationError, ModelError
 from ..formats.figures import SIX_COLOURS, WITH, WITHOUT, picture_text
 from ..kernels.struts import smooth_error
 from ..machine.field import COMPONENTS, CROSS_AXES
@@ -21,6 +21,9 @@ from ..virtual.trial import Trial
 from .fit import ModelFit
 from .lines import LineFit, LinesFit
 from .observability import left_in_space
+from .posterior import FittedParameters
+from .prediction import COMPONENTS as PREDICTED
+from .prediction import ErrorPredictor
 
 SAMPLES = 161
 """Points of a curve."""
@@ -250,4 +253,54 @@ def left_error_figure(fit: ModelFit) -> Figure:
     panels[0].set_ylabel("y in work, mm")
     figure.colorbar(drawn, ax=panels, label="RMS error in space to expect, µm")
     figure.suptitle("what is left after compensation, level tool, datum aligned")
+    return figure
+
+
+def predicted_error_figure(machine: RealMachine, fitted: FittedParameters | None) -> Figure:
+    """Map the tool's predicted error without compensation at half the measured box's height, level tool, datum aligned.
+
+    Six components along and about the axes of ``work``; contour lines are their standard deviations.
+
+    Parameters
+    ----------
+    machine : RealMachine
+        Geometry and model.
+    fitted : FittedParameters or None
+        What the model's fit knows; None: no standard deviations.
+
+    Raises
+    ------
+    ModelError
+        The model tells of no box.
+    """
+    box = commanded_box(machine.geometry, machine.model)
+    x, y = (np.linspace(box[0, axis], box[1, axis], MAP_NODES) for axis in range(2))
+    height = float(box[:, 2].mean())
+    points = np.stack([*np.meshgrid(x, y), np.full((MAP_NODES, MAP_NODES), height)], axis=-1).reshape(-1, 3)
+    poses = machine.geometry.platform_poses(points, np.tile(np.eye(3), (len(points), 1, 1)))
+    aligned = ErrorPredictor(machine, fitted).predict(poses)[1]
+    if aligned is None:
+        raise ModelError("valid_box", "holds too few poses that the machine takes")
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    panels = figure.subplots(2, 3, sharex=True, sharey=True)
+    for n, (axes, component) in enumerate(zip(panels.ravel(), PREDICTED, strict=True)):
+        unit = "µrad" if component[0] == "r" else "µm"
+        values = np.ma.masked_invalid(aligned.values[:, n].reshape(MAP_NODES, MAP_NODES) * 1e6)
+        most = max(float(np.abs(values).max()), 1e-6)
+        drawn = axes.contourf(x * 1e3, y * 1e3, values, np.linspace(-most, most, 21), cmap="PuOr")
+        figure.colorbar(drawn, ax=axes, label=unit, shrink=0.65)
+        if aligned.deviations is not None:
+            sigma = aligned.deviations[:, n].reshape(MAP_NODES, MAP_NODES) * 1e6
+            axes.clabel(axes.contour(x * 1e3, y * 1e3, sigma, 4, colors="black", linewidths=0.6), fontsize=6)
+        name = f"rotation about {component[1]}" if component[0] == "r" else f"displacement along {component}"
+        axes.set(title=name, aspect="equal")
+    for axes in panels[1]:
+        axes.set_xlabel("x in work, mm")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("y in work, mm")
+    known = "black lines: one standard deviation" if fitted is not None else "standard deviation not known"
+    title = (
+        f"predicted error without compensation, z = {height * 1e3:.0f} mm in work, level tool, datum aligned; {known}"
+    )
+    figure.suptitle(picture_text(f"{machine.geometry.name}, {machine.model.name}: {title}"), fontsize=9)
     return figure

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..errors import CalibrationError
 from ..kernels.kinematics import OK
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import RealMachine, Temperatures, platform_box
@@ -117,6 +118,29 @@ class ErrorPredictor:
             if self._datum is not None:
                 aligned.append(self._with_covariance(errors.without(self._datum)))
         return _joined(standing), _joined(aligned) if aligned else None
+
+    def slopes(self, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return how the fit's parameters move the tool at poses, directions of motion not known.
+
+        Returns
+        -------
+        tips : ndarray, shape (N, 3)
+            The tool in ``work``, m.
+        standing, aligned : ndarray, shape (N, 6, size)
+            Derivatives of the errors as the machine stands, and with the datum aligned; NaN where the machine has no
+            pose.
+
+        Raises
+        ------
+        CalibrationError
+            There is no fit, or its model has no box over which a datum can be aligned.
+        """
+        if self._fitted is None or self._datum is None:
+            raise CalibrationError("model", "tells neither how well it is known, nor where it was measured")
+        errors = _first_order(
+            self._machine, self._fitted, _stations(self._machine, poses, np.zeros((len(poses[0]), FOLLOWED)))
+        )
+        return errors.tips, errors.slopes, errors.without(self._datum).slopes
 
     def _with_covariance(self, errors: _FirstOrder) -> PredictedError:
         if self._fitted is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,20 @@ if TYPE_CHECKING:
     from ..workspace.study import Study
 
 
+OF_A_BUDGET = {
+    "budget": "error_budget.yaml",
+    "method": "exact",
+    "separate_joints": False,
+    "compare": None,
+    "allow_um": None,
+    "workers": 1,
+    "scheduler": None,
+    "no_page": False,
+    "publish": False,
+}
+"""Options that say something of a budget, and what they are when nobody gives them."""
+
+
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
     from ..machine.geometry import load_geometry
@@ -30,6 +45,8 @@ def run(args: argparse.Namespace) -> int:
     geometry = load_geometry(args.machine)
     if args.clearance_mm is not None:
         geometry = replace(geometry, limits=replace(geometry.limits, clearance=args.clearance_mm * 1e-3))
+    if args.model is not None:
+        return _after_calibration(args, geometry)
     budget = _budget(args.budget, geometry)
     common.mention_compiling("kinematics.solve_pose_many")
     turned = orientations(geometry, (args.tilt_deg, args.tilt_deg, (0.0,)))
@@ -61,6 +78,38 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry) -> int:
+    """Show what a model's calibration leaves, and which measurement would remove most of it."""
+    from ..calibration.pictures import predicted_error_figure
+    from ..calibration.posterior import load_posterior
+    from ..calibration.remaining import measurement_rows, remaining, remaining_json, remaining_text
+    from ..errors import CommandError
+    from ..machine.model import RealMachine
+    from ..machine.model_file import load_model
+    from ..workspace.reach import orientations, reaches
+    from ..workspace.study import COMBINED_POSES, random_poses
+
+    for name, unused in OF_A_BUDGET.items():
+        if getattr(args, name) != unused:
+            problem = f"--{name.replace('_', '-')} has no meaning with --model, which takes the place of a budget"
+            raise CommandError("usage", problem)
+    model = load_model(args.model, geometry)
+    fitted, unknown = load_posterior(model, geometry, args.model)
+    if fitted is None:
+        raise CommandError("model", f"it is not known what {args.model} leaves: {unknown}")
+    common.mention_compiling("model.actual_pose_one")
+    tilts = args.tilt_deg
+    reached = reaches(geometry, orientations(geometry, (tilts, tilts, (0.0,))), args.cells)
+    poses, machine = random_poses(reached, COMBINED_POSES, args.seed), RealMachine(geometry, model)
+    name = f"workspace, α and β of {', '.join(f'{math.degrees(tilt):g}' for tilt in tilts)}°"
+    with common.stage_line() as say:
+        result = remaining(machine, fitted, poses, name, say)
+    common.show(remaining_json(result) if args.json else remaining_text(result))
+    common.write_table(args, measurement_rows(result))
+    common.save_pictures(args, lambda: {"predicted_error.png": predicted_error_figure(machine, fitted)})
+    return 0
+
+
 def _budget(file: str, geometry: HexapodGeometry) -> Budget:
     """Return the budget of a file; what does not fit the machine is refused before the work starts."""
     from ..errors import InputFileError, ModelError
@@ -78,7 +127,6 @@ def _budget(file: str, geometry: HexapodGeometry) -> Budget:
 
 def _names(tilts: tuple[float, ...]) -> tuple[str, ...]:
     """Return the names of every combination of tilts about x and y, in their order."""
-    import math
     from itertools import product
 
     return tuple(f"α {math.degrees(a):g}°, β {math.degrees(b):g}°" for a, b in product(tilts, tilts))

@@ -162,35 +162,42 @@ def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSett
     from ..calibration.fit import fit_model
     from ..calibration.posterior import FittedParameters
     from ..calibration.report import as_json, fit_report
+    from ..machine.model import RealMachine
 
     with common.stage_line() as say:
         fit = fit_model(measured, settings, say)
 
+    fitted = FittedParameters.of(fit)
+
     def pictures() -> dict[str, Figure]:
-        from ..calibration.pictures import fit_figure, left_error_figure, strut_error_figure
+        from ..calibration.pictures import fit_figure, left_error_figure, predicted_error_figure, strut_error_figure
 
         made = {"fit.png": fit_figure(fit)}
         if fit.model.valid_box is not None:
             made["left.png"] = left_error_figure(fit)
+            machine = RealMachine(measured.geometry, fit.model)
+            made["predicted_error.png"] = predicted_error_figure(machine, fitted)
             made["strut_errors.png"] = strut_error_figure(measured.geometry, {"scheme joint": fit.model})
         return made
 
     model = fit.model if args.name is None else replace(fit.model, name=args.name)
-    return _Result(model, fit_report(fit), lambda: as_json(fit), pictures, fit.misfit, FittedParameters.of(fit))
+    return _Result(model, fit_report(fit), lambda: as_json(fit), pictures, fit.misfit, fitted)
 
 
 def _lines(args: argparse.Namespace, measured: MeasurementSet) -> _Result:
     """Fit with scheme lines."""
     from ..calibration.lines import fit_lines
     from ..calibration.lines_report import as_json, report
+    from ..machine.model import RealMachine
 
     fit = fit_lines(measured, args.order or "adjusted-r2", name=args.name or "")
 
     def pictures() -> dict[str, Figure]:
-        from ..calibration.pictures import fitted_lines_figure, strut_error_figure
+        from ..calibration.pictures import fitted_lines_figure, predicted_error_figure, strut_error_figure
 
         of_struts = strut_error_figure(measured.geometry, {fit.model.name: fit.model})
-        return {"lines.png": fitted_lines_figure(fit), "strut_errors.png": of_struts}
+        predicted = predicted_error_figure(RealMachine(measured.geometry, fit.model), None)
+        return {"lines.png": fitted_lines_figure(fit), "strut_errors.png": of_struts, "predicted_error.png": predicted}
 
     text = report(fit, every_line=args.every_line)
     return _Result(fit.model, text, lambda: as_json(fit), pictures, fit.misfit)

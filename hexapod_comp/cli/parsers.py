@@ -330,6 +330,8 @@ def _classify(parser: argparse.ArgumentParser) -> None:
     _machine(add, "positioning_unit.yaml")
     text = "error budget, or the name of a shipped one (default error_budget.yaml)"
     add("--budget", metavar="FILE", default="error_budget.yaml", help=text)
+    text = "in place of a budget: what the fit of this model leaves, and which measurement would remove most of it"
+    add("--model", metavar="FILE", help=text)
     _table_out(add, "the ranking")
     _pictures(add)
     _json(add)

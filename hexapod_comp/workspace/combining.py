@@ -90,16 +90,26 @@ def covariance_vectors(rows: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     size = rows.shape[-1]
     if covariance.shape != (size, size):
         raise CalibrationError("covariance", f"must have shape ({size}, {size}), not {covariance.shape}")
+    return np.swapaxes(rows @ covariance_factor(covariance), 1, 2)
+
+
+def covariance_factor(covariance: np.ndarray) -> np.ndarray:
+    """Return A with A·Aᵀ = a covariance, shape (P, P).
+
+    Raises
+    ------
+    CalibrationError
+        The matrix is no covariance.
+    """
     scale = np.sqrt(np.abs(np.diag(covariance)))
     scale = np.where(scale > 0.0, scale, 1.0)
     normalised = covariance / np.outer(scale, scale)  # parameters of µm and of rad/m in one matrix
     if not (np.isfinite(covariance).all() and np.allclose(normalised, normalised.T, atol=1e-8)):
         raise CalibrationError("covariance", "must be finite and symmetric")
     values, directions = np.linalg.eigh(normalised)
-    if values[0] < -1e-8 * size:
+    if values[0] < -1e-8 * len(covariance):
         raise CalibrationError("covariance", f"must not be negative in any direction, eigenvalue {values[0]:.3g}")
-    factor = scale[:, None] * directions * np.sqrt(np.maximum(values, 0.0))
-    return np.swapaxes(rows @ factor, 1, 2)
+    return scale[:, None] * directions * np.sqrt(np.maximum(values, 0.0))
 
 
 @dataclass(frozen=True)

@@ -142,7 +142,7 @@ def classify(
     errors = budget.single_errors(geometry, shared_platform_joints)
     reaches = (reach(geometry),) if reaches is None else reaches
     extremes = survey(reaches, errors, method, workers, scheduler, progress)
-    vectors = effect_vectors(geometry, errors, *_random_poses(reaches, COMBINED_POSES, seed), LINEAR)
+    vectors = effect_vectors(geometry, errors, *random_poses(reaches, COMBINED_POSES, seed), LINEAR)
     vectors = vectors[np.isfinite(vectors).all(axis=(1, 2))]
     ways = () if allowed is None else (RSS, WORST_CASE)
     return Study(
@@ -163,8 +163,8 @@ def _combined(errors: SingleErrors, vectors: np.ndarray, seed: int) -> Combined:
     )
 
 
-def _random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return platform poses picked from all reaches alike, (n, 3) and (n, 3, 3); all of them where there are few."""
+def random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return platform poses picked from all reaches alike, (n, 3), m, and (n, 3, 3); all where there are few."""
     sizes = np.array([int(one.within.sum()) for one in reaches])
     first = np.cumsum([0, *sizes])
     chosen = np.random.default_rng(seed).choice(first[-1], min(count, first[-1]), replace=False)
@@ -191,7 +191,7 @@ def compared(
         Picks them.
     """
     moved = errors.select(errors.part != TOOL)
-    positions, rotations = _random_poses(reaches, count, seed)
+    positions, rotations = random_poses(reaches, count, seed)
     exact = effects(geometry, moved, positions, rotations, EXACT)[..., 0]
     linear = effects(geometry, moved, positions, rotations, LINEAR)[..., 0]
     walked, drift = np.empty_like(exact), 0.0

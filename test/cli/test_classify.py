@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calibration_helpers import fitted_model
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp import cli
@@ -314,6 +315,45 @@ def test_an_allocation_says_of_every_type_what_it_may_be(tmp_path: Path) -> None
     text = classify(*QUICK, "--allow-um", 10)[1]
     assert text.count("nothing is left") == 2 * len(budget)
     assert "may be, equal parts" in text
+
+
+def test_a_model_in_place_of_a_budget_says_what_is_left_and_what_to_measure(tmp_path: Path) -> None:
+    """Six known numbers of 2 µm each leave about as much; the work frame is named, units are in the keys."""
+    model = fitted_model(tmp_path)
+    machine = ("--machine", "paper", "--model", model, "--cells", 6, "--tilt-deg", 0)
+    code, out, err = classify(*machine)
+    assert (code, err) == (0, "")
+    parts = ("model 'fitted'", "measured box, level tool", "workspace, α and β of 0°", "tool in work: x, y, z mm")
+    parts += ("if these parameters were known exactly", "linear laser, body diagonals", "roll, lines along z")
+    for part in parts:
+        assert part in out, part
+    content = json.loads(classify(*machine, "--json", "--out", tmp_path / "r.csv", "--pictures", tmp_path / "p")[1])
+    assert content["frame"] == "work"
+    assert [part["where"] for part in content["left"]] == ["measured box, level tool", "workspace, α and β of 0°"]
+    assert 0.2e-6 < content["left"][0]["rms_m"] < 4e-6
+    assert content["left"][0]["rms_m"] < content["left"][1]["rms_m"] < content["left"][1]["machines_95_m"]
+    with open(tmp_path / "r.csv", newline="", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    measured = content["if_measured"]
+    assert [row["measurement"] for row in rows] == [entry["name"] for entry in measured]
+    left = [entry["left_workspace_m"] for entry in measured]
+    assert left == sorted(left)
+    assert max(left) <= content["left"][1]["rms_m"] * (1 + 1e-9)
+    assert float(rows[0]["left_workspace_um"]) == pytest.approx(left[0] * 1e6, abs=1e-5)
+    assert (tmp_path / "p" / "predicted_error.png").read_bytes().startswith(PNG)
+
+
+def test_a_model_of_which_nobody_knows_how_good_it_is_leaves_nobody_knows_what() -> None:
+    code, out, err = classify("--machine", "paper", "--model", "paper_machine")
+    assert (code, out) == (2, "")
+    assert "it is not known what paper_machine leaves: model 'virtual machine' carries no covariance of a fit" in err
+
+
+@pytest.mark.parametrize("option", ["--allow-um 3", "--workers 2", "--compare 3", "--separate-joints", "--publish"])
+def test_what_a_model_has_no_use_for_is_refused(tmp_path: Path, option: str) -> None:
+    code, out, err = classify("--machine", "paper", "--model", fitted_model(tmp_path), *option.split())
+    assert (code, out) == (2, "")
+    assert f"{option.split()[0]} has no meaning with --model" in err
 
 
 # What is refused: nothing is written, one line says what and where.

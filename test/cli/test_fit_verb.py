@@ -232,7 +232,7 @@ def test_covariance_is_one(done: Calibration) -> None:
 
 def test_pictures_are_pictures(done: Calibration) -> None:
     pictures = sorted(done.file("pictures").iterdir())
-    assert [path.name for path in pictures] == ["fit.png", "left.png", "strut_errors.png"]
+    assert [path.name for path in pictures] == ["fit.png", "left.png", "predicted_error.png", "strut_errors.png"]
     for path in pictures:
         content = path.read_bytes()
         assert content.startswith(PNG)
@@ -297,7 +297,7 @@ def test_scheme_lines(hexapod: Program, done: Calibration, tmp_path: Path) -> No
     np.testing.assert_allclose(model.field.box, BOX, atol=1e-12)
     assert model.origin.sources[0][0] == "measured.csv"
     names = [path.name for path in sorted((tmp_path / "pictures").iterdir())]
-    assert names == ["lines.png", "strut_errors.png"]
+    assert names == ["lines.png", "predicted_error.png", "strut_errors.png"]
     assert (tmp_path / "pictures" / "lines.png").read_bytes().startswith(PNG)
 
 
@@ -315,7 +315,9 @@ def test_json_of_scheme_lines(hexapod: Program, done: Calibration, tmp_path: Pat
     options = ("--scheme", "lines", "--json", "--out", tmp_path / "m.yaml", "--pictures", tmp_path / "pictures")
     code, out, err = hexapod("fit", done.measured, *options)
     assert code == 0
-    assert err.splitlines() == [f"picture: {tmp_path / 'pictures' / n}" for n in ("lines.png", "strut_errors.png")]
+    assert err.splitlines() == [
+        f"picture: {tmp_path / 'pictures' / n}" for n in ("lines.png", "strut_errors.png", "predicted_error.png")
+    ]
     content = json.loads(out)
     assert (content["machine"], content["scheme"], len(content["lines"])) == ("paper", "lines", 42)
     assert [len(axis) for axis in content["grid_m"]] == [3, 3, 2]

@@ -5,11 +5,9 @@ What should be said comes from the machine's own forward run; the spread from th
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 from collections.abc import Iterator
-from pathlib import Path
 
 import calibration_helpers as small
 import numpy as np
@@ -21,8 +19,6 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from node_helpers import RELIABLE, Bench
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
-from hexapod_comp.calibration.posterior import FittedParameters, save_with_posterior
 from hexapod_comp.machine.kinematics import Structure, strut_lengths
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
@@ -51,20 +47,6 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[PredictionProcess]:
     return found
 
 
-def fitted_model(folder: Path, offset: float = 30 * UM) -> Path:
-    """Write a model with all struts too long by as much, every parameter known to 2 µm, and its posterior."""
-    grid = np.stack(np.meshgrid([-0.1, 0.1], [-0.1, 0.1], [0.38, 0.45]), axis=-1).reshape(-1, 3)
-    readings = small.scattered(small.paper(), [Pose(p, np.eye(3)) for p in grid])
-    space = ParameterSpace(readings, FitSettings(blocks=()))
-    x = np.zeros(space.size)
-    x[-6:] = offset
-    model = space.model(x, "fitted")
-    model = dataclasses.replace(model, origin=dataclasses.replace(model.origin, date="2026-01-31"))
-    covariance = (2 * UM) ** 2 * np.eye(space.size)
-    save_with_posterior(model, FittedParameters(space, x, covariance, np.ones(1), np.ones(5)), folder / "fitted.yaml")
-    return folder / "fitted.yaml"
-
-
 def listen(bench: Bench, *topics: str) -> None:
     for topic in topics:
         bench.witness.create_subscription(PoseWithCovarianceStamped, topic, bench.seen[topic].append, RELIABLE)
@@ -75,7 +57,7 @@ def test_the_topics_say_what_the_machine_would_do_and_how_well_that_is_known(ben
 
     Of the covariance: known struts and joints of 2 µm make the tool known to about as much; the datum takes most.
     """
-    bench.compensator(model_file=str(fitted_model(tmp_path)), ramp_rate=1.0)
+    bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
     geometry = small.paper()
     answer = bench.ask(geometry.home)
     listen(bench, STANDING, ALIGNED)
@@ -116,7 +98,7 @@ def test_without_a_fit_the_covariance_is_nan_never_zero(bench):
 
 def test_nothing_is_worked_out_while_nobody_listens(bench, started, tmp_path):
     """No process at all, until somebody subscribes; and it goes when they leave."""
-    node = bench.compensator(model_file=str(fitted_model(tmp_path)), ramp_rate=1.0)
+    node = bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
     bench.ask(small.paper().home)
     looks = []
     predicted = node._outputs._predicted
@@ -136,7 +118,7 @@ def test_nothing_is_worked_out_while_nobody_listens(bench, started, tmp_path):
 
 
 def test_a_process_that_dies_is_told_once_and_stops_nothing(bench, started, tmp_path):
-    bench.compensator(model_file=str(fitted_model(tmp_path)), ramp_rate=1.0)
+    bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
     bench.ask(small.paper().home)
     listen(bench, STANDING)
     bench.until(lambda: bench.seen[STANDING], "predicted error", STARTED)
@@ -147,13 +129,13 @@ def test_a_process_that_dies_is_told_once_and_stops_nothing(bench, started, tmp_
 
 
 def test_a_new_model_is_predicted_with(bench, tmp_path):
-    path = fitted_model(tmp_path)
+    path = small.fitted_model(tmp_path)
     bench.compensator(model_file=str(path), ramp_rate=1.0)
     bench.ask(small.paper().home)
     listen(bench, STANDING)
     bench.until(lambda: bench.seen[STANDING], "predicted error", STARTED)
     before = bench.seen[STANDING][-1].pose.pose.position.z
-    fitted_model(tmp_path, 60 * UM)
+    small.fitted_model(tmp_path, 60 * UM)
     loaded = bench.begin("reload_model")
     bench.until(loaded.done, "the new model", STARTED)
     assert loaded.result().success
