@@ -252,8 +252,8 @@ def remaining_text(result: Remaining) -> str:
         f"covariance of the fit's {result.parameters} parameters.\nThe datum is aligned over the measured box. Where "
         "nothing was measured, only what the fit's parameters describe counts."
     )
-    titles = ("where", "poses", "RMS µm", "worst pose µm", "there, tool in work: x, y, z mm")
-    titles += ("95 % of machines below µm", "rotation µrad", "datum as it stands, RMS µm")
+    titles = ["where", "poses", "RMS µm", "worst pose µm", "there, tool in work: x, y, z mm"]
+    titles += ["95 % of machines below µm", "rotation µrad", "datum as it stands, RMS µm"]
     rows = [_left_row(part) for part in result.left]
     noise = ", ".join(f"{name} {value * 1e6:g}" for name, value in DEFAULT_UNCERTAINTY.items())
     return "\n\n".join(

@@ -240,8 +240,8 @@ one of shells for each error type) and, with plotly installed, page.html, which 
 
 --tilt-deg says which orientations: every combination of the tilts about x and y.
 
---model takes what a fit does not know of its model in place of a budget: what is left of the tool's error in the measured
-box and in the workspace (µm, frame work), which parameters make it up, and which measurement would remove most of it.
+--model takes the covariance of a fit in place of a budget: what is left of the tool's error in the measured box and in
+the workspace (µm; places in work), which parameters make it up, and which measurement would remove most of it.
 
 example:
   $ hexapod_comp classify --pictures out

@@ -62,8 +62,8 @@ def test_the_measurement_that_is_recommended_does_what_is_foretold(result: Remai
     assert again.left[1].rms[0] == pytest.approx(foretold, rel=0.25)
 
 
-def test_what_is_left_is_what_the_prediction_says_it_knows(lines: Fitted, result: Remaining) -> None:
-    """Standard deviations that :mod:`test_prediction` draws; RMS over the poses. A drawn machine's worst is beyond it."""
+def test_what_is_left_is_what_the_prediction_knows(lines: Fitted, result: Remaining) -> None:
+    """Standard deviations that :mod:`test_prediction` draws; RMS over poses. A drawn machine's worst is beyond."""
     poses = tilted()
     standing, aligned = ErrorPredictor(*lines).predict(poses)
     assert aligned is not None
