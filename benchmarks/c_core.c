@@ -1,12 +1,21 @@
 /* Loops around the C core and around LinuxCNC's inverse kinematics, timed in one thread; linked with an export. */
 #define _POSIX_C_SOURCE 200809L
 
+#include <math.h>
 #include <time.h>
 
 #include "hexapod_comp.h"
 #include "hexapod_model.h"
 
 #define BINS 4000 /* of 10 ns */
+
+static hc_time made(double seconds)
+{
+    hc_time time;
+    time.made = seconds;
+    time.received = NAN;
+    return time;
+}
 
 /* Processor time of this thread, s: others on the machine do not count. */
 static double seconds(void)
@@ -43,7 +52,7 @@ double commands_many(long count, long rounds, const double *poses, const double 
     begun = seconds();
     for (k = 0; k < rounds; k++) {
         for (n = 0; n < count; n++) {
-            if (hc_command(&state, poses + 7 * n, 1e-3 * (double)(k * count + n), 0, &answer) != HC_OK) {
+            if (hc_command(&state, poses + 7 * n, made(1e-3 * (double)(k * count + n)), 0, &answer) != HC_OK) {
                 return -1.0;
             }
         }
@@ -62,7 +71,7 @@ double estimates_many(long count, long rounds, const double *poses, const double
     begin(&state, warm);
     for (k = 0; k < rounds; k++) {
         for (n = 0; n < count; n++) {
-            hc_command(&state, poses + 7 * n, 1e-3 * (double)(k * count + n), 0, &answer);
+            hc_command(&state, poses + 7 * n, made(1e-3 * (double)(k * count + n)), 0, &answer);
             begun = seconds();
             if (hc_estimate(&state, answer.command, &where) != HC_OK) {
                 return -1.0;
@@ -98,7 +107,7 @@ double each_command(long count, long rounds, const double *poses, const double *
             const double begun = wall();
             double took;
             long bin;
-            hc_command(&state, poses + 7 * n, 1e-3 * (double)(k * count + n), 0, &answer);
+            hc_command(&state, poses + 7 * n, made(1e-3 * (double)(k * count + n)), 0, &answer);
             took = wall() - begun;
             bin = (long)(took * 1e8);
             bins[bin < BINS ? bin : BINS - 1]++;

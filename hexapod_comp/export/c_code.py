@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..compensation.compensator import DEFAULT_RAMP_RATE, Compensator
-from ..errors import HexapodError
+from ..errors import HexapodError, TooEarlyError
 from ..formats.outputs import write_text
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel, RealMachine, Temperatures
@@ -42,6 +42,9 @@ STATUS = (
     "not_finite",
     "correction",
     "step",
+    "speed",
+    "early",
+    "acceleration",
     "not_converged",
     "outside_field",
     "quaternion",
@@ -287,6 +290,8 @@ class Recorder:
 def status_of(error: HexapodError) -> int:
     """Return the hc_status of what the Python compensator raises."""
     name = {"bad_model": "temperature"}.get(error.reason, error.reason)
+    if isinstance(error, TooEarlyError):
+        name = "early"
     if name == "stroke":
         name = "stroke_short" if error.value < error.limit else "stroke_long"  # type: ignore[attr-defined]
     return STATUS.index(name)

@@ -7,6 +7,7 @@ state is the caller's, so it lies here, field by field as in ``hexapod_comp.h``.
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Mapping
 from ctypes import Structure, byref, c_char_p, c_double, c_int, c_void_p
 from pathlib import Path
@@ -43,7 +44,18 @@ class CLast(Structure):
         ("enabled", c_int),
         ("changed", c_int),
         ("resumes", c_int),
+        ("received", c_double),
+        ("published", c_double),
+        ("ahead_by_stamp", c_double * 6),
+        ("ahead_by_receipt", c_double * 6),
+        ("smooth_speed", c_double * 6),
     )
+
+
+class CTime(Structure):
+    """hc_time: when a command was made and received, s."""
+
+    _fields_ = (("made", c_double), ("received", c_double))
 
 
 class CState(Structure):
@@ -146,18 +158,24 @@ class CCompensator:
         """Corrections of the last command, m."""
         return np.array(self.state.last.correction)
 
-    def step(self, numbers: tuple[float, ...], time: float, frame: np.ndarray | None = None) -> np.ndarray:
+    def step(
+        self, numbers: tuple[float, ...], time: float, frame: np.ndarray | None = None, received: float = math.nan
+    ) -> np.ndarray:
         """Compensate one tool pose: position, m, and quaternion, seen from `frame`; return strut commands, m."""
         seen_from = None if frame is None else byref(CPose(tuple(frame[:3]), tuple(frame[3:])))
-        pose = (c_double * 7)(*numbers)
-        self._check(self._library.hc_command(byref(self.state), pose, c_double(time), seen_from, byref(self.answer)))
+        pose, times = (c_double * 7)(*numbers), CTime(time, received)
+        self._check(self._library.hc_command(byref(self.state), pose, times, seen_from, byref(self.answer)))
         return self.command
 
     def step_lengths(self, nominal: np.ndarray, time: float) -> np.ndarray:
         """Compensate nominal strut lengths, m; return strut commands, m."""
-        lengths = (c_double * 6)(*nominal)
-        self._check(self._library.hc_command_lengths(byref(self.state), lengths, c_double(time), byref(self.answer)))
+        lengths, times = (c_double * 6)(*nominal), CTime(time, math.nan)
+        self._check(self._library.hc_command_lengths(byref(self.state), lengths, times, byref(self.answer)))
         return self.command
+
+    def published(self, time: float) -> None:
+        """Take notice that the last command had gone out at a time, s."""
+        self._library.hc_published(byref(self.state), c_double(time))
 
     def estimate(self, struts: np.ndarray) -> np.ndarray:
         """Return ``pose_tool_in_base`` for strut readings, m: position, then the rotation matrix by rows."""
@@ -234,7 +252,7 @@ def load_library(path: str | Path) -> Any:
         library.hc_machine.restype = library.hc_reason.restype = c_void_p
         size = library.hc_state_size()
         library.hc_reason.restype = c_char_p
-        library.hc_init.restype = None
+        library.hc_init.restype = library.hc_published.restype = None
         library.hc_init.argtypes = (c_void_p, c_void_p, c_double)
     except (OSError, AttributeError) as error:
         raise InputFileError(str(path), "", f"is no library made of an export --c: {error}") from error

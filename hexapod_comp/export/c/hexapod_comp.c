@@ -20,6 +20,10 @@
 #define COPLANAR 1e-3          /* smaller volumes of three unit struts need pivoting */
 #define SMALLEST_PIVOT 1e-14
 #define LONGEST_RAMP_STEP 0.02 /* s */
+#define AHEAD_BY_STAMP 5e-3    /* s of motion at the largest speed that a command may be ahead by its stamp ... */
+#define AHEAD_BY_RECEIPT 8e-4  /* ... and by its receipt */
+#define SHORTEST_PERIOD 1e-4   /* s */
+#define SMOOTHED_OVER 0.02     /* s */
 #define QUATERNION_TOLERANCE 1e-3
 #define REFERENCE_TEMPERATURE 20.0
 #define LOWEST_TEMPERATURE (-40.0)
@@ -1006,10 +1010,13 @@ static int run_backwards(const hc_state *state, const hc_pose *platform, double 
 
 static void shrink_ramp(const hc_last *last, hc_last *next, double ramp_rate)
 {
-    const double pause = next->time - last->time;
-    const double step = pause != pause ? 0.0 : ramp_rate * fmin(fmax(pause, 0.0), LONGEST_RAMP_STEP);
-    double largest = 0.0, keep;
+    const double by_stamp = next->time - last->time;
+    const double pause = by_stamp == by_stamp ? by_stamp : next->received - last->received;
+    double step = 0.0, largest = 0.0, keep;
     int i;
+    if (pause == pause && last->nominal[0] == last->nominal[0]) { /* the first command stands where the struts are */
+        step = ramp_rate * fmin(fmax(pause, 0.0), LONGEST_RAMP_STEP);
+    }
     for (i = 0; i < 6; i++) {
         if (last->changed && last->correction[i] == last->correction[i]) {
             next->ramp[i] = last->correction[i] - next->correction[i];
@@ -1022,8 +1029,72 @@ static void shrink_ramp(const hc_last *last, hc_last *next, double ramp_rate)
     }
 }
 
-/* check_command: correction and steps; `compensated` tells the stage */
-static finding check_command(const hc_last *last, const hc_last *next, const hc_limits *limits, int *compensated)
+/* elapsed: time since the last command by the stamps and by the receipt, s; -1: not known */
+static hc_time elapsed(const hc_last *last, const hc_last *next)
+{
+    hc_time since;
+    since.made = next->time - last->time;
+    since.received = next->received - last->received;
+    since.made = since.made >= 0.0 ? since.made : -1.0;
+    since.received = since.received >= 0.0 ? since.received : -1.0;
+    return since;
+}
+
+/* The struts' speed by both clocks; writes how far they are ahead of what is allowed. */
+static finding check_speed(const hc_last *last, hc_last *next, double limit)
+{
+    const hc_time since = elapsed(last, next);
+    const double late = last->published - last->received, held_up = late == late ? late : 0.0;
+    double speed = 0.0, wait = 0.0;
+    int hurried = -1, early = -1, i;
+    for (i = 0; i < 6; i++) {
+        const double moved = fabs(next->command[i] - last->command[i]), change = moved == moved ? moved : 0.0;
+        if (since.made >= 0.0) {
+            const double ahead = fmax(0.0, last->ahead_by_stamp[i] + change - limit * since.made);
+            next->ahead_by_stamp[i] = ahead;
+            if (ahead > limit * AHEAD_BY_STAMP && change > speed * since.made) {
+                hurried = i;
+                speed = change / fmax(since.made, 1e-9);
+            }
+        }
+        if (since.received >= 0.0) {
+            double ahead = fmax(0.0, last->ahead_by_receipt[i] - limit * held_up);
+            ahead = fmax(0.0, ahead + change - limit * (since.received - held_up));
+            next->ahead_by_receipt[i] = ahead;
+            if (ahead / limit - AHEAD_BY_RECEIPT > wait) {
+                early = i;
+                wait = ahead / limit - AHEAD_BY_RECEIPT;
+            }
+        }
+    }
+    if (hurried >= 0) {
+        return found(HC_SPEED, hurried, speed);
+    }
+    return early >= 0 ? found(HC_EARLY, early, wait) : found(HC_OK, -1, 0.0);
+}
+
+/* How fast the struts' smoothed speeds change; writes them. */
+static finding check_acceleration(const hc_last *last, hc_last *next, double limit)
+{
+    const hc_time since = elapsed(last, next);
+    const double period = fmax(since.made >= 0.0 ? since.made : since.received, SHORTEST_PERIOD);
+    const double keep = exp(-period / SMOOTHED_OVER);
+    finding worst = found(HC_OK, -1, limit);
+    int i;
+    for (i = 0; i < 6; i++) {
+        const double before = last->smooth_speed[i], speed = (next->command[i] - last->command[i]) / period;
+        const double smooth = speed == speed ? keep * before + (1.0 - keep) * speed : 0.0;
+        const double acceleration = fabs(smooth - before) / period;
+        next->smooth_speed[i] = smooth;
+        if (acceleration > worst.value) {
+            worst = found(HC_ACCELERATION, i, acceleration);
+        }
+    }
+    return worst;
+}
+
+/* check_command: correction, steps, speed and acceleration; `compensated` tells the stage */
+static finding check_command(const hc_last *last, hc_last *next, const hc_limits *limits, int *compensated)
 {
     finding f;
     int i;
@@ -1038,7 +1109,14 @@ static finding check_command(const hc_last *last, const hc_last *next, const hc_
         *compensated = 0;
         return f;
     }
-    return check_change(next->command, last->command, limits->step);
+    f = check_change(next->command, last->command, limits->step);
+    if (f.status == HC_OK) {
+        f = check_speed(last, next, limits->speed);
+    }
+    if (f.status == HC_OK && limits->acceleration > 0.0) {
+        f = check_acceleration(last, next, limits->acceleration);
+    }
+    return f;
 }
 
 /* read_pose: a position and a quaternion as a pose */
@@ -1062,7 +1140,7 @@ static hc_status read_pose(const double n[7], hc_pose *pose)
 }
 
 /* compensate_one from the platform's pose on: work out the next command; `next` counts only when nothing was found */
-static finding work_out(const hc_state *state, const hc_pose *platform, double time, hc_last *next, hc_answer *answer)
+static finding work_out(const hc_state *state, const hc_pose *platform, hc_time time, hc_last *next, hc_answer *answer)
 {
     const hc_model *model = state->model;
     const hc_last *last = &state->last;
@@ -1090,7 +1168,9 @@ static finding work_out(const hc_state *state, const hc_pose *platform, double t
     for (i = 0; i < 6; i++) {
         next->correction[i] = (double)last->enabled * (next->command[i] - next->nominal[i]);
     }
-    next->time = time;
+    next->time = time.made;
+    next->received = time.received;
+    next->published = NAN;
     next->changed = 0;
     next->resumes = 0;
     shrink_ramp(last, next, state->ramp_rate);
@@ -1140,7 +1220,7 @@ static void fill_answer(const hc_last *last, finding f, hc_answer *answer)
 }
 
 /* Compensator.step from the platform's pose on, when there is one */
-static hc_status command_platform(hc_state *state, hc_status status, const hc_pose *platform, double time,
+static hc_status command_platform(hc_state *state, hc_status status, const hc_pose *platform, hc_time time,
                                   hc_answer *answer)
 {
     hc_last next;
@@ -1164,7 +1244,7 @@ static hc_status command_platform(hc_state *state, hc_status status, const hc_po
     return f.status;
 }
 
-hc_status hc_command(hc_state *state, const double numbers[7], double time, const hc_pose *frame, hc_answer *answer)
+hc_status hc_command(hc_state *state, const double numbers[7], hc_time time, const hc_pose *frame, hc_answer *answer)
 {
     const hc_model *model = state->model;
     hc_pose pose, platform;
@@ -1176,7 +1256,7 @@ hc_status hc_command(hc_state *state, const double numbers[7], double time, cons
     return command_platform(state, status, &platform, time, answer);
 }
 
-hc_status hc_command_lengths(hc_state *state, const double nominal[6], double time, hc_answer *answer)
+hc_status hc_command_lengths(hc_state *state, const double nominal[6], hc_time time, hc_answer *answer)
 {
     const hc_model *model = state->model;
     hc_pose platform = state->last.platform;
@@ -1184,6 +1264,11 @@ hc_status hc_command_lengths(hc_state *state, const double nominal[6], double ti
     const hc_status status = solve_pose(model->base.joints, model->platform.joints, nominal, &model->limits, &platform,
                                         &unused);
     return command_platform(state, status, &platform, time, answer);
+}
+
+void hc_published(hc_state *state, double time)
+{
+    state->last.published = time;
 }
 
 /* actual_pose_one: the model forwards; lengths and screw rotation are settled in turn */
@@ -1305,6 +1390,7 @@ static hc_status check_whole(const hc_state *state)
     hc_state trial = *state;
     hc_last unused;
     hc_answer answer;
+    hc_time unknown;
     int i, home = 0;
     for (i = 0; i < 6; i++) {
         home = home || !finite_number(state->last.nominal[i]);
@@ -1314,9 +1400,12 @@ static hc_status check_whole(const hc_state *state)
         trial.last.ramp[i] = 0.0;
     }
     trial.last.time = NAN;
+    trial.last.received = NAN;
+    unknown.made = NAN;
+    unknown.received = NAN;
     trial.last.enabled = 1;
     trial.last.changed = 0;
-    return work_out(&trial, home ? &state->model->home : &state->last.platform, NAN, &unused, &answer).status;
+    return work_out(&trial, home ? &state->model->home : &state->last.platform, unknown, &unused, &answer).status;
 }
 
 hc_status hc_enable(hc_state *state, int enabled)
@@ -1345,6 +1434,8 @@ static void forget(hc_state *state)
     for (i = 0; i < 6; i++) {
         last->nominal[i] = NAN;
         last->command[i] = NAN;
+        last->ahead_by_stamp[i] = 0.0;
+        last->smooth_speed[i] = 0.0;
     }
     last->time = NAN;
     last->resumes = 0;
@@ -1379,7 +1470,10 @@ void hc_init(hc_state *state, const hc_model *model, double ramp_rate)
     for (i = 0; i < 6; i++) {
         state->last.correction[i] = NAN;
         state->last.ramp[i] = 0.0;
+        state->last.ahead_by_receipt[i] = 0.0;
     }
+    state->last.received = NAN;
+    state->last.published = NAN;
     state->last.platform = model->home;
     state->last.model = model->home;
     state->last.enabled = 1;
@@ -1401,6 +1495,9 @@ const char *hc_reason(hc_status status)
     case HC_NOT_FINITE: return "not_finite";
     case HC_CORRECTION: return "correction";
     case HC_STEP: return "step";
+    case HC_SPEED: return "speed";
+    case HC_EARLY: return "speed";
+    case HC_ACCELERATION: return "acceleration";
     case HC_NOT_CONVERGED: return "not_converged";
     case HC_OUTSIDE_FIELD: return "outside_field";
     case HC_QUATERNION: return "quaternion";

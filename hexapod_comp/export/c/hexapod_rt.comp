@@ -27,7 +27,7 @@ param rw float temperature-step = 0.01 "A temperature that has changed by less i
 include "hexapod_comp.c";
 include "hexapod_model.h";
 variable hc_state core;
-variable double elapsed;
+variable double elapsed_time;
 variable double temperature_now[8];
 variable int started;
 variable int begun;
@@ -81,7 +81,7 @@ FUNCTION(correct)
     const double seconds = (double)period * 1e-9;
     int i, good = 0;
     begin_once(&core, &begun, temperature_now);
-    elapsed += seconds;
+    elapsed_time += seconds;
     for (i = 0; i < 6; i++) {
         nominal[i] = joint_pos_cmd(i) * unit;
         standing[i] = correction(i) * unit;
@@ -95,10 +95,13 @@ FUNCTION(correct)
     hc_enable(&core, enable);
     if (machine_on) {
         hc_answer answer;
+        hc_time now;
+        now.made = elapsed_time;
+        now.received = NAN;
         if (!started) {
             start_from(&core, standing);
         }
-        reason = (int)hc_command_lengths(&core, nominal, elapsed, &answer);
+        reason = (int)hc_command_lengths(&core, nominal, now, &answer);
         good = reason == HC_OK;
         for (i = 0; i < 6 && good; i++) {
             standing[i] = answer.correction[i];

@@ -31,6 +31,7 @@ static hc_status take(hc_state *state, const hexapod_vector *vector, double leng
 {
     hc_answer answer;
     hc_estimated estimated;
+    hc_time time;
     hc_status status = HC_OK;
     int i;
     switch (vector->kind) {
@@ -46,7 +47,9 @@ static hc_status take(hc_state *state, const hexapod_vector *vector, double leng
         }
         return status;
     default:
-        status = hc_command(state, vector->input, vector->time, NULL, &answer);
+        time.made = vector->time;
+        time.received = NAN;
+        status = hc_command(state, vector->input, time, NULL, &answer);
         for (i = 0; i < 6; i++) {
             lengths[i] = answer.command[i];
         }
