@@ -255,6 +255,7 @@ class _PathCheck:
     def check_moves(self, positions: np.ndarray, rotations: np.ndarray, progress: Callable[[int], object]) -> None:
         """Check the rows, then the moves between those that are within their limits."""
         self.check_rows(positions, rotations, False, lambda rows: None)
+        progress(1)  # no move leads to the first row
         bad = np.zeros(self.count, dtype=bool)
         bad[[row for worst in self.worst.values() for row, _ in worst.broken]] = True
         self.unchecked[1:] = bad[1:] | bad[:-1]

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from hexapod_comp.errors import KinematicsError, NotFiniteError, OtherAssemblyModeError, SingularError, UnreachableError
 from hexapod_comp.kernels import kinematics as kernels
 from hexapod_comp.machine.assembly import assembly_modes, mode_objections, platform_pair_gap, working_mode
+from hexapod_comp.machine.elimination import joint_circles, start_angles
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import Structure
 from hexapod_comp.pose import Pose
@@ -63,6 +64,18 @@ def workspace_poses(geometry: HexapodGeometry, count: int, seed: int) -> list[Po
         Pose.from_angles(geometry.home.position + rng.uniform(-0.05, 0.05, 3), np.deg2rad(rng.uniform(-30.0, 30.0, 3)))
         for _ in range(count)
     ]
+
+
+def test_each_of_the_three_eliminations_finds_the_pose(geometry, structure):
+    """Each eliminates two of the joints' angles. Where one loses a root to rounding the others have it, so that a
+    fault in one would not be seen in the modes."""
+    for pose in workspace_poses(geometry, 10, seed=8):
+        joints = pose.position + structure.platform_joints[::2] @ pose.rotation.T
+        sides = np.linalg.norm(joints - joints[[1, 2, 0]], axis=1)
+        circles = joint_circles(structure.base_joints, distances(structure, pose), 1e-9)
+        angles = start_angles(circles, sides)[..., None]
+        points = circles[:, 0] + np.cos(angles) * circles[:, 1] + np.sin(angles) * circles[:, 2]
+        assert (np.abs(points - joints).max(axis=(1, 2)) < 1e-6).sum() >= 3
 
 
 def random_machine(seed: int, planar: bool) -> tuple[Structure, np.ndarray]:

@@ -192,6 +192,15 @@ def test_largest_step(way: float) -> None:
         assert caught.value.value == pytest.approx(way * step, rel=1e-9)
 
 
+@pytest.mark.parametrize("mode", ["poses", "stream", "moves"])
+def test_progress_counts_every_row_once(mode: str) -> None:
+    done: list[int] = []
+    poses = [Pose([0.0, 0.0, 0.4 + 1e-4 * n], np.eye(3)) for n in range(130)]
+    check(paper_geometry(), MachineModel("paper"), poses, mode, progress=done.append)
+    assert sum(done) == len(poses)
+    assert min(done) > 0
+
+
 def test_compensated_lengths_are_checked_too() -> None:
     """Nominally 30 µm inside; the correction of +50 µm leads 20 µm outside."""
     length = np.linalg.norm(struts(TILTED), axis=1)[2]
