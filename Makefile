@@ -30,7 +30,7 @@ VERSIONS ?= 3.10 3.11 3.12 3.13
 .NOTPARALLEL:
 
 help:
-	@echo 'make demo    run the compensator against a simulated machine; figures, out/demo.png'
+	@echo 'make demo    measure, fit and run a machine with hidden errors; figures, out/demo.png'
 	@echo 'make test    ruff, mypy and the tests, in two processes'
 	@echo 'make test-all     the same with every Python found here, each in .venv-3.x; VERSIONS="3.10 3.13" for some'
 	@echo 'make docs    the pages of doc/ as a site with a search and the Python reference, in out/doc'

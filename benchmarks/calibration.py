@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.smooth_imperfections import with_length_map, with_wavy_field
+from benchmarks.smooth_imperfections import with_wavy_field
 from hexapod_comp.calibration.evaluation import Worth, worth
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.lines import fit_lines
@@ -33,7 +33,7 @@ from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.measurements.campaign import Campaign, load_campaign, template
-from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
+from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model, with_length_map
 from hexapod_comp.virtual.instruments import measure
 
 CONFIG = Path(__file__).resolve().parents[1] / "config"

@@ -1,7 +1,6 @@
-"""Imperfections that no model has exactly: random waves in the struts' lengths and in space.
+"""Imperfections in space that no model has exactly: sums of sine waves of random length, direction and phase.
 
-A calibration is only tried honestly on errors that are not made of its own terms. These are sums of sine
-waves of random length, direction and phase.
+A calibration is only tried honestly on errors that are not made of its own terms.
 """
 
 from __future__ import annotations
@@ -11,51 +10,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.polynomial import polynomial
 
-from hexapod_comp.errors import ModelError
 from hexapod_comp.machine.field import GridField
-from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.model import MachineModel
+from hexapod_comp.virtual.imperfections import seeded
 
-MAP_WAVES, FIELD_WAVES = 8, 6
-"""Waves added up in each strut, and in each component of a field."""
-
-KNOTS_PER_WAVE = 15
-"""Knots of a length map on its shortest wave: the spline between them is then the wave."""
+FIELD_WAVES = 6
+"""Waves added up in each component of a field."""
 
 FIELD_NODES, FIELD_POWERS = 17, 12
 """Lines of a wavy field along y and z, and coefficients along x."""
-
-
-def with_length_map(
-    model: MachineModel,
-    geometry: HexapodGeometry,
-    seed: int,
-    rms: float = 5e-6,
-    waves: tuple[float, float] = (0.06, 0.2),
-) -> MachineModel:
-    """Return a model whose struts have a smooth length error as well.
-
-    Parameters
-    ----------
-    model : MachineModel
-        The machine so far.
-    geometry : HexapodGeometry
-        Tells the struts' stroke.
-    seed : int
-        0 or above.
-    rms : float
-        Root mean square of each strut's error over its stroke, m.
-    waves : (float, float)
-        Shortest and longest wave, m.
-    """
-    rng = _generator(seed, "length map")
-    low, high = geometry.limits.stroke[:, 0].min(), geometry.limits.stroke[:, 1].max()
-    knots = np.linspace(low, high, int(np.ceil((high - low) / waves[0] * KNOTS_PER_WAVE)) + 1)
-    lengths, phases = rng.uniform(*waves, (6, MAP_WAVES)), rng.uniform(0.0, 2.0 * np.pi, (6, MAP_WAVES))
-    sizes = rng.standard_normal((6, MAP_WAVES))
-    values = np.einsum("sw,swk->sk", sizes, np.sin(2.0 * np.pi * knots / lengths[..., None] + phases[..., None]))
-    values *= rms / np.sqrt((values**2).mean(axis=1, keepdims=True))
-    return replace(model, struts=replace(model.struts, map_knots=knots, map_values=values))
 
 
 def with_wavy_field(
@@ -81,7 +44,7 @@ def with_wavy_field(
     waves : (float, float)
         Shortest and longest wave, m.
     """
-    rng = _generator(seed, "field")
+    rng = seeded(seed, "field")
     vectors = rng.standard_normal((6, FIELD_WAVES, 3))
     vectors *= 2.0 * np.pi / (np.linalg.norm(vectors, axis=2) * rng.uniform(*waves, (6, FIELD_WAVES)))[..., None]
     phases = rng.uniform(0.0, 2.0 * np.pi, (6, FIELD_WAVES))
@@ -103,16 +66,3 @@ def with_wavy_field(
     lines = np.moveaxis(fitted.reshape(FIELD_POWERS, *values.shape[:2], 6), 0, -1)
     empty = np.zeros((2, 2, FIELD_NODES, 6, 0))
     return replace(model, field=GridField((x[[0, -1]], y, z), (np.stack([lines, lines]), empty, empty)))
-
-
-def _generator(seed: int, what: str) -> np.random.Generator:
-    """Return a generator of its own for each kind of imperfection.
-
-    Raises
-    ------
-    ModelError
-        A seed that is not one.
-    """
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise ModelError("seed", "must be a whole number, 0 or above", seed)
-    return np.random.default_rng([int(seed), len(what)])

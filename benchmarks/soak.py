@@ -32,7 +32,7 @@ from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
-from hexapod_comp.loop.processes import PrivateDomain
+from hexapod_comp.loop.processes import PrivateDomain, waited_for_processor
 from hexapod_comp.nodes.messages import pose_message
 from hexapod_comp.nodes.running import SPIN_PERIOD
 from hexapod_comp.nodes.runtime import COMMAND_QOS, EVENT_QOS
@@ -225,17 +225,7 @@ class Commander:
 
     def _run_queue(self) -> dict[str, float]:
         """Return how long the threads of each process have waited for a processor up to now, s."""
-        return {name: _waited(pid) for name, pid in {**self._pids, "client": os.getpid()}.items()}
-
-
-def _waited(pid: int) -> float:
-    waited = 0
-    for task in Path(f"/proc/{pid}/task").iterdir():
-        try:
-            waited += int((task / "schedstat").read_text().split()[1])
-        except OSError:  # a thread that has just ended
-            continue
-    return waited * 1e-9
+        return {name: waited_for_processor(pid) for name, pid in {**self._pids, "client": os.getpid()}.items()}
 
 
 def _resident(pid: int) -> int:

@@ -25,6 +25,10 @@ ROTATION_TOLERANCE = 1e-9
 """Largest deviation of RᵀR from the identity that passes as rounding."""
 
 
+IN_A_LINE = 1e-6
+"""Points whose width is below this share of their length lie in a line."""
+
+
 @dataclass(frozen=True)
 class Pose:
     """A rigid-body pose, e.g. ``pose_platform_in_base``.
@@ -161,6 +165,28 @@ def angles_from_rotation(rotation: np.ndarray) -> np.ndarray:
 def rotation_angle(rotation: np.ndarray) -> float:
     """Return the angle of a rotation matrix, radians in [0, π]."""
     return float(Rotation.from_matrix(rotation).magnitude())
+
+
+def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
+    """Return the rigid motion that brings points as close as it can to others: the datum aligned (Kabsch).
+
+    Parameters
+    ----------
+    points, onto : ndarray, shape (N, 3)
+        Pairs of places, m.
+
+    Returns
+    -------
+    Pose or None
+        T with T·points ≈ onto, least squares; None for fewer than three points or points in a line, which leave a
+        turn open.
+    """
+    centre, mean = onto.mean(axis=0), points.mean(axis=0)
+    spread = np.linalg.svd(onto - centre, compute_uv=False)
+    if len(points) < 3 or spread[1] <= IN_A_LINE * spread[0]:
+        return None
+    turn = Rotation.align_vectors(onto - centre, points - mean)[0].as_matrix()
+    return Pose(centre - turn @ mean, turn)
 
 
 def _finite(values: object, shape: tuple[int, ...], name: str) -> np.ndarray:

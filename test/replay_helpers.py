@@ -30,6 +30,7 @@ TYPES = STORE.types
 KINDS = {
     "tool_pose_command": "geometry_msgs/msg/PoseStamped",
     "tool_pose_estimate": "geometry_msgs/msg/PoseStamped",
+    "tool_pose_true": "geometry_msgs/msg/PoseStamped",
     "strut_commands": "sensor_msgs/msg/JointState",
     "strut_corrections": "sensor_msgs/msg/JointState",
     "strut_states": "sensor_msgs/msg/JointState",
@@ -132,6 +133,15 @@ class RecordedMachine:
         joint_state = TYPES["sensor_msgs/msg/JointState"]
         self.keep(topic, joint_state(self.header(stamp), list(STRUT_NAMES), numbers, np.zeros(6), np.zeros(0)))
 
+    def keep_pose(self, topic: str, stamp: int, pose: Pose, frame: str = "base") -> tuple[float, ...]:
+        """Keep a message of a pose; return its seven numbers."""
+        numbers = (*pose.position.tolist(), *Rotation.from_matrix(pose.rotation).as_quat().tolist())
+        point = TYPES["geometry_msgs/msg/Point"](*numbers[:3])
+        turn = TYPES["geometry_msgs/msg/Quaternion"](*numbers[3:])
+        posed = TYPES["geometry_msgs/msg/Pose"](point, turn)
+        self.keep(topic, TYPES["geometry_msgs/msg/PoseStamped"](self.header(stamp, frame), posed))
+        return numbers
+
     def keep_text(self, topic: str, text: str) -> None:
         """Keep a page or the files."""
         self.keep(topic, TYPES["std_msgs/msg/String"](text))
@@ -149,12 +159,7 @@ class RecordedMachine:
         """
         self.now += MILLISECOND
         stamp, received = self.now if stamped else 0, UP_SINCE + (self.now - BEGAN) * 1e-9
-        quaternion = Rotation.from_matrix(pose.rotation).as_quat().tolist()
-        numbers = (*pose.position.tolist(), *quaternion)
-        point = TYPES["geometry_msgs/msg/Point"](*numbers[:3])
-        turn = TYPES["geometry_msgs/msg/Quaternion"](*numbers[3:])
-        posed = TYPES["geometry_msgs/msg/Pose"](point, turn)
-        self.keep("tool_pose_command", TYPES["geometry_msgs/msg/PoseStamped"](self.header(stamp, frame), posed))
+        numbers = self.keep_pose("tool_pose_command", stamp, pose, frame)
         try:
             self.compensator.step(numbers, time_of(self.now, stamped), self.frames[frame], received)
         except HexapodError as error:

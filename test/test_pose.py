@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers import moved
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from strategies import fixed
 
 from hexapod_comp.errors import PoseError
-from hexapod_comp.pose import Pose, angles_from_rotation, rotation_angle, rotation_from_angles
+from hexapod_comp.pose import Pose, angles_from_rotation, best_motion, rotation_angle, rotation_from_angles
 
 turns = st.floats(-np.pi, np.pi)
 tilts = st.floats(-1.5, 1.5)
@@ -178,3 +179,26 @@ def test_what_is_no_quaternion(quaternion, message):
 def test_angles_that_are_none():
     with pytest.raises(PoseError, match="angles must be finite"):
         Pose.from_angles(np.zeros(3), [0.0, np.nan, 0.0])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_best_motion_takes_points_back_to_where_they_came_from(seed):
+    """Points moved by a known turn and shift; then with errors, where no small motion more makes it better."""
+    rng = np.random.default_rng(seed)
+    points, turn = rng.uniform(-0.2, 0.2, (9, 3)), Rotation.from_rotvec(rng.uniform(-1.0, 1.0, 3)).as_matrix()
+    shift = rng.uniform(-0.5, 0.5, 3)
+    motion = best_motion((points - shift) @ turn, points)  # turn @ p + shift undone
+    np.testing.assert_allclose(motion.rotation, turn, atol=1e-12)
+    np.testing.assert_allclose(motion.position, shift, atol=1e-12)
+    seen = points + rng.uniform(-1e-3, 1e-3, points.shape)
+    motion = best_motion(seen, points)
+    left = np.linalg.norm(motion.position + seen @ motion.rotation.T - points)
+    for twist in 1e-5 * np.vstack([np.eye(6), -np.eye(6)]):
+        other = moved(motion, twist)
+        assert np.linalg.norm(other.position + seen @ other.rotation.T - points) > left
+
+
+@pytest.mark.parametrize("count", [2, 7])
+def test_points_in_a_line_have_no_best_motion(count):
+    line = np.linspace(0.0, 1.0, count)[:, None] * [0.1, 0.2, -0.3] + [1.0, 2.0, 3.0]
+    assert best_motion(line + 1e-4, line) is None

@@ -13,7 +13,7 @@ from ..machine.model import REFERENCE_TEMPERATURE, MachineModel, ModelOrigin
 from ..machine.size import rms
 from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementSet, refuse_unmoved
 from .estimation import HUBER, OUTLIER, Estimation, Posterior, Solution, held_out, iterate, physical_covariance
-from .observability import Observability, ToolError, expected_error, observe, without_trace
+from .observability import Allowed, Observability, ToolError, expected_error, observe, without_trace
 from .parameters import FitSettings, ParameterSpace
 from .selection import Decision, select
 from .smooth_field import DIGITS
@@ -114,6 +114,8 @@ class ModelFit:
         Largest first.
     notes : tuple of str
         What a reader must know.
+    allowed : Allowed
+        What the readings do not rule out.
     """
 
     model: MachineModel
@@ -128,6 +130,7 @@ class ModelFit:
     tilted: ToolError | None
     outliers: tuple[Outlier, ...]
     notes: tuple[str, ...]
+    allowed: Allowed
 
     @property
     def misfit(self) -> str:
@@ -188,6 +191,7 @@ def fit_model(
         tilted=tilted,
         outliers=tuple(_outliers(estimation, solution)),
         notes=(*measurements.notes, *notes, *_check_worth(level)),
+        allowed=allowed,
     )
 
 
@@ -248,9 +252,7 @@ def _decide(
     return select(everything.space, problem, noise, progress)
 
 
-def _allowed(
-    everything: ParameterSpace, possible: Posterior, answer: tuple[ParameterSpace, Solution]
-) -> tuple[ParameterSpace, np.ndarray, np.ndarray]:
+def _allowed(everything: ParameterSpace, possible: Posterior, answer: tuple[ParameterSpace, Solution]) -> Allowed:
     """Return what the readings allow, as :func:`expected_error` wants it, seen from an answer."""
     x, _, _ = _carried_over(answer, everything)
     return everything, everything.physical(possible.y) - x, physical_covariance(everything, possible)

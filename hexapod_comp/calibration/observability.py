@@ -14,7 +14,7 @@ from ..pose import rotation_from_angles
 from ..virtual.trial import without_datum
 from .estimation import LinearProblem, Posterior, physical_covariance
 from .parameters import ParameterSpace
-from .sensitivity import derivatives, predict
+from .sensitivity import Prediction, derivatives, predict
 
 SEEN = 1.0
 """A direction is observable when its tolerance changes the readings by more than so many standard deviations."""
@@ -223,13 +223,17 @@ class ToolError:
     rotation_after: float
 
 
+Allowed = tuple[ParameterSpace, np.ndarray, np.ndarray]
+"""A larger space, the way from a fit's parameters to its most probable ones, and their covariance."""
+
+
 def expected_error(
     space: ParameterSpace,
     x: np.ndarray,
     covariance: np.ndarray,
     tilt: float = 0.0,
     prior: np.ndarray | None = None,
-    allowed: tuple[ParameterSpace, np.ndarray, np.ndarray] | None = None,
+    allowed: Allowed | None = None,
 ) -> ToolError | None:
     """Return the tool error that the parameters' covariance leaves, at random points, both directions.
 
@@ -252,19 +256,49 @@ def expected_error(
     if stations is None:
         return None
     prediction = predict(space, x, stations)
-    rows = derivatives(space, prediction, stations)
     points = stations.positions + stations.rotations @ space.probe
-    errors = prediction.errors[:, :, None] if prior is None else rows @ _drawn(prior)
+    errors = prediction.errors[:, :, None]
+    if prior is not None:
+        errors = derivatives(space, prediction, stations) @ _drawn(prior)
     before, rotation_before = _aligned_rms(points, errors)
-    after, rotation_after = _aligned_rms(points, rows @ _drawn(covariance))
-    possible = after
-    if allowed is not None:
-        wide_space, shift, wide_covariance = allowed
-        wide = derivatives(wide_space, prediction, stations)
-        possible, _ = _aligned_rms(points, wide @ (shift[:, None] + _drawn(wide_covariance)))
-    low, high = np.percentile(after, [2.5, 97.5])
-    high = max(high, np.percentile(possible, 97.5))
-    return ToolError(rms(before), rms(after), float(low), float(high), rms(rotation_before), rms(rotation_after))
+    left, possible = left_errors(space, prediction, stations, covariance, allowed)
+    after, rotation_after = _aligned_rms(points, left)
+    low, high = interval(after, _aligned_rms(points, possible)[0])
+    return ToolError(rms(before), rms(after), low, high, rms(rotation_before), rms(rotation_after))
+
+
+def left_errors(
+    space: ParameterSpace,
+    prediction: Prediction,
+    stations: Stations,
+    covariance: np.ndarray,
+    allowed: Allowed | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return errors that a model may leave at stations, by machines drawn from its covariance, and the possible ones.
+
+    Parameters
+    ----------
+    space, covariance, allowed
+        As for :func:`expected_error`.
+    prediction, stations : Prediction, Stations
+        The fitted machine at some stations.
+
+    Returns
+    -------
+    left, possible : ndarray, shape (M, 6, D)
+        m and rad; possible ones also have what the readings do not rule out.
+    """
+    left = derivatives(space, prediction, stations) @ _drawn(covariance)
+    if allowed is None:
+        return left, left
+    wide_space, shift, wide_covariance = allowed
+    return left, derivatives(wide_space, prediction, stations) @ (shift[:, None] + _drawn(wide_covariance))
+
+
+def interval(left: np.ndarray, possible: np.ndarray) -> tuple[float, float]:
+    """Return between what an error lies with 95 %, given draws of it and of what is possible, shape (D,) each."""
+    low, high = np.percentile(left, [2.5, 97.5])
+    return float(low), float(max(high, np.percentile(possible, 97.5)))
 
 
 def _aligned_rms(points: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -294,7 +328,7 @@ def left_in_space(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, 
     left = np.full(len(points), np.nan)
     if not reachable.any():
         return left
-    stations = _stations(every.select(reachable).both_ways())
+    stations = stations_of(every.select(reachable).both_ways())
     rows = derivatives(space, predict(space, x, stations), stations)[:, :3]
     places = np.tile(points[reachable], (2, 1))
     squares = (without_datum(places, rows @ _drawn(covariance)) ** 2).sum(axis=1).mean(axis=1)
@@ -324,10 +358,10 @@ def box_stations(space: ParameterSpace, tilt: float = 0.0) -> Stations | None:
     rotations = work @ rotation_from_angles(angles) @ work.T @ space.level
     every = Passes(space.geometry, points - rotations @ space.probe, rotations, directions)
     reachable = every.reachable()
-    return _stations(every.select(reachable).both_ways()) if reachable.any() else None
+    return stations_of(every.select(reachable).both_ways()) if reachable.any() else None
 
 
-def _stations(passes: Passes) -> Stations:
+def stations_of(passes: Passes) -> Stations:
     """Return the stations of some passes, told nominal lengths, at 20 °C."""
     return Stations(
         positions=passes.positions,

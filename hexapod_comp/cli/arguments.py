@@ -81,6 +81,15 @@ def above_zero(text: str) -> float:
     return value
 
 
+def span(text: str) -> tuple[float, float]:
+    """Read ``LOW,HIGH``, or one number that stands for 0 to it; both not negative."""
+    values = numbers(text)
+    low, high = (0.0, *values) if len(values) == 1 else values if len(values) == 2 else (1.0, 0.0)
+    if not 0.0 <= low <= high:
+        raise argparse.ArgumentTypeError(f"needs one number, or the lowest and the highest, not negative: {text}")
+    return low, high
+
+
 def count(text: str, most: int = 10_000_000) -> int:
     """Read a whole number above zero, and not so large that nobody lives to see the end."""
     if not text.isdecimal() or len(text) > 12 or not 1 <= int(text) <= most:

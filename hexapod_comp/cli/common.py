@@ -29,10 +29,10 @@ DECIMALS = {"mm": 9, "deg": 9, "um": 6, "urad": 6}
 def load_machine(args: argparse.Namespace) -> tuple[HexapodGeometry, MachineModel]:
     """Return the geometry and the model that the options name."""
     from ..machine.geometry import load_geometry
-    from ..machine.model_file import load_model
+    from ..virtual.named import find_model
 
     geometry = load_geometry(args.machine)
-    return geometry, load_model(getattr(args, "model", "ideal"), geometry)
+    return geometry, find_model(getattr(args, "model", "ideal"), geometry)
 
 
 def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campaign:

@@ -60,7 +60,7 @@ class _Names:
         kind = KINDS.get(self._argument)
         if kind is None:
             return []
-        own = ["ideal"] if self._argument == "model" else []
+        own = ["ideal", "random"] if kind == "model" else []
         return own + [name for name in shipped_names() if "/" not in name and _kind(name) == kind]
 
 

@@ -1,31 +1,67 @@
-"""``hexapod_comp demo``: the whole loop on the paper's machine, with a verdict in the exit code."""
+"""``hexapod_comp demo``: hidden errors, a laser campaign, a fit, and what the fit is worth when the machine runs."""
 
 from __future__ import annotations
 
 import argparse
+import os
+from typing import TYPE_CHECKING
 
 from . import common
-from .run import draw, show
+from .run import TRUE, chosen_model, draw, hidden_errors
+
+if TYPE_CHECKING:
+    from ..loop.story import Calibration
+    from ..machine.geometry import HexapodGeometry
+    from ..machine.model import MachineModel
+
+FITTED = "fit"
+"""The model that is yet to be made, of readings."""
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the verb."""
-    from ..formats.csv import read_poses
+    """Run the verb; 0 when the loop kept what the fit promised."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as for fit: its matrices are small
+    from ..formats.csv import Row
     from ..loop import run as loop
+    from ..loop import story
+    from ..loop.report import error_rows, summary
     from ..machine.geometry import load_geometry
 
     rate = loop.checked_rate(args.rate_hz)
     geometry = load_geometry(args.machine)
-    rows, poses = read_poses("table1.csv")
-    path = loop.demo_path(geometry, rate)
-    with loop.simulated(geometry, args.machine, args.model, args.truth) as nodes:
-        result = loop.witnessed(geometry, nodes, poses, path, rate, compare=True)
-    if not args.json:
-        show(rows, result, "Table 1, pose")
-    draw(args, result, f"{geometry.name}: Table 1 and a milled pocket")
-    complaints = loop.complaints(result, loop.Bars() if args.model == args.truth else None)
-    if args.json:
-        common.show({**loop.as_json(rows, result), "complaints": complaints})
+    truth, calibration = hidden_errors(args, geometry), None
+    poses, path = story.demo_poses(geometry, args.seed), story.demo_path(geometry, rate)
+    if args.model == FITTED:
+        calibration = _calibration(args, geometry, truth)
+        model = calibration.fit.model
     else:
+        model = chosen_model(args, geometry, truth)
+    with loop.simulated(args.machine, model, truth) as nodes:
+        result = loop.witnessed(geometry, nodes, poses, path, rate, compare=True)
+    rows = error_rows(result)
+    if args.model in (TRUE, FITTED):
+        promised = story.EXACT if calibration is None else story.promises(calibration.fit, poses, path)
+        rows = story.with_promises(rows, promised, story.left_by_drives(geometry, truth, poses, path))
+    complaints = loop.complaints(result, rows)
+    if args.json:
+        named = [Row(0, str(n + 1)) for n in range(len(poses))]
+        measured = None if calibration is None else story.as_json(calibration)
+        known = {"machine": geometry.name, "truth": args.truth, "calibration": measured}
+        common.show({**known, **loop.as_json(named, result, rows), "complaints": complaints})
+    else:
+        print(f"\n{summary(result, rows)}\n{story.REMARK}")
         print("\n".join(f"NOT AS IT SHOULD BE: {complaint}" for complaint in complaints) or "all as it should be")
+    draw(args, result, rows, f"{geometry.name}, hidden errors {args.truth}", calibration)
     return 1 if complaints else 0
+
+
+def _calibration(args: argparse.Namespace, geometry: HexapodGeometry, truth: MachineModel) -> Calibration:
+    """Measure and fit the machine, and say what came of it before the loop starts."""
+    from ..loop.story import calibrate, calibration_text
+
+    common.mention_compiling("model.actual_pose_one")
+    with common.stage_line() as say:
+        calibration = calibrate(geometry, truth, args.seed, say)
+    if not args.json:
+        print(f"machine {geometry.name}, hidden errors: {args.truth}\n{calibration_text(calibration)}", flush=True)
+    return calibration

@@ -67,12 +67,12 @@ def run(args: argparse.Namespace) -> int:
     from ..formats.paths import config_file
     from ..machine.geometry import load_geometry
     from ..machine.model import RealMachine
-    from ..machine.model_file import load_model
     from ..measurements.files import read_measurements
+    from ..virtual.named import find_model
 
     _refuse_options_of_the_other_scheme(args)
     geometry = load_geometry(args.machine)
-    truth = None if args.truth is None else RealMachine(geometry, load_model(args.truth, geometry))
+    truth = None if args.truth is None else RealMachine(geometry, find_model(args.truth, geometry))
     columns = None if args.columns is None else config_file(args.columns)
     settings = fit_settings(args)
     measured = read_measurements(args.files, geometry, columns, args.probe_mm)

@@ -31,6 +31,9 @@ ALIASES = {"simulate": ("measure",)}
 
 SHAPE = "X,Y,Z[,A,B,C]"
 
+WORDS = "ideal, random or random:SEED"
+"""Models that are no files."""
+
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser; it leaves the verb as ``verb``, and the name under which it was called as ``called``."""
@@ -86,7 +89,7 @@ def _machine(add: Add, default: str = "paper.yaml") -> None:
 
 def _machine_and_model(add: Add) -> None:
     _machine(add)
-    text = "model of the machine's errors: a file, the name of a shipped one, or ideal (default)"
+    text = f"model of the machine's errors: a file, the name of a shipped one, {WORDS} (default ideal)"
     add("--model", metavar="FILE", default="ideal", help=text)
 
 
@@ -103,8 +106,8 @@ def _pictures(add: Add, default: str | None = None) -> None:
     add("--pictures", metavar="FOLDER", default=default, help=text)
 
 
-def _seed(add: Add, what: str) -> None:
-    add("--seed", type=arguments.seed, default=0, metavar="N", help=f"of {what} (default 0)")
+def _seed(add: Add, what: str, default: int = 0) -> None:
+    add("--seed", type=arguments.seed, default=default, metavar="N", help=f"of {what} (default {default})")
 
 
 def _show(parser: argparse.ArgumentParser) -> None:
@@ -154,10 +157,7 @@ def _check(parser: argparse.ArgumentParser) -> None:
 def _loop(add: Add) -> None:
     """Add what ``run`` and ``demo`` share."""
     _machine(add)
-    text = "model that the compensator runs: file, shipped name or ideal (default paper_machine.yaml)"
-    add("--model", metavar="FILE", default="paper_machine.yaml", help=text)
-    text = "hidden truth of the simulated machine: model file, shipped name, ideal or random"
-    add("--truth", metavar="FILE", default="paper_machine.yaml", help=text)
+    _truth(add)
     add("--rate-hz", type=float, default=250.0, metavar="HZ", help="commands per second (default 250)")
     add("--plot", action=_Renamed, const="--pictures FOLDER", metavar="PNG", help=argparse.SUPPRESS)
     _json(add)
@@ -167,6 +167,8 @@ def _run(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("poses", metavar="POSES.csv", help="CSV file of poses (mm, degrees)")
     _loop(add)
+    text = f"model that the compensator runs: file, shipped name, {WORDS}, or truth, the machine's own errors (default)"
+    add("--model", metavar="FILE", default="truth", help=text)
     _pictures(add)
     add("--attach", action="store_true", help="use nodes that already run; one pass, as they are")
     add("--namespace", default="", metavar="NAME", help="namespace of those nodes")
@@ -176,6 +178,9 @@ def _run(parser: argparse.ArgumentParser) -> None:
 def _demo(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     _loop(add)
+    text = f"model that the compensator runs: fit, made of laser readings (default); truth; file, shipped name, {WORDS}"
+    add("--model", metavar="FILE", default="fit", help=text)
+    _seed(add, "noise and poses")
     _pictures(add, "out")
 
 
@@ -185,7 +190,7 @@ def _replay(parser: argparse.ArgumentParser) -> None:
     add("--namespace", metavar="NAME", help="the machine meant, when the bag holds several")
     own = "(default: what the recording carries)"
     add("--machine", metavar="FILE", help=f"geometry file, or the name of a shipped one {own}")
-    add("--model", metavar="FILE", help=f"model file, the name of a shipped one, or ideal {own}")
+    add("--model", metavar="FILE", help=f"model file, the name of a shipped one, {WORDS} {own}")
     text = "accept differences up to this, µm (default 0: the same bits)"
     add("--tolerance-um", type=arguments.bound, default=0.0, metavar="UM", help=text)
     add("--c", metavar="LIBRARY", help="run the C core of an export --c, compiled as a shared library, instead")
@@ -203,11 +208,50 @@ def _plan(parser: argparse.ArgumentParser) -> None:
     _json(add)
 
 
+def _truth(add: Add) -> None:
+    """Add the hidden errors of a virtual machine."""
+    default = "(default: paper_machine for the paper's machine, random for others)"
+    add("--truth", metavar="FILE", help=f"errors of the virtual machine: file, shipped name, {WORDS} {default}")
+
+
+def _imagine(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    _machine(add)
+    _bounds(parser)
+    _seed(add, "the machine", 1)
+    add("--name", metavar="TEXT", help="name of the model (default virtual-SEED)")
+    add("--out", metavar="MODEL", required=True, help="write the errors to a model file (YAML)")
+    _json(add)
+
+
+def _bounds(parser: argparse.ArgumentParser) -> None:
+    """Add how imperfect an imagined machine may be; defaults are those of ``random``."""
+    add = parser.add_argument_group("how imperfect it may be").add_argument
+    one, spans = "NUMBER", "LOW,HIGH"
+    for name, kind, metavar, text in (
+        ("joints-um", arguments.bound, one, "every coordinate of every joint, ± µm (default 50)"),
+        ("struts-um", arguments.bound, one, "every strut's length, ± µm (default 50)"),
+        ("pitch-ppm", arguments.bound, one, "every screw's pitch, ± ppm (default 50)"),
+        ("wave-um", arguments.span, spans, "amplitude of the screws' periodic error, µm (default 1,3)"),
+        ("wave-period-mm", arguments.above_zero, one, "its period, mm (default: the geometry's lead, else 10)"),
+        ("map-um", arguments.bound, one, "smooth length error of every strut, RMS µm (default 1)"),
+        ("backlash-um", arguments.span, spans, "backlash of every strut, µm (default 2,4)"),
+        ("strut-expansion-ppm-per-k", arguments.span, spans, "thermal expansion of the struts (default 0)"),
+        ("body-expansion-ppm-per-k", arguments.span, spans, "the same of base and platform (default 0)"),
+        ("field-um", arguments.bound, one, "largest displacement by a field in space, µm (default 0)"),
+        ("field-urad", arguments.bound, one, "its largest rotation, µrad (default 0)"),
+        ("field-reversal-percent", arguments.bound, one, "share of it that changes with direction (default 10)"),
+    ):
+        add(f"--{name}", type=kind, metavar=metavar, help=text)
+    text = "where the field is: lowest and highest tool position, mm (default: what a level tool reaches about home)"
+    add("--box", type=arguments.box, metavar="X0,Y0,Z0,X1,Y1,Z1", help=text)
+    add("--separate-joints", action="store_true", help="struts that share a platform joint each get one of their own")
+
+
 def _simulate(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     _machine_and_model(add)
-    text = "model of the virtual machine's real errors (default paper_machine.yaml)"
-    add("--truth", metavar="FILE", default="paper_machine.yaml", help=text)
+    _truth(add)
     text = "campaign file, or the name of a shipped one (default campaign_5d.yaml for the machine paper, else campaign)"
     add("--campaign", metavar="FILE", help=text)
     _seed(add, "all that is random")
@@ -226,7 +270,7 @@ def _fit(parser: argparse.ArgumentParser) -> None:
     add("--covariance", action=_Renamed, const=now, metavar="FILE.npz", help=argparse.SUPPRESS)
     _pictures(add)
     _json(add)
-    add("--truth", metavar="FILE", help="model of the virtual machine that was measured")
+    add("--truth", metavar="FILE", help=f"errors of the virtual machine that was measured: file, shipped name, {WORDS}")
     add("--force", action="store_true", help="write a model that the readings do not bear out")
     _estimation(parser)
     text = "trust readings that disagree with the rest (scheme joint)"
@@ -366,6 +410,7 @@ OPTIONS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     "demo": _demo,
     "replay": _replay,
     "plan": _plan,
+    "imagine": _imagine,
     "simulate": _simulate,
     "fit": _fit,
     "iso230": _iso230,

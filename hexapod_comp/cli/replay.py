@@ -56,7 +56,9 @@ def _replayed(args: argparse.Namespace, recording: Recording) -> tuple[Report, H
         if other is not None:
             report.other = what_if(recording, *other, bar.update)
             report.other_name = f"machine {other[0].name}, model {other[1].name}"
-    return report, files.geometry(recording.first.geometry) if as_it_was or other is None else other[0]
+    geometry = files.geometry(recording.first.geometry) if as_it_was or other is None else other[0]
+    report.work = geometry.work
+    return report, geometry
 
 
 def _maker(args: argparse.Namespace, recording: Recording) -> Callable[[HexapodGeometry, MachineModel], Any]:
@@ -93,19 +95,20 @@ def _given(args: argparse.Namespace) -> dict[str, Source]:
     """Return the texts of the files that the options name, by hash."""
     from ..compensation.journal import Source
     from ..formats.paths import input_file
+    from ..virtual.named import is_word
 
-    names = [name for name in (args.machine, args.model) if name is not None and name != "ideal"]
-    sources = [Source.read(input_file(name)) for name in names]
+    names = [args.machine] + ([] if args.model is None or is_word(args.model) else [args.model])
+    sources = [Source.read(input_file(name)) for name in names if name is not None]
     return {source.sha256: source for source in sources}
 
 
 def _other(args: argparse.Namespace, recording: Recording, files: Files) -> tuple[HexapodGeometry, MachineModel] | None:
     """Return the geometry and the model of the options, when one of them is another than was in use."""
     from ..machine.geometry import load_geometry
-    from ..machine.model_file import load_model
+    from ..virtual.named import find_model, is_random
 
-    first, ideal = recording.first, args.model == "ideal"
-    if not (set(_given(args)) - files.used or (ideal and not files.used_ideal)):
+    first, model = recording.first, args.model or ""
+    if not (set(_given(args)) - files.used or is_random(model) or (model == "ideal" and not files.used_ideal)):
         return None
     geometry = load_geometry(args.machine) if args.machine else files.geometry(first.geometry)
-    return geometry, load_model(args.model, geometry) if args.model else files.model(first.model, geometry)
+    return geometry, find_model(args.model, geometry) if args.model else files.model(first.model, geometry)

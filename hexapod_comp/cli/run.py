@@ -9,8 +9,14 @@ from typing import TYPE_CHECKING
 from . import common
 
 if TYPE_CHECKING:
-    from ..formats.csv import Row
     from ..loop.records import SessionResult
+    from ..loop.report import ErrorRow
+    from ..loop.story import Calibration
+    from ..machine.geometry import HexapodGeometry
+    from ..machine.model import MachineModel
+
+TRUE = "truth"
+"""The model that is no file: the machine's own errors."""
 
 
 def run(args: argparse.Namespace) -> int:
@@ -19,35 +25,59 @@ def run(args: argparse.Namespace) -> int:
 
     from ..formats.csv import read_poses
     from ..loop import run as loop
+    from ..loop.report import busy_text, error_rows, pose_block, summary
     from ..machine.geometry import load_geometry
+    from ..machine.model import MachineModel
 
     rate = loop.checked_rate(args.rate_hz)
     geometry = load_geometry(args.machine)
+    truth = hidden_errors(args, geometry)
+    model = MachineModel(geometry.name) if args.attach else chosen_model(args, geometry, truth)
     rows, poses = read_poses(args.poses)
-    loop.refuse_broken_limits(args.poses, geometry, "ideal" if args.attach else args.model, rows, poses)
-    started = nullcontext(()) if args.attach else loop.simulated(geometry, args.machine, args.model, args.truth)
+    loop.refuse_broken_limits(args.poses, geometry, model, rows, poses)
+    started = nullcontext(()) if args.attach else loop.simulated(args.machine, model, truth)
     compare = not (args.attach or args.no_compare)  # nobody switches a real machine's compensation off in passing
     with started as nodes:
         result = loop.witnessed(geometry, nodes, poses, None, rate, compare, args.namespace)
-    if not args.json:
-        show(rows, result, "pose")
-    draw(args, result, f"{geometry.name}: {args.poses}")
+    errors, unanswered = error_rows(result), result.lost + result.refused
     if args.json:
-        common.show(loop.as_json(rows, result))
-    return 0 if result.lost == 0 and result.refused == 0 else 1
+        common.show(loop.as_json(rows, result, errors))
+    else:
+        for row, record in zip(rows, result.poses, strict=True):
+            print(pose_block(f"pose {row.label}", record))
+        print(summary(result, errors))
+    if unanswered and result.answering.busy:
+        common.say_notes([busy_text(result.answering)])
+    draw(args, result, errors, f"{geometry.name}: {args.poses}")
+    return 1 if unanswered else 0
 
 
-def show(rows: Sequence[Row], result: SessionResult, name: str) -> None:
-    """Print every pose, under a name and its label, and the summary."""
-    from ..loop.report import pose_block, summary
+def hidden_errors(args: argparse.Namespace, geometry: HexapodGeometry) -> MachineModel:
+    """Return the machine's hidden errors, and leave the name that they go by in the options."""
+    from ..virtual.named import find_model, truth_name
 
-    for row, record in zip(rows, result.poses, strict=True):
-        print(pose_block(f"{name} {row.label}", record))
-    print(summary(result))
+    args.truth = truth_name(args.truth, geometry)
+    return find_model(args.truth, geometry)
 
 
-def draw(args: argparse.Namespace, result: SessionResult, title: str) -> None:
+def chosen_model(args: argparse.Namespace, geometry: HexapodGeometry, truth: MachineModel) -> MachineModel:
+    """Return the model that the compensator runs."""
+    from ..virtual.named import find_model
+
+    return truth if args.model == TRUE else find_model(args.model, geometry)
+
+
+def draw(
+    args: argparse.Namespace,
+    result: SessionResult,
+    rows: Sequence[ErrorRow],
+    title: str,
+    calibration: Calibration | None = None,
+) -> None:
     """Draw the session into the folder of ``--pictures``, under the verb's name."""
     from ..loop.pictures import session_figure
 
-    common.save_pictures(args, lambda: {f"{args.verb}.png": session_figure(result, f"{title}, model {result.model}")})
+    def pictures() -> dict:
+        return {f"{args.verb}.png": session_figure(result, rows, f"{title}, model {result.model}", calibration)}
+
+    common.save_pictures(args, pictures)

@@ -19,13 +19,14 @@ RESOLUTION = 10
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
     from ..machine.model import RealMachine
-    from ..machine.model_file import load_model
     from ..measurements.campaign import template
     from ..measurements.writing import write_measurements
     from ..virtual.instruments import compensated, measure
+    from ..virtual.named import find_model, truth_name
 
     geometry, model = common.load_machine(args)
-    truth = load_model(args.truth, geometry)
+    args.truth = truth_name(args.truth, geometry)
+    truth = find_model(args.truth, geometry)
     campaign = common.load_campaign(args, geometry)
     common.mention_compiling("model.actual_pose_one")
     plan = template(campaign, geometry, args.seed, args.campaign)

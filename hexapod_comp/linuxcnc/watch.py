@@ -31,9 +31,9 @@ from ..kernels.drives import follow_point
 from ..kernels.motion import follow
 from ..machine.geometry import load_geometry
 from ..machine.model import RealMachine
-from ..machine.model_file import load_model
 from ..machine.motion import MotionState
 from ..pose import Pose
+from ..virtual.named import find_model
 from .hal import METRES, HalComponent, pins, quaternion_from_axes
 
 AXES = ("x", "y", "z", "a", "b", "c")
@@ -156,7 +156,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     stop = threading.Event()
     try:
         geometry = load_geometry(options.geometry)
-        machine = RealMachine(geometry, load_model(options.truth, geometry))
+        machine = RealMachine(geometry, find_model(options.truth, geometry))
         shown = MachineComponent(machine, options.units, options.name)
     except HexapodError as error:
         print(f"cannot start: {error}", file=sys.stderr)
@@ -176,9 +176,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="linuxcnc_machine", description="HAL component: the tool's true pose.")
     parser.add_argument("--geometry", default="paper.yaml", metavar="FILE", help="geometry file (default: paper.yaml)")
-    parser.add_argument(
-        "--truth", default="paper_machine.yaml", metavar="FILE", help="model file of the hidden truth, or ideal"
-    )
+    text = "model file of the hidden truth, ideal, random or random:SEED"
+    parser.add_argument("--truth", default="paper_machine.yaml", metavar="FILE", help=text)
     parser.add_argument("--units", choices=tuple(METRES), default="mm", help="LinuxCNC's length unit (default: mm)")
     parser.add_argument("--rate", type=_rate, default=50.0, metavar="HZ", help="looks per second (default: 50)")
     parser.add_argument("--name", default="hexapod_machine", help="of the HAL component (default: hexapod_machine)")

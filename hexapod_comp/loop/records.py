@@ -1,16 +1,20 @@
-"""Records of a witnessed run, and the errors they show; no ROS in here."""
+"""Records of a witnessed run, and the errors they show, as they are and with the datum aligned; no ROS in here."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..machine.trajectory import Path
-from ..pose import Pose, rotation_angle
+from ..machine.trajectory import Path, feet_on
+from ..pose import Pose, best_motion, rotation_angle
 
-TRACK_WINDOW = 25
-"""How many commands the tool may lag behind the newest one; at 250 Hz a tenth of a second."""
+FEWEST_ALIGNED = 6
+"""A datum takes six numbers away, two poses' worth: from fewer poses hardly anything would be left."""
+
+LATE_SHARE, WAITED_SHARE = 0.02, 0.2
+"""A computer is called busy when more of its answers are late, or when its processes wait for more of the time."""
 
 
 @dataclass
@@ -58,12 +62,20 @@ class Track:
     ----------
     positions : ndarray, shape (n, 3)
         True tool positions on the way, m.
+    sent : ndarray of int, shape (n,)
+        How many poses of the path had been sent when each was seen.
     feet : ndarray, shape (n, 3)
         The nearest point of the commanded path to each, m: a late tool is no contour error.
     """
 
     positions: np.ndarray
+    sent: np.ndarray
     feet: np.ndarray
+
+    @staticmethod
+    def along(path: Path, positions: np.ndarray, sent: np.ndarray) -> Track | None:
+        """Return the track of true positions, shape (n, 3), m, along a path; None when there are none."""
+        return Track(positions, sent, feet_on(path.positions, positions, sent)) if len(positions) else None
 
     @property
     def deviation(self) -> np.ndarray:
@@ -78,7 +90,7 @@ class PathRecord:
     Attributes
     ----------
     path : Path
-        Commanded poses in ``base``.
+        Commanded poses, in ``base`` at first.
     without, compensated : Track or None
         The two passes; None where there was none, or nobody to tell where the tool was.
     corrections : ndarray, shape (N, 6)
@@ -89,6 +101,54 @@ class PathRecord:
     without: Track | None
     compensated: Track | None
     corrections: np.ndarray
+
+    def seen_from(self, frame: Pose) -> PathRecord:
+        """Return the same in another frame, whose own pose is given in the present one."""
+        inverse = frame.inverse()
+        path = Path(_moved(inverse, self.path.positions), inverse.rotation @ self.path.rotations, self.path.rate)
+        return self._with(path, (inverse, inverse))
+
+    def aligned(self, datums: tuple[Pose | None, Pose | None]) -> PathRecord:
+        """Return the same with each pass's true positions moved by its datum; a pass without a datum is left out."""
+        return self._with(self.path, datums)
+
+    def _with(self, path: Path, motions: tuple[Pose | None, Pose | None]) -> PathRecord:
+        without, compensated = (
+            None if track is None or motion is None else Track.along(path, _moved(motion, track.positions), track.sent)
+            for track, motion in zip((self.without, self.compensated), motions, strict=True)
+        )
+        return replace(self, path=path, without=without, compensated=compensated)
+
+
+@dataclass
+class Answering:
+    """How fast the loop answered, and what kept it waiting.
+
+    Attributes
+    ----------
+    latencies : ndarray
+        Command to answer of the compensated pass, s.
+    answered, late : int
+        Commands of the whole session that were answered, and those of which the answer came after the next was due.
+    longest : float
+        Longest time to an answer in the whole session, s.
+    elapsed : float
+        Length of the session, s.
+    waited : float
+        How long its processes waited for a processor, added up, s.
+    """
+
+    latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    answered: int = 0
+    late: int = 0
+    longest: float = 0.0
+    elapsed: float = 0.0
+    waited: float = 0.0
+
+    @property
+    def busy(self) -> bool:
+        """Whether something else kept the processors: a share of the answers was late, or the processes waited long."""
+        return self.late > LATE_SHARE * self.answered or self.waited > WAITED_SHARE * self.elapsed
 
 
 @dataclass
@@ -101,8 +161,8 @@ class SessionResult:
         The single poses.
     path : PathRecord or None
         The path.
-    latencies : ndarray
-        Command to answer of the compensated pass, s.
+    answering : Answering
+        How fast the loop answered.
     sent, lost, refused : int
         Commands of the whole session.
     refusals : dict of str to int
@@ -113,12 +173,50 @@ class SessionResult:
 
     poses: list[PoseRecord] = field(default_factory=list)
     path: PathRecord | None = None
-    latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    answering: Answering = field(default_factory=Answering)
     sent: int = 0
     lost: int = 0
     refused: int = 0
     refusals: dict[str, int] = field(default_factory=dict)
     model: str = ""
+
+    def seen_from(self, frame: Pose) -> SessionResult:
+        """Return the same in another frame, whose own pose is given in the present one."""
+        path = None if self.path is None else self.path.seen_from(frame)
+        return replace(self, poses=[record.seen_from(frame) for record in self.poses], path=path)
+
+    def aligned(self) -> SessionResult | None:
+        """Return the same once the datum is aligned: each pass by the rigid motion that fits its poses best.
+
+        A path is moved by its pass's poses, as a workpiece whose zero was set by them. None with fewer than
+        :data:`FEWEST_ALIGNED` poses, with poses in a line, or when nobody told where the tool was.
+        """
+        before = _datum(self.poses, [record.true_without for record in self.poses])
+        after = _datum(self.poses, [record.true_with for record in self.poses])
+        if after is None:
+            return None
+        poses = []
+        for record in self.poses:
+            moved = _after(before, record.true_without), _after(after, record.true_with)
+            poses.append(replace(record, true_without=moved[0], true_with=moved[1]))
+        path = None if self.path is None else self.path.aligned((before, after))
+        return replace(self, poses=poses, path=path)
+
+
+def _datum(records: Sequence[PoseRecord], actual: Sequence[Pose | None]) -> Pose | None:
+    """Return the rigid motion that brings true tool positions onto commanded ones; None where there is no telling."""
+    seen = [pose.position for pose in actual if pose is not None]
+    if len(seen) < len(records) or len(seen) < FEWEST_ALIGNED:
+        return None
+    return best_motion(np.array(seen), np.array([record.target.position for record in records]))
+
+
+def _after(motion: Pose | None, pose: Pose | None) -> Pose | None:
+    return None if motion is None or pose is None else motion @ pose
+
+
+def _moved(motion: Pose, points: np.ndarray) -> np.ndarray:
+    return motion.position + points @ motion.rotation.T
 
 
 def pose_error(target: Pose, actual: Pose | None) -> tuple[float, float] | None:
@@ -127,29 +225,3 @@ def pose_error(target: Pose, actual: Pose | None) -> tuple[float, float] | None:
         return None
     distance = float(np.linalg.norm(actual.position - target.position))
     return distance, rotation_angle(target.rotation.T @ actual.rotation)
-
-
-def track_along(path: Path, positions: np.ndarray, sent: np.ndarray) -> Track | None:
-    """Return true positions with their feet on the commanded polyline.
-
-    Parameters
-    ----------
-    path : Path
-        Commanded poses.
-    positions : ndarray, shape (n, 3)
-        True tool positions, m.
-    sent : ndarray of int, shape (n,)
-        How many poses of the path had been sent when each was seen. Only what was commanded within the
-        last :data:`TRACK_WINDOW` poses counts, so that a path that crosses itself is not mistaken.
-    """
-    if not len(positions):
-        return None
-    start, along = path.positions[:-1], np.diff(path.positions, axis=0)
-    square = np.maximum((along**2).sum(axis=1), 1e-30)
-    feet = np.empty_like(positions)
-    for n, (point, count) in enumerate(zip(positions, sent, strict=True)):
-        near = slice(max(0, min(count, len(start)) - TRACK_WINDOW), max(1, min(count, len(start))))
-        share = np.clip(((point - start[near]) * along[near]).sum(axis=1) / square[near], 0.0, 1.0)
-        candidates = start[near] + share[:, None] * along[near]
-        feet[n] = candidates[np.linalg.norm(point - candidates, axis=1).argmin()]
-    return Track(positions, feet)

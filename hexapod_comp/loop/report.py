@@ -1,14 +1,48 @@
-"""What a witnessed run prints: one block per pose, and a summary with a verdict."""
+"""What a witnessed run prints: one block per pose, a table of errors, how the loop answered, and what was wrong."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from ..formats.texts import aligned, number
 from ..machine.size import rms
 from ..pose import Pose
-from .records import PathRecord, PoseRecord, SessionResult
+from .records import Answering, PathRecord, PoseRecord, SessionResult, Track
+
+AS_IT_IS, ALIGNED = "as it is", "datum aligned"
+"""How a tool error is taken: where the machine stands, or less the one rigid motion that a new zero takes up."""
+
+
+@dataclass(frozen=True)
+class ErrorRow:
+    """The tool's error at rest or along a path, in one way of taking it.
+
+    Attributes
+    ----------
+    what, datum : str
+        ``at rest`` or ``path``; :data:`AS_IT_IS` or :data:`ALIGNED`.
+    count : int
+        Poses.
+    without, compensated : ndarray or None
+        Errors of the two passes, m: distances to the pose at rest, to the nearest place of the path along it.
+    promised : (float, float) or None
+        Between these the RMS is expected, m, with 95 %.
+    """
+
+    what: str
+    datum: str
+    count: int
+    without: np.ndarray | None
+    compensated: np.ndarray
+    promised: tuple[float, float] | None = None
+
+    @property
+    def removed(self) -> float | None:
+        """Share of the RMS error that compensation removes."""
+        return None if self.without is None else 1.0 - rms(self.compensated) / rms(self.without)
 
 
 def pose_block(title: str, record: PoseRecord) -> str:
@@ -30,44 +64,75 @@ def pose_block(title: str, record: PoseRecord) -> str:
     return "\n".join(lines)
 
 
-def summary(result: SessionResult) -> str:
-    """Return the closing lines: errors with and without, latency, commands."""
-    lines = [f"model {result.model}", *_error_lines(result)]
-    if len(result.latencies):
-        p50, p95, worst = np.percentile(result.latencies, [50, 95, 100]) * 1e3
-        lines.append(f"latency, command to answer: median {p50:.2f} ms, 95 % {p95:.2f} ms, longest {worst:.2f} ms")
+def error_rows(result: SessionResult) -> list[ErrorRow]:
+    """Return the tool's errors at rest and along the path, first with the datum aligned where that can be."""
+    taken = ((ALIGNED, result.aligned()), (AS_IT_IS, result))
+    rows = [_rest_row(datum, one.poses) for datum, one in taken if one is not None]
+    rows += [_path_row(datum, one.path) for datum, one in taken if one is not None and one.path is not None]
+    return [row for row in rows if row is not None]
+
+
+def _rest_row(datum: str, records: Sequence[PoseRecord]) -> ErrorRow | None:
+    pairs = [record.errors() for record in records]
+    before, after = ([error[0] for pair in pairs if (error := pair[side]) is not None] for side in (0, 1))
+    if not after:
+        return None
+    return ErrorRow("at rest", datum, len(records), np.array(before) if before else None, np.array(after))
+
+
+def _path_row(datum: str, path: PathRecord) -> ErrorRow | None:
+    def deviation(track: Track | None) -> np.ndarray | None:
+        return None if track is None else track.deviation
+
+    after = deviation(path.compensated)
+    return None if after is None else ErrorRow("path", datum, len(path.path), deviation(path.without), after)
+
+
+def error_table(rows: Sequence[ErrorRow]) -> str:
+    """Return the table of errors: RMS without and with compensation, what that removes, the largest left; µm."""
+    promises = any(row.promised for row in rows)
+    header = ["tool error, µm", "without", "with", "largest", "removed", *(["promised"] if promises else [])]
+    return aligned([*header, ""], [[*_cells(row, promises), _about(row)] for row in rows])
+
+
+def _cells(row: ErrorRow, promises: bool) -> Iterator[str]:
+    yield f"{row.what}, {row.datum}"
+    yield "–" if row.without is None else number(rms(row.without) * 1e6, 2)
+    yield number(rms(row.compensated) * 1e6, 3)
+    yield number(float(row.compensated.max()) * 1e6, 3)
+    yield "–" if row.removed is None else f"{100.0 * row.removed:.2f} %"
+    if promises:
+        yield "–" if row.promised is None else "…".join(number(v * 1e6, 3) for v in row.promised)
+
+
+def _about(row: ErrorRow) -> str:
+    return f"RMS of {row.count} poses" if row.what == "at rest" else f"RMS distance to a path of {row.count} poses"
+
+
+def summary(result: SessionResult, rows: Sequence[ErrorRow]) -> str:
+    """Return the closing lines: model, errors without and with it, latency, commands."""
+    table = [error_table(rows)] if rows else []
+    return "\n".join([f"model {result.model}", *table, *_commands(result)])
+
+
+def _commands(result: SessionResult) -> Iterator[str]:
+    """Yield how fast the loop answered and what became of the commands."""
+    answering = result.answering
+    if len(answering.latencies):
+        p50, p95, worst = np.percentile(answering.latencies, [50, 95, 100]) * 1e3
+        yield f"latency, command to answer: median {p50:.2f} ms, 95 % {p95:.2f} ms, longest {worst:.2f} ms"
     refused = "".join(f", {count} {reason}" for reason, count in sorted(result.refusals.items()))
-    lines.append(f"commands: {result.sent} sent, {result.lost} lost, {result.refused} refused{refused}")
-    return "\n".join(lines)
+    yield f"commands: {result.sent} sent, {result.lost} lost, {result.refused} refused{refused}"
 
 
-def _error_lines(result: SessionResult) -> Iterator[str]:
-    pairs = [record.errors() for record in result.poses]
-    if pairs and pairs[0][1] is not None:
-        yield _comparison(
-            f"{len(pairs)} poses, position error",
-            np.array([before[0] for before, _ in pairs if before is not None]),
-            np.array([after[0] for _, after in pairs if after is not None]),
-        )
-    path = result.path
-    if path is not None and path.compensated is not None:
-        before = np.zeros(0) if path.without is None else path.without.deviation
-        yield _comparison(path_title(path), before, path.compensated.deviation)
-
-
-def path_title(path: PathRecord) -> str:
-    """Return what a path's figures are about."""
-    return f"path of {len(path.path)} poses at {path.path.rate:g} Hz, distance of the tool to it"
-
-
-def _comparison(title: str, before: np.ndarray, after: np.ndarray) -> str:
-    text = f"{title}: with compensation RMS {rms(after) * 1e6:.3f} µm, maximum {after.max() * 1e6:.3f} µm"
-    if not len(before):
-        return text
-    removed = 100.0 * (1.0 - rms(after) / rms(before))
+def busy_text(answering: Answering) -> str:
+    """Return that the computer was busy and by what one sees it; empty when it was not."""
+    if not answering.busy:
+        return ""
     return (
-        f"{text}; without RMS {rms(before) * 1e6:.2f} µm, maximum {before.max() * 1e6:.2f} µm: "
-        f"{removed:.2f} % of the RMS removed"
+        f"the computer was busy: {answering.late} of {answering.answered} answers came after the next command was due, "
+        f"the longest after {answering.longest * 1e3:.0f} ms, and its processes waited {answering.waited:.1f} s in "
+        f"{answering.elapsed:.0f} s for a processor; try again with less going on"
     )
 
 

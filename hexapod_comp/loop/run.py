@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import date
 from typing import TYPE_CHECKING
 
 import numpy as np
 from tqdm import tqdm
 
 from ..compensation.checks import check
-from ..errors import GeometryError, HexapodError, InputFileError
+from ..errors import GeometryError, HexapodError, InputFileError, NoAnswerError
 from ..formats.csv import Row, length_values
 from ..formats.paths import config_file
 from ..formats.texts import CODES, own_terminal
 from ..machine.geometry import HexapodGeometry
-from ..machine.model_file import load_model
+from ..machine.model import MachineModel
+from ..machine.model_file import save_model
 from ..machine.size import rms
-from ..machine.trajectory import Path, circle, commanded_in_base, join, move, pocket
+from ..machine.trajectory import Path
 from ..pose import Pose
 from . import session
 from .processes import NodeProcess
-from .records import PathRecord, PoseRecord, SessionResult, Track
+from .records import PoseRecord, SessionResult
+from .report import ALIGNED, ErrorRow, busy_text
 
 if TYPE_CHECKING:
     from ..nodes.client import LoopClient
@@ -31,8 +35,10 @@ if TYPE_CHECKING:
 RATES = (1.0, 1000.0)
 """Commands per second that make sense over DDS from Python, Hz."""
 
-DEMO_FEED = 0.02
-"""Tool speed of the demo's path, m/s: the simulated drives follow it without reaching their acceleration."""
+
+PATIENCE = {"following_error_limit": 0.02, "max_command_age": 5.0}
+"""What a simulated machine's compensator lets pass, m and s: drives and clocks are sound, but wait for a processor at
+times, and the usual 2 mm are 20 ms of that."""
 
 
 def checked_rate(rate: float) -> float:
@@ -42,18 +48,9 @@ def checked_rate(rate: float) -> float:
     return rate
 
 
-def demo_path(geometry: HexapodGeometry, rate: float) -> Path:
-    """Return the demo's milling path about home: a circle of 24 mm, then a zigzag pocket of 24 × 8 mm, in ``base``."""
-    geometry = commanded_in_base(geometry)
-    home = geometry.home @ geometry.tool
-    ring = circle(home, radius=0.012, feed=DEMO_FEED, rate=rate)
-    corner = home @ Pose(np.array([-0.012, -0.004, 0.0]), np.eye(3))
-    rows = pocket(geometry, corner, (0.024, 0.008), pitch=0.004, feed=DEMO_FEED, rate=rate)
-    to_corner = move(geometry, ring.pose(len(ring) - 1), corner, rate, DEMO_FEED)
-    return join([ring, to_corner, rows])
-
-
-def refuse_broken_limits(path: str, geometry: HexapodGeometry, model: str, rows: list[Row], poses: list[Pose]) -> None:
+def refuse_broken_limits(
+    path: str, geometry: HexapodGeometry, model: MachineModel, rows: list[Row], poses: list[Pose]
+) -> None:
     """Check poses and the way between them before anything moves.
 
     Raises
@@ -61,36 +58,44 @@ def refuse_broken_limits(path: str, geometry: HexapodGeometry, model: str, rows:
     InputFileError
         A limit is broken; names the first pose and says how to see them all.
     """
-    known = load_model(model, geometry)
-    breaches = check(geometry, known, poses).breaches
+    breaches = check(geometry, model, poses).breaches
     if breaches:
         row = rows[breaches[0].row]
         problem = f"pose {row.label}: {breaches[0].error}; `hexapod_comp check` lists all {len(breaches)} breaches"
         raise InputFileError(path, f"line {row.line}", problem)
 
 
-def simulated(
-    geometry: HexapodGeometry, machine: str, model: str, truth: str
-) -> AbstractContextManager[Sequence[NodeProcess]]:
-    """Start compensator and strut drive as two processes in a ROS domain of their own."""
+@contextmanager
+def simulated(machine: str, model: MachineModel, truth: MachineModel) -> Iterator[Sequence[NodeProcess]]:
+    """Start compensator and strut drive as two processes in a ROS domain of their own.
 
-    def checked(name: str, *words: str) -> str:
-        """Return a model as the nodes take it, refused here rather than in a process of its own."""
-        if name in words:
-            return name
-        load_model(config_file(name), geometry)
-        return str(config_file(name).resolve())
-
-    geometry_file = str(config_file(machine).resolve())
-    model_file, truth_file = checked(model, "ideal"), checked(truth, "ideal", "random")
+    Parameters
+    ----------
+    machine : str
+        The machine's file.
+    model, truth : MachineModel
+        What the compensator runs, and the hidden errors of the machine; both reach the nodes as files.
+    """
     from ..nodes.warming import warm
 
     print("preparing; the first run on a machine compiles its kernels, which takes up to a minute", file=sys.stderr)
     warm()
-    return session.simulated_machine(
-        {"geometry_file": geometry_file, "model_file": model_file},
-        {"geometry_file": geometry_file, "truth_file": truth_file},
-    )
+    geometry_file = str(config_file(machine).resolve())
+    with tempfile.TemporaryDirectory(prefix="hexapod_comp_") as folder:
+        model_file, truth_file = (f"{folder}/{name}.yaml" for name in ("model", "truth"))
+        save_model(_portable(model), model_file)
+        save_model(_portable(truth), truth_file)
+        with session.simulated_machine(
+            {"geometry_file": geometry_file, "model_file": model_file, **PATIENCE},
+            {"geometry_file": geometry_file, "truth_file": truth_file},
+        ) as nodes:
+            yield nodes
+
+
+def _portable(model: MachineModel) -> MachineModel:
+    """Return a model that can be written elsewhere: with a date, and without what lies beside its own file."""
+    origin = replace(model.origin, date=model.origin.date or date.today().isoformat(), posterior=None)
+    return replace(model, origin=origin)
 
 
 def witnessed(
@@ -104,16 +109,26 @@ def witnessed(
 ) -> SessionResult:
     """Run poses of the work frame and a path in ``base`` through the loop, with a progress bar.
 
-    The result's poses are in the work frame, as the user's file says them; the nodes are told, and tell, ``base``.
+    The result is in the work frame, as the user's file has it; the nodes are told, and tell, ``base``.
+
+    Raises
+    ------
+    NoAnswerError
+        A command was lost or refused; says when the computer was busy.
     """
     client = _client(namespace)
     try:
         session.connect(client, nodes)
+        watch = session.Watch(nodes)
         with _progress() as bar:
             targets = [geometry.work @ pose for pose in poses]
-            result = session.run_session(client, geometry, targets, path, rate, compare, bar.update, _announce)
-        result.poses = [record.seen_from(geometry.work) for record in result.poses]
-        return result
+            try:
+                result = session.run_session(client, geometry, targets, path, rate, compare, bar.update, _announce)
+            except NoAnswerError as error:
+                busy = busy_text(watch.answering(client, rate))
+                raise NoAnswerError(f"{error}; {busy}" if busy else str(error)) from error
+        result.answering = watch.answering(client, rate, result.answering.latencies)
+        return result.seen_from(geometry.work)
     finally:
         client.close()
 
@@ -141,85 +156,69 @@ def _client(namespace: str) -> LoopClient:
     return LoopClient(namespace=namespace)
 
 
-@dataclass(frozen=True)
-class Bars:
-    """What a run with the simulated machine's true model may leave, m.
-
-    Parameters
-    ----------
-    rest : float
-        Largest error at a pose where the machine rests: steps and encoder counts of 0.1 µm.
-    path : float
-        RMS distance to the path.
-    passing : float
-        Largest distance to the path: a backlash of some µm shows while a strut takes it up.
-    """
-
-    rest: float = 1e-6
-    path: float = 0.5e-6
-    passing: float = 10e-6
-
-
-def complaints(result: SessionResult, bars: Bars | None) -> list[str]:
-    """Return what was not as it should be, empty when all was well.
+def complaints(result: SessionResult, rows: Sequence[ErrorRow]) -> list[str]:
+    """Return what was not as it should be, and whether a busy computer may be the cause; empty when all was well.
 
     Parameters
     ----------
     result : SessionResult
         A compared run.
-    bars : Bars or None
-        What may be left; None asks only that compensation reduces the RMS error.
+    rows : sequence of ErrorRow
+        Its errors. What a laser can see is judged: the errors with the datum aligned, where they are known.
     """
     listed = []
     if result.lost:
         listed.append(f"{result.lost} commands were lost")
     if result.refused:
         listed.append(f"{result.refused} commands were refused: {result.refusals}")
-    pairs = [record.errors() for record in result.poses]
-    before = np.array([pair[0][0] for pair in pairs if pair[0]])
-    after = np.array([pair[1][0] for pair in pairs if pair[1]])
-    listed += _left("poses", before, after, None if bars is None else (bars.rest, bars.rest))
-    if result.path is not None:
-        tracks = (result.path.without, result.path.compensated)
-        before, after = (np.zeros(0) if track is None else track.deviation for track in tracks)
-        listed += _left("path", before, after, None if bars is None else (bars.path, bars.passing))
-    return listed
+    if not rows:
+        listed.append("the true tool pose was not seen")
+    judged = [row for row in rows if row.datum == ALIGNED] or rows
+    listed += [problem for row in judged if (problem := _too_much(row))]
+    busy = busy_text(result.answering)
+    return [*listed, busy] if listed and busy else listed
 
 
-def _left(name: str, before: np.ndarray, after: np.ndarray, bars: tuple[float, float] | None) -> list[str]:
-    """Return complaints about errors, m, before and after, given bars of RMS and maximum."""
-    if not len(before) or not len(after):
-        return [f"{name}: the true tool pose was not seen"]
-    if rms(after) >= rms(before):
-        return [f"{name}: compensation does not reduce the error"]
-    if bars is None or (rms(after) <= bars[0] and after.max() <= bars[1]):
-        return []
-    left = f"RMS {rms(after) * 1e6:.3f} µm, largest {after.max() * 1e6:.3f} µm"
-    return [f"{name}: {left}; allowed {bars[0] * 1e6:g} and {bars[1] * 1e6:g} µm"]
+def _too_much(row: ErrorRow) -> str:
+    """Return what is wrong with an error that is left, m; empty when nothing is."""
+    left, name = rms(row.compensated), f"{row.what}, {row.datum}"
+    if row.without is not None and left >= rms(row.without):
+        return f"{name}: compensation does not reduce the error"
+    if row.promised is None or left <= row.promised[1]:
+        return ""
+    return f"{name}: {left * 1e6:.3f} µm RMS are left; at most {row.promised[1] * 1e6:.3f} were promised"
 
 
-def as_json(rows: list[Row], result: SessionResult) -> dict[str, object]:
-    """Return what is told of a session: tool poses in ``work``."""
+def as_json(rows: list[Row], result: SessionResult, errors: Sequence[ErrorRow]) -> dict[str, object]:
+    """Return what is told of a session: tool poses in ``work``, and its :func:`~.report.error_rows`."""
+    answering = result.answering
     return {
         "frame": "work",
         "model": result.model,
         "sent": result.sent,
         "lost": result.lost,
         "refused": result.refused,
-        "latency_median_ms": np.median(result.latencies) * 1e3 if len(result.latencies) else None,
+        "latency_median_ms": np.median(answering.latencies) * 1e3 if len(answering.latencies) else None,
+        "late_answers": answering.late,
+        "longest_latency_ms": answering.longest * 1e3,
+        "waited_for_processor_s": answering.waited,
+        "errors": [_row_json(row) for row in errors],
         "poses": [_pose_json(row, record) for row, record in zip(rows, result.poses, strict=True)],
-        "path": None if result.path is None else _path_json(result.path),
+        "path": None if result.path is None else {"poses": len(result.path.path), "rate_hz": result.path.path.rate},
     }
 
 
-def _path_json(record: PathRecord) -> dict[str, object]:
-    def distance(track: Track | None) -> dict[str, float] | None:
-        deviation = None if track is None else track.deviation * 1e6
-        return None if deviation is None else {"rms_um": rms(deviation), "max_um": float(deviation.max())}
+def _row_json(row: ErrorRow) -> dict[str, object]:
+    def size(errors: np.ndarray | None) -> dict[str, float] | None:
+        return None if errors is None else {"rms_um": rms(errors) * 1e6, "max_um": float(errors.max()) * 1e6}
 
-    without, compensated = distance(record.without), distance(record.compensated)
-    sent = {"poses": len(record.path), "rate_hz": record.path.rate}
-    return {**sent, "distance_without": without, "distance_with": compensated}
+    return {
+        "what": row.what,
+        "datum": row.datum,
+        "without": size(row.without),
+        "with": size(row.compensated),
+        "promised_rms_um": None if row.promised is None else [v * 1e6 for v in row.promised],
+    }
 
 
 def _pose_json(row: Row, record: PoseRecord) -> dict[str, object]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -12,8 +14,8 @@ from ..errors import HexapodError, NoAnswerError
 from ..machine.geometry import HexapodGeometry
 from ..machine.trajectory import Path, commanded_in_base, move
 from ..pose import Pose
-from .processes import NodeProcess, PrivateDomain
-from .records import PathRecord, PoseRecord, SessionResult, Track, track_along
+from .processes import NodeProcess, PrivateDomain, waited_for_processor
+from .records import Answering, PathRecord, PoseRecord, SessionResult, Track
 
 if TYPE_CHECKING:
     from ..nodes.client import LoopClient, Sent
@@ -125,8 +127,7 @@ class Session:
         self._at = path.pose(len(path) - 1)
         positions = np.array([position for position, _ in self._client.track])
         sent = np.array([count for _, count in self._client.track])
-        track = track_along(path, positions, sent)
-        return track, np.array([entry.correction for entry in streamed])
+        return Track.along(path, positions, sent), np.array([entry.correction for entry in streamed])
 
     def _stream(self, path: Path) -> list[Sent]:
         progress = self._progress
@@ -134,11 +135,48 @@ class Session:
         self._sent += sent
         return sent
 
-    def latencies(self) -> np.ndarray:
-        """Return and forget the latencies of the streamed commands, s."""
-        values = np.array([entry.answered_at - entry.sent_at for entry in self._sent])
+    def forget(self) -> None:
+        """Forget the streamed commands so far."""
         self._sent = []
-        return values[np.isfinite(values)]
+
+    def latencies(self) -> np.ndarray:
+        """Return the latencies of the streamed commands, s."""
+        return _latencies(self._sent)
+
+
+def _latencies(sent: Iterable[Sent]) -> np.ndarray:
+    """Return from command to answer, s, of those that were answered."""
+    values = np.array([entry.answered_at - entry.sent_at for entry in sent])
+    return values[np.isfinite(values)]
+
+
+class Watch:
+    """How long the loop's processes work, and wait for a processor, from now on.
+
+    Parameters
+    ----------
+    nodes : sequence of NodeProcess
+        Those that are watched beside this process.
+    """
+
+    def __init__(self, nodes: Sequence[NodeProcess]) -> None:
+        self._pids = [os.getpid(), *(node.pid for node in nodes)]
+        self._began, self._waited = time.monotonic(), self._waiting()
+
+    def _waiting(self) -> float:
+        return sum(map(waited_for_processor, self._pids))
+
+    def answering(self, client: LoopClient, rate: float, latencies: np.ndarray | None = None) -> Answering:
+        """Return how fast a client's commands at some rate, Hz, were answered since then."""
+        every = _latencies(client.sent.values())
+        return Answering(
+            latencies=np.zeros(0) if latencies is None else latencies,
+            answered=len(every),
+            late=int((every > 1.0 / rate).sum()),
+            longest=float(every.max(initial=0.0)),
+            elapsed=time.monotonic() - self._began,
+            waited=max(0.0, self._waiting() - self._waited),  # an ended thread takes its share along
+        )
 
 
 def connect(client: LoopClient, nodes: Sequence[NodeProcess] = (), timeout: float = CONNECT_TIMEOUT) -> None:
@@ -195,14 +233,14 @@ def run_session(
         if path is not None:
             track_without, _ = session.mill(path)
         session.enable(True)
-        session.latencies()
+        session.forget()
     announce("pass with compensation …")
     session.visit(records, compensated=True)
     result = SessionResult(records)
     if path is not None:
         track_with, corrections = session.mill(path)
         result.path = PathRecord(path, track_without, track_with, corrections)
-    result.latencies = session.latencies()
+    result.answering.latencies = session.latencies()
     _count(client, result)
     return result
 

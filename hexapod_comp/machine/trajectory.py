@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..pose import Pose
+from ..pose import Pose, best_motion, rotation_angle
 from .geometry import HexapodGeometry
 from .kinematics import Structure, strut_lengths_batch
 
@@ -20,6 +20,12 @@ PEAK_OF_QUINTIC = 1.875
 
 BEND_OF_QUINTIC = 10.0 / 3.0**0.5
 """Its largest second derivative."""
+
+TRACK_WINDOW = 25
+"""How many commands the tool may lag behind the newest one; at 250 Hz a tenth of a second."""
+
+MOST_ALIGNED, ALIGNING_STEPS, SETTLED = 5000, 200, 1e-9
+"""Points by which a track is aligned; steps of that, each a motion onto the nearest places; last step, m and rad."""
 
 COARSE = 20
 """Sections of a move over which the struts' slopes are taken."""
@@ -177,6 +183,59 @@ def pocket(
 def commanded_in_base(geometry: HexapodGeometry) -> HexapodGeometry:
     """Return the machine with its work frame in the base, for poses that are given in ``base``."""
     return replace(geometry, work=Pose.identity())
+
+
+def feet_on(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> np.ndarray:
+    """Return the nearest place of a commanded polyline to each point, shape (n, 3), m: a late tool is no error.
+
+    Parameters
+    ----------
+    corners : ndarray, shape (N, 3)
+        Commanded positions, two at least, m.
+    points : ndarray, shape (n, 3)
+        Where the tool was, m.
+    sent : ndarray of int, shape (n,)
+        How many positions had been commanded when each was seen. Only what was commanded within the last
+        :data:`TRACK_WINDOW` counts, so that a path that crosses itself is not mistaken.
+    """
+    start, along = corners[:-1], np.diff(corners, axis=0)
+    square = np.maximum((along**2).sum(axis=1), 1e-30)
+    newest = np.clip(sent, 1, len(start))
+    feet, nearest = np.array(points), np.full(len(points), np.inf)
+    for back in range(TRACK_WINDOW):
+        leg = np.maximum(newest - 1 - back, 0)
+        share = np.clip(((points - start[leg]) * along[leg]).sum(axis=1) / square[leg], 0.0, 1.0)
+        candidates = start[leg] + share[:, None] * along[leg]
+        distance = np.linalg.norm(points - candidates, axis=1)
+        closer = distance < nearest
+        feet[closer], nearest[closer] = candidates[closer], distance[closer]
+    return feet
+
+
+def motion_onto(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> Pose | None:
+    """Return the rigid motion that brings points closest to a commanded polyline: the datum of a track aligned.
+
+    Parameters
+    ----------
+    corners, points, sent
+        As for :func:`feet_on`.
+
+    Returns
+    -------
+    Pose or None
+        T with T·points near the polyline; None for points in a line, which leave a turn open.
+    """
+    every = max(1, len(points) // MOST_ALIGNED)
+    points, sent, motion = points[::every], sent[::every], Pose.identity()
+    for _ in range(ALIGNING_STEPS):
+        moved = motion.position + points @ motion.rotation.T
+        step = best_motion(moved, feet_on(corners, moved, sent))
+        if step is None:
+            return None
+        motion = step @ motion
+        if np.linalg.norm(step.position) < SETTLED and rotation_angle(step.rotation) < SETTLED:
+            break
+    return motion
 
 
 def join(paths: list[Path]) -> Path:

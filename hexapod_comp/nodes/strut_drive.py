@@ -23,9 +23,8 @@ from ..errors import CommandError, HexapodError, KinematicsError
 from ..formats.paths import config_file
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry, load_geometry
 from ..machine.model import MachineModel, RealMachine
-from ..machine.model_file import IDEAL, load_model
-from ..virtual.imperfections import ImperfectionBounds, draw_model
 from ..virtual.machine import DriveParameters, Faults, StrutDrive
+from ..virtual.named import RANDOM, find_model, is_word
 from .command_source import CommandSource
 from .health import ERROR, OK, WARN, Flow, Refusals, joined, seconds
 from .log_space import LogSpace
@@ -115,9 +114,9 @@ class StrutDriveNode(MachineNode):
 
     def _truth(self, geometry: HexapodGeometry) -> MachineModel:
         name = self._options["truth_file"]
-        if name == "random":
-            return draw_model(geometry, ImperfectionBounds(), self._options["truth_seed"], "random")
-        return load_model(name if name == IDEAL else config_file(name), geometry)
+        if name == RANDOM:
+            name = f"{RANDOM}:{self._options['truth_seed']}"
+        return find_model(name if is_word(name) else config_file(name), geometry)
 
     def _drive_parameters(self) -> DriveParameters:
         names = ("step", "lag", "max_acceleration", "encoder_resolution", "encoder_noise", "tracker_noise")

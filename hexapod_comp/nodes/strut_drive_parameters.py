@@ -11,7 +11,7 @@ PARAMETERS = (
     Parameter(
         "truth_file",
         "paper_machine.yaml",
-        "hidden truth: a model file, ideal for none, or random for one drawn from truth_seed",
+        "hidden truth: a model file, ideal for none, random for one drawn from truth_seed, or random:SEED",
     ),
     Parameter("truth_seed", 1, "seed of a random truth", 0, 2**31),
     Parameter("noise_seed", 0, "seed of the noise", 0, 2**31),

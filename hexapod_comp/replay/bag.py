@@ -2,8 +2,8 @@
 
 A bag is a folder with ``metadata.yaml`` as ``ros2 bag record`` writes it, or a bare ``.mcap`` or ``.db3`` file. Of
 its topics a replay needs the compensator's journal alone; ``compensator/files`` spares the user the search for geometry
-and model; ``strut_states`` and ``tool_pose_estimate`` are shown where there are any. All others are left alone,
-whatever their types.
+and model; ``strut_states``, ``tool_pose_estimate`` and ``tool_pose_true`` are shown where there are any. All others are
+left alone, whatever their types.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ POSE, STRUTS, TEXT = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointStat
 TOPICS = {
     "strut_states": STRUTS,
     "tool_pose_estimate": POSE,
+    "tool_pose_true": POSE,
 }
 """A machine's topics in its namespace that are shown, and their types."""
 

@@ -13,6 +13,7 @@ import numpy as np
 from ..compensation.journal import ROLES, made_with
 from ..errors import printable
 from ..formats.texts import aligned
+from ..machine.trajectory import feet_on, motion_onto
 from ..pose import Pose
 from .bag import Recording
 from .replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Event, Replay
@@ -48,6 +49,8 @@ class Report:
         What that was.
     tolerance : float
         Differences up to this, m, are accepted.
+    work : Pose or None
+        The work frame in ``base``, where the geometry is at hand: without it nobody can tell where the tool went.
     """
 
     recording: Recording
@@ -55,6 +58,7 @@ class Report:
     other: Replay | None = None
     other_name: str = ""
     tolerance: float = 0.0
+    work: Pose | None = None
 
     @property
     def seconds(self) -> np.ndarray:
@@ -228,6 +232,42 @@ def _figures(report: Report) -> Iterator[str]:
         shown = " ".join(f"{_rms(column):.2f}/{np.abs(column).max() * 1e6:.2f}" for column in error.T)
         yield f"following error (measured − commanded, drives' lag included), RMS/largest µm per strut: {shown}"
 
+    yield from (_tool_text(name, raw, aligned) for name, raw, aligned in tool_distances(report))
+
+
+def _tool_text(name: str, raw: np.ndarray, left: np.ndarray | None) -> str:
+    sizes = [f"as it is {_size(raw)}", *([] if left is None else [f"datum aligned {_size(left)}"])]
+    return f"distance of {name} to the commanded path, RMS/largest µm: {', '.join(sizes)}"
+
+
+def _size(distances: np.ndarray) -> str:
+    return f"{_rms(distances):.2f}/{distances.max() * 1e6:.2f}"
+
+
+def tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
+    """Yield by how much the tool was off its path: a topic, distances as they are, and with the datum aligned, m.
+
+    A late tool is not off. The second is None where the tool moved in a line or not at all.
+    """
+    when = report.seconds
+    if report.work is None or len(when) < 2:
+        return
+    corners = tool_positions(report.recording, report.work)
+    for name in ("tool_pose_estimate", "tool_pose_true"):
+        poses = report.recording.topics[name]
+        stamps = poses.stamps if poses.stamps.all() else poses.times
+        at = since(stamps, report.recording.commands["stamp"])
+        inside = (at >= when[0]) & (at <= when[-1])
+        if not inside.any():
+            continue
+        points, sent = poses.values[inside], np.searchsorted(when, at[inside], side="right")
+        raw = np.linalg.norm(points - feet_on(corners, points, sent), axis=1)
+        motion, left = motion_onto(corners, points, sent), None
+        if motion is not None:
+            points = motion.position + points @ motion.rotation.T
+            left = np.linalg.norm(points - feet_on(corners, points, sent), axis=1)
+        yield name, raw, left
+
 
 def _refused(report: Report) -> Iterator[str]:
     if not report.refusals:
@@ -308,6 +348,7 @@ def as_json(report: Report) -> dict[str, Any]:
         "made_with": recording.first.made_with,
         "refused": report.refusals,
         "notes": recording.notes,
+        "distance_to_path": {name: _distance_json(raw, left) for name, raw, left in tool_distances(report)},
     }
     if replayed is not None:
         content |= _replay_json(replayed)
@@ -319,6 +360,13 @@ def as_json(report: Report) -> dict[str, Any]:
             "refused": len(other.refused_now),
         }
     return content
+
+
+def _distance_json(raw: np.ndarray, left: np.ndarray | None) -> dict[str, Any]:
+    def size(distances: np.ndarray | None) -> dict[str, float] | None:
+        return None if distances is None else {"rms_m": _rms(distances) * 1e-6, "max_m": float(distances.max())}
+
+    return {"as_it_is": size(raw), "datum_aligned": size(left)}
 
 
 def _replay_json(replayed: Replay) -> dict[str, Any]:

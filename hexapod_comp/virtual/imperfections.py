@@ -24,6 +24,15 @@ FIELD_NODES = 3
 FIELD_POWERS = 4
 """Coefficients of a drawn field's polynomials: cubic along each line."""
 
+MAP_WAVES, KNOTS_PER_WAVE = 8, 15
+"""Waves added up in a smooth length error; its knots on the shortest one: the spline between them is then the wave."""
+
+WAVES_OF_STROKE = (0.1, 0.35)
+"""Shortest and longest of them where bounds draw them, as shares of the stroke."""
+
+SPANS = {"wave": "m", "backlash": "m", "strut_expansion": "1/K", "body_expansion": "1/K"}
+"""Bounds that have a lowest and a highest value, and their units."""
+
 
 @dataclass(frozen=True)
 class ImperfectionBounds:
@@ -53,6 +62,10 @@ class ImperfectionBounds:
         Share of the field by which forward and backward may differ, 0…1.
     field_box : ndarray, shape (2, 3) or None
         Corners of the field's box, m in ``base``; needed when there is a field.
+    length_map : float
+        Root mean square of every strut's smooth length error, m: waves from a tenth to a third of its stroke.
+    strut_expansion, body_expansion : (float, float)
+        Lowest and highest thermal expansion of a strut, and of base and platform, 1/K.
     shared_platform_joints : bool
         True: platform joints that coincide nominally are one ball joint and move together. False: each
         strut has a joint of its own.
@@ -73,15 +86,18 @@ class ImperfectionBounds:
     field_rotation: float = 0.0
     field_reversal: float = 0.1
     field_box: np.ndarray | None = None
+    length_map: float = 0.0
+    strut_expansion: tuple[float, float] = (0.0, 0.0)
+    body_expansion: tuple[float, float] = (0.0, 0.0)
     shared_platform_joints: bool = True
 
     def __post_init__(self) -> None:
         for entry in fields(self):
             value = getattr(self, entry.name)
-            if entry.name in ("wave", "backlash"):
+            if entry.name in SPANS:
                 low, high = value
                 if not 0.0 <= low <= high < math.inf:
-                    problem = "must be two lengths, 0 ≤ lowest ≤ highest, m"
+                    problem = f"must be two numbers, 0 ≤ lowest ≤ highest, {SPANS[entry.name]}"
                     raise ModelError(f"bounds.{entry.name}", problem, value)
             elif entry.name not in ("field_box", "shared_platform_joints") and not 0.0 <= value < math.inf:
                 raise ModelError(f"bounds.{entry.name}", "must be finite and not negative", value)
@@ -122,22 +138,73 @@ def draw_model(geometry: HexapodGeometry, bounds: ImperfectionBounds, seed: int,
     ModelError
         A seed that is not one, or draws that cannot describe a machine.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise ModelError("seed", "must be a whole number, 0 or above", seed)
-    rng = np.random.default_rng(int(seed))
+    rng = seeded(seed)
     base = bounds.joint * rng.uniform(-1.0, 1.0, (6, 3))
     platform = bounds.joint * rng.uniform(-1.0, 1.0, (6, 3))
     if bounds.shared_platform_joints:
         platform = platform[first_of_same(geometry.platform_joints)]
-    return MachineModel(
+    struts, field = _draw_struts(geometry, bounds, rng), _draw_field(bounds, rng)
+    expansion, bodies = rng.uniform(*bounds.strut_expansion, 6), rng.uniform(*bounds.body_expansion, 2)
+    model = MachineModel(
         machine=geometry.name,
         name=name or f"virtual-{seed}",
         base_deviation=base,
         platform_deviation=platform,
-        struts=_draw_struts(geometry, bounds, rng),
-        field=_draw_field(bounds, rng),
+        struts=replace(struts, expansion=expansion),
+        field=field,
+        base_expansion=float(bodies[0]),
+        platform_expansion=float(bodies[1]),
         origin=ModelOrigin(note=f"virtual machine drawn with seed {seed}"),
     )
+    if not bounds.length_map:
+        return model
+    shortest, longest = (share * float(np.ptp(geometry.limits.stroke)) for share in WAVES_OF_STROKE)
+    return with_length_map(model, geometry, seed, bounds.length_map, (shortest, longest))
+
+
+def with_length_map(
+    model: MachineModel,
+    geometry: HexapodGeometry,
+    seed: int,
+    rms: float = 5e-6,
+    waves: tuple[float, float] = (0.06, 0.2),
+) -> MachineModel:
+    """Return a model whose struts have a smooth length error as well: sine waves of random length and phase.
+
+    Parameters
+    ----------
+    model : MachineModel
+        The machine so far.
+    geometry : HexapodGeometry
+        Tells the struts' stroke.
+    seed : int
+        0 or above.
+    rms : float
+        Root mean square of each strut's error over its stroke, m.
+    waves : (float, float)
+        Shortest and longest wave, m.
+    """
+    rng = seeded(seed, "length map")
+    low, high = geometry.limits.stroke[:, 0].min(), geometry.limits.stroke[:, 1].max()
+    knots = np.linspace(low, high, int(np.ceil((high - low) / waves[0] * KNOTS_PER_WAVE)) + 1)
+    lengths, phases = rng.uniform(*waves, (6, MAP_WAVES)), rng.uniform(0.0, 2.0 * np.pi, (6, MAP_WAVES))
+    sizes = rng.standard_normal((6, MAP_WAVES))
+    values = np.einsum("sw,swk->sk", sizes, np.sin(2.0 * np.pi * knots / lengths[..., None] + phases[..., None]))
+    values *= rms / np.sqrt((values**2).mean(axis=1, keepdims=True))
+    return replace(model, struts=replace(model.struts, map_knots=knots, map_values=values))
+
+
+def seeded(seed: int, what: str = "") -> np.random.Generator:
+    """Return a generator for a seed; one of its own for each kind of imperfection that is named.
+
+    Raises
+    ------
+    ModelError
+        A seed that is not one.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise ModelError("seed", "must be a whole number, 0 or above", seed)
+    return np.random.default_rng([int(seed), len(what)] if what else int(seed))
 
 
 def _draw_struts(geometry: HexapodGeometry, bounds: ImperfectionBounds, rng: np.random.Generator) -> StrutErrors:
@@ -169,7 +236,7 @@ def _draw_field(bounds: ImperfectionBounds, rng: np.random.Generator) -> GridFie
     ]
     raw = GridField((x, y, z), (lines[0], lines[1], lines[2]))
     wanted = np.repeat([bounds.field_displacement, bounds.field_rotation], 3)
-    scale = (wanted / _largest(raw))[:, None]
+    scale = (wanted / largest_errors(raw))[:, None]
     return replace(raw, lines=tuple(family * scale for family in raw.lines))
 
 
@@ -181,7 +248,7 @@ def _draw_lines(rng: np.random.Generator, directions: int) -> list[np.ndarray]:
     return [np.einsum("nmk,dkcp->dnmcp", terms, family) for family in weights]
 
 
-def _largest(grid_field: GridField) -> np.ndarray:
+def largest_errors(grid_field: GridField) -> np.ndarray:
     """Return the largest magnitude of each component over the box and both directions, shape (6,)."""
     samples = [np.linspace(nodes[0], nodes[-1], 9) for nodes in grid_field.grid]
     points = np.stack(np.meshgrid(*samples), axis=-1).reshape(-1, 3)

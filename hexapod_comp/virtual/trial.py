@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..errors import NotConvergedError
+from ..errors import ModelError, NotConvergedError
 from ..kernels.kinematics import OK
 from ..kernels.model import command_one
 from ..machine.kinematics import forward_error
@@ -19,6 +19,7 @@ from ..machine.model import MachineModel, RealMachine, Temperatures
 from ..machine.motion import FOLLOWED
 from ..machine.passes import Passes, Poses, at
 from ..measurements.readings import attitude_error
+from ..pose import best_motion
 
 NameOf = Callable[[int], str]
 """Says in an error which row it is about."""
@@ -51,26 +52,34 @@ class ToolErrors:
         """Return the same once the datum is aligned: less the turn and shift that best explain the displacements.
 
         Rotations lose their mean.
+
+        Raises
+        ------
+        ModelError
+            Fewer than three points, or points in a line.
         """
         actual = self.points + self.displacement
-        centre, mean = self.points.mean(axis=0), actual.mean(axis=0)
-        turn, _ = Rotation.align_vectors(self.points - centre, actual - mean)
+        motion = best_motion(actual, self.points)
+        if motion is None:
+            raise ModelError("points", "must be three or more, not in a line, for a datum", len(actual))
         turned = Rotation.from_rotvec(self.rotation)
-        displacement = turn.apply(actual - mean) + centre - self.points
+        displacement = motion.position + actual @ motion.rotation.T - self.points
         return replace(self, displacement=displacement, rotation=(turned.mean().inv() * turned).as_rotvec())
 
 
-def without_datum(points: np.ndarray, displacements: np.ndarray) -> np.ndarray:
+def without_datum(points: np.ndarray, displacements: np.ndarray, by: slice = slice(None)) -> np.ndarray:
     """Return displacements (M, 3, D) of points (M, 3) less what one shift and rotation of the datum explain.
 
-    The linear case of :meth:`ToolErrors.aligned`, for D sets of small displacements at once.
+    The linear case of :meth:`ToolErrors.aligned`, for D sets of small displacements at once. The datum is found by
+    all points, or by some of them, and taken off all.
     """
-    arms = points - points.mean(axis=0)
+    arms = points - points[by].mean(axis=0)
     columns = [np.tile(axis, (len(arms), 1)) for axis in np.eye(3)]
     columns += [np.cross(axis, arms) for axis in np.eye(3)]
-    free = np.linalg.qr(np.stack([column.ravel() for column in columns], axis=1))[0]
-    flat = displacements.reshape(3 * len(points), -1)
-    return (flat - free @ (free.T @ flat)).reshape(displacements.shape)
+    free = np.stack(columns, axis=2)
+    seen = free[by].reshape(-1, 6)
+    found = np.linalg.lstsq(seen, displacements[by].reshape(len(seen), -1), rcond=None)[0]
+    return displacements - (free.reshape(-1, 6) @ found).reshape(displacements.shape)
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 from strategies import paper_geometry, random_model
 
-from benchmarks.smooth_imperfections import with_length_map, with_wavy_field
+from benchmarks.smooth_imperfections import with_wavy_field
 from hexapod_comp.errors import ModelError
 from hexapod_comp.kernels.struts import smooth_error
 from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.virtual.imperfections import with_length_map
 
 PAPER = paper_geometry()
 PLAIN = MachineModel("paper")

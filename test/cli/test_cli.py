@@ -76,7 +76,7 @@ def test_help_is_fast_and_needs_no_compiler() -> None:
     assert done.returncode == 0, done.stderr
     listed = re.findall(r"^ +(\w+):$|^    (\w+)  ", done.stdout, re.MULTILINE)
     assert " ".join(group + ":" if group else verb for group, verb in listed) == (
-        "kinematics: show ik fk check loop: run demo replay calibration: plan simulate fit iso230 export "
+        "kinematics: show ik fk check loop: run demo replay calibration: plan imagine simulate fit iso230 export "
         "analysis: assess classify paper"
     )
     assert all(len(line) <= 80 for line in done.stdout.splitlines() if line.startswith("    ")), "one line a verb"
@@ -133,7 +133,7 @@ def test_json_is_printed_and_out_stays_csv(hexapod, tmp_path: Path) -> None:
         ("ik --m", {"--machine", "--model"}),
         ("ik --machine pap", {"paper.yaml"}),
         ("ik --machine ", {*MACHINES, "mine.csv", "deep/"}),
-        ("ik --model ", {"ideal", "paper_machine.yaml", "paper_lines_model.yaml", "mine.csv", "deep/"}),
+        ("ik --model ", {"ideal", "random", "paper_machine.yaml", "paper_lines_model.yaml", "mine.csv", "deep/"}),
         ("plan campaign_", {"campaign_1d.yaml", "campaign_5d.yaml", "campaign_full.yaml"}),
         ("classify --budget e", {"error_budget.yaml"}),
         ("check ", {*(f"table{n}.csv" for n in range(1, 6)), "mine.csv", "deep/"}),

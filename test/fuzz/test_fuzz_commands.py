@@ -159,12 +159,13 @@ OPTIONS = {
     "assess": ("--joint-um", "--strut-um", "--pitch-ppm", "--wave-um", "--wave-period-mm", "--seed", "--json"),
     "iso230": ("--probe-mm", "--columns", "--targets", "--machine"),
     "plan": ("--lead-mm", "--blocks", "--tolerance-um", "--expansion-ppm", "--seed", "--machine"),
+    "imagine": ("--joints-um", "--wave-um", "--backlash-um", "--box", "--seed", "--name", "--machine", "--out"),
     "simulate": ("--seed", "--truth", "--campaign", "--out", "--model"),
     "fit": ("--scheme", "--lead-mm", "--blocks", "--probe-mm", "--order", "--columns", "--out", "--truth"),
     "export": ("--units", "--box", "--step-mm", "--poses", "--tilt-deg", "--seed", "--table"),
     "classify": ("--cells", "--clearance-mm", "--tilt-deg", "--compare", "--allow-um", "--workers", "--budget"),
     "run": ("--rate-hz", "--machine", "--model", "--truth", "--pictures"),
-    "demo": ("--rate-hz", "--machine", "--model", "--truth", "--pictures"),
+    "demo": ("--rate-hz", "--machine", "--model", "--truth", "--seed", "--pictures"),
 }
 """Verbs and options that are given nonsense; a file that does not exist keeps the long ones from starting."""
 
@@ -184,9 +185,9 @@ def test_nonsense_options(folder: Path, verb: str, place: int, value: str, other
     arguments = [verb, options[place % len(options)], value]
     if other is not None:
         arguments += [options[other[0] % len(options)], other[1]]
-    if verb not in ("ik", "fk", "demo"):
+    if verb not in ("ik", "fk", "demo", "imagine"):
         arguments.append("no_such_file.csv")
-    if verb in ("simulate", "export", "classify", "demo"):
+    if verb in ("imagine", "simulate", "export", "classify", "demo"):
         arguments += ["--machine", "no_such_machine"]
     COUNTS["options"] += 1
     command(*arguments)

@@ -14,17 +14,30 @@ import numpy as np
 import pytest
 from strategies import paper_geometry
 
+from hexapod_comp.errors import NoAnswerError
 from hexapod_comp.formats.csv import Row
 from hexapod_comp.formats.json import plain
 from hexapod_comp.loop import run as loop
-from hexapod_comp.loop.records import PoseRecord, SessionResult
-from hexapod_comp.loop.report import pose_block
+from hexapod_comp.loop.records import Answering, PathRecord, PoseRecord, SessionResult, Track
+from hexapod_comp.loop.report import ALIGNED, AS_IT_IS, ErrorRow, busy_text, error_rows, error_table, pose_block
+from hexapod_comp.machine.size import rms
+from hexapod_comp.machine.trajectory import circle
 from hexapod_comp.pose import Pose, rotation_from_angles
 
 TURNED_WORK = Pose(np.array([0.03, -0.02, 0.35]), rotation_from_angles(np.radians([4.0, -7.0, 90.0])))
 TURNED_TOOL = Pose(np.array([0.01, 0.02, 0.05]), rotation_from_angles(np.radians([10.0, 5.0, -60.0])))
 GIVEN = Pose(np.array([0.012, -0.034, 0.056]), rotation_from_angles(np.radians([1.0, -2.0, 3.0])))
 OFF = np.array([30e-6, -40e-6, 0.0])  # in the work frame: 50 µm
+
+
+class NoWatch:
+    """Sees nothing."""
+
+    def __init__(self, nodes: object) -> None:
+        pass
+
+    def answering(self, *_: object) -> Answering:
+        return Answering()
 
 
 @pytest.fixture
@@ -42,7 +55,9 @@ def result(monkeypatch: pytest.MonkeyPatch) -> SessionResult:
         yield SimpleNamespace(update=None)
 
     client = SimpleNamespace(close=lambda: None)
-    monkeypatch.setattr(loop, "session", SimpleNamespace(connect=lambda *_: None, run_session=run_session))
+    monkeypatch.setattr(
+        loop, "session", SimpleNamespace(connect=lambda *_: None, run_session=run_session, Watch=NoWatch)
+    )
     monkeypatch.setattr(loop, "_client", lambda _: client)
     monkeypatch.setattr(loop, "_progress", no_bar)
     geometry = replace(paper_geometry(), work=TURNED_WORK, tool=TURNED_TOOL)
@@ -53,7 +68,7 @@ def result(monkeypatch: pytest.MonkeyPatch) -> SessionResult:
 
 
 def test_json_says_the_frame_and_gives_back_the_users_own_numbers(result: SessionResult):
-    content = plain(loop.as_json([Row(2, "1")], result))
+    content = plain(loop.as_json([Row(2, "1")], result, []))
     assert content["frame"] == "work"
     (pose,) = content["poses"]
     given = {"x_mm": 12.0, "y_mm": -34.0, "z_mm": 56.0, "alpha_deg": 1.0, "beta_deg": -2.0, "gamma_deg": 3.0}
@@ -69,3 +84,116 @@ def test_text_says_the_frame_and_gives_back_the_users_own_numbers(result: Sessio
     assert [float(word) for word in commanded.split()[2:7:2]] == [12.0, -34.0, 56.0]
     (true,) = (line for line in rest if line.split()[0] == "true")
     assert [float(word) for word in true.split()[2:7:2]] == [12.03, -34.04, 56.0]
+
+
+# The datum: one rigid motion of everything that the tool does.
+
+DATUM = Pose(np.array([90e-6, -40e-6, 10e-6]), rotation_from_angles(np.array([2e-4, -1e-4, 3e-4])))
+
+
+def shifted(count: int = 8, noise: float = 0.0) -> SessionResult:
+    """Return poses and a circle that a machine meets but for its datum, with compensation, and `noise`, m."""
+    rng = np.random.default_rng(1)
+    targets = [Pose(place, np.eye(3)) for place in rng.uniform(-0.1, 0.1, (count, 3))]
+
+    def seen(datum: Pose, pose: Pose, noise: float) -> Pose:
+        there = datum @ pose
+        return Pose(there.position + noise * rng.standard_normal(3), there.rotation)
+
+    poses = [
+        PoseRecord(pose, true_without=seen(DATUM, pose, 2e-5), true_with=seen(DATUM, pose, noise)) for pose in targets
+    ]
+    path = circle(Pose.identity(), 0.01, 0.02, 250.0)
+    sent = np.arange(1, len(path) + 1)
+    tracks = [
+        Track.along(
+            path, DATUM.position + path.positions @ DATUM.rotation.T + more * rng.standard_normal((len(path), 3)), sent
+        )
+        for more in (2e-5, noise)
+    ]
+    return SessionResult(poses, PathRecord(path, tracks[0], tracks[1], np.zeros((len(path), 6))))
+
+
+def test_a_datum_is_aligned_at_rest_and_along_the_path() -> None:
+    """Shifted and turned by 100 µm and 0.4 mrad alone: nothing is left; 20 µm of noise without compensation stay."""
+    rows = {(row.what, row.datum): row for row in error_rows(shifted())}
+    assert list(rows) == [("at rest", ALIGNED), ("at rest", AS_IT_IS), ("path", ALIGNED), ("path", AS_IT_IS)]
+    assert rms(rows["at rest", AS_IT_IS].compensated) == pytest.approx(np.linalg.norm(DATUM.position), rel=0.3)
+    assert rows["at rest", ALIGNED].compensated.max() < 1e-12
+    assert rows["path", ALIGNED].compensated.max() < 1e-12
+    before = rows["at rest", ALIGNED].without
+    assert before is not None
+    assert rms(before) == pytest.approx(2e-5 * np.sqrt(3.0 - 6.0 / 8.0), rel=0.4)  # six of 24 numbers are the datum's
+    table = error_table(list(rows.values())).splitlines()
+    assert len(table) == 5
+    assert "datum aligned" in table[1]
+
+
+def test_a_datum_is_in_the_same_place_from_any_frame() -> None:
+    one = shifted(noise=3e-6)
+    for row, other in zip(error_rows(one), error_rows(one.seen_from(TURNED_WORK)), strict=True):
+        np.testing.assert_allclose(row.compensated, other.compensated, atol=1e-12)
+
+
+def test_too_few_poses_are_not_aligned() -> None:
+    """Five poses are fifteen numbers, of which a datum takes six: what is left would flatter."""
+    few, line = shifted(5), shifted(8)
+    for record in line.poses:
+        record.target = Pose([record.target.position[0], 0.0, 0.0], np.eye(3))
+    for result in (few, line):
+        assert result.aligned() is None
+        assert {row.datum for row in error_rows(result)} == {AS_IT_IS}
+
+
+def test_what_nobody_saw_has_no_rows() -> None:
+    assert error_rows(SessionResult([PoseRecord(GIVEN)])) == []
+    assert loop.complaints(SessionResult(), []) == ["the true tool pose was not seen"]
+
+
+# The verdict.
+
+
+def row(left: float, before: float = 1e-4, promised: tuple[float, float] | None = (1e-7, 3e-7)) -> ErrorRow:
+    return ErrorRow("at rest", ALIGNED, 4, np.full(4, before), np.full(4, left), promised)
+
+
+def test_the_verdict_is_by_what_was_promised_with_the_datum_aligned() -> None:
+    as_it_is = ErrorRow("at rest", AS_IT_IS, 4, np.full(4, 1e-4), np.full(4, 2e-4))
+    assert loop.complaints(SessionResult(), [row(2.9e-7), as_it_is]) == []
+    (said,) = loop.complaints(SessionResult(), [row(3.1e-7), as_it_is])
+    assert said == "at rest, datum aligned: 0.310 µm RMS are left; at most 0.300 were promised"
+    (said,) = loop.complaints(SessionResult(), [row(2e-4, promised=None)])
+    assert said == "at rest, datum aligned: compensation does not reduce the error"
+    (said,) = loop.complaints(SessionResult(), [as_it_is])
+    assert said == "at rest, as it is: compensation does not reduce the error"
+
+
+def test_a_busy_computer_is_named_as_the_cause_and_only_of_something() -> None:
+    busy = SessionResult(lost=2, answering=Answering(answered=1000, late=40, longest=0.81, elapsed=60.0, waited=9.04))
+    lost, cause = loop.complaints(busy, [row(1e-7)])
+    assert lost == "2 commands were lost"
+    assert cause.startswith(
+        "the computer was busy: 40 of 1000 answers came after the next command was due, the longest"
+    )
+    assert "after 810 ms, and its processes waited 9.0 s in 60 s for a processor" in cause
+    busy.lost = 0
+    assert loop.complaints(busy, [row(1e-7)]) == []
+    idle = SessionResult(lost=2, answering=Answering(answered=1000, late=3, longest=0.02, elapsed=60.0, waited=1.0))
+    assert loop.complaints(idle, [row(1e-7)]) == ["2 commands were lost"]
+    assert busy_text(idle.answering) == ""
+
+
+def test_a_busy_computer_is_named_when_an_answer_does_not_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The session ends with an error then, and there is no report."""
+
+    class Busy(NoWatch):
+        def answering(self, *_: object) -> Answering:
+            return Answering(answered=100, late=50, longest=0.9, elapsed=2.0, waited=3.0)
+
+    def run_session(*_: object) -> SessionResult:
+        raise NoAnswerError("no answer to a command within 1 s; last refusal: none")
+
+    monkeypatch.setattr(loop, "session", SimpleNamespace(connect=lambda *_: None, run_session=run_session, Watch=Busy))
+    monkeypatch.setattr(loop, "_client", lambda _: SimpleNamespace(close=lambda: None))
+    with pytest.raises(NoAnswerError, match="within 1 s; last refusal: none; the computer was busy: 50 of 100"):
+        loop.witnessed(paper_geometry(), (), [GIVEN], None, 100.0, False)

@@ -12,7 +12,17 @@ from scipy.spatial.transform import Rotation, Slerp
 from strategies import paper_geometry, random_pose
 
 from hexapod_comp.machine.geometry import HexapodGeometry
-from hexapod_comp.machine.trajectory import Path, circle, join, move, moves, pocket
+from hexapod_comp.machine.trajectory import (
+    TRACK_WINDOW,
+    Path,
+    circle,
+    feet_on,
+    join,
+    motion_onto,
+    move,
+    moves,
+    pocket,
+)
 from hexapod_comp.pose import Pose
 
 PAPER = paper_geometry()
@@ -175,3 +185,37 @@ def test_pocket_mills_every_row_and_keeps_the_limits() -> None:
     assert steps <= PAPER.limits.speed / 250.0
     directions = np.sign(np.diff(local[:, 0]))[np.abs(np.diff(local[:, 0])) > 1e-9]
     assert (np.diff(directions) != 0.0).sum() == 4  # five rows, four reversals
+
+
+def figure_of_eight(count: int = 400) -> np.ndarray:
+    """Return a path that crosses itself and leaves its plane, (count, 3), m."""
+    t = np.linspace(0.0, 2.0 * np.pi, count)
+    return np.stack([0.02 * np.sin(t), 0.01 * np.sin(2.0 * t), 0.4 + 0.003 * np.cos(t)], axis=1)
+
+
+def test_the_foot_of_a_point_is_the_nearest_place_of_what_was_just_commanded() -> None:
+    """Beside a dense sampling of the last legs; where the path crosses itself the other branch does not count."""
+    corners, rng = figure_of_eight(), np.random.default_rng(4)
+    sent = rng.integers(0, len(corners) + 3, 200)
+    newest = np.clip(sent, 1, len(corners) - 1)
+    behind = np.maximum(newest - rng.integers(0, TRACK_WINDOW - 5, 200), 0)
+    points = corners[behind] + rng.uniform(-1e-4, 1e-4, (200, 3))
+    feet = feet_on(corners, points, sent)
+    for point, last, foot in zip(points, newest, feet, strict=True):
+        near = corners[max(0, last - TRACK_WINDOW) : last + 1]
+        legs = [near[i] + np.linspace(0.0, 1.0, 2001)[:, None] * (near[i + 1] - near[i]) for i in range(len(near) - 1)]
+        nearest = np.linalg.norm(np.concatenate(legs) - point, axis=1).min()
+        assert np.linalg.norm(foot - point) == pytest.approx(nearest, rel=1e-4, abs=1e-9)
+
+
+def test_a_track_is_moved_back_onto_its_path() -> None:
+    """A tool that runs late on a path which stands 150 µm and 0.3 mrad off: the path's own motion takes it back."""
+    corners = figure_of_eight()
+    sent = np.arange(10, len(corners))
+    turn, shift = Rotation.from_rotvec([1e-4, -2e-4, 2e-4]), np.array([1e-4, -1e-4, 5e-5])
+    late = corners[sent - 4]
+    motion = motion_onto(corners, turn.apply(late) + shift, sent)
+    assert motion is not None
+    back = motion.position + (turn.apply(late) + shift) @ motion.rotation.T
+    assert np.linalg.norm(back - feet_on(corners, back, sent), axis=1).max() < 1e-7
+    assert motion_onto(corners[:, [0, 0, 0]], late[:, [0, 0, 0]], sent) is None

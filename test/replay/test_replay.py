@@ -843,3 +843,27 @@ def test_tables_that_compute_what_they_hold_are_refused(run, tmp_path, statement
         database.commit()
     with pytest.raises(InputFileError, match="computes what it seems to hold"):
         read_recording(bag)
+
+
+def test_the_distance_to_the_path_is_given_as_it_is_and_with_the_datum_aligned(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A tool that is 5 ms late on a path that stands 100 µm and 0.4 mrad off, and nothing else: the motion is known."""
+    datum = Pose.from_angles([60e-6, -70e-6, 40e-6], np.array([2e-4, -2e-4, 3e-4]))
+    machine = RecordedMachine()
+    for n in range(1200):
+        machine.send(wave_pose(n))
+        if n >= 5:
+            machine.keep_pose("tool_pose_true", machine.now, datum @ wave_pose(n - 5))
+        if n % 50 == 49:
+            machine.page()
+    bag = str(write_bag(tmp_path / "run", machine.messages))
+    assert main(["replay", bag, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["distance_to_path"]
+    assert list(found) == ["tool_pose_true"]
+    raw, aligned = found["tool_pose_true"]["as_it_is"], found["tool_pose_true"]["datum_aligned"]
+    assert 20e-6 < raw["rms_m"] < raw["max_m"] < 500e-6  # across the path; 0.4 mrad at 0.4 m are 160 µm more
+    assert aligned["max_m"] < 1e-7
+    assert main(["replay", bag]) == 0
+    (said,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("distance of tool_pose_true"))
+    assert f"as it is {raw['rms_m'] * 1e6:.2f}/{raw['max_m'] * 1e6:.2f}, datum aligned 0.0" in said

@@ -1,0 +1,141 @@
+"""``hexapod_comp imagine``: the hidden errors of a virtual machine, for any geometry."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from . import common
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ..calibration.evaluation import HeldOut
+    from ..machine.geometry import HexapodGeometry
+    from ..machine.model import MachineModel
+    from ..virtual.imperfections import ImperfectionBounds
+
+IN_SI = {
+    "joints_um": ("joint", 1e-6),
+    "struts_um": ("strut_offset", 1e-6),
+    "pitch_ppm": ("pitch", 1e-6),
+    "wave_um": ("wave", 1e-6),
+    "wave_period_mm": ("wave_period", 1e-3),
+    "map_um": ("length_map", 1e-6),
+    "backlash_um": ("backlash", 1e-6),
+    "strut_expansion_ppm_per_k": ("strut_expansion", 1e-6),
+    "body_expansion_ppm_per_k": ("body_expansion", 1e-6),
+    "field_um": ("field_displacement", 1e-6),
+    "field_urad": ("field_rotation", 1e-6),
+    "field_reversal_percent": ("field_reversal", 1e-2),
+}
+"""What each option is called among the bounds, and its unit in SI."""
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the verb."""
+    from ..calibration.evaluation import held_out
+    from ..errors import GeometryError
+    from ..machine.box import level_box
+    from ..machine.geometry import load_geometry
+    from ..machine.model import RealMachine
+    from ..machine.model_file import save_model
+    from ..virtual.named import imagine
+
+    geometry = load_geometry(args.machine)
+    model = imagine(geometry, args.seed, _bounds(args, geometry), args.name or "")
+    save_model(model, args.out)
+    box, error_of_tool = None, None
+    try:
+        found = box = level_box(geometry)
+        common.mention_compiling("model.actual_pose_one")
+        error_of_tool = held_out(RealMachine(geometry, model), None, found)
+    except GeometryError as error:
+        common.say_notes([f"what the tool does is not shown: {error}"])
+    drawn = _drawn(model)
+    if args.json:
+        common.show(_as_json(args, model, drawn, box, error_of_tool))
+    else:
+        common.show(_report(args, model, drawn, box, error_of_tool))
+    return 0
+
+
+def _bounds(args: argparse.Namespace, geometry: HexapodGeometry) -> ImperfectionBounds:
+    """Return the bounds that the options give; the usual ones where they give none."""
+    import numpy as np
+
+    from ..machine.box import box_of_platforms
+    from ..virtual.named import usual_bounds
+
+    given: dict[str, Any] = {"shared_platform_joints": not args.separate_joints}
+    for option, (name, unit) in IN_SI.items():
+        value = getattr(args, option)
+        if value is not None:
+            given[name] = tuple(unit * v for v in value) if isinstance(value, tuple) else unit * value
+    if args.box is not None:
+        given["field_box"] = box_of_platforms(geometry, np.array(args.box))
+    return usual_bounds(geometry, **given)
+
+
+def _drawn(model: MachineModel) -> list[tuple[str, float, str]]:
+    """Return name, largest value and unit of each error that the machine has."""
+    import numpy as np
+
+    from ..virtual.imperfections import largest_errors
+
+    struts, size = model.struts, np.abs
+    bodies = np.array([model.base_expansion, model.platform_expansion])
+    of_field = largest_errors(model.field) if any(family.size for family in model.field.lines) else np.zeros(6)
+    found = (
+        ("base joints", size(model.base_deviation).max(), "um"),
+        ("platform joints", size(model.platform_deviation).max(), "um"),
+        ("strut lengths", size(struts.offset).max(), "um"),
+        ("pitch", size(struts.pitch).max(), "ppm"),
+        ("wave", np.hypot(struts.cosine, struts.sine).max(), "um"),
+        ("smooth length error", size(struts.map_values).max(initial=0.0), "um"),
+        ("backlash", struts.backlash.max(), "um"),
+        ("expansion of struts", size(struts.expansion).max(), "ppm_per_k"),
+        ("expansion of bodies", size(bodies).max(), "ppm_per_k"),
+        ("field, displacement", of_field[:3].max(), "um"),
+        ("field, rotation", of_field[3:].max(), "urad"),
+    )
+    return [(name, float(value) * 1e6, unit) for name, value, unit in found if value > 0.0]
+
+
+def _report(
+    args: argparse.Namespace,
+    model: MachineModel,
+    drawn: list[tuple[str, float, str]],
+    box: np.ndarray | None,
+    error: HeldOut | None,
+) -> str:
+    """Say what was drawn, what the tool makes of it, and where it went."""
+    from ..formats import texts
+
+    units = {"um": "µm", "urad": "µrad", "ppm_per_k": "ppm/K"}
+    lines = [f"machine {model.machine}, seed {args.seed}: model {model.name}"]
+    rows = [[name, texts.number(value, 3), units.get(unit, unit)] for name, value, unit in drawn]
+    lines.append(texts.aligned(["error", "largest", ""], rows) if rows else "no errors at all")
+    if box is not None and error is not None:
+        low, high = (", ".join(texts.number(v * 1e3, 1) for v in corner) for corner in box)
+        lines.append(
+            f"tool error, level tool in ({low})…({high}) mm of work: {error.raw.rms * 1e6:.2f} µm RMS as it is, "
+            f"{error.aligned.rms * 1e6:.2f} µm with the datum aligned"
+        )
+    return "\n".join([*lines, f"truth: {args.out}"])
+
+
+def _as_json(
+    args: argparse.Namespace,
+    model: MachineModel,
+    drawn: list[tuple[str, float, str]],
+    box: np.ndarray | None,
+    error: HeldOut | None,
+) -> dict[str, Any]:
+    """Return the same for programs."""
+    largest = {f"{name.replace(', ', ' ').replace(' ', '_')}_{unit}": value for name, value, unit in drawn}
+    tool = None
+    if error is not None:
+        tool = {"frame": "work", "box_m": box, "rms_m": error.raw.rms, "aligned_rms_m": error.aligned.rms}
+    head = {"machine": model.machine, "name": model.name, "seed": args.seed}
+    return {**head, "largest": largest, "tool_error": tool, "written": args.out}

@@ -1,0 +1,271 @@
+"""The demonstration's story: hidden errors, a laser campaign, a fit, and what it promises for the poses to come."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..calibration.evaluation import PaperMetric, paper_metric
+from ..calibration.fit import ModelFit, fit_model
+from ..calibration.lines import fit_lines
+from ..calibration.observability import interval, left_errors, stations_of
+from ..calibration.parameters import FitSettings
+from ..calibration.report import tool_error_text
+from ..calibration.sensitivity import predict
+from ..compensation.compensator import Compensator
+from ..formats.texts import number
+from ..machine.box import level_box
+from ..machine.geometry import HexapodGeometry
+from ..machine.model import MachineModel, RealMachine
+from ..machine.passes import Passes
+from ..machine.size import rms
+from ..machine.trajectory import Path, circle, commanded_in_base, join, move, pocket
+from ..measurements.campaign import Campaign, template
+from ..measurements.readings import ANGULAR_KINDS
+from ..pose import Pose
+from ..virtual.instruments import measure
+from ..virtual.machine import StrutDrive
+from ..virtual.trial import without_datum
+from .records import PathRecord, PoseRecord, SessionResult, Track
+from .report import ALIGNED, ErrorRow, error_rows
+from .session import MOVE_FEED
+
+LONGEST_SIDE = 0.2
+"""Longest side of the measured box, m: what the demonstration crosses in two seconds."""
+
+LINES_APART, READINGS_APART = 0.25, 0.0625
+"""Distances of the grid's lines, and of the readings along them, as shares of the longest side."""
+
+POSES = 12
+"""Held-out poses of the measured box."""
+
+PATH_SIDE, PATH_TIME = 0.018, 0.9
+"""Largest side of the milled figure, m, and the time that a side takes at full speed, s: as slow as the drives need."""
+
+ON_PATH = 150
+"""Places of a path for which a promise is worked out."""
+
+DRIVES = 2.0
+"""What the drives leave over DDS, where no command comes on time to the millisecond, over what they leave without."""
+
+EXACT = ((0.0, 0.0), (0.0, 0.0))
+"""What the true model promises: drives apart, nothing is left."""
+
+REMARK = """as it is: with where the machine stands as a whole. Laser lines cannot see that, and a workpiece zero set
+with the model on takes it up. Datum aligned: less the one rigid motion that such a zero makes."""
+
+REST = 0.3
+"""The machine is given so long to come to rest, s: sixty of the drives' lags."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A machine measured and fitted.
+
+    Attributes
+    ----------
+    fit : ModelFit
+        Scheme joint on 5-D lines and diagonals.
+    lines, joint : PaperMetric
+        Mou & King's own measure of their 1-D scheme, and of `fit`.
+    """
+
+    fit: ModelFit
+    lines: PaperMetric
+    joint: PaperMetric
+
+
+def demo_box(geometry: HexapodGeometry) -> np.ndarray:
+    """Return the box of tool positions in ``work`` that is measured: about home, no larger than need be; (2, 3), m."""
+    box = level_box(geometry)
+    centre, half = box.mean(axis=0), 0.5 * np.ptp(box, axis=0)
+    half = (half * min(1.0, 0.5 * LONGEST_SIDE / half.max())).round(4)
+    return np.array([centre - half, centre + half]).round(9)
+
+
+def demo_campaign(box: np.ndarray, instrument: str = "5-D", diagonals: int = 16) -> Campaign:
+    """Return the campaign on a box: lines along its sides, and its diagonals, read with the default noise."""
+    longest = float(np.ptp(box, axis=0).max())
+    return Campaign(box, LINES_APART * longest, READINGS_APART * longest, instrument, diagonals)
+
+
+def calibrate(
+    geometry: HexapodGeometry, truth: MachineModel, seed: int, say: Callable[[str], object] = lambda text: None
+) -> Calibration:
+    """Measure a machine with virtual lasers, noise included, and fit it by both schemes.
+
+    Parameters
+    ----------
+    geometry, truth : HexapodGeometry, MachineModel
+        The machine and its hidden errors.
+    seed : int
+        Of the noise.
+    say : callable, optional
+        Hears what goes on.
+    """
+    real, campaign = RealMachine(geometry, truth), demo_campaign(demo_box(geometry))
+    say("measuring with 5-D lasers")
+    measured = measure(template(campaign, geometry, seed), campaign, real, seed)
+    fit = fit_model(measured, FitSettings(lead=_lead(geometry, truth)), say)
+    say("the 1-D scheme of Mou & King")
+    # Their lines run along the base's axes, and the tool is as level as above, whatever the work frame is.
+    level = geometry.work.rotation @ geometry.tool.rotation.T
+    straight = replace(geometry, work=Pose.identity(), tool=Pose(geometry.tool.position, level.T))
+    real, box = RealMachine(straight, truth), demo_box(straight)
+    campaign = demo_campaign(box, "1-D", 0)
+    lines = fit_lines(measure(template(campaign, straight, seed), campaign, real, seed)).model
+    of_lines, of_joint = (paper_metric(real, model, box, campaign.step, seed=seed) for model in (lines, fit.model))
+    return Calibration(fit, of_lines, of_joint)
+
+
+def calibration_text(calibration: Calibration) -> str:
+    """Return what was measured, what was fitted and what it promises, as lines for people."""
+    fit, lines, joint = calibration.fit, calibration.lines, calibration.joint
+    sides = " × ".join(number(side * 1e3, 1) for side in np.ptp(fit.space.work_box, axis=0))
+    noise = [f"{c.stated * 1e6:g} {'µrad' if c.kind in ANGULAR_KINDS else 'µm'} {c.kind}" for c in fit.channels]
+    count = f"{len(fit.measurements)} readings of {len(fit.measurements.runs)} lines"
+    parts = [
+        f"measured: {count} by 5-D lasers, box of {sides} mm",
+        f"noise:    {', '.join(noise)}",
+        f"fitted:   {', '.join(block.name for block in fit.space.blocks)}",
+    ]
+    if fit.level is not None:
+        parts.append(f"promised: {tool_error_text(fit.level)}; datum aligned, in the whole box")
+    parts.append(
+        f"Mou & King's measure, mean |error| along {lines.lines} lines: {lines.before * 1e6:.2f} µm; "
+        f"their 1-D scheme leaves {lines.after * 1e6:.3f}, this fit {joint.after * 1e6:.3f}"
+    )
+    return "\n".join([*parts, *(f"note: {note}" for note in (*fit.notes, *filter(None, [fit.misfit])))])
+
+
+def as_json(calibration: Calibration) -> dict[str, object]:
+    """Return the same for programs; SI units are in the keys."""
+    fit, lines, joint = calibration.fit, calibration.lines, calibration.joint
+    level = fit.level and {f"{name}_m": getattr(fit.level, name) for name in ("before", "after", "low", "high")}
+    return {
+        "readings": len(fit.measurements),
+        "frame": "work",
+        "box_m": fit.space.work_box,
+        "blocks": [block.name for block in fit.space.blocks],
+        "expected_tool_error": level,
+        "mean_displacement_error_along_lines": {
+            "without_m": lines.before,
+            "scheme_lines_1d_m": lines.after,
+            "scheme_joint_m": joint.after,
+        },
+        "notes": fit.notes,
+        "misfit": fit.misfit,
+    }
+
+
+def _lead(geometry: HexapodGeometry, truth: MachineModel) -> float | None:
+    """Return the screws' lead as their data sheet has it, m, where they have an error and the geometry is silent."""
+    struts = truth.struts
+    waves = struts.cosine.any() or struts.sine.any()
+    return float(struts.period[0]) if waves and not geometry.screw_lead.any() else None
+
+
+def demo_poses(geometry: HexapodGeometry, seed: int) -> list[Pose]:
+    """Return random poses of a level tool in the measured box, in ``work``, each the next nearest."""
+    box = demo_box(geometry)
+    left = list(np.random.default_rng(seed).uniform(box[0], box[1], (POSES, 3)).round(6))
+    ordered = [box.mean(axis=0)]
+    while left:
+        distances = [float(np.linalg.norm(point - ordered[-1])) for point in left]
+        ordered.append(left.pop(int(np.argmin(distances))))
+    return [Pose(point, np.eye(3)) for point in ordered[1:]]
+
+
+def demo_path(geometry: HexapodGeometry, rate: float) -> Path:
+    """Return a milled circle, then a zigzag pocket, in the middle of the measured box, in ``base``."""
+    box, in_base = demo_box(geometry), commanded_in_base(geometry)
+    side = min(PATH_SIDE, 0.25 * float(np.ptp(box, axis=0)[:2].min()))
+    feed, centre = side / PATH_TIME, geometry.work @ Pose(box.mean(axis=0), np.eye(3))
+    ring = circle(centre, radius=0.5 * side, feed=feed, rate=rate)
+    corner = centre @ Pose(np.array([-0.5 * side, -side / 6.0, 0.0]), np.eye(3))
+    rows = pocket(in_base, corner, (side, side / 3.0), pitch=side / 6.0, feed=feed, rate=rate)
+    return join([ring, move(in_base, ring.pose(len(ring) - 1), corner, rate, feed), rows])
+
+
+def promises(fit: ModelFit, poses: Sequence[Pose], path: Path) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return between what the tool's RMS error lies at rest and along a path, m, with 95 %, the datum aligned.
+
+    As the fit's own expected tool error, at these very poses and with their own datum instead of the whole box's. Along
+    the path only what is across it counts.
+
+    Parameters
+    ----------
+    fit : ModelFit
+        The fit.
+    poses : sequence of Pose
+        ``pose_tool_in_work``, approached one from the other, the first from home.
+    path : Path
+        Poses in ``base``.
+    """
+    geometry, space = fit.space.geometry, fit.space
+    in_base = [geometry.work @ pose for pose in poses]
+    at = np.linspace(1, len(path) - 1, ON_PATH).astype(int)
+    home = (geometry.home @ geometry.tool).position
+    positions = np.array([pose.position for pose in in_base])
+    ways = np.concatenate([np.diff(positions, axis=0, prepend=[home]), path.positions[at] - path.positions[at - 1]])
+    tool = (
+        np.concatenate([positions, path.positions[at]]),
+        np.concatenate([[pose.rotation for pose in in_base], path.rotations[at]]),
+    )
+    stations = stations_of(Passes.of_tool(commanded_in_base(geometry), *tool, ways))
+    rest, prediction = slice(0, len(poses)), predict(space, fit.solution.x, stations)
+    lengths = np.linalg.norm(ways, axis=1, keepdims=True)
+    along = ways / np.where(lengths > 0.0, lengths, 1.0)
+    sizes = []
+    for errors in left_errors(space, prediction, stations, fit.covariance, fit.allowed):
+        aligned = without_datum(tool[0], errors[:, :3], rest)
+        across = aligned - along[:, :, None] * np.einsum("ni,nid->nd", along, aligned)[:, None]
+        sizes.append([np.sqrt((e**2).sum(axis=1).mean(axis=0)) for e in (aligned[rest], across[len(poses) :])])
+    (rest_left, path_left), (rest_possible, path_possible) = sizes
+    return interval(rest_left, rest_possible), interval(path_left, path_possible)
+
+
+def left_by_drives(
+    geometry: HexapodGeometry, truth: MachineModel, poses: Sequence[Pose], path: Path
+) -> tuple[float, float]:
+    """Return the RMS tool error that the drives leave with the true model, at rest and along a path, m, datum aligned.
+
+    The same commands to the same drives, here and without DDS: motor steps, lag, backlash being taken up.
+    """
+    in_base = commanded_in_base(geometry)
+    core, drive = Compensator(in_base, truth), StrutDrive(RealMachine(in_base, truth))
+    seen: list[np.ndarray] = []
+
+    def travel(way: Path) -> None:
+        seen.clear()
+        for n in range(len(way)):
+            drive.set_command(core.correct(way.pose(n)).command)
+            drive.advance(1.0 / way.rate)
+            seen.append(drive.true_tool_pose().position)
+
+    records, at = [], in_base.home @ in_base.tool
+    for target in [geometry.work @ pose for pose in poses]:
+        travel(move(in_base, at, target, path.rate, MOVE_FEED))
+        drive.advance(REST)
+        records.append(PoseRecord(target, true_with=drive.true_tool_pose()))
+        at = target
+    travel(move(in_base, at, path.pose(0), path.rate, MOVE_FEED))
+    drive.advance(REST)
+    travel(path)
+    track = Track.along(path, np.array(seen), np.arange(1, len(path) + 1))
+    result = SessionResult(records, PathRecord(path, None, track, np.zeros((0, 6))))
+    at_rest, on_path = (rms(row.compensated) for row in error_rows(result) if row.datum == ALIGNED)
+    return at_rest, on_path
+
+
+def with_promises(
+    rows: Sequence[ErrorRow], promised: Sequence[tuple[float, float]], drives: Sequence[float]
+) -> list[ErrorRow]:
+    """Return rows of which the aligned ones carry what was promised for rest and path, the drives' share added."""
+    whole = {
+        what: (low, float(np.hypot(high, DRIVES * own)))
+        for what, (low, high), own in zip(("at rest", "path"), promised, drives, strict=True)
+    }
+    return [replace(row, promised=whole[row.what]) if row.datum == ALIGNED else row for row in rows]

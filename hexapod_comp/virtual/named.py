@@ -1,0 +1,124 @@
+"""Models by name: a file, ``ideal``, or a virtual machine that is drawn on the spot.
+
+Every verb and the simulated machines take a truth, or a model, through :func:`find_model`.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError
+from ..machine.box import box_of_platforms, level_box
+from ..machine.geometry import HexapodGeometry
+from ..machine.model import MachineModel
+from ..machine.model_file import IDEAL, load_model
+from .imperfections import ImperfectionBounds, draw_model
+
+RANDOM = "random"
+"""A machine drawn with :data:`USUAL` bounds and seed 1; ``random:7`` has seed 7."""
+
+RANDOM_SEED = 1
+
+SHIPPED_TRUTH = {"paper": "paper_machine.yaml"}
+"""Hidden errors that are shipped, by machine; every other machine's are drawn."""
+
+USUAL: dict[str, Any] = {
+    "joint": 50e-6,
+    "strut_offset": 50e-6,
+    "pitch": 50e-6,
+    "wave": (1e-6, 3e-6),
+    "backlash": (2e-6, 4e-6),
+    "length_map": 1e-6,
+}
+"""What a machine is like that was built with care and never measured, m and m per m."""
+
+USUAL_LEAD = 0.01
+"""Period of the screws' errors where the geometry file gives no lead, m."""
+
+
+def usual_bounds(geometry: HexapodGeometry, **given: Any) -> ImperfectionBounds:
+    """Return :data:`USUAL` bounds for a machine; what is given goes before.
+
+    A field without a box gets that of :func:`~hexapod_comp.machine.box.level_box`.
+
+    Raises
+    ------
+    GeometryError
+        Bounds that cannot be, or a field without a box on a machine that has none.
+    """
+    leads = np.abs(geometry.screw_lead)
+    usual = {**USUAL, "wave_period": float(leads.max()) if leads.any() else USUAL_LEAD}
+    if (given.get("field_displacement") or given.get("field_rotation")) and given.get("field_box") is None:
+        given["field_box"] = box_of_platforms(geometry, level_box(geometry))
+    return ImperfectionBounds(**{**usual, **given})
+
+
+def imagine(
+    geometry: HexapodGeometry, seed: int, bounds: ImperfectionBounds | None = None, name: str = ""
+) -> MachineModel:
+    """Draw a virtual machine's hidden errors, dated today so that they can be written to a file.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        Any machine.
+    seed : int
+        0 or above; the same seed gives the same machine.
+    bounds : ImperfectionBounds, optional
+        By default :func:`usual_bounds`.
+    name : str, optional
+        Of the model.
+
+    Raises
+    ------
+    ModelError
+        As :func:`~hexapod_comp.virtual.imperfections.draw_model`.
+    """
+    model = draw_model(geometry, usual_bounds(geometry) if bounds is None else bounds, seed, name)
+    return replace(model, origin=replace(model.origin, date=date.today().isoformat()))
+
+
+def truth_name(name: str | None, geometry: HexapodGeometry) -> str:
+    """Return a truth's name; without one the shipped truth of the paper's machine, ``random`` for any other."""
+    return SHIPPED_TRUTH.get(geometry.name, RANDOM) if name is None else name
+
+
+def find_model(name: str | Path, geometry: HexapodGeometry) -> MachineModel:
+    """Return the model that a name stands for.
+
+    Parameters
+    ----------
+    name : str or Path
+        A model file, or the name of a shipped one; ``ideal``; ``random`` or ``random:SEED``.
+    geometry : HexapodGeometry
+        The machine.
+
+    Raises
+    ------
+    InputFileError
+        As :func:`~hexapod_comp.machine.model_file.load_model`.
+    ModelError
+        A seed that is none.
+    """
+    if not is_random(name):
+        return load_model(name, geometry)
+    _, colon, seed = str(name).partition(":")
+    if colon and not re.fullmatch("[0-9]{1,12}", seed):
+        raise ModelError(str(name), "must be random:SEED with a whole number, 0 or above, as random:7")
+    return imagine(geometry, int(seed) if colon else RANDOM_SEED)
+
+
+def is_random(name: str | Path) -> bool:
+    """Return whether a name asks for a machine that is drawn."""
+    return str(name).partition(":")[0] == RANDOM
+
+
+def is_word(name: str | Path) -> bool:
+    """Return whether a name is no file's."""
+    return name == IDEAL or is_random(name)
