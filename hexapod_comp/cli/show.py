@@ -15,7 +15,9 @@ def run(args: argparse.Namespace) -> int:
 
     geometry = load_geometry(args.machine)
     common.mention_compiling("limits.check_poses")
-    seen = overview(geometry)
+    with common.stage_line() as say:
+        say("reach and largest box")
+        seen = overview(geometry)
     common.show(as_json(seen) if args.json else report(seen))
     common.save_pictures(args, lambda: {"machine.png": overview_figure(seen)})
     return 0

@@ -18,9 +18,9 @@ def configuration_figure(geometry: HexapodGeometry) -> Figure:
     figure = machine_figure(geometry)
     base, platform = geometry.base_joints * 1e3, geometry.platform_joints * 1e3
     above = figure.axes[1]
-    sides = ("b", base[2], base[3]), ("d", base[1], base[2]), ("a", platform[0], platform[4])
-    for name, first, second in sides:
-        x, y = 0.5 * (first + second)[:2]
+    sides = ("b", base[2], base[3], 0.3), ("d", base[1], base[2], 0.5), ("a", platform[0], platform[4], 0.5)
+    for name, first, second, share in sides:  # of the way; the middle of b is where platform joint 3 has its name
+        x, y = (first + share * (second - first))[:2]
         side = np.linalg.norm(first - second)
         box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
         above.text(x, y, f"{name} = {side:g} mm", ha="center", va="center", bbox=box)
