@@ -36,6 +36,7 @@ from .guard import ON_LOSS, CorrectionGuard, GuardStatus
 from .hal import COUNTS, METRES, HalComponent, pose_from_axes
 from .parameters import AXES, CORRECTIONS, COUNTERS, FEEDBACK, FLAGS, PARAMETERS, PINS, PROGRAM, SWITCHES
 from .restarting import CompensatorReset
+from .stop_input import StopInput
 
 CHECK_PERIOD = 0.05
 """How often the node looks whether its state has changed, s."""
@@ -87,7 +88,9 @@ class LinuxcncBridgeNode(MachineNode):
         self._reset: CompensatorReset | None = None  # while topics are open
         self._hal: HalComponent | None = HalComponent(self._options["component"], PINS, hal)
         self._open_pins(self._hal)
-        self._make_messages()
+        self._pose_out, self._states_out = PoseStamped(), StrutMessage()
+        self._pose_out.header.frame_id = self._options["frame_id"]
+        self._stop = StopInput(self, self._options["timeout"])
         self._hal.ready()
         self._loop = self.every(1.0 / self._options["rate"], self._cycle)
 
@@ -102,17 +105,13 @@ class LinuxcncBridgeNode(MachineNode):
         self._read_switches = hal.reader(*SWITCHES)
         self._write_corrections = hal.writer(*CORRECTIONS)
         self._write_state = hal.writer("status", "age", "largest", *FLAGS, *COUNTERS)
-        self._write_state((GuardStatus.OFF, NEVER, 0.0, False, False, 0, 0, 0))
-
-    def _make_messages(self) -> None:
-        self._pose_out, self._states_out = PoseStamped(), StrutMessage()
-        self._pose_out.header.frame_id = self._options["frame_id"]
+        self._write_state((GuardStatus.OFF, NEVER, 0.0, False, False, True, 0, 0, 0))
 
     # ---- lifecycle ----
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Open topics."""
-        self._pose_pub = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS)
+        self._pose_pub = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS, self._options["timeout"])
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
         self.speak_for(self._options["component"])
         self._subscription = self.obey(JointState, "strut_corrections", self._on_correction, self._look_at_publishers)
@@ -186,6 +185,7 @@ class LinuxcncBridgeNode(MachineNode):
             max(map(abs, output)) / self._metres,
             guard.status is GuardStatus.COMPENSATING,
             self._beat,
+            self._stop.stopped(now),
             guard.accepted % COUNTS,
             rejected % COUNTS,
             self._status.resets % COUNTS,

@@ -26,7 +26,7 @@ AXES = ("x", "y", "z", "a", "b", "c", "tool-offset")
 FEEDBACK = tuple(f"joint-fb.{n}" for n in range(6))
 SWITCHES = ("machine-on", "enable")
 CORRECTIONS = tuple(f"correction.{n}" for n in range(6))
-FLAGS = ("compensating", "heartbeat")
+FLAGS = ("compensating", "heartbeat", "stopped")
 COUNTERS = ("updates", "rejected", "resets")
 
 PINS = (
@@ -41,6 +41,7 @@ PINS = (
 TOPICS = """
 in   strut_corrections   JointState: what the compensator adds to the struts, m
      /diagnostics        DiagnosticArray: what the compensator complains of
+     compensator/stopped, compensator/heartbeat
 out  tool_pose_command   PoseStamped: LinuxCNC's commanded axes
      strut_states        JointState: LinuxCNC's measured struts, m
      /diagnostics

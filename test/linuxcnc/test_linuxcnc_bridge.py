@@ -51,8 +51,8 @@ class Machine:
     def __init__(self, bench: Bench, metres: float = 1e-3, **parameters: object) -> None:
         self.bench, self.hal, self._metres = bench, StandInHal(), metres
         self.node = bench.add(LinuxcncBridgeNode, False, {**SLOW, **parameters}, hal=self.hal)
-        # The witness does not command here: the compensator obeys no two publishers.
-        bench.witness.destroy_publisher(bench._publishers.pop("tool_pose_command"))
+        for topic in ("tool_pose_command", "strut_states"):  # the compensator hears no two publishers
+            bench.hush(topic)
         self.poses: list[PoseStamped] = []
         bench.witness.create_subscription(PoseStamped, "tool_pose_command", self.poses.append, RELIABLE)
         self.place(HOME)
@@ -269,6 +269,23 @@ def test_corrections_of_a_real_compensator_arrive(bench, units, metres):
     bench.until(lambda: bench.values(NODE).get("largest_correction_m") == said, f"{said} in the diagnostics")
 
 
+def test_the_stop_pin_is_true_unless_the_compensator_says_otherwise(bench):
+    """Not heard yet, refusing, silent: LinuxCNC's feed is held; hearing it for long enough releases it."""
+    machine = Machine(bench)
+    hal = machine.hal
+    bench.until(lambda: hal["heartbeat"], "a cycle")
+    assert hal["stopped"] is True
+    node = bench.compensator()
+    machine.start()
+    bench.until(lambda: hal["stopped"] is False, "the compensator to be heard")
+    assert bench.change("deactivate")
+    bench.until(lambda: hal["stopped"] is True, "an inactive compensator")
+    assert bench.change("activate")
+    bench.until(lambda: hal["stopped"] is False, "an active one")
+    bench.executor.remove_node(node)  # hangs: what is latched stays false
+    bench.until(lambda: hal["stopped"] is True, "one that hangs")
+
+
 def test_enable_ramps_in_and_out(bench, speak):
     """100 µm at 1 mm/s take 0.1 s each way, less at most the 20 ms that the first update may stand for."""
     hal = Machine(bench).start().hal
@@ -397,7 +414,7 @@ def test_pins_are_those_of_the_agreement(bench):
     feedback = {f"joint-fb.{n}" for n in range(6)}
     assert inputs == {"x", "y", "z", "a", "b", "c", "tool-offset", "machine-on", "enable"} | feedback
     assert set(hal.pins) - inputs == {f"correction.{n}" for n in range(6)} | {
-        *("status", "compensating", "age", "heartbeat", "updates", "rejected", "resets", "largest")
+        *("status", "compensating", "age", "heartbeat", "stopped", "updates", "rejected", "resets", "largest")
     }
     assert hal.is_ready
 

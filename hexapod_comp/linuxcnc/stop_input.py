@@ -1,0 +1,38 @@
+"""What the compensator says of itself for LinuxCNC's feed hold."""
+
+from __future__ import annotations
+
+import math
+import time
+
+from std_msgs.msg import Bool, UInt64
+
+from ..nodes.runtime import EVENT_QOS, MachineNode
+from ..nodes.vital_signs import LATCHED_QOS
+
+
+class StopInput:
+    """Hears ``compensator/stopped`` and ``compensator/heartbeat``.
+
+    Parameters
+    ----------
+    node : MachineNode
+        Listens.
+    patience : float
+        Without a heartbeat for longer, the compensator counts as stopped, s.
+    """
+
+    def __init__(self, node: MachineNode, patience: float) -> None:
+        self._stopped, self._beat_at, self._patience = True, -math.inf, patience
+        node.listen_to(Bool, "compensator/stopped", self._on_stopped, LATCHED_QOS)
+        node.listen_to(UInt64, "compensator/heartbeat", self._on_beat, EVENT_QOS)
+
+    def stopped(self, now: float) -> bool:
+        """Return whether it refuses commands, or is not heard, at the monotonic time `now`, s."""
+        return self._stopped or now - self._beat_at > self._patience
+
+    def _on_stopped(self, message: Bool) -> None:
+        self._stopped = message.data
+
+    def _on_beat(self, _: UInt64) -> None:
+        self._beat_at = time.monotonic()
