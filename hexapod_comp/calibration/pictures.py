@@ -23,7 +23,7 @@ from .lines import LineFit, LinesFit
 from .observability import left_in_space
 from .posterior import FittedParameters
 from .prediction import COMPONENTS as PREDICTED
-from .prediction import ErrorPredictor
+from .prediction import ErrorPredictor, PredictedError
 
 SAMPLES = 161
 """Points of a curve."""
@@ -283,24 +283,28 @@ def predicted_error_figure(machine: RealMachine, fitted: FittedParameters | None
         raise ModelError("valid_box", "holds too few poses that the machine takes")
     figure = Figure(figsize=(11, 7), layout="constrained")
     panels = figure.subplots(2, 3, sharex=True, sharey=True)
-    for n, (axes, component) in enumerate(zip(panels.ravel(), PREDICTED, strict=True)):
-        unit = "µrad" if component[0] == "r" else "µm"
-        values = np.ma.masked_invalid(aligned.values[:, n].reshape(MAP_NODES, MAP_NODES) * 1e6)
-        most = max(float(np.abs(values).max()), 1e-6)
-        drawn = axes.contourf(x * 1e3, y * 1e3, values, np.linspace(-most, most, 21), cmap="PuOr")
-        figure.colorbar(drawn, ax=axes, label=unit, shrink=0.65)
-        if aligned.deviations is not None:
-            sigma = aligned.deviations[:, n].reshape(MAP_NODES, MAP_NODES) * 1e6
-            axes.clabel(axes.contour(x * 1e3, y * 1e3, sigma, 4, colors="black", linewidths=0.6), fontsize=6)
-        name = f"rotation about {component[1]}" if component[0] == "r" else f"displacement along {component}"
-        axes.set(title=name, aspect="equal")
-    for axes in panels[1]:
-        axes.set_xlabel("x in work, mm")
-    for axes in panels[:, 0]:
-        axes.set_ylabel("y in work, mm")
+    for n, axes in enumerate(panels.ravel()):
+        _component_panel(axes, x * 1e3, y * 1e3, aligned, n)
     known = "black lines: one standard deviation" if fitted is not None else "standard deviation not known"
-    title = (
-        f"predicted error without compensation, z = {height * 1e3:.0f} mm in work, level tool, datum aligned; {known}"
-    )
-    figure.suptitle(picture_text(f"{machine.geometry.name}, {machine.model.name}: {title}"), fontsize=9)
+    title = f"{machine.geometry.name}, {machine.model.name}: predicted error of the tool without compensation"
+    where = f"z = {height * 1e3:.0f} mm in work, level tool, datum aligned; {known}"
+    figure.suptitle(f"{picture_text(title)}\n{where}", fontsize=10)
     return figure
+
+
+def _component_panel(axes: Axes, x_mm: np.ndarray, y_mm: np.ndarray, error: PredictedError, n: int) -> None:
+    """Map one component of errors on a grid of places, and its standard deviation where that is known."""
+    component, shape = PREDICTED[n], (len(y_mm), len(x_mm))
+    turn = component[0] == "r"
+    values = np.ma.masked_invalid(error.values[:, n].reshape(shape) * 1e6)
+    most = max(float(np.abs(values).max()), 1e-6)
+    drawn = axes.contourf(x_mm, y_mm, values, np.linspace(-most, most, 21), cmap="PuOr")
+    axes.figure.colorbar(drawn, ax=axes, label="µrad" if turn else "µm", shrink=0.65)
+    if error.deviations is not None:
+        sigma = error.deviations[:, n].reshape(shape) * 1e6
+        axes.clabel(axes.contour(x_mm, y_mm, sigma, 4, colors="black", linewidths=0.6), fontsize=6)
+    axes.set(title=f"rotation about {component[1]}" if turn else f"displacement along {component}", aspect="equal")
+    if n >= 3:
+        axes.set_xlabel("x in work, mm")
+    if n % 3 == 0:
+        axes.set_ylabel("y in work, mm")

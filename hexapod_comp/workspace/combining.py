@@ -297,10 +297,16 @@ def allocate(
     alone = np.array([_alone(combined, types, k, allowed) for k in range(types)])
     scale = allowed / float(now[pose]) if now[pose] > 0.0 else np.inf
     only, without = (np.array([combined(row).max() for row in rows]) for rows in (np.eye(types), 1.0 - np.eye(types)))
+    return Allocation(
+        method, allowed, float(now[pose]), pose, scale, alone, only, without, _equal_parts(only, allowed, method)
+    )
+
+
+def _equal_parts(only: np.ndarray, allowed: float, method: str) -> np.ndarray:
+    """Return the factors (K,) with which types that alone add up to so much each use up the same part."""
     acting = only > 0.0
     part = allowed / (np.sqrt(acting.sum()) if method == RSS else acting.sum())
-    equal = np.where(acting, part / np.where(acting, only, 1.0), np.inf)
-    return Allocation(method, allowed, float(now[pose]), pose, scale, alone, only, without, equal)
+    return np.where(acting, part / np.where(acting, only, 1.0), np.inf)
 
 
 def _check_allocation(vectors: np.ndarray, allowed: float, method: str) -> None:

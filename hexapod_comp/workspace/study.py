@@ -20,6 +20,9 @@ from .tangential import tangential_effects
 COMBINED_POSES = 500
 """Random poses of the workspace at which budgets are combined."""
 
+WAYS = (RSS, WORST_CASE)
+"""How errors add up where tolerances are allocated."""
+
 DRAWS = 4000
 """Machines of the Monte Carlo."""
 
@@ -129,10 +132,8 @@ def classify(
         ``exact``, ``linear`` or ``iteration``, for the ranking; displacement of the tool to allocate tolerances for, m.
     compare, seed : int
         Poses at which exact, linear and tangential effects are compared, 0 for none; the seed picks them.
-    workers, scheduler, progress
-        As for :func:`~hexapod_comp.workspace.runner.survey`.
-    shared_platform_joints : bool
-        As for :meth:`~hexapod_comp.workspace.sources.Budget.single_errors`.
+    workers, scheduler, progress, shared_platform_joints
+        As for :func:`~.runner.survey`, and for :meth:`~.sources.Budget.single_errors`.
 
     Raises
     ------
@@ -142,16 +143,19 @@ def classify(
     errors = budget.single_errors(geometry, shared_platform_joints)
     reaches = (reach(geometry),) if reaches is None else reaches
     extremes = survey(reaches, errors, method, workers, scheduler, progress)
-    vectors = effect_vectors(geometry, errors, *random_poses(reaches, COMBINED_POSES, seed), LINEAR)
-    vectors = vectors[np.isfinite(vectors).all(axis=(1, 2))]
-    ways = () if allowed is None else (RSS, WORST_CASE)
+    vectors = _finite(effect_vectors(geometry, errors, *random_poses(reaches, COMBINED_POSES, seed), LINEAR))
     return Study(
         *(geometry, budget, errors, reaches, extremes),
         rows=tuple(ranked(extremes, geometry)),
         combined=_combined(errors, vectors, seed),
-        allocations=tuple(allocate(errors, vectors, float(allowed or 0.0), way) for way in ways),
+        allocations=() if allowed is None else tuple(allocate(errors, vectors, allowed, way) for way in WAYS),
         agreement=compared(geometry, errors, reaches, compare, seed) if compare else None,
     )
+
+
+def _finite(vectors: np.ndarray) -> np.ndarray:
+    """Return the effects at the poses where all are known."""
+    return vectors[np.isfinite(vectors).all(axis=(1, 2))]
 
 
 def _combined(errors: SingleErrors, vectors: np.ndarray, seed: int) -> Combined:

@@ -140,9 +140,8 @@ def tangential_effects(
     if errors.part[index] == TOOL:
         shifts = rotations @ errors.vector[index] @ geometry.work.rotation
         return TangentialResult(np.hstack([shifts, np.zeros((count, 3))]), none, none, 0, none.astype(int))
-    joints = geometry.base_joints.copy(), geometry.platform_joints.copy()
     tips = positions + rotations @ geometry.tool.position
-    state = _State(*joints, geometry.tool.position, tips, rotations)
+    state = _State(geometry.base_joints, geometry.platform_joints, geometry.tool.position, tips, rotations)
     path = _path(geometry, errors, index, state.lengths(), step)
     return _walk(geometry.work.rotation, state, errors.struts[index], path, tolerance)
 
