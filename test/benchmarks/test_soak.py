@@ -1,4 +1,4 @@
-"""Ten seconds of what ``python -m benchmarks.soak`` does for half an hour, and that its account is right.
+"""Five seconds of what ``python -m benchmarks.soak`` does for half an hour, and that its account is right.
 
 No latency is judged here: other jobs decide it on a shared machine. What is judged holds on any: a command
 without an answer has been counted, and nothing is compiled or hoarded while the machine moves.
@@ -13,10 +13,10 @@ pytest.importorskip("rclpy")
 
 from benchmarks.soak import BINS, NODES, Soak, soak
 
-SECONDS = 10.0
+SECONDS = 5.0
 
 
-def test_ten_seconds_at_1_khz():
+def test_five_seconds_at_1_khz():
     found = soak(SECONDS, 1000.0)
     counted = sum(int(found.diagnostics["compensator"][name]) for name in ("commands_missed", "refused"))
     assert found.commands > 100.0 * SECONDS, "a machine too busy for 100 Hz shows nothing"
@@ -24,7 +24,7 @@ def test_ten_seconds_at_1_khz():
     assert found.histogram.sum() == found.commands - found.lost
     assert [note["name"] for node in NODES for note in found.notes[node] if note["kind"] == "compile"] == []
     memory = np.array(found.memory)[:, 1:]
-    assert (memory[-1] - memory[len(memory) // 2]).max() < 1e6, "an hour of that would be more than 700 MB"
+    assert (memory[-1] - memory[len(memory) // 2]).max() < 1e6, "an hour of that would be more than 1.4 GB"
 
 
 def test_quantiles_and_growth_of_a_known_run():

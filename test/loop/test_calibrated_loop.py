@@ -53,8 +53,8 @@ cycles: 2
 BLOCKS = ("pitch", "wave", "backlash", "map")
 """The machine has the first three; a length map it has not, and the fit has to find that out."""
 
-POINTS = 30
-"""Held-out points, each approached from both sides: 60 rests."""
+POINTS = 15
+"""Held-out points, each approached from both sides: 30 rests."""
 
 APPROACH = 2e-3
 """Way on which a point is approached, m: four hundred times the backlash."""
@@ -137,7 +137,7 @@ def held_out_points(geometry: HexapodGeometry) -> tuple[np.ndarray, np.ndarray]:
 
 
 def start_loop(bench: Bench, folder: Path, promise: Promise) -> HexapodGeometry:
-    """Start both nodes on a machine that is as accurate but faster than the paper's: 60 rests take seconds."""
+    """Start both nodes on a machine that is as accurate but faster than the paper's: 30 rests take seconds."""
     file = geometry_file(folder, {"speed_mm_s": 5000, "step_mm": 40})
     bench.drive(geometry_file=file, truth_file=promise.truth_file, step=STEP, max_acceleration=200.0)
     # Every command is waited for: one that a busy machine delivers late is late, not lost.
@@ -208,8 +208,8 @@ def test_the_loop_leaves_what_the_fit_promised(bench: Bench, tmp_path: Path, pro
 
     The promise is of the RMS over the whole box. The loop adds two things. Motors stand on steps of 0.1 µm: each
     strut is off by up to half a step, evenly distributed, standard deviation step/√12, and the tool by that times
-    the struts' leverage, added as squares (some 0.05 µm, next to some 0.2 µm promised). And 60 rests are not
-    the whole box: an RMS of 30 independent error vectors of three components scatters by 1/√(2·90) = 7.5 %, so
+    the struts' leverage, added as squares (some 0.05 µm, next to some 0.2 µm promised). And 30 rests are not
+    the whole box: an RMS of 15 independent error vectors of three components scatters by 1/√(2·45) = 10.5 %, so
     the interval is widened by twice that. A wrong sign, or one block that is lost between file and
     machine, would leave microns.
     """
