@@ -1,6 +1,6 @@
 """The fault campaign: a moving machine, one or two faults per episode, and a judge.
 
-Usage: python -m benchmarks.faults [--episodes 200] [--seed 0] [--only 17,kill_drive] [--definitions]
+Usage: python -m benchmarks.faults [--episodes 300] [--seed 0] [--only 17,kill_drive] [--definitions]
 
 Every miss is printed with what runs it alone. Exits with 1 when a bar is missed.
 """
@@ -55,7 +55,7 @@ def table(outcomes: list[Outcome]) -> str:
 def main() -> int:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="numbers of episodes, or kinds of faults, with commas between")
     parser.add_argument("--definitions", action="store_true", help="print when each fault is visible, and to whom")

@@ -36,7 +36,8 @@ class Mode(Enum):
 class Controller:
     """Sends pose after pose, each after the answer to the one before; without an answer it waits and repeats.
 
-    While it is `heedless`, it goes on along its path whatever is answered, as a controller without feed hold does.
+    While it is `heedless`, it goes on along its path whatever is answered, as a controller without feed hold does, by
+    `stride` poses at a time. Unless it `may_reset`, it does not call for a reset.
 
     When the compensator no longer takes commands because the machine is not where it was told to be, or after
     the drive was restarted, it resets the compensator and moves from the measured pose back to its path.
@@ -62,7 +63,8 @@ class Controller:
         self._index = 0
         self._way: Path | None = None
         self._way_index = 0
-        self.mode, self.heedless = Mode.MILL, False
+        self.mode, self.heedless, self.may_reset = Mode.MILL, False, True
+        self.stride = 1
         self._awaited = self._sent_at = self._answered_at = 0.0
         self._must_return = False
 
@@ -87,7 +89,7 @@ class Controller:
             return
         if self.heedless:
             self._go_on(now)
-        elif self._must_return or (stuck and now - self._answered_at > STUCK_AFTER):
+        elif self.may_reset and (self._must_return or (stuck and now - self._answered_at > STUCK_AFTER)):
             self._ask()
         elif now >= self.due():
             self._awaited, self._sent_at = self._send(self._next_pose()), now
@@ -100,7 +102,7 @@ class Controller:
 
     def _go_on(self, now: float) -> None:
         if now >= self.due():
-            self.mode, self._way, self._index = Mode.MILL, None, self._index + 1
+            self.mode, self._way, self._index = Mode.MILL, None, self._index + self.stride
             self._awaited, self._sent_at = 0, now
             self._send(self.target)
 

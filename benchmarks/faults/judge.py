@@ -31,23 +31,39 @@ LATELY = 0.05
 RECENT = 0.1
 """How old the measured struts may be from which a compensator starts afresh, s."""
 
+HEARD = 0.05
+"""Where nothing has been measured for so long, s, it may start from what it told last as well."""
+
+SPEED_OVER = 0.02
+"""Over so long or longer, s, between two commands as they were sent, no strut goes faster than allowed."""
+
+CLOCK_ROUNDING = 1e-6
+"""Times of this century in seconds are doubles to 0.24 µs."""
+
+SPEED_SHARE = 1.05
+"""So much of the geometry's largest speed is allowed there."""
+
+NOTICED_WITHIN = 0.05
+"""What a node must not do from a moment on, it may still do for this long, s: it has to hear of it."""
+
 ROUNDING = 1e-9
 """Allowed beyond a limit, m: the limits are decimal fractions."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What may be published: stroke (6, 2), largest step and largest correction, m."""
+    """What may be published: stroke (6, 2), largest step and largest correction, m, largest speed, m/s."""
 
     stroke: np.ndarray
     step: float
     correction: float
+    speed: float
 
     @staticmethod
     def of(geometry: HexapodGeometry) -> Limits:
         """Return a machine's."""
         limits = geometry.limits
-        return Limits(limits.stroke, limits.step, limits.correction)
+        return Limits(limits.stroke, limits.step, limits.correction, limits.speed)
 
 
 @dataclass
@@ -113,8 +129,8 @@ def _answered(entry: Sent) -> bool:
 
 
 def breaches(record: Record, limits: Limits) -> list[str]:
-    """Return what was published that must not be: not finite, outside the stroke, too large a step or correction."""
-    found = []
+    """Return what was published that must not be: not finite, outside the stroke, too far, too fast, too corrected."""
+    found = [text for fault in record.faults for text in fault.breaches]
     for previous, struts in zip([None, *record.commands], record.commands, strict=False):
         found += [f"strut_commands {problem}" for problem in _outside(struts.lengths, limits)]
         if previous is not None and (step := _step(record, previous, struts)) > limits.step + ROUNDING:
@@ -124,7 +140,7 @@ def breaches(record: Record, limits: Limits) -> list[str]:
             found.append("strut_corrections not finite")
         elif (largest := np.abs(struts.lengths).max()) > limits.correction + ROUNDING:
             found.append(f"strut_corrections of {largest * 1e3:.3f} mm")
-    return found
+    return [*found, *_too_fast(record, limits), *_not_standing(record)]
 
 
 def _outside(lengths: np.ndarray, limits: Limits) -> list[str]:
@@ -135,11 +151,48 @@ def _outside(lengths: np.ndarray, limits: Limits) -> list[str]:
 
 
 def _step(record: Record, previous: Struts, struts: Struts) -> float:
-    """Return the step of a command, m: from the one before, or from measured struts if it is a fresh start."""
-    steps = [_distance(struts.lengths, previous.lengths)]
-    if any(previous.time < start <= struts.time for start in record.fresh_starts):
-        steps += [_distance(struts.lengths, m.lengths) for m in record.measured if 0 <= struts.time - m.time < RECENT]
-    return min(steps)
+    """Return the step of a command, m: from the one before, or at a fresh start from the struts measured last."""
+    if _fresh(record, previous, struts):
+        recent = [m for m in record.measured if 0 <= struts.time - m.time < RECENT]
+        steps = [_distance(struts.lengths, measured.lengths) for measured in recent]
+        if not recent or recent[-1].time < struts.time - HEARD:
+            steps.append(_distance(struts.lengths, previous.lengths))
+        return min(steps)
+    return _distance(struts.lengths, previous.lengths)
+
+
+def _fresh(record: Record, previous: Struts, struts: Struts) -> bool:
+    """Return whether a compensator was started or reset between two commands."""
+    return any(previous.time < start <= struts.time for start in record.fresh_starts)
+
+
+def _too_fast(record: Record, limits: Limits) -> list[str]:
+    """Return the largest speed if it is too large; a fresh start begins anew."""
+    begin, worst = 0, 0.0
+    for n, struts in enumerate(record.commands):
+        if n and _fresh(record, record.commands[n - 1], struts):
+            begin = n
+        while begin + 1 < n and record.commands[begin + 1].published <= struts.published - SPEED_OVER:
+            begin += 1
+        since = struts.published - record.commands[begin].published
+        if since < SPEED_OVER - CLOCK_ROUNDING:
+            continue
+        speed = _distance(struts.lengths, record.commands[begin].lengths) / since
+        worst = max(worst, speed)
+    too_fast = worst > SPEED_SHARE * limits.speed
+    return [f"strut_commands at {worst * 1e3:.0f} mm/s over {SPEED_OVER * 1e3:g} ms"] if too_fast else []
+
+
+def _not_standing(record: Record) -> list[str]:
+    """Return how many commands were published while none may be."""
+    times = np.array([struts.time for struts in record.commands])
+    found = []
+    for fault in record.faults:
+        for since, until in fault.standing:
+            count = int(((times > since + NOTICED_WITHIN) & (times < until)).sum())
+            if count:
+                found.append(f"{fault.kind}: {count} strut_commands though the machine must stand")
+    return found
 
 
 def _distance(a: np.ndarray, b: np.ndarray) -> float:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 import time
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from hexapod_comp.machine.geometry import STRUT_NAMES
+from hexapod_comp.machine.kinematics import Structure, strut_lengths
+from hexapod_comp.nodes.messages import message_pose
 
 from . import wire
 from .record import LINKS, Happened
 from .rig import Rig
-from .visible import COMMAND_TIMEOUT, DRIVE_TIMEOUT, FEEDBACK_TIMEOUT, FOLLOWING_LIMIT
+from .visible import COMMAND_TIMEOUT, DRIVE_TIMEOUT, FEEDBACK_TIMEOUT, FOLLOWING_LIMIT, following_error
 
 STOPPED_FOR = 2.0
 """SIGSTOP lasts this long, s."""
@@ -24,6 +27,12 @@ RESTARTED_AFTER = 0.2
 
 UNHEARD_FOR = 0.2
 """After a start or a reset under a stream the drive is not heard for this long, s."""
+
+MOVES = 2e-4
+"""Struts that were told to go so far within 80 ms, m, are in motion, whoever looks and when."""
+
+CERTAINLY = 8e-3
+"""At their largest speed for so long, s, and more, struts are too fast for their stamps: more than any jitter."""
 
 OLDEST_COMMAND = 0.5
 """Commands older than this are refused, s: the compensator's default max_command_age."""
@@ -35,6 +44,13 @@ class Meaning:
 
     visible: str
     said: str
+
+
+SILENT = {
+    "pose": Meaning(f"no pose command has been delivered for {COMMAND_TIMEOUT:g} s", "compensator: no new command"),
+    "command": Meaning(f"no strut command has been delivered for {DRIVE_TIMEOUT:g} s", "strut_drive: no new command"),
+    "feedback": Meaning(f"no reading has been delivered for {FEEDBACK_TIMEOUT:g} s", "compensator: feedback lost"),
+}
 
 
 class Fault(ABC):
@@ -145,6 +161,206 @@ class Reset(Fault):
         rig.wires["feedback"].mend(now)
         rig.controller.heedless = False
         return True
+
+
+class ReloadUnderStream(Fault):
+    """`~/reload_model`, again and again, while the controller streams on: the changes ramp in."""
+
+    kind, touches = "reload_under_stream", frozenset({"compensator", "pose"})
+    meaning = Meaning("never: the model is good", "nobody has anything to say")
+
+    def begin(self, rig: Rig, happened: Happened) -> None:
+        """Let it stream, and reload."""
+        rig.controller.heedless = True
+        self._left = 3
+        self._reload(rig, happened)
+
+    def _reload(self, rig: Rig, happened: Happened) -> None:
+        def answered(taken: bool) -> None:
+            self._left -= 1
+            if not taken:
+                happened.breaches.append("a good model was not taken")
+            if self._left:
+                self._reload(rig, happened)
+
+        rig.reload_model(answered)
+
+    def end(self, rig: Rig, happened: Happened) -> None:
+        """Wait: see :meth:`over`."""
+
+    def over(self, rig: Rig) -> bool:
+        """Hold the controller again once all have been answered."""
+        rig.controller.heedless = self._left > 0
+        return not self._left
+
+
+class ResetInMotion(Fault):
+    """`~/reset` while the machine moves, three times; one that comes while the path turns may be granted."""
+
+    kind, touches = "reset_in_motion", frozenset({"compensator", *LINKS})
+    meaning = Meaning("the first that is refused is answered", "compensator: reset refused while the machine moves")
+
+    def begin(self, rig: Rig, happened: Happened) -> None:
+        """Ask."""
+        self._ask(rig, happened, 3)
+
+    def _ask(self, rig: Rig, happened: Happened, times: int) -> None:
+        began = time.monotonic()
+
+        def answered(done: bool) -> None:
+            told = [c.lengths for c in rig.record.commands if began - 0.08 < c.time < began]
+            way = float(np.ptp(told, axis=0).max()) if told else 0.0
+            if done and way > MOVES:
+                happened.breaches.append(f"reset granted though the struts moved by {way * 1e3:.2f} mm in 80 ms")
+            elif not done:
+                happened.marks.append(time.monotonic())
+            if times > 1:
+                self._ask(rig, happened, times - 1)
+
+        rig.reset(answered)
+
+    def end(self, rig: Rig, happened: Happened) -> None:
+        """Nothing: it is over when it is answered."""
+
+
+class Latched(Fault):
+    """A strut is knocked away and pulled back; nobody resets for a while: until then the machine must stand."""
+
+    kind, touches = "latched_following_error", frozenset({"drive", "feedback", "compensator", "pose"})
+    meaning = Meaning(
+        f"the first reading more than {FOLLOWING_LIMIT * 1e3:g} mm from all commands of the last 0.1 s",
+        "compensator: following_error",
+    )
+    shortest = longest = 0.6
+
+    def begin(self, rig: Rig, happened: Happened) -> None:
+        """Knock it, far enough that it is seen."""
+        strut = int(self.rng.integers(1, 7))
+        rig.controller.may_reset = False
+        happened.detail = STRUT_NAMES[strut - 1]
+        rig.set_drive(fault_jump_strut=strut, fault_jump=float(self.rng.choice([-8e-3, 8e-3])))
+
+    def end(self, rig: Rig, happened: Happened) -> None:
+        """Let the controller reset; until now the machine had to stand, from when it was seen."""
+        rig.controller.may_reset = True
+        expected = following_error(rig.record, replace(happened, ended=time.monotonic()))
+        happened.standing += [(since, time.monotonic()) for _, _, since in expected]
+
+
+class SimTime(Fault):
+    """`use_sim_time` is set in the running compensator."""
+
+    kind, touches = "use_sim_time_set", frozenset({"compensator"})
+    meaning = Meaning("never: it is refused, and nothing changes", "nobody has anything to say")
+
+    def begin(self, rig: Rig, happened: Happened) -> None:
+        """Ask for it."""
+
+        def answered(taken: bool) -> None:
+            if taken:
+                happened.breaches.append("use_sim_time was taken by a running node")
+
+        rig.simulate_time(answered)
+
+    def end(self, rig: Rig, happened: Happened) -> None:
+        """Nothing."""
+
+
+class StreamsOn(Fault):
+    """The controller streams on, and is held again a while after the fault."""
+
+    touches = frozenset({"compensator", *LINKS})
+
+    def begin(self, rig: Rig, happened: Happened) -> None:
+        """Let it."""
+        rig.controller.heedless = True
+
+    def end(self, rig: Rig, happened: Happened) -> None:
+        """Let it stream for a while yet."""
+        self._held_at = time.monotonic() + UNHEARD_FOR
+
+    def over(self, rig: Rig) -> bool:
+        """Return whether it is held again."""
+        rig.controller.heedless = time.monotonic() < self._held_at
+        return not rig.controller.heedless
+
+
+class StopUnderStream(StreamsOn):
+    """SIGSTOP of the compensator for 0.4 s while the controller streams on: what has come meanwhile is a burst."""
+
+    kind, meaning = "stop_under_stream", SILENT["command"]
+    shortest = longest = 0.4
+
+    def begin(self, rig: Rig, happened: Happened) -> None:
+        """Stop it."""
+        super().begin(rig, happened)
+        rig.freeze("compensator")
+
+    def end(self, rig: Rig, happened: Happened) -> None:
+        """Let it go on."""
+        rig.thaw("compensator")
+        super().end(rig, happened)
+
+
+class Bunched(StreamsOn):
+    """Poses are held up on the way while the controller streams on, and come all at once: unnoticed, or too many."""
+
+    kind, meaning = "bunched_pose", SILENT["pose"]
+
+    def begin(self, rig: Rig, happened: Happened) -> None:
+        """Hold them up."""
+        super().begin(rig, happened)
+        self.duration = float(self.rng.choice([0.05, 0.3]))
+        happened.detail = f"{self.duration:g} s"
+        rig.wires["pose"].rule = wire.Bunch(self.rng, 1.0)
+
+    def end(self, rig: Rig, happened: Happened) -> None:
+        """Let them come."""
+        rig.wires["pose"].mend(time.monotonic())
+        super().end(rig, happened)
+
+
+class Restamped(StreamsOn):
+    """Stamps stand, or are a microsecond apart, while the controller streams on."""
+
+    kind = "stamps_stand"
+    meaning = Meaning("the first command that is too fast by its stamp is delivered", "compensator: speed, or step")
+
+    def begin(self, rig: Rig, happened: Happened) -> None:
+        """Spoil the stamps."""
+        super().begin(rig, happened)
+        apart = int(self.rng.choice([0, 1000]))
+        happened.detail = f"{apart} ns, reason speed|step"
+        structure, speed = Structure.of(rig.geometry), rig.geometry.limits.speed
+
+        def lengths(message: Any) -> np.ndarray:
+            return strut_lengths(structure, message_pose(message) @ rig.geometry.tool.inverse())
+
+        link = rig.wires["pose"]
+        link.marks = happened.marks
+        link.rule = wire.Restamp(self.rng, apart, lengths, lambda seconds: speed * (seconds + CERTAINLY))
+
+    def end(self, rig: Rig, happened: Happened) -> None:
+        """Stamp well again."""
+        rig.wires["pose"].mend(time.monotonic())
+        super().end(rig, happened)
+
+
+class Hurried(StreamsOn):
+    """The controller leaves out poses: at 640 mm/s it asks for more than the machine can do."""
+
+    kind = "too_fast"
+    meaning = Meaning("never certainly: it may be where its path turns", "nobody must")
+
+    def begin(self, rig: Rig, happened: Happened) -> None:
+        """Hurry."""
+        super().begin(rig, happened)
+        rig.controller.stride = 8
+
+    def end(self, rig: Rig, happened: Happened) -> None:
+        """Take time."""
+        rig.controller.stride = 1
+        super().end(rig, happened)
 
 
 class Stop(Fault):
@@ -344,12 +560,6 @@ def _make(base: type[Fault], kind: str, touches: set[str], meaning: Meaning, **a
     return type(f"{base.__name__}_{kind}", (base,), attributes)
 
 
-SILENT = {
-    "pose": Meaning(f"no pose command has been delivered for {COMMAND_TIMEOUT:g} s", "compensator: no new command"),
-    "command": Meaning(f"no strut command has been delivered for {DRIVE_TIMEOUT:g} s", "strut_drive: no new command"),
-    "feedback": Meaning(f"no reading has been delivered for {FEEDBACK_TIMEOUT:g} s", "compensator: feedback lost"),
-}
-
 REFUSED = {
     "pose": "compensator: refusing commands: the reason",
     "command": "strut_drive: refusing commands: the reason",
@@ -391,8 +601,16 @@ KINDS: dict[str, type[Fault]] = {
         *(kind for link in LINKS for kind in _wired_kinds(link)),
         _make(Restart, "restart_under_stream", {"compensator", *LINKS}, SILENT["command"]),
         _make(Reset, "reset_under_stream", {"compensator", *LINKS}, SILENT["feedback"]),
+        ReloadUnderStream,
+        StopUnderStream,
+        Bunched,
+        Restamped,
+        Hurried,
+        ResetInMotion,
+        SimTime,
         Stuck,
         Jumping,
+        Latched,
         LostEncoder,
         FullDisk,
         HalfModel,

@@ -24,10 +24,19 @@ class Sent:
 
 @dataclass(frozen=True)
 class Struts:
-    """Six lengths as one message had them, m, shape (6,); NaN where it had none."""
+    """Six lengths as one message had them, m, shape (6,); NaN where it had none.
+
+    Attributes
+    ----------
+    time : float
+        When it came, or was delivered, monotonic, s.
+    published : float
+        When its publisher's middleware sent it, s on the system's clock; NaN where that does not matter.
+    """
 
     time: float
     lengths: np.ndarray
+    published: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -73,6 +82,10 @@ class Happened:
         When something wrong was delivered, for the kinds whose visibility is that.
     detail : str
         What was drawn.
+    standing : list of (float, float)
+        From when to when no command may be published, whatever comes.
+    breaches : list of str
+        What else was done and must not be.
     """
 
     kind: str
@@ -80,6 +93,8 @@ class Happened:
     ended: float = math.nan
     marks: list[float] = field(default_factory=list)
     detail: str = ""
+    standing: list[tuple[float, float]] = field(default_factory=list)
+    breaches: list[str] = field(default_factory=list)
 
 
 @dataclass

@@ -7,8 +7,10 @@ come back to it and go through a third wire to the compensator.
 
 from __future__ import annotations
 
+import inspect
 import math
 import os
+import re
 import shutil
 import signal
 import tempfile
@@ -133,12 +135,13 @@ class Rig:
         self._executor.add_node(node)
         poses = node.create_publisher(PoseStamped, "tool_pose_command", COMMAND_QOS)
         self._poses = poses
-        node.create_subscription(JointState, "strut_commands", self._on_commands, LISTENER_QOS)
+        node.create_subscription(JointState, "strut_commands", dated(self._on_commands), LISTENER_QOS)
         node.create_subscription(JointState, "strut_corrections", self._on_corrections, LISTENER_QOS)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, LISTENER_QOS)
         node.create_subscription(PoseStamped, "tool_pose_estimate", self._on_estimate, STATE_QOS)
         self._open_wires(node, poses)
         self._set_parameters = node.create_client(SetParameters, "strut_drive/set_parameters")
+        self._set_clock = node.create_client(SetParameters, "compensator/set_parameters")
         self._reload = node.create_client(Trigger, "compensator/reload_model")
         self._reset = node.create_client(Trigger, "compensator/reset")
         self.controller = Controller(self.geometry, self._send, self._ask_for_reset)
@@ -246,10 +249,23 @@ class Rig:
         future = self._reload.call_async(Trigger.Request())
         future.add_done_callback(lambda f: then(bool(f.result().success)))
 
-    def reset(self) -> None:
-        """Ask the compensator to forget its last command, as an operator does, without waiting."""
-        self._reset.call_async(Trigger.Request())
-        self.record.fresh_starts.append(time.monotonic())
+    def simulate_time(self, then: Callable[[bool], None]) -> None:
+        """Ask the compensator to go by simulated time; calls back with whether it does."""
+        value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True)
+        request = SetParameters.Request(parameters=[Parameter(name="use_sim_time", value=value)])
+        future = self._set_clock.call_async(request)
+        future.add_done_callback(lambda f: then(bool(f.result().results[0].successful)))
+
+    def reset(self, then: Callable[[bool], None] = lambda done: None) -> None:
+        """Ask the compensator to forget its last command, as an operator does; calls back with whether it has."""
+        asked = time.monotonic()
+
+        def answered(future: Future) -> None:
+            if future.result().success:
+                self.record.fresh_starts.append(asked)
+            then(bool(future.result().success))
+
+        self._reset.call_async(Trigger.Request()).add_done_callback(answered)
 
     # ---- what comes and goes ----
 
@@ -268,9 +284,9 @@ class Rig:
         if link == "feedback":
             self.record.measured.append(Struts(now, lengths_of(message.position)))
 
-    def _on_commands(self, message: JointState) -> None:
+    def _on_commands(self, message: JointState, published: float) -> None:
         now = time.monotonic()
-        self.record.commands.append(Struts(now, lengths_of(message.position)))
+        self.record.commands.append(Struts(now, lengths_of(message.position), published))
         stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
         entry = self.record.sent.get(stamp)
         if entry is not None and math.isnan(entry.answered_at):
@@ -301,7 +317,7 @@ class Rig:
         """Return whether the compensator says that the machine is not where it was told to be."""
         said = self.record.said("compensator")
         words = said[-1].message if said else ""
-        return "following" in words or "refusing commands: step" in words
+        return re.search("refusing commands: .*(following|step|speed)", words) is not None
 
     # ---- the controller's reset ----
 
@@ -316,7 +332,10 @@ class Rig:
         if self._reset_answer is None:
             return
         began, then, future = self._reset_answer
-        if isinstance(future, Future) and future.done():
+        if isinstance(future, Future) and future.done() and not future.result().success:
+            self._reset_answer = None
+            then(None)
+        elif isinstance(future, Future) and future.done():
             self.record.fresh_starts.append(now)
             # Estimates come every few ms; the next one is from the measured struts.
             self._reset_answer, self._estimate = (began, then, now), None
@@ -348,6 +367,20 @@ class Rig:
         """Begin the record of another episode."""
         self.record = self.record.continued()
         return self.record
+
+
+def dated(callback: Callable[[Any, float], None]) -> Callable[..., None]:
+    """Return a callback for rclpy that hands on a message and when its publisher sent it, s on the system's clock.
+
+    As :func:`hexapod_comp.nodes.runtime.numbered`: rclpy asks the signature, and its executors differ.
+    """
+
+    def called(*arguments: Any) -> None:
+        message, info = arguments[0] if len(arguments) == 1 else arguments
+        callback(message, info["source_timestamp"] * 1e-9)
+
+    called.__signature__ = inspect.signature(lambda message, info: None)  # type: ignore[attr-defined]
+    return called
 
 
 def waited_for_processor(pid: int) -> float:

@@ -142,6 +142,53 @@ class Delay(Rule):
         return [(now + self._time, copy.deepcopy(message), SPOILT if self._too_old else NOTHING)]
 
 
+class Bunch(Rule):
+    """The message is held up until the link is mended; then all come at once."""
+
+    def happen(self, message: Any, now: float) -> Deliveries:
+        """Hold it up."""
+        return [(float("inf"), copy.deepcopy(message), NOTHING)]
+
+
+class Restamp(Rule):
+    """The stamps of the messages stand, or nearly.
+
+    Parameters
+    ----------
+    apart : int
+        From one message's stamp to the next, ns.
+    lengths : callable
+        Returns the strut lengths that a message asks for, m.
+    allowed : callable
+        Returns the way that no strut may go within some seconds, m.
+    """
+
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        apart: int,
+        lengths: Callable[[Any], np.ndarray],
+        allowed: Callable[[float], float],
+    ) -> None:
+        super().__init__(rng, 1.0)
+        self._apart, self._lengths, self._allowed = apart, lengths, allowed
+        self._first: tuple[int, np.ndarray] | None = None
+        self._count = 0
+
+    def happen(self, message: Any, now: float) -> Deliveries:
+        """Deliver it with the first one's stamp, or one little later; it is wrong once the struts are too fast."""
+        out = copy.deepcopy(message)
+        stamp, lengths = out.header.stamp, self._lengths(message)
+        if self._first is None:
+            self._first = stamp.sec * NANOSECONDS + stamp.nanosec, lengths
+        first, before = self._first
+        self._count += 1
+        stamp.sec, stamp.nanosec = divmod(first + self._count * self._apart, NANOSECONDS)
+        way = float(np.abs(lengths - before).max())
+        too_fast = way > self._allowed(self._count * self._apart * 1e-9)
+        return [(now, out, SPOILT if too_fast else NOTHING)]
+
+
 class Corrupt(Rule):
     """The message is spoilt.
 

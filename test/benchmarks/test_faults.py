@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -25,7 +26,10 @@ from benchmarks.faults.visible import VISIBLE
 from benchmarks.faults.wire import Corrupt, Delay, Drop, Duplicate, Reorder, Wire
 from hexapod_comp.nodes.log_space import LogSpace
 
-LIMITS = Limits(np.tile([0.33, 0.88], (6, 1)), 2e-3, 2e-3)
+LIMITS = Limits(np.tile([0.33, 0.88], (6, 1)), 2e-3, 2e-3, 0.25)
+
+CLOCK = 1.8e9
+"""What the system's clock reads when the records begin, s."""
 
 PERIOD = 0.004
 """Of the commands in the records made here, s."""
@@ -39,7 +43,7 @@ def quiet(seconds: float = 6.0) -> Record:
         now = index * PERIOD
         lengths = np.full(6, 0.5 + 0.01 * math.sin(4.0 * now))
         record.sent[index] = Sent(now, now + 0.001)
-        record.commands.append(Struts(now + 0.001, lengths))
+        record.commands.append(Struts(now + 0.001, lengths, CLOCK + now))
         record.corrections.append(Struts(now + 0.001, np.full(6, 1e-4)))
         record.measured.append(Struts(now + 0.002, lengths.copy()))
         for link in record.delivered:
@@ -76,7 +80,7 @@ def test_nothing_is_found_where_nothing_is_wrong():
 )
 def test_the_judge_catches_one_bad_command_among_1500(spoil, found):
     record = quiet()
-    record.commands[700] = Struts(record.commands[700].time, spoil(record.commands[700].lengths))
+    record.commands[700] = replace(record.commands[700], lengths=spoil(record.commands[700].lengths))
     assert any(found in miss for miss in judge(record, LIMITS).misses())
 
 
@@ -97,6 +101,33 @@ def test_a_fresh_start_may_step_to_the_measured_struts_and_nowhere_else():
     assert judge(record, LIMITS).breaches == []
     record.commands[700].lengths[:] += 5e-3
     assert any("step" in breach for breach in judge(record, LIMITS).breaches)
+
+
+@pytest.mark.parametrize(("speed", "caught"), [(0.24, False), (0.262, False), (0.264, True), (0.5, True)])
+def test_the_judge_catches_20_ms_that_are_too_fast(speed, caught):
+    """Eight commands 4 ms apart as they were sent, at so many m/s; 250 mm/s are allowed, and 5 % more."""
+    record = quiet()
+    for n, struts in enumerate(record.commands[700:]):
+        start = record.commands[699].lengths
+        record.commands[700 + n] = replace(struts, lengths=start + speed * PERIOD * min(n + 1, 7))
+    found = judge(record, LIMITS).breaches
+    assert any("mm/s over 20 ms" in breach for breach in found) == caught, found
+    assert not any("step" in breach for breach in found[:1])
+
+
+def test_commands_that_came_bunched_and_were_not_sent_so_are_not_too_fast():
+    record = quiet()
+    for n in range(700, 750):
+        record.commands[n] = replace(record.commands[n], time=record.commands[750].time)
+    assert judge(record, LIMITS).breaches == []
+
+
+def test_the_judge_catches_commands_while_the_machine_must_stand():
+    record = quiet()
+    record.faults = [Happened("latched_following_error", 2.0, 2.5, standing=[(2.1, 2.5)])]
+    assert any("87 strut_commands though the machine must stand" in b for b in judge(record, LIMITS).breaches)
+    record.commands = [c for c in record.commands if not 2.15 < c.time < 2.5]
+    assert not any("must stand" in breach for breach in judge(record, LIMITS).breaches)
 
 
 def test_the_judge_catches_one_lost_command_outside_the_fault_and_forgives_those_inside():
@@ -300,7 +331,8 @@ def test_a_few_episodes(isolated_ros):
     """With two faults each, or under a stream that goes on; the campaign's bars on time want a computer to itself."""
     disk = () if refusal_to_mount() else ("log_disk_full",)
     kinds = [("corrupt_pose", *disk), ("encoder_nan", "drop_pose"), ("kill_compensator", "drop_feedback")]
-    kinds += [("restart_under_stream",), ("reset_under_stream",)]
+    kinds += [("restart_under_stream",), ("reset_under_stream",), ("stop_under_stream",), ("stamps_stand",)]
+    kinds += [("latched_following_error",), ("reset_in_motion", "use_sim_time_set")]
     with Rig(domain=False) as rig:
         for names in kinds:
             outcome = run_episode(rig, Chosen(*names))
