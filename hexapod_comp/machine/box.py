@@ -1,4 +1,4 @@
-"""The box of tool positions about home that a machine reaches: where it is measured when nobody says where."""
+"""The box of tool positions about home that a machine reaches: where the demonstration measures, fields are drawn."""
 
 from __future__ import annotations
 
