@@ -275,6 +275,12 @@ SPOILS: dict[str, dict[str, tuple[Callable[[Any], None], str]]] = {
         "5 s ahead": (shifted_stamp(5.0), "stamp_future"),
     },
     "command": {**STRUT_SPOILS, "1e30 m": (_huge_strut, "step"), "30 mm away": (_far_strut, "step")},
-    "feedback": {**STRUT_SPOILS, "1e30 m": (_huge_strut, "stroke"), "30 mm away": (_far_strut, "following|stroke")},
+    "feedback": {
+        **STRUT_SPOILS,
+        "1e30 m": (_huge_strut, "stroke"),
+        "30 mm away": (_far_strut, "following|stroke|jump"),
+        "5 s old": (shifted_stamp(-5.0), "stamp_past"),
+        "5 s ahead": (shifted_stamp(5.0), "stamp_future"),
+    },
 }
 """For each link the ways to spoil a message on it, and the reason with which it must be refused."""
