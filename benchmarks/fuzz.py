@@ -3,7 +3,8 @@
     python -m benchmarks.fuzz [--cases N] [--seed N] [--jobs N] [-k WORD]
 
 The tests are those of ``test/fuzz/test_fuzz_*.py``, which ``make test`` runs at a bounded size, the same cases every
-time; here every seed makes other cases. Exit code 1: some case failed; hypothesis has then shrunk it and printed it.
+time; here every seed makes other cases. ``-k any_content`` sends N messages of any bytes to each node, as processes,
+over DDS. Exit code 1: some case failed; hypothesis has then shrunk it and printed it.
 """
 
 from __future__ import annotations

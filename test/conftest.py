@@ -62,6 +62,7 @@ def isolated_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         patch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("ros_log")))
         patch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(config_file("fastdds.xml")))
+        patch.setenv("RMW_FASTRTPS_USE_QOS_FROM_XML", "1")  # as the nodes do with it
         patch.delenv("ROS_LOCALHOST_ONLY", raising=False)
         patch.delenv("ROS_STATIC_PEERS", raising=False)
         patch.delenv("ROS_DISCOVERY_SERVER", raising=False)

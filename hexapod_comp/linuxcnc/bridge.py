@@ -248,15 +248,14 @@ class LinuxcncBridgeNode(MachineNode):
     def _look_at_publishers(self) -> None:
         self._source.look(time.monotonic())
 
-    def _on_correction(self, message: JointState, number: int | None) -> None:
+    def _on_correction(self, data: bytes, number: int | None) -> None:
         now = time.monotonic()
         self._heard.tick(now)
         self._source.hear(number, now)
         try:
             if self._source.problem:
                 raise CommandError(self._source.reason, self._source.problem)
-            self._check_stamp(message.header.stamp)
-            self._reader.read(message)
+            self._check_stamp(self._reader.take(data).header.stamp)
             self._guard.offer(self._reader.lengths.tolist(), now)
         except CommandError as error:
             self._refusals.add(error.reason, str(error), now)

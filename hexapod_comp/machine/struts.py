@@ -12,9 +12,9 @@ home, and thermal growth g. The compensator solves it for c.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from ..errors import ModelError
 from ..kernels.struts import (
@@ -32,6 +32,9 @@ from ..kernels.struts import (
     screw_twist,
 )
 from .geometry import HexapodGeometry
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 STEEPEST_ERROR = 0.2
 """Largest slope of the strut error against the command: below it, undoing the error is a contraction."""
@@ -112,16 +115,21 @@ class StrutErrors:
         waves = 2.0 * np.pi / self.period * np.hypot(self.cosine, self.sine)
         steep = np.abs(self.pitch) + waves
         if len(self.map_knots):
-            spline = CubicSpline(self.map_knots, self.map_values, axis=1, bc_type="natural").derivative()
+            spline = self._spline().derivative()
             dense = np.linspace(self.map_knots[0], self.map_knots[-1], 20 * len(self.map_knots))
             steep = steep + np.abs(spline(dense)).max(axis=1)
         return steep
+
+    def _spline(self) -> CubicSpline:
+        from scipy.interpolate import CubicSpline  # 14 MB with all that it needs, which a node without a map does not
+
+        return CubicSpline(self.map_knots, self.map_values, axis=1, bc_type="natural")
 
     def spline_coefficients(self) -> np.ndarray:
         """Return the map's cubic pieces, shape (6, n − 1, 4), highest power first, about each left knot."""
         if not len(self.map_knots):
             return np.zeros((6, 0, 4))
-        spline = CubicSpline(self.map_knots, self.map_values, axis=1, bc_type="natural")
+        spline = self._spline()
         return np.ascontiguousarray(np.transpose(spline.c, (2, 1, 0)))
 
     def parameter_table(self, geometry: HexapodGeometry, growth: np.ndarray) -> np.ndarray:

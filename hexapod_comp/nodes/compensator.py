@@ -131,7 +131,7 @@ class CompensatorNode(MachineNode):
         self._outputs = outputs = CompensatorOutputs(self, self.compensator, self._options, self._files)
         inputs = (self.compensator, self._status, self._options)
         self._feedback = Feedback(self, *inputs, outputs.estimate, self._look_at_publishers)
-        commands = self.obey(PoseStamped, "tool_pose_command", self._on_command, self._look_at_publishers, raw=True)
+        commands = self.obey(PoseStamped, "tool_pose_command", self._on_command, self._look_at_publishers)
         self._subscription = commands
         allowed = self._options["allow_several_publishers"]
         self._pacing = Pacing(self, self._options["catch_up_within"], self._take, self._refuse_waiting)

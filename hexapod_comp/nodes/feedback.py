@@ -16,7 +16,7 @@ from ..errors import CommandError, HexapodError
 from .command_source import CommandSource
 from .compensator_status import CompensatorStatus
 from .following import StrokeRange
-from .messages import StrutReader
+from .messages import StrutReader, read_message
 from .plausible import NoJump
 from .runtime import EVENT_QOS, STATE_QOS, MachineNode
 from .stamps import nanoseconds_of
@@ -74,14 +74,14 @@ class Feedback:
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
 
-    def _on_states(self, message: JointState, number: int | None) -> None:
-        now, stamp = time.monotonic(), nanoseconds_of(message.header.stamp)
-        struts = self._reader.lengths
+    def _on_states(self, data: bytes, number: int | None) -> None:
+        now, struts = time.monotonic(), self._reader.lengths
         try:
             self._hear(self._measuring, number, now)
+            header = self._reader.take(data).header
+            stamp = nanoseconds_of(header.stamp)
             if stamp:
                 self._stamps.check(stamp, now)
-            self._reader.read(message)
             self._range.check(struts)
             self._watch_following(struts, now)  # also of what cannot be: then the strut or its encoder is broken
             self._jumps.check(struts, stamp, now)
@@ -96,7 +96,7 @@ class Feedback:
             self._stamps.accept(stamp, now)
         self._status.feedback.tick(now)
         if self._node.active:
-            self._publish(pose, message.header.stamp)
+            self._publish(pose, header.stamp)
 
     def _hear(self, owner: CommandSource, number: int | None, now: float) -> None:
         """Take a reading's sequence number; refuse the reading while it is not clear whose it is."""
@@ -116,12 +116,14 @@ class Feedback:
             self._look()
             self._status.bad_feedback.add(following.reason, following.problem, now)
 
-    def _on_temperature(self, message: Temperature, number: int | None) -> None:
+    def _on_temperature(self, data: bytes, number: int | None) -> None:
         # Dated by arrival: sensors need not stamp, clocks may be set, and what a transport delays a drift does not
         # notice.
-        name, now = message.header.frame_id, time.monotonic()
+        now = time.monotonic()
         try:
             self._hear(self._warming, number, now)
+            message = read_message(data, Temperature)
+            name = message.header.frame_id
             self._compensator.set_temperature(name, self._thermometers.take(name, message.temperature, now))
         except CommandError as error:
             self._ignore("temperatures", error.reason, f"temperature ignored: {error}", str(error), now)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
 from ..errors import CommandError
@@ -13,6 +15,25 @@ from ..kernels.pose import quaternion_of
 from ..kernels.struts import write_lengths
 from ..machine.geometry import STRUT_NAMES
 from ..pose import Pose
+
+LARGEST_MESSAGE = 1 << 18
+"""Longer messages are refused unread, byte: a thousand times ours. Read, they would fill many times their size."""
+
+
+def read_message(data: bytes, kind: type) -> Any:
+    """Return the message of a type that a subscription got as bytes.
+
+    Raises
+    ------
+    CommandError
+        ``message``: it is too long, or none of this type.
+    """
+    if len(data) > LARGEST_MESSAGE:
+        raise CommandError("message", f"a message must not have more than {LARGEST_MESSAGE} bytes, not {len(data)}")
+    try:
+        return deserialize_message(data, kind)
+    except (RuntimeError, ValueError) as error:  # the middleware's, or a text that is not UTF-8
+        raise CommandError("message", f"the message cannot be read: {error}") from error
 
 
 def pose_numbers(message: PoseStamped) -> tuple[float, float, float, float, float, float, float]:
@@ -89,6 +110,12 @@ class StrutReader:
         self.lengths = np.zeros(6)
         self._names: list[str] | None = None
         self._order = np.arange(6)
+
+    def take(self, data: bytes) -> JointState:
+        """Read a message that came as bytes, and return it; errors as :func:`read_message` and :meth:`read`."""
+        message: JointState = read_message(data, JointState)
+        self.read(message)
+        return message
 
     def read(self, message: JointState) -> None:
         """Read a message.

@@ -21,7 +21,7 @@ from rclpy.signals import SignalHandlerOptions
 from ..errors import LONGEST_TEXT, HexapodError, printable
 from .arguments import Program
 from .log_relay import LogRelay
-from .middleware import avoid_shared_memory
+from .middleware import avoid_shared_memory, give_memory_back
 from .runtime import MachineNode
 from .starting import Starting
 from .warming import Warming
@@ -75,6 +75,7 @@ def run(make_node: Callable[[], MachineNode], program: Program, argv: Sequence[s
     refusal = program.refusal(arguments)
     if refusal is not None:
         return refusal
+    give_memory_back()
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())

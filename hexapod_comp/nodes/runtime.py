@@ -181,24 +181,25 @@ class MachineNode(LifecycleNode):
         return self.create_timer(period, callback, clock=self._steady)
 
     def listen_to(
-        self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
+        self, message_type: type, topic: str, callback: Callable[[bytes], None], qos: QoSProfile
     ) -> Subscription:
-        """Return a subscription."""
-        return self.create_subscription(message_type, topic, callback, copy.copy(qos), qos_overriding_options=OVERRIDES)
+        """Return a subscription of what anybody may say; its callback gets the message's bytes."""
+        qos = copy.copy(qos)
+        return self.create_subscription(message_type, topic, callback, qos, qos_overriding_options=OVERRIDES, raw=True)
 
     def obey(
         self,
         message_type: type,
         topic: str,
-        callback: Callable[[Any, int | None], None],
+        callback: Callable[[bytes, int | None], None],
         matched: Callable[[], None],
-        raw: bool = False,
         qos: QoSProfile = COMMAND_QOS,
     ) -> Subscription:
         """Return a subscription of what only one node may say.
 
-        Its callback gets the message, or with `raw` its bytes, and the message's sequence number; `matched` is called
-        when a publisher comes or goes, where the middleware tells (who wants to be sure also looks now and then).
+        Its callback gets the message's bytes, so that it need not read what is too long, and its sequence number;
+        `matched` is called when a publisher comes or goes, where the middleware tells (who wants to be sure also looks
+        now and then).
         """
         make = functools.partial(
             self.create_subscription,
@@ -207,7 +208,7 @@ class MachineNode(LifecycleNode):
             numbered(callback),
             copy.copy(qos),
             qos_overriding_options=OVERRIDES,
-            raw=raw,
+            raw=True,
         )
 
         def on_matched(_: Any) -> None:

@@ -173,7 +173,7 @@ class StrutDriveNode(MachineNode):
     def _look_at_publishers(self) -> None:
         self._source.look(time.monotonic())
 
-    def _on_commands(self, message: JointState, number: int | None) -> None:
+    def _on_commands(self, data: bytes, number: int | None) -> None:
         if not self._active:
             return
         now = time.monotonic()
@@ -181,17 +181,16 @@ class StrutDriveNode(MachineNode):
         try:
             if self._source.problem:
                 raise CommandError(self._source.reason, self._source.problem)
-            self._obey_commands(message, now)
+            self._obey_commands(data, now)
         except HexapodError as error:
             self._refusals.add(error.reason, str(error), now)
             self.warn_of(error.reason, f"command refused ({error.reason}): {error}")
             return
         self._commands.tick(now)
 
-    def _obey_commands(self, message: JointState, now: float) -> None:
+    def _obey_commands(self, data: bytes, now: float) -> None:
         """Take commands that are six lengths, in order, and no step from the last ones."""
-        stamp, lengths = nanoseconds_of(message.header.stamp), self._reader.lengths
-        self._reader.read(message)
+        stamp, lengths = nanoseconds_of(self._reader.take(data).header.stamp), self._reader.lengths
         self._order.check(stamp, now)
         self._no_step.check(lengths, now)
         self.drive.set_command(lengths)

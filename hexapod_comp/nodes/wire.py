@@ -12,13 +12,13 @@ import struct
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
 from ..errors import CommandError
 from ..kernels.struts import write_lengths
 from ..machine.geometry import STRUT_NAMES
-from .messages import StrutMessage, pose_numbers
+from .messages import LARGEST_MESSAGE, StrutMessage, pose_numbers, read_message
 from .stamps import nanoseconds_of, stamp_of
 
 LITTLE_ENDIAN = b"\x00\x01"
@@ -51,7 +51,7 @@ def read_pose_bytes(data: bytes) -> tuple[int, str, tuple[float, ...]]:
     CommandError
         ``message``: the bytes are no PoseStamped, or its stamp no time.
     """
-    if data[:2] == LITTLE_ENDIAN and len(data) >= _FRAME_AT + _NUMBERS.size:
+    if data[:2] == LITTLE_ENDIAN and _FRAME_AT + _NUMBERS.size <= len(data) <= LARGEST_MESSAGE:
         seconds, nanoseconds, length = _START.unpack_from(data, _START_AT)
         end = _FRAME_AT + length
         numbers_at = end + (_START_AT - end) % 8  # alignment counts from behind the four bytes
@@ -72,10 +72,7 @@ def stamp_in(data: bytes) -> int:
 
 def _read_unusual(data: bytes) -> tuple[int, str, tuple[float, ...]]:
     """Read a PoseStamped of another encoding as rclpy does."""
-    try:
-        message = deserialize_message(data, PoseStamped)
-    except (RuntimeError, ValueError) as error:  # the middleware's, or a text that is not UTF-8
-        raise CommandError("message", f"the message cannot be read: {error}") from error
+    message = read_message(data, PoseStamped)
     stamp = message.header.stamp
     if stamp.nanosec >= _SECOND:  # with the largest seconds it would not fit into an answer's stamp
         raise CommandError("message", f"nanosec of the stamp must be below {_SECOND}, not {stamp.nanosec}")

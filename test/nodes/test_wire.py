@@ -19,8 +19,8 @@ from strategies import fixed
 
 from hexapod_comp.errors import CommandError
 from hexapod_comp.machine.geometry import STRUT_NAMES
-from hexapod_comp.nodes import wire
-from hexapod_comp.nodes.messages import StrutMessage
+from hexapod_comp.nodes import messages, wire
+from hexapod_comp.nodes.messages import LARGEST_MESSAGE, StrutMessage, StrutReader, read_message
 from hexapod_comp.nodes.wire import StrutBytes, read_pose_bytes
 
 NUMBERS = st.lists(st.floats(), min_size=7, max_size=7)
@@ -65,9 +65,31 @@ def test_a_stamp_that_is_no_time_is_refused(nanosec):
 
 
 def test_usual_bytes_are_read_without_a_message(monkeypatch):
-    monkeypatch.setattr(wire, "deserialize_message", None)
+    monkeypatch.setattr(wire, "read_message", None)
     for name in ("", "b", "base", "a_frame_id_of_19_xx"):
         assert read_pose_bytes(serialize_message(pose(1, 2, name, [0.5] * 7)))[1:] == (name, (0.5,) * 7)
+
+
+def test_a_message_that_is_too_long_is_refused_unread(monkeypatch):
+    """A quarter of a MB is allowed, a thousand times ours; read, a text of 10 MB would be there several times."""
+    monkeypatch.setattr(messages, "deserialize_message", None)
+    with pytest.raises(CommandError, match=r"must not have more than 262144 bytes, not 262145") as caught:
+        read_message(bytes(LARGEST_MESSAGE + 1), JointState)
+    assert caught.value.reason == "message"
+    assert reason_of(serialize_message(pose(1, 2, "x" * LARGEST_MESSAGE, [0.5] * 7))) == "message"
+
+
+def test_struts_are_taken_from_bytes_that_are_theirs():
+    reader, numbers = StrutReader(), [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+    message = JointState(name=list(STRUT_NAMES), position=numbers)
+    message.header.stamp.sec = 7
+    assert reader.take(serialize_message(message)).header.stamp.sec == 7
+    assert reader.lengths.tolist() == numbers
+    for data in (b"", serialize_message(message)[:40], b"\xff" * 80):
+        with pytest.raises(CommandError, match="cannot be read") as caught:
+            reader.take(data)
+        assert caught.value.reason == "message"
+    assert reader.lengths.tolist() == numbers
 
 
 def test_bytes_of_the_other_endianness_are_read():
