@@ -220,7 +220,7 @@ class Bench:
         """Call a service and return its response."""
         client = self._client(kind, name)
         future = client.call_async(kind.Request() if request is None else request)
-        self.until(future.done, f"answer of {name}")
+        self.until(future.done, f"answer of {name}", timeout=30.0)  # one starts a process, and others may be busy
         return future.result()
 
     def _client(self, kind: type, name: str) -> Any:

@@ -51,6 +51,7 @@ def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
 def bridge(bench: Bench) -> LinuxcncBridgeNode:
     """Add a LinuxCNC bridge on a machine that is on; the witness no longer commands."""
     bench.hush("tool_pose_command")
+    bench.hush("strut_states")
     hal = StandInHal()
     node = bench.add(LinuxcncBridgeNode, True, {"rate": 250.0, "timeout": 1.0}, hal=hal)
     for n, length in enumerate(closed_form_lengths(HOME)):
