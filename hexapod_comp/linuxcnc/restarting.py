@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
 
@@ -10,9 +9,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from ..errors import CommandError
 from ..nodes.health import ERROR
-from ..nodes.messages import read_message
 from ..nodes.runtime import EVENT_QOS, MachineNode
 from .bridge_status import BridgeStatus
 
@@ -61,11 +58,7 @@ class CompensatorReset:
         self._node.destroy_client(self._client)
         self._node.destroy_subscription(self._complaints)
 
-    def _on_diagnostics(self, data: bytes) -> None:
-        with contextlib.suppress(CommandError):  # anybody's: what cannot be read is not for us
-            self._look_for_complaints(read_message(data, DiagnosticArray))
-
-    def _look_for_complaints(self, message: DiagnosticArray) -> None:
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.level == ERROR and status.name.startswith(self._name):
                 self._complained_at = time.monotonic()

@@ -28,6 +28,7 @@ from rclpy.timer import Timer
 from ..errors import CommandError, shorten
 from .guarding import CallbackGuard, PlainLogger, Throttle
 from .health import HealthReport, joined
+from .messages import read_message
 
 USE_SIM_TIME = "use_sim_time"
 
@@ -181,11 +182,19 @@ class MachineNode(LifecycleNode):
         return self.create_timer(period, callback, clock=self._steady)
 
     def listen_to(
-        self, message_type: type, topic: str, callback: Callable[[bytes], None], qos: QoSProfile
+        self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
     ) -> Subscription:
-        """Return a subscription of what anybody may say; its callback gets the message's bytes."""
+        """Return a subscription of what anybody may say; what cannot be read, or is too long, is left aside."""
+
+        def hear(data: bytes) -> None:
+            try:
+                message = read_message(data, message_type)
+            except CommandError:
+                return
+            callback(message)
+
         qos = copy.copy(qos)
-        return self.create_subscription(message_type, topic, callback, qos, qos_overriding_options=OVERRIDES, raw=True)
+        return self.create_subscription(message_type, topic, hear, qos, qos_overriding_options=OVERRIDES, raw=True)
 
     def obey(
         self,
