@@ -31,6 +31,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
+from std_msgs.msg import UInt64
 
 from hexapod_comp.loop.processes import PrivateDomain, waited_for_processor
 from hexapod_comp.nodes.messages import pose_message
@@ -89,6 +90,8 @@ class Soak:
     ----------
     commands, lost : int
         Sent, and never answered.
+    heartbeats, heartbeats_lost : int
+        Of the compensator: heard, and missing between them.
     histogram : ndarray
         Answers by latency, in :data:`BINS`.
     worst : list of Gap
@@ -101,6 +104,8 @@ class Soak:
 
     commands: int = 0
     lost: int = 0
+    heartbeats: int = 0
+    heartbeats_lost: int = 0
     longest: float = 0.0
     histogram: np.ndarray = field(default_factory=lambda: np.zeros(len(BINS) + 1, dtype=np.int64))
     worst: list[Gap] = field(default_factory=list)
@@ -142,6 +147,8 @@ class Commander:
         self._publisher = self.node.create_publisher(PoseStamped, "tool_pose_command", COMMAND_QOS)
         self.node.create_subscription(JointState, "strut_commands", self._on_answer, QoSProfile(depth=1000))
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
+        self.node.create_subscription(UInt64, "compensator/heartbeat", self._on_heartbeat, QoSProfile(depth=1000))
+        self._beat: int | None = None
         self._message = pose_message(Pose(np.array([0.0, 0.0, 0.4]), np.eye(3)), "base")
         self._sent: dict[int, float] = {}
         self._start, self._turned = 0.0, 0.0
@@ -212,6 +219,11 @@ class Commander:
             found.worst.sort(key=lambda gap: -gap.latency)
             del found.worst[WORST_KEPT:]
 
+    def _on_heartbeat(self, message: UInt64) -> None:
+        self.found.heartbeats += 1
+        self.found.heartbeats_lost += 0 if self._beat is None else message.data - self._beat - 1
+        self._beat = message.data
+
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             self.found.diagnostics[status.name.partition(":")[0]] = {v.key: v.value for v in status.values}
@@ -276,7 +288,8 @@ def report(found: Soak) -> list[str]:
     shares = (0.5, 0.9, 0.99, 0.999, 0.9999)
     quantiles = "  ".join(f"{100 * share:g} % {found.quantile(share) * 1e6:.0f}" for share in shares)
     lines = [
-        f"{found.commands} commands, {found.lost} without an answer",
+        f"{found.commands} commands, {found.lost} without an answer; "
+        f"{found.heartbeats} heartbeats, {found.heartbeats_lost} lost",
         f"latency, µs: {quantiles}  largest {found.longest * 1e6:.0f}",
     ]
     for index, node in enumerate(NODES):
@@ -311,12 +324,17 @@ def main() -> int:
     args = parser.parse_args()
     found = soak(args.minutes * 60.0, args.rate_hz)
     if args.json:
-        values = {"commands": found.commands, "lost": found.lost, "growth_mb_h": [found.growth(i)[0] for i in (0, 1)]}
+        values = {
+            "commands": found.commands,
+            "lost": found.lost,
+            "heartbeats_lost": found.heartbeats_lost,
+            "growth_mb_h": [found.growth(i)[0] for i in (0, 1)],
+        }
         print(json.dumps(values | {"diagnostics": found.diagnostics}, indent=1))
     else:
         print("\n".join(report(found)))
     grows = [found.growth(i)[0] > BAR_GROWTH for i in (0, 1)]
-    verdict = "MISSED" if found.lost or any(grows) else "kept"
+    verdict = "MISSED" if found.lost or found.heartbeats_lost or any(grows) else "kept"
     print(f"bars (nothing lost, memory grows by less than {BAR_GROWTH:g} MB/h): {verdict}", file=sys.stderr)
     return int(verdict == "MISSED")
 

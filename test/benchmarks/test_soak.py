@@ -21,6 +21,7 @@ def test_five_seconds_at_1_khz():
     counted = sum(int(found.diagnostics["compensator"][name]) for name in ("commands_missed", "refused"))
     assert found.commands > 100.0 * SECONDS, "a machine too busy for 100 Hz shows nothing"
     assert found.lost <= counted
+    assert found.heartbeats > 10.0 * SECONDS  # of 50 a second
     assert found.histogram.sum() == found.commands - found.lost
     assert [note["name"] for node in NODES for note in found.notes[node] if note["kind"] == "compile"] == []
     memory = np.array(found.memory)[:, 1:]
