@@ -10,7 +10,7 @@ from . import common
 from .run import TRUE, chosen_model, draw, hidden_errors
 
 if TYPE_CHECKING:
-    from ..loop.story import Calibration
+    from ..loop.story import Calibration, Place
     from ..machine.geometry import HexapodGeometry
     from ..machine.model import MachineModel
 
@@ -30,9 +30,10 @@ def run(args: argparse.Namespace) -> int:
     rate = loop.checked_rate(args.rate_hz)
     geometry = load_geometry(args.machine)
     truth, calibration = hidden_errors(args, geometry), None
-    poses, path = story.demo_poses(geometry, args.seed), story.demo_path(geometry, rate)
+    place = story.demo_place(geometry)
+    poses, path = story.demo_poses(place, args.seed), story.demo_path(geometry, place, rate)
     if args.model == FITTED:
-        calibration = _calibration(args, geometry, truth)
+        calibration = _calibration(args, geometry, truth, place)
         model = calibration.fit.model
     else:
         model = chosen_model(args, geometry, truth)
@@ -55,13 +56,13 @@ def run(args: argparse.Namespace) -> int:
     return 1 if complaints else 0
 
 
-def _calibration(args: argparse.Namespace, geometry: HexapodGeometry, truth: MachineModel) -> Calibration:
+def _calibration(args: argparse.Namespace, geometry: HexapodGeometry, truth: MachineModel, place: Place) -> Calibration:
     """Measure and fit the machine, and say what came of it before the loop starts."""
     from ..loop.story import calibrate, calibration_text
 
     common.mention_compiling("model.actual_pose_one")
     with common.stage_line() as say:
-        calibration = calibrate(geometry, truth, args.seed, say)
+        calibration = calibrate(geometry, truth, place, args.seed, say)
     if not args.json:
         print(f"machine {geometry.name}, hidden errors: {args.truth}\n{calibration_text(calibration)}", flush=True)
     return calibration

@@ -36,20 +36,20 @@ def run(args: argparse.Namespace) -> int:
     """Run the verb."""
     from ..calibration.evaluation import held_out
     from ..errors import GeometryError
-    from ..machine.box import level_box
     from ..machine.geometry import load_geometry
     from ..machine.model import RealMachine
     from ..machine.model_file import save_model
     from ..virtual.named import imagine
+    from ..workspace.box import machine_box
 
     geometry = load_geometry(args.machine)
     model = imagine(geometry, args.seed, _bounds(args, geometry), args.name or "")
     save_model(model, args.out)
     box, error_of_tool = None, None
     try:
-        found = box = level_box(geometry)
+        box, attitude, _ = machine_box(geometry)
         common.mention_compiling("model.actual_pose_one")
-        error_of_tool = held_out(RealMachine(geometry, model), None, found)
+        error_of_tool = held_out(RealMachine(geometry, model), None, box, level=attitude)
     except GeometryError as error:
         common.say_notes([f"what the tool does is not shown: {error}"])
     drawn = _drawn(model)
@@ -64,17 +64,27 @@ def _bounds(args: argparse.Namespace, geometry: HexapodGeometry) -> Imperfection
     """Return the bounds that the options give; the usual ones where they give none."""
     import numpy as np
 
-    from ..machine.box import box_of_platforms
     from ..virtual.named import usual_bounds
+    from ..workspace.box import machine_box
 
     given: dict[str, Any] = {"shared_platform_joints": not args.separate_joints}
     for option, (name, unit) in IN_SI.items():
         value = getattr(args, option)
         if value is not None:
             given[name] = tuple(unit * v for v in value) if isinstance(value, tuple) else unit * value
-    if args.box is not None:
-        given["field_box"] = box_of_platforms(geometry, np.array(args.box))
+    if args.field_um or args.field_urad:
+        box, attitude, _ = machine_box(geometry)
+        given["field_box"] = _platform_box(geometry, box if args.box is None else np.array(args.box), attitude)
     return usual_bounds(geometry, **given)
+
+
+def _platform_box(geometry: HexapodGeometry, box: np.ndarray, attitude: np.ndarray) -> np.ndarray:
+    """Return the lowest and highest platform position in ``base`` of a tool in a box of ``work``, shape (2, 3), m."""
+    import numpy as np
+
+    corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)
+    positions, _ = geometry.platform_poses(corners, np.tile(attitude, (len(corners), 1, 1)))
+    return np.array([positions.min(axis=0), positions.max(axis=0)])
 
 
 def _drawn(model: MachineModel) -> list[tuple[str, float, str]]:
@@ -119,7 +129,7 @@ def _report(
     if box is not None and error is not None:
         low, high = (", ".join(texts.number(v * 1e3, 1) for v in corner) for corner in box)
         lines.append(
-            f"tool error, level tool in ({low})…({high}) mm of work: {error.raw.rms * 1e6:.2f} µm RMS as it is, "
+            f"tool error, tool positions in ({low})…({high}) mm of work: {error.raw.rms * 1e6:.2f} µm RMS as it is, "
             f"{error.aligned.rms * 1e6:.2f} µm with the datum aligned"
         )
     return "\n".join([*lines, f"truth: {args.out}"])

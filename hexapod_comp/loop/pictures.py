@@ -82,17 +82,19 @@ def _tracks(path: PathRecord) -> list[tuple[Track, str]]:
 
 
 def _path(axes: Axes, record: PathRecord, datum: str) -> None:
-    """Draw the path in x and y, and the true tracks with their deviation magnified to be seen."""
+    """Draw the path in its plane, and the true tracks with their deviation magnified to be seen."""
     commanded, tracks = record.path.positions * 1e3, _tracks(record)
-    width = float(np.ptp(record.path.positions[:, :2], axis=0).max())
+    extent = np.ptp(record.path.positions, axis=0)
+    across, up = sorted(np.argsort(extent)[1:])  # the plane in which it lies, or the one nearest to that
+    width = float(extent.max())
     largest = max((rms(track.deviation) for track, _ in tracks), default=0.0)
     magnified = float(f"{DRAWN_DEVIATION * width / max(largest, 1e-9):.0e}")
     for track, colour in tracks:
         drawn = (track.feet + magnified * (track.positions - track.feet)) * 1e3
-        axes.plot(drawn[:, 0], drawn[:, 1], color=colour, lw=2.2)
-    axes.plot(commanded[:, 0], commanded[:, 1], color="black", lw=1.0, ls=(0, (5, 4)))
-    title = f"Tool path seen from above, deviation × {magnified:g}{datum}"
-    axes.set(title=title, xlabel="x in work, mm", ylabel="y in work, mm", aspect="equal")
+        axes.plot(drawn[:, across], drawn[:, up], color=colour, lw=2.2)
+    axes.plot(commanded[:, across], commanded[:, up], color="black", lw=1.0, ls=(0, (5, 4)))
+    names = [f"{'xyz'[axis]} in work, mm" for axis in (across, up)]
+    axes.set(title=f"Tool path, deviation × {magnified:g}{datum}", xlabel=names[0], ylabel=names[1], aspect="equal")
 
 
 def _rest(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -16,7 +17,6 @@ from ..calibration.report import tool_error_text
 from ..calibration.sensitivity import predict
 from ..compensation.compensator import Compensator
 from ..formats.texts import number
-from ..machine.box import level_box
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel, RealMachine
 from ..machine.passes import Passes
@@ -28,12 +28,16 @@ from ..pose import Pose
 from ..virtual.instruments import measure
 from ..virtual.machine import StrutDrive
 from ..virtual.trial import without_datum
+from ..workspace.box import machine_box
 from .records import PathRecord, PoseRecord, SessionResult, Track
 from .report import ALIGNED, ErrorRow, error_rows
 from .session import MOVE_FEED
 
 LONGEST_SIDE = 0.2
 """Longest side of the measured box, m: what the demonstration crosses in two seconds."""
+
+PROPORTIONS = np.array([1.0, 1.0, 0.5])
+"""Sides of that box to each other, along x, y and z of the work frame."""
 
 LINES_APART, READINGS_APART = 0.25, 0.0625
 """Distances of the grid's lines, and of the readings along them, as shares of the longest side."""
@@ -77,22 +81,44 @@ class Calibration:
     joint: PaperMetric
 
 
-def demo_box(geometry: HexapodGeometry) -> np.ndarray:
-    """Return the box of tool positions in ``work`` that is measured: about home, no larger than need be; (2, 3), m."""
-    box = level_box(geometry)
-    centre, half = box.mean(axis=0), 0.5 * np.ptp(box, axis=0)
-    half = (half * min(1.0, 0.5 * LONGEST_SIDE / half.max())).round(4)
-    return np.array([centre - half, centre + half]).round(9)
+@dataclass(frozen=True)
+class Place:
+    """Where the demonstration happens.
+
+    Attributes
+    ----------
+    box : ndarray, shape (2, 3)
+        Lowest and highest tool position that is measured, m in ``work``.
+    attitude : ndarray, shape (3, 3)
+        Of the tool in ``work``: level, or as at home where it cannot be level.
+    """
+
+    box: np.ndarray
+    attitude: np.ndarray
 
 
-def demo_campaign(box: np.ndarray, instrument: str = "5-D", diagonals: int = 16) -> Campaign:
-    """Return the campaign on a box: lines along its sides, and its diagonals, read with the default noise."""
-    longest = float(np.ptp(box, axis=0).max())
-    return Campaign(box, LINES_APART * longest, READINGS_APART * longest, instrument, diagonals)
+def demo_place(geometry: HexapodGeometry) -> Place:
+    """Return the box that is measured: about home, within the machine's largest box, and no larger than need be."""
+    largest = machine_box(geometry)
+    low, high = largest.box
+    half = np.minimum(0.5 * LONGEST_SIDE * PROPORTIONS, 0.49 * (high - low)).round(4)
+    centre = np.clip(geometry.tool_pose(geometry.home).position, low + half, high - half)
+    return Place(np.array([centre - half, centre + half]).round(9), largest.rotation)
+
+
+def demo_campaign(place: Place, instrument: str = "5-D", diagonals: int = 16) -> Campaign:
+    """Return the campaign there: lines along the box's sides, and its diagonals, read with the default noise."""
+    sides = np.ptp(place.box, axis=0)
+    apart, step = (min(share * float(sides.max()), float(sides.min())) for share in (LINES_APART, READINGS_APART))
+    return Campaign(place.box, apart, step, instrument, diagonals, level=place.attitude)
 
 
 def calibrate(
-    geometry: HexapodGeometry, truth: MachineModel, seed: int, say: Callable[[str], object] = lambda text: None
+    geometry: HexapodGeometry,
+    truth: MachineModel,
+    place: Place,
+    seed: int,
+    say: Callable[[str], object] = lambda text: None,
 ) -> Calibration:
     """Measure a machine with virtual lasers, noise included, and fit it by both schemes.
 
@@ -100,24 +126,26 @@ def calibrate(
     ----------
     geometry, truth : HexapodGeometry, MachineModel
         The machine and its hidden errors.
+    place : Place
+        Where it is measured.
     seed : int
         Of the noise.
     say : callable, optional
         Hears what goes on.
     """
-    real, campaign = RealMachine(geometry, truth), demo_campaign(demo_box(geometry))
+    real, campaign = RealMachine(geometry, truth), demo_campaign(place)
     say("measuring with 5-D lasers")
     measured = measure(template(campaign, geometry, seed), campaign, real, seed)
     fit = fit_model(measured, FitSettings(lead=_lead(geometry, truth)), say)
     say("the 1-D scheme of Mou & King")
-    # Their lines run along the base's axes, and the tool is as level as above, whatever the work frame is.
-    level = geometry.work.rotation @ geometry.tool.rotation.T
+    # Their lines run along the base's axes, and the platform is as level as above, whatever the work frame is.
+    level = geometry.work.rotation @ place.attitude @ geometry.tool.rotation.T
     straight = replace(geometry, work=Pose.identity(), tool=Pose(geometry.tool.position, level.T))
-    real, box = RealMachine(straight, truth), demo_box(straight)
-    campaign = demo_campaign(box, "1-D", 0)
+    real, place = RealMachine(straight, truth), demo_place(straight)
+    campaign = demo_campaign(place, "1-D", 0)
     lines = fit_lines(measure(template(campaign, straight, seed), campaign, real, seed)).model
-    of_lines, of_joint = (paper_metric(real, model, box, campaign.step, seed=seed) for model in (lines, fit.model))
-    return Calibration(fit, of_lines, of_joint)
+    metric = partial(paper_metric, real, box=place.box, step=campaign.step, seed=seed)
+    return Calibration(fit, metric(lines), metric(fit.model))
 
 
 def calibration_text(calibration: Calibration) -> str:
@@ -167,22 +195,22 @@ def _lead(geometry: HexapodGeometry, truth: MachineModel) -> float | None:
     return float(struts.period[0]) if waves and not geometry.screw_lead.any() else None
 
 
-def demo_poses(geometry: HexapodGeometry, seed: int) -> list[Pose]:
-    """Return random poses of a level tool in the measured box, in ``work``, each the next nearest."""
-    box = demo_box(geometry)
+def demo_poses(place: Place, seed: int) -> list[Pose]:
+    """Return random poses of the tool in the measured box, in ``work``, each the next nearest."""
+    box = place.box
     left = list(np.random.default_rng(seed).uniform(box[0], box[1], (POSES, 3)).round(6))
     ordered = [box.mean(axis=0)]
     while left:
         distances = [float(np.linalg.norm(point - ordered[-1])) for point in left]
         ordered.append(left.pop(int(np.argmin(distances))))
-    return [Pose(point, np.eye(3)) for point in ordered[1:]]
+    return [Pose(point, place.attitude) for point in ordered[1:]]
 
 
-def demo_path(geometry: HexapodGeometry, rate: float) -> Path:
-    """Return a milled circle, then a zigzag pocket, in the middle of the measured box, in ``base``."""
-    box, in_base = demo_box(geometry), commanded_in_base(geometry)
+def demo_path(geometry: HexapodGeometry, place: Place, rate: float) -> Path:
+    """Return a milled circle, then a zigzag pocket, in the middle of the measured box, across the tool, in ``base``."""
+    box, in_base = place.box, commanded_in_base(geometry)
     side = min(PATH_SIDE, 0.25 * float(np.ptp(box, axis=0)[:2].min()))
-    feed, centre = side / PATH_TIME, geometry.work @ Pose(box.mean(axis=0), np.eye(3))
+    feed, centre = side / PATH_TIME, geometry.work @ Pose(box.mean(axis=0), place.attitude)
     ring = circle(centre, radius=0.5 * side, feed=feed, rate=rate)
     corner = centre @ Pose(np.array([-0.5 * side, -side / 6.0, 0.0]), np.eye(3))
     rows = pocket(in_base, corner, (side, side / 3.0), pitch=side / 6.0, feed=feed, rate=rate)

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError
-from ..machine.box import box_of_platforms, level_box
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL, load_model
@@ -45,17 +44,13 @@ USUAL_LEAD = 0.01
 def usual_bounds(geometry: HexapodGeometry, **given: Any) -> ImperfectionBounds:
     """Return :data:`USUAL` bounds for a machine; what is given goes before.
 
-    A field without a box gets that of :func:`~hexapod_comp.machine.box.level_box`.
-
     Raises
     ------
-    GeometryError
-        Bounds that cannot be, or a field without a box on a machine that has none.
+    ModelError
+        As :class:`~hexapod_comp.virtual.imperfections.ImperfectionBounds`.
     """
     leads = np.abs(geometry.screw_lead)
     usual = {**USUAL, "wave_period": float(leads.max()) if leads.any() else USUAL_LEAD}
-    if (given.get("field_displacement") or given.get("field_rotation")) and given.get("field_box") is None:
-        given["field_box"] = box_of_platforms(geometry, level_box(geometry))
     return ImperfectionBounds(**{**usual, **given})
 
 

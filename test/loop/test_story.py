@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,14 @@ import pytest
 from foreign_machines import Errors, aligned_rms, machines, tool_errors
 
 from hexapod_comp import cli
+from hexapod_comp.compensation.checks import check
 from hexapod_comp.loop import story
 from hexapod_comp.loop.records import SessionResult
 from hexapod_comp.loop.report import ALIGNED, AS_IT_IS, ErrorRow
 from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.model_file import load_model, save_model
+from hexapod_comp.pose import Pose, rotation_from_angles
 from hexapod_comp.virtual.named import find_model
 
 RATE = 250.0
@@ -50,8 +54,9 @@ def test_the_promise_for_the_poses_is_kept(name: str, tmp_path: Path, coarse: No
     machine = machines()[name]
     truth = Errors.drawn(machine, 7)
     geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
-    calibration = story.calibrate(geometry, load_model(truth.write(tmp_path / "truth.yaml", machine), geometry), 1)
-    poses, path = story.demo_poses(geometry, 1), story.demo_path(geometry, RATE)
+    place, hidden = story.demo_place(geometry), load_model(truth.write(tmp_path / "truth.yaml", machine), geometry)
+    calibration = story.calibrate(geometry, hidden, place, 1)
+    poses, path = story.demo_poses(place, 1), story.demo_path(geometry, place, RATE)
     (low, high), (path_low, path_high) = story.promises(calibration.fit, poses, path)
     model = tmp_path / "model.yaml"
     save_model(calibration.fit.model, model)
@@ -68,7 +73,8 @@ def test_poses_and_path_are_about_this_machines_home(tmp_path: Path) -> None:
     """Inside the measured box, the tool level, in the frames that are said; the next pose is the nearest one left."""
     for machine in machines().values():
         geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
-        box, poses, path = story.demo_box(geometry), story.demo_poses(geometry, 0), story.demo_path(geometry, RATE)
+        place = story.demo_place(geometry)
+        box, poses, path = place.box, story.demo_poses(place, 0), story.demo_path(geometry, place, RATE)
         home = machine.tips(np.array([machine.home]), np.eye(3)[None])[0]
         np.testing.assert_allclose(box.mean(axis=0), home, atol=1e-9)
         places = np.array([pose.position for pose in poses])
@@ -82,10 +88,23 @@ def test_poses_and_path_are_about_this_machines_home(tmp_path: Path) -> None:
         np.testing.assert_allclose(path.rotations, np.tile(machine.work.matrix, (len(path), 1, 1)), atol=1e-12)
 
 
+def test_a_tool_that_cannot_be_level_stays_as_at_home() -> None:
+    """A spindle whose frame looks down, in a work frame that looks up: poses and path are within the limits."""
+    paper = load_geometry("paper")
+    geometry = replace(paper, tool=Pose([0.0, 0.0, 0.1], rotation_from_angles(np.radians([180.0, 0.0, 0.0]))))
+    place = story.demo_place(geometry)
+    np.testing.assert_allclose(place.attitude, geometry.tool.rotation, atol=1e-12)
+    path = story.demo_path(geometry, place, RATE)
+    assert check(geometry, MachineModel("paper"), story.demo_poses(place, 0)).ok
+    assert check(geometry, MachineModel("paper"), (path.positions, path.rotations), mode="stream", rate=RATE).ok
+    story.demo_campaign(place)  # which a measuring plan can be made of
+
+
 def test_drives_leave_their_steps_and_their_lag(small: None) -> None:
     """At rest half a step of 0.1 µm a strut, evenly: between a tenth of it and the whole times the machine's levers."""
     geometry = load_geometry("paper")
-    poses, path = story.demo_poses(geometry, 0), story.demo_path(geometry, RATE)
+    place = story.demo_place(geometry)
+    poses, path = story.demo_poses(place, 0), story.demo_path(geometry, place, RATE)
     at_rest, on_path = story.left_by_drives(geometry, find_model("ideal", geometry), poses, path)
     assert 0.5e-8 < at_rest < 1e-7
     assert at_rest < on_path < 1e-5
@@ -113,6 +132,7 @@ def refuse_all_but_the_path_of_a_busy_computer(code: int, complaints: list[str])
         assert [text.partition(",")[0].partition(" was busy")[0] for text in complaints] == ["path", "the computer"]
 
 
+@pytest.mark.timeout(300)  # a fit and half a minute of motion, on a busy computer
 def test_the_whole_story_on_a_foreign_machine(isolated_ros, tmp_path: Path, small: None) -> None:
     """Turned tool and work frames, every kind of error that ``random`` has, both nodes over DDS.
 
@@ -152,7 +172,6 @@ def test_the_picture_of_a_run_needs_neither_path_nor_truth(tmp_path: Path) -> No
     from hexapod_comp.formats.figures import save
     from hexapod_comp.loop.pictures import session_figure
     from hexapod_comp.loop.records import PoseRecord
-    from hexapod_comp.pose import Pose
 
     save(session_figure(SessionResult([PoseRecord(Pose.identity())]), [], "nothing seen"), tmp_path / "run.png")
     assert (tmp_path / "run.png").stat().st_size > 1_000

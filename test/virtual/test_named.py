@@ -84,13 +84,3 @@ def test_waves_have_the_lead_that_the_geometry_gives() -> None:
     screwed = replace(geometry, base_axes=axes, platform_axes=axes, screw_lead=np.full(6, -0.002))
     assert imagine(geometry, 1).struts.period.tolist() == [0.01] * 6
     assert imagine(screwed, 1).struts.period.tolist() == [0.002] * 6
-
-
-def test_a_field_without_a_box_is_where_a_level_tool_gets(tmp_path) -> None:
-    geometry = paper_geometry()
-    bounds = usual_bounds(geometry, field_displacement=2e-6)
-    field = imagine(geometry, 1, bounds).field
-    np.testing.assert_allclose(field.box.mean(axis=0), [0.0, 0.0, 0.4], atol=1e-12)  # about home
-    errors, outside = field.evaluate(geometry.home.position, np.zeros(3))
-    assert np.abs(errors[:3]).max() > 0.0
-    assert not outside
