@@ -8,7 +8,7 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -34,6 +34,21 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 def _has_nodes(item: pytest.Item) -> bool:
     return not ROS_FIXTURES.isdisjoint(getattr(item, "fixturenames", ()))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
+    """Keep a file's tests in one process, as ``--dist loadfile`` does, but those of the zoo machine by machine."""
+    if config.getvalue("dist") != "loadfile":
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = super()._split_scope(nodeid)
+            return nodeid[nodeid.rindex("[") :] if file.endswith("test_zoo.py") else file
+
+    return Scheduling(config, log)
 
 
 @pytest.hookimpl(wrapper=True)

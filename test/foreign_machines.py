@@ -1,8 +1,8 @@
-"""Machines that are not the paper's, with kinematics of the tests' own.
+"""A zoo of machines, most of them not the paper's, with kinematics of the tests' own.
 
 Nothing here uses the package: closures are written out from the geometry file's and the model file's description
-(L = command + offset + pitch · (command − reference) between the real joints), solved by Newton's method with the
-textbook Jacobian, rows (u, R·p × u). Lengths are m, positions (N, 3), rotations (N, 3, 3).
+(L = command + offset + pitch · (command − reference) + lead · turns between the real joints), solved by Newton's
+method with the textbook Jacobian, rows (u, R·p × u). Lengths are m, positions (N, 3), rotations (N, 3, 3).
 """
 
 from __future__ import annotations
@@ -39,7 +39,11 @@ class Frame:
 
 @dataclass(frozen=True)
 class Machine:
-    """A hexapod; `half`: half sides of the box of tool positions in work that is measured, around `middle`."""
+    """A hexapod; `half`: half sides of the box of tool positions in work that is measured, around `middle`.
+
+    With a `lead` (m, positive right-hand) the screws turn with cardan joints whose axes on base and platform are
+    `axes`, each (6, 3), at the machine's default those across the struts at home.
+    """
 
     name: str
     base: np.ndarray
@@ -50,15 +54,27 @@ class Machine:
     work: Frame = field(default_factory=Frame)
     stroke: tuple[float, float] = (0.25, 1.2)
     unit: str = "mm"
+    lead: float = 0.0
+    axes: tuple[np.ndarray, np.ndarray] | None = None
+    limits: dict[str, float] = field(default_factory=dict)
+
+    def lengths(self, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+        """Return the nominal distances between the joints of each strut, (N, 6)."""
+        return np.linalg.norm(positions[:, None] + self.platform @ np.swapaxes(rotations, 1, 2) - self.base, axis=2)
 
     def level(self) -> np.ndarray:
         """Return the platform's rotation in base when the tool is parallel to work."""
         return self.work.matrix @ self.tool.matrix.T
 
+    def platform_poses(self, tips: np.ndarray, tools: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return platform poses in base, (N, 3) and (N, 3, 3), for the tool at places and attitudes in work."""
+        rotations = self.work.matrix @ tools @ self.tool.matrix.T
+        in_base = np.array(self.work.position) + tips @ self.work.matrix.T
+        return in_base - rotations @ np.array(self.tool.position), rotations
+
     def platforms(self, tips: np.ndarray) -> np.ndarray:
         """Return where the platform is for a level tool at places of work (N, 3)."""
-        in_base = np.array(self.work.position) + tips @ self.work.matrix.T
-        return in_base - self.level() @ np.array(self.tool.position)
+        return self.platform_poses(tips, np.tile(np.eye(3), (len(tips), 1, 1)))[0]
 
     def tips(self, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
         """Return where the tool's tip is in work for platform poses in base."""
@@ -102,8 +118,14 @@ class Machine:
                 "correction_um": 3000,
                 "step_mm": 3,
                 "speed_mm_s": 250,
+                **self.limits,
             },
         }
+        if self.axes is not None:
+            for body, axes in zip(("base", "platform"), self.axes, strict=True):
+                content[body]["joint_axes"] = axes.tolist()
+        if self.lead:
+            content["screw"] = {f"lead_{self.unit}": lengths(self.lead)}
         path.write_text(yaml.safe_dump(content))
         return path
 
@@ -137,7 +159,7 @@ class Errors:
         """Read a model file that has no more than structure, offset and pitch."""
         content = yaml.safe_load(path.read_text())
         structure, struts = content.get("structure", {}), content.get("struts", {})
-        assert "wave" not in struts
+        assert not np.any([struts.get("wave", {}).get(f"{part}_um", 0.0) for part in ("cosine", "sine")])
         assert "map" not in struts
         assert not content.get("field", {}).get("lines")
         values = [np.array(structure[f"{body}_deviation_um"]) * UM for body in ("base", "platform")]
@@ -170,9 +192,31 @@ class Errors:
 
 def commands(machine: Machine, errors: Errors, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     """Return what the struts must be told for platform poses if the machine has these errors, (N, 6), m."""
-    ends = positions[:, None] + (machine.platform + errors.platform) @ np.swapaxes(rotations, 1, 2)
-    lengths = np.linalg.norm(ends - machine.base - errors.base, axis=2)
+    arms = (machine.platform + errors.platform) @ np.swapaxes(rotations, 1, 2)
+    struts = positions[:, None] + arms - machine.base - errors.base
+    lengths = np.linalg.norm(struts, axis=2) - advance(machine, struts, rotations)
     return (lengths - errors.offset + errors.pitch * errors.reference) / (1.0 + errors.pitch)
+
+
+def advance(machine: Machine, struts: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Return by how much struts (N, 6, 3) have become longer by themselves since home, as their screws turned.
+
+    A cardan joint's cross holds the strut's fork across both its own axis and the strut. So the screw stands along
+    (base axis) × u and the nut along (platform axis) × u, and from the one to the other is what the screw has turned.
+    """
+    if not machine.lead or machine.axes is None:
+        return np.zeros(struts.shape[:2])
+    at_home = np.array(machine.home) + machine.platform - machine.base
+    turned = _screw_angles(machine, struts, rotations) - _screw_angles(machine, at_home[None], np.eye(3)[None])
+    return machine.lead * np.angle(np.exp(1j * turned)) / (2.0 * np.pi)
+
+
+def _screw_angles(machine: Machine, struts: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Return the angles about the struts from screw to nut, right-handed, rad."""
+    assert machine.axes is not None
+    u = struts / np.linalg.norm(struts, axis=2, keepdims=True)
+    screw, nut = np.cross(machine.axes[0], u), np.cross(machine.axes[1] @ np.swapaxes(rotations, 1, 2), u)
+    return np.arctan2((u * np.cross(screw, nut)).sum(axis=2), (screw * nut).sum(axis=2))
 
 
 def goes_to(
@@ -181,11 +225,12 @@ def goes_to(
     """Return where the machine with these errors goes when told lengths (N, 6), by Newton from the poses meant."""
     wanted = told + errors.offset + errors.pitch * (told - errors.reference)
     positions, rotations = positions.copy(), rotations.copy()
-    for _ in range(6):  # quadratic, from a tenth of a millimetre: two are enough
+    for _ in range(8):  # quadratic, from a tenth of a millimetre: two are enough, some more where screws turn
         arms = (machine.platform + errors.platform) @ np.swapaxes(rotations, 1, 2)
         struts = positions[:, None] + arms - machine.base - errors.base
-        lengths = np.linalg.norm(struts, axis=2)
-        u = struts / lengths[:, :, None]
+        distances = np.linalg.norm(struts, axis=2)
+        lengths = distances - advance(machine, struts, rotations)
+        u = struts / distances[:, :, None]
         step = np.linalg.solve(np.concatenate([u, np.cross(arms, u)], axis=2), (wanted - lengths)[:, :, None])[:, :, 0]
         positions += step[:, :3]
         rotations = _turned(step[:, 3:]) @ rotations
@@ -204,11 +249,15 @@ def _turned(vectors: np.ndarray) -> np.ndarray:
     return np.eye(3) + k * np.sin(angle) / safe + k @ k * (1.0 - np.cos(angle)) / safe**2
 
 
-def tool_errors(machine: Machine, truth: Errors, believed: Errors, tips: np.ndarray) -> np.ndarray:
-    """Return actual minus wanted tip (N, 3), m in work, of a level tool told what `believed` makes of it."""
+def tool_errors(machine: Machine, truth: Errors, believed: Errors | None, tips: np.ndarray) -> np.ndarray:
+    """Return actual minus wanted tip (N, 3), m in work, of a level tool told what `believed` makes of it.
+
+    None is a machine told nominal lengths, also where its screws turn.
+    """
     positions = machine.platforms(tips)
     rotations = np.tile(machine.level(), (len(tips), 1, 1))
-    told = commands(machine, believed, positions, rotations)
+    poses = positions, rotations
+    told = machine.lengths(*poses) if believed is None else commands(machine, believed, *poses)
     return machine.tips(*goes_to(machine, truth, told, positions, rotations)) - tips
 
 
@@ -237,6 +286,14 @@ def _ring(radius: float, angles: list[float], heights: list[float]) -> np.ndarra
     return np.stack([radius * np.cos(turns), radius * np.sin(turns), np.array(heights)], axis=1)
 
 
+def _across(base: np.ndarray, platform: np.ndarray, home: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return cardan axes on base and platform: level and across each strut at home, the platform's turned by 30°."""
+    struts = np.array(home) + platform - base
+    axes = np.cross([0.0, 0.0, 1.0], struts)
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    return axes, axes @ rotation(0.0, 0.0, 30.0).T
+
+
 def machines() -> dict[str, Machine]:
     """Return the machines by name."""
     paper = _paper()
@@ -246,21 +303,44 @@ def machines() -> dict[str, Machine]:
     )
     flipped = np.array([1.0, -1.0, -1.0])
     small = (0.1, 0.09, 0.05)
-    framed = {
+    turned = {
         "tool": Frame((0.021, -0.014, 0.095), (3.0, -4.0, 90.0)),
         "work": Frame((0.15, -0.08, 0.31), (2.0, -3.0, 72.0)),
     }
-    return {
-        "paper": Machine("paper", *paper, (0.0, 0.0, 0.4516), (0.15, 0.15, 0.08)),
-        "tool offset": Machine("offset", *paper, (0.0, 0.0, 0.45), small, Frame((0.0, 0.0, 0.26))),
-        "framed 6-6": Machine("framed", *uneven, (0.01, -0.02, 0.5), small, **framed),
-        "hanging": Machine(
+    telescope = (
+        _ring(1.45, [22.0, 98.0, 142.0, 218.0, 262.0, 338.0], [0.0] * 6),
+        _ring(1.1, [52.0, 68.0, 172.0, 188.0, 292.0, 308.0], [0.03] * 6),
+    )
+    unit = (
+        _ring(0.15, [15.0, 105.0, 135.0, 225.0, 255.0, 345.0], [0.0] * 6),
+        _ring(0.06, [40.0, 80.0, 160.0, 200.0, 280.0, 320.0], [0.0] * 6),
+    )
+    cardan = 0.9 * uneven[0], 1.1 * uneven[1]
+    zoo = [
+        Machine("paper", *paper, (0.0, 0.0, 0.4516), (0.15, 0.15, 0.08)),
+        Machine("offset", *paper, (0.0, 0.0, 0.45), small, Frame((0.0, 0.0, 0.26))),
+        Machine("framed", *uneven, (0.01, -0.02, 0.5), small, **turned),
+        Machine(
             "hanging", uneven[0] * flipped, uneven[1] * flipped, (0.0, 0.01, -0.52), small,
             Frame((0.01, 0.0, -0.12)), Frame((-0.05, 0.02, -0.9), (0.0, 0.0, 25.0)),
         ),
-        "inches": Machine(
+        Machine(
             "inches", 1.2 * paper[0], 1.2 * paper[1], (0.0, 0.0, 22 * INCH), (4 * INCH, 4 * INCH, 2 * INCH),
             Frame((0.0, 0.5 * INCH, 3 * INCH), (0.0, 0.0, -90.0)), Frame((INCH, 0.0, 6 * INCH), (0.0, 0.0, -90.0)),
             unit="in",
         ),
-    }  # fmt: skip
+        Machine(
+            "mirror", *telescope, (0.0, 0.0, 1.6), (0.12, 0.12, 0.08), Frame((0.0, 0.0, 0.4)), stroke=(1.2, 2.4),
+        ),
+        Machine(
+            "unit", *unit, (0.0, 0.0, 0.16), (0.012, 0.012, 0.01), Frame((0.0, 0.0, 0.025)), stroke=(0.158, 0.218),
+            lead=0.002, axes=_across(*unit, (0.0, 0.0, 0.16)),
+            limits={"base_cone_deg": 18, "platform_cone_deg": 25, "condition_number": 8, "correction_um": 1000,
+                    "step_mm": 1, "speed_mm_s": 20},
+        ),
+        Machine(
+            "left-hand", *cardan, (-0.01, 0.02, 0.48), small, Frame((0.03, 0.01, 0.07), (0.0, 5.0, 0.0)),
+            Frame((0.0, 0.0, 0.2), (0.0, 0.0, -35.0)), lead=-0.01, axes=_across(*cardan, (-0.01, 0.02, 0.48)),
+        ),
+    ]  # fmt: skip
+    return {machine.name: machine for machine in zoo}

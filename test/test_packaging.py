@@ -225,7 +225,7 @@ def test_a_missing_config_file_is_refused_with_the_shipped_names(
 ):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputFileError, match=r"paper\.yaml"):
-        config_file(name)
+        config_file(name, "geometry")
     assert "paper.yaml" in shipped_names()
 
 

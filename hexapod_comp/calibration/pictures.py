@@ -98,9 +98,10 @@ def strut_error_figure(
         errors = strut_length_errors(geometry, model, along, *line)
         for axes, lengths, letter, way in zip(panels, errors, "ab", ("forward →", "backward ←"), strict=True):
             _strut_curves(axes, along, lengths)
-            axes.set(title=f"{picture_text(title)}, ({letter}) {way}", xlabel="x, mm", ylabel="ΔL = actual − ideal, µm")
+            text = f"{picture_text(title)}, ({letter}) {way}"
+            axes.set(title=text, xlabel="x in work, mm", ylabel="ΔL = actual − ideal, µm")
     figure.legend(*rows[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
-    figure.suptitle(f"Strut length error along x at y = {line[0] * 1e3:g} mm, z = {line[1] * 1e3:g} mm")
+    figure.suptitle(f"Strut length error along x in work, at y = {line[0] * 1e3:g} mm, z = {line[1] * 1e3:g} mm")
     return figure
 
 
@@ -157,7 +158,7 @@ def _line_panel(axes: Axes, line: LineFit, grid: Sequence[np.ndarray]) -> None:
 
 def _label_edges(panels: np.ndarray, axis: int, component: int) -> None:
     for axes in panels[-1]:
-        axes.set_xlabel(f"{AXES[axis]}, mm")
+        axes.set_xlabel(f"{AXES[axis]} in work, mm")
     for axes in panels[:, 0]:
         axes.set_ylabel("µm" if component < 3 else "µrad")
     panels[0, 0].legend(fontsize=6)
@@ -249,7 +250,7 @@ def left_error_figure(fit: ModelFit) -> Figure:
     levels = np.linspace(np.nanmin(left), np.nanmax(left), 13)
     for axes, height, values in zip(panels, heights, left, strict=True):
         drawn = axes.contourf(x * 1e3, y * 1e3, np.ma.masked_invalid(values), levels, cmap="viridis")
-        axes.set(title=f"z = {height * 1e3:.0f} mm", xlabel="x in work, mm", aspect="equal")
+        axes.set(title=f"z in work = {height * 1e3:.0f} mm", xlabel="x in work, mm", aspect="equal")
     panels[0].set_ylabel("y in work, mm")
     figure.colorbar(drawn, ax=panels, label="RMS error in space to expect, µm")
     figure.suptitle("what is left after compensation, level tool, datum aligned")

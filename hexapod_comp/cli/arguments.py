@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 
+from ..formats.texts import number_hint
+
 POSE_HELP = "mm and degrees: x,y,z or x,y,z,alpha,beta,gamma"
 
 POSE_OPTIONS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
@@ -136,4 +138,4 @@ def numbers(text: str) -> tuple[float, ...]:
 
 
 def _not_finite(text: str) -> argparse.ArgumentTypeError:
-    return argparse.ArgumentTypeError(f"is not finite numbers: {text!r}")
+    return argparse.ArgumentTypeError(f"must be finite numbers{number_hint(text)}, not {text!r}")

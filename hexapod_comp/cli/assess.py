@@ -70,7 +70,7 @@ def _report(
     last = f"…{result.seeds[-1]}" if len(result.seeds) > 1 else ""
     lines = [f"machine {geometry.name}, {_bounds_text(args)}; seed {result.seeds[0]}{last}"]
     commanded = _pose_rows(poses)
-    lines += ["", "commanded poses (as Table 1):", _table(POSE_COLUMNS, rows, commanded, 6)]
+    lines += ["", "commanded poses of the tool in work (as Table 1):", _table(POSE_COLUMNS, rows, commanded, 6)]
     lines += ["", "strut lengths of the ideal machine (as Table 2):", _lengths(rows, result.ideal_lengths)]
     lines += ["", "strut lengths of the real machine at the same poses (as Table 4):", _lengths(rows, real)]
     header = [f"dL{i}_um" for i in range(1, 7)]
@@ -78,7 +78,7 @@ def _report(
     taken = _pose_rows(_taken(result))
     lines += [
         "",
-        "pose that the real machine takes under ideal lengths:",
+        "pose of the tool in work that the real machine takes under ideal lengths:",
         _table(POSE_COLUMNS, rows, taken, 6),
     ]
     if len(result.seeds) > 1:
@@ -197,6 +197,7 @@ def _as_json(
     ]
     return {
         "machine": geometry.name,
+        "frame": "work",
         "bounds": {"joint_um": args.joint_um, "strut_um": args.strut_um, "pitch_ppm": args.pitch_ppm}
         | {"wave_um": args.wave_um, "wave_period_mm": args.wave_period_mm},
         "seeds": list(result.seeds),

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 MOST_ROWS = 100
 """Rows of margins printed; --out writes all."""
 
+MOST_BREACHES = 20
+"""Broken limits printed; --json prints all."""
+
 UNSIGNED = ("step", "speed")
 """Values of which only the size is of interest."""
 
@@ -39,7 +42,8 @@ def run(args: argparse.Namespace) -> int:
     from ..compensation.checks import check
     from ..formats.csv import read_pose_arrays
 
-    rows, positions, rotations = read_pose_arrays(args.poses)
+    with common.stage(f"reading {args.poses}"):
+        rows, positions, rotations = read_pose_arrays(args.poses)
     geometry, model = common.load_machine(args)
     mode = "stream" if args.stream else "moves"
     common.mention_compiling("checks.examine_many")
@@ -64,14 +68,16 @@ def _report(
         lines += ["", _margin_table(rows, result, ideal)]
     if result.breaches:
         lines += ["", f"broken limits ({len(result.breaches)}):"]
-        lines += [f"{_place(rows, breach)}: {breach.error}" for breach in result.breaches]
+        lines += [f"{_place(rows, breach)}: {breach.error}" for breach in result.breaches[:MOST_BREACHES]]
+        if len(result.breaches) > MOST_BREACHES:
+            lines.append(f"… and {len(result.breaches) - MOST_BREACHES} more; --json prints all")
     lines += ["", "smallest margin per limit:", _smallest_table(geometry.limits, rows, result)]
     lines += ["", *_notes(rows, result, ideal), _verdict(rows, result)]
     return "\n".join(lines)
 
 
 def _title(geometry: HexapodGeometry, model: MachineModel, rows: list[Row], result: CheckResult) -> str:
-    counted = f"{len(rows)} pose" + "s" * (len(rows) != 1)
+    counted = f"{len(rows)} pose{'s' * (len(rows) != 1)} of the tool in work"
     what = {
         "moves": f"{counted} as targets joined by moves at {result.rate:g} Hz",
         "stream": f"{counted} as a stream at {result.rate:g} Hz",
@@ -219,6 +225,7 @@ def _as_json(geometry: HexapodGeometry, model: MachineModel, rows: list[Row], re
     return {
         "machine": geometry.name,
         "model": model.name,
+        "frame": "work",
         "mode": result.mode,
         "rate_hz": result.rate,
         "within_limits": result.ok,

@@ -113,10 +113,10 @@ def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry) -> i
 def _budget(file: str, geometry: HexapodGeometry) -> Budget:
     """Return the budget of a file; what does not fit the machine is refused before the work starts."""
     from ..errors import InputFileError, ModelError
-    from ..formats.paths import config_file
+    from ..formats.paths import input_file
     from ..workspace.sources import load_budget
 
-    path = config_file(file)
+    path = input_file(file, "error_budget")
     budget = load_budget(path)
     try:
         budget.single_errors(geometry)

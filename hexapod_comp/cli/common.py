@@ -52,6 +52,11 @@ def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campai
     return load_campaign(args.campaign, own_box)
 
 
+def machine_title(geometry: HexapodGeometry, model: MachineModel) -> str:
+    """Return what a report begins with: the machine and, where there is one, the model."""
+    return f"machine {geometry.name}" + (f", model {model.name}" if model.name != "ideal" else "")
+
+
 def one_row(
     argument: tuple[tuple[float, ...], tuple[float, ...]],
 ) -> tuple[list[Row], np.ndarray, np.ndarray]:
@@ -114,9 +119,12 @@ def save_pictures(args: argparse.Namespace, pictures: Callable[[], Mapping[str, 
 
     if args.pictures is None:
         return
-    for name, figure in pictures().items():
+    with stage("drawing pictures"):
+        figures = pictures()
+    for name, figure in figures.items():
         path = os.path.join(args.pictures, name)
-        save(figure, path)
+        with stage(f"writing {path}"):
+            save(figure, path)
         mention(args, f"picture: {path}")
 
 
@@ -152,6 +160,14 @@ def say_notes(notes: Iterable[str]) -> None:
 
 
 @contextlib.contextmanager
+def stage(text: str) -> Iterator[None]:
+    """Show on stderr, on terminals only, what is done as long as this context is open."""
+    with stage_line() as say:
+        say(text)
+        yield
+
+
+@contextlib.contextmanager
 def stage_line() -> Iterator[Callable[[str], None]]:
     """Give a function that shows on stderr, on terminals only, what a long calculation is at and since when."""
     if not sys.stderr.isatty():
@@ -160,7 +176,7 @@ def stage_line() -> Iterator[Callable[[str], None]]:
     began = time.monotonic()
 
     def say(text: str) -> None:
-        width = os.get_terminal_size(sys.stderr.fileno()).columns - 1
+        width = (os.get_terminal_size(sys.stderr.fileno()).columns or 80) - 1  # some say 0 where they do not know
         line = CODES.sub("", f"{time.monotonic() - began:5.1f} s  {text}")[:width]
         print(f"\r\033[K{line}", end="", file=own_terminal(), flush=True)
 

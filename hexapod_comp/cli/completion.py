@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Iterable, Iterator
 from typing import Any
 
 from ..formats.outputs import FOLDERS, READ, WRITTEN
-from ..formats.paths import config_folder, shipped_names
+from ..formats.paths import shipped_names
 from .parsers import ALIASES
 
 KINDS = {
@@ -18,10 +17,9 @@ KINDS = {
     "campaign": "campaign",
     "budget": "error_budget",
     "columns": "columns",
+    "poses": "poses",
 }
 """What a file says that it is, by the argument that names it."""
-
-FORMAT = re.compile(r"^format: hexapod_comp/(\w+)", re.MULTILINE)
 
 
 def complete(parser: argparse.ArgumentParser) -> None:
@@ -55,15 +53,6 @@ class _Names:
         return [name for name in self._shipped() if name.startswith(prefix)] + self._files(prefix)
 
     def _shipped(self) -> Iterable[str]:
-        if self._argument == "poses":
-            return [name for name in shipped_names() if name.endswith(".csv")]
         kind = KINDS.get(self._argument)
-        if kind is None:
-            return []
         own = ["ideal", "random"] if kind == "model" else []
-        return own + [name for name in shipped_names() if "/" not in name and _kind(name) == kind]
-
-
-def _kind(name: str) -> str:
-    stated = FORMAT.search((config_folder() / name).read_text(encoding="utf-8"))
-    return stated.group(1) if stated else ""
+        return own + shipped_names(kind) if kind else []

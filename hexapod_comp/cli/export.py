@@ -37,15 +37,19 @@ def run(args: argparse.Namespace) -> int:
     if args.linuxcnc is None and args.table is None:
         return _show_core(args, model, core)
     box = commanded_box(geometry, model) if args.box is None else np.array(args.box)
-    trial = ExportTrial(geometry, model, box, args.poses, args.seed, math.radians(args.tilt_deg))
     written, checks = core, []
-    if args.linuxcnc is not None:
-        files, result = _linuxcnc(args, trial, box)
-        written += files
-        checks.append(result)
-    if args.table is not None:
-        written.append(args.table)
-        checks += _table(args, trial, box)
+    with common.stage_line() as say:
+        say("the tool's error as the machine is")
+        trial = ExportTrial(geometry, model, box, args.poses, args.seed, math.radians(args.tilt_deg))
+        if args.linuxcnc is not None:
+            say("LinuxCNC's files, and what they leave")
+            files, result = _linuxcnc(args, trial, box)
+            written += files
+            checks.append(result)
+        if args.table is not None:
+            say("the table, and what it leaves")
+            written.append(args.table)
+            checks += _table(args, trial, box)
     if args.json:
         common.show(_as_json(args, model, box, written, checks))
     else:
@@ -86,7 +90,7 @@ def _titles(model: MachineModel, box: np.ndarray) -> list[str]:
 
 def _box_text(box: np.ndarray) -> str:
     low, high = (", ".join(f"{v:g}" for v in corner.round(9) * 1e3) for corner in box)
-    return f"box of tool positions ({low})…({high}) mm, 20 °C"
+    return f"box of tool positions in work ({low})…({high}) mm, 20 °C"
 
 
 def _linuxcnc(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray) -> tuple[list[str], Result]:
@@ -170,6 +174,7 @@ def _as_json(
     return {
         "machine": model.machine,
         "model": model.name,
+        "frame": "work",
         "box_mm": box * 1e3,
         "poses": args.poses,
         "seed": args.seed,

@@ -64,7 +64,6 @@ def run(args: argparse.Namespace) -> int:
     # reads this when it is loaded, and nothing has loaded it yet.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from ..errors import CalibrationError
-    from ..formats.paths import config_file
     from ..machine.geometry import load_geometry
     from ..machine.model import RealMachine
     from ..measurements.files import read_measurements
@@ -73,9 +72,9 @@ def run(args: argparse.Namespace) -> int:
     _refuse_options_of_the_other_scheme(args)
     geometry = load_geometry(args.machine)
     truth = None if args.truth is None else RealMachine(geometry, find_model(args.truth, geometry))
-    columns = None if args.columns is None else config_file(args.columns)
     settings = fit_settings(args)
-    measured = read_measurements(args.files, geometry, columns, args.probe_mm)
+    with common.stage("reading measurements"):
+        measured = read_measurements(args.files, geometry, args.columns, args.probe_mm)
     common.mention_compiling("model.actual_pose_one")
     try:
         result = _joint(args, measured, settings) if args.scheme == "joint" else _lines(args, measured)
@@ -85,7 +84,9 @@ def run(args: argparse.Namespace) -> int:
     if result.misfit and not args.force:
         _refuse(args, result)
         return 1
-    _write(args, result, measured, _worth(truth, result.model, measured))
+    with common.stage("trying the model on the virtual machine"):
+        worth = _worth(truth, result.model, measured)
+    _write(args, result, measured, worth)
     return 0
 
 

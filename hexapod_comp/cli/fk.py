@@ -27,7 +27,8 @@ def run(args: argparse.Namespace) -> int:
         raise CommandError("usage", "give either a CSV file of lengths or --lengths")
     if args.all_modes and (args.lengths is None or args.model != "ideal"):
         raise CommandError("usage", "--all-modes goes with --lengths and the nominal machine only")
-    rows, lengths = _read(args)
+    with common.stage(f"reading {args.lengths_file}"):
+        rows, lengths = _read(args)
     geometry, model = common.load_machine(args)
     common.mention_compiling("kinematics.solve_pose_many")
     if args.all_modes:
@@ -63,12 +64,12 @@ def _poses(
     ]
     common.write_table(args, table)
     if args.json:
-        common.show({"machine": geometry.name, "model": model.name, "rows": table})
+        common.show({"machine": geometry.name, "model": model.name, "frame": "work", "rows": table})
     elif args.out is None and args.lengths is None:
         common.show(common.csv_text(table))
     elif args.out is None:
         header = list(table[0])[1:]
-        title = f"machine {geometry.name}" + (f", model {model.name}" if args.model != "ideal" else "")
+        title = f"{common.machine_title(geometry, model)}: pose of the tool in work"
         common.show(f"{title}\n{texts.aligned(header, [[texts.number(table[0][name], 6) for name in header]])}")
 
 
@@ -89,7 +90,8 @@ def _solve(
     from ..pose import Pose
 
     machine = RealMachine(geometry, model)
-    structure = machine.structure if args.model != "ideal" else Structure.of(geometry)
+    commands = args.model != "ideal" or bool(geometry.screw_lead.any())  # rather than lengths
+    structure = machine.structure if commands else Structure.of(geometry)
     guess = _guess(args, geometry)
     batch = None if args.cold else solve_poses(structure, lengths, guess)
     poses = []
@@ -103,7 +105,7 @@ def _solve(
                 pose = Pose(batch.positions[n], batch.rotations[n])
             else:
                 pose = solve_pose(structure, lengths[n], guess)
-            if args.model != "ideal":  # struts and field come on top; directions of motion are not known
+            if commands:  # struts and field come on top; directions of motion are not known
                 pose = machine.pose_for(lengths[n], np.zeros(9), pose)[0]
         except KinematicsError as error:
             problem = f"{common.where(row)}: {error}" if row.line else str(error)
@@ -145,11 +147,14 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
     joined = [{**m, "working": int(m["working"]), "objections": "; ".join(m["objections"])} for m in listed]
     common.write_table(args, joined)
     if args.json:
-        common.show({"machine": geometry.name, "modes": listed, "no_working_mode": reason})
+        common.show({"machine": geometry.name, "frame": "work", "modes": listed, "no_working_mode": reason})
     elif args.out is None:
         numbers = MODE_COLUMNS[1:7]
         body = [[str(m["mode"]), *(texts.number(m[name], 6) for name in numbers), _verdict(m)] for m in listed]
-        lines = [f"machine {geometry.name}: {len(modes)} assembly modes", texts.aligned(MODE_COLUMNS, body)]
+        lines = [
+            f"machine {geometry.name}: {len(modes)} assembly modes, tool in work",
+            texts.aligned(MODE_COLUMNS, body),
+        ]
         common.show("\n".join(lines + [f"no working mode: {reason}"] * bool(reason)))
 
 

@@ -21,16 +21,22 @@ if TYPE_CHECKING:
     from ..machine.passes import Poses
 
 
+MOST_NOTES = 10
+"""Broken limits named on stderr."""
+
+
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
     from ..compensation.checks import check
     from ..formats.csv import read_pose_arrays
     from ..machine.model import RealMachine
 
-    rows, positions, rotations = _given_pose(args) or read_pose_arrays(args.poses)
+    with common.stage(f"reading {args.poses}"):
+        rows, positions, rotations = _given_pose(args) or read_pose_arrays(args.poses)
     geometry, model = common.load_machine(args)
     common.mention_compiling("checks.examine_many")
-    result = check(geometry, model, (positions, rotations), "poses")
+    with common.progress_bar(len(rows), " poses") as bar:
+        result = check(geometry, model, (positions, rotations), "poses", progress=bar.update)
     _refuse_lengthless(result, rows)
     predicted = None
     if args.model != "ideal":
@@ -38,8 +44,9 @@ def run(args: argparse.Namespace) -> int:
         predicted = _Predicted.of(RealMachine(geometry, model), args.model, platforms)
         _mention_outside(int(result.outside_box.sum()), len(rows))
     _show(args, geometry, model, rows, result, predicted)
-    for breach in result.breaches:
-        print(f"hexapod_comp: note: {common.where(rows[breach.row])}: {breach.error}", file=sys.stderr)
+    common.say_notes(f"{common.where(rows[breach.row])}: {breach.error}" for breach in result.breaches[:MOST_NOTES])
+    if len(result.breaches) > MOST_NOTES:
+        common.say_notes([f"{len(result.breaches) - MOST_NOTES} more limits are broken; see check"])
     return 0
 
 
@@ -145,13 +152,17 @@ def _show(
     result: CheckResult,
     predicted: _Predicted | None,
 ) -> None:
-    """Write the CSV file; print JSON or, where no file was written, CSV or a table of one pose."""
-    table = [_columns(row, lengths, predicted is not None) for row, lengths in zip(rows, result.lengths, strict=True)]
+    """Write the CSV file; print JSON or, where no file was written, CSV or a table of one pose.
+
+    Also an ideal machine's commands are not its lengths where screws turn with the joints.
+    """
+    with_model = predicted is not None or bool(geometry.screw_lead.any())
+    table = [_columns(row, lengths, with_model) for row, lengths in zip(rows, result.lengths, strict=True)]
     if predicted is not None:
         table = [{**columns, **predicted.columns(n)} for n, columns in enumerate(table)]
     common.write_table(args, table)
     if args.json:
-        content: dict[str, Any] = {"machine": geometry.name, "model": model.name}
+        content: dict[str, Any] = {"machine": geometry.name, "model": model.name, "frame": "work"}
         if predicted is not None:
             content |= {"error_frame": "work", "error_sd_not_known": predicted.unknown or None}
         common.show({**content, "rows": table})
@@ -181,7 +192,7 @@ def _one_pose(geometry: HexapodGeometry, model: MachineModel, lengths: np.ndarra
 
     nominal, command = lengths
     header, columns = ["strut", "nominal_mm"], [nominal * 1e3]
-    if predicted is not None:
+    if predicted is not None or geometry.screw_lead.any():
         header += ["command_mm", "correction_um"]
         columns += [command * 1e3, (command - nominal) * 1e6]
     digits = [6, 6, 3]
@@ -189,5 +200,5 @@ def _one_pose(geometry: HexapodGeometry, model: MachineModel, lengths: np.ndarra
         [name, *(texts.number(float(c[i]), d) for c, d in zip(columns, digits, strict=False))]
         for i, name in enumerate(STRUT_NAMES)
     ]
-    title = f"machine {geometry.name}" + (f", model {model.name}" if predicted is not None else "")
+    title = common.machine_title(geometry, model) + ": strut lengths for a pose of the tool in work"
     return f"{title}\n{texts.aligned(header, body)}\n" + (f"\n{predicted.text()}" if predicted is not None else "")

@@ -10,14 +10,13 @@ from . import common
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
     from ..errors import CalibrationError
-    from ..formats.paths import config_file
     from ..machine.geometry import load_geometry
     from ..measurements.files import read_measurements
     from ..measurements.iso230 import evaluate, iso230_runs, report, table
 
     geometry = load_geometry(args.machine)
-    columns = None if args.columns is None else config_file(args.columns)
-    measured = read_measurements(args.files, geometry, columns, args.probe_mm)
+    with common.stage("reading measurements"):
+        measured = read_measurements(args.files, geometry, args.columns, args.probe_mm)
     common.say_notes(measured.notes)
     tests = {run.name: evaluate(run.targets, run.deviations) for run in iso230_runs(measured)}
     if not tests:

@@ -384,7 +384,7 @@ def _classify(parser: argparse.ArgumentParser) -> None:
     add("--cells", type=arguments.count, default=30, metavar="N", help=text)
     text = "smallest distance between the axes of two struts, mm; 0: not limited (default: the geometry's)"
     add("--clearance-mm", type=arguments.bound, metavar="MM", help=text)
-    text = "tilts about x and y (default -4,0,4)"
+    text = "tilts about the tool's x and y, from its attitude at home (default -4,0,4)"
     add("--tilt-deg", type=arguments.tilts, default=arguments.tilts("-4,0,4"), metavar="A,B,…", help=text)
     text = "of the ranking: exact (default), linear, or iteration, which is v. Daake et al.'s own"
     add("--method", choices=("exact", "linear", "iteration"), default="exact", help=text)

@@ -18,6 +18,10 @@ def run(args: argparse.Namespace) -> int:
     geometry = load_geometry(args.machine)
     campaign = common.load_campaign(args, geometry)
     common.mention_compiling("model.actual_pose_one")
-    result = plan(template(campaign, geometry, args.seed, args.campaign), campaign, fit_settings(args))
+    with common.stage_line() as say:
+        say("laying out the readings")
+        measured = template(campaign, geometry, args.seed, args.campaign)
+        say(f"what {len(measured)} readings determine")
+        result = plan(measured, campaign, fit_settings(args))
     common.show(plan_json(result) if args.json else plan_report(result))
     return 0

@@ -97,8 +97,8 @@ def _given(args: argparse.Namespace) -> dict[str, Source]:
     from ..formats.paths import input_file
     from ..virtual.named import is_word
 
-    names = [args.machine] + ([] if args.model is None or is_word(args.model) else [args.model])
-    sources = [Source.read(input_file(name)) for name in names if name is not None]
+    files = {"geometry": args.machine, "model": None if is_word(args.model or "") else args.model}
+    sources = [Source.read(input_file(name, kind)) for kind, name in files.items() if name is not None]
     return {source.sha256: source for source in sources}
 
 

@@ -52,7 +52,7 @@ half either way. Lengths are given for any pose; limits that it breaks are named
 
 example:
   $ hexapod_comp ik --pose 0,0,400,5,0,0
-  machine paper
+  machine paper: strut lengths for a pose of the tool in work
     strut  nominal_mm
   strut_1  519.493721
   strut_2  519.807869
@@ -72,7 +72,7 @@ and picks the one in which the machine can work (6-3 machines).
 
 example:
   $ hexapod_comp fk --lengths 519.494,519.808,509.192,509.192,499.282,498.955
-  machine paper
+  machine paper: pose of the tool in work
        x_mm      y_mm        z_mm  alpha_deg  beta_deg  gamma_deg
   -0.000130  0.000034  400.000021   5.000127  0.000074   0.000011
   $ hexapod_comp ik config/table1.csv | hexapod_comp fk -""",
@@ -89,7 +89,7 @@ within, 1 a limit is broken, 2 bad input.
 
 example:
   $ hexapod_comp check config/table1.csv
-  machine paper, model ideal: 10 poses as targets joined by moves at 250 Hz; 753 poses examined
+  machine paper, model ideal: 10 poses of the tool in work as targets joined by moves at 250 Hz; 753 poses examined
 
   margins of stroke and cones, values of the rest, the worst of the move to each pose:
   row  line  stroke_mm  base_cone_deg  platform_cone_deg  condition  correction_um  step_mm  speed_mm_s
@@ -263,7 +263,7 @@ Prints the ranked table of v. Daake et al. with their figures beside it (µm, md
 with --allow-um what each error may be. --out writes the ranking as CSV. --pictures writes pictures (ranking, causes,
 one of shells for each error type) and, with plotly installed, page.html, which shows every error from all sides.
 
---tilt-deg says which orientations: every combination of the tilts about x and y.
+--tilt-deg says which orientations: every combination of tilts about the tool's x and y, from its attitude at home.
 
 --model takes the covariance of a fit in place of a budget: what is left of the tool's error in the measured box and in
 the workspace (µm; places in work), which parameters make it up, and which measurement would remove most of it.

@@ -57,4 +57,4 @@ def _outside_error(command: CommandState, field: GridField) -> OutsideFieldError
     point = (platform.position + platform.rotation @ field.probe) * 1e3
     low, high = (", ".join(f"{v:g}" for v in corner) for corner in box)
     problem = f"the measured point ({point[0]:.3f}, {point[1]:.3f}, {point[2]:.3f}) mm is outside the field's box"
-    return OutsideFieldError(f"{problem} ({low})…({high}) mm", point, box)
+    return OutsideFieldError(f"{problem} ({low})…({high}) mm, in base", point, box)

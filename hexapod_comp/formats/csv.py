@@ -1,11 +1,17 @@
-"""CSV files of poses and of strut lengths: units in the column names, errors that name row and column."""
+"""CSV files of poses and of strut lengths: units in the column names, errors that name row and column.
+
+What separates the columns shows in the header: commas or else semicolons or else tabs. Where it is not commas, numbers
+may have decimal commas, as spreadsheets of many countries write them.
+"""
 
 from __future__ import annotations
 
 import csv
 import hashlib
 import io
+import itertools
 import math
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
@@ -20,8 +26,8 @@ from ..errors import InputFileError, PoseError
 from ..kernels.pose import QUATERNION_NORM_TOLERANCE
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
 from .paths import input_file
-from .texts import plain_number
-from .yaml import UNITS
+from .texts import DECIMAL_COMMA, MICRO_ERRORS, number_hint, plain_number
+from .yaml import UNITS, spellings
 
 LABEL_COLUMNS = ("sequence", "name")
 POSITION_COLUMNS = ("x", "y", "z")
@@ -42,6 +48,15 @@ MAX_COLUMNS = 1000
 MAX_LINE = 1_000_000
 """Longer lines are refused, in characters: a file without line ends would be read into memory whole."""
 
+
+SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
+"""What may stand between columns; the first of them that is in the header does."""
+
+QUOTED = re.compile(r'"[^"]*"')
+"""What stands in quotes separates nothing."""
+
+THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
+"""A number whose comma may be a decimal one, or stand between thousands."""
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """A spreadsheet takes a cell that begins so for a formula, and runs it."""
@@ -100,7 +115,7 @@ class Table:
 
     def __init__(self, path: str | Path) -> None:
         self.path = path
-        numbered, self.sha256 = _read_rows(path)
+        numbered, separator, self.sha256 = _read_rows(path)
         self.header = [name.strip() for name in numbered[0][1]] if numbered else []
         if len(self.header) > MAX_COLUMNS:
             problem = f"has {len(self.header)} columns, at most {MAX_COLUMNS} are allowed"
@@ -113,13 +128,37 @@ class Table:
             raise InputFileError(path, "", "has a header but no rows" if self.header else "has no header")
         for line, row in self.rows:
             if len(row) != len(self.header):
-                problem = f"has {len(row)} columns, the header has {len(self.header)}"
+                problem = f"has {len(row)} columns, the header has {len(self.header)}{_other_separator(row, separator)}"
                 raise InputFileError(path, f"line {line}", problem)
+        if separator != ",":
+            self._point_decimals()
         self._known: set[str] = {name for name in LABEL_COLUMNS if name in self.header}
+
+    def _point_decimals(self) -> None:
+        """Give numbers with decimal commas points; refuse a file in which a comma may mean two things."""
+        commas = [
+            (line, row, k)
+            for line, row in self.rows
+            for k, cell in enumerate(row)
+            if "," in cell and DECIMAL_COMMA.fullmatch(cell.strip())
+        ]
+        if not commas:
+            return
+        first, row, k = commas[0]
+        where, cell = f"line {first}, column {self.header[k]}", row[k]
+        for line, row in self.rows:
+            if any("." in cell and not math.isnan(plain_number(cell)) for cell in row):
+                problem = f"has a decimal comma, but line {line} has a decimal point; write points everywhere"
+                raise InputFileError(self.path, where, problem, cell)
+        if all(THOUSANDS.fullmatch(row[k].strip()) for _, row, k in commas):
+            problem = "has a comma that may be a decimal one or stand between thousands; write a decimal point"
+            raise InputFileError(self.path, where, problem, cell)
+        for _, row, k in commas:
+            row[k] = row[k].replace(",", ".")
 
     def column(self, name: str, dimension: str | None) -> tuple[int, float] | None:
         """Return index and unit of a column, or None when there is none of that name."""
-        wanted = {name: 1.0} if dimension is None else {f"{name}_{u}": s for u, s in UNITS[dimension].items()}
+        wanted = {name: 1.0} if dimension is None else {f"{name}_{u}": s for u, s in spellings(dimension).items()}
         keys = [key for key in wanted if key in self.header]
         if len(keys) > 1:
             raise InputFileError(self.path, "header", f"{name} is given twice", keys)
@@ -135,15 +174,23 @@ class Table:
             return None
         for name, entry in zip(names, columns, strict=True):
             if entry is None:
-                raise InputFileError(self.path, "header", f"column {_column_names(name, dimension)} is missing")
+                raise self._missing(name, dimension)
         return [entry for entry in columns if entry is not None]
 
     def required(self, names: tuple[str, ...], dimension: str | None) -> list[tuple[int, float]]:
         """Return all columns of a group that must be there."""
         columns = self.columns(names, dimension)
         if columns is None:
-            raise InputFileError(self.path, "header", f"column {_column_names(names[0], dimension)} is missing")
+            raise self._missing(names[0], dimension)
         return columns
+
+    def _missing(self, name: str, dimension: str | None) -> InputFileError:
+        """Return (not raise) the complaint about a column that is not there."""
+        problem = f"column {_column_names(name, dimension)} is missing"
+        if len(self.header) > 1:
+            return InputFileError(self.path, "header", problem)
+        problem += f"; columns are separated by {', '.join(SEPARATORS.values())}, and this is one column"
+        return InputFileError(self.path, "header", problem, self.header[0])
 
     def refuse_unknown(self) -> None:
         """Raise on a column that nobody asked for."""
@@ -203,7 +250,7 @@ def number_in(path: str | Path, where: str, text: str) -> float:
     """Return the finite number that stands somewhere in a file."""
     value = plain_number(text)
     if math.isnan(value):
-        raise InputFileError(path, where, "must be a finite number", text)
+        raise InputFileError(path, where, f"must be a finite number{number_hint(text)}", text)
     return value
 
 
@@ -223,26 +270,48 @@ class _Hashed(io.RawIOBase):
         return count
 
 
-def _read_rows(path: str | Path) -> tuple[list[tuple[int, list[str]]], str]:
-    """Return the rows of a CSV file that are neither empty nor comments, with their lines, and its SHA-256."""
+def _read_rows(path: str | Path) -> tuple[list[tuple[int, list[str]]], str, str]:
+    """Return the rows of a CSV file, less empty ones and comments, with their lines; its separator; its SHA-256."""
     numbered: list[tuple[int, list[str]]] = []
     try:
         with open(path, "rb", buffering=0) as file:
             source = _Hashed(file)
-            stream = io.TextIOWrapper(io.BufferedReader(source), newline="", encoding="utf-8-sig")
-            lines = csv.reader(_bounded_lines(path, stream), skipinitialspace=True)
+            buffered = io.BufferedReader(source)
+            stream = io.TextIOWrapper(buffered, newline="", encoding="utf-8-sig", errors=MICRO_ERRORS)
+            before, header, rest = _up_to_header(_bounded_lines(path, stream))
+            separator = next((mark for mark in SEPARATORS if mark in QUOTED.sub("", header)), ",")
+            lines = csv.reader(itertools.chain([header], rest), delimiter=separator, skipinitialspace=True)
             for row in lines:
                 if row and not row[0].startswith("#"):
-                    numbered.append((lines.line_num, row))
+                    numbered.append((before + lines.line_num, row))
                 if len(numbered) > MAX_ROWS:
                     raise InputFileError(path, "", f"has more than the allowed {MAX_ROWS} rows")
     except csv.Error as error:
-        raise InputFileError(path, f"line {lines.line_num}", f"is not CSV: {error}") from error
+        raise InputFileError(path, f"line {before + lines.line_num}", f"is not CSV: {error}") from error
     except OSError as error:
         raise InputFileError(path, "", f"cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise InputFileError(path, f"line {len(numbered) + 1} or later", "is not UTF-8 text") from error
-    return numbered, source.sha256.hexdigest()
+        problem = "is not UTF-8 text; spreadsheets have 'CSV UTF-8' among the formats in which they save"
+        raise InputFileError(path, f"line {len(numbered) + 1} or later", problem) from error
+    return numbered, separator, source.sha256.hexdigest()
+
+
+def _up_to_header(lines: Iterator[str]) -> tuple[int, str, Iterator[str]]:
+    """Return how many lines stand before the first that is neither empty nor a comment, that line, and the rest."""
+    before = 0
+    for line in lines:
+        if line.strip() and not line.lstrip().startswith(("#", '"#')):
+            return before, line, lines
+        before += 1
+    return before, "", lines
+
+
+def _other_separator(row: list[str], separator: str) -> str:
+    """Return what may have gone wrong with a row that has not as many columns as the header, to follow a complaint."""
+    others = [name for mark, name in SEPARATORS.items() if mark != separator and any(mark in cell for cell in row)]
+    if others:
+        return f"; {SEPARATORS[separator]} separate columns here, as in the header, and this line has {others[0]} too"
+    return "; are its decimal points commas? Then separate columns by semicolons" if separator == "," else ""
 
 
 def _bounded_lines(path: str | Path, stream: io.TextIOWrapper) -> Iterator[str]:
@@ -330,7 +399,7 @@ def read_pose_arrays(path: str | Path) -> tuple[list[Row], np.ndarray, np.ndarra
     InputFileError
         Naming file, line and column.
     """
-    table = Table(input_file(path))
+    table = Table(input_file(path, "poses"))
     positions, rotations = table.poses()
     table.refuse_unknown()
     return table.labels(), positions, rotations
@@ -365,7 +434,7 @@ def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
     InputFileError
         Naming file, line and column.
     """
-    table = Table(input_file(path))
+    table = Table(input_file(path, "lengths"))
     lengths = table.numbers(table.required(LENGTH_COLUMNS, "length"))
     shifts, turns = (
         tuple(n.format(axis) for n in PREDICTED_ERRORS for axis in axes) for axes in ("xyz", ("rx", "ry", "rz"))

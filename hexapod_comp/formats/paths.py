@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 import os
 import re
 import stat
@@ -14,8 +15,23 @@ from ..errors import InputFileError
 
 PACKAGE = "hexapod_comp"
 
+FORMAT = re.compile(r"^format: hexapod_comp/(\w+)", re.MULTILINE)
+"""What a YAML file says that it is."""
 
-def config_file(name: str | os.PathLike[str]) -> Path:
+SUFFIXES = {"poses": (".csv",), "lengths": (".csv",), "readings": (".csv", ".rtl", ".rtx")}
+"""Kinds of files that go by their suffixes; all others are YAML files that say what they are."""
+
+COLUMNS = {"poses": re.compile(r'(?:^|[",;\t])\s*x_'), "lengths": re.compile(r'(?:^|[",;\t])\s*L1_')}
+"""What stands in the header of CSV files of a kind."""
+
+MOST_LISTED = 12
+"""Names in a message about a file that is missing."""
+
+MOST_LOOKED_AT = 500
+"""Files of a folder that are looked into for those of a kind."""
+
+
+def config_file(name: str | os.PathLike[str], kind: str = "", beside: bool = False) -> Path:
     """Find a configuration file: the user's own where `name` is a path to one, else a shipped one.
 
     Parameters
@@ -23,6 +39,11 @@ def config_file(name: str | os.PathLike[str]) -> Path:
     name : str or path
         Path of a file (``~`` is understood), or the name of a shipped file relative to its folder,
         with or without ``.yaml``: ``paper``, ``paper.yaml``.
+    kind : str
+        What it should be, for the message where it is missing: ``geometry``, ``model``, … as its line ``format`` says,
+        or one of :data:`SUFFIXES`; any kind by default.
+    beside : bool
+        Whether the message may tell which files lie in its folder.
 
     Returns
     -------
@@ -32,7 +53,7 @@ def config_file(name: str | os.PathLike[str]) -> Path:
     Raises
     ------
     InputFileError
-        There is no such file; the message lists the shipped names.
+        There is no such file; the message lists those of its kind.
     """
     own = os.path.expanduser(name)
     if os.path.isfile(own):
@@ -41,16 +62,18 @@ def config_file(name: str | os.PathLike[str]) -> Path:
     for candidate in (os.fspath(name), f"{os.fspath(name)}.yaml"):
         if candidate in shipped:
             return config_folder() / candidate
-    raise InputFileError(os.fspath(name) or "''", "", _no_such_file(os.fspath(name), shipped))
+    raise InputFileError(os.fspath(name) or "''", "", _no_such_file(os.fspath(name), kind, beside))
 
 
-def input_file(name: str | os.PathLike[str]) -> Path:
+def input_file(name: str | os.PathLike[str], kind: str = "") -> Path:
     """Find what is to be read: anything but a folder at a path, pipes too; else a shipped file.
 
     Parameters
     ----------
     name : str or path
         As for :func:`config_file`, or ``-`` for standard input.
+    kind : str
+        As for :func:`config_file`.
 
     Raises
     ------
@@ -60,10 +83,10 @@ def input_file(name: str | os.PathLike[str]) -> Path:
     own = os.path.expanduser(name)
     if own == "-":
         return Path("/dev/stdin")
-    return Path(own) if os.path.exists(own) and not os.path.isdir(own) else config_file(name)
+    return Path(own) if os.path.exists(own) and not os.path.isdir(own) else config_file(name, kind, beside=True)
 
 
-def confined_file(name: str | os.PathLike[str], folder: Path | None) -> Path:
+def confined_file(name: str | os.PathLike[str], folder: Path | None, kind: str = "") -> Path:
     """Find a configuration file as :func:`config_file` does, but only in one folder or among the shipped ones.
 
     Parameters
@@ -72,6 +95,8 @@ def confined_file(name: str | os.PathLike[str], folder: Path | None) -> Path:
         Path of a file, also relative to `folder`, or the name of a shipped one.
     folder : Path or None
         Folder, with all below it, from which files may be read; None: only shipped ones.
+    kind : str
+        As for :func:`config_file`; whoever asks is not told what lies in folders.
 
     Returns
     -------
@@ -88,7 +113,7 @@ def confined_file(name: str | os.PathLike[str], folder: Path | None) -> Path:
         own = os.path.join(folder, own)
     if os.path.exists(own) and not os.path.isfile(own):
         raise InputFileError(own, "", "is not a regular file")
-    path = config_file(own).resolve()
+    path = config_file(own, kind).resolve()
     _refuse_elsewhere(name, path, folder)
     return path
 
@@ -141,11 +166,28 @@ def folder_of(name: str | os.PathLike[str]) -> Path | None:
     return None
 
 
-def shipped_names() -> list[str]:
-    """Return the names of all shipped configuration files, relative to their folder, sorted."""
+def shipped_names(kind: str = "") -> list[str]:
+    """Return the names of all shipped configuration files, or of those of a kind, relative to their folder, sorted."""
     folder = config_folder()
-    files = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
-    return sorted(path.as_posix() for path in files if not path.name.startswith("."))
+    files = [path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".")]
+    chosen = [path for path in files if path.parent == folder and _is_a(path, kind)] if kind else files
+    return sorted(path.relative_to(folder).as_posix() for path in chosen)
+
+
+def _is_a(path: Path, kind: str) -> bool:
+    """Return whether a file is of a kind, by its suffix or by what it says at its beginning."""
+    if path.suffix.lower() not in SUFFIXES.get(kind, (".yaml", ".yml")):
+        return False
+    try:
+        with open(path, encoding="utf-8-sig", errors="replace") as stream:
+            text = stream.read(4096)
+    except OSError:
+        return False
+    if kind in COLUMNS:
+        header = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
+        return COLUMNS[kind].search(header) is not None
+    stated = FORMAT.search(text)
+    return kind in SUFFIXES or (stated is not None and stated.group(1) == kind)
 
 
 @cache
@@ -182,9 +224,31 @@ def version() -> str:
     return match.group(1) if match else "unknown"
 
 
-def _no_such_file(name: str, shipped: list[str]) -> str:
-    """Say that `name` is neither a file nor shipped, and what is."""
-    near = difflib.get_close_matches(name, shipped, 1)
-    hint = f"; did you mean {near[0]}?" if near else ""
-    what = "is a folder" if os.path.isdir(os.path.expanduser(name)) else "there is no such file"
-    return f"{what}, and the shipped ones are {', '.join(shipped)}{hint}"
+def _no_such_file(name: str, kind: str, beside: bool) -> str:
+    """Say that `name` is neither a file nor shipped, and which of its kind there are: beside it, and shipped."""
+    own = os.path.expanduser(name)
+    folder = os.path.dirname(own)
+    if folder and not os.path.isdir(folder):
+        return "there is no such file, nor its folder"
+    shipped = shipped_names(kind) if kind != "readings" else []
+    present = sorted(path.name for path in _files_in(Path(folder or ".")) if _is_a(path, kind)) if beside else []
+    near = difflib.get_close_matches(os.path.basename(own), present + shipped, 1)
+    parts = ["is a folder" if os.path.isdir(own) else "there is no such file"]
+    what = ", ".join(SUFFIXES[kind]) if kind in SUFFIXES else kind.replace("_", " ")
+    parts += [f"{what} files beside it: {_listed(present)}"] if present else []
+    parts += [f"shipped: {_listed(shipped)}"] if shipped else []
+    parts += ["or ideal"] if kind == "model" else []
+    return "; ".join(parts) + (f"; did you mean {near[0]}?" if near else "")
+
+
+def _files_in(folder: Path) -> list[Path]:
+    """Return the files of a folder, not too many; none where it cannot be read."""
+    try:
+        return [path for path in itertools.islice(folder.iterdir(), MOST_LOOKED_AT) if path.is_file()]
+    except OSError:
+        return []
+
+
+def _listed(names: list[str]) -> str:
+    more = len(names) - MOST_LISTED
+    return ", ".join(names[:MOST_LISTED]) + (f" and {more} more" if more > 0 else "")

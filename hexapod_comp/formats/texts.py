@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import io
 import math
 import os
@@ -32,6 +33,31 @@ def plain_number(text: str) -> float:
     except ValueError:
         return math.nan
     return value if math.isfinite(value) and text.isascii() and "_" not in text else math.nan
+
+
+DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
+"""A number as much of the world writes it."""
+
+
+def number_hint(text: str) -> str:
+    """Return what keeps a text from being a number, to follow a complaint, where that is plain to see."""
+    text = text.strip()
+    if DECIMAL_COMMA.fullmatch(text):
+        return f", with a decimal point: {text.replace(',', '.')}"
+    return ", without semicolons" if ";" in text else ""
+
+
+def _micro(error: UnicodeError) -> tuple[str, int]:
+    """Read the byte B5, which no UTF-8 has alone, as µ: so it stands in the files of spreadsheets under Windows."""
+    if isinstance(error, UnicodeDecodeError) and error.object[error.start] == 0xB5:
+        return "µ", error.start + 1
+    raise error
+
+
+MICRO_ERRORS = "hexapod_comp_micro"
+"""Handler of decoding errors: UTF-8 in which a micro sign may be that of Windows-1252."""
+
+codecs.register_error(MICRO_ERRORS, _micro)
 
 
 def aligned(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Callable, Iterator
 from decimal import Decimal
+from functools import cache
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ import numpy as np
 import yaml
 
 from ..errors import InputFileError, shorten
+from .texts import MICRO_ERRORS, number_hint
 
 MAX_FILE_BYTES = 8_000_000
 """Larger files are refused before they are read: no model comes near it."""
@@ -41,6 +43,16 @@ UNITS: dict[str, dict[str, float]] = {
     "pressure": {"Pa": 1.0, "hPa": 1e2, "kPa": 1e3},
 }
 """Unit suffixes per kind of quantity, and their size in SI (temperatures stay in degrees Celsius)."""
+
+MICROS = "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"
+"""They look alike, and either may be on a keyboard: both stand for the u of um and urad."""
+
+
+@cache
+def spellings(dimension: str) -> dict[str, float]:
+    """Return the units of a kind of quantity with their sizes, by every spelling: µm and μm too, where um is."""
+    units = UNITS[dimension]
+    return units | {micro + unit[1:]: size for unit, size in units.items() if unit[0] == "u" for micro in MICROS}
 
 
 AMBIGUOUS_NUMBER = re.compile(r"[-+]?0[0-9A-Za-z]|.*[:_]")
@@ -111,7 +123,7 @@ def read_text(path: str | Path, opener: Callable[[str, int], int] | None = None)
             content = stream.read(MAX_FILE_BYTES + 1)
         if len(content) > MAX_FILE_BYTES:
             raise InputFileError(path, "", f"larger than the allowed {MAX_FILE_BYTES // 1_000_000} MB")
-        text = content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+        text = content.decode("utf-8-sig", MICRO_ERRORS).replace("\r\n", "\n").replace("\r", "\n")
     except OSError as error:
         raise InputFileError(path, "", f"cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -157,6 +169,8 @@ def parse_yaml(text: str, name: str | Path, file_format: str, version: int) -> S
         problem = getattr(error, "problem", None) or type(error).__name__
         mark = getattr(error, "problem_mark", None)
         where = f"line {mark.line + 1}" if mark is not None else ""
+        if mark is not None and "".join(text.split("\n")[mark.line : mark.line + 1]).lstrip(" ").startswith("\t"):
+            problem += "; YAML is indented by spaces, not by tabs"
         raise InputFileError(name, where, f"is not valid YAML: {problem}") from error
     if not isinstance(content, dict):
         raise InputFileError(name, "", "must hold keys and values at its top level", content)
@@ -240,6 +254,13 @@ class Section:
             raise self.error(key, f"must be one of {', '.join(allowed)}", value)
         return value
 
+    def unit(self, key: str, dimension: str) -> float:
+        """Take the name of a unit; return its size in SI."""
+        value = self.take(key)
+        if not isinstance(value, str) or value not in spellings(dimension):
+            raise self.error(key, f"must be one of {', '.join(UNITS[dimension])}", value)
+        return spellings(dimension)[value]
+
     def integer(self, key: str, default: int) -> int:
         """Take an optional whole number."""
         value = self._left.pop(key, default)
@@ -283,7 +304,7 @@ class Section:
 
     def quantity_key(self, name: str, dimension: str) -> str | None:
         """Return the key that carries `name` with a unit of `dimension`, or None when there is none."""
-        keys = [f"{name}_{unit}" for unit in UNITS[dimension] if f"{name}_{unit}" in self._left]
+        keys = [f"{name}_{unit}" for unit in spellings(dimension) if f"{name}_{unit}" in self._left]
         if name in self._left:
             units = ", ".join(f"{name}_{unit}" for unit in UNITS[dimension])
             raise self.error(name, f"has no unit; write one of {units}", self._left[name])
@@ -317,7 +338,7 @@ class Section:
                 return np.array(default, dtype=float)
             units = ", ".join(f"{name}_{unit}" for unit in UNITS[dimension])
             raise self.error(name, f"is missing; write one of {units}")
-        return in_si(self.array(key, shape), UNITS[dimension][key[len(name) + 1 :]])
+        return in_si(self.array(key, shape), spellings(dimension)[key[len(name) + 1 :]])
 
     def per_strut(self, name: str, dimension: str, default: float | None = None) -> np.ndarray:
         """Take a quantity given once for all struts or as a list of six; return shape (6,), SI."""
@@ -366,7 +387,8 @@ def _refuse_non_numbers(section: Section, key: str, value: Any) -> None:
         if isinstance(item, list):
             stack.extend((f"{where}[{i}]", part) for i, part in enumerate(item))
         elif isinstance(item, bool) or not isinstance(item, int | float):
-            raise section.error(where, "must be a number", item)
+            hint = number_hint(item) if isinstance(item, str) else ""
+            raise section.error(where, f"must be a number{hint}", item)
 
 
 def _shape_text(shape: tuple[int | None, ...]) -> str:

@@ -80,7 +80,7 @@ def simulated(machine: str, model: MachineModel, truth: MachineModel) -> Iterato
 
     print("preparing; the first run on a machine compiles its kernels, which takes up to a minute", file=sys.stderr)
     warm()
-    geometry_file = str(config_file(machine).resolve())
+    geometry_file = str(config_file(machine, "geometry", beside=True).resolve())
     with tempfile.TemporaryDirectory(prefix="hexapod_comp_") as folder:
         model_file, truth_file = (f"{folder}/{name}.yaml" for name in ("model", "truth"))
         save_model(_portable(model), model_file)

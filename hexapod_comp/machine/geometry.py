@@ -222,7 +222,7 @@ def load_geometry(path: str | Path) -> HexapodGeometry:
     InputFileError
         Naming file, key and value.
     """
-    file = input_file(path)
+    file = input_file(path, "geometry")
     return parse_geometry(read_text(file), file)
 
 

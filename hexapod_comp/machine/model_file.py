@@ -137,7 +137,7 @@ def load_model(path: str | Path, geometry: HexapodGeometry) -> MachineModel:
     """
     if path == IDEAL:
         return MachineModel(geometry.name)
-    file = input_file(path)
+    file = input_file(path, "model")
     return parse_model(read_text(file), geometry.name, file)
 
 

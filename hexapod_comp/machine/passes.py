@@ -130,7 +130,7 @@ class Passes:
 
 def at(position: np.ndarray) -> str:
     """Say where the platform is, for messages; position (3,), m."""
-    return "platform at ({:.3f}, {:.3f}, {:.3f}) mm".format(*(position * 1e3))
+    return "platform at ({:.3f}, {:.3f}, {:.3f}) mm in base".format(*(position * 1e3))
 
 
 def random_directions(rng: np.random.Generator, count: int) -> np.ndarray:

@@ -155,7 +155,7 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
     InputFileError
         With file, key and value.
     """
-    path = input_file(path)
+    path = input_file(path, "campaign")
     top = read_yaml(path, CAMPAIGN_FORMAT, CAMPAIGN_VERSION)
     box, level, cell, step = _read_grid(top, own_box)
     instrument = top.choice("instrument", (*INSTRUMENTS, "none"), "none")

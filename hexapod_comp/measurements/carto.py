@@ -101,13 +101,12 @@ def load_line(path: str | Path) -> LineFile:
     top = read_yaml(path, LINE_FORMAT, LINE_VERSION)
     axis = AXES.index(top.choice("axis", AXES))
     channel = top.choice("channel", tuple(c for c in DIMENSIONS if c.partition("_")[0] in LINE_KINDS))
-    units = UNITS[DIMENSIONS[channel]]
     line = LineFile(
         run=top.text("run"),
         axis=axis,
         across=top.quantity("across", "length", (2,)),
         channel=f"rotation_{AXES[TURN_AXES[axis][TURNS.index(channel)]]}" if channel in TURNS else channel,
-        unit=units[top.choice("unit", tuple(units))],
+        unit=top.unit("unit", DIMENSIONS[channel]),
         value_sense=_sense(top, "value_sense"),
         target_offset=float(top.quantity("target_offset", "length", default=0.0)),
         target_sense=_sense(top, "target_sense"),

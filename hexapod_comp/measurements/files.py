@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputFileError
+from ..formats.paths import config_file, input_file
 from ..machine.geometry import HexapodGeometry
 from .carto import read_carto
 from .readings import MeasurementSet
@@ -35,7 +36,8 @@ def read_measurements(
     geometry : HexapodGeometry
         The machine that was measured.
     columns : path, optional
-        Columns file that explains the CSV files; without it they are tidy CSV, one reading a row.
+        Columns file that explains the CSV files, or the name of a shipped one; without it they are tidy CSV, one
+        reading a row.
     probe : array_like, shape (3,), optional
         The measured point in ``platform``, m; the tool's tip by default.
 
@@ -47,8 +49,10 @@ def read_measurements(
     paths = [paths] if isinstance(paths, str | Path) else paths
     if not paths:
         raise InputFileError("measurements", "", "no file is given")
-    laser = [path for path in paths if Path(path).suffix.lower() in LASER_SUFFIXES]
-    tables = [path for path in paths if path not in laser]
+    files = [input_file(path, "readings") for path in paths]
+    columns = None if columns is None else config_file(columns, "columns", beside=True)
+    laser = [path for path in files if path.suffix.lower() in LASER_SUFFIXES]
+    tables = [path for path in files if path not in laser]
     sets = []
     if laser:
         sets.append(read_carto([(path, f"{path}.yaml") for path in laser], geometry, probe))

@@ -57,7 +57,7 @@ import numpy as np
 
 from ..errors import InputFileError, PoseError
 from ..formats.csv import Table, exact, si_from_text
-from ..formats.yaml import UNITS
+from ..formats.yaml import UNITS, spellings
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.model import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
 from ..pose import Pose
@@ -317,9 +317,10 @@ def _unit_size(table: Table, line: int, channel: str, unit: str) -> float:
     if channel not in DIMENSIONS:
         allowed = f"must be one of {', '.join(DIMENSIONS)}"
         raise InputFileError(table.path, f"line {line}, column channel", allowed, channel)
-    units = UNITS[DIMENSIONS[channel]] if DIMENSIONS[channel] else {"": 1.0}
+    dimension = DIMENSIONS[channel]
+    units = spellings(dimension) if dimension else {"": 1.0}
     if unit not in units:
-        allowed = f"must be {' or '.join(units)}" if units != {"": 1.0} else "must be empty"
+        allowed = f"must be {' or '.join(UNITS[dimension])}" if dimension else "must be empty"
         raise InputFileError(table.path, f"line {line}, column unit", f"{allowed} for {channel}", unit)
     return units[unit]
 

@@ -36,7 +36,7 @@ import numpy as np
 
 from ..errors import InputFileError, PoseError
 from ..formats.csv import Table
-from ..formats.yaml import UNITS, Section, read_yaml
+from ..formats.yaml import Section, read_yaml
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, solve_poses, strut_lengths_batch
 from ..pose import Pose
@@ -152,10 +152,10 @@ def _pose_columns(section: Section) -> PoseColumns:
         turn = _names(section, "quaternion", 4)
     elif "angles" in section:
         turn = _names(section, "angles", 3)
-        angle_unit = UNITS["angle"][section.choice("angle_unit", tuple(UNITS["angle"]))]
+        angle_unit = section.unit("angle_unit", "angle")
     columns = PoseColumns(
         position=_names(section, "position", 3),
-        unit=UNITS["length"][section.choice("unit", tuple(UNITS["length"]))],
+        unit=section.unit("unit", "length"),
         offset=section.quantity("offset", "length", (3,), np.zeros(3)),
         turn=turn,
         angle_unit=angle_unit,

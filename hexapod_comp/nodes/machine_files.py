@@ -41,13 +41,13 @@ class MachineFiles:
 
     def geometry(self) -> HexapodGeometry:
         """Read the geometry."""
-        self.sources["geometry"] = self._read(self._geometry_file)
+        self.sources["geometry"] = self._read(self._geometry_file, "geometry")
         return self.sources["geometry"].geometry()
 
     def model(self, geometry: HexapodGeometry) -> MachineModel:
         """Read the model; the ideal one has no file."""
         ideal = self._model_file == IDEAL
-        self.sources["model"] = IDEAL_SOURCE if ideal else self._read(self._model_file)
+        self.sources["model"] = IDEAL_SOURCE if ideal else self._read(self._model_file, "model")
         return self.sources["model"].model(geometry.name)
 
     def begin_loading(self, machine: str) -> Loading:
@@ -66,9 +66,9 @@ class MachineFiles:
             return "the ideal model, which corrects nothing (parameter model_file)"
         return f"model {model.name!r}"
 
-    def _read(self, name: str) -> Source:
+    def _read(self, name: str, kind: str) -> Source:
         folder = self._folders[name]
-        return Source.read(confined_file(name, folder), confined_opener(folder))
+        return Source.read(confined_file(name, folder, kind), confined_opener(folder))
 
 
 def _place() -> str:

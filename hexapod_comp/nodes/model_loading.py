@@ -176,7 +176,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     folder = Path(folders[0]) if folders else None
     try:
         os.chdir(place)
-        source = Source.read(confined_file(name, folder), confined_opener(folder))
+        source = Source.read(confined_file(name, folder, "model"), confined_opener(folder))
         model = source.model(machine)
     except (HexapodError, OSError) as error:
         sys.stdout.buffer.write(str(error).encode("utf-8", "replace"))

@@ -69,7 +69,7 @@ class StrutDriveNode(MachineNode):
         """Build the machine and open topics."""
         options = self._options
         try:
-            geometry = load_geometry(config_file(options["geometry_file"]))
+            geometry = load_geometry(config_file(options["geometry_file"], "geometry"))
             machine = RealMachine(geometry, self._truth(geometry))
             self._drive = StrutDrive(machine, self._drive_parameters(), options["noise_seed"])
             self.drive.faults = self._faults(options)
@@ -116,7 +116,7 @@ class StrutDriveNode(MachineNode):
         name = self._options["truth_file"]
         if name == RANDOM:
             name = f"{RANDOM}:{self._options['truth_seed']}"
-        return find_model(name if is_word(name) else config_file(name), geometry)
+        return find_model(name if is_word(name) else config_file(name, "model"), geometry)
 
     def _drive_parameters(self) -> DriveParameters:
         names = ("step", "lag", "max_acceleration", "encoder_resolution", "encoder_noise", "tracker_noise")

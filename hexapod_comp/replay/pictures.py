@@ -141,7 +141,7 @@ def following_figure(report: Report) -> Figure:
 
 def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
     """Show the commanded tool path from above and from the side, and where the compensator thought the tool was."""
-    figure = _figure(report, "Tool in base", 5.0)
+    figure = _figure(report, "Tool", 5.0)
     positions = tool_positions(report.recording, geometry.work)
     estimates = report.recording.topics["tool_pose_estimate"]
     both = len(estimates) > 1 and len(positions) > 1
@@ -151,7 +151,7 @@ def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
             points = estimates.values[:, :3] * 1e3
             axes.plot(points[:, first], points[:, second], color=WITHOUT, lw=1.6, label="estimated")
         axes.plot(positions[:, first] * 1e3, positions[:, second] * 1e3, color=WITH, lw=0.8, label="commanded")
-        axes.set(xlabel=f"{'xyz'[first]}, mm", ylabel=f"{'xyz'[second]}, mm")
+        axes.set(xlabel=f"{'xyz'[first]} in base, mm", ylabel=f"{'xyz'[second]} in base, mm")
         axes.axis("equal")
     panels[0].legend(fontsize=7)
     if both:
@@ -165,7 +165,7 @@ def _off(axes: Axes, seconds: np.ndarray, wanted: np.ndarray, at: np.ndarray, po
     inside = (at >= seconds[0]) & (at <= seconds[-1])
     for name, column, point in zip("xyz", wanted.T, points.T, strict=True):
         off = point[inside] - np.interp(at[inside], seconds, column)
-        axes.plot(*_broken(at[inside], off * 1e6), lw=0.8, label=name)
+        axes.plot(*_broken(at[inside], off * 1e6), lw=0.8, label=f"{name} in base")
     axes.set(title="estimated − commanded, lag included", xlabel="time, s", ylabel="µm")
     axes.legend(fontsize=7)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..machine.geometry import HexapodGeometry
-from ..machine.model import RealMachine
+from ..machine.model import MachineModel, RealMachine
 from ..machine.passes import Passes, Poses
 from ..measurements.readings import attitude_error
 from ..pose import Pose
@@ -31,7 +31,7 @@ class Assessment:
     seeds : tuple of int
         The machines' seeds.
     ideal_lengths : ndarray, shape (P, 6)
-        Strut lengths of the nominal machine (Song et al., Table 2).
+        Strut lengths of the nominal machine (Song et al., Table 2); where screws turn with the joints, its commands.
     real_lengths : ndarray, shape (M, P, 6)
         Strut commands that bring each real machine exactly to the poses (Song et al., Table 4).
     taken_positions, taken_rotations : ndarray, shape (M, P, 3), (M, P, 3, 3)
@@ -110,24 +110,39 @@ def assess(
     names = names or [f"pose {n + 1}" for n in range(len(poses))]
     tool = np.array([pose.position for pose in poses]), np.array([pose.rotation for pose in poses])
     passes = Passes.of_tool(geometry, *tool, np.zeros_like(tool[0]))
+    ideal = _ideal_commands(geometry, passes, names)
     seeds = tuple(range(seed, seed + machines))
     runs = []
     for one in seeds:
-        runs.append(_run_machine(RealMachine(geometry, draw_model(geometry, bounds, one)), passes, tool, names))
+        real = RealMachine(geometry, draw_model(geometry, bounds, one))
+        runs.append(_run_machine(real, ideal, passes, tool, names))
         progress(1)
-    real, positions, rotations, errors, trips = (np.array(part) for part in zip(*runs, strict=True))
-    return Assessment(seeds, passes.nominal_commands(), real, positions, rotations, errors, trips)
+    parts = (np.array(part) for part in zip(*runs, strict=True))
+    return Assessment(seeds, ideal, *parts)
 
 
-def _run_machine(machine: RealMachine, passes: Passes, tool: Poses, names: Sequence[str]) -> tuple[np.ndarray, ...]:
-    """Return real lengths, taken tool poses, their errors and round trips of one machine; `tool` as commanded."""
+def _ideal_commands(geometry: HexapodGeometry, passes: Passes, names: Sequence[str]) -> np.ndarray:
+    """Return what the struts of the nominal machine must be told, shape (P, 6), m."""
+    if not geometry.screw_lead.any():
+        return passes.nominal_commands()
+    ideal = RealMachine(geometry, MachineModel(geometry.name))
+    return model_commands([ideal] * len(passes), passes.poses, passes.senses(), lambda n: names[n])[0]
+
+
+def _run_machine(
+    machine: RealMachine, ideal: np.ndarray, passes: Passes, tool: Poses, names: Sequence[str]
+) -> tuple[np.ndarray, ...]:
+    """Return real lengths, taken tool poses, their errors and round trips of one machine.
+
+    `ideal` are the commands of the nominal machine for the poses, `tool` the tool poses commanded.
+    """
 
     def name_of(n: int) -> str:
         return f"{names[n]}, {machine.model.name}"
 
     machines, unknown = [machine] * len(passes), passes.senses()
     real, modelled = model_commands(machines, passes.poses, unknown, name_of)
-    driven = drive(machines, passes.poses, unknown, passes.nominal_commands(), name_of)
+    driven = drive(machines, passes.poses, unknown, ideal, name_of)
     taken = machine.geometry.tool_poses(*driven.actual)
     # The start is 1 mm off, so that Newton has something to do.
     back = drive(machines, (modelled[0] + 1e-3, modelled[1]), unknown, real, name_of)

@@ -104,7 +104,7 @@ def _station_name(measurements: MeasurementSet, station: int) -> str:
     reading = int((measurements.station == station).argmax())
     position = (measurements.stations.positions[station] * 1e3).round(3).tolist()
     run = measurements.runs[measurements.run[reading]].name
-    return f"run {run}, reading {reading + 1}, platform at {position} mm"
+    return f"run {run}, reading {reading + 1}, platform at {position} mm in base"
 
 
 def _stopping(template: MeasurementSet, repeatability: float, rng: np.random.Generator) -> np.ndarray:

@@ -295,10 +295,10 @@ function traces() {
       showscale: s === S - 1, colorbar: { title: { text: name + ", " + unit, side: "right" }, len: 0.85 },
       lighting: { ambient: 0.85, diffuse: 0.25, specular: 0.0 }, name: data.layers[s],
       contours: { x: { highlight: false }, y: { highlight: false }, z: { highlight: false } },
-      hovertemplate: "x %{x:.1f}, y %{y:.1f}, z %{z:.1f} mm<br>%{surfacecolor:.4g} " + unit };
+      hovertemplate: "x %{x:.1f}, y %{y:.1f}, z %{z:.1f} mm in work<br>%{surfacecolor:.4g} " + unit };
   });
   const mm = value => String(Math.round(10 * value) / 10 + 0);
-  const say = e => `${e.value.toPrecision(4)} ${unit} at x ${mm(e.x)}, y ${mm(e.y)}, z ${mm(e.z)} mm`;
+  const say = e => `${e.value.toPrecision(4)} ${unit} at x ${mm(e.x)}, y ${mm(e.y)}, z ${mm(e.z)} mm in work`;
   get("found").textContent = `${name}: largest ${say(most)}; smallest ${say(least)}`;
   found.forEach((t, s) => { t.showscale = boxes[s].checked && !boxes.slice(s + 1).some(b => b.checked); });
   const lines = get("machine").checked ? data.outline : data.outline.slice(1, 2);  // of it only the platform
@@ -309,8 +309,8 @@ function traces() {
 
 const around = data.view[0] * Math.PI / 180, up = data.view[1] * Math.PI / 180;
 const layout = { margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: "kept", showlegend: false,
-  scene: { aspectmode: "data", xaxis: { title: { text: "x, mm" } }, yaxis: { title: { text: "y, mm" } },
-    zaxis: { title: { text: "z, mm" } }, uirevision: "kept",
+  scene: { aspectmode: "data", xaxis: { title: { text: "x in work, mm" } },
+    yaxis: { title: { text: "y in work, mm" } }, zaxis: { title: { text: "z in work, mm" } }, uirevision: "kept",
     camera: { eye: { x: 1.6 * Math.cos(up) * Math.cos(around), y: 1.6 * Math.cos(up) * Math.sin(around),
       z: 1.6 * Math.sin(up) }, center: { x: 0, y: 0, z: -0.05 } } } };
 

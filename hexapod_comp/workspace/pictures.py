@@ -277,7 +277,7 @@ def _space(figure: Figure, place: SubplotSpec, title: str, elevation: float = VI
     """Return 3-D axes, drawn in the order in which things are added to them."""
     axes: Any = figure.add_subplot(place, projection="3d", computed_zorder=False)
     axes.view_init(elev=elevation, azim=VIEW_AZIMUTH)
-    axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm", title=title)
+    axes.set(xlabel="x in work, mm", ylabel="y in work, mm", zlabel="z in work, mm", title=title)
     axes.locator_params(nbins=5)
     return axes
 

@@ -41,7 +41,8 @@ def _reach_table(study: Study, names: Sequence[str]) -> str:
         size = " × ".join(f"{side * 1e3:.0f}" for side in np.ptp(reach.box, axis=0))
         limits = ", ".join(f"{cause} {100.0 * share:.0f} %" for cause, share in reach.shares().items())
         rows.append((name, number(reach.volume * 1e6, 1), size, str(reach.parts), limits))
-    return aligned(("orientation", "volume cm³", "box mm", "pieces", "limited by (share of the boundary)"), rows)
+    head = ("tilted from home", "volume cm³", "box in work mm", "pieces", "limited by (share of the boundary)")
+    return aligned(head, rows)
 
 
 def _combined_text(study: Study) -> str:
@@ -104,6 +105,7 @@ def as_json(study: Study) -> dict[str, Any]:
     drawn = study.combined.monte_carlo
     return {
         "machine": study.geometry.name,
+        "frame": "work",
         "budget_si": study.budget.sizes,
         "poses": study.extremes.poses,
         "ranking": ranking_rows(study.rows, beside(study.geometry, study.errors)),

@@ -220,7 +220,7 @@ def load_budget(path: str | Path) -> Budget:
     InputFileError
         With file, key and value: unknown type, no unit, negative size.
     """
-    path = input_file(path)
+    path = input_file(path, "error_budget")
     top = read_yaml(path, BUDGET_FORMAT, BUDGET_VERSION)
     machine, section = top.text("machine"), top.section("errors")
     top.finish()

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+import pty
 import re
 import subprocess
 import sys
@@ -136,7 +137,7 @@ def test_json_is_printed_and_out_stays_csv(hexapod, tmp_path: Path) -> None:
         ("ik --model ", {"ideal", "random", "paper_machine.yaml", "paper_lines_model.yaml", "mine.csv", "deep/"}),
         ("plan campaign_", {"campaign_1d.yaml", "campaign_5d.yaml", "campaign_full.yaml"}),
         ("classify --budget e", {"error_budget.yaml"}),
-        ("check ", {*(f"table{n}.csv" for n in range(1, 6)), "mine.csv", "deep/"}),
+        ("check ", {"table1.csv", "table3.csv", "table5.csv", "mine.csv", "deep/"}),
         ("fit --scheme ", {"joint", "lines"}),
         ("demo --pictures d", {"deep/"}),
         ("ik --x-mm ", set()),
@@ -382,7 +383,7 @@ def test_all_modes_lists_each_once_and_marks_the_working_one(hexapod) -> None:
     working = next(mode for mode in modes if mode["working"])
     assert working["alpha_deg"] == pytest.approx(5.0, abs=1e-3)
     text = hexapod("fk", "--lengths", lengths, "--all-modes")[1]
-    assert text.splitlines()[0] == f"machine paper: {len(modes)} assembly modes"
+    assert text.splitlines()[0] == f"machine paper: {len(modes)} assembly modes, tool in work"
     assert text.count("working mode") == 1
 
 
@@ -391,6 +392,33 @@ def test_all_modes_lists_each_once_and_marks_the_working_one(hexapod) -> None:
 
 def stream_pose(z: float) -> tuple[object, ...]:
     return ("", 0, 0, z, 0, 0, 0)
+
+
+def test_a_terminal_shows_what_is_done() -> None:
+    """What takes seconds says so on a terminal, in whole lines also where that gives no width; pipes stay clean."""
+    code = "import hexapod_comp.cli as cli; cli.main(['plan', 'campaign_1d', '--blocks', 'pitch'])"
+    ours, theirs = pty.openpty()
+    with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=theirs) as process:
+        out = process.communicate(timeout=60)[0]
+    os.close(theirs)
+    shown = os.read(ours, 10_000).decode()
+    os.close(ours)
+    assert "s  what 1670 readings determine\r" in shown
+    assert out.startswith(b"machine paper: 1670 readings")
+
+
+def test_lists_of_broken_limits_are_capped(hexapod, tmp_path: Path) -> None:
+    """However many targets are out of reach: twenty lines in check, ten notes of ik, and how many more there are."""
+    path = file_of(tmp_path, [(n, 0, 0, 950, 0, 0, 0) for n in range(30)])
+    code, out, _ = hexapod("check", path, "--stream", "--rate-hz", "1")
+    broken = int(re.search(r"broken limits \((\d+)\)", out).group(1))
+    assert code == 1
+    assert out.count(" is outside the stroke") == 20
+    assert f"… and {broken - 20} more; --json prints all" in out
+    assert len(json.loads(hexapod("check", path, "--stream", "--rate-hz", "1", "--json")[1])["broken"]) == broken
+    code, _, err = hexapod("ik", path)
+    assert (code, err.count("note: line ")) == (0, 10)
+    assert re.search(r"note: \d+ more limits are broken; see check\n$", err)
 
 
 LINES = {

@@ -427,8 +427,8 @@ TIDY = "run,direction,x_mm,y_mm,z_mm,channel,value,unit\n"
 WIDE = "cx,cy,cz,mx,my,mz\n0,0,400,0.1,0,400\n"
 
 WRONG = {
-    "no such file": Wrong("gone.csv", r"gone\.csv: cannot be read: No such file"),
-    "a folder": Wrong(".", r"\.: cannot be read: Is a directory"),
+    "no such file": Wrong("gone.csv", r"gone\.csv: there is no such file"),
+    "a folder": Wrong(".", r"\.: is a folder"),
     "empty": Wrong("e.csv", r"e\.csv: has no header", "e.csv"),
     "header only": Wrong("h.csv", r"h\.csv: has a header but no rows", "h.csv", TIDY),
     "not text": Wrong("b.csv", r"b\.csv: line 1 or later: is not UTF-8 text", "b.csv", "\xff\xfe"),
@@ -490,8 +490,8 @@ def test_a_wrong_fit_is_one_line_and_writes_nothing(
         ("x.csv", "arguments are required: --out"),
         ("--out m.yaml", "arguments are required: FILE"),
         ("x.csv --out m.yaml --lead-mm -1", "argument --lead-mm: must not be negative"),
-        ("x.csv --out m.yaml --lead-mm nan", "argument --lead-mm: is not finite"),
-        ("x.csv --out m.yaml --lead-mm ten", "argument --lead-mm: is not finite numbers: 'ten'"),
+        ("x.csv --out m.yaml --lead-mm nan", "argument --lead-mm: must be finite"),
+        ("x.csv --out m.yaml --lead-mm ten", "argument --lead-mm: must be finite numbers, not 'ten'"),
         ("x.csv --out m.yaml --tolerance-um -3", "argument --tolerance-um: must not be negative"),
         ("x.csv --out m.yaml --field-degree 0", "argument --field-degree: must be a whole number from 1 to 10000000"),
         ("x.csv --out m.yaml --field-degree 2.5", "argument --field-degree: must be a whole number from 1 to 10000000"),
@@ -719,4 +719,5 @@ def test_iso230_of_single_passes_says_what_is_missing(hexapod: Program, tmp_path
     rows = [f"l,{way},{x},0,400,linear,{x},um\n" for way in ("forward", "backward") for x in (0, 10, 20)]
     (tmp_path / "once.csv").write_text(TIDY + "".join(rows))
     assert_refused(hexapod("iso230", tmp_path / "once.csv"), "no linear run has two cycles or more")
-    assert_refused(hexapod("iso230", "gone.csv"), r"gone\.csv: cannot be read")
+    complaint = r"gone\.csv: there is no such file; \.csv, \.rtl, \.rtx files beside it: once\.csv"
+    assert_refused(hexapod("iso230", "gone.csv"), complaint)

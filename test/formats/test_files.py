@@ -191,6 +191,40 @@ def test_units(dimension, unit, number, si):
     assert section(**{f"a_{unit}": number}).quantity("a", dimension) == si
 
 
+@pytest.mark.parametrize("micro", ["\N{MICRO SIGN}", "\N{GREEK SMALL LETTER MU}"])
+def test_both_micro_signs_are_the_u_of_um(tmp_path, micro):
+    taken = load(tmp_path, HEAD + f"a_{micro}m: 12.3\nb_{micro}rad: [1, 2]\nunit: {micro}m\n")
+    assert taken.quantity("a", "length") == 12.3e-6
+    np.testing.assert_array_equal(taken.quantity("b", "angle", (2,)), [1e-6, 2e-6])
+    assert taken.unit("unit", "length") == 1e-6
+    taken.finish()
+    with pytest.raises(InputFileError, match="a_um: is given twice, also as a_"):
+        section(**{"a_um": 1, f"a_{micro}m": 2}).quantity("a", "length")
+    with pytest.raises(InputFileError, match=r"unit: must be one of m, mm, um, in \(found"):
+        section(unit=f"{micro}rad").unit("unit", "length")
+    with pytest.raises(InputFileError, match=r"must be one of m, mm, um, in \(found \['um'\]\)"):
+        section(unit=["um"]).unit("unit", "length")
+
+
+def test_a_micro_sign_of_windows(tmp_path):
+    path = tmp_path / "some.yaml"
+    path.write_bytes((HEAD + "a_µm: 3").encode("cp1252"))
+    assert read_yaml(path, "test", 1).quantity("a", "length") == 3e-6
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a:\n\tb: 1", "line 4: is not valid YAML: .*; YAML is indented by spaces, not by tabs"),
+        ("a_mm: 4,5", r"a_mm: must be a number, with a decimal point: 4\.5 \(found '4,5'\)"),
+        ("a_mm: [1; 2; 3]", r"a_mm\[0\]: must be a number, without semicolons"),
+    ],
+)
+def test_tabs_semicolons_and_decimal_commas_are_named(tmp_path, text, said):
+    with pytest.raises(InputFileError, match=said):
+        load(tmp_path, HEAD + text).quantity("a", "length")
+
+
 def test_every_unit_ends_its_key_in_one_way():
     """A key must not fit two units of one kind: a_m_min is not the length a_m in min."""
     for units in UNITS.values():

@@ -105,6 +105,82 @@ def test_a_missing_file_and_a_folder_are_named(tmp_path: Path) -> None:
         assert caught.value.path == str(path)
 
 
+@pytest.mark.parametrize(
+    ("folder", "asked", "complaint"),
+    [
+        ((), "gone.csv", "there is no such file; shipped: table1.csv"),
+        (
+            ("mine.csv", "notes.txt"),
+            "mien.csv",
+            ".csv files beside it: mine.csv; shipped: table1.csv, table3.csv, table5.csv; did you mean mine",
+        ),
+        ((), "none/gone.csv", "there is no such file, nor its folder"),
+        ([f"{n:02}.csv" for n in range(15)], "x.csv", "10.csv, 11.csv and 3 more; shipped"),
+    ],
+)
+def test_a_missing_file_lists_those_of_its_kind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: tuple[str, ...], asked: str, complaint: str
+) -> None:
+    for name in folder:
+        (tmp_path / name).write_text("# by hand\n x_mm,y_mm,z_mm\n")
+    (tmp_path / "lengths.csv").write_text("sequence;L1_mm\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputFileError) as caught:
+        read_poses(asked)
+    assert complaint in str(caught.value)
+    for other in ("notes.txt", "paper.yaml", "fastdds.xml", "lengths.csv", "table2.csv"):
+        assert other not in str(caught.value)
+    with pytest.raises(InputFileError) as caught:
+        read_lengths(asked)
+    assert "table1.csv" not in str(caught.value), "it holds poses"
+    assert "none/" in asked or "files beside it: lengths.csv; shipped: table2.csv" in str(caught.value)
+
+
+# Files of spreadsheets.
+
+POSE = Pose([0.0015, -0.002, 0.4], np.eye(3))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x_mm;y_mm;z_mm\n1.5;-2;400\n",
+        "x_mm;y_mm;z_mm\n1,5;-2;400\n",
+        "x_mm; y_mm; z_mm\n1,5; -2; 4,0E2\n",
+        "x_mm\ty_mm\tz_mm\n1,500\t-2,000\t400,0\n",
+        "# made by hand; with care, of course\n\n x_mm ;y_mm;z_mm\r\n0,0015e3;-2;400\r\n",
+        '"x_mm";"y_mm";"z_mm"\n"1,5";"-2";"400"\n',
+        "\ufeffx_µm;y_\N{GREEK SMALL LETTER MU}m;z_m\n1500,0;-2000;0,4\n",
+        "x_µm,y_µm,z_m\n1500,-2000,0.4\n".encode("cp1252"),
+    ],
+)
+def test_semicolons_tabs_decimal_commas_and_micro_signs(tmp_path: Path, text: str | bytes) -> None:
+    """As spreadsheets of many countries save; the numbers are the very floats that a point would give."""
+    (pose,) = read_poses(written(tmp_path, text))[1]
+    np.testing.assert_array_equal(pose.position, POSE.position)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("x_mm,y_mm,z_mm\n1,5,-2,400\n", "line 2: has 4 columns, the header has 3; are its decimal points commas?"),
+        ("x_mm,y_mm,z_mm\n1;-2;400\n", "commas separate columns here, as in the header, and this line has semicolons"),
+        ("x_mm;y_mm;z_mm\n1,-2,400\n", "semicolons separate columns here, as in the header, and this line has commas"),
+        ('x_mm,y_mm,z_mm\n"1,5",-2,400\n', "column x_mm: must be a finite number, with a decimal point: 1.5 (found"),
+        ("x_mm;y_mm;z_mm\n1,5;-2;400.5\n", "column x_mm: has a decimal comma, but line 2 has a decimal point"),
+        ("x_mm;y_mm;z_mm\n1,500;2;-400,000\n", "column x_mm: has a comma that may be a decimal one or stand between"),
+        ("x_mm;y_mm;z_mm\n1.234,5;2;400\n", "column x_mm: must be a finite number (found '1.234,5')"),
+        ("x_mm y_mm z_mm\n1 2 400\n", "columns are separated by commas, semicolons, tabs, and this is one column"),
+        ("x_um,x_µm,y_mm,z_mm\n1,1,2,400\n", "header: x is given twice"),
+        ("x_mm;y_mm;Länge_mm\n1;2;400\n".encode("cp1252"), "is not UTF-8 text; spreadsheets have 'CSV UTF-8'"),
+    ],
+)
+def test_what_may_mean_two_things_is_refused(tmp_path: Path, text: str | bytes, complaint: str) -> None:
+    with pytest.raises(InputFileError) as caught:
+        read_poses(written(tmp_path, text))
+    assert complaint in str(caught.value)
+
+
 def test_endless_input_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tables, "MAX_ROWS", 10)
     path = written(tmp_path, "x_mm,y_mm,z_mm\n" + "1,2,3\n" * 11)

@@ -1,8 +1,6 @@
 """Recordings of the real node: what a recorder hears over DDS, written as a bag, gives the same bits again.
 
-The recorder takes messages as they travel, as ``ros2 bag record`` does, with that program's quality of service:
-reliable where the publisher is, kept for late subscribers where the publisher does so. The truth is what the node
-has sent.
+The truth is what the node has sent.
 """
 
 from __future__ import annotations
@@ -13,72 +11,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseStamped
 from node_helpers import HOME, Bench, model_file, near
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import JointState
-from std_msgs.msg import String
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from hexapod_comp.nodes.messages import pose_message
 from hexapod_comp.pose import Pose
 
 pytest.importorskip("rosbags")
 
-from replay_helpers import KINDS, Messages, write_bag
+from node_recorder import Recorder
+from replay_helpers import Messages, write_bag
 
 from hexapod_comp.replay.bag import Recording, read_recording
 from hexapod_comp.replay.replay import BEFORE, IDENTICAL, Replay, replay_recording
-
-TYPES = {"PoseStamped": PoseStamped, "JointState": JointState, "String": String}
-
-RECORDER_DEPTH = 10
-"""The least that ``ros2 bag record`` has ever given a topic; newer ones keep all where the depth is not known."""
 
 
 @pytest.fixture
 def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
     with Bench(ros_context, spin_until, capfd) as made:
         yield made
-
-
-class Recorder:
-    """Hears a machine's topics from now on, as serialized messages."""
-
-    def __init__(self, bench: Bench) -> None:
-        self.messages, self._bench = Messages(), bench
-        node = bench.witness
-        self._subscriptions = []
-        for topic, kind in KINDS.items():
-            kept = topic.startswith("compensator/")
-            qos = QoSProfile(
-                depth=RECORDER_DEPTH,
-                reliability=ReliabilityPolicy.BEST_EFFORT
-                if topic == "tool_pose_estimate"
-                else ReliabilityPolicy.RELIABLE,
-                durability=DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE,
-            )
-            name = node.resolve_topic_name(topic)
-            message_type = TYPES[kind.rpartition("/")[2]]
-            self._subscriptions.append(
-                node.create_subscription(message_type, topic, self._keeper(name, kind), qos, raw=True)
-            )
-        wanted = [s for s in self._subscriptions if not s.topic_name.endswith("strut_states")]
-        bench.until(lambda: all(s.get_publisher_count() for s in wanted), "the recorder's discovery")
-        bench.until(lambda: self.heard("/compensator/journal"), "a page of the journal")
-
-    def _keeper(self, topic: str, kind: str):
-        return lambda raw: self.messages.append((time.time_ns(), topic, kind, bytes(raw)))
-
-    def heard(self, ending: str) -> int:
-        """Return how many messages of a topic have come."""
-        return sum(topic.endswith(ending) for _, topic, _, _ in self.messages)
-
-    def stop(self) -> None:
-        """Wait until the journal confirms all answers, and hear no more."""
-        pages = self.heard("/compensator/journal")
-        self._bench.until(lambda: self.heard("/compensator/journal") > pages + 1, "two more pages of the journal")
-        for subscription in self._subscriptions:
-            self._bench.witness.destroy_subscription(subscription)
 
 
 def replayed(bag: Path, namespace: str | None = None) -> tuple[Recording, Replay]:

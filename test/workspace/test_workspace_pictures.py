@@ -57,7 +57,7 @@ def test_shells_say_what_they_show(tmp_path):
     """Truth: values from 1 µm to 1 µm + 10⁻³·0.05² m = 3.5 µm; six struts, base, platform and tool in the context."""
     figure = shells_figure(unit(), layers(), TRANSLATION, "unit: screw pitch on strut 1")
     written = texts(figure)
-    for part in ("unit: screw pitch on strut 1", "translation of the tool, µm", "x, mm", "3.5", "1", "at home"):
+    for part in ("unit: screw pitch on strut 1", "translation of the tool, µm", "x in work, mm", "3.5", "1", "at home"):
         assert part in written
     context, near, bar = figure.axes
     assert len(context.lines) == 9

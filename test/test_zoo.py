@@ -1,0 +1,494 @@
+"""Every machine of the zoo through every verb and the node pair, from files to files as a user goes.
+
+Simulate, fit, check, ik and fk, export, run, replay, classify: what each says is judged by the kinematics of
+:mod:`foreign_machines`, which are not the package's. One campaign and one fit a machine; where tests run
+in several processes, conftest keeps those of a machine in one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from foreign_machines import MM, UM, Errors, Machine, aligned_rms, commands, goes_to, machines, rotation, tool_errors
+
+from hexapod_comp import cli
+from hexapod_comp.calibration.posterior import load_posterior
+from hexapod_comp.calibration.prediction import ErrorPredictor
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.model import RealMachine
+from hexapod_comp.machine.model_file import load_model
+
+NOISE = 0.5 * UM
+"""Standard deviation of the laser."""
+
+STEP = 0.1 * UM
+"""Motor step of the strut drive, its default."""
+
+WRITTEN = 1e-11
+"""m; a picometre is the last digit of CSV files, and rounding takes some of them."""
+
+
+@dataclass(frozen=True)
+class Animal:
+    """A machine, its truth, and the folder with its files; `fit` is what fit printed as JSON."""
+
+    machine: Machine
+    truth: Errors
+    folder: Path
+    fit: dict[str, Any]
+
+    def file(self, name: str) -> str:
+        return str(self.folder / name)
+
+    def says(self, *words: object, code: int = 0) -> str:
+        return hexapod(*words, "--machine", self.file("machine.yaml"), code=code)
+
+    def tells(self, *words: object, code: int = 0) -> dict[str, Any]:
+        return json.loads(self.says(*words, "--json", code=code))
+
+    @property
+    def model(self) -> str:
+        return self.file("model.yaml")
+
+    @property
+    def believed(self) -> Errors:
+        return Errors.read(self.folder / "model.yaml")
+
+
+def hexapod(*words: object, code: int = 0) -> str:
+    """Run the command in this process, and return what it prints."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        found = cli.main([str(word) for word in words])
+    assert found == code, f"{words}: {found}\n{out.getvalue()}"
+    return out.getvalue()
+
+
+@pytest.fixture(scope="module", params=list(machines()))
+def animal(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Animal:
+    """Give joints and struts of a machine 50 µm, its screws 50 ppm; measure it, and fit what it has."""
+    machine = machines()[request.param]
+    folder = tmp_path_factory.mktemp("zoo")
+    truth = Errors.drawn(machine, 7)
+    machine.write(folder / "machine.yaml")
+    truth.write(folder / "truth.yaml", machine)
+    write_campaign(machine, folder / "campaign.yaml")
+    write_poses(machine, folder / "poses.csv")
+    files = ["--machine", folder / "machine.yaml", "--truth", folder / "truth.yaml"]
+    hexapod("simulate", "--campaign", folder / "campaign.yaml", "--out", folder / "readings.csv", *files)
+    out = ["--out", folder / "model.yaml", "--pictures", folder / "pictures", "--json"]
+    said = hexapod("fit", folder / "readings.csv", "--blocks", "pitch", *out, *files)
+    return Animal(machine, truth, folder, json.loads(said))
+
+
+def write_campaign(machine: Machine, path: Path) -> None:
+    """Write a campaign: a linear laser on a coarse grid of the machine's box and on its diagonals, twice both ways."""
+    shortest = 2.0 * min(machine.half)
+    content = {
+        "format": "hexapod_comp/campaign",
+        "version": 1,
+        "box_m": machine.box.tolist(),
+        "cell_m": shortest,
+        "step_m": shortest / 5.0,
+        "instrument": "1-D",
+        "diagonals": 16,
+        "cycles": 2,
+        "noise": {"linear_m": NOISE},
+    }
+    path.write_text(yaml.safe_dump(content))
+
+
+def tool_poses(machine: Machine) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return four poses of the tool in work near the middle, tilted by up to 2°: tips, angles (degrees), rotations."""
+    rng = np.random.default_rng(3)
+    tips = machine.middle + rng.uniform(-0.1, 0.1, (4, 3)) * np.array(machine.half)
+    angles = rng.uniform(-2.0, 2.0, (4, 3))
+    return tips, angles, np.array([rotation(*row) for row in angles])
+
+
+def write_poses(machine: Machine, path: Path) -> None:
+    tips, angles, _ = tool_poses(machine)
+    rows = [",".join(f"{v:.12f}" for v in row) for row in np.hstack([tips / MM, angles])]
+    path.write_text("\n".join(["x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg", *rows]) + "\n")
+
+
+def somewhere(machine: Machine, count: int = 1000) -> np.ndarray:
+    """Return random places of the measured box, in work."""
+    return np.random.default_rng(11).uniform(*machine.box, (count, 3))
+
+
+def corners(box: np.ndarray) -> np.ndarray:
+    return np.array(np.meshgrid(*box.T)).reshape(3, 8).T
+
+
+def table(path: str | Path) -> list[dict[str, str]]:
+    """Read a CSV file with comment lines."""
+    lines = [line for line in Path(path).read_text().splitlines() if not line.startswith("#")]
+    return list(csv.DictReader(lines))
+
+
+def columns(rows: list[dict[str, Any]], *names: str) -> np.ndarray:
+    return np.array([[float(row[name]) for name in names] for row in rows])
+
+
+def lengths(rows: list[dict[str, Any]], form: str = "L{}_mm") -> np.ndarray:
+    """Return lengths of rows, (N, 6), m."""
+    return columns(rows, *(form.format(i) for i in range(1, 7))) * (MM if form.endswith("mm") else UM)
+
+
+def leverage(machine: Machine, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Return what each strut's length moves the tip by, (N, 3, 6) m per m, by differences."""
+    none, poses = Errors.none(), (positions, rotations)
+    told, moved = commands(machine, none, *poses), []
+    for change in UM * np.eye(6):
+        ends = [machine.tips(*goes_to(machine, none, told + way * change, *poses)) for way in (1.0, -1.0)]
+        moved.append((ends[0] - ends[1]) / (2.0 * UM))
+    return np.stack(moved, axis=2)
+
+
+# Calibration
+
+
+def test_simulate_reads_what_the_machine_does(animal: Animal) -> None:
+    """Each reading is the tool's error along its line in work, from the line's first on, and the laser's noise."""
+    rows = table(animal.file("readings.csv"))
+    tips, value = columns(rows, "x_mm", "y_mm", "z_mm") * MM, columns(rows, "value")[:, 0] * UM
+    assert {row["channel"] for row in rows} == {"linear"}
+    assert {row["unit"] for row in rows} == {"um"}
+    errors = tool_errors(animal.machine, animal.truth, None, tips)
+    expected = np.empty(len(rows))
+    for run in {row["run"] for row in rows}:
+        members = np.flatnonzero([row["run"] == run for row in rows])
+        ways = tips[members] - tips[members[0]]
+        along = ways[np.linalg.norm(ways, axis=1).argmax()]
+        along *= np.sign(along[np.abs(along) > 1e-9][0]) / np.linalg.norm(along)
+        expected[members] = (errors[members] - errors[members[0]]) @ along
+    left = value - expected
+    assert np.abs(left).max() < 5.0 * NOISE, "5 σ: once in two million readings"
+    assert np.std(left) == pytest.approx(NOISE, rel=0.1)
+
+
+def test_the_model_is_good(animal: Animal) -> None:
+    """Less than a twentieth of the error at held-out points, the datum aligned."""
+    tips = somewhere(animal.machine)
+    before = aligned_rms(tips, tool_errors(animal.machine, animal.truth, None, tips))
+    after = aligned_rms(tips, tool_errors(animal.machine, animal.truth, animal.believed, tips))
+    print(f"{animal.machine.name}: {before / UM:.2f} → {after / UM:.3f} µm, {1.0 - after / before:.1%} less")
+    assert after < 0.05 * before
+
+
+def test_the_predicted_error_is_as_well_known_as_it_says(animal: Animal) -> None:
+    """The truth's error by kinematics that are not ours, at 200 places, the datum aligned over them in both.
+
+    Places of one machine are not independent: the RMS may be two and a half times what is said, and ten times less.
+    """
+    machine, tips = animal.machine, somewhere(animal.machine, 200)
+    geometry = load_geometry(animal.file("machine.yaml"))
+    model = load_model(animal.model, geometry)
+    parameters, why = load_posterior(model, geometry, animal.model)
+    assert why == ""
+    aligned = ErrorPredictor(RealMachine(geometry, model), parameters).predict(level_poses(machine, tips))[1]
+    assert aligned is not None
+    assert aligned.deviations is not None
+    truth = tool_errors(machine, animal.truth, None, tips)
+    sigma = np.sqrt((aligned.deviations[:, :3] ** 2).sum(axis=1).mean())
+    assert sigma < 0.05 * aligned_rms(tips, truth)
+    assert 0.1 * sigma < aligned_rms(tips, truth - aligned.values[:, :3]) < 2.5 * sigma
+
+
+def test_the_valid_box_is_of_platform_positions_in_base(animal: Animal) -> None:
+    """The file's own words. Eight corners of the measured box say how far the platform went; home is in."""
+    platforms = animal.machine.platforms(corners(animal.machine.box))
+    box = np.array(yaml.safe_load(Path(animal.model).read_text())["valid_box_mm"]) * MM
+    np.testing.assert_allclose(box, [platforms.min(axis=0), platforms.max(axis=0)], atol=1e-9)
+    assert ((box[0] < animal.machine.home) & (animal.machine.home < box[1])).all()
+
+
+def test_what_it_is_worth_is_judged_where_the_machine_was_measured(animal: Animal) -> None:
+    """Against this file's own evaluation at other random places of the measured box. The mean square of 1,000 places
+    whose squares scatter by their own size is good to 3/√1000 = 10 %, its root to 5 %; both draws together 7 %."""
+    tips, worth = somewhere(animal.machine), animal.fit["worth"]
+    for name, believed in (("error_without", None), ("error_with", animal.believed)):
+        errors = tool_errors(animal.machine, animal.truth, believed, tips)
+        raw = np.sqrt((errors**2).sum(axis=1).mean())
+        assert worth[name]["aligned_rms_m"] == pytest.approx(aligned_rms(tips, errors), rel=0.07)
+        assert worth[name]["rms_m"] == pytest.approx(raw, rel=0.07)
+    wild = aligned_rms(tips, tool_errors(animal.machine, animal.truth, None, tips))
+    # The fitted machine's own error differs from the truth's by what the fit leaves, a twentieth at most.
+    assert animal.fit["expected_tool_error"]["before_m"] == pytest.approx(wild, rel=0.1)
+
+
+def test_the_papers_metric_is_taken_along_the_work_frame(animal: Animal) -> None:
+    """Mean |error| along lines of this file's own, read against their start; both means are of 60 and 600 lines whose
+    figures scatter by about their size: 3/√60 = 40 %."""
+    rng, box, machine = np.random.default_rng(12), animal.machine.box, animal.machine
+    for name, believed in (("without_m", None), ("with_m", animal.believed)):
+        read: list[float] = []
+        for axis in range(3):
+            tips = np.tile(rng.uniform(*box, (200, 1, 3)), (1, 9, 1))
+            tips[:, :, axis] = np.linspace(box[0, axis], box[1, axis], 9)
+            errors = tool_errors(machine, animal.truth, believed, tips.reshape(-1, 3))[:, axis].reshape(200, 9)
+            # A long axis has more readings, one an inch.
+            means = np.abs(errors[:, 1:] - errors[:, :1]).mean(axis=1).tolist()
+            read += means * len(np.arange(0.0127, np.ptp(box[:, axis]), 0.0254))
+        found = animal.fit["worth"]["mean_displacement_error_along_lines"][name]
+        assert found == pytest.approx(np.mean(read), rel=0.4, abs=0.02 * UM)
+
+
+def test_pictures_are_drawn(animal: Animal) -> None:
+    names = {path.name for path in Path(animal.file("pictures")).iterdir()}
+    assert names == {"fit.png", "left.png", "strut_errors.png"}
+
+
+def test_plan_and_iso230_take_the_campaign_and_its_readings(animal: Animal) -> None:
+    """A: the standard's; of it, M: the range of the mean deviations of both ways at each target (ISO 230-2, 3.17)."""
+    plan = animal.tells("plan", animal.file("campaign.yaml"), "--blocks", "pitch")
+    assert plan["readings"] == len(table(animal.file("readings.csv")))
+    assert 0.0 < plan["expected_tool_error"]["after_m"] < 0.05 * plan["expected_tool_error"]["before_m"]
+    figures = animal.tells("iso230", animal.file("readings.csv"))
+    for name, found in figures.items():
+        rows = [row for row in table(animal.file("readings.csv")) if row["run"] == name]
+        places = columns(rows, "x_mm", "y_mm", "z_mm").round(6)
+        means = [
+            columns([row for row, here in zip(rows, places, strict=True) if (here == place).all()], "value").mean()
+            for place in np.unique(places, axis=0)
+        ]
+        assert found["M_m"] == pytest.approx(np.ptp(means) * UM, abs=1e-9)
+
+
+# Kinematics
+
+
+def test_ik_and_fk(animal: Animal) -> None:
+    """Nominal lengths are distances; commands are what the fitted machine needs; fk finds the way back, cold too."""
+    machine = animal.machine
+    tips, angles, tools = tool_poses(machine)
+    poses = machine.platform_poses(tips, tools)
+    rows = animal.tells("ik", animal.file("poses.csv"), "--model", animal.model, "--out", animal.file("L.csv"))["rows"]
+    wanted = commands(machine, animal.believed, *poses)
+    np.testing.assert_allclose(lengths(rows), wanted, atol=WRITTEN)
+    np.testing.assert_allclose(lengths(rows, "nominal_L{}_mm"), machine.lengths(*poses), atol=WRITTEN)
+    np.testing.assert_allclose(lengths(rows, "correction_L{}_um"), wanted - machine.lengths(*poses), atol=WRITTEN)
+    np.testing.assert_allclose(lengths(table(animal.file("L.csv"))), wanted, atol=WRITTEN)
+    for start in ((), ("--cold",)):
+        back = animal.tells("fk", animal.file("L.csv"), "--model", animal.model, *start)
+        assert back["frame"] == "work"
+        np.testing.assert_allclose(columns(back["rows"], "x_mm", "y_mm", "z_mm") * MM, tips, atol=100 * WRITTEN)
+        np.testing.assert_allclose(columns(back["rows"], "alpha_deg", "beta_deg", "gamma_deg"), angles, atol=1e-7)
+
+
+def test_without_a_model_only_the_screws_count(animal: Animal) -> None:
+    """The ideal machine has no errors, but its screws turn, and lengths are commands that lead back."""
+    machine = animal.machine
+    tips, _, tools = tool_poses(machine)
+    told = commands(machine, Errors.none(), *machine.platform_poses(tips, tools))
+    rows = animal.tells("ik", animal.file("poses.csv"), "--out", animal.file("ideal.csv"))["rows"]
+    np.testing.assert_allclose(lengths(rows), told, atol=WRITTEN)
+    back = animal.tells("fk", animal.file("ideal.csv"))["rows"]
+    np.testing.assert_allclose(columns(back, "x_mm", "y_mm", "z_mm") * MM, tips, atol=100 * WRITTEN)
+
+
+def test_check(animal: Animal) -> None:
+    """Home is inside the box in which the model was measured; what stands beyond is named. Stroke margins are ours."""
+    machine = animal.machine
+    home = animal.folder / "home.csv"
+    home.write_text("x_mm,y_mm,z_mm\n" + ",".join(f"{v / MM:.9f}" for v in machine.middle) + "\n")
+    said = animal.says("check", home, "--model", animal.model)
+    assert "tool in work" in said
+    assert "outside the box" not in said
+    up = machine.work.matrix.T[:, 2]
+    half = 0.5 * np.ptp(machine.platforms(corners(machine.box))[:, 2])
+    home.write_text("x_mm,y_mm,z_mm\n" + ",".join(f"{v / MM:.9f}" for v in machine.middle + (half + UM) * up) + "\n")
+    assert "outside the box" in animal.says("check", home, "--model", animal.model)
+    found = animal.tells("check", home, "--model", animal.model)
+    assert found["frame"] == "work"
+    distances = machine.lengths(*level_poses(machine, machine.middle + half * up[None]))
+    margin = np.minimum(distances - machine.stroke[0], machine.stroke[1] - distances).min()
+    assert found["rows"][0]["stroke_margin_nominal_mm"] * MM == pytest.approx(margin, abs=2 * UM)
+
+
+def test_assess(animal: Animal) -> None:
+    """Ideal lengths are the distances of the joints, and each machine's lengths differ by no more than its bounds."""
+    found = animal.tells("assess", animal.file("poses.csv"), "--joint-um", 10, "--strut-um", 10, "--machines", 2)
+    assert found["frame"] == "work"
+    tips, _, tools = tool_poses(animal.machine)
+    ideal = commands(animal.machine, Errors.none(), *animal.machine.platform_poses(tips, tools))
+    for seed in (0, 1):
+        rows = [row for row in found["records"] if row["seed"] == seed]
+        np.testing.assert_allclose(lengths(rows, "ideal_L{}_mm"), ideal, atol=WRITTEN)
+        assert 0.0 < np.abs(lengths(rows, "change_L{}_um")).max() < (2.0 * np.sqrt(3.0) + 1.0) * 10 * UM
+
+
+# Export
+
+
+def test_exports_read_back(animal: Animal) -> None:
+    """LinuxCNC's files and the table, read as their users do, give the commands of the fitted machine."""
+    cnc, path = animal.folder / "cnc", animal.file("table.csv")
+    found = animal.tells("export", "--model", animal.model, "--linuxcnc", cnc, "--table", path, "--step-mm", 1000)
+    assert found["frame"] == "work"
+    box = np.array(found["box_mm"]) * MM
+    platforms = animal.machine.platforms(corners(box))
+    valid = np.array(yaml.safe_load(Path(animal.model).read_text())["valid_box_mm"]) * MM
+    assert (platforms > valid[0] - UM).all()
+    assert (platforms < valid[1] + UM).all()
+    assert (np.ptp(box, axis=0) > 0.5 * np.array(animal.machine.half)).all(), "a box that is of use"
+    for check in found["checks"]:
+        assert check["level"]["after_rms_um"] < 0.5 * check["level"]["before_rms_um"]
+
+    rows = table(path)
+    tips = columns(rows, "x_mm", "y_mm", "z_mm") * MM
+    poses = level_poses(animal.machine, tips)
+    wanted = commands(animal.machine, animal.believed, *poses)
+    np.testing.assert_allclose(
+        lengths(rows, "correction_L{}_um") + animal.machine.lengths(*poses), wanted, atol=WRITTEN
+    )
+    tips = np.random.default_rng(8).uniform(*box, (50, 3))
+    wanted = commands(animal.machine, animal.believed, *level_poses(animal.machine, tips))
+    # Six decimals of mm in the files, and trims that bend by a few ppm of what the screws turn.
+    np.testing.assert_allclose(linuxcnc(cnc, tips), wanted, atol=3e-9)
+
+
+def level_poses(machine: Machine, tips: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return machine.platform_poses(tips, np.tile(np.eye(3), (len(tips), 1, 1)))
+
+
+def linuxcnc(folder: Path, tips: np.ndarray) -> np.ndarray:
+    """Return LinuxCNC's motor commands, (N, 6), m, at places of a level tool, from its files.
+
+    genhexkins.c: |P + a − b| + lead · arcsin(n_b3 · n_a2) / 2π with n_b3 = unit(u × (n_b × u)), n_a2 = unit(n_a × u);
+    control.c: plus the trim, straight between the points of the .comp file.
+    """
+    pins = dict(
+        line.split()[1:3] for line in (folder / "genhexkins.hal").read_text().splitlines() if line[:4] == "setp"
+    )
+
+    def six(name: str) -> np.ndarray:
+        keys = [[f"genhexkins.{name}.{i}.{axis}" for axis in "xyz"] for i in range(6)]
+        return np.array([[float(pins.get(key, 0.0)) for key in row] for row in keys])
+
+    struts = tips[:, None] / MM + six("platform") - six("base")
+    joints = np.linalg.norm(struts, axis=2)
+    lead = float(pins.get("genhexkins.screw-lead", 0.0))
+    if lead:
+        u = struts / joints[:, :, None]
+        b, a = np.cross(u, np.cross(six("base-n"), u)), np.cross(six("platform-n"), u)
+        sine = (a * b).sum(axis=2) / np.linalg.norm(a, axis=2) / np.linalg.norm(b, axis=2)
+        joints = joints + lead * np.arcsin(sine) / (2.0 * np.pi)
+    for i in range(6):
+        lines = (folder / f"strut_{i + 1}.comp").read_text().splitlines()
+        points = np.array([line.split() for line in lines if not line.startswith("#")], dtype=float)
+        joints[:, i] += np.interp(joints[:, i], points[:, 0], points[:, 1])
+    return joints * MM
+
+
+# Loop
+
+
+@pytest.fixture
+def bench(ros_context, spin_until, capfd) -> Iterator[Any]:
+    from node_helpers import Bench
+
+    with Bench(ros_context, spin_until, capfd) as made:
+        yield made
+
+
+def test_run_and_replay(animal: Animal, bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The node pair with the fitted model on the true machine: commands and true poses are ours, replayed bit for bit.
+
+    Each motor stands on a step: the tool is off by up to half a step of each strut times its leverage.
+    """
+    pytest.importorskip("rosbags")
+    from node_recorder import Recorder
+    from replay_helpers import write_bag
+
+    from hexapod_comp.nodes.client import LoopClient
+
+    # Nodes and client share one interpreter: on a busy computer an answer may take more than its second.
+    monkeypatch.setattr(LoopClient.wait_for_answer, "__defaults__", (20.0,))
+    machine = animal.machine
+    tips, _, tools = tool_poses(machine)
+    poses = machine.platform_poses(tips, tools)
+    files = {"geometry_file": animal.file("machine.yaml")}
+    bench.drive(truth_file=animal.file("truth.yaml"), **files)
+    bench.compensator(model_file=animal.model, max_command_age=0.0, ramp_rate=0.01, **files)
+    recorder = Recorder(bench)
+    bench.hush("tool_pose_command")  # only one may command
+    with spinning(bench):
+        found = animal.tells("run", animal.file("poses.csv"), "--attach")
+    recorder.stop()
+
+    assert (found["frame"], found["lost"], found["refused"]) == ("work", 0, 0)
+    told = lengths([pose["struts"] for pose in found["poses"]])
+    np.testing.assert_allclose(told, commands(machine, animal.believed, *poses), atol=WRITTEN)
+    true = columns([pose["true"] for pose in found["poses"]], "x_mm", "y_mm", "z_mm") * MM
+    expected = machine.tips(*goes_to(machine, animal.truth, told, *poses))
+    bound = np.abs(leverage(machine, *poses)).sum(axis=2) * STEP / 2.0 + 1e-9
+    assert (np.abs(true - expected) < bound).all()
+
+    bag = write_bag(animal.folder / "bag", recorder.messages)
+    assert "identical bit for bit" in hexapod("replay", bag)
+    found = json.loads(hexapod("replay", bag, "--json"))
+    assert found["same"]
+    assert found["geometry"]["name"] == machine.name
+
+
+@contextlib.contextmanager
+def spinning(bench: Any) -> Iterator[None]:
+    """Handle the bench's messages in another thread."""
+    done = threading.Event()
+
+    def spin() -> None:
+        while not done.is_set():
+            bench.executor.spin_once(timeout_sec=0.02)
+
+    thread = threading.Thread(target=spin)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+# Classification
+
+
+def test_classify(animal: Animal) -> None:
+    """At the pose that it names, the error that it names moves the tool as far as it says.
+
+    An effect is that of a structure: that screws turn with what they cause is left out.
+    """
+    machine = replace(animal.machine, lead=0.0)
+    budget = animal.folder / "budget.yaml"
+    errors = {"strut_length_um": 10, "base_joint_z_um": 10}
+    head = {"format": "hexapod_comp/error_budget", "version": 1, "machine": machine.name, "errors": errors}
+    budget.write_text(yaml.safe_dump(head))
+    words = ["classify", "--budget", budget, "--cells", 8, "--tilt-deg", 0]
+    found = animal.tells(*words)
+    box = np.array(found["reach"][0]["box_m"])
+    assert (box[0] < machine.middle).all()
+    assert (machine.middle < box[1]).all()
+    for row in found["ranking"]:
+        for name in ("translation_max", "translation_min"):
+            strut = int(row[f"{name}_error"].replace("joint ", "joint_").split("_")[1].split()[0]) - 1
+            tip = columns([row], *(f"{name}_{axis}_mm" for axis in "xyz")) * MM
+            angles = columns([row], *(f"{name}_{angle}_deg" for angle in ("alpha", "beta", "gamma")))[0]
+            poses = machine.platform_poses(tip, rotation(*angles)[None])
+            truth = Errors.none()
+            if "strut" in row[f"{name}_error"]:
+                truth.offset[strut] = 10 * UM
+            else:
+                truth.base[strut, 2] = 10 * UM
+            moved = machine.tips(*goes_to(machine, truth, commands(machine, Errors.none(), *poses), *poses)) - tip
+            assert row[f"{name}_um"] == pytest.approx(np.linalg.norm(moved) / UM, rel=2e-3)
