@@ -39,10 +39,17 @@ CORE += ("machine/*.py", "compensation/*.py", "kernels/*.py")
 NOT_CORE = {"pictures.py", "compiling.py"}
 
 TESTS = {
-    "pose.py": ["test_pose.py", "machine"],
+    "pose.py": ["test_pose.py", "nodes/test_conversions.py", "machine"],
     "machine": ["machine", "compensation", "virtual/test_simulation.py"],
-    "compensation": ["compensation", "machine/test_limits.py", "virtual/test_simulation.py", "replay"],
-    "kernels": ["machine/test_kinematics.py", "machine", "compensation", "virtual/test_simulation.py", "kernels"],
+    "compensation": ["compensation", "machine/test_limits.py", "replay", "virtual/test_simulation.py"],
+    "kernels": [
+        "machine/test_kinematics.py",
+        "machine",
+        "nodes/test_conversions.py",
+        "compensation",
+        "virtual",
+        "kernels",
+    ],
     "calibration": ["calibration/test_sensitivity.py", "calibration/test_fit.py", "calibration/test_observability.py"],
 }
 """Where a room's tests are, from near to far; before them run those whose file has the mutated module's name."""

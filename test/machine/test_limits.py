@@ -27,6 +27,7 @@ from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.kinematics import Structure, strut_lengths
 from hexapod_comp.machine.limits import REASONS, Limits
 from hexapod_comp.machine.model import MachineModel
+from hexapod_comp.machine.passes import Passes
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.pose import Pose
 from hexapod_comp.workspace.reach import Examiner
@@ -199,6 +200,13 @@ def test_progress_counts_every_row_once(mode: str) -> None:
     check(paper_geometry(), MachineModel("paper"), poses, mode, progress=done.append)
     assert sum(done) == len(poses)
     assert min(done) > 0
+
+
+def test_a_pass_out_of_reach_is_named_by_its_place() -> None:
+    positions = np.array([[0.0, 0.0, 0.4], [0.0125, 0.0, 0.9]])
+    passes = Passes(paper_geometry(), positions, np.tile(np.eye(3), (2, 1, 1)), np.tile([1.0, 0.0, 0.0], (2, 1)))
+    with pytest.raises(LimitError, match=r"^platform at \(12\.500, 0\.000, 900\.000\) mm: strut_1"):
+        passes.refuse_unreachable()
 
 
 def test_compensated_lengths_are_checked_too() -> None:
