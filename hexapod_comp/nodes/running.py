@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import TextIO
 
 import rclpy
@@ -84,8 +84,9 @@ def run(make_node: Callable[[], MachineNode], program: Program, argv: Sequence[s
             code = _run_until(stop, make_node, arguments, stderr)
         if argv is None:
             # Python's own end waits for threads of DDS, which now and then never end, though all has been closed.
-            sys.stdout.flush()
-            sys.stderr.flush()
+            for stream in filter(None, (sys.stdout, sys.stderr)):  # None: it was closed from the beginning
+                with suppress(OSError):
+                    stream.flush()
             os._exit(code)
         faulthandler.cancel_dump_traceback_later()
         signal.setitimer(signal.ITIMER_REAL, 0.0)

@@ -307,3 +307,10 @@ def test_an_end_that_hangs_is_cut_short_and_says_where(isolated_ros, tmp_path, h
     finally:
         made.kill()
     assert ENDED_WITHIN < 5.0  # after which ros2 launch asks again, and then kills
+
+
+def test_a_node_without_anybody_to_print_to_ends_in_order(isolated_ros):
+    """As a service manager may start it; a failed start ends with 1, as with a terminal."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = f"{sys.executable} -m hexapod_comp.nodes.compensator --ros-args -p geometry_file:=nowhere.yaml >&- 2>&-"
+    assert subprocess.run(["sh", "-c", command], env=environment, timeout=60.0, check=False).returncode == 1
