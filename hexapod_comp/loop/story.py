@@ -42,6 +42,9 @@ PROPORTIONS = np.array([1.0, 1.0, 0.5])
 LINES_APART, READINGS_APART = 0.25, 0.0625
 """Distances of the grid's lines, and of the readings along them, as shares of the longest side."""
 
+FEWEST_STEPS = 8
+"""Readings stand so close that the shortest side has as many steps: polynomials along it need nine."""
+
 POSES = 12
 """Held-out poses of the measured box."""
 
@@ -109,7 +112,8 @@ def demo_place(geometry: HexapodGeometry) -> Place:
 def demo_campaign(place: Place, instrument: str = "5-D", diagonals: int = 16) -> Campaign:
     """Return the campaign there: lines along the box's sides, and its diagonals, read with the default noise."""
     sides = np.ptp(place.box, axis=0)
-    apart, step = (min(share * float(sides.max()), float(sides.min())) for share in (LINES_APART, READINGS_APART))
+    longest, shortest = float(sides.max()), float(sides.min())
+    apart, step = min(LINES_APART * longest, shortest), min(READINGS_APART * longest, shortest / FEWEST_STEPS)
     return Campaign(place.box, apart, step, instrument, diagonals, level=place.attitude)
 
 

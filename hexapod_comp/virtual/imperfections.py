@@ -27,8 +27,8 @@ FIELD_POWERS = 4
 MAP_WAVES, KNOTS_PER_WAVE = 8, 15
 """Waves added up in a smooth length error; its knots on the shortest one: the spline between them is then the wave."""
 
-WAVES_OF_STROKE = (0.1, 0.35)
-"""Shortest and longest of them where bounds draw them, as shares of the stroke."""
+WAVES_OF_STROKE, LEAST_WAVES = (0.1, 0.35), (0.06, 0.2)
+"""Shortest and longest of them where bounds draw them: shares of the stroke, but no shorter than this, m."""
 
 SPANS = {"wave": "m", "backlash": "m", "strut_expansion": "1/K", "body_expansion": "1/K"}
 """Bounds that have a lowest and a highest value, and their units."""
@@ -63,7 +63,8 @@ class ImperfectionBounds:
     field_box : ndarray, shape (2, 3) or None
         Corners of the field's box, m in ``base``; needed when there is a field.
     length_map : float
-        Root mean square of every strut's smooth length error, m: waves from a tenth to a third of its stroke.
+        Root mean square of every strut's smooth length error, m: waves from a tenth to a third of its stroke,
+        but not below 60 and 200 mm.
     strut_expansion, body_expansion : (float, float)
         Lowest and highest thermal expansion of a strut, and of base and platform, 1/K.
     shared_platform_joints : bool
@@ -158,7 +159,8 @@ def draw_model(geometry: HexapodGeometry, bounds: ImperfectionBounds, seed: int,
     )
     if not bounds.length_map:
         return model
-    shortest, longest = (share * float(np.ptp(geometry.limits.stroke)) for share in WAVES_OF_STROKE)
+    stroke = float(np.ptp(geometry.limits.stroke))
+    shortest, longest = (max(share * stroke, least) for share, least in zip(WAVES_OF_STROKE, LEAST_WAVES, strict=True))
     return with_length_map(model, geometry, seed, bounds.length_map, (shortest, longest))
 
 
