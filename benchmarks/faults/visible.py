@@ -44,7 +44,7 @@ FOLLOWING_LIMIT = _default(compensator, "following_error_limit", 1e-3)
 
 SILENCE = {
     "pose": ("compensator", re.compile("no new command"), COMMAND_TIMEOUT),
-    "command": ("strut_drive", re.compile("no new command"), DRIVE_TIMEOUT),
+    "command": ("strut_drive", re.compile("no new command|waiting for the first command"), DRIVE_TIMEOUT),
     "feedback": ("compensator", re.compile("feedback lost|pose estimated from own commands"), FEEDBACK_TIMEOUT),
 }
 """Who must say what when a link is silent for longer than a time, s."""

@@ -240,7 +240,7 @@ class StrutDriveNode(MachineNode):
             yield WARN, "running, commands are being missed"
         if self._log_space.problem:
             yield WARN, self._log_space.problem
-        yield OK, "running"
+        yield OK, "running" if self._commands.count else "waiting for the first command"
 
     def _check_state(self) -> None:
         self._look_at_publishers()

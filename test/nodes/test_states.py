@@ -137,7 +137,7 @@ def test_no_command_yet(bench):
 
 def test_no_command_yet_drive(bench):
     bench.drive()
-    bench.until_status(OK, "running", DRIVE)
+    bench.until_status(OK, "waiting for the first command", DRIVE)
     bench.until(lambda: len(bench.seen["strut_states"]) > 20, "readings")
     readings = np.array([message.position for message in bench.seen["strut_states"]])
     assert np.ptp(readings, axis=0).max() < 1e-6, "noise"
