@@ -287,6 +287,24 @@ def test_ik_and_fk(animal: Animal) -> None:
         np.testing.assert_allclose(columns(back["rows"], "alpha_deg", "beta_deg", "gamma_deg"), angles, atol=1e-7)
 
 
+def test_a_cold_start_says_what_it_is_worth(animal: Animal, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every pose listed has the lengths, one is the working one, and a machine that is not 6-3 gets a note."""
+    machine = animal.machine
+    tips, _, tools = tool_poses(machine)
+    distances = machine.lengths(*machine.platform_poses(tips[:1], tools[:1]))[0]
+    found = animal.tells("fk", "--lengths", ",".join(f"{v / MM:.12f}" for v in distances), "--all-modes")
+    coincide = np.linalg.norm(machine.platform[::2] - machine.platform[1::2], axis=1).max() < 1e-9
+    assert ("nothing proves that there are no others" in capsys.readouterr().err) == (not coincide)
+    modes = found["modes"]
+    assert sum(mode["working"] for mode in modes) == 1
+    working = columns([mode for mode in modes if mode["working"]], "x_mm", "y_mm", "z_mm") * MM
+    np.testing.assert_allclose(working, tips[:1], atol=1e-9)
+    places = columns(modes, "x_mm", "y_mm", "z_mm") * MM
+    turns = np.array([rotation(*row) for row in columns(modes, "alpha_deg", "beta_deg", "gamma_deg")])
+    back = machine.lengths(*machine.platform_poses(places, turns))
+    np.testing.assert_allclose(back, np.tile(distances, (len(modes), 1)), atol=1e-9)
+
+
 def test_without_a_model_only_the_screws_count(animal: Animal) -> None:
     """The ideal machine has no errors, but its screws turn, and lengths are commands that lead back."""
     machine = animal.machine

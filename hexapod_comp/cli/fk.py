@@ -31,11 +31,28 @@ def run(args: argparse.Namespace) -> int:
         rows, lengths = _read(args)
     geometry, model = common.load_machine(args)
     common.mention_compiling("kinematics.solve_pose_many")
+    _mention_search(args, geometry, len(rows))
     if args.all_modes:
         _all_modes(args, geometry, lengths[0])
     else:
         _poses(args, geometry, model, rows, lengths)
     return 0
+
+
+def _mention_search(args: argparse.Namespace, geometry: HexapodGeometry, rows: int) -> None:
+    """Say on stderr what a start without a guess is worth where no theory counts the poses."""
+    from ..machine.assembly import ORIENTATIONS, is_six_three
+    from ..machine.kinematics import Structure
+
+    if not (args.cold or args.all_modes) or is_six_three(Structure.of(geometry)):
+        return
+    sets = "these lengths" if rows == 1 else "each row's lengths"
+    common.say_notes(
+        [
+            f"machine {geometry.name} is no 6-3 machine: Newton sought the poses of {sets} from home and "
+            f"{2 * ORIENTATIONS} starts all around; each closes the loops, but nothing proves that there are no others"
+        ]
+    )
 
 
 def _read(args: argparse.Namespace) -> tuple[list[Row], np.ndarray]:

@@ -68,7 +68,8 @@ example:
         """A file's columns are L1_mm … L6_mm (or _m, _um, _in), optionally sequence or name; CSV in gives CSV
 out, which ik and check read. With --model the lengths are commands, and the pose is where the real machine
 goes. Newton starts at home, or at --guess; --cold needs no guess: it finds every pose with these lengths
-and picks the one in which the machine can work (6-3 machines).
+and picks the one in which the machine can work. Of a 6-3 machine these are all; of others those that Newton
+finds from 4000 starts all around.
 
 example:
   $ hexapod_comp fk --lengths 519.494,519.808,509.192,509.192,499.282,498.955

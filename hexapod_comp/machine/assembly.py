@@ -1,12 +1,14 @@
 """Forward kinematics without a guess: every assembly mode of a 6-3 machine, and the pick of the working one.
 
 :mod:`hexapod_comp.machine.elimination` finds where to look, :mod:`hexapod_comp.kernels.assembly` closes the
-loops from there; this module makes poses of the triangles, continues them to real structures, and picks.
+loops from there; this module makes poses of the triangles, continues them to real structures, and picks. The modes
+of other machines, of which there may be forty, are sought by Newton from some thousand poses all around.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,7 +20,7 @@ from ..kernels.limits import Quantities, examine
 from ..pose import Pose, rotation_angle
 from .elimination import joint_circles, start_angles
 from .geometry import HexapodGeometry
-from .kinematics import Structure, jacobian, six_lengths, solve_pose
+from .kinematics import Structure, jacobian, six_lengths, solve_poses
 
 CLOSURE = 1e-12
 """Largest error of a strut length or of a platform side in a mode, relative to the longest strut."""
@@ -40,19 +42,23 @@ NEARLY_CLOSED = 20.0
 MOST_MODES = 16
 """A 6-3 machine has at most sixteen modes unless it can move with all struts locked."""
 
+MOST_GENERAL_MODES = 40
+"""A 6-6 machine has at most forty modes (Raghavan 1993) unless it can move with all struts locked."""
+
+ORIENTATIONS = 2000
+"""Attitudes from which the modes of a machine that is not 6-3 are sought, two positions each."""
+
 AMBIGUITY = 1.2
 """A cold start is refused when the second-nearest candidate is within this factor of the nearest."""
 
 
 def assembly_modes(structure: Structure, lengths: np.ndarray) -> list[Pose]:
-    """Return every real pose of a 6-3 machine that has these strut lengths; no guess is needed.
+    """Return every real pose of a machine that has these strut lengths; no guess is needed.
 
     Parameters
     ----------
     structure : Structure
-        Machine whose platform joints coincide in the pairs (1, 2), (3, 4), (5, 6), exactly or, on a real
-        structure, within :data:`PAIR_GAP`; base joints anywhere. Its home sign and largest condition number
-        are not used: all modes are returned.
+        Where the joints are. Its home sign and largest condition number are not used: all modes are returned.
     lengths : array_like, shape (6,)
         Strut lengths, m.
 
@@ -69,15 +75,19 @@ def assembly_modes(structure: Structure, lengths: np.ndarray) -> list[Pose]:
     SingularError
         The machine moves with its struts locked: its poses are not countable.
     KinematicsError
-        Not a 6-3 machine; or joints that define no circle or no triangle.
+        Joints of a 6-3 machine that define no circle or no triangle.
 
     Notes
     -----
-    For pairs that coincide the list is complete. For a real structure the modes of the machine with the
-    pairs' midpoints are continued by Newton. With deviations of a few tenths of a per cent of the platform's
-    size, modes within a hair of a singular pose (condition numbers above 100) can be missed there.
+    Where platform joints coincide in the pairs (1, 2), (3, 4), (5, 6), the list is complete. For a real structure,
+    pairs within :data:`PAIR_GAP`, the modes of the machine with the pairs' midpoints are continued by Newton. With
+    deviations of a few tenths of a per cent of the platform's size, modes within a hair of a singular pose
+    (condition numbers above 100) can be missed there. On any other machine the list is what Newton finds from
+    2 · :data:`ORIENTATIONS` poses and from home: nothing proves that it is complete.
     """
     lengths = six_lengths(lengths)
+    if not is_six_three(structure):
+        return sorted(_sought_poses(structure, lengths), key=lambda pose: -pose.position[2])
     _refuse_degenerate(structure)
     if platform_pair_gap(structure) <= EXACT_GAP * structure.characteristic_length:
         poses = _exact_poses(structure, lengths)
@@ -90,8 +100,7 @@ def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.nd
     """Return the pose in which the machine must be standing, for cold starts: no guess but its home.
 
     Of the modes to which :func:`mode_objections` has none the nearest to home is taken, by |Δposition| +
-    characteristic length · angle, unless the next is nearly as near. On a machine that is not 6-3 the one
-    candidate is what Newton finds from home.
+    characteristic length · angle, unless the next is nearly as near.
     A machine that stands outside its own limits, which lengths alone cannot show, is refused or, where another
     mode keeps the limits, taken to be in that one.
 
@@ -115,13 +124,10 @@ def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.nd
         No pose has these lengths.
     OtherAssemblyModeError
         No mode can be the working one (says how many there are and what rules each out), or two can.
-    NotFiniteError, SingularError, NotConvergedError, KinematicsError
-        As :func:`assembly_modes` or, where the machine is not 6-3, as :func:`solve_pose`.
+    NotFiniteError, SingularError, KinematicsError
+        As :func:`assembly_modes`.
     """
-    if platform_pair_gap(structure) > PAIR_GAP * structure.characteristic_length:
-        modes = [solve_pose(structure, lengths, geometry.home)]
-    else:
-        modes = assembly_modes(structure, lengths)
+    modes = assembly_modes(structure, lengths)
     if not modes:
         raise UnreachableError("no pose of the machine has these strut lengths", 0)
     objections = [mode_objections(geometry, structure, mode) for mode in modes]
@@ -186,6 +192,11 @@ def platform_pair_gap(structure: Structure) -> float:
     return float(np.linalg.norm(joints[0::2] - joints[1::2], axis=1).max())
 
 
+def is_six_three(structure: Structure) -> bool:
+    """Return whether a machine's platform joints coincide in pairs, to within :data:`PAIR_GAP`."""
+    return platform_pair_gap(structure) <= PAIR_GAP * structure.characteristic_length
+
+
 def _nearest_to_home(geometry: HexapodGeometry, structure: Structure, modes: list[Pose]) -> Pose:
     """Return the mode nearest to home; refuse where the next is nearly as near."""
 
@@ -221,15 +232,7 @@ def _home_side(geometry: HexapodGeometry, structure: Structure) -> tuple[np.ndar
 
 
 def _refuse_degenerate(structure: Structure) -> None:
-    """Refuse joints that make no 6-3 machine, or define no circles or no triangle."""
-    gap, allowed = platform_pair_gap(structure), PAIR_GAP * structure.characteristic_length
-    if gap > allowed:
-        raise KinematicsError(
-            "platform joints of struts (1, 2), (3, 4), (5, 6) must coincide to find poses without a guess, "
-            f"but are up to {gap * 1e3:.4g} mm apart ({allowed * 1e3:.4g} mm allowed): use solve_pose",
-            gap,
-            allowed,
-        )
+    """Refuse joints of a 6-3 machine that define no circles or no triangle."""
     tiny = 1e-6 * structure.characteristic_length
     for i in (0, 2, 4):
         apart = float(np.linalg.norm(structure.base_joints[i] - structure.base_joints[i + 1]))
@@ -287,6 +290,49 @@ def _continued_poses(structure: Structure, lengths: np.ndarray) -> list[Pose]:
             if pose is not None and not any(_same(structure, pose, other, lengths) for other in poses):
                 poses.append(pose)
     return poses
+
+
+def _sought_poses(structure: Structure, lengths: np.ndarray) -> list[Pose]:
+    """Return the poses that Newton finds from all around: random attitudes, and home, each pose once."""
+    anything = replace(structure, home_sign=0.0, max_condition=math.inf)
+    starts = _starts_around(structure, lengths)
+    batch = solve_poses(anything, np.tile(lengths, (len(starts[0]), 1)), starts)
+    positions, rotations = batch.positions[batch.ok], batch.rotations[batch.ok]
+    joints = positions[:, None] + structure.platform_joints @ np.swapaxes(rotations, 1, 2)
+    poses: list[Pose] = []
+    left = np.arange(len(positions))
+    while len(left):
+        first = left[0]
+        poses.append(Pose(positions[first], rotations[first]))
+        if len(poses) > MOST_GENERAL_MODES:
+            raise SingularError("the machine moves with its struts locked at these lengths: its pose is open")
+        apart = np.abs(joints[left] - joints[first]).max(axis=(1, 2))
+        left = left[apart > DISTINCT * lengths.max()]
+    return poses
+
+
+def _starts_around(structure: Structure, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions (N, 3), m, and rotations (N, 3, 3) that have the struts' lengths about right; home comes first.
+
+    At a given attitude the platform's origin is as far from b − R·t as strut's lengths say: six spheres. Their
+    common chords say where in the plane across which the centres spread least; the mean square of the lengths says
+    how far off it, to either side.
+    """
+    rotations = Rotation.random(ORIENTATIONS, random_state=0).as_matrix()
+    centres = structure.base_joints - structure.platform_joints @ np.swapaxes(rotations, 1, 2)
+    middle = centres.mean(axis=1)
+    around, squares = centres - middle[:, None], lengths**2
+    distances = (around**2).sum(axis=2)
+    chords = 0.5 * (distances - distances.mean(axis=1, keepdims=True) - squares + squares.mean())
+    left, sizes, axes = np.linalg.svd(around, full_matrices=False)
+    along = np.einsum("nik,ni->nk", left, chords)[:, :2] / np.maximum(
+        sizes[:, :2], 1e-9 * structure.characteristic_length
+    )
+    beside = np.einsum("nk,nki->ni", along, axes[:, :2])
+    off = squares.mean() - (beside**2).sum(axis=1) - distances.mean(axis=1)
+    off = np.sqrt(np.maximum(off, 0.0))[:, None] * axes[:, 2]
+    positions = np.concatenate([structure.home.position[None], middle + beside + off, middle + beside - off])
+    return positions, np.concatenate([structure.home.rotation[None], rotations, rotations])
 
 
 def _poses_at(structure: Structure, triangles: np.ndarray) -> list[Pose]:

@@ -16,7 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from hexapod_comp.errors import KinematicsError, NotFiniteError, OtherAssemblyModeError, SingularError, UnreachableError
 from hexapod_comp.kernels import kinematics as kernels
-from hexapod_comp.machine.assembly import assembly_modes, mode_objections, platform_pair_gap, working_mode
+from hexapod_comp.machine.assembly import (
+    _sought_poses,
+    assembly_modes,
+    mode_objections,
+    platform_pair_gap,
+    working_mode,
+)
 from hexapod_comp.machine.elimination import joint_circles, start_angles
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import Structure
@@ -263,16 +269,38 @@ def test_unreachable_lengths(geometry, structure):
             working_mode(geometry, structure, lengths)
 
 
-def test_other_machines_need_a_guess(geometry, structure):
+def test_other_machines_are_sought_from_all_around(geometry, structure):
+    """Truth: the pose that made the lengths, distances, and a multi-start of the tests' own."""
     split = structure.platform_joints.copy()
     split[::2, 0] += 0.03
     general = replace(structure, platform_joints=split)
-    pose = pose_mm_deg([10, -5, 410], [3, -4, 5])
-    lengths = distances(general, pose)
     assert platform_pair_gap(general) == pytest.approx(0.03)
-    with pytest.raises(KinematicsError, match=r"30 mm apart.*solve_pose"):
-        assembly_modes(general, lengths)
-    assert miss(pose, [working_mode(geometry, general, lengths)]) < REGULAR
+    for number, pose in enumerate(workspace_poses(geometry, 10, seed=6)):
+        lengths = distances(general, pose)
+        modes = assembly_modes(general, lengths)
+        assert miss(pose, modes) < REGULAR
+        assert miss(pose, [working_mode(geometry, general, lengths)]) < REGULAR
+        for mode in modes:
+            np.testing.assert_allclose(distances(general, mode), lengths, rtol=0, atol=5e-13)
+        if number < 2:
+            truth = multi_start(general, lengths, number)
+            assert len(modes) == len(truth)
+            assert max(miss(other, modes) for other in truth) < 1e-8
+
+
+def test_the_search_finds_what_the_elimination_finds(geometry, structure):
+    for pose in workspace_poses(geometry, 10, seed=7):
+        lengths = distances(structure, pose)
+        modes, sought = assembly_modes(structure, lengths), _sought_poses(structure, lengths)
+        assert len(sought) == len(modes)
+        assert max(miss(mode, sought) for mode in modes) < 1e-8
+
+
+def test_no_pose_of_a_general_machine(geometry, structure):
+    split = structure.platform_joints.copy()
+    split[::2, 0] += 0.03
+    with pytest.raises(UnreachableError):
+        working_mode(geometry, replace(structure, platform_joints=split), np.array([0.3, 0.9, 0.3, 0.9, 0.3, 0.9]))
 
 
 def test_joints_that_define_nothing(structure):
