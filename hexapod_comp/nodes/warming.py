@@ -28,6 +28,7 @@ from ..kernels.compiling import NotCompiledError, cache_folder, from_cache_only
 from ..machine.geometry import load_geometry
 from ..machine.model import RealMachine
 from ..machine.model_file import load_model
+from ..machine.struts import home_twists
 from ..virtual.machine import StrutDrive
 from .children import end_with_parent
 from .following import Following
@@ -41,6 +42,7 @@ LOCK = "compiling.lock"
 def warm() -> None:
     """Run every kernel that the nodes use, on a machine of every block, so that none compiles later."""
     geometry = load_geometry(config_file("paper.yaml"))
+    home_twists(load_geometry(config_file("example_6_6.yaml")))  # its screws have a lead
     model = load_model(config_file("paper_machine.yaml"), geometry)
     warm_up(Compensator(geometry, model))
     drive = StrutDrive(RealMachine(geometry, model))
