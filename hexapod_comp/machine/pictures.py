@@ -54,7 +54,7 @@ def draw_in_space(axes: Any, geometry: HexapodGeometry) -> None:
                 ends = joint + 0.1 * reach * np.outer([-1.0, 1.0], direction)
                 axes.plot(*ends.T, color=CARDAN, lw=2.5, label=label)
                 label = None
-    axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm")
+    axes.set(xlabel="x in base, mm", ylabel="y in base, mm", zlabel="z in base, mm")
     axes.view_init(elev=22.0, azim=-62.0)
 
 
@@ -62,7 +62,7 @@ def draw_flat(axes: Any, geometry: HexapodGeometry, plane: tuple[int, int], labe
     """Draw bodies and struts at home on flat axes, those two coordinates of ``base``, mm; with numbers or without."""
     base, platform = _joints(geometry)
     _bodies(axes, base[:, plane], platform[:, plane], labels)
-    axes.set(xlabel=f"{'xyz'[plane[0]]}, mm", ylabel=f"{'xyz'[plane[1]]}, mm", aspect="equal")
+    axes.set(xlabel=f"{'xyz'[plane[0]]} in base, mm", ylabel=f"{'xyz'[plane[1]]} in base, mm", aspect="equal")
     axes.margins(0.12)
 
 
