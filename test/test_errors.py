@@ -16,7 +16,7 @@ import pytest
 from hexapod_comp.errors import HexapodError
 
 PACKAGE = Path(__file__).resolve().parents[1] / "hexapod_comp"
-GIVEN = {"path": Path("mine.yaml"), "value": 0.25, "limit": 0.2, "strut": 3}
+GIVEN = {"path": Path("mine.yaml"), "value": 0.25, "limit": 0.2, "strut": 3, "status": 1}
 """Arguments that are no text."""
 
 

@@ -108,9 +108,6 @@ class CRefusal(HexapodError):
         self.status, self.reason = status, reason
         super().__init__(f"the C core refuses: {STATUS[status]}")
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return CRefusal, (self.status, self.reason)
-
 
 class CCompensator:
     """The C core of one machine; its methods are those of the Python ``Compensator`` of the same names.

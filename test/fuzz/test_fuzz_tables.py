@@ -15,7 +15,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fuzzing import FACTORS, Refused, cases, document, edits, finite, mutated, number_of, quantity, reader_of, same
+from fuzzing import (
+    FACTORS,
+    PLAIN,
+    Refused,
+    cases,
+    document,
+    edits,
+    finite,
+    mutated,
+    number_of,
+    quantity,
+    reader_of,
+    same,
+)
 from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -66,13 +79,33 @@ def put(folder: Path, name: str, data: bytes) -> Path:
 
 
 def rows_of(data: bytes) -> list[dict[str, str]]:
-    """Return a CSV file's rows as a spreadsheet shows them: comments and empty lines left out, no spaces around."""
-    lines = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), skipinitialspace=True)
+    """Return a CSV file's rows as a spreadsheet shows them: comments and empty lines left out, no spaces around.
+
+    The header tells what separates columns: commas, or else semicolons, or else tabs. Where it is not commas, numbers
+    with decimal commas get points.
+    """
+    assert b"\0" not in data
+    text = data.decode("utf-8-sig")
+    top = next(line for line in io.StringIO(text, newline="") if re.match(r'(?!\s*"?#)\s*\S', line))
+    bare = re.sub(r'"[^"]*"', "", top)
+    separator = next((mark for mark in ",;\t" if mark in bare), ",")
+    lines = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True)
     cells = [line for line in lines if line and not line[0].startswith("#")]
     header = [name.strip() for name in cells[0]]
     assert len(set(header)) == len(header)
     assert all(len(line) == len(header) for line in cells)
-    return [dict(zip(header, line, strict=True)) for line in cells[1:]]
+    rows = cells[1:] if separator == "," else with_points(cells[1:])
+    return [dict(zip(header, line, strict=True)) for line in rows]
+
+
+def with_points(rows: list[list[str]]) -> list[list[str]]:
+    """Return rows whose numbers with decimal commas have points; check that a comma can only be a decimal one."""
+    flat = [cell.strip() for line in rows for cell in line]
+    commas = [cell for cell in flat if re.fullmatch(r"[-+]?[0-9]+,[0-9]+([eE][-+]?[0-9]+)?", cell)]
+    if commas:
+        assert not [cell for cell in flat if "." in cell and PLAIN.fullmatch(cell)], "points and commas"
+        assert not all(re.fullmatch(r"[-+]?[1-9][0-9]{0,2},[0-9]{3}", cell) for cell in commas), "may be thousands"
+    return [[cell.replace(",", ".") if cell.strip() in commas else cell for cell in line] for line in rows]
 
 
 def column(rows: list[dict[str, str]], name: str, kind: str) -> list[float] | None:
