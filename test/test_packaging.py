@@ -36,9 +36,9 @@ ROSDEP_KEYS = {name: f"python3-{name}" for name in PYTHON3}
 PYPI_NAMES = {"yaml": "pyyaml"}
 # setuptools runs setup.py wherever that is read, mpl_toolkits comes with matplotlib and llvmlite with Numba, apsw
 # and lz4 with rosbags, hal and linuxcnc with LinuxCNC, benchmarks are the source tree's; the others are optional
-# extras and benchmark tools.
+# extras, what only `pytest -n` needs, and benchmark tools.
 COMING_WITH = {"setuptools", "mpl_toolkits", "llvmlite", "apsw", "lz4", "hal", "linuxcnc", "benchmarks"}
-EXEMPT = COMING_WITH | {"argcomplete", "plotly", "distributed", "rosbags", "mujoco", "pinocchio"}
+EXEMPT = COMING_WITH | {"xdist", "argcomplete", "plotly", "distributed", "rosbags", "mujoco", "pinocchio"}
 WITHOUT_ROS = """
 import importlib, sys
 

@@ -247,7 +247,7 @@ def test_the_papers_metric_is_taken_along_the_work_frame(animal: Animal) -> None
 
 def test_pictures_are_drawn(animal: Animal) -> None:
     names = {path.name for path in Path(animal.file("pictures")).iterdir()}
-    assert names == {"fit.png", "left.png", "strut_errors.png"}
+    assert names == {"fit.png", "left.png", "predicted_error.png", "strut_errors.png"}
 
 
 def test_plan_and_iso230_take_the_campaign_and_its_readings(animal: Animal) -> None:

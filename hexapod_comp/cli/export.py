@@ -29,11 +29,11 @@ def run(args: argparse.Namespace) -> int:
     from ..export.worth import ExportTrial
     from ..machine.model import commanded_box
 
-    if args.linuxcnc is None and args.table is None and args.c is None:
+    if args.linuxcnc is None and args.table is None and args.c_folder is None:
         raise InputFileError("export", "--linuxcnc, --table, --c", "at least one is needed: nothing to write")
     geometry, model = common.load_machine(args)
     common.mention_compiling("model.actual_pose_one")
-    core = [] if args.c is None else _c(args, geometry, model)
+    core = [] if args.c_folder is None else _c(args, geometry, model)
     if args.linuxcnc is None and args.table is None:
         return _show_core(args, model, core)
     box = commanded_box(geometry, model) if args.box is None else np.array(args.box)
@@ -66,7 +66,7 @@ def _c(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel)
     from ..machine.model_file import IDEAL
 
     made_of = [IDEAL_SOURCE if name == IDEAL else Source.read(input_file(name)) for name in (args.machine, args.model)]
-    return [str(file) for file in write_c(args.c, geometry, model, (made_of[0].sha256, made_of[1].sha256))]
+    return [str(file) for file in write_c(args.c_folder, geometry, model, (made_of[0].sha256, made_of[1].sha256))]
 
 
 def _show_core(args: argparse.Namespace, model: MachineModel, written: list[str]) -> int:

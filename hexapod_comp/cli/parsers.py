@@ -193,7 +193,12 @@ def _replay(parser: argparse.ArgumentParser) -> None:
     add("--model", metavar="FILE", help=f"model file, the name of a shipped one, {WORDS} {own}")
     text = "accept differences up to this, µm (default 0: the same bits)"
     add("--tolerance-um", type=arguments.bound, default=0.0, metavar="UM", help=text)
-    add("--c", metavar="LIBRARY", help="run the C core of an export --c, compiled as a shared library, instead")
+    add(
+        "--c",
+        dest="library",
+        metavar="LIBRARY",
+        help="run the C core of an export --c, compiled as a shared library, instead",
+    )
     _pictures(add)
     _table_out(add, "all corrections")
     _json(add)
@@ -322,7 +327,7 @@ def _export(parser: argparse.ArgumentParser) -> None:
     _machine_and_model(add)
     add("--linuxcnc", metavar="FOLDER", help="folder for LinuxCNC's files; made if it is missing")
     add("--table", type=arguments.csv_file, metavar="FILE.csv", help="CSV file for the trilinear table")
-    add("--c", metavar="FOLDER", help="folder for the compensator in C with this machine's constants")
+    add("--c", dest="c_folder", metavar="FOLDER", help="folder for the compensator in C with this machine's constants")
     text = "LinuxCNC's machine unit, [TRAJ]LINEAR_UNITS (default mm)"
     add("--units", choices=("mm", "inch"), default="mm", help=text)
     text = "lowest and highest tool position, mm (default: the model's valid box, else its field's)"

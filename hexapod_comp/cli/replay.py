@@ -67,17 +67,17 @@ def _maker(args: argparse.Namespace, recording: Recording) -> Callable[[HexapodG
     from ..errors import InputFileError
     from ..export.c_library import CCompensator
 
-    if args.c is None:
+    if args.library is None:
         return Compensator
     first = recording.first
     wanted = first.geometry["sha256"], first.model["sha256"]
 
     def make(geometry: HexapodGeometry, model: MachineModel) -> CCompensator:
-        core = CCompensator(args.c, geometry, model)
+        core = CCompensator(args.library, geometry, model)
         for what, made_of, used in zip(("geometry", "model"), core.hashes, wanted, strict=True):
             if made_of != used:
                 raise InputFileError(
-                    args.c, "", f"is made of another {what} file than the recording's (SHA-256 {made_of})"
+                    args.library, "", f"is made of another {what} file than the recording's (SHA-256 {made_of})"
                 )
         return core
 

@@ -14,13 +14,25 @@ from typing import IO, Any
 
 from ..errors import InputFileError
 
-READ = ("bag", "budget", "campaign", "columns", "files", "lengths_file", "machine", "model", "poses", "truth")
+READ = (
+    "bag",
+    "budget",
+    "campaign",
+    "columns",
+    "files",
+    "lengths_file",
+    "library",
+    "machine",
+    "model",
+    "poses",
+    "truth",
+)
 """Arguments of all verbs that name what is read: files, shipped files, or a bag's folder."""
 
 WRITTEN = ("out", "report", "table")
 """Arguments that name files to write."""
 
-FOLDERS = ("folder", "linuxcnc", "pictures")
+FOLDERS = ("c_folder", "folder", "linuxcnc", "pictures")
 """Arguments that name folders to write into; they are made."""
 
 _protected: dict[tuple[int, int], str] = {}

@@ -57,7 +57,7 @@ def tool_motion(machine: Machine, errors: Errors, positions: np.ndarray, rotatio
     return np.hstack([machine.tips(*went) - machine.tips(positions, rotations), turns])
 
 
-@pytest.mark.parametrize("name", ["framed 6-6", "hanging", "inches"])
+@pytest.mark.parametrize("name", ["framed", "hanging", "inches"])
 def test_errors_spread_as_those_of_machines_that_are_drawn(name: str, tmp_path: Path) -> None:
     """1500 machines: a standard deviation is known to 1/√3000, 1.8 %; 8 % is beyond four of these.
 
@@ -136,7 +136,7 @@ def test_without_a_fit_errors_are_there_but_nobody_knows_how_well() -> None:
 
 
 def test_many_poses_are_as_each_alone(tmp_path: Path) -> None:
-    fitted = known(machines()["framed 6-6"], tmp_path)
+    fitted = known(machines()["framed"], tmp_path)
     predictor = ErrorPredictor(RealMachine(fitted.space.geometry, fitted.space.model(fitted.x)), fitted)
     rng, home = np.random.default_rng(5), fitted.space.geometry.home
     positions = home.position + 0.02 * rng.uniform(-1.0, 1.0, (600, 3))  # three parts
@@ -158,7 +158,7 @@ def test_many_poses_are_as_each_alone(tmp_path: Path) -> None:
 
 def saved(folder: Path) -> tuple[FittedParameters, Path]:
     """Write a model and what its fit knows."""
-    fitted, path = known(machines()["framed 6-6"], folder), folder / "after the crash.yaml"
+    fitted, path = known(machines()["framed"], folder), folder / "after the crash.yaml"
     model = fitted.space.model(fitted.x)
     model = dataclasses.replace(model, origin=dataclasses.replace(model.origin, date="2026-01-31"))
     assert save_with_posterior(model, fitted, path) == [folder / "after the crash.posterior.npz"]

@@ -567,7 +567,10 @@ def test_fit_of_too_short_lines_says_which_and_what_is_needed(hexapod: Program, 
         ("--campaign key.yaml", r"key\.yaml: colour: is not a known key here \(found 'blue'\)"),
         ("--campaign paper", "format: must be 'hexapod_comp/campaign'"),
         ("--campaign small.yaml --truth gone.yaml", r"gone\.yaml: there is no such file"),
-        ("--campaign small.yaml --machine jugglebot", r"machine: the model is for another machine"),
+        (
+            "--campaign small.yaml --machine jugglebot --truth paper_machine",
+            r"machine: the model is for another machine",
+        ),
         ("--campaign small.yaml --out nowhere/m.csv", r"nowhere/m\.csv: cannot be written"),
     ],
 )
@@ -720,4 +723,4 @@ def test_iso230_of_single_passes_says_what_is_missing(hexapod: Program, tmp_path
     (tmp_path / "once.csv").write_text(TIDY + "".join(rows))
     assert_refused(hexapod("iso230", tmp_path / "once.csv"), "no linear run has two cycles or more")
     complaint = r"gone\.csv: there is no such file; \.csv, \.rtl, \.rtx files beside it: once\.csv"
-    assert_refused(hexapod("iso230", "gone.csv"), complaint)
+    assert_refused(hexapod("iso230", tmp_path / "gone.csv"), complaint)

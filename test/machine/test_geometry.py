@@ -289,6 +289,6 @@ def test_a_file_is_read_once(tmp_path):
 
 
 def test_no_such_machine_says_which_there_are(tmp_path):
-    shipped = r"no such file; shipped: jugglebot\.yaml, paper\.yaml, positioning_unit\.yaml"
+    shipped = r"no such file; shipped: example_6_6\.yaml, jugglebot\.yaml, paper\.yaml, positioning_unit\.yaml"
     with pytest.raises(InputFileError, match=shipped):
         load_geometry(tmp_path / "papper.yaml")

@@ -205,7 +205,7 @@ def test_progress_counts_every_row_once(mode: str) -> None:
 def test_a_pass_out_of_reach_is_named_by_its_place() -> None:
     positions = np.array([[0.0, 0.0, 0.4], [0.0125, 0.0, 0.9]])
     passes = Passes(paper_geometry(), positions, np.tile(np.eye(3), (2, 1, 1)), np.tile([1.0, 0.0, 0.0], (2, 1)))
-    with pytest.raises(LimitError, match=r"^platform at \(12\.500, 0\.000, 900\.000\) mm: strut_1"):
+    with pytest.raises(LimitError, match=r"^platform at \(12\.500, 0\.000, 900\.000\) mm in base: strut_1"):
         passes.refuse_unreachable()
 
 
