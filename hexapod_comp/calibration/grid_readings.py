@@ -11,8 +11,9 @@ import numpy as np
 from ..errors import CalibrationError
 from ..machine.field import COMPONENTS, CROSS_AXES
 from ..machine.kinematics import Structure, strut_lengths_batch
-from ..machine.model import REFERENCE_TEMPERATURE
+from ..machine.model import REFERENCE_TEMPERATURE, MachineModel, RealMachine
 from ..measurements.readings import AXES, CHANNELS, KINDS, LEAST_TRAVEL, MeasurementSet
+from ..virtual.instruments import station_errors
 
 WARM = 0.5
 """Temperatures further than this from the reference, K, are mentioned: the scheme has no temperature."""
@@ -81,10 +82,22 @@ def grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
     notes += _warm_note(m.stations.temperatures[station]) + _command_note(m, np.unique(station))
     direction = m.stations.sense[station, axis].astype(int)
     node = np.zeros((len(kept), 3), dtype=int)
-    value = m.value[kept] * np.sign(m.directions()[kept, component[kept]])
+    value = _of_the_model(m)[kept] * np.sign(m.directions()[kept, component[kept]])
     sloping = m.kind[kept] == KINDS.index("straightness")
     point = m.points()[station]
     return Readings(axis, component[kept], direction, m.run[kept], m.cycle[kept], point, node, value, sloping), notes
+
+
+def _of_the_model(measurements: MeasurementSet) -> np.ndarray:
+    """Return readings without what the turning of the screws does to them, shape (N,), m or rad.
+
+    Where the geometry has a lead, whoever applies the model undoes that anyway: in the field it would count twice.
+    """
+    m = measurements
+    if not m.geometry.screw_lead.any():
+        return m.value
+    turning = station_errors(m, RealMachine(m.geometry, MachineModel(m.geometry.name)))
+    return m.value - (m.directions() * turning[m.station]).sum(axis=1)
 
 
 def _components(measurements: MeasurementSet, wanted: np.ndarray) -> np.ndarray:

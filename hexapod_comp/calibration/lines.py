@@ -14,6 +14,8 @@ straightness beam lies off the axis by a slope that nobody knows. So
 How the planes through home stand and bend (1-D data), or the squareness of the axes, the twists of the
 planes and, without a roll channel, the roll (5-D data) so remain in the machine.
 
+Where screws turn with cardan joints, what that does to the readings is known from the geometry and taken off first.
+
 **What several families say about one component.** The three families of a field add up, but the lines along
 x, y and z all cross in the grid's nodes and see the same errors there. With 5-D data dx is the linear
 displacement on x-lines and a straightness on y- and z-lines. Were all three added as read, a term such as

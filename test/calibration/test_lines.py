@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from foreign_machines import machines
 from scipy.stats import linregress
 
 from hexapod_comp.calibration.evaluation import PaperMetric, held_out, paper_metric, worth
@@ -102,6 +103,22 @@ def test_a_machine_of_the_papers_form_is_found_again(quiet, linear_truth, order)
     assert all(nodes == pytest.approx(true) for nodes, true in zip(fit.model.field.grid, GRID, strict=True))
     assert fit.model.valid_box == pytest.approx(BOX)
     assert len([note for note in fit.notes if "too few points" in note]) == (order == 4)
+
+
+@pytest.mark.parametrize("instrument", ["1-D", "5-D"])
+def test_what_the_screws_turning_does_is_not_counted_twice(tmp_path, instrument):
+    """A machine without errors has none, though its screws turn: 1e-12 m and rad are the solver's rounding.
+
+    Told nominal lengths it errs by micrometres, and whoever applies the model takes that from the geometry.
+    """
+    machine = machines()["unit"]
+    geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
+    campaign = Campaign(machine.box, 0.01, 0.002, instrument=instrument, diagonals=0, noise=(0.0,) * 5)
+    ideal = RealMachine(geometry, MachineModel(geometry.name))
+    measured = measure(template(campaign, geometry), campaign, ideal, 0)
+    assert np.abs(measured.value).max() > 1e-6
+    for family in fit_lines(measured).model.field.lines:
+        assert np.abs(family).max(initial=0.0) < 1e-12
 
 
 def test_every_line_is_zero_at_home_in_the_mean_of_both_directions(geometry, real_fit):
