@@ -96,6 +96,21 @@ def test_self_test_notices_three_units_in_the_last_place(tmp_path):
     assert "WRONG" in ran.stdout
 
 
+def test_the_loop_of_the_page_compiles_and_answers(tmp_path):
+    """doc/c_core.md, as it stands there; at home an ideal machine is told its nominal lengths."""
+    geometry = paper_geometry()
+    write_c(tmp_path, geometry, MachineModel(geometry.name), ("", ""))
+    page = (CONFIG.parent / "doc" / "c_core.md").read_text(encoding="utf-8")
+    (tmp_path / "loop.c").write_text(page.split("```c\n")[1].split("```")[0])
+    made = compiled(tmp_path, "-fPIC", "-shared", "hexapod_comp.c", "loop.c", "-o", "loop.so")
+    assert made.returncode == 0, made.stderr
+    loop, struts, pose = ctypes.CDLL(str(tmp_path / "loop.so")), (c_double * 6)(), geometry.tool_pose(geometry.home)
+    loop.start()
+    assert loop.cycle((c_double * 7)(*pose.position, *pose.quaternion()), c_double(0.0), struts) == 0
+    expected = np.linalg.norm(geometry.home.position + geometry.platform_joints - geometry.base_joints, axis=1)
+    np.testing.assert_allclose(list(struts), expected, rtol=0.0, atol=1e-15)
+
+
 def test_names_of_refusals_are_the_header_s_in_its_order():
     """The enumeration is counted by hand on both sides."""
     header = (SOURCES / "hexapod_comp.h").read_text()
