@@ -16,6 +16,7 @@ from hexapod_comp.formats.paths import config_file
 from hexapod_comp.loop.processes import reserve_domain
 
 if TYPE_CHECKING:
+    from node_helpers import Bench
     from rclpy.context import Context
     from rclpy.executors import Executor
 
@@ -103,6 +104,15 @@ def _private_context(domain: int) -> Iterator[Context]:
     rclpy.init(args=[], context=context, domain_id=domain)
     yield context
     rclpy.try_shutdown(context=context)
+
+
+@pytest.fixture
+def bench(ros_context: Context, spin_until: Callable[..., None], capfd: pytest.CaptureFixture[str]) -> Iterator[Bench]:
+    """Give a bench for nodes in a private context."""
+    from node_helpers import Bench
+
+    with Bench(ros_context, spin_until, capfd) as made:
+        yield made
 
 
 @pytest.fixture

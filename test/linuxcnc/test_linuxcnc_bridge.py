@@ -13,7 +13,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
 
@@ -81,12 +80,6 @@ class Machine:
         seen = len(self.poses)
         self.bench.until(lambda: len(self.poses) >= seen + count, "poses")
         return self.poses[-1]
-
-
-@pytest.fixture
-def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
-    with Bench(ros_context, spin_until, capfd) as made:
-        yield made
 
 
 @pytest.fixture

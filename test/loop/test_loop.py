@@ -9,7 +9,6 @@ from the package. The reversal bands, ticks and Newton steps add 1e-9 m, which i
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -48,12 +47,6 @@ LINES_MODEL = "paper_lines_model.yaml"
 
 TARGETS = [table_poses()[index] for index in (1, 3)]
 """Two poses of the paper's Table 1, tilted by 5° about x and about z."""
-
-
-@pytest.fixture
-def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
-    with Bench(ros_context, spin_until, capfd) as made:
-        yield made
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -58,12 +58,6 @@ CROSSED = Pose.from_angles([0.01, -0.02, 0.42], np.deg2rad([3.0, -2.0, 60.0]))
 
 ROUNDING = 1e-12
 """Lengths below a metre, a dozen operations: a few 1e-16 m; the wire is exact. Everything real is 1e-9 m."""
-
-
-@pytest.fixture
-def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
-    with Bench(ros_context, spin_until, capfd) as made:
-        yield made
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ strut lengthens by less than the tool rises, so closed form lengths say how far.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -27,12 +26,6 @@ from hexapod_comp.nodes.stamps import nanoseconds_of, stamp_of
 
 SPEED = 0.25
 """Largest strut speed of the bench's machine, m/s."""
-
-
-@pytest.fixture
-def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
-    with Bench(ros_context, spin_until, capfd) as made:
-        yield made
 
 
 @pytest.fixture(autouse=True)

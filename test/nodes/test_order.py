@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 from node_helpers import CONFIG, HOME, Bench, closed_form_lengths, near
@@ -18,12 +16,6 @@ from hexapod_comp.nodes.log_space import LogSpace
 from hexapod_comp.nodes.order import InOrder, NoStep
 
 SECOND = 1_000_000_000
-
-
-@pytest.fixture
-def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
-    with Bench(ros_context, spin_until, capfd) as made:
-        yield made
 
 
 @pytest.mark.parametrize(

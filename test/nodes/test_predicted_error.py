@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
 
 import calibration_helpers as small
 import numpy as np
@@ -30,12 +29,6 @@ STANDING, ALIGNED = "compensator/predicted_error", "compensator/predicted_error_
 UM = 1e-6
 STARTED = 60.0
 """The process imports for a second on a free processor, s."""
-
-
-@pytest.fixture
-def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
-    with Bench(ros_context, spin_until, capfd) as made:
-        yield made
 
 
 @pytest.fixture

@@ -32,12 +32,6 @@ SECOND = 1_000_000_000
 EXPANDING = {"expansion_ppm_per_K": 12.0}
 
 
-@pytest.fixture
-def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
-    with Bench(ros_context, spin_until, capfd) as made:
-        yield made
-
-
 @pytest.fixture(params=["stranger", "witness"])
 def other(request: pytest.FixtureRequest, bench: Bench) -> Iterator[Node]:
     """Another node: of a name of its own, or of the one that is there already."""

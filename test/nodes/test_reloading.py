@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from node_helpers import CONFIG, HOME, Bench, model_file, near
+from node_helpers import CONFIG, HOME, model_file, near
 
 from hexapod_comp.compensation.journal import LARGEST_SOURCE, Source
 from hexapod_comp.errors import InputFileError
@@ -28,12 +27,6 @@ from hexapod_comp.nodes.health import WARN
 from hexapod_comp.nodes.model_loading import Loading, LoadingError, ModelName
 
 ROUNDING = 1e-12
-
-
-@pytest.fixture
-def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
-    with Bench(ros_context, spin_until, capfd) as made:
-        yield made
 
 
 def field(displacement_um: float, outside: str = "hold") -> dict[str, object]:

@@ -6,7 +6,7 @@ The truth is what the node has sent.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +24,6 @@ from replay_helpers import Messages, write_bag
 
 from hexapod_comp.replay.bag import Recording, read_recording
 from hexapod_comp.replay.replay import BEFORE, IDENTICAL, Replay, replay_recording
-
-
-@pytest.fixture
-def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
-    with Bench(ros_context, spin_until, capfd) as made:
-        yield made
 
 
 def replayed(bag: Path, namespace: str | None = None) -> tuple[Recording, Replay]:

@@ -6,11 +6,10 @@ After its process has started, an activation, a reset; with feedback, without, a
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from node_helpers import HOME, Bench, closed_form_lengths, near
+from node_helpers import HOME, closed_form_lengths, near
 
 from hexapod_comp.errors import CommandError
 from hexapod_comp.nodes import health
@@ -18,12 +17,6 @@ from hexapod_comp.nodes.following import LastKnown
 from hexapod_comp.nodes.health import ERROR, OK, WARN
 
 ROUNDING = 1e-12
-
-
-@pytest.fixture
-def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
-    with Bench(ros_context, spin_until, capfd) as made:
-        yield made
 
 
 @pytest.fixture(autouse=True)

@@ -37,12 +37,6 @@ MOVED = near(HOME, (0.0002, 0.0001, -0.0003))
 ROUNDING = 1e-12
 
 
-@pytest.fixture
-def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
-    with Bench(ros_context, spin_until, capfd) as made:
-        yield made
-
-
 @pytest.fixture(autouse=True)
 def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """What colours a status for one or two seconds does so for 0.3 s."""

@@ -42,12 +42,6 @@ FORGED = "base\n[INFO] [1.0] [compensator]: all is well\r\x1b[2J\x1b[31m\u202e"
 HUGE = FORGED + 10_000_000 * "x"
 
 
-@pytest.fixture
-def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
-    with Bench(ros_context, spin_until, capfd) as made:
-        yield made
-
-
 def bridge(bench: Bench) -> LinuxcncBridgeNode:
     """Add a LinuxCNC bridge on a machine that is on; the witness no longer commands."""
     bench.hush("tool_pose_command")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -29,12 +28,6 @@ EXACT = {"truth_file": "ideal", "step": 0.0, "encoder_resolution": 0.0, "encoder
 """A machine without errors: where its struts are is where they were sent."""
 
 TARGET = near(HOME, (0.0003, -0.0002, 0.0005))
-
-
-@pytest.fixture
-def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
-    with Bench(ros_context, spin_until, capfd) as made:
-        yield made
 
 
 def command(bench: Bench, lengths: np.ndarray, names: tuple[str, ...] = STRUT_NAMES) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -19,12 +18,6 @@ from std_msgs.msg import Bool, UInt64
 from hexapod_comp.nodes import health
 from hexapod_comp.nodes.health import ERROR, OK, WARN
 from hexapod_comp.nodes.vital_signs import LATCHED_QOS
-
-
-@pytest.fixture
-def bench(ros_context, spin_until, capfd) -> Iterator[Bench]:
-    with Bench(ros_context, spin_until, capfd) as made:
-        yield made
 
 
 @pytest.fixture(autouse=True)
