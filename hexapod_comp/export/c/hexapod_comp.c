@@ -272,12 +272,6 @@ static double rotation_error(const mat *r)
 
 /* ---- Kinematics: kernels/kinematics.py ------------------------------------------------------------------------ */
 
-static vec strut_vector(const double base[6][3], const double platform[6][3], const hc_pose *pose, int i)
-{
-    const mat r = three_rows(pose->rotation);
-    return strut_between(row_of(base[i]), row_of(platform[i]), row_of(pose->position), &r);
-}
-
 /* Replace R by exp(w) R. */
 static void rotate(double r[3][3], double wx, double wy, double wz)
 {
@@ -459,10 +453,10 @@ static hc_status newton(const double base[6][3], const double platform[6][3], co
     double jacobian[6][6], step[6];
     int iteration, i, k;
     for (iteration = 0; iteration < MAX_ITERATIONS; iteration++) {
+        const six_struts now = struts_of(base, platform, pose);
         double turn, shrink, size;
         for (i = 0; i < 6; i++) {
-            step[i] = lengths[i]
-                      - jacobian_row(base[i], pose->position, strut_vector(base, platform, pose, i), jacobian[i]);
+            step[i] = lengths[i] - jacobian_row(base[i], pose->position, now.strut[i], jacobian[i]);
         }
         if (solve_six(jacobian, step) == 0.0) {
             return HC_SINGULAR;
@@ -480,11 +474,11 @@ static hc_status newton(const double base[6][3], const double platform[6][3], co
         rotate(pose->rotation, shrink * step[3], shrink * step[4], shrink * step[5]);
         if (size < STEP_TOLERANCE) {
             mat r;
-            six_struts now;
+            six_struts settled;
             orthonormalise(pose->rotation);
             r = three_rows((const double(*)[3])pose->rotation);
-            now = struts_at(base, platform, row_of(pose->position), &r);
-            return closes(&now, &r, lengths) ? HC_OK : HC_NOT_CONVERGED;
+            settled = struts_at(base, platform, row_of(pose->position), &r);
+            return closes(&settled, &r, lengths) ? HC_OK : HC_NOT_CONVERGED;
         }
     }
     return HC_NOT_CONVERGED;
@@ -904,18 +898,18 @@ static double follow(double value, double threshold, double low[9], double sense
     return sense[index];
 }
 
-/* screw_shift: how much longer the command must be for the screw's rotation, m (screw_twist is part of it) */
-static double screw_shift(const hc_state *state, const hc_pose *pose, int i)
+/* screw_shift: how much longer the command must be for the screw's rotation, m (screw_twist is part of it); `now` are
+ * the struts at the pose */
+static double screw_shift(const hc_model *model, const hc_pose *pose, const six_struts *now, int i)
 {
-    const hc_model *model = state->model;
     const hc_strut *strut = &model->struts[i];
     vec s, u, b, p;
     double length, sine, cosine, turns;
     if (strut->lead == 0.0) {
         return 0.0;
     }
-    s = strut_vector(state->base_joints, state->platform_joints, pose, i);
-    length = norm(s);
+    s = now->strut[i];
+    length = now->length[i];
     u = vector(s.x / length, s.y / length, s.z / length);
     b = row_of(model->base.axes[i]);
     p = lever(pose, model->platform.axes[i]);
@@ -1003,7 +997,7 @@ static int run_backwards(const hc_state *state, const hc_pose *platform, double 
     *now = struts_of(state->base_joints, state->platform_joints, q);
     for (i = 0; i < 6; i++) {
         const double direction = follow(now->length[i], model->strut_threshold, low, sense, 3 + i);
-        commands[i] = command_for_length(state, i, now->length[i], direction, screw_shift(state, q, i));
+        commands[i] = command_for_length(state, i, now->length[i], direction, screw_shift(model, q, now, i));
     }
     return solved;
 }
@@ -1282,9 +1276,13 @@ static hc_status run_forwards(const hc_state *state, const double commands[6], h
         turning = turning || model->struts[i].lead != 0.0;
     }
     for (count = 0; count < LEAD_ITERATIONS; count++) {
+        six_struts now;
         double change = 0.0;
+        if (turning) {
+            now = struts_of(state->base_joints, state->platform_joints, q);
+        }
         for (i = 0; i < 6; i++) {
-            const double shift = screw_shift(state, q, i);
+            const double shift = screw_shift(model, q, &now, i);
             change = fmax(change, fabs(shift - shifts[i]));
             shifts[i] = shift;
             lengths[i] = actual_length(state, i, commands[i], state->last.motion_sense[3 + i], shift);
