@@ -63,12 +63,13 @@ def _replayed(args: argparse.Namespace, recording: Recording) -> tuple[Report, H
 
 def _maker(args: argparse.Namespace, recording: Recording) -> Callable[[HexapodGeometry, MachineModel], Any]:
     """Return what makes the compensator: the Python one, or the C core of ``--c``, if it is of the same files."""
-    from ..compensation.compensator import Compensator
+    if args.library is None:
+        from ..compensation.compensator import Compensator
+
+        return Compensator
     from ..errors import InputFileError
     from ..export.c_library import CCompensator
 
-    if args.library is None:
-        return Compensator
     first = recording.first
     wanted = first.geometry["sha256"], first.model["sha256"]
 

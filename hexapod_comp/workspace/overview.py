@@ -13,6 +13,7 @@ from ..machine.doubts import doubts, twist_per_lead
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import condition_number, strut_lengths
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
+from ..virtual.named import USUAL_LEAD
 from .box import CELLS, ReachedBox, largest_box, machine_box
 from .reach import Examiner, Reach, home_orientation, orientations, reach
 
@@ -24,9 +25,6 @@ TILT_STEPS = 361
 
 TURN = np.radians(5.0)
 """By which a tool turns about x, y or z, rad."""
-
-USUAL_LEAD = 0.01
-"""Of a screw, m, where the file gives none."""
 
 
 @dataclass(frozen=True)
