@@ -17,7 +17,7 @@ SHIPPED = sorted(path for folder in ("config", "launch") for path in (ROOT / fol
 PAPER_NUMBER = re.compile(r"(?<![\d.,])00[014](?![\d.])")
 """000, 001 and 004 were file names of the papers; numbers as 0.001 and 1,000 are none of them."""
 
-NO_NAMES = {"told", "untold", "said", "mine", "bump", "lockstep", "gathering", "gathered", "answers"}
+NO_NAMES = {"told", "untold", "said", "mine", "bump", "lockstep", "gathering", "gathered", "answers", "found"}
 """Verbs and pronouns, where the field has a word: commanded, predicted, members, ramp, batch, assembled."""
 
 

@@ -96,7 +96,7 @@ def _drawn(model: MachineModel) -> list[tuple[str, float, str]]:
     struts, size = model.struts, np.abs
     bodies = np.array([model.base_expansion, model.platform_expansion])
     of_field = largest_errors(model.field) if any(family.size for family in model.field.lines) else np.zeros(6)
-    found = (
+    sizes = (
         ("base joints", size(model.base_deviation).max(), "um"),
         ("platform joints", size(model.platform_deviation).max(), "um"),
         ("strut lengths", size(struts.offset).max(), "um"),
@@ -109,7 +109,7 @@ def _drawn(model: MachineModel) -> list[tuple[str, float, str]]:
         ("field, displacement", of_field[:3].max(), "um"),
         ("field, rotation", of_field[3:].max(), "urad"),
     )
-    return [(name, float(value) * 1e6, unit) for name, value, unit in found if value > 0.0]
+    return [(name, float(value) * 1e6, unit) for name, value, unit in sizes if value > 0.0]
 
 
 def _report(

@@ -29,18 +29,18 @@ USUAL_RADII = (0.01, 5.0)
 def doubts(geometry: HexapodGeometry) -> tuple[str, ...]:
     """Return what is worth a second look, a sentence each, in the words of geometry files."""
     platform = geometry.home.position + geometry.platform_joints @ geometry.home.rotation.T
-    found = [*joint_doubts(geometry.base_joints, platform)]
+    remarks = [*joint_doubts(geometry.base_joints, platform)]
     axis = platform.mean(axis=0) - geometry.base_joints.mean(axis=0)
     tool = geometry.home.rotation @ geometry.tool.position
     if tool @ axis < -0.5 * np.linalg.norm(tool) * np.linalg.norm(axis):
-        found.append(
+        remarks.append(
             "at home the tool points from the platform to the base: is home mirrored (the sign of its z), or the tool? "
             "Both homes have the same strut lengths where base and platform are flat"
         )
     given = geometry.base_axes is not None or geometry.platform_axes is not None
     if given and not geometry.screw_lead.any():
-        found.append("joint_axes have no effect without screw.lead")
-    return tuple(found)
+        remarks.append("joint_axes have no effect without screw.lead")
+    return tuple(remarks)
 
 
 def joint_doubts(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:

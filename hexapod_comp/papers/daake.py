@@ -41,14 +41,14 @@ FACTORS = np.array([1e6, 1e6, 180e3 / np.pi, 180e3 / np.pi])
 def study(cells: int = 30, progress: Callable[[int], object] = lambda poses: None) -> Study:
     """Classify the shipped positioning unit; parameters as ``hexapod_comp classify`` has them."""
     geometry = load_geometry(MACHINE)
-    found = reaches(geometry, orientations(geometry, (TILTS, TILTS, (0.0,))), cells)
-    return classify(geometry, load_budget(BUDGET), found, progress=progress)
+    reached = reaches(geometry, orientations(geometry, (TILTS, TILTS, (0.0,))), cells)
+    return classify(geometry, load_budget(BUDGET), reached, progress=progress)
 
 
 def paper(cells: int = 30) -> Paper:
     """Return everything of the paper, computed for the shipped positioning unit."""
-    found = study(cells)
-    exhibits = (ranking(found), shells(found.geometry), iteration(found))
+    case = study(cells)
+    exhibits = (ranking(case), shells(case.geometry), iteration(case))
     return Paper(
         "v. Daake, Vetter, Böhm & Zirn",
         "Error Classification and Visualisation for Hexapod Positioning Units",
@@ -56,10 +56,10 @@ def paper(cells: int = 30) -> Paper:
     )
 
 
-def ranking(found: Study) -> Exhibit:
+def ranking(case: Study) -> Exhibit:
     """Return Table 1 beside the unit's ranking, and what holds on any machine."""
     rows = {str(row.title): row for row in PAPER_TABLE}
-    computed = {printed.title: row for row in found.rows if (printed := paper_row(row.title)) is not None}
+    computed = {printed.title: row for row in case.rows if (printed := paper_row(row.title)) is not None}
     names = tuple(rows)
     digits = np.array([rows[name].figures * FACTORS for name in names])
     cells = tuple(tuple(f"{value:.2f}" if value else "≈ 0" for value in row) for row in digits)
@@ -72,7 +72,7 @@ def ranking(found: Study) -> Exhibit:
         *(COLUMNS, names, cells, figures, judged(zero & (figures < 0.005), OPEN)),
     )
     statements = (_order(rows, computed), *_scaling(computed))
-    return Exhibit("Table 1: the ranking", f"{found.extremes.poses} poses.", (table,), statements)
+    return Exhibit("Table 1: the ranking", f"{case.extremes.poses} poses.", (table,), statements)
 
 
 def _order(rows: dict, computed: dict[str, RankingRow]) -> Statement:
@@ -135,9 +135,9 @@ def shells(geometry: HexapodGeometry) -> Exhibit:
     return Exhibit("Figure 2: shells", text, (), (statement,), figures)
 
 
-def iteration(found: Study) -> Exhibit:
+def iteration(case: Study) -> Exhibit:
     """Return the tangential iteration of chapter 1 beside the exact solution."""
-    agreement = compared(found.geometry, found.errors, found.reaches, COMPARED, seed=0)
+    agreement = compared(case.geometry, case.errors, case.reaches, COMPARED, seed=0)
     statements = (
         Statement(
             "passive legs over the active one, steps of 0.01 mm",

@@ -203,8 +203,8 @@ def heights(at: Case, back: bool) -> float:
     """
     lifted = np.array([0.010, -0.004, 0.007])
     along = at.top - np.column_stack([at.xp, at.yp, lifted])
-    found = np.sqrt((along**2).sum(axis=1) - np.array([4.0, 1.0, 4.0]) * along[:, 0] ** 2)
-    return float(np.abs(found + (lifted if back else 0.0) - at.top[:, 2]).max() * 1e3)
+    heights = np.sqrt((along**2).sum(axis=1) - np.array([4.0, 1.0, 4.0]) * along[:, 0] ** 2)
+    return float(np.abs(heights + (lifted if back else 0.0) - at.top[:, 2]).max() * 1e3)
 
 
 def alpha(at: Case, sign: float) -> float:

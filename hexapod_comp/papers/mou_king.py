@@ -199,8 +199,8 @@ def weights(field: GridField) -> Exhibit:
     """Return the weights of Figure 2."""
     rng = np.random.default_rng(1)
     points = rng.uniform(field.box[0], field.box[1], (200, 3))
-    found = [line_errors(field, axis, point)[0] for point in points for axis in range(3)]
-    off = float(np.abs(np.sum(found, axis=1) - 1.0).max())
+    sums = [line_errors(field, axis, point)[0] for point in points for axis in range(3)]
+    off = float(np.abs(np.sum(sums, axis=1) - 1.0).max())
     errors = max(
         float(np.abs(printed_error(field, point, way) - field.evaluate(point, np.full(3, way))[0][:3]).max())
         for point in points
@@ -233,17 +233,17 @@ def strut_errors(truth: RealMachine, one: Scheme, title: str) -> Exhibit:
     geometry, model = truth.geometry, one.fit.model
     box = commanded_box(geometry, model)
     along, z = np.linspace(box[0, 0], box[1, 0], SAMPLES), float(box[:, 2].mean())
-    found = strut_length_errors(geometry, model, along, LINE_Y, z) * 1e6
+    predicted = strut_length_errors(geometry, model, along, LINE_Y, z) * 1e6
     real = strut_length_errors(geometry, truth.model, along, LINE_Y, z) * 1e6
-    real -= (real - found).mean(axis=1, keepdims=True)  # what lines say begins at zeros of their own
+    real -= (real - predicted).mean(axis=1, keepdims=True)  # what lines say begins at zeros of their own
     statements = tuple(
         Statement(
             name,
             "a curve",
-            f"forward {found[0, :, n].min():.1f} … {found[0, :, n].max():.1f} µm, "
-            f"backward {found[1, :, n].min():.1f} … {found[1, :, n].max():.1f} µm",
+            f"forward {predicted[0, :, n].min():.1f} … {predicted[0, :, n].max():.1f} µm, "
+            f"backward {predicted[1, :, n].min():.1f} … {predicted[1, :, n].max():.1f} µm",
             OPEN,
-            f"From the virtual machine's real curve, less its mean, RMS {rms(real[..., n] - found[..., n]):.1f} µm.",
+            f"From the virtual machine's real curve, less its mean, RMS {rms((real - predicted)[..., n]):.1f} µm.",
         )
         for n, name in enumerate(STRUT_NAMES)
     )

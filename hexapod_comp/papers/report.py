@@ -69,8 +69,8 @@ def records(papers: Sequence[Paper]) -> Iterator[dict[str, Any]]:
                         }
             for one in exhibit.statements:
                 place = {"paper": paper.short, "where": exhibit.title, "what": one.what, "unit": ""}
-                found = {"printed": one.printed, "computed": one.computed, "difference": ""}
-                yield {**place, **found, "verdict": one.verdict, "why": one.why}
+                numbers = {"printed": one.printed, "computed": one.computed, "difference": ""}
+                yield {**place, **numbers, "verdict": one.verdict, "why": one.why}
 
 
 def as_json(papers: Sequence[Paper]) -> dict[str, Any]:

@@ -139,12 +139,12 @@ def table_2(run: Simulation) -> Exhibit:
     """Return Table 2: lengths of the ideal structure."""
     printed, computed = table(2), run.lengths * 1e3
     met = np.abs(computed - values(2)) <= roundings(printed)
-    found = NumberTable(
+    compared = NumberTable(
         "Table 2: strut lengths of the ideal structure",
         "Computed: the distances between the joints at the poses of Table 1.",
         *(LENGTHS, ROWS, printed, computed, judged(met, MISSED)),
     )
-    return Exhibit("Tables 1 and 2", "Ten commanded poses, and the lengths that they need.", (found,))
+    return Exhibit("Tables 1 and 2", "Ten commanded poses, and the lengths that they need.", (compared,))
 
 
 def table_3(run: Simulation) -> Exhibit:
@@ -154,7 +154,7 @@ def table_3(run: Simulation) -> Exhibit:
     allowed = np.maximum(roundings(printed), [_stated_angle(IDEAL_MM)] * 3 + [IDEAL_MM] * 3)
     right = np.abs(exact - truth) <= 1e-9
     met = np.abs(exact - values(3)) <= allowed
-    found = NumberTable(
+    compared = NumberTable(
         "Table 3: predicted poses of the ideal structure",
         "Computed: the loop closures solved for the exact lengths. They give Table 1 back. Where the print has "
         "4.99998° for 5° and 9.99937° or 9.99938° for 10°, it is off by what a series cut after its third-order term "
@@ -165,7 +165,7 @@ def table_3(run: Simulation) -> Exhibit:
         _trip("from the exact lengths", exact - truth, IDEAL_MM),
         _rounded_trip(run, rounded - truth),
     )
-    return Exhibit("Table 3: the round trip", "Lengths back to poses.", (found,), statements)
+    return Exhibit("Table 3: the round trip", "Lengths back to poses.", (compared,), statements)
 
 
 def _solved(run: Simulation, lengths: np.ndarray) -> list[Pose]:
@@ -213,7 +213,7 @@ def table_4(run: Simulation) -> Exhibit:
     changes = np.array([one.strut_changes[:, 0] for one in run.drawn])
     shown = (values(4) * 1e-3 - run.lengths) * 1e6
     bounds = np.array([change_bounds(run.geometry, pose) for pose in run.poses])
-    found = NumberTable(
+    compared = NumberTable(
         "Table 4: strut lengths of the real structure",
         "Computed: one machine for each pose, drawn within ±10 µm on every joint coordinate and strut. The paper's "
         "random numbers are not printed, so its digits cannot be met; the differences are those of two draws.",
@@ -230,7 +230,9 @@ def table_4(run: Simulation) -> Exhibit:
         *_range_statements(run, changes * 1e6, shown),
     )
     figures = {"Table 4 − Table 2: as printed, and of the machines drawn": changes_figure(changes * 1e6, shown)}
-    return Exhibit("Table 4: imperfect machines", "The same poses on real structures.", (found,), statements, figures)
+    return Exhibit(
+        "Table 4: imperfect machines", "The same poses on real structures.", (compared,), statements, figures
+    )
 
 
 def change_bounds(geometry: HexapodGeometry, pose: Pose) -> np.ndarray:
@@ -322,8 +324,8 @@ def _nearest(matrix: np.ndarray, changes: np.ndarray) -> tuple[float, np.ndarray
     rows = np.block([[matrix, -ones], [-matrix, -ones]])
     limits = [(-BOUND * 1e6, BOUND * 1e6)] * matrix.shape[1] + [(0.0, None)]
     cost = np.append(np.zeros(matrix.shape[1]), 1.0)
-    found = linprog(cost, rows, np.concatenate([changes, -changes]), bounds=limits)
-    return float(found.fun), found.x[:-1]
+    best = linprog(cost, rows, np.concatenate([changes, -changes]), bounds=limits)
+    return float(best.fun), best.x[:-1]
 
 
 def _least_bound(matrix: np.ndarray, changes: np.ndarray) -> float:
@@ -415,8 +417,8 @@ def random_poses(run: Simulation, seed: int = 1) -> Exhibit:
     rotations = rotation_from_angles(rng.uniform(-RANDOM_TILT, RANDOM_TILT, (RANDOM_POSES, 3)))
     structure = Structure.of(run.geometry)
     lengths = strut_lengths_batch(structure, positions, rotations)
-    found = solve_poses(structure, lengths, run.geometry.home)
-    place = float(np.linalg.norm(found.positions - positions, axis=1).max())
+    solved = solve_poses(structure, lengths, run.geometry.home)
+    place = float(np.linalg.norm(solved.positions - positions, axis=1).max())
     trips = [
         assess(run.geometry, [Pose(position, rotation)], BOUNDS, seed + n).round_trip[0, 0, 0]
         for n, (position, rotation) in enumerate(zip(positions[:REAL_POSES], rotations[:REAL_POSES], strict=True))

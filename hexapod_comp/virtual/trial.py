@@ -78,8 +78,8 @@ def without_datum(points: np.ndarray, displacements: np.ndarray, by: slice = sli
     columns += [np.cross(axis, arms) for axis in np.eye(3)]
     free = np.stack(columns, axis=2)
     seen = free[by].reshape(-1, 6)
-    found = np.linalg.lstsq(seen, displacements[by].reshape(len(seen), -1), rcond=None)[0]
-    return displacements - (free.reshape(-1, 6) @ found).reshape(displacements.shape)
+    motion = np.linalg.lstsq(seen, displacements[by].reshape(len(seen), -1), rcond=None)[0]
+    return displacements - (free.reshape(-1, 6) @ motion).reshape(displacements.shape)
 
 
 @dataclass(frozen=True)

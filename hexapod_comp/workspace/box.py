@@ -45,7 +45,7 @@ class ReachedBox(NamedTuple):
     causes: dict[str, str]
 
 
-def largest_box(found: Reach) -> ReachedBox:
+def largest_box(reached: Reach) -> ReachedBox:
     """Return the box of largest volume, parallel to the work frame, in the piece of a reach that home belongs to.
 
     Every grid point within it is within all limits; then each face moves out as far as the limits let it, and all come
@@ -53,7 +53,7 @@ def largest_box(found: Reach) -> ReachedBox:
 
     Parameters
     ----------
-    found : Reach
+    reached : Reach
         What the machine reaches at one orientation.
 
     Raises
@@ -61,21 +61,21 @@ def largest_box(found: Reach) -> ReachedBox:
     GeometryError
         The reach is too small for its grid: no cell of it lies within.
     """
-    piece = _home_piece(found)
+    piece = _home_piece(reached)
     corners = _largest_cells(piece)
     if corners is None:
         raise GeometryError("limits", "leave no room for a box; the workspace is smaller than a cell of its grid")
-    axes = found.axes
+    axes = reached.axes
     box = np.array([[axis[index] for axis, index in zip(axes, corner, strict=True)] for corner in corners])
-    examiner = Examiner(found.geometry)
-    while not _fits(examiner, found.rotation, box):  # a dent between grid points
+    examiner = Examiner(reached.geometry)
+    while not _fits(examiner, reached.rotation, box):  # a dent between grid points
         middle = box.mean(axis=0)
         box = middle + 0.97 * (box - middle)
-    box, causes = _grown(examiner, found, box)
+    box, causes = _grown(examiner, reached, box)
     room = ROOM * np.ptp(box, axis=0)
     digit = 10.0 ** (np.floor(np.log10(np.ptp(box, axis=0).min())) - 2.0)  # of the shortest edge, the third
     inside = np.array([np.ceil((box[0] + room) / digit), np.floor((box[1] - room) / digit)]) * digit
-    return ReachedBox(inside.round(12), found.rotation, causes)
+    return ReachedBox(inside.round(12), reached.rotation, causes)
 
 
 def machine_box(geometry: HexapodGeometry, cells: int = CELLS) -> ReachedBox:
@@ -95,14 +95,14 @@ def machine_box(geometry: HexapodGeometry, cells: int = CELLS) -> ReachedBox:
     return largest_box(reach(geometry, level if finding[0] == WITHIN else home, cells))
 
 
-def _home_piece(found: Reach) -> np.ndarray:
+def _home_piece(reached: Reach) -> np.ndarray:
     """Return the mask of the grid points that belong to the piece of the reach nearest to home."""
-    pieces, count = ndimage.label(found.within)
+    pieces, count = ndimage.label(reached.within)
     if count < 2:
-        return found.within
-    tip = found.geometry.tool_pose(found.geometry.home).position
-    where = np.argwhere(found.within)
-    places = np.stack([axis[index] for axis, index in zip(found.axes, where.T, strict=True)], axis=1)
+        return reached.within
+    tip = reached.geometry.tool_pose(reached.geometry.home).position
+    where = np.argwhere(reached.within)
+    places = np.stack([axis[index] for axis, index in zip(reached.axes, where.T, strict=True)], axis=1)
     nearest = where[np.linalg.norm(places - tip, axis=1).argmin()]
     return np.asarray(pieces == pieces[tuple(nearest)])
 
@@ -135,21 +135,21 @@ def _largest_cells(within: np.ndarray) -> tuple[tuple[int, int, int], tuple[int,
     return corners
 
 
-def _grown(examiner: Examiner, found: Reach, box: np.ndarray) -> tuple[np.ndarray, dict[str, str]]:
+def _grown(examiner: Examiner, reached: Reach, box: np.ndarray) -> tuple[np.ndarray, dict[str, str]]:
     """Move each face out until a limit stops it, at most by a cell at a time; return the box and what stops each."""
     causes = {}
-    step = found.spacing * 0.5**HALVINGS
+    step = reached.spacing * 0.5**HALVINGS
     for name, (axis, side) in zip(FACES, ((axis, side) for axis in range(3) for side in (0, 1)), strict=True):
         way = 2.0 * side - 1.0
-        reached, beyond = 0.0, found.spacing
-        while _fits(examiner, found.rotation, _moved(box, axis, side, way * beyond)):
-            reached, beyond = beyond, beyond + found.spacing
-        while beyond - reached > step:
-            middle = 0.5 * (reached + beyond)
-            fits = _fits(examiner, found.rotation, _moved(box, axis, side, way * middle))
-            reached, beyond = (middle, beyond) if fits else (reached, middle)
-        causes[name] = _cause(examiner, found.rotation, _moved(box, axis, side, way * beyond))
-        box = _moved(box, axis, side, way * reached)
+        inside, beyond = 0.0, reached.spacing
+        while _fits(examiner, reached.rotation, _moved(box, axis, side, way * beyond)):
+            inside, beyond = beyond, beyond + reached.spacing
+        while beyond - inside > step:
+            middle = 0.5 * (inside + beyond)
+            fits = _fits(examiner, reached.rotation, _moved(box, axis, side, way * middle))
+            inside, beyond = (middle, beyond) if fits else (inside, middle)
+        causes[name] = _cause(examiner, reached.rotation, _moved(box, axis, side, way * beyond))
+        box = _moved(box, axis, side, way * inside)
     return box, causes
 
 

@@ -76,12 +76,12 @@ def overview(geometry: HexapodGeometry, cells: int = CELLS) -> Overview:
     GeometryError
         Nothing is within the limits.
     """
-    found = reach(geometry, home_orientation(geometry), cells)
-    box = largest_box(found)
-    level = np.array_equal(found.rotation.round(12), np.eye(3))
+    reached = reach(geometry, home_orientation(geometry), cells)
+    box = largest_box(reached)
+    level = np.array_equal(reached.rotation.round(12), np.eye(3))
     return Overview(
         geometry=geometry,
-        reach=found,
+        reach=reached,
         box=box,
         campaign=box if level else machine_box(geometry, cells),
         tilts=_tilts(geometry),
@@ -119,28 +119,28 @@ def _screws(geometry: HexapodGeometry) -> tuple[str, ...]:
     )
 
 
-def report(found: Overview) -> str:
+def report(overview: Overview) -> str:
     """Return the overview as text."""
-    geometry, machine = found.geometry, found.reach
-    size = " × ".join(f"{edge * 1e3:.1f}" for edge in np.ptp(found.box.box, axis=0))
+    geometry, machine = overview.geometry, overview.reach
+    size = " × ".join(f"{edge * 1e3:.1f}" for edge in np.ptp(overview.box.box, axis=0))
     lines = [f"machine {geometry.name}", "", "frames, position mm and α, β, γ °:", _frames(geometry)]
-    lines += ["", "joints, mm; strut at home, mm, and its limits:", _joints(found)]
-    lines += ["", f"condition number at home {found.condition:.3f}, allowed {geometry.limits.condition:g}"]
-    lines += ["tool tilts at home, each axis of the work frame alone: " + _tilt_text(found.tilts)]
+    lines += ["", "joints, mm; strut at home, mm, and its limits:", _joints(overview)]
+    lines += ["", f"condition number at home {overview.condition:.3f}, allowed {geometry.limits.condition:g}"]
+    lines += ["tool tilts at home, each axis of the work frame alone: " + _tilt_text(overview.tilts)]
     shares = ", ".join(f"{cause} {100.0 * share:.0f} %" for cause, share in machine.shares().items())
     lines += ["", f"reach with the tool as at home: {machine.volume * 1e3:.4g} litres, {corners(machine.box)}"]
     lines += [f"  limited by {shares}"]
     lines += [f"  in {machine.parts} pieces; no way leads from one to another"] * (machine.parts > 1)
-    lines += [f"largest box in it: {size} mm, {corners(found.box.box)}"]
-    lines += [f"  {face} stops at {cause}" for face, cause in found.box.causes.items()]
-    if found.campaign is not found.box:
-        lines += [f"box for campaigns, tool {_level_text(found)}: {corners(found.campaign.box)}"]
-    lines += ["", *(f"look again: {doubt}" for doubt in found.doubts)] if found.doubts else []
+    lines += [f"largest box in it: {size} mm, {corners(overview.box.box)}"]
+    lines += [f"  {face} stops at {cause}" for face, cause in overview.box.causes.items()]
+    if overview.campaign is not overview.box:
+        lines += [f"box for campaigns, tool {_level_text(overview)}: {corners(overview.campaign.box)}"]
+    lines += ["", *(f"look again: {doubt}" for doubt in overview.doubts)] if overview.doubts else []
     return "\n".join(lines)
 
 
-def _level_text(found: Overview) -> str:
-    level = np.array_equal(found.campaign.rotation.round(12), np.eye(3))
+def _level_text(overview: Overview) -> str:
+    level = np.array_equal(overview.campaign.rotation.round(12), np.eye(3))
     return "parallel to the work frame" if level else "as at home"
 
 
@@ -177,32 +177,32 @@ def _frames(geometry: HexapodGeometry) -> str:
     return aligned(["frame", "in", "x", "y", "z", "α", "β", "γ"], rows)
 
 
-def _joints(found: Overview) -> str:
-    geometry, limits = found.geometry, found.geometry.limits
+def _joints(overview: Overview) -> str:
+    geometry, limits = overview.geometry, overview.geometry.limits
     rows = []
     for n in range(6):
-        places = [*geometry.base_joints[n], *geometry.platform_joints[n], found.lengths[n], *limits.stroke[n]]
+        places = [*geometry.base_joints[n], *geometry.platform_joints[n], overview.lengths[n], *limits.stroke[n]]
         cones = np.degrees([limits.base_cone[n], limits.platform_cone[n]])
         rows.append([str(n + 1), *(number(value * 1e3, 3) for value in places), *(f"{cone:g}" for cone in cones)])
     head = ["strut", "base x", "y", "z", "platform x", "y", "z", "home", "shortest", "longest", "base °", "platform °"]
     return aligned(head, rows)
 
 
-def as_json(found: Overview) -> dict[str, Any]:
+def as_json(overview: Overview) -> dict[str, Any]:
     """Return the overview for programs; units are in the keys, poses in mm and degrees."""
-    geometry, machine = found.geometry, found.reach
+    geometry, machine = overview.geometry, overview.reach
     return {
         "machine": geometry.name,
         "frames": {name: {"in": outer, "pose": pose} for name, (outer, pose) in named_frames(geometry).items()},
         "base_joints_m": geometry.base_joints,
         "platform_joints_m": geometry.platform_joints,
-        "home_lengths_m": found.lengths,
-        "home_condition": found.condition,
-        "home_tilts_rad": found.tilts,
+        "home_lengths_m": overview.lengths,
+        "home_condition": overview.condition,
+        "home_tilts_rad": overview.tilts,
         "reach": {"volume_m3": machine.volume, "box_m": machine.box, "frame": "work", "limits": machine.shares()},
-        "largest_box": _box_json(found.box),
-        "campaign_box": _box_json(found.campaign),
-        "look_again": found.doubts,
+        "largest_box": _box_json(overview.box),
+        "campaign_box": _box_json(overview.campaign),
+        "look_again": overview.doubts,
     }
 
 

@@ -164,19 +164,19 @@ def causes_figure(geometry: HexapodGeometry, points: np.ndarray, findings: np.nd
     return figure
 
 
-def overview_figure(found: Overview) -> Figure:
+def overview_figure(overview: Overview) -> Figure:
     """Show a machine at home with its frames, and in it what it reaches, by what limits it, and the largest box.
 
     Parameters
     ----------
-    found : Overview
+    overview : Overview
         The machine looked over.
     """
-    geometry, body = found.geometry, shell(found.reach, RINGS, SECTORS)
+    geometry, body = overview.geometry, shell(overview.reach, RINGS, SECTORS)
     faces, corners = _faces(_in_base(geometry, body.points), 0.0)
-    box = _in_base(geometry, _box_edges(found.box.box))
+    box = _in_base(geometry, _box_edges(overview.box.box))
     figure = Figure(figsize=(14.0, 8.0), layout=ConstrainedLayoutEngine(rect=(0.0, 0.08, 1.0, 0.92)))
-    figure.suptitle(_overview_title(found))
+    figure.suptitle(_overview_title(overview))
     places = figure.add_gridspec(2, 2, width_ratios=[3, 2])
     space: Any = figure.add_subplot(places[:, 0], projection="3d")
     draw_in_space(space, geometry)
@@ -197,7 +197,7 @@ def overview_figure(found: Overview) -> Figure:
         flat.set_title(f"{title}, base frame")
     handles = [
         Patch(color=CAUSE_COLOURS[FINDINGS.index(name)], label=f"{name}: {share:.0%}")
-        for name, share in found.reach.shares().items()
+        for name, share in overview.reach.shares().items()
     ]
     shadow, cardan = Patch(color=SHADOW, label="reach of the tool's tip"), space.get_legend_handles_labels()[0]
     lines = [Line2D([], [], color=BOX, label="largest box"), *cardan, shadow]
@@ -205,10 +205,10 @@ def overview_figure(found: Overview) -> Figure:
     return figure
 
 
-def _overview_title(found: Overview) -> str:
-    size = " × ".join(f"{edge * 1e3:.0f}" for edge in np.ptp(found.box.box, axis=0))
-    name = picture_text(found.geometry.name)
-    return f"{name} at home; reach of the tool's tip {found.reach.volume * 1e3:.3g} litres, largest box {size} mm"
+def _overview_title(overview: Overview) -> str:
+    size = " × ".join(f"{edge * 1e3:.0f}" for edge in np.ptp(overview.box.box, axis=0))
+    name = picture_text(overview.geometry.name)
+    return f"{name} at home; reach of the tool's tip {overview.reach.volume * 1e3:.3g} litres, largest box {size} mm"
 
 
 def _in_base(geometry: HexapodGeometry, points: np.ndarray) -> np.ndarray:
