@@ -23,7 +23,7 @@ from hexapod_comp.nodes.middleware import avoid_shared_memory
 from .faults import visible
 from .faults.cable import Cable
 from .faults.campaign import RUNS_AGAIN_WITHIN, WARM_UP, Episode, Outcome, run_episode
-from .faults.kinds import SILENT, Fault, Meaning
+from .faults.fault import SILENT, Fault, Meaning
 from .faults.namespaces import OWN_NETWORK, make_host, refusal
 from .faults.record import Happened
 from .faults.rig import Rig

@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from .fault import Fault
 from .judge import Limits, Verdict, judge
-from .kinds import KINDS, Fault
+from .kinds import KINDS
 from .record import Happened
 from .rig import Rig
 
