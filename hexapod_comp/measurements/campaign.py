@@ -7,19 +7,22 @@ A campaign is a plan: :func:`template` lists its readings as a :class:`Measureme
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 from ..errors import InputFileError
 from ..formats.paths import input_file
 from ..formats.yaml import Section, read_yaml
 from ..machine.field import CROSS_AXES
 from ..machine.geometry import HexapodGeometry
+from ..machine.model_blocks import ModelDumper, written
 from ..pose import Pose, rotation_from_angles
-from .readings import ANGULAR_KINDS, AXES, BACKWARD, FORWARD, KINDS, UNKNOWN, FileLine, MeasurementSet, Reading
+from .campaign_runs import CampaignRun, line_readings, read_runs
+from .readings import ANGULAR_KINDS, AXES, KINDS, UNKNOWN, FileLine, MeasurementSet, Reading
 from .runs import assemble
 
 CAMPAIGN_FORMAT = "hexapod_comp/campaign"
@@ -65,6 +68,8 @@ class Campaign:
         Standard deviation of where the machine really stops, along each axis, m.
     level : ndarray, shape (3, 3)
         Attitude of the tool in the work frame on lines; scattered poses tilt from there.
+    runs : tuple of CampaignRun
+        Runs one by one, in measuring order, after all others.
 
     Raises
     ------
@@ -84,6 +89,7 @@ class Campaign:
     beam_slope: float = 100e-6
     repeatability: float = 0.0
     level: np.ndarray = field(default_factory=lambda: np.eye(3))
+    runs: tuple[CampaignRun, ...] = ()
 
     def __post_init__(self) -> None:
         box = np.array(self.box, dtype=float)
@@ -101,8 +107,8 @@ class Campaign:
         if not (1 <= self.cycles <= MOST_READINGS and 0 <= self.poses <= MOST_READINGS):
             problem = f"must be at least 1 and 0, and at most {MOST_READINGS}"
             raise InputFileError("campaign", "cycles, poses", problem, [self.cycles, self.poses])
-        if not (self.instrument or self.diagonals or self.poses):
-            raise InputFileError("campaign", "instrument", "or diagonals or poses are needed: nothing is measured")
+        if not (self.instrument or self.diagonals or self.poses or self.runs):
+            raise InputFileError("campaign", "instrument", "or diagonals, poses or runs: nothing is measured")
         for name in ("tilt", "beam_slope", "repeatability"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise InputFileError("campaign", name, "must be finite and not negative", getattr(self, name))
@@ -110,7 +116,7 @@ class Campaign:
             raise InputFileError("campaign", "noise", "must be finite and not negative", list(self.noise))
         if not self._roughly() <= MOST_READINGS:
             problem = f"would be some {self._roughly():.3g} readings, at most {MOST_READINGS} are allowed"
-            raise InputFileError("campaign", "cell, step, cycles, poses", problem)
+            raise InputFileError("campaign", "cell, step, cycles, poses, runs", problem)
 
     def _roughly(self) -> float:
         """Return about how many readings the campaign takes, without making any."""
@@ -118,7 +124,8 @@ class Campaign:
         cells, passes = sides / self.cell + 1.0, 2.0 * self.cycles * (sides / self.step + 1.0)
         of_lines = cells.prod() * (passes / cells).sum() * len(self.channels(0)) if self.instrument else 0.0
         of_diagonals = 2.0 * self.cycles * self.diagonals * (float(np.linalg.norm(sides)) / self.step + 1.0)
-        return float(of_lines + of_diagonals + 6.0 * self.poses)
+        of_runs = sum(run.count(self.cycles) for run in self.runs)
+        return float(of_lines + of_diagonals + 6.0 * self.poses + of_runs)
 
     def nodes(self, axis: int) -> np.ndarray:
         """Return where the grid's lines stand along an axis, m; the last cell may be narrower."""
@@ -157,7 +164,7 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
     """
     path = input_file(path, "campaign")
     top = read_yaml(path, CAMPAIGN_FORMAT, CAMPAIGN_VERSION)
-    box, level, cell, step = _read_grid(top, own_box)
+    box, level, cell, step = _read_grid(top, own_box, "runs" in top)
     instrument = top.choice("instrument", (*INSTRUMENTS, "none"), "none")
     try:
         campaign = Campaign(
@@ -173,6 +180,7 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
             noise=_read_noise(top.section("noise")) if "noise" in top else Campaign.noise,
             beam_slope=float(top.quantity("beam_slope", "angle", default=100e-6)),
             repeatability=float(top.quantity("repeatability", "length", default=0.0)),
+            runs=read_runs(top) if "runs" in top else (),
         )
     except InputFileError as error:
         if error.path != "campaign":
@@ -182,10 +190,15 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
     return campaign
 
 
-def _read_grid(top: Section, own_box: OwnBox | None) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Return the box, m, the tool's attitude in it, and the distances of lines and of readings, m."""
+def _read_grid(top: Section, own_box: OwnBox | None, has_runs: bool) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Return the box, m, the tool's attitude in it, and the distances of lines and of readings, m.
+
+    A campaign that lists its runs needs no distances.
+    """
     if own_box is None or top.quantity_key("box", "length") is not None:
         box, level, cells = top.quantity("box", "length", (2, 3)), np.eye(3), None
+        if has_runs:
+            cells = float(np.ptp(box, axis=0).min())
     else:
         box, level = own_box()
         cells = float(np.ptp(box, axis=0).max()) / CELLS_OF_A_BOX
@@ -201,6 +214,36 @@ def _read_noise(section: Section) -> tuple[float, ...]:
     )
     section.finish()
     return noise
+
+
+def campaign_text(campaign: Campaign, remarks: Sequence[str] = ()) -> str:
+    """Return the file (YAML) of a campaign that lists its runs, with remarks on top.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        All that it measures are its runs.
+    remarks : sequence of str
+        Lines of comment.
+    """
+    noise = {
+        f"{kind}_urad" if kind in ANGULAR_KINDS else f"{kind}_um": written(
+            sigma, *(("angle", "urad") if kind in ANGULAR_KINDS else ("length", "um"))
+        )
+        for kind, sigma in zip(KINDS, campaign.noise, strict=True)
+    }
+    content = {
+        "format": CAMPAIGN_FORMAT,
+        "version": CAMPAIGN_VERSION,
+        "box_mm": written(campaign.box, "length", "mm"),
+        "cycles": campaign.cycles,
+        "noise": noise,
+        "beam_slope_urad": written(campaign.beam_slope, "angle", "urad"),
+        "repeatability_um": written(campaign.repeatability, "length", "um"),
+        "runs": [run.content() for run in campaign.runs],
+    }
+    text = yaml.dump(content, Dumper=ModelDumper, sort_keys=False, allow_unicode=True, width=math.inf)
+    return "".join(f"# {line}\n" for line in remarks) + text
 
 
 def template(campaign: Campaign, geometry: HexapodGeometry, seed: int = 0, name: str = "campaign") -> MeasurementSet:
@@ -222,7 +265,8 @@ def template(campaign: Campaign, geometry: HexapodGeometry, seed: int = 0, name:
     InputFileError
         A pose of the campaign is out of the machine's reach.
     """
-    readings = [*_lines(campaign), *_diagonals(campaign), *_scattered(campaign, seed)]
+    listed = (reading for run in campaign.runs for reading in run.readings(campaign.cycles))
+    readings = [*_lines(campaign), *_diagonals(campaign), *_scattered(campaign, seed), *listed]
     return assemble(geometry, [reading._replace(source=FileLine(name, 0)) for reading in readings])
 
 
@@ -265,17 +309,9 @@ def _diagonals(campaign: Campaign) -> Iterator[Reading]:
 
 def _line(campaign: Campaign, name: str, ends: np.ndarray, channels: tuple[str, ...]) -> Iterator[Reading]:
     """Yield the readings of all passes over the line between two points, shape (2, 3)."""
-    way = ends[1] - ends[0]
-    length = float(np.linalg.norm(way))
-    if way[np.flatnonzero(np.abs(way) > 1e-9)[0]] < 0.0:
-        ends = ends[::-1]  # forward is along the first of x, y, z that moves
-    count = max(2, round(length / campaign.step) + 1)
+    count = max(2, round(float(np.linalg.norm(ends[1] - ends[0])) / campaign.step) + 1)
     poses = [Pose(p, campaign.level) for p in np.linspace(ends[0], ends[1], count).round(12)]
-    for cycle in range(1, campaign.cycles + 1):
-        for direction in (FORWARD, BACKWARD):
-            for pose in poses[::direction]:
-                for channel in channels:
-                    yield Reading(name, cycle, direction, pose, channel, 0.0)
+    return line_readings(name, poses, channels, campaign.cycles)
 
 
 def _scattered(campaign: Campaign, seed: int) -> Iterator[Reading]:
