@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import importlib
+import os
+import signal
 import sys
 
 
 def start(module: str) -> int:
     """Run a program's module; without Numba it ends with one line that says where to get that.
 
+    A signal while the module is loaded ends the process at once: there is nothing yet to put in order.
+
     Parameters
     ----------
     module : str
         Full name of a module with a function ``main``.
     """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: os._exit(0))
     try:
         main = importlib.import_module(module).main
     except ImportError as error:

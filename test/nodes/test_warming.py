@@ -307,3 +307,21 @@ def test_a_node_without_anybody_to_print_to_ends_in_order(isolated_ros):
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = f"{sys.executable} -m hexapod_comp.nodes.compensator --ros-args -p geometry_file:=nowhere.yaml >&- 2>&-"
     assert subprocess.run(["sh", "-c", command], env=environment, timeout=60.0, check=False).returncode == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_modules_load_ends_a_program_without_a_traceback(tmp_path: Path, number: int):
+    """Loading takes seconds on a busy computer; here it takes for ever."""
+    (tmp_path / "endless.py").write_text("import threading\nprint('loading', flush=True)\nthreading.Event().wait()\n")
+    program = "from hexapod_comp.nodes import start; start('endless')"
+    process = subprocess.Popen(
+        [sys.executable, "-c", program],
+        env={**os.environ, "PYTHONPATH": f"{ROOT}:{tmp_path}"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert process.stdout.readline() == "loading\n"
+    process.send_signal(number)
+    rest, _ = process.communicate(timeout=STOP_WITHIN)
+    assert (process.returncode, rest) == (0, "")
