@@ -369,4 +369,5 @@ def stations_of(passes: Passes) -> Stations:
         commands=passes.nominal_commands(),
         sense=passes.senses(),
         temperatures=np.full((len(passes), len(Temperatures.NAMES)), REFERENCE_TEMPERATURE),
+        times=np.full(len(passes), np.nan),
     )

@@ -216,7 +216,8 @@ def _stations(machine: RealMachine, poses: Poses, senses: np.ndarray) -> Station
     positions, rotations = (np.ascontiguousarray(part, dtype=float) for part in poses)
     nominal = strut_lengths_batch(Structure.of(machine.geometry), positions, rotations)
     warmth = np.array([machine.temperatures.at(name) for name in Temperatures.NAMES])
-    return Stations(positions, rotations, nominal, senses, np.tile(warmth, (len(positions), 1)))
+    count = len(positions)
+    return Stations(positions, rotations, nominal, senses, np.tile(warmth, (count, 1)), np.full(count, np.nan))
 
 
 def _first_order(machine: RealMachine, fitted: FittedParameters | None, stations: Stations) -> _FirstOrder:

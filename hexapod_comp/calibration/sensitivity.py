@@ -48,7 +48,7 @@ def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Predict
     """
     positive, sense = _without_negative_backlash(space, x, stations.sense)
     model = space.model(positive, with_field=False)
-    machines = MachinesByTemperature(space.geometry, model).at_each(stations.temperatures)
+    machines = MachinesByTemperature(space.geometry, model).at_each(stations.temperatures, stations.times)
     commanded = stations.positions, stations.rotations
     driven = drive(machines, commanded, sense, stations.commands)
     errors = driven.errors(commanded, space.probe).as_array()

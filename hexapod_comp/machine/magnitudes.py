@@ -34,6 +34,7 @@ def check_magnitudes(model: MachineModel) -> None:
     for name in ("offset", "cosine", "sine", "backlash", "map_values"):
         _check(f"struts.{name}", getattr(model.struts, name), STRUT_LENGTH, f"{STRUT_LENGTH * 1e3:g} mm")
     expansions = {f"thermal.{name}": getattr(model, name) for name in ("base_expansion", "platform_expansion")}
+    expansions["thermal.late"] = model.late_growth.expansion
     for name, value in {"struts.expansion": model.struts.expansion, **expansions}.items():
         _check(name, np.asarray(value), EXPANSION, f"{EXPANSION * 1e6:g} ppm per K")
     for axis, family in zip("xyz", model.field.lines, strict=True):

@@ -19,8 +19,9 @@ from ..kernels import kinematics as kernels
 from ..kernels.model import actual_pose_one, command_one
 from ..pose import Pose
 from .field import GridField, no_field
-from .geometry import STRUT_NAMES, HexapodGeometry
+from .geometry import HexapodGeometry
 from .kinematics import Structure, forward_error
+from .late import AT_ONCE, PARTS, Lag, LateGrowth, late
 from .motion import MotionState
 from .struts import StrutErrors
 
@@ -78,6 +79,8 @@ class MachineModel:
         Interpolated rest.
     base_expansion, platform_expansion : float
         Thermal expansion of the two bodies about their origins, 1/K.
+    late_growth : LateGrowth
+        How parts follow their thermometers late, and which thermometer stands for all.
     reversal_threshold : float
         How far a strut must come back before its direction counts as reversed, m: above the noise of the
         commands, and as far below the backlash as that allows. The field has a threshold of its own.
@@ -100,6 +103,7 @@ class MachineModel:
     field: GridField = field(default_factory=no_field)
     base_expansion: float = 0.0
     platform_expansion: float = 0.0
+    late_growth: LateGrowth = AT_ONCE
     reversal_threshold: float = 0.2e-6
     valid_box: np.ndarray | None = None
     origin: ModelOrigin = ModelOrigin()
@@ -140,17 +144,39 @@ class Temperatures:
     ----------
     values : dict of str to float
         Readings by ``strut_1`` … ``strut_6``, ``base``, ``platform``.
+    lags : dict of str to Lag
+        How far what follows each of them is behind; whatever is not here is at rest.
     """
 
-    NAMES = (*STRUT_NAMES, "base", "platform")
+    NAMES = PARTS
 
-    def __init__(self, readings: Mapping[str, float] | None = None) -> None:
+    def __init__(self, readings: Mapping[str, float] | None = None, lags: Mapping[str, Lag] | None = None) -> None:
         self.values: dict[str, float] = {}
         for name, value in (readings or {}).items():
             self.set(name, value)
+        self.lags: dict[str, Lag] = dict(lags or {})
+
+    def follow(self, name: str, value: float, time: float, time_constants: tuple[float, ...]) -> None:
+        """Take a reading made at a time, s, on a clock that is never set; late parts follow.
+
+        The first reading finds its followers at rest: what was before nobody knows.
+
+        Raises
+        ------
+        ModelError
+            As :meth:`set`; or there are time constants, and the time is not finite. Nothing was taken.
+        """
+        before = self.values.get(name, REFERENCE_TEMPERATURE)
+        if time_constants and not math.isfinite(time):
+            raise ModelError(f"time of the temperature of {name}", "must be finite, s: the model has time constants")
+        self.set(name, value)
+        if name in self.lags:
+            self.lags[name].take(self.values[name] - before, time, time_constants)
+        elif time_constants:
+            self.lags[name] = Lag(time, time, [0.0] * len(time_constants))
 
     def set(self, name: str, value: float) -> None:
-        """Take a reading.
+        """Take a reading, whenever it was made: late parts stay as far behind as they are.
 
         Raises
         ------
@@ -200,28 +226,32 @@ class RealMachine:
         self.geometry, self.model = geometry, model
         self.temperatures = temperatures or Temperatures()
         base, platform = geometry.kernel_joints
-        self.structure = Structure.of(geometry).moved(
-            self._displacement("base", base, model.base_deviation, model.base_expansion),
-            self._displacement("platform", platform, model.platform_deviation, model.platform_expansion),
+        expansions = (*model.struts.expansion.tolist(), model.base_expansion, model.platform_expansion)
+        *growth, of_base, of_platform = (self._growth(n, expansion) for n, expansion in enumerate(expansions))
+        self.structure = structure = Structure.of(geometry).moved(
+            _displacement(base, model.base_deviation, of_base),
+            _displacement(platform, model.platform_deviation, of_platform),
         )
-        growth = np.array([self._growth(n, a) for n, a in zip(STRUT_NAMES, model.struts.expansion, strict=True)])
-        structure = self.structure
         self.body = (*structure.joints, *geometry.kernel_axes)
         self.solver = structure.solver
         self.strut_arrays = (
-            model.struts.parameter_table(geometry, growth),
+            model.struts.parameter_table(geometry, np.array(growth)),
             model.struts.map_knots.copy(),
             model.struts.spline_coefficients(),
         )
         self.thresholds = np.array([model.field.reversal_threshold, model.reversal_threshold])
         self.field_arrays = (model.field.probe, *model.field.grid, *model.field.lines)
 
-    def _displacement(self, body: str, nominal: np.ndarray, deviation: np.ndarray, expansion: float) -> np.ndarray:
-        """Return real minus nominal joints of a body that grows about its origin, shape (6, 3), m."""
-        return deviation + self._growth(body, expansion) * (nominal + deviation)
-
-    def _growth(self, name: str, expansion: float) -> float:
-        return float(expansion) * self.temperatures.above_reference(name)
+    def _growth(self, part: int, expansion: float) -> float:
+        """Return by which share a part has grown since 20 °C."""
+        late_growth = self.model.late_growth
+        sensor = PARTS[late_growth.sensor_of(part)]
+        growth = expansion * self.temperatures.above_reference(sensor)
+        lag = self.temperatures.lags.get(sensor)
+        if lag is not None:
+            for late_expansion, behind in zip(late_growth.expansion[part].tolist(), lag.behind, strict=True):
+                growth += late_expansion * behind
+        return growth
 
     def commands_for(self, target: Pose, motion: MotionState | None = None) -> tuple[np.ndarray, Pose, bool]:
         """Return the strut commands that really bring the platform to a pose (backward run).
@@ -322,6 +352,11 @@ class RealMachine:
         )
 
 
+def _displacement(nominal: np.ndarray, deviation: np.ndarray, growth: float) -> np.ndarray:
+    """Return real minus nominal joints of a body that grows about its origin, shape (6, 3), m."""
+    return deviation + growth * (nominal + deviation)
+
+
 class MachinesByTemperature:
     """Real machines at temperatures that come again and again, each made once.
 
@@ -335,17 +370,29 @@ class MachinesByTemperature:
         self._geometry, self._model = geometry, model
         self._known: dict[tuple[float, ...], RealMachine] = {}
 
-    def at(self, values: np.ndarray) -> RealMachine:
-        """Return the machine at the temperatures of struts 1–6, base and platform, °C, shape (8,)."""
-        key = tuple(values.tolist())
+    def at(self, values: np.ndarray, behind: np.ndarray | None = None) -> RealMachine:
+        """Return the machine at the temperatures of struts 1–6, base and platform, °C, shape (8,).
+
+        Late parts are `behind` these, K, shape (8, time constants); by default they are at rest.
+        """
+        key = (*values.tolist(), *(() if behind is None else behind.ravel().tolist()))
         if key not in self._known:
-            temperatures = Temperatures(dict(zip(Temperatures.NAMES, key, strict=True)))
+            late_parts = {} if behind is None else dict(zip(PARTS, behind.tolist(), strict=True))
+            lags = {name: Lag(math.nan, math.nan, row) for name, row in late_parts.items()}
+            temperatures = Temperatures(dict(zip(PARTS, values.tolist(), strict=True)), lags)
             self._known[key] = RealMachine(self._geometry, self._model, temperatures)
         return self._known[key]
 
-    def at_each(self, temperatures: np.ndarray) -> list[RealMachine]:
-        """Return the machine at each row of temperatures, °C, shape (N, 8)."""
-        return [self.at(values) for values in temperatures]
+    def at_each(self, temperatures: np.ndarray, times: np.ndarray) -> list[RealMachine]:
+        """Return the machine at each row of temperatures, °C, shape (N, 8), read at some times, s, shape (N,).
+
+        Where a time is not known, late parts are at rest.
+        """
+        constants = self._model.late_growth.time_constants
+        if not constants or not np.isfinite(times).all():
+            return [self.at(values) for values in temperatures]
+        behind = late(times, temperatures, constants)
+        return [self.at(*row) for row in zip(temperatures, behind, strict=True)]
 
 
 def platform_box(model: MachineModel, level: np.ndarray) -> np.ndarray | None:

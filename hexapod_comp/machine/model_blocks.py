@@ -26,6 +26,9 @@ STRUT_TERMS = {
 }
 """Per-strut terms: kind of quantity, and the unit in which they are written."""
 
+LATE_PARTS = ("late_struts", "late_base", "late_platform")
+"""What follows a thermometer late, in the order of the rows of :class:`~.late.LateGrowth`."""
+
 COMPONENT_UNITS = {name: ("length", "um") if name[0] == "d" else ("angle", "urad") for name in COMPONENTS}
 
 
@@ -83,10 +86,17 @@ def structure_block(model: MachineModel) -> dict[str, Any]:
 
 
 def thermal_block(model: MachineModel) -> dict[str, Any]:
-    """Return how much the two bodies grow, ppm/K."""
+    """Return how much the two bodies grow, ppm/K, and how parts follow their thermometers."""
     given = {"base_expansion": model.base_expansion, "platform_expansion": model.platform_expansion}
-    unit = "ppm_per_K"
-    return {f"{name}_{unit}": written(value, "expansion", unit) for name, value in given.items() if value}
+    unit, late_growth = "ppm_per_K", model.late_growth
+    block = {f"{name}_{unit}": written(value, "expansion", unit) for name, value in given.items() if value}
+    if late_growth.thermometer:
+        block["thermometer"] = late_growth.thermometer
+    if late_growth.time_constants:
+        block["time_constants_s"] = list(late_growth.time_constants)
+        rows = dict(zip(LATE_PARTS, (late_growth.expansion[:6], *late_growth.expansion[6:]), strict=True))
+        block |= {f"{name}_{unit}": written(row, "expansion", unit) for name, row in rows.items() if row.any()}
+    return block
 
 
 def struts_block(struts: StrutErrors) -> dict[str, Any]:

@@ -42,6 +42,11 @@ all six or a list of six. Everything marked optional may be left out and is then
     thermal:                          # optional: bodies about their origins
       base_expansion_ppm_per_K: 0.0
       platform_expansion_ppm_per_K: 0.0
+      thermometer: base               # optional: this part's sensor stands for all; else each part has its own
+      time_constants_s: [1800, 7200]  # optional: how late parts follow, one or two, see hexapod_comp.machine.late
+      late_struts_ppm_per_K:          # optional, 6 × time constants: what of a strut's growth comes so late
+      late_base_ppm_per_K: [0, 0]     # optional: the same of the base, and of the platform
+      late_platform_ppm_per_K: [0, 0]
 
     field:                            # optional: interpolated error of the measured point, in base
       grid_x_mm: [-200, 0, 200]       # increasing nodes; the outermost bound the measured box
@@ -86,11 +91,13 @@ from ..formats.paths import input_file
 from ..formats.yaml import Section, parse_yaml, read_text
 from .field import CROSS_AXES, OUTSIDE_POLICIES, GridField, no_field
 from .geometry import HexapodGeometry
+from .late import PARTS, LateGrowth
 from .magnitudes import check_magnitudes
 from .model import MachineModel, ModelOrigin
 from .model_blocks import (
     COMPONENT_UNITS,
     DIRECTIONS,
+    LATE_PARTS,
     STRUT_TERMS,
     ModelDumper,
     field_block,
@@ -316,8 +323,13 @@ def _read_thermal(top: Section) -> dict[str, Any]:
         return {}
     section = top.section("thermal")
     names = ("base_expansion", "platform_expansion")
-    values = {name: float(section.quantity(name, "expansion", (), 0.0)) for name in names}
+    values: dict[str, Any] = {name: float(section.quantity(name, "expansion", (), 0.0)) for name in names}
+    thermometer = section.choice("thermometer", PARTS) if "thermometer" in section else ""
+    constants = section.quantity("time_constants", "time", (None,), ())
+    shapes = zip(LATE_PARTS, ((6, len(constants)), (len(constants),), (len(constants),)), strict=True)
+    late = [section.quantity(name, "expansion", shape, np.zeros(shape)) for name, shape in shapes]
     section.finish()
+    values["late_growth"] = LateGrowth(tuple(constants.tolist()), np.vstack(late), thermometer)
     return values
 
 

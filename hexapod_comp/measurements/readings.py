@@ -8,7 +8,7 @@ axes of ``base``,
 
 so a laser line, a straightness, an angle, a body diagonal and a tracker's pose differ only in w and in what
 is unknown. Readings of one *run* share these unknowns; readings taken at the same command, from the same
-direction, under the same temperatures share a *station*.
+direction, under the same temperatures (where these change: at the same time) share a *station*.
 """
 
 from __future__ import annotations
@@ -107,6 +107,8 @@ class Reading(NamedTuple):
         Strut readings, m, when the file has them; otherwise the machine was told nominal lengths.
     source : FileLine
         For messages.
+    time : float
+        When it was taken, s, on a clock that all readings share; NaN when not known.
     """
 
     run: str
@@ -119,6 +121,7 @@ class Reading(NamedTuple):
     temperatures: tuple[float, ...] = (REFERENCE_TEMPERATURE,) * 8
     commands: tuple[float, ...] | None = None
     source: FileLine = FileLine("", 0)
+    time: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -166,6 +169,8 @@ class Stations:
         Directions of motion as in :class:`hexapod_comp.machine.motion.MotionState`.
     temperatures : ndarray, shape (M, 8)
         Struts 1–6, base, platform, °C.
+    times : ndarray, shape (M,)
+        When these were read, s; NaN where that is not known.
     """
 
     positions: np.ndarray
@@ -173,6 +178,7 @@ class Stations:
     commands: np.ndarray
     sense: np.ndarray
     temperatures: np.ndarray
+    times: np.ndarray
 
     def __len__(self) -> int:
         return len(self.positions)

@@ -6,6 +6,7 @@ Runs are recognised as lines, equal commands become one station, poses out of re
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import fields
 
 import numpy as np
 
@@ -177,6 +178,7 @@ def _collect_stations(
     rows: list[tuple] = []
     index = np.empty(len(readings), dtype=int)
     nominal = Structure.of(geometry)
+    warming = len({r.temperatures for r in readings}) > 1  # else when it was does not matter, and passes are alike
     here: tuple | None = None
     before: int | None = None
     for n, (r, pose, run) in enumerate(zip(readings, poses, runs, strict=True)):
@@ -186,14 +188,15 @@ def _collect_stations(
         here = place
         # A station belongs to a run: lines that cross at a point pass it in different ways.
         came_from = rows[before] if before is not None and r.direction == FROM_PREVIOUS else None
-        key = (place, r.direction, None if came_from is None else before, r.temperatures)
+        time = r.time if warming else np.nan
+        key = (place, r.direction, None if came_from is None else before, r.temperatures, str(time))
         if key not in known:
             lengths = strut_lengths(nominal, pose)
             _check_reach(geometry, pose, lengths, r)
             commands = np.array(lengths if r.commands is None else r.commands, dtype=float)
             sense = _sense(geometry, r.direction, run, pose, commands, came_from)
             known[key] = len(rows)
-            rows.append((pose.position, pose.rotation, commands, sense, r.temperatures))
+            rows.append((pose.position, pose.rotation, commands, sense, r.temperatures, time))
         index[n] = known[key]
     columns = [np.array(column, dtype=float) for column in zip(*rows, strict=True)]
     return Stations(*columns), index
@@ -261,12 +264,11 @@ def joined(sets: Sequence[MeasurementSet]) -> MeasurementSet:
     def together(name: str) -> np.ndarray:
         return np.concatenate([getattr(s, name) for s in sets])
 
-    columns = ("positions", "rotations", "commands", "sense", "temperatures")
     return MeasurementSet(
         geometry=first.geometry,
         probe=first.probe,
         runs=tuple(run for s in sets for run in s.runs),
-        stations=Stations(*(np.concatenate([getattr(s.stations, c) for s in sets]) for c in columns)),
+        stations=Stations(*(np.concatenate([getattr(s.stations, c.name) for s in sets]) for c in fields(Stations))),
         station=np.concatenate([s.station + n for s, n in zip(sets, stations_before, strict=True)]),
         run=np.concatenate([s.run + n for s, n in zip(sets, runs_before, strict=True)]),
         cycle=together("cycle"),

@@ -18,7 +18,9 @@ Columns
     Standard deviation, in the value's unit; may be empty.
 ``temperature_degC`` (optional)
     Of the air, and of the whole machine unless ``strut_1_degC`` … ``strut_6_degC``, ``base_degC``,
-    ``platform_degC`` say otherwise. Without any, 20 °C.
+    ``platform_degC`` say otherwise. Without any, 20 °C. Where one part alone has a column, its sensor stands for all.
+``time_s`` (optional)
+    When the row was read, on one clock for all files: what shows how late parts follow their sensors.
 ``instrument_index``, ``pressure_kPa``, ``humidity_percent`` (optional)
     The refractive index with which the instrument turned its counts into lengths; 1 when it counts vacuum
     wavelengths. A row that has one is corrected to the air of that row (Ciddor), which needs its temperature,
@@ -100,6 +102,9 @@ DIMENSIONS = {
 LINE_KINDS = ("linear", "straightness", "rotation", *TURNS)
 """Channels that light reads along a line, and that the air therefore bends."""
 
+LATEST = 1e11
+"""Largest time, s: seconds since 1970 of the next three thousand years; nanoseconds are not seconds."""
+
 PARALLEL = 1e-9
 """Largest cross component of a unit vector that still is parallel to an axis."""
 
@@ -119,6 +124,7 @@ class _Row(NamedTuple):
     temperatures: tuple[float, ...]
     air: tuple[float, ...] | None
     line: int
+    time: float
 
 
 def read_tidy(
@@ -183,6 +189,7 @@ def _read_rows(table: Table) -> list[_Row]:
     value_column = table.required(("value",), None)[0][0]
     uncertainty_column = table.column("uncertainty", None)
     temperatures, air = _temperatures(table), _air(table)
+    times = _optional(table, "time", "time", lambda v: abs(v) <= LATEST, f"±{LATEST:g} s", blank=True)
     table.refuse_unknown()
     sizes: dict[tuple[str, str], float] = {}
     rows = []
@@ -197,7 +204,7 @@ def _read_rows(table: Table) -> list[_Row]:
         value = (si_from_text(text, number, sizes[key]), exact(text, number), sizes[key])
         uncertainty = _uncertainty(table, line, cells, uncertainty_column, sizes[key])
         place = (runs[n], cycles[n], directions[n], poses[n], channels[n])
-        rows.append(_Row(*place, *value, uncertainty, temperatures[n], air[n], line))
+        rows.append(_Row(*place, *value, uncertainty, temperatures[n], air[n], line, times[n]))
     return rows
 
 
@@ -350,7 +357,7 @@ def _file_readings(
         for channel, value in pairs:
             reading = (names[row.run], row.cycle, row.direction, row.pose, channel, value, row.uncertainty)
             source = FileLine(file, row.line)
-            readings.append(Reading(*reading, row.temperatures, commands.get(visits[n]), source))
+            readings.append(Reading(*reading, row.temperatures, commands.get(visits[n]), source, row.time))
     if not readings:
         raise InputFileError(file, "", "holds strut readings only: nothing that was measured")
     return readings, len(corrected)

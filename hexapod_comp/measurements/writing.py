@@ -45,6 +45,10 @@ def _csv_rows(measurements: MeasurementSet) -> Iterator[list[str]]:
     commanded = positions + rotations @ offset if offset.any() else positions
     pose_names, poses = _pose_cells(positions, rotations)
     temperature_names, temperatures = _temperature_cells(measurements)
+    if np.isfinite(measurements.stations.times).any():
+        temperature_names = [*temperature_names, "time_s"]
+        times = ("" if math.isnan(time) else repr(time) for time in measurements.stations.times.tolist())
+        temperatures = [[*cells, time] for cells, time in zip(temperatures, times, strict=True)]
     with_uncertainty = bool(np.isfinite(measurements.uncertainty).any())
     tail = ["uncertainty"] * with_uncertainty + temperature_names
     yield ["run", "direction", "cycle", *pose_names, "channel", "value", "unit", *tail]

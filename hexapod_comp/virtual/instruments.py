@@ -70,8 +70,8 @@ def station_errors(
     Displacement of the point and rotation of the platform, actual minus commanded, under the stations'
     commands, directions of motion and temperatures.
     """
-    machines = MachinesByTemperature(truth.geometry, truth.model).at_each(measurements.stations.temperatures)
     stations, name_of = measurements.stations, partial(_station_name, measurements)
+    machines = MachinesByTemperature(truth.geometry, truth.model).at_each(stations.temperatures, stations.times)
     commanded = stations.positions, stations.rotations
     driven = drive(machines, commanded, stations.sense, stations.commands, name_of, advance)
     return driven.errors(commanded, measurements.probe).as_array()
@@ -93,7 +93,7 @@ def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet
         A pose at which the model cannot be undone; names the reading.
     """
     stations = template.stations
-    machines = MachinesByTemperature(template.geometry, model).at_each(stations.temperatures)
+    machines = MachinesByTemperature(template.geometry, model).at_each(stations.temperatures, stations.times)
     targets, name_of = (stations.positions, stations.rotations), partial(_station_name, template)
     commands, _ = model_commands(machines, targets, stations.sense, name_of)
     return replace(template, stations=replace(stations, commands=commands))

@@ -1,0 +1,121 @@
+"""Parts that follow a thermometer late: against a numerical integration of the lag, and of two bodies that warm."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calibration_helpers import paper
+from scipy.integrate import solve_ivp
+
+from hexapod_comp.errors import InputFileError, ModelError
+from hexapod_comp.machine.late import PARTS, LateGrowth, late
+from hexapod_comp.machine.model import MachineModel, MachinesByTemperature, ModelOrigin, RealMachine, Temperatures
+from hexapod_comp.machine.model_file import load_model, save_model
+from hexapod_comp.machine.struts import StrutErrors
+
+TIMES = np.array([5.0, 65.0, 66.0, 200.0, 900.0, 1000.0])
+VALUES = np.array([20.0, 20.4, 20.4, 21.5, 23.0, 22.1])
+
+
+def integrated(constant: float) -> np.ndarray:
+    """Return the lag's output minus its input at TIMES by integrating τ F' = s − F, s straight between readings."""
+    flow = solve_ivp(
+        lambda t, f: (np.interp(t, TIMES, VALUES) - f) / constant,
+        (TIMES[0], TIMES[-1]), [VALUES[0]], t_eval=TIMES, rtol=1e-10, atol=1e-12, max_step=0.5,
+    )  # fmt: skip
+    return flow.y[0] - VALUES
+
+
+@pytest.mark.parametrize("constant", [10.0, 300.0, 1e5])
+def test_a_lag_is_the_solution_of_its_equation(constant: float):
+    """The integration's own error is some 1e-9 K."""
+    found = late(TIMES, VALUES[:, None], [constant])[:, 0, 0]
+    np.testing.assert_allclose(found, integrated(constant), atol=1e-7)
+
+
+def test_readings_one_by_one_and_all_at_once_in_any_order():
+    """What a compensator carries is what a fit works out, to rounding."""
+    constants, temperatures = (100.0, 1000.0), Temperatures()
+    behind = []
+    for time, value in zip(TIMES, VALUES, strict=True):
+        temperatures.follow("base", value, time, constants)
+        behind.append(list(temperatures.lags["base"].behind))
+    shuffled = np.array([3, 0, 5, 1, 4, 2])
+    found = late(TIMES[shuffled], VALUES[shuffled, None], constants)[:, 0]
+    np.testing.assert_allclose(found, np.array(behind)[shuffled], atol=1e-12)
+
+
+def test_a_base_that_lags_its_struts_tells_what_they_are():
+    """One source warms base (T = 5400 s) and struts (τ = 1500 s) through a lag each, by 3 and 2.5 K.
+
+    The struts' share that comes late is then 1 − T/τ of their growth, by the lags' transfer functions. Readings a
+    second apart, straight in between, follow the base's curve to 1e-7 K.
+    """
+    times = np.arange(0.0, 7200.0)
+    base, struts = (rise * -np.expm1(-times / constant) for rise, constant in ((3.0, 5400.0), (2.5, 1500.0)))
+    behind = late(times, base[:, None], [1500.0])[:, 0, 0]
+    steady = 2.5 / 3.0
+    np.testing.assert_allclose(steady * base + steady * (1.0 - 5400.0 / 1500.0) * behind, struts, atol=1e-6)
+
+
+def warming_model(**changes) -> MachineModel:
+    """Return a model with two time constants, all parts by the base's thermometer."""
+    expansion = 1e-6 * np.arange(16.0).reshape(8, 2)
+    values = {"time_constants": (600.0, 7200.0), "expansion": expansion, "thermometer": "base"} | changes
+    struts = StrutErrors(expansion=np.full(6, 11e-6))
+    model = MachineModel("paper", "warm", struts=struts, base_expansion=10e-6, platform_expansion=23e-6)
+    return replace(model, late_growth=LateGrowth(**values), origin=ModelOrigin("2026-01-31"))
+
+
+def test_a_machine_grows_by_one_thermometer_and_what_is_behind_it():
+    """Growth of strut 3: 11 ppm/K of 2 K, less 4 and 5 ppm/K of 1 and 1.5 K: 10.5 ppm; the base: 20 − 12 − 19.5."""
+    machines = MachinesByTemperature(paper(), warming_model())
+    behind = np.zeros((8, 2))
+    behind[6] = -1.0, -1.5
+    warm = machines.at(np.array([99.0] * 6 + [22.0, 50.0]), behind)
+    assert warm.strut_arrays[0][2, -1] == pytest.approx(10.5e-6)
+    nominal = paper().kernel_joints[0]
+    np.testing.assert_allclose(warm.structure.base_joints - nominal, -11.5e-6 * nominal, atol=1e-15)
+    own = RealMachine(paper(), warming_model(thermometer=""), Temperatures({"strut_3": 24.0, "base": 22.0}))
+    assert own.strut_arrays[0][2, -1] == pytest.approx(44e-6)  # its own reading; at rest
+
+
+def test_a_file_brings_the_same_model_back(tmp_path: Path):
+    model = warming_model()
+    save_model(model, tmp_path / "warm.yaml")
+    back = load_model(tmp_path / "warm.yaml", paper()).late_growth
+    assert (back.time_constants, back.thermometer) == ((600.0, 7200.0), "base")
+    np.testing.assert_allclose(back.expansion, model.late_growth.expansion, rtol=3e-16)  # one rounding, as the file says
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("thermometer: base", "thermometer: spindle", ["thermometer", "spindle", "strut_1"]),
+        ("time_constants_s: [600.0, 7200.0]", "time_constants_s: [7200.0, 600.0]", ["time_constants", "increasing"]),
+        ("time_constants_s: [600.0, 7200.0]", "time_constants_s: [0.6, 7200.0]", ["time_constants", "10…1e"]),
+        ("time_constants_s: [600.0, 7200.0]", "time_constants_s: [1, 2, 3]", ["late_struts"]),
+        ("time_constants_s: [600.0, 7200.0]", "time_constants: [600, 7200]", ["no unit", "time_constants_s"]),
+        ("late_base_ppm_per_K: [12.0, 13.0]", "late_base_ppm_per_K: [12.0, .nan]", ["late_base", "finite"]),
+        ("late_base_ppm_per_K: [12.0, 13.0]", "late_base_ppm_per_K: [12.0, 1300000]", ["thermal.late", "unit"]),
+    ],
+)
+def test_a_file_in_doubt_is_refused(tmp_path: Path, old: str, new: str, words: list[str]):
+    path = tmp_path / "warm.yaml"
+    save_model(warming_model(), path)
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(InputFileError) as refused:
+        load_model(path, paper())
+    assert all(word in str(refused.value) for word in words)
+
+
+def test_a_reading_without_its_time_is_refused_where_time_counts():
+    temperatures = Temperatures()
+    temperatures.follow("base", 21.0, math.nan, ())
+    with pytest.raises(ModelError, match="time of the temperature of base"):
+        temperatures.follow("base", 22.0, math.nan, (600.0,))
+    assert temperatures.at("base") == 21.0
+    assert len(PARTS) == 8
