@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from .errors import PoseError
-from .kernels.pose import QUATERNION_NORM_TOLERANCE, rotation_flaw
+from .kernels.pose import QUATERNION_NORM_TOLERANCE, quaternion_of, read_pose, rotation_flaw
 
 LARGEST_ANGLE = 1000.0
 """Larger angles, rad, are refused: nobody turns a tool 159 times, and at 1e16 rounding turns it anywhere."""
@@ -88,7 +87,9 @@ class Pose:
         norm = float(np.linalg.norm(quaternion))
         if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
             raise PoseError(f"quaternion must have norm 1, not {norm:.6g}", quaternion.tolist())
-        return Pose(np.asarray(position), Rotation.from_quat(quaternion).as_matrix())
+        rotation = np.empty((3, 3))
+        read_pose(0.0, 0.0, 0.0, *quaternion, np.empty(3), rotation)
+        return Pose(np.asarray(position), rotation)
 
     def angles(self) -> np.ndarray:
         """Return the paper's α, β, γ, radians, shape (3,)."""
@@ -96,7 +97,8 @@ class Pose:
 
     def quaternion(self) -> np.ndarray:
         """Return the unit quaternion (x, y, z, w) with w ≥ 0, shape (4,)."""
-        return Rotation.from_matrix(self.rotation).as_quat(canonical=True)
+        quaternion = np.array(quaternion_of(self.rotation))
+        return quaternion if quaternion[3] >= 0.0 else -quaternion
 
     def inverse(self) -> Pose:
         """Return the pose of the outer frame seen from this one."""
@@ -144,8 +146,14 @@ def rotation_from_angles(angles: np.ndarray) -> np.ndarray:
     angles = np.asarray(angles, dtype=float)
     if (np.abs(angles) > LARGEST_ANGLE).any():
         raise PoseError(f"angles must lie within ±{LARGEST_ANGLE:g} rad", float(np.abs(angles).max()))
-    rows = angles[..., [1, 0, 2]].reshape(-1, 3)  # older SciPy takes no further axes
-    return Rotation.from_euler("YXZ", rows).as_matrix().reshape(*angles.shape, 3)
+    cosines, sines = np.moveaxis(np.cos(angles), -1, 0), np.moveaxis(np.sin(angles), -1, 0)
+    (ca, cb, cg), (sa, sb, sg) = cosines, sines
+    rows = [
+        [cb * cg + sb * sa * sg, sb * sa * cg - cb * sg, sb * ca],
+        [ca * sg, ca * cg, -sa],
+        [cb * sa * sg - sb * cg, sb * sg + cb * sa * cg, cb * ca],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def angles_from_rotation(rotation: np.ndarray) -> np.ndarray:
@@ -164,7 +172,8 @@ def angles_from_rotation(rotation: np.ndarray) -> np.ndarray:
 
 def rotation_angle(rotation: np.ndarray) -> float:
     """Return the angle of a rotation matrix, radians in [0, π]."""
-    return float(Rotation.from_matrix(rotation).magnitude())
+    *vector, scalar = quaternion_of(rotation)
+    return 2.0 * math.atan2(math.hypot(*vector), abs(scalar))
 
 
 def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
@@ -181,6 +190,8 @@ def best_motion(points: np.ndarray, onto: np.ndarray) -> Pose | None:
         T with T·points ≈ onto, least squares; None for fewer than three points or points in a line, which leave a
         turn open.
     """
+    from scipy.spatial.transform import Rotation  # 27 MB with all that it needs, which a node does without
+
     centre, mean = onto.mean(axis=0), points.mean(axis=0)
     spread = np.linalg.svd(onto - centre, compute_uv=False)
     if len(points) < 3 or spread[1] <= IN_A_LINE * spread[0]:

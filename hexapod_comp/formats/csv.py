@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..errors import InputFileError, PoseError
 from ..kernels.pose import QUATERNION_NORM_TOLERANCE
@@ -414,6 +413,8 @@ def _rotations_from_quaternions(path: str | Path, rows: list[Row], quaternions: 
             Pose.from_quaternion(np.zeros(3), quaternions[row])
         except PoseError as error:
             raise InputFileError(path, f"line {rows[row].line}, columns qx…qw", str(error)) from error
+    from scipy.spatial.transform import Rotation  # 27 MB that a node, which reads other tables, does without
+
     return Rotation.from_quat(quaternions).as_matrix()
 
 

@@ -16,7 +16,6 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from ..errors import (
     KinematicsError,
@@ -405,6 +404,9 @@ def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tup
         The guess is so far away that numbers overflow.
     """
 
+    from scipy.optimize import least_squares  # 39 MB with the next one that a running node does not need
+    from scipy.spatial.transform import Rotation
+
     def pose_at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         rotation = Rotation.from_rotvec(x[3:] / structure.characteristic_length).as_matrix() @ guess.rotation
         return guess.position + x[:3], rotation
@@ -417,7 +419,6 @@ def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tup
     first = misfit(np.zeros(6))
     if not np.isfinite(first @ first):
         raise NotConvergedError(f"the guess {guess.position.tolist()} m is too far away to start from")
-    from scipy.optimize import least_squares  # 12 MB that a running node does not need
 
     fit = least_squares(misfit, np.zeros(6), xtol=1e-12, ftol=1e-12, gtol=1e-12, max_nfev=200)
     rest = float(np.abs(fit.fun).max())

@@ -18,7 +18,6 @@ from typing import IO, Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from scipy.spatial.transform import Rotation
 
 from ..compensation.compensator import Compensator
 from ..compensation.journal import Source
@@ -209,7 +208,9 @@ def error_message(
     message.header.frame_id, message.header.stamp = frame, stamp_of(stamp)
     position, orientation = message.pose.pose.position, message.pose.pose.orientation
     position.x, position.y, position.z = values[:3]
-    turn = Rotation.from_rotvec(values[3:]).as_quat()
-    orientation.x, orientation.y, orientation.z, orientation.w = turn.tolist()
+    half = 0.5 * math.hypot(*values[3:])
+    share = 0.5 * math.sin(half) / half if half > 0.0 else 0.5
+    orientation.x, orientation.y, orientation.z = (share * turn for turn in values[3:])
+    orientation.w = math.cos(half)
     message.pose.covariance = [math.nan] * 36 if covariance is None else covariance
     return message

@@ -325,3 +325,16 @@ def test_a_signal_while_modules_load_ends_a_program_without_a_traceback(tmp_path
     process.send_signal(number)
     rest, _ = process.communicate(timeout=STOP_WITHIN)
     assert (process.returncode, rest) == (0, "")
+
+
+def test_a_node_loads_no_scipy_that_it_does_not_need():
+    """27 MB a node: rotations at the edges are closed forms, and what turns others is loaded where it is used."""
+    program = """
+import sys
+import hexapod_comp.nodes.compensator, hexapod_comp.nodes.strut_drive
+from hexapod_comp.nodes.warming import warm
+warm()
+print(*sorted({"scipy.spatial", "scipy.sparse", "scipy.optimize", "scipy.interpolate"} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stdout) == (0, "\n"), done.stderr
