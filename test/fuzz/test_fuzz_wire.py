@@ -39,8 +39,10 @@ HUGE = 10_000_000
 GROWTH = 20
 """A node may have grown by so much when all is over, MB: the log's and diagnostics' share of a long life."""
 
-PEAK = 250
-"""No node may ever have more, MB, wherever it starts below 225: as it does on CPython 3.11."""
+PEAK, COPIES = 250, 35
+"""No node may ever have more than this, MB, or than it began with and three copies of the longest message: the
+middleware's, rclpy's, and the one that is looked at. A node begins with 210 to 240, half of it pages of libraries that
+all processes share."""
 
 TOPICS = {"compensator": ("tool_pose_command", "strut_states", "temperatures"), "strut_drive": ("strut_commands",)}
 AT_HOME = closed_form_lengths(HOME)
@@ -147,7 +149,7 @@ def test_bytes_of_any_content(stranger: Node, name: str) -> None:
         goes_on(stranger, publishers, seen)
         after, peak = memory(node)
         assert after <= before + GROWTH
-        assert peak <= PEAK or before > 225
+        assert peak <= max(PEAK, before + COPIES)
         COUNTS["wire"] += 1
     finally:
         code, said = node.stop()

@@ -87,7 +87,9 @@ def test_a_file_brings_the_same_model_back(tmp_path: Path):
     save_model(model, tmp_path / "warm.yaml")
     back = load_model(tmp_path / "warm.yaml", paper()).late_growth
     assert (back.time_constants, back.thermometer) == ((600.0, 7200.0), "base")
-    np.testing.assert_allclose(back.expansion, model.late_growth.expansion, rtol=3e-16)  # one rounding, as the file says
+    np.testing.assert_allclose(
+        back.expansion, model.late_growth.expansion, rtol=3e-16
+    )  # one rounding, as the file says
 
 
 @pytest.mark.parametrize(
