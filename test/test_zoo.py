@@ -256,7 +256,7 @@ def test_plan_and_iso230_take_the_campaign_and_its_readings(animal: Animal) -> N
     assert plan["readings"] == len(table(animal.file("readings.csv")))
     assert 0.0 < plan["expected_tool_error"]["after_m"] < 0.05 * plan["expected_tool_error"]["before_m"]
     figures = animal.tells("iso230", animal.file("readings.csv"))
-    for name, found in figures.items():
+    for name, found in {**figures["iso230_2"], **figures["iso230_6"]["body"]}.items():
         rows = [row for row in table(animal.file("readings.csv")) if row["run"] == name]
         places = columns(rows, "x_mm", "y_mm", "z_mm").round(6)
         means = [

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from . import common
-from .iso230 import with_units
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -104,19 +103,18 @@ def _write(args: argparse.Namespace, result: _Result, measured: MeasurementSet, 
     from ..calibration.lines_report import worth_json, worth_text
     from ..calibration.posterior import save_with_posterior
     from ..formats.outputs import write_text
-    from ..measurements.iso230 import evaluate, iso230_runs, table
+    from ..measurements.standards import judge, standards_json, standards_text
 
-    tests = {run.name: evaluate(run.targets, run.deviations) for run in iso230_runs(measured)}
+    judged = judge(measured)
     parts = [result.text]
-    parts += [table(tests) + "\n"] if tests else []
+    parts += [standards_text(judged) + "\n"] if judged else []
     parts += [worth_text(worth) + "\n"] if worth else []
     text = "\n".join(parts)
     if result.misfit:
         text = f"{FORCED}: {result.misfit}. {ADVICE}\n\n{text}"
     beside = save_with_posterior(result.saved, result.fitted, args.out)
     if args.json:
-        figures = {name: with_units(test.figures()) for name, test in tests.items()}
-        more = {"iso230": figures, "worth": worth_json(worth) if worth else None}
+        more = {"standards": standards_json(judged), "worth": worth_json(worth) if worth else None}
         files = {"written": args.out, "written_beside": beside}
         common.show({**result.content(), **more, "misfit": result.misfit, **files})
     else:

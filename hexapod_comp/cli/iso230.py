@@ -1,4 +1,4 @@
-"""``hexapod_comp iso230``: the figures of ISO 230-2 from measured lines."""
+"""``hexapod_comp iso230``: the figures of ISO 230 from measured lines."""
 
 from __future__ import annotations
 
@@ -12,25 +12,18 @@ def run(args: argparse.Namespace) -> int:
     from ..errors import CalibrationError
     from ..machine.geometry import load_geometry
     from ..measurements.files import read_measurements
-    from ..measurements.iso230 import evaluate, iso230_runs, report, table
+    from ..measurements.standards import every_target, judge, standards_json, standards_text
 
     geometry = load_geometry(args.machine)
     with common.stage("reading measurements"):
-        measured = read_measurements(args.files, geometry, args.columns, args.probe_mm)
+        measured = read_measurements(args.files, geometry, args.columns, args.probe_mm, in_reach=False)
     common.say_notes(measured.notes)
-    tests = {run.name: evaluate(run.targets, run.deviations) for run in iso230_runs(measured)}
-    if not tests:
+    judged = judge(measured)
+    if not judged:
         problem = "no linear run has two cycles or more with every target read from both sides in each"
         raise CalibrationError("measurements", problem)
     if args.json:
-        common.show({name: with_units(test.figures()) for name, test in tests.items()})
-    elif args.targets:
-        common.show("\n\n".join(f"{name}\n{report(test)}" for name, test in tests.items()))
+        common.show(standards_json(judged))
     else:
-        common.show(table(tests))
+        common.show(every_target(judged) if args.targets else standards_text(judged))
     return 0
-
-
-def with_units(figures: dict[str, float]) -> dict[str, float]:
-    """Return the standard's figures with their unit in the keys: ``A_m``, ``E_up_m``, …"""
-    return {f"{name}_m": value for name, value in figures.items()}

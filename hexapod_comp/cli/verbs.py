@@ -215,9 +215,11 @@ example:
     ),
     "iso230": Verb(
         "calibration",
-        "the figures of ISO 230-2:2014 (A, E, R, M, B) of measured lines",
-        """Judges every linear run with two cycles or more, all targets read from both sides in each (the standard asks
-for five cycles; a campaign says how many it makes). Figures are in µm. --targets prints each run target by target.
+        "the figures of ISO 230-2 and 230-6 (A, E, R, M, B) of measured lines",
+        """Judges every linear run with two cycles or more, all targets read from both sides in each (the standards ask
+for five cycles; a campaign says how many it makes). Lines along an axis of the work frame come under ISO 230-2:2014,
+all others, as body and face diagonals, under ISO 230-6:2002. Figures are in µm. --targets prints each run target by
+target. Targets that the machine of --machine does not reach are judged like all others.
 
 example:
   $ hexapod_comp iso230 measured.csv""",

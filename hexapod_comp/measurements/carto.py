@@ -150,7 +150,10 @@ def _capture(top: Section) -> Capture:
 
 
 def read_carto(
-    pairs: Sequence[tuple[str | Path, str | Path]], geometry: HexapodGeometry, probe: np.ndarray | None = None
+    pairs: Sequence[tuple[str | Path, str | Path]],
+    geometry: HexapodGeometry,
+    probe: np.ndarray | None = None,
+    in_reach: bool = True,
 ) -> MeasurementSet:
     """Read files of the laser software, each with its line file, as one set.
 
@@ -162,6 +165,8 @@ def read_carto(
         The machine that was measured.
     probe : array_like, shape (3,), optional
         The measured point in ``platform``, m; the tool's tip by default.
+    in_reach : bool
+        Refuse commands that the nominal machine cannot take; the figures of a standard do not need that.
 
     Raises
     ------
@@ -177,7 +182,7 @@ def read_carto(
         notes += remarks
         files.append((Path(path).name, sha256))
     _refuse_duplicates(readings)
-    return assemble(geometry, readings, probe, files, notes)
+    return assemble(geometry, readings, probe, files, notes, in_reach)
 
 
 def _file_readings(path: str | Path, line: LineFile, line_path: str | Path) -> tuple[list[Reading], str, Sequence[str]]:

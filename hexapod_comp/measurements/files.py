@@ -25,6 +25,7 @@ def read_measurements(
     geometry: HexapodGeometry,
     columns: str | Path | None = None,
     probe: np.ndarray | None = None,
+    in_reach: bool = True,
 ) -> MeasurementSet:
     """Read measured files, whatever wrote them, as one set.
 
@@ -40,6 +41,8 @@ def read_measurements(
         reading a row.
     probe : array_like, shape (3,), optional
         The measured point in ``platform``, m; the tool's tip by default.
+    in_reach : bool
+        Refuse commands that the nominal machine cannot take; the figures of a standard do not need that.
 
     Raises
     ------
@@ -55,11 +58,11 @@ def read_measurements(
     tables = [path for path in files if path not in laser]
     sets = []
     if laser:
-        sets.append(read_carto([(path, f"{path}.yaml") for path in laser], geometry, probe))
+        sets.append(read_carto([(path, f"{path}.yaml") for path in laser], geometry, probe, in_reach))
     if tables and columns is None:
-        sets.append(read_tidy(tables, geometry, probe))
+        sets.append(read_tidy(tables, geometry, probe, in_reach))
     if tables and columns is not None:
         if probe is not None:
             raise InputFileError(tables[0], "", "a wide file is of the tool's tip; leave the probe out")
-        sets += [read_wide(path, columns, geometry) for path in tables]
+        sets += [read_wide(path, columns, geometry, in_reach) for path in tables]
     return joined(sets)

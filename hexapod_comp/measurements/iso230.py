@@ -1,20 +1,19 @@
 """Figures of ISO 230-2:2014 for positioning along one line: targets approached again and again, from both sides.
 
 Up (↑) is the approach in the positive direction. A deviation is the position reached minus the target. The
-symbols of the standard stand beside each figure; the formulas are those of its clause 3.
+symbols of the standard stand beside each figure; the formulas are those of its clause 3. ISO 230-6:2002 judges
+diagonals by the same formulas.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..errors import ModelError
-from ..formats.texts import aligned
-from .readings import BACKWARD, FORWARD, MeasurementSet
 
 DIRECTIONS = ("up", "down")
 """Approach in the positive direction, and in the negative."""
@@ -304,11 +303,11 @@ def _swap_notes(both: BothDirections, cycles: int) -> list[str]:
     ]
 
 
-def report(test: PositioningTest) -> str:
-    """Return a test as text: targets in mm, everything else in µm, notes below."""
+def report(test: PositioningTest, standard: str = "ISO 230-2:2014") -> str:
+    """Return a test as text, under the name of its standard: targets in mm, everything else in µm, notes below."""
     arrows = "".join(ARROWS[name] for name in test.directions)
     travel = float(np.ptp(test.targets)) * 1e3
-    title = f"ISO 230-2:2014: {len(test.targets)} targets over {travel:g} mm, {test.cycles} cycles {arrows}; µm"
+    title = f"{standard}: {len(test.targets)} targets over {travel:g} mm, {test.cycles} cycles {arrows}; µm"
     lines = [title, "", *_target_lines(test), "", *_figure_lines(test)]
     if test.notes:
         lines += ["", *(f"note: {note}" for note in test.notes)]
@@ -349,67 +348,3 @@ def _figure_lines(test: PositioningTest) -> list[str]:
 def _micrometres(value: float) -> str:
     """Return a length in µm, ten characters wide, never −0."""
     return f"{round(value * 1e6, 3) + 0.0:10.3f}"
-
-
-def table(tests: Mapping[str, PositioningTest]) -> str:
-    """Return the figures of several bidirectional tests, one row each, µm."""
-    keys = ("A", "E", "R", "M", "B", "B_mean")
-    header = ("run", "targets", "cycles", *keys[:-1], "B̄", "")
-    rows = []
-    for name, test in tests.items():
-        figures = test.figures()
-        cells = [_micrometres(figures[key]).strip() if key in figures else "–" for key in keys]
-        rows.append((name, str(len(test.targets)), str(test.cycles), *cells, "um"))
-    return "ISO 230-2:2014, both directions\n" + aligned(header, rows)
-
-
-@dataclass(frozen=True)
-class Iso230Run:
-    """A linear run as ISO 230-2 wants it.
-
-    Attributes
-    ----------
-    name : str
-        Of the run.
-    targets : ndarray, shape (m,)
-        Commanded coordinates along the line, rising, m.
-    deviations : ndarray, shape (2, cycles, m)
-        Readings, forward and backward, m.
-    """
-
-    name: str
-    targets: np.ndarray
-    deviations: np.ndarray
-
-
-def iso230_runs(measurements: MeasurementSet) -> list[Iso230Run]:
-    """Return the linear runs that ISO 230-2 can judge: two cycles or more, every target from both sides in each.
-
-    Runs with fewer cycles, gaps or without both directions are left out.
-    """
-    points = measurements.points()[measurements.station]
-    runs = []
-    for number, run in enumerate(measurements.runs):
-        chosen = np.flatnonzero((measurements.run == number) & (measurements.channel == 0))
-        table: dict[tuple[int, int], dict[float, float]] = {}
-        for n in chosen:
-            pass_of = (int(measurements.direction[n]), int(measurements.cycle[n]))
-            target = round(float(points[n] @ run.axis), 9) + 0.0
-            table.setdefault(pass_of, {})[target] = float(measurements.value[n])
-        complete = _complete_run(run.name, table)
-        if complete is not None:
-            runs.append(complete)
-    return runs
-
-
-def _complete_run(name: str, table: dict[tuple[int, int], dict[float, float]]) -> Iso230Run | None:
-    """Return a run from {(direction, cycle): {target: reading}} if nothing is missing in it."""
-    cycles = sorted({cycle for _, cycle in table})
-    passes = {(direction, cycle) for direction in (FORWARD, BACKWARD) for cycle in cycles}
-    if len(cycles) < 2 or set(table) != passes:
-        return None
-    targets = sorted(table[FORWARD, cycles[0]])
-    if any(sorted(readings) != targets for readings in table.values()):
-        return None
-    deviations = [[[table[d, c][t] for t in targets] for c in cycles] for d in (FORWARD, BACKWARD)]
-    return Iso230Run(name, np.array(targets), np.array(deviations))

@@ -47,6 +47,7 @@ def assemble(
     probe: np.ndarray | None = None,
     files: Iterable[tuple[str, str]] = (),
     notes: Iterable[str] = (),
+    in_reach: bool = True,
 ) -> MeasurementSet:
     """Return the set of some readings: runs recognised as lines, stations made unique, reach checked.
 
@@ -58,6 +59,8 @@ def assemble(
         Measured point in ``platform``, m; the tool's tip by default.
     files, notes : iterable of (str, str), iterable of str
         Name and SHA-256 of each file, and remarks so far.
+    in_reach : bool
+        Refuse commands that the nominal machine cannot take; the figures of a standard do not need that.
 
     Raises
     ------
@@ -69,7 +72,7 @@ def assemble(
     poses = _platform_poses(geometry, readings)
     points = np.array([pose.position + pose.rotation @ probe for pose in poses])
     runs, run_of, swapped = _runs(readings, points, geometry.work.rotation.T)
-    stations, station = _collect_stations(geometry, readings, poses, [runs[i] for i in run_of])
+    stations, station = _collect_stations(geometry, readings, poses, [runs[i] for i in run_of], in_reach)
     return MeasurementSet(
         geometry=geometry,
         probe=probe,
@@ -171,7 +174,7 @@ def _recognise(readings: list[Reading], points: np.ndarray, work_axes: np.ndarra
 
 
 def _collect_stations(
-    geometry: HexapodGeometry, readings: Sequence[Reading], poses: list[Pose], runs: list[Run]
+    geometry: HexapodGeometry, readings: Sequence[Reading], poses: list[Pose], runs: list[Run], in_reach: bool
 ) -> tuple[Stations, np.ndarray]:
     """Return the distinct stations and each reading's index among them; poses and runs per reading."""
     known: dict[tuple, int] = {}
@@ -192,7 +195,8 @@ def _collect_stations(
         key = (place, r.direction, None if came_from is None else before, r.temperatures, str(time))
         if key not in known:
             lengths = strut_lengths(nominal, pose)
-            _check_reach(geometry, pose, lengths, r)
+            if in_reach:
+                _check_reach(geometry, pose, lengths, r)
             commands = np.array(lengths if r.commands is None else r.commands, dtype=float)
             sense = _sense(geometry, r.direction, run, pose, commands, came_from)
             known[key] = len(rows)

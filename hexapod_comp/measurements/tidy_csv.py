@@ -128,7 +128,10 @@ class _Row(NamedTuple):
 
 
 def read_tidy(
-    paths: str | Path | Sequence[str | Path], geometry: HexapodGeometry, probe: np.ndarray | None = None
+    paths: str | Path | Sequence[str | Path],
+    geometry: HexapodGeometry,
+    probe: np.ndarray | None = None,
+    in_reach: bool = True,
 ) -> MeasurementSet:
     """Read tidy CSV files (described above) as one set.
 
@@ -140,6 +143,8 @@ def read_tidy(
         The machine that was measured.
     probe : array_like, shape (3,), optional
         The measured point in ``platform``, m; the tool's tip by default.
+    in_reach : bool
+        Refuse commands that the nominal machine cannot take; the figures of a standard do not need that.
 
     Raises
     ------
@@ -159,7 +164,7 @@ def read_tidy(
         files.append((Path(table.path).name, table.sha256))
         if corrected:
             notes.append(f"{table.path}: {corrected} readings corrected to the air of their rows (Ciddor)")
-    return assemble(geometry, readings, probe, files, notes)
+    return assemble(geometry, readings, probe, files, notes, in_reach)
 
 
 def _refuse_twice(tables: Sequence[Table]) -> None:

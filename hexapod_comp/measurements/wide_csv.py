@@ -188,7 +188,9 @@ class _Poses:
     rotations: np.ndarray
 
 
-def read_wide(path: str | Path, columns_path: str | Path, geometry: HexapodGeometry) -> MeasurementSet:
+def read_wide(
+    path: str | Path, columns_path: str | Path, geometry: HexapodGeometry, in_reach: bool = True
+) -> MeasurementSet:
     """Read a wide CSV file as one run of absolute positions and, where there are any, attitudes.
 
     Parameters
@@ -199,6 +201,8 @@ def read_wide(path: str | Path, columns_path: str | Path, geometry: HexapodGeome
         The columns file that explains it.
     geometry : HexapodGeometry
         The machine that was measured; the measured point is its tool's tip.
+    in_reach : bool
+        Refuse commands that the nominal machine cannot take; the figures of a standard do not need that.
 
     Returns
     -------
@@ -222,7 +226,7 @@ def read_wide(path: str | Path, columns_path: str | Path, geometry: HexapodGeome
     unused = [name for name in table.header if name not in used]
     notes += [f"{path}: columns not used: {', '.join(unused)}"] if unused else []
     readings = _readings(table, columns, commanded, measured, commands)
-    return assemble(geometry, readings, None, [(Path(path).name, table.sha256)], notes)
+    return assemble(geometry, readings, None, [(Path(path).name, table.sha256)], notes, in_reach)
 
 
 def _read_numbers(table: Table, names: tuple[str, ...], unit: float, used: set[str]) -> np.ndarray:

@@ -144,7 +144,8 @@ def test_fit_reports_all_its_sections(done: Calibration) -> None:
         "structure parameters are observable",
         "observability indices: O1 ",
         "not seen (left near nominal): base 1",
-        "ISO 230-2:2014, both directions",
+        "ISO 230-2:2014, lines along the axes, both directions",
+        "ISO 230-6:2002, body diagonals, both directions",
         "On the virtual machine, without → with the model",
         "metric of Mou & King, mean |displacement error|",
         f"model: {done.file('model.yaml')}",
@@ -207,7 +208,7 @@ def test_json_holds_every_parameter_with_its_error(done: Calibration) -> None:
     assert 0.0 < content["channels"][0]["found_m"] < 1e-5
     assert content["misfit"] == ""
     assert content["worth"]["error_with"]["aligned_rms_m"] < 0.1 * content["worth"]["error_without"]["aligned_rms_m"]
-    assert content["iso230"]["x line at y 0.0, z 350.0"]["A_m"] > 0.0
+    assert content["standards"]["iso230_2"]["x line at y 0.0, z 350.0"]["A_m"] > 0.0
     assert content["written"] == str(done.file("model.yaml"))
     error = content["expected_tool_error"]
     assert error["low_m"] < error["after_m"] < error["high_m"] < error["before_m"]
@@ -683,9 +684,11 @@ def test_iso230_judges_every_line(hexapod: Program, done: Calibration) -> None:
     code, out, err = hexapod("iso230", done.measured)
     assert (code, err) == (0, "")
     rows = out.splitlines()
-    assert rows[0] == "ISO 230-2:2014, both directions"
+    assert rows[0] == "ISO 230-2:2014, lines along the axes, both directions"
     assert rows[1].split()[:5] == ["run", "targets", "cycles", "A", "E"]
-    assert len(rows) == 2 + 25
+    assert rows[2 + 21 :][:2] == ["", "ISO 230-6:2002, body diagonals, both directions"]
+    assert [row.split()[:2] for row in rows[26:30]] == [["diagonal", str(n)] for n in (1, 2, 3, 4)]
+    assert rows[30].startswith("largest of the 4: E_d ")
     assert out.strip() in done.fit_said, "the same table is part of the fit's report"
 
 
@@ -704,7 +707,7 @@ def test_iso230_figures_follow_from_the_readings(hexapod: Program, done: Calibra
         ]
     )  # fmt: skip
     assert means.shape == (2, 11)
-    figures = json.loads(hexapod("iso230", done.measured, "--json")[1])[name]
+    figures = json.loads(hexapod("iso230", done.measured, "--json")[1])["iso230_2"][name]
     assert figures["M_m"] == pytest.approx(np.ptp(means.mean(axis=0)), abs=1e-12)
     assert figures["B_m"] == pytest.approx(np.abs(means[0] - means[1]).max(), abs=1e-12)
     assert figures["E_m"] == pytest.approx(np.ptp(means), abs=1e-12)
@@ -715,6 +718,7 @@ def test_iso230_target_by_target(hexapod: Program, done: Calibration) -> None:
     code, out, _ = hexapod("iso230", done.measured, "--targets")
     assert code == 0
     assert out.count("accuracy A") == 25
+    assert (out.count("ISO 230-2:2014: "), out.count("ISO 230-6:2002: ")) == (21, 4)
     assert "x line at y 0.0, z 350.0" in out
 
 

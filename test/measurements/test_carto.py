@@ -18,8 +18,8 @@ from test_measurement_csv import edits, mutated
 from hexapod_comp.errors import HexapodError, InputFileError
 from hexapod_comp.measurements.carto import load_line, read_carto
 from hexapod_comp.measurements.carto_files import read_rtl, read_rtx, read_sections
-from hexapod_comp.measurements.iso230 import iso230_runs
 from hexapod_comp.measurements.readings import BACKWARD, CHANNELS, FORWARD
+from hexapod_comp.measurements.standards import linear_runs
 
 RATE, SPEED = 100.0, 5.0  # 1/s, mm/s
 
@@ -202,7 +202,7 @@ def test_rtl_becomes_readings_with_cycles_and_directions(tmp_path: Path) -> None
     """Runs 1 and 3 go up, 2 and 4 come down: two cycles of both directions, ready for ISO 230-2."""
     data = write(tmp_path, "a.rtl", rtl().replace("\n", "\r\n"))
     found = read_carto([(data, write(tmp_path, "a.yaml", RTL_LINE))], paper_geometry())
-    run = iso230_runs(found)[0]
+    run = linear_runs(found)[0]
     np.testing.assert_allclose(run.targets, np.array(TARGETS) * 1e-3, atol=1e-12)
     expected = np.array([[1000, 3000], [2000, 4000]])[..., None] + np.arange(1, 7)
     np.testing.assert_allclose(run.deviations, expected * 1e-6, rtol=1e-12)

@@ -21,8 +21,8 @@ from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import Structure, strut_lengths
 from hexapod_comp.measurements.campaign import Campaign, template
-from hexapod_comp.measurements.iso230 import iso230_runs
 from hexapod_comp.measurements.readings import CHANNELS, MeasurementSet
+from hexapod_comp.measurements.standards import linear_runs
 from hexapod_comp.measurements.tidy_csv import read_tidy
 from hexapod_comp.measurements.wide_csv import read_wide
 from hexapod_comp.measurements.writing import write_measurements
@@ -292,7 +292,7 @@ def test_iso_230_2_runs(tmp_path: Path) -> None:
                 rows += f"a,{direction},0,{target},400,linear,{value},um,{cycle}\n"
                 rows += f"gap,{direction},0,{target},400,linear,1,um,{cycle}\n" * (target != 0 or cycle == 1)
                 rows += f"once,{direction},0,{target},400,linear,1,um,1\n" * (cycle == 1)
-    runs = iso230_runs(read(tmp_path, rows, f"{HEADER},cycle"))
+    runs = linear_runs(read(tmp_path, rows, f"{HEADER},cycle"))
     assert [run.name for run in runs] == ["a"]
     np.testing.assert_array_equal(runs[0].targets, [-0.01, 0.0, 0.01])
     expected = [[[99, 100, 101], [199, 200, 201]], [[109, 110, 111], [209, 210, 211]]]
