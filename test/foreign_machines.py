@@ -139,6 +139,7 @@ class Errors:
     offset: np.ndarray
     pitch: np.ndarray
     reference: np.ndarray
+    axes_turn: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     @staticmethod
     def none() -> Errors:
@@ -165,7 +166,7 @@ class Errors:
         values = [np.array(structure[f"{body}_deviation_um"]) * UM for body in ("base", "platform")]
         values += [np.full(6, struts.get(key, 0.0)) * unit for key, unit in
                    (("offset_um", UM), ("pitch_ppm", 1e-6), ("reference_length_mm", MM))]  # fmt: skip
-        return Errors(*values)
+        return Errors(*values, np.array(structure.get("base_axes_turn_urad", np.zeros(3))) * 1e-6)
 
     def write(self, path: Path, machine: Machine) -> Path:
         """Write the model file."""
@@ -194,12 +195,14 @@ def commands(machine: Machine, errors: Errors, positions: np.ndarray, rotations:
     """Return what the struts must be told for platform poses if the machine has these errors, (N, 6), m."""
     arms = (machine.platform + errors.platform) @ np.swapaxes(rotations, 1, 2)
     struts = positions[:, None] + arms - machine.base - errors.base
-    lengths = np.linalg.norm(struts, axis=2) - advance(machine, struts, rotations)
+    lengths = np.linalg.norm(struts, axis=2) - advance(machine, struts, rotations, errors.axes_turn)
     return (lengths - errors.offset + errors.pitch * errors.reference) / (1.0 + errors.pitch)
 
 
-def advance(machine: Machine, struts: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+def advance(machine: Machine, struts: np.ndarray, rotations: np.ndarray, turn: np.ndarray | None = None) -> np.ndarray:
     """Return by how much struts (N, 6, 3) have become longer by themselves since home, as their screws turned.
+
+    The base's axes may be turned from the drawing by `turn`, a rotation vector; home's turn is the drawing's.
 
     A cardan joint's cross holds the strut's fork across both its own axis and the strut. So the screw stands along
     (base axis) × u and the nut along (platform axis) × u, and from the one to the other is what the screw has turned.
@@ -207,15 +210,18 @@ def advance(machine: Machine, struts: np.ndarray, rotations: np.ndarray) -> np.n
     if not machine.lead or machine.axes is None:
         return np.zeros(struts.shape[:2])
     at_home = np.array(machine.home) + machine.platform - machine.base
-    turned = _screw_angles(machine, struts, rotations) - _screw_angles(machine, at_home[None], np.eye(3)[None])
+    turned = _screw_angles(machine, struts, rotations, turn) - _screw_angles(machine, at_home[None], np.eye(3)[None])
     return machine.lead * np.angle(np.exp(1j * turned)) / (2.0 * np.pi)
 
 
-def _screw_angles(machine: Machine, struts: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+def _screw_angles(
+    machine: Machine, struts: np.ndarray, rotations: np.ndarray, turn: np.ndarray | None = None
+) -> np.ndarray:
     """Return the angles about the struts from screw to nut, right-handed, rad."""
     assert machine.axes is not None
     u = struts / np.linalg.norm(struts, axis=2, keepdims=True)
-    screw, nut = np.cross(machine.axes[0], u), np.cross(machine.axes[1] @ np.swapaxes(rotations, 1, 2), u)
+    on_base = machine.axes[0] if turn is None else machine.axes[0] @ _turned(turn[None])[0].T
+    screw, nut = np.cross(on_base, u), np.cross(machine.axes[1] @ np.swapaxes(rotations, 1, 2), u)
     return np.arctan2((u * np.cross(screw, nut)).sum(axis=2), (screw * nut).sum(axis=2))
 
 
@@ -229,7 +235,7 @@ def goes_to(
         arms = (machine.platform + errors.platform) @ np.swapaxes(rotations, 1, 2)
         struts = positions[:, None] + arms - machine.base - errors.base
         distances = np.linalg.norm(struts, axis=2)
-        lengths = distances - advance(machine, struts, rotations)
+        lengths = distances - advance(machine, struts, rotations, errors.axes_turn)
         u = struts / distances[:, :, None]
         step = np.linalg.solve(np.concatenate([u, np.cross(arms, u)], axis=2), (wanted - lengths)[:, :, None])[:, :, 0]
         positions += step[:, :3]

@@ -241,6 +241,18 @@ class Estimation:
         beyond = np.bincount(m.kind, weights * (1.0 - reading_weights) * residuals**2, len(KINDS))
         return self._problem(target + rows @ x, self.space.whitened(rows), scatter - beyond), residuals
 
+    def free_of_unknowns(self, rows: np.ndarray) -> np.ndarray:
+        """Return what is left of cells' derivatives (C, K) beside all that instruments do not know, over their noise.
+
+        The noise is the stated one.
+        """
+        scale = np.sqrt(np.bincount(self.cells.of_reading, self.uncertainty**-2))
+        rows = scale[:, None] * rows
+        for members, columns in self._unknowns:
+            q, _ = np.linalg.qr(scale[members, None] * columns)
+            rows[members] -= q @ (q.T @ rows[members])
+        return rows
+
     def _expected(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return what each cell should read, shape (C,), and its derivatives, (C, size), m and rad.
 

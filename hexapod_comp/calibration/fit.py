@@ -12,6 +12,8 @@ from ..errors import CalibrationError
 from ..machine.model import REFERENCE_TEMPERATURE, MachineModel, ModelOrigin
 from ..machine.size import rms
 from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementSet, refuse_unmoved
+from ..pose import Pose
+from .datum import HeldDatum, hold, unseen_part
 from .estimation import HUBER, OUTLIER, Estimation, Posterior, Solution, held_out, iterate, physical_covariance
 from .observability import Allowed, Observability, ToolError, expected_error, observe, without_trace
 from .parameters import FitSettings, ParameterSpace
@@ -116,6 +118,8 @@ class ModelFit:
         What a reader must know.
     allowed : Allowed
         What the readings do not rule out.
+    held : HeldDatum
+        Where the tool is held: the model is the solution's machine, shifted and turned as a whole.
     """
 
     model: MachineModel
@@ -131,6 +135,7 @@ class ModelFit:
     outliers: tuple[Outlier, ...]
     notes: tuple[str, ...]
     allowed: Allowed
+    held: HeldDatum
 
     @property
     def misfit(self) -> str:
@@ -152,6 +157,7 @@ def fit_model(
     measurements: MeasurementSet,
     settings: FitSettings | None = None,
     progress: Callable[[str], object] = lambda text: None,
+    datum: Pose | None = None,
 ) -> ModelFit:
     """Fit structure, struts and field to all readings at once.
 
@@ -163,11 +169,15 @@ def fit_model(
         What else is known.
     progress : callable
         Told what goes on.
+    datum : Pose, optional
+        ``pose_platform_in_base`` at which the model moves the tool by nothing, as far as the readings do not show where
+        the machine stands as a whole; home by default.
 
     Raises
     ------
     CalibrationError
-        Too few readings, or such that show nothing, a fit that does not settle, forward and backward swapped.
+        A datum that the machine does not reach, too few readings, or such that show nothing, a fit that does not
+        settle, forward and backward swapped.
     """
     settings = settings or FitSettings()
     everything = Estimation(measurements, ParameterSpace(measurements, settings))
@@ -178,8 +188,12 @@ def fit_model(
     covariance = physical_covariance(space, solution.posterior)
     allowed = _allowed(everything.space, possible, (space, solution))
     level, tilted = (expected_error(space, solution.x, covariance, tilt, allowed=allowed) for tilt in (0.0, TILT))
+    pose = measurements.geometry.home if datum is None else datum
+    part = unseen_part(estimation, solution.posterior, pose)
+    as_solved = _named(space, solution, measurements, channels, len(decisions))
+    model, held = hold(measurements.geometry, as_solved, pose, part)
     return ModelFit(
-        model=_named(space, solution, measurements, channels, len(decisions)),
+        model=model,
         measurements=measurements,
         space=space,
         solution=solution,
@@ -192,6 +206,7 @@ def fit_model(
         outliers=tuple(_outliers(estimation, solution)),
         notes=(*measurements.notes, *notes, *_check_worth(level)),
         allowed=allowed,
+        held=held,
     )
 
 

@@ -48,6 +48,8 @@ from ..machine.field import CROSS_AXES, GridField
 from ..machine.model import MachineModel, ModelOrigin
 from ..machine.size import rms
 from ..measurements.readings import AXES, KINDS, LEAST_NOISE, MeasurementSet, refuse_unmoved
+from ..pose import Pose
+from .datum import HeldDatum, hold
 from .grid_readings import (
     Readings,
     check_complete,
@@ -134,11 +136,13 @@ class LinesFit:
     Attributes
     ----------
     model : MachineModel
-        The field alone; structure and struts are nominal.
+        The field; struts are nominal, and so is the structure, but for the whole base where holding the datum moves it.
     lines : tuple of LineFit
         Every polynomial.
     notes : tuple of str
         What was odd, left out or assumed.
+    held : HeldDatum
+        Where the tool is held.
     misfit : str
         Why the model is not to be trusted: readings that scatter more than :data:`MISFIT` allows when repeated, or
         lie further off their polynomials than :data:`LINES_MISFIT`; empty if none does.
@@ -147,11 +151,16 @@ class LinesFit:
     model: MachineModel
     lines: tuple[LineFit, ...]
     notes: tuple[str, ...]
+    held: HeldDatum
     misfit: str = ""
 
 
 def fit_lines(
-    measurements: MeasurementSet, order: OrderRule = "adjusted-r2", date: str = "", name: str = ""
+    measurements: MeasurementSet,
+    order: OrderRule = "adjusted-r2",
+    date: str = "",
+    name: str = "",
+    datum: Pose | None = None,
 ) -> LinesFit:
     """Fit Mou & King's polynomials to the readings on a rectangular grid of lines.
 
@@ -166,6 +175,9 @@ def fit_lines(
         whose points do not carry it get the highest that they do, and are noted.
     date, name : str, optional
         ISO 8601 date and name of the model; today, and the scheme's, by default.
+    datum : Pose, optional
+        ``pose_platform_in_base`` at which the model moves the tool by nothing; home by default. Lines do not show where
+        the machine stands as a whole.
 
     Raises
     ------
@@ -179,9 +191,9 @@ def fit_lines(
     grid = grid_of(readings)
     readings = readings._replace(node=nearest_nodes(readings.point, grid))
     check_complete(readings, grid)
-    datum, remark = datum_of(measurements, grid)
+    zero, remark = datum_of(measurements, grid)
     notes += remark
-    field, fits = _fit_families(readings, GridField(grid, _no_lines(grid), probe=measurements.probe), order, datum)
+    field, fits = _fit_families(readings, GridField(grid, _no_lines(grid), probe=measurements.probe), order, zero)
     notes += _fit_notes(fits, order)
     left = _without_means(measurements)
     if np.abs(left).max() <= LEAST_NOISE:  # one silent kind among others does this scheme no harm
@@ -194,7 +206,8 @@ def fit_lines(
         origin=ModelOrigin(date or calendar.today().isoformat(), measurements.files, None, _origin_note(order)),
     )
     notes = list(dict.fromkeys((*measurements.notes, *notes)))
-    return LinesFit(model, tuple(fits), tuple(notes), _misfit(measurements, fits))
+    model, held = hold(measurements.geometry, model, measurements.geometry.home if datum is None else datum, np.eye(6))
+    return LinesFit(model, tuple(fits), tuple(notes), held, _misfit(measurements, fits))
 
 
 def _without_means(measurements: MeasurementSet) -> np.ndarray:

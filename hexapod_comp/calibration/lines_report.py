@@ -34,6 +34,7 @@ def report(fit: LinesFit, worth: Worth | None = None, every_line: bool = False) 
     blocks = [f"{fit.model.name}: {len(fit.lines)} polynomials on a grid of {nodes} nodes", summary_table(fit.lines)]
     if every_line:
         blocks.append(line_table(fit.lines))
+    blocks.append(fit.held.report())
     blocks += [f"note: {note}" for note in fit.notes]
     if worth is not None:
         blocks.append(worth_text(worth))
@@ -107,6 +108,7 @@ def as_json(fit: LinesFit) -> dict[str, Any]:
         "scheme": "lines",
         "grid_m": [axis.tolist() for axis in field.grid],
         "lines": [_line_json(line) for line in fit.lines],
+        "datum": fit.held.as_json(),
         "notes": fit.notes,
     }
 

@@ -18,13 +18,15 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import HexapodError, InputFileError, ModelError
+from ..errors import HexapodError, InputFileError, ModelError, PoseError
 from ..formats.outputs import new_file
 from ..formats.paths import input_file
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
 from ..machine.model_file import save_model
 from ..measurements.readings import KINDS
+from ..pose import Pose
+from .datum import HeldDatum
 from .fit import ModelFit
 from .parameters import FitSettings, ParameterSpace, Region
 
@@ -32,6 +34,9 @@ FORMAT = "hexapod_comp/posterior"
 VERSION = 1
 
 SUFFIX = ".posterior.npz"
+
+HELD = ("datum_position", "datum_rotation", "datum_part", "datum_given_up")
+"""Arrays of a held datum."""
 
 MOST_BYTES = 200_000_000
 """Larger arrays are no fit's: some 5000 parameters."""
@@ -53,6 +58,9 @@ class FittedParameters:
         Size of each block's prior.
     noise : ndarray, shape (kinds,)
         Factor on the stated standard deviation of each kind's readings.
+    held : HeldDatum or None
+        Where the model holds the tool; `x` and `covariance` are as readings and priors left them, before. None in
+        older files.
     """
 
     space: ParameterSpace
@@ -60,12 +68,15 @@ class FittedParameters:
     covariance: np.ndarray
     tolerances: np.ndarray
     noise: np.ndarray
+    held: HeldDatum | None = None
 
     @staticmethod
     def of(fit: ModelFit) -> FittedParameters:
         """Return what a fit knows."""
         posterior = fit.solution.posterior
-        return FittedParameters(fit.space, fit.solution.x, fit.covariance, posterior.tolerances, posterior.noise)
+        return FittedParameters(
+            fit.space, fit.solution.x, fit.covariance, posterior.tolerances, posterior.noise, fit.held
+        )
 
 
 def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, path: str | Path) -> list[Path]:
@@ -103,6 +114,9 @@ def _content(fitted: FittedParameters) -> bytes:
     arrays = {name: getattr(fitted, name) for name in ("x", "tolerances", "noise")}
     arrays["covariance"] = fitted.covariance[np.tril_indices(space.size)]  # it is symmetric
     arrays |= {f"region_{name}": value for name, value in vars(space.region).items()}
+    if fitted.held is not None:
+        values = fitted.held.pose.position, fitted.held.pose.rotation, fitted.held.part, fitted.held.given_up
+        arrays |= dict(zip(HELD, values, strict=True))
     np.savez_compressed(stream, head=np.array(json.dumps(head)), labels=np.array(space.labels), **arrays)
     return stream.getvalue()
 
@@ -178,8 +192,8 @@ def _parsed(content: bytes, path: Path, geometry: HexapodGeometry) -> FittedPara
         covariance = np.zeros((space.size, space.size))
         covariance[np.tril_indices(space.size)] = arrays["covariance"]
         covariance += np.tril(covariance, -1).T
-        fitted = FittedParameters(space, arrays["x"], covariance, arrays["tolerances"], arrays["noise"])
-    except (KeyError, TypeError, ValueError, zipfile.BadZipFile, ModelError) as error:
+        fitted = FittedParameters(space, arrays["x"], covariance, arrays["tolerances"], arrays["noise"], _held(arrays))
+    except (KeyError, TypeError, ValueError, zipfile.BadZipFile, ModelError, PoseError) as error:
         raise InputFileError(path, "", f"is no file of a fit's posterior: {error}") from error
     shapes = {"x": (space.size,), "covariance": (space.size,) * 2}
     shapes |= {"tolerances": (len(space.blocks),), "noise": (len(KINDS),)}
@@ -188,6 +202,16 @@ def _parsed(content: bytes, path: Path, geometry: HexapodGeometry) -> FittedPara
         if array.shape != shape or not np.isfinite(array).all():
             raise InputFileError(path, name, f"must be finite, of shape {shape}", list(array.shape))
     return fitted
+
+
+def _held(arrays: dict[str, np.ndarray]) -> HeldDatum | None:
+    """Return the datum of a file's arrays; None: it is older than that."""
+    if not any(name in arrays for name in HELD):
+        return None
+    position, rotation, part, given_up = (arrays[name] for name in HELD)
+    if part.shape != (6, 6) or given_up.shape != (6,) or not (np.isfinite(part).all() and np.isfinite(given_up).all()):
+        raise ValueError("datum_part and datum_given_up must be finite, of shapes (6, 6) and (6,)")
+    return HeldDatum(Pose(position, rotation), part, given_up)
 
 
 def _settings(given: dict[str, Any]) -> FitSettings:

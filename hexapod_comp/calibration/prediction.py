@@ -18,9 +18,10 @@ from ..machine.model import RealMachine, Temperatures, platform_box
 from ..machine.motion import FOLLOWED
 from ..machine.passes import Poses
 from ..measurements.readings import Stations, attitude_error
+from .datum import HeldDatum
 from .parameters import ParameterSpace
 from .posterior import FittedParameters
-from .sensitivity import Prediction, derivatives
+from .sensitivity import Prediction, carried, derivatives
 
 CHUNK = 256
 """Poses handled together: bounds the memory of their derivatives."""
@@ -84,6 +85,7 @@ class ErrorPredictor:
 
     def __init__(self, machine: RealMachine, fitted: FittedParameters | None) -> None:
         self._machine, self._fitted = machine, fitted
+        self._at_held = None if fitted is None or fitted.held is None else self._slopes_at(fitted.held)
         self._datum = self._find_datum()
 
     def predict(self, poses: Poses, senses: np.ndarray | None = None) -> tuple[PredictedError, PredictedError | None]:
@@ -108,12 +110,13 @@ class ErrorPredictor:
             A pose is not finite.
         """
         count = len(poses[0])
-        stations = _stations(self._machine, poses, np.zeros((count, FOLLOWED)) if senses is None else senses)
+        positions, rotations = poses
+        senses = np.zeros((count, FOLLOWED)) if senses is None else senses
         standing: list[PredictedError] = []
         aligned: list[PredictedError] = []
         for start in range(0, max(count, 1), CHUNK):
-            chosen = np.arange(start, min(start + CHUNK, count))
-            errors = _first_order(self._machine, self._fitted, stations.select(chosen))
+            chosen = slice(start, start + CHUNK)
+            errors = self._errors((positions[chosen], rotations[chosen]), senses[chosen])
             standing.append(self._with_covariance(errors))
             if self._datum is not None:
                 aligned.append(self._with_covariance(errors.without(self._datum)))
@@ -137,10 +140,25 @@ class ErrorPredictor:
         """
         if self._fitted is None or self._datum is None:
             raise CalibrationError("model", "tells neither how well it is known, nor where it was measured")
-        errors = _first_order(
-            self._machine, self._fitted, _stations(self._machine, poses, np.zeros((len(poses[0]), FOLLOWED)))
-        )
+        errors = self._errors(poses)
         return errors.tips, errors.slopes, errors.without(self._datum).slopes
+
+    def _slopes_at(self, held: HeldDatum) -> np.ndarray:
+        """Return how the parameters move the tool at the held datum, at 20 °C, shape (6, size)."""
+        machine = RealMachine(self._machine.geometry, self._machine.model)
+        poses = held.pose.position[None], held.pose.rotation[None]
+        return _first_order(machine, self._fitted, _stations(machine, poses, np.zeros((1, FOLLOWED)))).slopes[0]
+
+    def _errors(self, poses: Poses, senses: np.ndarray | None = None) -> _FirstOrder:
+        """Return the errors at poses: parameters move the whole machine by nothing that is held at the datum."""
+        senses = np.zeros((len(poses[0]), FOLLOWED)) if senses is None else senses
+        errors = _first_order(self._machine, self._fitted, _stations(self._machine, poses, senses))
+        if self._at_held is None:
+            return errors
+        geometry, held = self._machine.geometry, self._fitted.held  # type: ignore[union-attr]
+        arms = errors.tips - geometry.tool_pose(held.pose).position  # type: ignore[union-attr]
+        taken = held.taken(self._at_held, arms, geometry.work.rotation)  # type: ignore[union-attr]
+        return errors._replace(slopes=errors.slopes - taken)
 
     def _with_covariance(self, errors: _FirstOrder) -> PredictedError:
         if self._fitted is None:
@@ -157,9 +175,7 @@ class ErrorPredictor:
         nodes = [np.linspace(low, high, 3) for low, high in box.T]
         positions = np.stack(np.meshgrid(*nodes), axis=-1).reshape(-1, 3)
         poses = positions, np.tile(level, (len(positions), 1, 1))
-        errors = _first_order(
-            self._machine, fitted, _stations(self._machine, poses, np.zeros((len(positions), FOLLOWED)))
-        )
+        errors = self._errors(poses)
         reached = np.isfinite(errors.values).all(axis=1)
         if reached.sum() < 3:
             return None
@@ -189,7 +205,7 @@ class _Datum:
         """Return what explains the errors at some places best, by least squares of the displacements."""
         centre = errors.tips.mean(axis=0)
         unit = np.tile(np.eye(6)[None], (len(errors.tips), 1, 1))
-        explain = np.linalg.pinv(_carried(unit, errors.tips - centre)[:, :3].reshape(-1, 6))
+        explain = np.linalg.pinv(carried(unit, errors.tips - centre)[:, :3].reshape(-1, 6))
         parts = errors.values[:, :, None], errors.slopes
         motion, slopes = (explain @ part[:, :3].reshape(len(explain[0]), -1) for part in parts)
         means = errors.values[:, 3:].mean(axis=0), errors.slopes[:, 3:].mean(axis=0)
@@ -198,7 +214,7 @@ class _Datum:
     def at(self, arms: np.ndarray, which: int) -> np.ndarray:
         """Return what the datum is at points beside its centre, arms (N, 3): values (N, 6), or slopes (N, 6, size)."""
         motion, rotation = self.motion[which], self.rotation[which]
-        whole = _carried(motion.reshape(1, 6, -1), arms)
+        whole = carried(motion.reshape(1, 6, -1), arms)
         whole[:, 3:] = rotation.reshape(1, 3, -1)
         return whole if which else whole[:, :, 0]
 
@@ -257,12 +273,6 @@ def tool_derivatives(machine: RealMachine, space: ParameterSpace, stations: Stat
     count, structure = len(stations), machine.structure
     base, platform = (np.tile(array, (count, 1, 1)) for array in (structure.base_joints, structure.platform_joints))
     rows = derivatives(space, Prediction(np.zeros((count, 6)), *modelled, base, platform), stations)
-    rows = _carried(rows, modelled[1] @ (machine.geometry.tool.position - space.probe))
+    rows = carried(rows, modelled[1] @ (machine.geometry.tool.position - space.probe))
     work = machine.geometry.work.rotation.T
     return np.concatenate([work @ rows[:, :3], work @ rows[:, 3:]], axis=1)
-
-
-def _carried(motions: np.ndarray, arms: np.ndarray) -> np.ndarray:
-    """Return small motions (N or 1, 6, K) of a body, known at one point, at points that are arms (N, 3) away."""
-    displacements = motions[:, :3] + np.cross(motions[:, 3:], arms[:, :, None], axis=1)
-    return np.concatenate([displacements, np.broadcast_to(motions[:, 3:], displacements.shape)], axis=1)

@@ -22,6 +22,7 @@ def fit_report(fit: ModelFit) -> str:
     parts = [
         _headline(fit),
         *_expected(fit.level, fit.tilted, fit.observability),
+        fit.held.report(),
         *_notes(fit),
         _channel_table(fit),
         _decision_table(fit),
@@ -138,6 +139,7 @@ def as_json(fit: ModelFit) -> dict:
         "blocks": fit.decisions,
         "channels": [_channel_json(c) for c in fit.channels],
         **_expected_json(fit.level, fit.tilted, fit.observability, fit.unseen_errors),
+        "datum": fit.held.as_json(),
         "outliers": [_outlier_json(o) for o in fit.outliers],
         "notes": fit.notes,
     }

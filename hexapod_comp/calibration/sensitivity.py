@@ -147,3 +147,9 @@ def _add_field(space: ParameterSpace, points: np.ndarray, sense: np.ndarray, res
             axis, c = divmod(n, 6)
             start = block.part.start + n * count
             result[:, c, start : start + count] = 0.5 * sense[:, axis, None] * turning
+
+
+def carried(motions: np.ndarray, arms: np.ndarray) -> np.ndarray:
+    """Return small motions (N or 1, 6, K) of a body, known at one point, at points that are arms (N, 3) away."""
+    displacements = motions[:, :3] + np.cross(motions[:, 3:], arms[:, :, None], axis=1)
+    return np.concatenate([displacements, np.broadcast_to(motions[:, 3:], displacements.shape)], axis=1)

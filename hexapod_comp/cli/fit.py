@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ..calibration.posterior import FittedParameters
     from ..machine.model import MachineModel, RealMachine
     from ..measurements.readings import MeasurementSet
+    from ..pose import Pose
 
 REFUSED = "NOT WRITTEN: this model is not to be trusted"
 FORCED = "WRITTEN BY FORCE: this model is not to be trusted"
@@ -156,6 +157,13 @@ class _Result:
         return replace(self.model, origin=replace(origin, note=f"FORCED: {self.misfit}. {origin.note}"))
 
 
+def _datum(args: argparse.Namespace, measured: MeasurementSet) -> Pose | None:
+    """Return the platform's pose in base at the datum, None for home."""
+    from ..pose import Pose
+
+    return None if args.datum is None else measured.geometry.platform_pose(Pose.from_angles(*args.datum))
+
+
 def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSettings) -> _Result:
     """Fit with scheme joint."""
     from ..calibration.fit import fit_model
@@ -164,7 +172,7 @@ def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSett
     from ..machine.model import RealMachine
 
     with common.stage_line() as say:
-        fit = fit_model(measured, settings, say)
+        fit = fit_model(measured, settings, say, _datum(args, measured))
 
     fitted = FittedParameters.of(fit)
 
@@ -189,7 +197,7 @@ def _lines(args: argparse.Namespace, measured: MeasurementSet) -> _Result:
     from ..calibration.lines_report import as_json, report
     from ..machine.model import RealMachine
 
-    fit = fit_lines(measured, args.order or "adjusted-r2", name=args.name or "")
+    fit = fit_lines(measured, args.order or "adjusted-r2", name=args.name or "", datum=_datum(args, measured))
 
     def pictures() -> dict[str, Figure]:
         from ..calibration.pictures import fitted_lines_figure, predicted_error_figure, strut_error_figure

@@ -270,6 +270,8 @@ def _fit(parser: argparse.ArgumentParser) -> None:
     add("--scheme", choices=("joint", "lines"), default="joint", help="how to fit (default joint)")
     add("--out", metavar="MODEL", required=True, help="write the model to a YAML file")
     add("--name", metavar="TEXT", help="name of the model")
+    text = f"tool pose in work that stays where it is, {arguments.POSE_HELP} (default: home)"
+    add("--datum", type=arguments.pose, metavar="POSE", help=text)
     add("--report", metavar="FILE", help="write the report to a file too")
     now = "always written, beside the model, as MODEL.posterior.npz"
     add("--covariance", action=_Renamed, const=now, metavar="FILE.npz", help=argparse.SUPPRESS)

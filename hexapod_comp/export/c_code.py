@@ -141,7 +141,7 @@ def _members(
     strings = {"machine": model.machine, "model": model.name, "date": model.origin.date or ""}
     strings |= {"geometry_sha256": hashes[0], "model_sha256": hashes[1]}
     yield from ((name, _text(value)) for name, value in strings.items())
-    bodies = zip(("base", "platform"), geometry.kernel_joints, geometry.kernel_axes, strict=True)
+    bodies = zip(("base", "platform"), geometry.kernel_joints, machine.body[2:], strict=True)
     for name, joints, axes in bodies:
         deviation, expansion = getattr(model, f"{name}_deviation"), getattr(model, f"{name}_expansion")
         yield name, _struct({"joints": joints, "deviation": deviation, "axes": axes, "expansion": expansion})

@@ -31,8 +31,61 @@ REFERENCE_TEMPERATURE = 20.0
 LARGEST_DEVIATION = 0.05
 """Joint deviations above this, m, are a unit error, not a machine."""
 
+LARGEST_TURN = 0.1
+"""A base turned by more, rad, is a unit error, or another machine."""
+
 TEMPERATURE_RANGE = (-40.0, 120.0)
 """Sensor readings outside this, °C, are not a machine shop's."""
+
+
+@dataclass(frozen=True)
+class Datum:
+    """A pose at which a calibration leaves the tool where the nominal machine has it.
+
+    Parameters
+    ----------
+    position, angles : tuple of float
+        ``pose_platform_in_base``: m, and the paper's α, β, γ, rad.
+    held : int
+        In how many of the six ways to shift and turn the whole machine. Those that the readings see are not held: there
+        the model says where the machine stands.
+
+    Raises
+    ------
+    ModelError
+        A number is not finite, or no such count.
+    """
+
+    position: tuple[float, float, float]
+    angles: tuple[float, float, float]
+    held: int
+
+    def __post_init__(self) -> None:
+        for name in ("position", "angles"):
+            values = tuple(getattr(self, name))
+            if len(values) != 3 or not all(math.isfinite(value) for value in values):
+                raise ModelError(f"datum.{name}", "must be three finite numbers, m or rad", values)
+            object.__setattr__(self, name, values)
+        if not (type(self.held) is int and 0 <= self.held <= 6):
+            raise ModelError("datum.held", "must be a whole number, 0…6", self.held)
+
+    @staticmethod
+    def at(pose: Pose, held: int) -> Datum:
+        """Return the datum at a ``pose_platform_in_base``."""
+        x, y, z = pose.position.tolist()
+        alpha, beta, gamma = pose.angles().tolist()
+        return Datum((x, y, z), (alpha, beta, gamma), held)
+
+    @property
+    def pose(self) -> Pose:
+        """``pose_platform_in_base``."""
+        return Pose.from_angles(self.position, self.angles)
+
+    def __str__(self) -> str:
+        position = ", ".join(f"{value * 1e3:.10g}" for value in self.position)
+        angles = ", ".join(f"{math.degrees(value):.10g}" for value in self.angles)
+        ways = f"held in {self.held} of 6 ways" if self.held else "not held, the readings saw it"
+        return f"{ways}; platform at {position} mm, {angles}° in base"
 
 
 @dataclass(frozen=True)
@@ -52,6 +105,8 @@ class ModelOrigin:
     posterior : (str, str) or None
         Name, beside the model file, and SHA-256 of the file that says how well the fit knows its parameters; None
         when nobody says.
+    datum : Datum or None
+        Where the tool is not moved, and by how much that was free to choose; None when nobody says.
     """
 
     date: str = ""
@@ -59,6 +114,7 @@ class ModelOrigin:
     held_out_residual: float | None = None
     note: str = ""
     posterior: tuple[str, str] | None = None
+    datum: Datum | None = None
 
 
 @dataclass(frozen=True)
@@ -73,6 +129,8 @@ class MachineModel:
         Name of the model, shown in diagnostics.
     base_deviation, platform_deviation : ndarray, shape (6, 3)
         Real minus nominal joint position, m, in each body's frame.
+    base_axes_turn : ndarray, shape (3,)
+        Rotation vector, rad in ``base``, by which the base's cardan axes are turned when the whole base is.
     struts : StrutErrors
         Errors of the six struts.
     field : GridField
@@ -99,6 +157,7 @@ class MachineModel:
     name: str = "ideal"
     base_deviation: np.ndarray = field(default_factory=lambda: np.zeros((6, 3)))
     platform_deviation: np.ndarray = field(default_factory=lambda: np.zeros((6, 3)))
+    base_axes_turn: np.ndarray = field(default_factory=lambda: np.zeros(3))
     struts: StrutErrors = field(default_factory=StrutErrors)
     field: GridField = field(default_factory=no_field)
     base_expansion: float = 0.0
@@ -119,6 +178,12 @@ class MachineModel:
                 raise ModelError(key, problem, float(np.abs(array).max()))
             array.flags.writeable = False
             object.__setattr__(self, name, array)
+        turn = np.array(self.base_axes_turn, dtype=float)
+        if turn.shape != (3,) or not np.abs(turn).max() <= LARGEST_TURN:
+            problem = f"must be three numbers within ±{LARGEST_TURN:g} rad; is the unit right?"
+            raise ModelError("structure.base_axes_turn", problem, turn.tolist())
+        turn.flags.writeable = False
+        object.__setattr__(self, "base_axes_turn", turn)
         for name in ("base_expansion", "platform_expansion"):
             if not math.isfinite(getattr(self, name)):
                 raise ModelError(f"thermal.{name}", "must be finite, 1/K", getattr(self, name))
@@ -232,7 +297,12 @@ class RealMachine:
             _displacement(base, model.base_deviation, of_base),
             _displacement(platform, model.platform_deviation, of_platform),
         )
-        self.body = (*structure.joints, *geometry.kernel_axes)
+        base_axes, platform_axes = geometry.kernel_axes
+        if model.base_axes_turn.any():
+            turn = np.eye(3)
+            kernels.rotate(turn, *model.base_axes_turn.tolist())
+            base_axes = base_axes @ turn.T
+        self.body = (*structure.joints, base_axes, platform_axes)
         self.solver = structure.solver
         self.strut_arrays = (
             model.struts.parameter_table(geometry, np.array(growth)),

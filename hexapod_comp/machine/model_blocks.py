@@ -11,7 +11,7 @@ import yaml
 
 from ..formats.yaml import UNITS, in_si
 from .field import COMPONENTS, GridField, no_field
-from .model import MachineModel
+from .model import Datum, MachineModel
 from .struts import StrutErrors
 
 DIRECTIONS = ("forward", "backward")
@@ -79,10 +79,19 @@ def _per_strut(values: np.ndarray, kind: str, unit: str) -> Any:
     return written(values[0] if (values == values[0]).all() else values, kind, unit)
 
 
+def datum_block(datum: Datum) -> dict[str, Any]:
+    """Return where the tool is not moved."""
+    position, angles = written(datum.position, "length", "mm"), written(datum.angles, "angle", "deg")
+    return {"position_mm": position, "rotation_deg": angles, "held": datum.held}
+
+
 def structure_block(model: MachineModel) -> dict[str, Any]:
-    """Return where the real joints are, µm."""
+    """Return where the real joints are, µm, and how far the base's axes are turned, µrad."""
     given = {"base_deviation": model.base_deviation, "platform_deviation": model.platform_deviation}
-    return {f"{name}_um": written(values, "length", "um") for name, values in given.items() if values.any()}
+    block = {f"{name}_um": written(values, "length", "um") for name, values in given.items() if values.any()}
+    if model.base_axes_turn.any():
+        block["base_axes_turn_urad"] = written(model.base_axes_turn, "angle", "urad")
+    return block
 
 
 def thermal_block(model: MachineModel) -> dict[str, Any]:

@@ -19,11 +19,16 @@ all six or a list of six. Everything marked optional may be left out and is then
     posterior:                        # optional: how well the fit knows its parameters, in a file beside this one
       file: crash.posterior.npz
       sha256: 64 lower-case hexadecimal digits
+    datum:                            # optional: where the tool stays, as readings did not see where the machine stands
+      position_mm: [0, 0, 450]        # platform in base
+      rotation_deg: [0, 0, 0]         # α, β, γ; optional
+      held: 6                         # of the six ways to shift and turn the whole machine; 0: the readings saw all
     reversal_threshold_um: 0.2        # optional (0.2): way back until a strut's direction counts as reversed
 
     structure:                        # optional: real − nominal joint position
       base_deviation_um:              # optional, 6×3, in base
       platform_deviation_um:          # optional, 6×3, in platform
+      base_axes_turn_urad: [0, 0, 0]  # optional: rotation vector of the base's cardan axes, turned with the whole base
 
     struts:                           # optional; L = (1 + g)(c + errors), see hexapod_comp.machine.struts
       offset_um: 0.0                  # each of these optional and per strut
@@ -93,13 +98,14 @@ from .field import CROSS_AXES, OUTSIDE_POLICIES, GridField, no_field
 from .geometry import HexapodGeometry
 from .late import PARTS, LateGrowth
 from .magnitudes import check_magnitudes
-from .model import MachineModel, ModelOrigin
+from .model import Datum, MachineModel, ModelOrigin
 from .model_blocks import (
     COMPONENT_UNITS,
     DIRECTIONS,
     LATE_PARTS,
     STRUT_TERMS,
     ModelDumper,
+    datum_block,
     field_block,
     structure_block,
     struts_block,
@@ -224,6 +230,8 @@ def model_text(model: MachineModel) -> str:
         content["note"] = model.origin.note
     if model.origin.posterior is not None:
         content["posterior"] = dict(zip(("file", "sha256"), model.origin.posterior, strict=True))
+    if model.origin.datum is not None:
+        content["datum"] = datum_block(model.origin.datum)
     content["reversal_threshold_um"] = written(model.reversal_threshold, "length", "um")
     blocks = {
         "structure": structure_block(model),
@@ -268,9 +276,20 @@ def _read_origin(top: Section) -> ModelOrigin:
         section = top.section("posterior")
         posterior = section.text("file"), section.take("sha256")
         section.finish()
-    origin = ModelOrigin(given, tuple(sources), residual, note, posterior)
+    origin = ModelOrigin(given, tuple(sources), residual, note, posterior, _read_datum(top))
     _check_origin(origin)
     return origin
+
+
+def _read_datum(top: Section) -> Datum | None:
+    if "datum" not in top:
+        return None
+    section = top.section("datum")
+    position = section.quantity("position", "length", (3,))
+    angles = section.quantity("rotation", "angle", (3,), np.zeros(3))
+    datum = Datum(tuple(position.tolist()), tuple(angles.tolist()), section.take("held"))
+    section.finish()
+    return datum
 
 
 def _check_origin(origin: ModelOrigin) -> None:
@@ -314,6 +333,7 @@ def _read_structure(top: Section) -> dict[str, Any]:
     section = top.section("structure")
     names = ("base_deviation", "platform_deviation")
     values = {name: section.quantity(name, "length", (6, 3), np.zeros((6, 3))) for name in names}
+    values["base_axes_turn"] = section.quantity("base_axes_turn", "angle", (3,), np.zeros(3))
     section.finish()
     return values
 

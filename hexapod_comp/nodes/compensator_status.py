@@ -159,6 +159,7 @@ class CompensatorStatus:
         correction = 0.0 if fresh_start else float(np.abs(compensator.correction).max())
         values = {
             "model": compensator.model.name,
+            "datum": str(compensator.model.origin.datum or "not known"),
             "compensation": "on" if compensator.enabled else "off",
             "ramping": str(compensator.ramping).lower(),
             "pose_estimated_from": "strut_states" if self.fed(now) else "own commands",

@@ -1,0 +1,176 @@
+"""A calibration leaves the tool where it is at the datum, as far as readings do not show where the machine stands.
+
+Truth: the foreign machines' own kinematics (:mod:`foreign_machines`), and what a rigid motion of everything does to an
+instrument, by hand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import calibration_helpers as small
+import numpy as np
+import pytest
+from foreign_machines import Errors, commands, machines, rotation, tool_errors
+from foreign_machines import aligned_rms as rms_aligned
+
+from hexapod_comp.calibration.datum import HeldDatum, unseen_part
+from hexapod_comp.calibration.estimation import Estimation
+from hexapod_comp.calibration.fit import ModelFit, fit_model
+from hexapod_comp.calibration.lines import fit_lines
+from hexapod_comp.calibration.parameters import FitSettings
+from hexapod_comp.calibration.posterior import FittedParameters, load_posterior, save_with_posterior
+from hexapod_comp.calibration.prediction import ErrorPredictor
+from hexapod_comp.errors import CalibrationError, InputFileError, ModelError
+from hexapod_comp.machine.datum import tool_move
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.model import Datum, MachineModel, RealMachine
+from hexapod_comp.machine.model_file import load_model, model_text, parse_model, save_model
+from hexapod_comp.measurements.campaign import Campaign, template
+from hexapod_comp.pose import Pose
+from hexapod_comp.virtual.instruments import measure
+
+STILL = 1e-9
+"""m and rad: the bar; a model file keeps a hundredth of a nanometre."""
+
+
+@pytest.fixture(scope="module", params=["framed", "hanging", "inches", "mirror", "left-hand"])
+def foreign(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory):
+    """A machine, its errors, and a fit of laser lines on it."""
+    folder, machine = tmp_path_factory.mktemp("datum"), machines()[request.param]
+    geometry = load_geometry(machine.write(folder / "machine.yaml"))
+    truth = Errors.drawn(machine, 5)
+    real = RealMachine(geometry, load_model(truth.write(folder / "truth.yaml", machine), geometry))
+    side = float(np.ptp(machine.box, axis=0).min())
+    campaign = Campaign(machine.box, side, side / 3.0, "5-D", 4)
+    fit = fit_model(measure(template(campaign, geometry), campaign, real, 1), FitSettings(blocks=("pitch",)))
+    save_model(fit.model, folder / "model.yaml")
+    return machine, truth, fit, Errors.read(folder / "model.yaml")
+
+
+def test_switching_compensation_on_does_not_move_the_tool_at_home(foreign) -> None:
+    """By the tests' own kinematics the model wants the nominal lengths there."""
+    machine, _, fit, believed = foreign
+    home = np.array([machine.home]), np.eye(3)[None]
+    told, nominal = commands(machine, believed, *home), machine.lengths(*home)
+    np.testing.assert_allclose(told, nominal, rtol=0.0, atol=STILL / 10.0)
+    geometry = fit.measurements.geometry
+    by_the_model, _, _ = RealMachine(geometry, fit.model).commands_for(geometry.home)
+    np.testing.assert_allclose(by_the_model, nominal[0], rtol=0.0, atol=STILL / 10.0)
+    assert fit.model.origin.datum == Datum(machine.home, (0.0, 0.0, 0.0), 6)
+
+
+def test_the_error_with_the_datum_aligned_is_as_good_as_before(foreign) -> None:
+    """A motion of the whole machine, its cardan axes too, is all that holding changes: second order remains."""
+    machine, truth, fit, believed = foreign
+    rng = np.random.default_rng(2)
+    tips = rng.uniform(*machine.box, (100, 3))
+    left = rms_aligned(tips, tool_errors(machine, truth, believed, tips))
+    assert left < 1.2 * fit.level.high
+    assert left < 0.1 * rms_aligned(tips, tool_errors(machine, truth, None, tips))
+
+
+@cache
+def laser_fit() -> ModelFit:
+    return fit_model(small.measured(small.virtual_machine(4), small.campaign(), 4), small.FEW)
+
+
+def projection(readings) -> np.ndarray:
+    """Return what readings do not show at home, by the fit's own weights at a tolerance of 0.1 mm."""
+    estimation = Estimation(readings, laser_fit().space, alone=False)
+    posterior = replace(laser_fit().solution.posterior, tolerances=np.array([1e-4]), noise=np.ones(5))
+    return unseen_part(estimation, posterior, small.paper().home)
+
+
+def test_a_tracker_is_believed_and_one_pose_of_it_shows_no_more_than_its_place() -> None:
+    far = Pose(np.array([0.1, 0.05, 0.45]), np.eye(3))
+    poses = [far, Pose(np.array([-0.1, 0.0, 0.4]), np.eye(3)), Pose(np.array([0.0, 0.1, 0.5]), np.eye(3))]
+    full = small.scattered(small.paper(), poses)
+    positions = full.select(full.channel < 10)
+    assert np.abs(projection(full)).max() == pytest.approx(0.0, abs=1e-12)
+    assert np.abs(projection(positions)).max() == pytest.approx(0.0, abs=1e-12)
+    one = positions.select(positions.station == 0)
+    part = projection(one)
+    assert np.trace(part) == pytest.approx(3.0)
+    # Whatever is taken off turns everything about the one place that was seen.
+    for taken in part.T:
+        shift, turn = taken[:3], taken[3:]
+        arm = far.position - small.paper().home.position
+        np.testing.assert_allclose(shift + np.cross(turn, arm), 0.0, atol=1e-10)
+
+
+def test_a_fit_with_poses_of_a_tracker_is_not_touched() -> None:
+    truth = small.virtual_machine(4)
+    fit = fit_model(small.measured(truth, small.campaign(poses=6), 4), small.FEW)
+    assert fit.held.held == 0
+    np.testing.assert_array_equal(fit.model.base_deviation, fit.space.model(fit.solution.x.round(11)).base_deviation)
+    assert "the readings saw it" in str(fit.model.origin.datum)
+
+
+def test_another_datum_can_be_given_and_one_out_of_reach_is_refused() -> None:
+    pose = Pose(np.array([0.05, -0.04, 0.42]), rotation(3.0, -2.0, 5.0))
+    readings = small.measured(small.virtual_machine(4), small.campaign(), 4)
+    model = fit_model(readings, replace(small.FEW, blocks=()), datum=pose).model
+    assert np.abs(tool_move(small.paper(), model, pose)).max() < STILL
+    assert np.abs(tool_move(small.paper(), model, small.paper().home)).max() > 1e-6
+    with pytest.raises(CalibrationError, match="a pose that the machine cannot take"):
+        fit_model(readings, replace(small.FEW, blocks=()), datum=Pose(np.array([0.0, 0.0, 2.0]), np.eye(3)))
+
+
+def test_scheme_lines_holds_it_too() -> None:
+    plan = Campaign(small.BOX, 0.2032, 0.0254, "5-D", 0)
+    readings = small.measured(small.virtual_machine(4), plan, 4)
+    at_home, pose = fit_lines(readings), Pose(np.array([0.05, 0.0, 0.42]), np.eye(3))
+    assert np.abs(tool_move(small.paper(), at_home.model, small.paper().home)).max() < STILL
+    assert np.abs(tool_move(small.paper(), fit_lines(readings, datum=pose).model, pose)).max() < STILL
+
+
+def test_the_predicted_error_is_known_at_the_datum_and_as_well_as_before_when_aligned(tmp_path: Path) -> None:
+    fit, home = laser_fit(), small.paper().home
+    fitted = FittedParameters.of(fit)
+    save_with_posterior(fit.model, fitted, tmp_path / "model.yaml")
+    model = load_model(tmp_path / "model.yaml", small.paper())
+    stored, _ = load_posterior(model, small.paper(), tmp_path / "model.yaml")
+    assert stored is not None
+    assert stored.held is not None
+    positions = home.position + np.array([[0.0, 0.0, 0.0], [0.1, 0.05, 0.02]])
+    poses = positions, np.tile(np.eye(3), (2, 1, 1))
+    machine = RealMachine(small.paper(), model)
+    standing, aligned = ErrorPredictor(machine, stored).predict(poses)
+    assert np.abs(standing.values[0]).max() < STILL
+    assert standing.deviations is not None
+    assert standing.deviations[0].max() < STILL
+    assert standing.deviations[1, :3].min() > STILL
+    _, before = ErrorPredictor(machine, replace(fitted, held=None)).predict(poses)
+    assert aligned is not None
+    assert before is not None
+    np.testing.assert_allclose(aligned.deviations, before.deviations, rtol=1e-3)
+
+
+def test_the_model_file_keeps_it_and_older_ones_have_none() -> None:
+    model = MachineModel("paper", base_axes_turn=np.array([1e-4, 0.0, -2e-4]))
+    origin = replace(model.origin, date="2026-01-31", datum=Datum((0.01, 0.0, 0.45), (0.1, 0.0, -0.2), 3))
+    text = model_text(replace(model, origin=origin))
+    again = parse_model(text, "paper")
+    assert again.origin.datum == origin.datum
+    np.testing.assert_array_equal(again.base_axes_turn, model.base_axes_turn)
+    older = model_text(replace(model, origin=replace(origin, datum=None)))
+    assert parse_model(older, "paper").origin.datum is None
+    for wrong in ("held: 7", "held: 1.5", "held: yes"):
+        with pytest.raises(InputFileError, match=r"datum\.held"):
+            parse_model(text.replace("held: 3", wrong), "paper")
+    with pytest.raises(InputFileError, match="position"):
+        parse_model(text.replace("position_mm: [10.0, 0.0, 450.0]", "position_mm: [10.0, .nan, 450.0]"), "paper")
+    with pytest.raises(ModelError, match="base_axes_turn"):
+        MachineModel("paper", base_axes_turn=np.full(3, np.nan))
+
+
+def test_what_is_taken_off_errors_beside_the_datum_is_a_rigid_motion() -> None:
+    """A turn of 1 mrad about z at the datum moves a point 0.1 m along x by 0.1 mm along y."""
+    held = HeldDatum(Pose.identity(), np.eye(6), np.zeros(6))
+    turn = np.zeros((6, 1))
+    turn[5] = 1e-3
+    taken = held.taken(turn, np.array([[0.1, 0.0, 0.0]]), np.eye(3))
+    np.testing.assert_allclose(taken[0, :, 0], [0.0, 1e-4, 0.0, 0.0, 0.0, 1e-3], atol=1e-18)
