@@ -59,6 +59,7 @@ WATCHED = {
 
 SENT = {
     "tool_pose_command": PoseStamped,
+    "strut_setpoints": JointState,
     "strut_states": JointState,
     "strut_commands": JointState,
     "temperatures": Temperature,
@@ -142,7 +143,7 @@ class Bench:
         for topic, (kind, qos) in WATCHED.items():
             self.witness.create_subscription(kind, topic, self.seen[topic].append, qos)
         self._publishers: dict[str, Any] = {}
-        for topic in SENT.keys() - {"strut_commands"}:  # where there is a compensator, only that may publish
+        for topic in SENT.keys() - {"strut_commands", "strut_setpoints"}:  # a test asks for these
             self.speak(topic)
         self._clients: dict[str, Any] = {}
 

@@ -21,7 +21,7 @@ import math
 import platform
 import secrets
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ import numpy as np
 
 from ..errors import HexapodError, InputFileError
 from ..formats.yaml import read_text
-from ..machine.geometry import HexapodGeometry, parse_geometry
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry, parse_geometry
 from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL, parse_model
 from .compensator import Compensator
@@ -167,6 +167,8 @@ class Snapshot:
         frame_id of poses in the machine's ``base`` and in its ``work`` frame.
     made_with : dict of str to str
         Versions that the last bit may depend on.
+    joints : tuple of str
+        Names of the struts in messages, in strut order.
     """
 
     state: dict[str, Any]
@@ -174,6 +176,7 @@ class Snapshot:
     geometry: dict[str, str]
     frames: dict[str, str]
     made_with: dict[str, str]
+    joints: tuple[str, ...] = STRUT_NAMES
 
 
 @dataclass(frozen=True)
@@ -229,11 +232,19 @@ class Journal:
         ``geometry`` and ``model`` in use; looked up whenever they are named.
     frames : dict of str to str
         See :class:`Snapshot`.
+    joints : sequence of str, optional
+        See :class:`Snapshot`.
     """
 
-    def __init__(self, compensator: Compensator, sources: Mapping[str, Source], frames: dict[str, str]) -> None:
+    def __init__(
+        self,
+        compensator: Compensator,
+        sources: Mapping[str, Source],
+        frames: dict[str, str],
+        joints: Sequence[str] = STRUT_NAMES,
+    ) -> None:
         self._compensator, self._sources = compensator, sources
-        self._always = {"frames": frames, "made_with": made_with()}
+        self._always = {"frames": frames, "made_with": made_with(), "joints": list(joints)}
         self._places = {frames[role]: place for place, role in enumerate(ROLES)}
         self._session, self._number, self._count = secrets.token_hex(4), 0, 0
         self._commands, self._begins = bytearray(), 0
@@ -458,6 +469,7 @@ def _read_snapshot(content: Any) -> Snapshot:
         geometry=_words(content["geometry"], "name", "sha256"),
         frames=_words(content["frames"], *ROLES),
         made_with=_words(content["made_with"]),
+        joints=tuple(str(name) for name in content.get("joints", STRUT_NAMES)),
     )
 
 

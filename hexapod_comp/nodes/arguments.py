@@ -91,10 +91,12 @@ class Program:
         return "\n".join([*lines, *(topics if self.topics else ()), *example])
 
 
-def _shown(value: bool | int | float | str) -> str:
+def _shown(value: bool | int | float | str | list[str]) -> str:
     """Return a default as a parameter's value is written."""
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, list):
+        return "[" + ", ".join(value) + "]"
     return f"{value:g}" if isinstance(value, float) else str(value) or "''"
 
 

@@ -12,7 +12,6 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 
 from ..compensation.compensator import Compensator
@@ -20,6 +19,7 @@ from ..compensation.journal import time_of
 from ..compensation.state import pack_pose
 from ..errors import CommandError, HexapodError, TooEarlyError, shorten
 from ..pose import Pose
+from .command_inputs import command_input
 from .command_source import CommandSource, OwnTopic
 from .compensator_outputs import CompensatorOutputs
 from .compensator_parameters import PARAMETERS, PROGRAM
@@ -36,7 +36,6 @@ from .running import keep_discovery_local, run
 from .runtime import ACKNOWLEDGED_WITHIN, MachineNode
 from .stamps import StampCheck, stamp_of
 from .warming import warm_up
-from .wire import read_pose_bytes, stamp_in
 
 CHECK_PERIOD = 0.05
 """How often the node looks whether its state has changed, s."""
@@ -91,10 +90,9 @@ class CompensatorNode(MachineNode):
             self._options["work_frame"]: pack_pose(geometry.work),
         }
         self._open_topics()
-        frames = {name: self._options[f"{name}_frame"] for name in ("base", "work")}
-        self._journal = JournalTopics(self, self.compensator, self._files.sources, frames)
-        what = f"machine {geometry.name!r} with {self._files.described(self.compensator.model)}"
-        self.get_logger().info(f"configured {what} in {time.perf_counter() - began:.2f} s")
+        self._journal = JournalTopics(self, self.compensator, self._files.sources, self._options)
+        what = f"{geometry.name!r} with {self._files.described(self.compensator.model)}"
+        self.get_logger().info(f"configured machine {what} in {time.perf_counter() - began:.2f} s")
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -131,7 +129,8 @@ class CompensatorNode(MachineNode):
         self._outputs = outputs = CompensatorOutputs(self, self.compensator, self._options, self._files)
         inputs = (self.compensator, self._status, self._options)
         self._feedback = Feedback(self, *inputs, outputs.estimate, self._look_at_publishers)
-        commands = self.obey(PoseStamped, "tool_pose_command", self._on_command, self._look_at_publishers)
+        self._input = asked = command_input(self.compensator, self._options)
+        commands = self.obey(asked.kind, asked.topic, self._on_command, self._look_at_publishers)
         self._subscription = commands
         allowed = self._options["allow_several_publishers"]
         self._pacing = Pacing(self, self._options["catch_up_within"], self._take, self._refuse_waiting)
@@ -175,7 +174,9 @@ class CompensatorNode(MachineNode):
         """Answer or refuse a command at the monotonic time `now`, s; return how long it must wait instead, s."""
         stamp = 0
         try:
-            stamp, frame_id, numbers = read_pose_bytes(data)
+            stamp, frame_id, numbers = self._input.read(data)
+            if numbers is None:
+                return 0.0
             frame = self._frames.get(frame_id)
             if frame is None or self._looks_closer:
                 self._examine(frame_id, now)
@@ -260,7 +261,7 @@ class CompensatorNode(MachineNode):
         self._following.forget()
 
     def _refuse_waiting(self, data: bytes, error: HexapodError, now: float) -> None:
-        self._refuse(stamp_in(data), error, now)
+        self._refuse(self._input.stamp(data), error, now)
 
     def _refuse(self, stamp: int, error: HexapodError, now: float) -> None:
         self._journal.refused(stamp, error.reason, str(error))

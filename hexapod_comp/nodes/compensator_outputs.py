@@ -52,7 +52,7 @@ class CompensatorOutputs:
             self._array = node.publish_on(Float64MultiArray, "strut_commands_array", COMMAND_QOS, deadline)
         self._array_out = Float64MultiArray(data=[0.0] * 6)
         self._array_view = np.frombuffer(self._array_out.data, dtype=float)
-        self._command_out, self._correction_out = StrutBytes(), StrutBytes()
+        self._command_out, self._correction_out = (StrutBytes(names=options["joint_names"]) for _ in range(2))
         self._estimate_out = PoseStamped()
         self._estimate_out.header.frame_id = self._frame
         self._answered, self._fastest = 0, compensator.geometry.limits.speed

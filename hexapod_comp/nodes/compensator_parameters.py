@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from ..compensation.thermal import DEFAULT_TIME_CONSTANT
 from .arguments import Program
-from .parameters import Parameter
+from .command_inputs import POSES, STRUTS
+from .parameters import JOINT_NAMES, Parameter
 
 PARAMETERS = (
     Parameter("autostart", True, "configure and activate at start"),
@@ -13,6 +14,13 @@ PARAMETERS = (
     Parameter("model_folder", "", "folder from which both files may be read; empty: each one's own at the start"),
     Parameter("base_frame", "base", "frame_id of poses in the machine base"),
     Parameter("work_frame", "work", "frame_id of poses in the geometry file's work frame"),
+    Parameter(
+        "command_input",
+        POSES,
+        f"what commands: {POSES} on tool_pose_command, or {STRUTS} (nominal lengths) on strut_setpoints",
+        choices=(POSES, STRUTS),
+    ),
+    JOINT_NAMES,
     Parameter("command_timeout", 0.1, "without a command for this long the state is stale, s; 0 = off", 0.0, 3600.0),
     Parameter("max_command_age", 0.5, "older (or newer) stamps are refused, s; 0 = off", 0.0, 3600.0),
     Parameter("feedback_timeout", 0.1, "without measured struts for this long there is no feedback, s", 1e-3, 3600.0),
@@ -65,7 +73,8 @@ PARAMETERS = (
 )
 
 TOPICS = """
-in   tool_pose_command       PoseStamped: commanded tool pose, frame_id base or work
+in   tool_pose_command       PoseStamped: commanded tool pose, frame_id base or work; or, by command_input,
+     strut_setpoints         JointState: nominal strut lengths, m; NaN while the controller is not active
      strut_states            JointState: measured strut lengths, m
      temperatures            Temperature: °C; frame_id names strut_1 to strut_6, base or platform
 out  strut_commands          JointState: compensated strut lengths, m

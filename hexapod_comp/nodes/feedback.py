@@ -56,7 +56,7 @@ class Feedback:
     ) -> None:
         self._node, self._compensator, self._status = node, compensator, status
         self._publish, self._look = publish, look
-        self._reader, self._range = StrutReader(), StrokeRange(compensator.geometry)
+        self._reader, self._range = StrutReader(options["joint_names"]), StrokeRange(compensator.geometry)
         self._stamps, self._jumps = status.reading_stamps, NoJump(compensator.geometry)
         rules = (options[f"temperature_{name}"] for name in ("rate_limit", "spread_limit", "timeout"))
         self._thermometers = Thermometers(Plausibility(*rules), options["temperature_time_constant_s"])

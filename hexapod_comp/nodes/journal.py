@@ -10,13 +10,14 @@ model in use, word for word.
 from __future__ import annotations
 
 import time
+from typing import Any
 
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
 from ..compensation.compensator import Compensator
-from ..compensation.journal import Journal, Source, sources_text
+from ..compensation.journal import ROLES, Journal, Source, sources_text
 from .runtime import ACKNOWLEDGED_WITHIN
 
 JOURNAL_QOS = QoSProfile(
@@ -29,7 +30,7 @@ JOURNAL_QOS = QoSProfile(
 
 
 class JournalTopics:
-    """The journal of a configured node; arguments are the node, and those of ``compensation.journal.Journal``.
+    """The journal of a configured node; arguments are the node, and its compensator, files and parameters.
 
     Nothing is published while a command is handled: what happens is noted, and goes out with :meth:`tick`.
     """
@@ -39,12 +40,13 @@ class JournalTopics:
         node: LifecycleNode,
         compensator: Compensator,
         sources: dict[str, Source],
-        frames: dict[str, str],
+        options: dict[str, Any],
     ) -> None:
         self._sources, self._published = sources, dict[str, Source]()
         self._pages = node.create_publisher(String, "~/journal", JOURNAL_QOS)
         self._files = node.create_publisher(String, "~/files", JOURNAL_QOS)
-        self._journal = Journal(compensator, sources, frames)
+        frames = {name: options[f"{name}_frame"] for name in ROLES}
+        self._journal = Journal(compensator, sources, frames, options["joint_names"])
         self.answered, self.refused = self._journal.answered, self._journal.refused
         self.tick(time.monotonic())  # so that no command comes before the first page
 

@@ -74,6 +74,13 @@ class StrutMessage:
 
     The velocity field is filled too: an empty one makes bags that some readers refuse.
 
+    Parameters
+    ----------
+    frame_id : str, optional
+        Of the header.
+    names : sequence of str, optional
+        The struts' joint names.
+
     Attributes
     ----------
     message : JointState
@@ -82,8 +89,8 @@ class StrutMessage:
         Views of the message's numbers, m and m/s.
     """
 
-    def __init__(self, frame_id: str = "") -> None:
-        self.message = JointState(name=list(STRUT_NAMES), position=[0.0] * 6, velocity=[0.0] * 6)
+    def __init__(self, frame_id: str = "", names: Sequence[str] = STRUT_NAMES) -> None:
+        self.message = JointState(name=list(names), position=[0.0] * 6, velocity=[0.0] * 6)
         self.message.header.frame_id = frame_id
         self.position = np.frombuffer(self.message.position, dtype=float)
         self.velocity = np.frombuffer(self.message.velocity, dtype=float)
@@ -100,15 +107,20 @@ LARGEST_LENGTH = 1e150
 class StrutReader:
     """Picks the six struts out of JointState messages by name; other joints beside them do not matter.
 
+    Parameters
+    ----------
+    names : sequence of str, optional
+        The struts' joint names, in strut order.
+
     Attributes
     ----------
     lengths : ndarray, shape (6,)
         Lengths last read, in strut order, m.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, names: Sequence[str] = STRUT_NAMES) -> None:
         self.lengths = np.zeros(6)
-        self._names: list[str] | None = None
+        self._struts, self._names = names, list[str]()
         self._order = np.arange(6)
 
     def take(self, data: bytes) -> JointState:
@@ -125,20 +137,30 @@ class StrutReader:
         CommandError
             ``strut_names``, ``strut_count`` or ``not_finite``; the lengths last read stay.
         """
-        if message.name != self._names:
-            self._order = strut_order(message.name)
-            self._names = list(message.name)
-        joints, positions = len(message.name), len(message.position)
-        if joints != positions:
-            raise CommandError("strut_count", f"each of {joints} names needs a position, there are {positions}")
-        lengths = np.frombuffer(message.position, dtype=float)[self._order]
+        lengths = self.pick(message)
         if not all(abs(length) < LARGEST_LENGTH for length in lengths.tolist()):
             allowed = f"finite and below {LARGEST_LENGTH:g} m"
             raise CommandError("not_finite", f"strut lengths must be {allowed}, not {lengths.tolist()}")
         self.lengths[:] = lengths
 
+    def pick(self, message: JointState) -> np.ndarray:
+        """Return a message's six lengths in strut order, whatever their values.
 
-def strut_order(names: Sequence[str]) -> np.ndarray:
+        Raises
+        ------
+        CommandError
+            ``strut_names`` or ``strut_count``.
+        """
+        if not self._names or message.name != self._names:
+            self._order = strut_order(message.name, self._struts)
+            self._names = list(message.name)
+        joints, positions = len(message.name), len(message.position)
+        if joints != positions:
+            raise CommandError("strut_count", f"each of {joints} names needs a position, there are {positions}")
+        return np.frombuffer(message.position, dtype=float)[self._order]
+
+
+def strut_order(names: Sequence[str], struts: Sequence[str] = STRUT_NAMES) -> np.ndarray:
     """Return where each of the six struts stands in a list of names.
 
     Raises
@@ -146,7 +168,7 @@ def strut_order(names: Sequence[str]) -> np.ndarray:
     CommandError
         ``strut_names``: one is missing, or there twice.
     """
-    places_of: dict[str, list[int]] = {name: [] for name in STRUT_NAMES}
+    places_of: dict[str, list[int]] = {name: [] for name in struts}
     for place, name in enumerate(names):
         if name in places_of:
             places_of[name].append(place)

@@ -12,6 +12,7 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.lifecycle import LifecycleNode
 
 from ..errors import HexapodError
+from ..machine.geometry import STRUT_NAMES
 
 
 class ParameterError(HexapodError):
@@ -28,22 +29,28 @@ class Parameter:
     ----------
     name : str
         Its name.
-    default : bool, int, float or str
-        Default, which also fixes the type; an int is accepted for a float.
+    default : bool, int, float, str or list of str
+        Default, which also fixes the type; an int is accepted for a float. A list holds as many different names.
     description : str
         What it means, with its unit.
     low, high : float, optional
         Allowed range of a number.
     read_only : bool
         Fixed at start; the others may be set while the node runs.
+    choices : tuple of str, optional
+        All that is allowed.
     """
 
     name: str
-    default: bool | int | float | str
+    default: bool | int | float | str | list[str]
     description: str
     low: float | None = None
     high: float | None = None
     read_only: bool = True
+    choices: tuple[str, ...] = ()
+
+
+JOINT_NAMES = Parameter("joint_names", list(STRUT_NAMES), "the struts' names in JointState messages, in strut order")
 
 
 def declare(node: LifecycleNode, parameters: Sequence[Parameter]) -> dict[str, Any]:
@@ -88,16 +95,30 @@ def checked(parameter: Parameter, value: Any) -> Any:
         Wrong type or out of range; an int is taken for a float.
     """
     wanted = type(parameter.default)
+    if wanted is list:
+        return _checked_names(parameter, value)
     if wanted is float and type(value) is int:
         value = float(value)
     if type(value) is not wanted:
         raise ParameterError(f"parameter {parameter.name}: must be {wanted.__name__}, not {value!r}")
+    if parameter.choices and value not in parameter.choices:
+        allowed = ", ".join(parameter.choices)
+        raise ParameterError(f"parameter {parameter.name}: must be one of {allowed}, not {value!r}")
     if isinstance(value, int | float) and wanted is not bool:
         low = -float("inf") if parameter.low is None else parameter.low
         high = float("inf") if parameter.high is None else parameter.high
         if not low <= value <= high:
             raise ParameterError(f"parameter {parameter.name}: must lie in {low:g}…{high:g}, not {value!r}")
     return value
+
+
+def _checked_names(parameter: Parameter, value: Any) -> list[str]:
+    """Return a list of names, or refuse it."""
+    names = list(value) if isinstance(value, list | tuple) else []
+    count = len(parameter.default) if isinstance(parameter.default, list) else 0
+    if len(set(names)) != count or len(names) != count or not all(isinstance(name, str) and name for name in names):
+        raise ParameterError(f"parameter {parameter.name}: must be {count} different names, not {value!r}")
+    return names
 
 
 def _warn_of_strangers(node: LifecycleNode) -> None:

@@ -50,8 +50,8 @@ class StrutDriveNode(MachineNode):
         self._options = declare(self, PARAMETERS + FAULT_PARAMETERS)
         self.wants_autostart = self._options["autostart"]
         self._refusals, self._commands = Refusals(), Flow()
-        self._reader = StrutReader()
-        self._states_out, self._true_out = StrutMessage(), PoseStamped()
+        names = self._options["joint_names"]
+        self._reader, self._states_out, self._true_out = StrutReader(names), StrutMessage(names=names), PoseStamped()
         self._true_out.header.frame_id = self._options["base_frame"]
         self._drive: StrutDrive | None = None
         self.add_on_set_parameters_callback(self._on_parameters)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .arguments import Program
-from .parameters import Parameter
+from .parameters import JOINT_NAMES, Parameter
 
 PARAMETERS = (
     Parameter("autostart", True, "configure and activate at start"),
@@ -16,6 +16,7 @@ PARAMETERS = (
     Parameter("truth_seed", 1, "seed of a random truth", 0, 2**31),
     Parameter("noise_seed", 0, "seed of the noise", 0, 2**31),
     Parameter("base_frame", "base", "frame_id of the true tool pose"),
+    JOINT_NAMES,
     Parameter("command_timeout", 0.1, "without a command for this long diagnostics warn, s; 0 = off", 0.0, 3600.0),
     Parameter("command_validity", 0.0, "commands stamped earlier than this are refused, s; 0 = off", 0.0, 3600.0),
     Parameter("allow_several_publishers", False, "obey though several nodes publish strut commands"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -19,6 +20,10 @@ LATCHED_QOS = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 """A state that who comes late must know too."""
+
+REPEATED_AFTER = 1.0
+"""Whether the node stops the machine is said again after this long, s: who comes late is given what is latched, but on
+a busy computer the middleware loses that now and then."""
 
 LAST_STAMP = 2**31 * 10**9 - 1
 """The largest time that a message can hold, ns: what is valid until later is valid until then."""
@@ -47,14 +52,16 @@ class VitalSigns:
         self._beat, self._validity = UInt64(), TimeReference(source=topic)
         self._lasting = round(options["command_timeout"] * 1e9)
         self._stopped: bool | None = None
+        self._published_at = 0.0
         self.stop(True)
         rate = options["heartbeat_rate"]
         self._timer = node.every(1.0 / rate, self._beats) if rate else None
 
     def stop(self, stopped: bool) -> None:
-        """Say whether the node stops the machine, where that has changed."""
-        if stopped != self._stopped:
-            self._stopped = stopped
+        """Say whether the node stops the machine, where that has changed or has not been said for a while."""
+        now = time.monotonic()
+        if stopped != self._stopped or now - self._published_at > REPEATED_AFTER:
+            self._stopped, self._published_at = stopped, now
             self._stops.publish(Bool(data=stopped))
 
     def wait(self) -> None:

@@ -9,8 +9,10 @@ each at a multiple of its size. Where the layout is not the usual one, rclpy's o
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
@@ -62,21 +64,23 @@ def read_pose_bytes(data: bytes) -> tuple[int, str, tuple[float, ...]]:
     return _read_unusual(data)
 
 
-def stamp_in(data: bytes) -> int:
-    """Return the stamp of a serialised PoseStamped, ns; 0 where there is none to be read."""
-    try:
-        return read_pose_bytes(data)[0]
-    except CommandError:
-        return 0
-
-
 def _read_unusual(data: bytes) -> tuple[int, str, tuple[float, ...]]:
     """Read a PoseStamped of another encoding as rclpy does."""
     message = read_message(data, PoseStamped)
-    stamp = message.header.stamp
-    if stamp.nanosec >= _SECOND:  # with the largest seconds it would not fit into an answer's stamp
+    return command_stamp(message.header.stamp), message.header.frame_id, pose_numbers(message)
+
+
+def command_stamp(stamp: Time) -> int:
+    """Return a command's stamp, ns.
+
+    Raises
+    ------
+    CommandError
+        ``message``: it is no time; with the largest seconds it would not fit into an answer's stamp.
+    """
+    if stamp.nanosec >= _SECOND:
         raise CommandError("message", f"nanosec of the stamp must be below {_SECOND}, not {stamp.nanosec}")
-    return nanoseconds_of(stamp), message.header.frame_id, pose_numbers(message)
+    return nanoseconds_of(stamp)
 
 
 class StrutBytes:
@@ -88,6 +92,8 @@ class StrutBytes:
     ----------
     frame_id : str, optional
         Of the header.
+    names : sequence of str, optional
+        The struts' joint names.
 
     Attributes
     ----------
@@ -97,17 +103,17 @@ class StrutBytes:
         Of the message last made, ns; 0 before.
     """
 
-    def __init__(self, frame_id: str = "") -> None:
+    def __init__(self, frame_id: str = "", names: Sequence[str] = STRUT_NAMES) -> None:
         self.stamp = 0
         self._message: StrutMessage | None = None
         marks = np.arange(1.0, 13.0)
-        sample = JointState(name=list(STRUT_NAMES), position=marks[:6].tolist(), velocity=marks[6:].tolist())
+        sample = JointState(name=list(names), position=marks[:6].tolist(), velocity=marks[6:].tolist())
         sample.header.frame_id = frame_id
         sample.header.stamp.sec, sample.header.stamp.nanosec = 0x01020304, 0x05060708
         data = serialize_message(sample)
         wanted = (_STAMP.pack(0x01020304, 0x05060708), marks[:6].tobytes(), marks[6:].tobytes())
         if data[:2] != LITTLE_ENDIAN or any(data.count(part) != 1 for part in wanted):
-            self._message = StrutMessage(frame_id)
+            self._message = StrutMessage(frame_id, names)
             self.position, self.velocity = self._message.position, self._message.velocity
             return
         stamp, position, velocity = (data.index(part) for part in wanted)

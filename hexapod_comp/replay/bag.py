@@ -8,8 +8,9 @@ left alone, whatever their types.
 
 from __future__ import annotations
 
+import itertools
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -149,8 +150,8 @@ def read_recording(
         node = _choose(path, connections, namespace)
         wanted = _wanted(path, connections, node)
         collected = _Collected(path, node, Allowance(size))
-        for reader in readers:
-            chosen = [c for c in reader.connections if c.topic in wanted]
+        for reader, named in itertools.product(readers, (True, False)):  # the journal first: it names the struts
+            chosen = [c for c in reader.connections if c.topic in wanted and (wanted[c.topic] in TOPICS) != named]
             for topic, time, message, length in _messages(path, reader, chosen):
                 collected.take(wanted[topic], time, message, length)
                 progress(1)
@@ -327,6 +328,7 @@ class _Collected:
         self._pages: list[tuple[int, Page]] = []
         self._sources: dict[str, Source] = {}
         self._odd: dict[str, int] = {}
+        self._joints: tuple[str, ...] = STRUT_NAMES
 
     def take(self, name: str, time: int, message: Any, length: int) -> None:
         """Take one message of some length, bytes: pages of a database may hold many of one piece of file."""
@@ -337,8 +339,9 @@ class _Collected:
         if name in (JOURNAL, FILES):
             self._take_text(name, time, message.data)
             return
-        columns, point = self._columns[name], getattr(message, "pose", None)
-        numbers = _lengths(message) if point is None else (point.position.x, point.position.y, point.position.z)
+        columns, pose = self._columns[name], getattr(message, "pose", None)
+        place = pose and pose.position
+        numbers = (place.x, place.y, place.z) if place else _lengths(message, self._joints)
         if numbers is None:
             self._odd[name] = self._odd.get(name, 0) + 1
             return
@@ -349,7 +352,8 @@ class _Collected:
     def _take_text(self, name: str, time: int, text: str) -> None:
         try:
             if name == JOURNAL:
-                self._pages.append((time, read_page(text)))
+                self._pages.append((time, page := read_page(text)))
+                self._joints = page.snapshot.joints if page.snapshot else self._joints
             else:
                 self._sources |= {source.sha256: source for source in read_sources(text).values()}
         except JournalError as error:
@@ -366,7 +370,7 @@ class _Collected:
             raise InputFileError(self._path, self._node + JOURNAL, "holds not a single answer of the compensator")
         topics = {name: columns.series(3 if TOPICS[name] == POSE else 6) for name, columns in self._columns.items()}
         notes = notes + [
-            f"{count} messages of {name} left out: not a position for each of {', '.join(STRUT_NAMES)}"
+            f"{count} messages of {name} left out: not a position for each of {', '.join(self._joints)}"
             for name, count in self._odd.items()
         ]
         return Recording(str(self._path), self._node, topics, pages, commands, self._sources, heard, notes)
@@ -388,12 +392,12 @@ def _joined(pages: list[tuple[int, Page]]) -> tuple[np.ndarray, list[tuple[int, 
     return commands, [(time, replace(page, commands=view)) for (time, page), view in zip(pages, views, strict=True)]
 
 
-def _lengths(message: Any) -> tuple[float, ...] | None:
+def _lengths(message: Any, joints: Sequence[str]) -> tuple[float, ...] | None:
     """Return the six struts' positions in strut order, m; None when they are not what the message holds."""
     names, positions = list(message.name), message.position.tolist()
-    if len(names) != len(positions) or any(names.count(name) != 1 for name in STRUT_NAMES):
+    if len(names) != len(positions) or any(names.count(name) != 1 for name in joints):
         return None
-    return tuple(positions[names.index(name)] for name in STRUT_NAMES)
+    return tuple(positions[names.index(name)] for name in joints)
 
 
 class Files:

@@ -65,6 +65,13 @@ def test_a_command_is_valid_until_its_stamp_and_the_command_timeout(bench, timeo
     assert validities[-1].header.stamp != stamp  # what is refused prolongs nothing
 
 
+def test_the_stop_output_is_repeated_for_who_has_missed_what_is_latched(bench):
+    bench.compensator()
+    stops = hear(bench, Bool, "compensator/stopped", LATCHED_QOS)
+    bench.until(lambda: len(stops) >= 3, "the same once more, and again")
+    assert {stop.data for stop in stops[1:]} == {stops[-1].data}
+
+
 def test_without_a_timeout_commands_are_valid_for_ever_and_no_deadline_is_offered(bench):
     node = bench.compensator(command_timeout=0.0)
     validities, beats = hear(bench, TimeReference, "compensator/validity"), hear(bench, UInt64, "compensator/heartbeat")

@@ -1,0 +1,136 @@
+"""Nominal strut lengths as commands: from a controller that plans struts and knows nothing of poses.
+
+Truth: strut lengths of foreign machines by the tests' own kinematics (closed form), and the answers to the tool poses
+that these lengths belong to.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foreign_machines import machines
+from node_helpers import HOME, Bench, closed_form_lengths, near
+from rclpy.serialization import serialize_message
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import JointState
+
+from hexapod_comp.compensation.compensator import NO_SHIFT, Compensator
+from hexapod_comp.errors import CommandError, KinematicsError
+from hexapod_comp.formats.paths import config_file
+from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
+from hexapod_comp.nodes.command_inputs import STRUTS, StrutInput
+from hexapod_comp.nodes.health import ERROR, OK, WARN
+from hexapod_comp.nodes.parameters import ParameterError
+from hexapod_comp.virtual.named import find_model
+
+POSES = 400
+"""Of each machine."""
+
+SAME = 1e-9
+"""What the two ways may differ, m: forward kinematics closes the loops to rounding, some 1e-15 m."""
+
+
+def setpoints(lengths: np.ndarray, names: tuple[str, ...] = STRUT_NAMES) -> JointState:
+    return JointState(name=list(names), position=[float(length) for length in lengths])
+
+
+@pytest.mark.parametrize("name", machines())
+def test_lengths_and_the_pose_they_belong_to_are_answered_alike(name: str, tmp_path: Path):
+    machine, rng = machines()[name], np.random.default_rng(5)
+    geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
+    model = find_model("random:3", geometry)
+    by_pose, by_struts = (Compensator(geometry, model) for _ in range(2))
+    read = StrutInput(by_struts, STRUT_NAMES, "base").read
+    tips = machine.middle + np.cumsum(rng.normal(0.0, 1e-4, (POSES, 3)), axis=0)
+    tools = Rotation.from_rotvec(np.cumsum(rng.normal(0.0, 1e-4, (POSES, 3)), axis=0))
+    lengths = machine.lengths(*machine.platform_poses(tips, tools.as_matrix()))
+    for tip, tool, length in zip(tips, tools.as_quat(), lengths, strict=True):
+        wanted = by_pose.step((*tip, *tool), math.nan)  # in work
+        _, frame, numbers = read(serialize_message(setpoints(length)))
+        answer = by_struts.step(numbers, math.nan, NO_SHIFT)
+        assert frame == "base"
+        np.testing.assert_allclose(answer, wanted, rtol=0, atol=SAME)
+        np.testing.assert_allclose(by_struts.nominal, length, rtol=0, atol=SAME)
+
+
+def test_who_cannot_be_told_is_refused_with_the_reason(paper: Compensator):
+    read = StrutInput(paper, STRUT_NAMES, "base").read
+    at_home = closed_form_lengths(HOME)
+    with pytest.raises(CommandError, match="strut_6 missing"):
+        read(serialize_message(setpoints(at_home[:5], STRUT_NAMES[:5])))
+    with pytest.raises(CommandError, match="finite"):
+        read(serialize_message(setpoints([*at_home[:5], math.nan])))
+    with pytest.raises(CommandError, match="each of 7 names needs a position"):
+        read(serialize_message(setpoints(at_home, (*STRUT_NAMES, "spindle"))))
+    late = setpoints(at_home)
+    late.header.stamp.nanosec = 2**32 - 1
+    with pytest.raises(CommandError, match="nanosec"):
+        read(serialize_message(late))
+    with pytest.raises(KinematicsError):
+        read(serialize_message(setpoints([0.5, 0.5, 0.5, 0.5, 0.5, 2.0])))
+
+
+@pytest.fixture
+def paper() -> Compensator:
+    geometry = load_geometry(config_file("paper.yaml"))
+    return Compensator(geometry, find_model("ideal", geometry))
+
+
+def ask(bench: Bench, lengths: np.ndarray, **others: float) -> JointState:
+    """Send setpoints beside other joints and return the strut commands that answer them."""
+    message = setpoints([*others.values(), *lengths], (*others, *STRUT_NAMES))
+    message.header.stamp = bench.now()
+    bench.publish("strut_setpoints", message)
+
+    def answers() -> list[JointState]:
+        return [m for m in bench.seen["strut_commands"][-5:] if m.header.stamp == message.header.stamp]
+
+    bench.until(answers, "an answer to setpoints")
+    return answers()[0]
+
+
+def test_a_controller_of_struts_commands_the_node(bench: Bench):
+    bench.speak("strut_setpoints")
+    bench.compensator(command_input=STRUTS, enable_compensation=False)
+    at_home = closed_form_lengths(HOME)
+    for _ in range(3):  # as ros2_control does until a controller is active
+        bench.publish("strut_setpoints", setpoints([math.nan] * 6))
+    bench.send(HOME)
+    bench.barrier()
+    values = bench.until_status(OK, "waiting for the first command")
+    assert values["commands"] == "0"
+    assert not any(value != "0" for key, value in values.items() if key.startswith("refused"))
+    assert not bench.seen["strut_commands"]
+    np.testing.assert_allclose(ask(bench, at_home, spindle=12.0).position, at_home, rtol=0, atol=SAME)
+    further = closed_form_lengths(near(HOME, (0.0, 0.001, 0.0), 0.1))
+    np.testing.assert_allclose(ask(bench, further).position, further, rtol=0, atol=SAME)
+    bench.publish("strut_setpoints", setpoints(closed_form_lengths(near(HOME, (0.0, 0.0, 0.05)))))
+    bench.until_status(ERROR, "refusing commands: step")
+    bench.until_status(WARN, "no new command")
+
+
+def test_joints_go_by_the_machine_s_own_names(bench: Bench):
+    names = [f"left_leg_{n}" for n in range(1, 7)]
+    bench.compensator(joint_names=names, enable_compensation=False)
+    bench.feed(closed_form_lengths(HOME))  # under the usual names: nobody's
+    bench.until(lambda: bench.logged("left_leg_1 missing"), "a warning")
+    answer = bench.ask(HOME)
+    assert list(answer.command.name) == names
+    bench.feed(closed_form_lengths(HOME)[::-1], tuple(reversed(names)))
+    bench.until(lambda: bench.values().get("pose_estimated_from") == "strut_states", "feedback")
+
+
+@pytest.mark.parametrize(
+    ("parameters", "problem"),
+    [
+        ({"command_input": "both"}, "command_input: must be one of poses, struts, not 'both'"),
+        ({"joint_names": ["a", "b"]}, "joint_names: must be 6 different names"),
+        ({"joint_names": ["a"] * 6}, "joint_names: must be 6 different names"),
+    ],
+)
+def test_other_values_are_refused(bench: Bench, parameters: dict[str, object], problem: str):
+    with pytest.raises(ParameterError, match=problem):
+        bench.compensator(**parameters)
