@@ -23,6 +23,7 @@ from ..errors import HexapodError
 from ..formats.json import json_text
 from ..formats.paths import confined_file, confined_opener
 from ..machine.field import GridField
+from ..machine.late import LateGrowth
 from ..machine.model import Datum, MachineModel, ModelOrigin
 from ..machine.struts import StrutErrors
 
@@ -60,6 +61,7 @@ def model_of(text: str) -> MachineModel:
     origin["sources"] = tuple(tuple(source) for source in origin["sources"])
     origin["posterior"] = None if origin["posterior"] is None else tuple(origin["posterior"])
     origin["datum"] = None if origin["datum"] is None else Datum(**origin["datum"])
+    data["late_growth"] = LateGrowth(**data["late_growth"])
     data["struts"] = StrutErrors(**data["struts"])
     data["field"] = GridField(**{**field, "grid": tuple(field["grid"]), "lines": tuple(field["lines"])})
     data["origin"] = ModelOrigin(**origin)

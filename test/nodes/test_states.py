@@ -670,6 +670,9 @@ def test_shipped_models_survive_the_way_through_the_loading_process():
         model = load_model(CONFIG / name, geometry)
         again = model_of(model_json(model))
         assert model_json(again) == model_json(model)
+        assert {name: type(value) for name, value in vars(again).items()} == {
+            name: type(value) for name, value in vars(model).items()
+        }
         for one, other in zip(again.field.lines, model.field.lines, strict=True):
             np.testing.assert_array_equal(one, other)
         np.testing.assert_array_equal(again.struts.map_values, model.struts.map_values)
