@@ -2,8 +2,8 @@
 
 Gauss–Newton on the exact machine. Each linear problem is Bayesian: every block of parameters has a prior
 whose size is estimated from the data (MacKay's fixed point), as is the noise of every kind of channel. What
-an instrument does not know (each run's zero, the slope of its beam) is projected out beforehand, so it costs
-no parameters and needs no prior.
+an instrument does not know (each run's zero, the slope of its beam, where a length starts from) is projected out
+beforehand, so it costs no parameters.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from ..errors import CalibrationError, KinematicsError, ModelError
 from ..measurements.readings import KINDS, LEAST_NOISE, MeasurementSet
+from .cells import Cells
 from .parameters import ParameterSpace
 from .sensitivity import derivatives, predict
+from .unknowns import Unknown, of_zero
 
 STEPS = 20
 """Most Gauss–Newton steps; a handful is enough for deviations of a tenth of a millimetre."""
@@ -49,56 +51,6 @@ MEDIAN_TO_SIGMA = 1.4826
 
 OUTLIER = 5.0
 """Residuals beyond so many standard deviations are listed."""
-
-
-@dataclass(frozen=True)
-class Cells:
-    """Readings of one channel at one station are one cell: they differ by noise only.
-
-    Attributes
-    ----------
-    of_reading : ndarray of int, shape (N,)
-        Cell of each reading.
-    station, channel, kind, group : ndarray of int, shape (C,)
-        Of each cell; a group is one channel of one run, whose unknowns its cells share.
-    directions : ndarray, shape (C, 6)
-        w of each cell.
-    along : ndarray, shape (C,)
-        Commanded coordinate along the line, m.
-    fold : ndarray of int, shape (C,)
-        What is left out together in cross-validation: a line's run, or a scattered pose.
-    """
-
-    of_reading: np.ndarray
-    station: np.ndarray
-    channel: np.ndarray
-    kind: np.ndarray
-    group: np.ndarray
-    directions: np.ndarray
-    along: np.ndarray
-    fold: np.ndarray
-
-    @staticmethod
-    def of(measurements: MeasurementSet) -> Cells:
-        """Return the cells of a set."""
-        m = measurements
-        keys = np.stack([m.station, m.channel], axis=1)
-        _, first, of_reading = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        groups = np.unique(np.stack([m.run, m.channel], axis=1), axis=0, return_inverse=True)[1].ravel()
-        is_line = np.array([run.is_line for run in m.runs])[m.run[first]]
-        poses = np.hstack([m.stations.positions, m.stations.rotations.reshape(-1, 9)]).round(9)
-        pose = np.unique(poses, axis=0, return_inverse=True)[1].ravel()[m.station[first]]
-        fold_key = np.where(is_line, -1 - m.run[first], pose)
-        return Cells(
-            of_reading=of_reading.ravel(),
-            station=m.station[first],
-            channel=m.channel[first],
-            kind=m.kind[first],
-            group=np.where(is_line, groups[first], -1),
-            directions=m.directions()[first],
-            along=m.along()[first],
-            fold=np.unique(fold_key, return_inverse=True)[1].ravel(),
-        )
 
 
 @dataclass(frozen=True)
@@ -186,24 +138,13 @@ class Estimation:
         self.measurements, self.space = measurements, space
         self.cells = Cells.of(measurements)
         self.uncertainty = measurements.stated
-        self._unknowns = self._make_unknowns()
+        self._zeros, self._lengths = self.cells.groups(measurements)
         needed = len(space.blocks[0].labels)
-        free = len(self.cells.station) - sum(q.shape[1] for _, q in self._unknowns)
+        free = len(self.cells.station) - len(self._zeros) - sum(along is not None for _, along in self._zeros)
+        free -= sum(lengths.count for lengths in self._lengths)
         if alone and free < needed:
             problem = f"{len(measurements)} readings at {len(self.cells.station)} distinct places leave {free} "
             raise CalibrationError("measurements", problem + f"numbers for the structure's {needed} parameters")
-
-    def _make_unknowns(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return, for each channel of each run, its cells and what of them its instrument does not know."""
-        c = self.cells
-        result = []
-        for group in np.unique(c.group[c.group >= 0]):
-            members = np.flatnonzero(c.group == group)
-            columns = [np.ones(len(members))]
-            if KINDS[c.kind[members[0]]] == "straightness" and np.ptp(c.along[members]) > 0.0:
-                columns.append(c.along[members] - c.along[members].mean())
-            result.append((members, np.stack(columns, axis=1)))
-        return result
 
     def linearise(self, x: np.ndarray, reading_weights: np.ndarray) -> tuple[LinearProblem, np.ndarray]:
         """Return the linear problem at a parameter vector, and each reading's residual there, m or rad.
@@ -221,25 +162,23 @@ class Estimation:
             No machine is like that, or it cannot take one of the poses.
         """
         c, m = self.cells, self.measurements
-        expected, rows = self._expected(x)
         weights = reading_weights / self.uncertainty**2
         total = np.bincount(c.of_reading, weights)
+        scale = np.sqrt(total)
+        expected, rows, unknowns = self._expected(x, np.bincount(c.of_reading, weights * m.value) / total, scale)
         misfit = m.value - expected[c.of_reading]
         mean = np.bincount(c.of_reading, weights * misfit) / total
-        scale = np.sqrt(total)
         target, rows = scale * mean, scale[:, None] * rows
         unknown = np.zeros(len(mean))
-        for members, columns in self._unknowns:
-            q, _ = np.linalg.qr(scale[members, None] * columns)
-            explained = q @ (q.T @ target[members])
-            target[members] -= explained
-            unknown[members] = explained / scale[members]
-            rows[members] -= q @ (q.T @ rows[members])
+        for part in unknowns:
+            unknown[part.members] += part.explained(target) / scale[part.members]
+            part.project_out(target)
+            part.project_out(rows)
         residuals = misfit - unknown[c.of_reading]
         scatter = np.bincount(m.kind, weights * (misfit - mean[c.of_reading]) ** 2, len(KINDS))
         # Huber's proposal 2: noise comes from the residuals cut off, weight² · residual², or outliers blow it up.
         beyond = np.bincount(m.kind, weights * (1.0 - reading_weights) * residuals**2, len(KINDS))
-        return self._problem(target + rows @ x, self.space.whitened(rows), scatter - beyond), residuals
+        return self._problem(target + rows @ x, self.space.whitened(rows), scatter - beyond, unknowns), residuals
 
     def free_of_unknowns(self, rows: np.ndarray) -> np.ndarray:
         """Return what is left of cells' derivatives (C, K) beside all that instruments do not know, over their noise.
@@ -248,18 +187,22 @@ class Estimation:
         """
         scale = np.sqrt(np.bincount(self.cells.of_reading, self.uncertainty**-2))
         rows = scale[:, None] * rows
-        for members, columns in self._unknowns:
-            q, _ = np.linalg.qr(scale[members, None] * columns)
-            rows[members] -= q @ (q.T @ rows[members])
+        values = np.zeros(len(scale))
+        for part in self._unknowns(self.cells.directions.copy(), np.zeros((len(scale), 6)), values, scale)[1]:
+            part.project_out(rows)
         return rows
 
-    def _expected(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return what each cell should read, shape (C,), and its derivatives, (C, size), m and rad.
+    def _expected(
+        self, x: np.ndarray, values: np.ndarray, scale: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, list[Unknown]]:
+        """Return what each cell should read, shape (C,), its derivatives, (C, size), m and rad, and what is unknown.
+
+        Lengths start from where their `values` and `scale`, one over their standard deviations, (C,) each, put it.
 
         Raises
         ------
         CalibrationError
-            No machine is like that, or it cannot take one of the poses.
+            No machine is like that, or it cannot take one of the poses; a length's centre is far from its place.
         """
         c, stations = self.cells, self.measurements.stations
         try:
@@ -268,17 +211,32 @@ class Estimation:
             hint = "do units, directions and commanded poses fit, and are all blocks allowed?"
             problem = f"left the machines that can be ({error}); {hint}"
             raise CalibrationError("fit", problem) from error
+        directions = c.directions.copy()
+        expected, unknowns = self._unknowns(directions, prediction.errors[c.station], values, scale)
         slopes = derivatives(self.space, prediction, stations)[c.station]
-        expected = np.einsum("ci,ci->c", c.directions, prediction.errors[c.station])
-        return expected, np.einsum("ci,cip->cp", c.directions, slopes)
+        return expected, np.einsum("ci,cip->cp", directions, slopes), unknowns
 
-    def _problem(self, target: np.ndarray, rows: np.ndarray, scatter: np.ndarray) -> LinearProblem:
+    def _unknowns(
+        self, directions: np.ndarray, errors: np.ndarray, values: np.ndarray, scale: np.ndarray
+    ) -> tuple[np.ndarray, list[Unknown]]:
+        """Return what cells with errors (C, 6) should read, and what is unknown; renews `directions` of lengths."""
+        expected = np.einsum("ci,ci->c", directions, errors)
+        unknowns = [of_zero(members, scale[members], along) for members, along in self._zeros]
+        for lengths in self._lengths:
+            n = lengths.members
+            expected[n], directions[n, :3], parts = lengths.seen(errors[n, :3], values[n], scale[n])
+            unknowns += parts
+        return expected, unknowns
+
+    def _problem(
+        self, target: np.ndarray, rows: np.ndarray, scatter: np.ndarray, unknowns: list[Unknown]
+    ) -> LinearProblem:
         """Gather the sums that everything later needs."""
         kind, size, kinds = self.cells.kind, self.space.size, len(KINDS)
         normal, moment, square = np.zeros((kinds, size, size)), np.zeros((kinds, size)), scatter.copy()
         freedom = np.bincount(self.measurements.kind, minlength=kinds).astype(float)
-        for members, columns in self._unknowns:
-            freedom[kind[members[0]]] -= columns.shape[1]
+        for part in unknowns:
+            freedom[kind[part.members[0]]] -= part.share.sum()
         for k in np.unique(kind):
             part = rows[kind == k]
             normal[k] = part.T @ part

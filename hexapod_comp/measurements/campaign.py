@@ -22,7 +22,7 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.model_blocks import ModelDumper, written
 from ..pose import Pose, rotation_from_angles
 from .campaign_runs import CampaignRun, line_readings, read_runs
-from .readings import ANGULAR_KINDS, AXES, KINDS, UNKNOWN, FileLine, MeasurementSet, Reading
+from .readings import ANGULAR_KINDS, AXES, DEFAULT_UNCERTAINTY, KINDS, UNKNOWN, FileLine, MeasurementSet, Reading
 from .runs import assemble
 
 CAMPAIGN_FORMAT = "hexapod_comp/campaign"
@@ -85,7 +85,7 @@ class Campaign:
     cycles: int = 1
     poses: int = 0
     tilt: float = 0.0
-    noise: tuple[float, ...] = (1e-6, 1e-6, 1e-6, 10e-6, 10e-6)
+    noise: tuple[float, ...] = tuple(DEFAULT_UNCERTAINTY.values())
     beam_slope: float = 100e-6
     repeatability: float = 0.0
     level: np.ndarray = field(default_factory=lambda: np.eye(3))

@@ -44,7 +44,7 @@ from ..pose import Pose
 from .carto_files import Dynamic, Static, is_capture, read_rtl, read_rtx
 from .readings import AXES, BACKWARD, FORWARD, FileLine, MeasurementSet, Reading
 from .runs import assemble
-from .tidy_csv import DIMENSIONS, LINE_KINDS, TURN_AXES, TURNS
+from .tidy_rows import ALONG_LINES, DIMENSIONS, TURN_AXES, TURNS
 
 LINE_FORMAT = "hexapod_comp/line"
 LINE_VERSION = 1
@@ -100,7 +100,7 @@ def load_line(path: str | Path) -> LineFile:
     """
     top = read_yaml(path, LINE_FORMAT, LINE_VERSION)
     axis = AXES.index(top.choice("axis", AXES))
-    channel = top.choice("channel", tuple(c for c in DIMENSIONS if c.partition("_")[0] in LINE_KINDS))
+    channel = top.choice("channel", tuple(c for c in DIMENSIONS if c.partition("_")[0] in ALONG_LINES))
     line = LineFile(
         run=top.text("run"),
         axis=axis,

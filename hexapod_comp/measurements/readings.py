@@ -7,7 +7,9 @@ axes of ``base``,
     value = w · e + what the instrument does not know (each run's own zero, the slope of its beam)
 
 so a laser line, a straightness, an angle, a body diagonal and a tracker's pose differ only in w and in what
-is unknown. Readings of one *run* share these unknowns; readings taken at the same command, from the same
+is unknown. A ball bar, a tracking interferometer and a probe that touches a sphere all read how far the point is
+from a *centre* that is only roughly known: w is the unit vector n from there, and unknown are the length's zero and
+where the centre is. Readings of one *run* share these unknowns; readings taken at the same command, from the same
 direction, under the same temperatures (where these change: at the same time) share a *station*.
 """
 
@@ -33,17 +35,29 @@ CHANNELS = (
     *(f"rotation_{a}" for a in AXES),
     *(f"position_{a}" for a in AXES),
     *(f"attitude_{a}" for a in AXES),
+    "length",
+    *(f"displacement_{a}" for a in AXES),
 )
-"""What a reading is of. ``linear`` is along the run's line; the others are along or about an axis of the work
-frame. Straightness and rotation belong to lines and have unknown zeros; position and attitude are absolute."""
+"""What a reading is of. ``linear`` is along the run's line, ``length`` from a centre; the others are along or about
+an axis of the work frame. Straightness and rotation belong to lines and have unknown zeros, displacement has one
+wherever the poses are; position and attitude are absolute."""
 
-KINDS = ("linear", "straightness", "rotation", "position", "attitude")
+LINE_KINDS = ("linear", "straightness", "rotation")
+"""Kinds of channel that are read along a line."""
+
+ABSOLUTE_KINDS = ("position", "attitude")
+"""Kinds of channel without an unknown zero."""
+
+KINDS = (*LINE_KINDS, *ABSOLUTE_KINDS, "length", "displacement")
 """Kinds of channel: those of one kind share an instrument and its noise."""
+
+LENGTH = CHANNELS.index("length")
+"""The channel of distances from a centre."""
 
 KIND_OF = np.array([KINDS.index(channel.partition("_")[0]) for channel in CHANNELS])
 """Kind of each channel, as an index."""
 
-DEFAULT_UNCERTAINTY = dict(zip(KINDS, (1e-6, 1e-6, 1e-6, 10e-6, 10e-6), strict=True))
+DEFAULT_UNCERTAINTY = dict(zip(KINDS, (1e-6, 1e-6, 1e-6, 10e-6, 10e-6, 1e-6, 1e-6), strict=True))
 """Standard deviation of a reading where neither the file nor repeated readings tell, m or rad."""
 
 ANGULAR_KINDS = ("rotation", "attitude")
@@ -109,6 +123,10 @@ class Reading(NamedTuple):
         For messages.
     time : float
         When it was taken, s, on a clock that all readings share; NaN when not known.
+    centre : tuple of float or None
+        From where a length is read: a place in the work frame, m, known to some millimetres; None for others.
+    known_zero : bool
+        A length that is known as a whole, as with a calibrated bar.
     """
 
     run: str
@@ -122,6 +140,8 @@ class Reading(NamedTuple):
     commands: tuple[float, ...] | None = None
     source: FileLine = FileLine("", 0)
     time: float = np.nan
+    centre: tuple[float, ...] | None = None
+    known_zero: bool = False
 
 
 @dataclass(frozen=True)
@@ -137,11 +157,14 @@ class Run:
         y, z along which the line travels: that is forward.
     origin : ndarray, shape (3,)
         First commanded point of the line, m in ``base``.
+    known_zero : bool
+        Its lengths are known as a whole.
     """
 
     name: str
     axis: np.ndarray
     origin: np.ndarray
+    known_zero: bool = False
 
     @property
     def is_line(self) -> bool:
@@ -214,6 +237,9 @@ class MeasurementSet:
         Indices of station, run and channel; number of the pass; direction.
     value, uncertainty : ndarray, shape (N,)
         m or rad; NaN where the uncertainty is not known.
+    centre : ndarray, shape (N, 3)
+        From where lengths are read, about, m in ``base``; NaN for other readings. The centres of one run belong to one
+        body, whose place and attitude are unknown.
     sources : tuple of FileLine
         Where each reading stands.
     files : tuple of (str, str)
@@ -233,6 +259,7 @@ class MeasurementSet:
     channel: np.ndarray
     value: np.ndarray
     uncertainty: np.ndarray
+    centre: np.ndarray
     sources: tuple[FileLine, ...]
     files: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = field(default=())
@@ -282,13 +309,18 @@ class MeasurementSet:
         """Return w of each reading, shape (N, 6): value = w · (dx, dy, dz, rx, ry, rz) in ``base``."""
         axes = self.geometry.work.rotation.T  # row a: the work frame's axis a, in base
         fixed = np.zeros((len(CHANNELS), 6))
-        for index, channel in enumerate(CHANNELS[1:], start=1):
+        for index, channel in enumerate(CHANNELS):
             kind, _, axis = channel.partition("_")
+            if not axis:
+                continue
             part = slice(3, 6) if kind in ANGULAR_KINDS else slice(0, 3)
             fixed[index, part] = axes[AXES.index(axis)]
         weights = fixed[self.channel]
         linear = self.channel == 0
         weights[linear, :3] = np.array([run.axis for run in self.runs]).reshape(-1, 3)[self.run[linear]]
+        length = self.channel == LENGTH
+        away = self.points()[self.station[length]] - self.centre[length]
+        weights[length, :3] = away / np.linalg.norm(away, axis=1, keepdims=True)
         return weights
 
     def points(self) -> np.ndarray:
@@ -335,7 +367,7 @@ class MeasurementSet:
 
     def select(self, mask: np.ndarray) -> MeasurementSet:
         """Return the set of the readings in a boolean mask (N,); runs and stations keep their numbers."""
-        arrays = ("station", "run", "cycle", "direction", "channel", "value", "uncertainty")
+        arrays = ("station", "run", "cycle", "direction", "channel", "value", "uncertainty", "centre")
         chosen = {name: getattr(self, name)[mask] for name in arrays}
         return replace(self, sources=tuple(s for s, m in zip(self.sources, mask, strict=True) if m), **chosen)
 

@@ -24,6 +24,8 @@ from .readings import (
     KIND_OF,
     KINDS,
     LEAST_TRAVEL,
+    LENGTH,
+    LINE_KINDS,
     MeasurementSet,
     Reading,
     Run,
@@ -33,6 +35,8 @@ from .readings import (
 SAME = 1e-9
 """Commands nearer to each other than this, m, are the same command."""
 
+SHORTEST_LENGTH = 1e-3
+"""A length shorter than this, m, has no direction: its centre is known to some millimetres only."""
 
 LARGEST_READING = 10.0
 """No machine errs by more, and no instrument's zero lies further off, m or rad."""
@@ -71,6 +75,7 @@ def assemble(
     _check_readings(readings)
     poses = _platform_poses(geometry, readings)
     points = np.array([pose.position + pose.rotation @ probe for pose in poses])
+    centre = _centres(geometry, readings, points)
     runs, run_of, swapped = _runs(readings, points, geometry.work.rotation.T)
     stations, station = _collect_stations(geometry, readings, poses, [runs[i] for i in run_of], in_reach)
     return MeasurementSet(
@@ -85,6 +90,7 @@ def assemble(
         channel=np.array([CHANNELS.index(r.channel) for r in readings]),
         value=np.array([r.value for r in readings], dtype=float),
         uncertainty=np.array([r.uncertainty for r in readings], dtype=float),
+        centre=centre,
         sources=tuple(r.source for r in readings),
         files=tuple(files),
         notes=(*notes, *swapped),
@@ -115,6 +121,35 @@ def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> l
             known[key] = geometry.platform_pose(reading.pose)
         poses.append(known[key])
     return poses
+
+
+def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.ndarray) -> np.ndarray:
+    """Return from where lengths are read, (N, 3), m in ``base``, NaN for others; `points` are the measured ones.
+
+    Raises
+    ------
+    InputFileError
+        A length without a centre, or at it; a centre of something else; a run whose zero is known and unknown.
+    """
+    centres = np.full((len(readings), 3), np.nan)
+    known: dict[str, bool] = {}
+    for n, r in enumerate(readings):
+        is_length = r.channel == CHANNELS[LENGTH]
+        if is_length and r.centre is None:
+            raise InputFileError(r.source.file, _line(r), "a length needs the place of its centre")
+        if not is_length and (r.centre is not None or r.known_zero):
+            problem = f"only lengths have a centre or a known zero; leave them empty for {r.channel}"
+            raise InputFileError(r.source.file, _line(r), problem)
+        if known.setdefault(r.run, r.known_zero) != r.known_zero:
+            problem = f"run {r.run}: one zero cannot be known and unknown; call them two runs"
+            raise InputFileError(r.source.file, _line(r), problem)
+        if r.centre is not None:
+            centres[n] = geometry.work.position + geometry.work.rotation @ np.array(r.centre)
+            distance = float(np.linalg.norm(points[n] - centres[n]))
+            if not SHORTEST_LENGTH <= distance < np.inf:
+                problem = f"the commanded point must be {SHORTEST_LENGTH * 1e3:g} mm or more from the centre, mm"
+                raise InputFileError(r.source.file, _line(r), problem, distance * 1e3)
+    return centres
 
 
 def _check_readings(readings: Sequence[Reading]) -> None:
@@ -149,15 +184,15 @@ def _recognise(readings: list[Reading], points: np.ndarray, work_axes: np.ndarra
     Raises
     ------
     InputFileError
-        Line channels whose commanded points do not lie on a line, or at one place only; line and absolute
-        channels mixed.
+        Line channels whose commanded points do not lie on a line, or at one place only; channels of lines and others
+        mixed.
     """
     first, name = readings[0], readings[0].run
-    of_lines = {KIND_OF[CHANNELS.index(r.channel)] < KINDS.index("position") for r in readings}
+    of_lines = {KINDS[KIND_OF[CHANNELS.index(r.channel)]] in LINE_KINDS for r in readings}
     if len(of_lines) == 2:
-        raise InputFileError(first.source.file, f"run {name}", "mixes channels of a line with absolute ones")
+        raise InputFileError(first.source.file, f"run {name}", "mixes channels of a line with others")
     if of_lines == {False}:
-        return Run(name, np.zeros(3), points[0])
+        return Run(name, np.zeros(3), points[0], first.known_zero)
     spread = points - points[0]
     far = spread[np.linalg.norm(spread, axis=1).argmax()]
     if np.linalg.norm(far) < LEAST_TRAVEL:
@@ -280,6 +315,7 @@ def joined(sets: Sequence[MeasurementSet]) -> MeasurementSet:
         channel=together("channel"),
         value=together("value"),
         uncertainty=together("uncertainty"),
+        centre=together("centre"),
         sources=tuple(source for s in sets for source in s.sources),
         files=tuple(file for s in sets for file in s.files),
         notes=tuple(note for s in sets for note in s.notes),

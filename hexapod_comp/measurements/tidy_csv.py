@@ -21,6 +21,12 @@ Columns
     ``platform_degC`` say otherwise. Without any, 20 °C. Where one part alone has a column, its sensor stands for all.
 ``time_s`` (optional)
     When the row was read, on one clock for all files: what shows how late parts follow their sensors.
+``centre_x_mm``, ``centre_y_mm``, ``centre_z_mm`` (for lengths)
+    From where the length is read, in the work frame, known to some millimetres: the fixed ball of a ball bar, the
+    station, the sphere. Centres of one run belong to one body, such as a ball plate: only as a whole it may stand
+    elsewhere.
+``zero`` (optional)
+    ``known`` where lengths are known as a whole, with a calibrated bar or sphere; else their run has an unknown zero.
 ``instrument_index``, ``pressure_kPa``, ``humidity_percent`` (optional)
     The refractive index with which the instrument turned its counts into lengths; 1 when it counts vacuum
     wavelengths. A row that has one is corrected to the air of that row (Ciddor), which needs its temperature,
@@ -42,6 +48,11 @@ Channels
     Measured orientation of the tool in the work frame, four rows for one pose.
 ``attitude_x`` … ``_z``
     Or its error: the rotation vector from the commanded to the measured orientation, along the work frame's axes.
+``length``
+    Distance read from the centre to the measured point, from any zero: a ball bar's change of length, an
+    interferometer's count, or always the same (0, say) at the poses at which a probe touches a sphere.
+``displacement_x`` … ``_z``
+    Displacement along an axis of the work frame minus that commanded, from any zero: an R-test at the tool's ball.
 ``strut_1`` … ``strut_6``
     Strut lengths that the machine was told, or that its encoders show, six rows for one pose: they then hold for
     all readings of that run, cycle, direction and pose. Without them the machine was told nominal lengths.
@@ -50,7 +61,7 @@ Channels
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import NamedTuple
@@ -58,73 +69,26 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import InputFileError, PoseError
-from ..formats.csv import Table, exact, si_from_text
-from ..formats.yaml import UNITS, spellings
+from ..formats.csv import Table
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
-from ..machine.model import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
 from ..pose import Pose
-from .air import AIR_RANGES, LARGEST_INDEX, Air, correct_displacement
+from .air import Air, correct_displacement
 from .readings import (
-    ANGULAR_KINDS,
     AXES,
-    BACKWARD,
     CHANNELS,
-    FORWARD,
     FROM_PREVIOUS,
     LEAST_TRAVEL,
-    UNKNOWN,
+    LENGTH,
     FileLine,
     MeasurementSet,
     Reading,
     attitude_error,
 )
 from .runs import assemble
-
-DIRECTIONS = {"forward": FORWARD, "backward": BACKWARD, "sequence": FROM_PREVIOUS, "": UNKNOWN}
-"""Words of the column ``direction``."""
-
-TURNS = ("roll", "pitch", "yaw")
-"""Rotations named after the line on which they are read."""
-
-TURN_AXES = ((0, 1, 2), (1, 0, 2), (2, 0, 1))
-"""Axes of roll, pitch and yaw on a line along x, y, z."""
-
-QUATERNION_CHANNELS = tuple(f"quaternion_{c}" for c in "xyzw")
-
-DIMENSIONS = {
-    **{channel: "angle" if channel.partition("_")[0] in ANGULAR_KINDS else "length" for channel in CHANNELS},
-    **dict.fromkeys(TURNS, "angle"),
-    **dict.fromkeys(QUATERNION_CHANNELS, ""),
-    **dict.fromkeys(STRUT_NAMES, "length"),
-}
-"""What each channel of a file is measured in."""
-
-LINE_KINDS = ("linear", "straightness", "rotation", *TURNS)
-"""Channels that light reads along a line, and that the air therefore bends."""
-
-LATEST = 1e11
-"""Largest time, s: seconds since 1970 of the next three thousand years; nanoseconds are not seconds."""
+from .tidy_rows import ALONG_LINES, QUATERNION_CHANNELS, TURN_AXES, TURNS, Row, read_rows
 
 PARALLEL = 1e-9
 """Largest cross component of a unit vector that still is parallel to an axis."""
-
-
-class _Row(NamedTuple):
-    """A row of a file; value and uncertainty in SI, `decimal` is the value as it stands there, in `unit`."""
-
-    run: str
-    cycle: int
-    direction: int
-    pose: Pose
-    channel: str
-    value: float
-    decimal: Decimal
-    unit: float
-    uncertainty: float
-    temperatures: tuple[float, ...]
-    air: tuple[float, ...] | None
-    line: int
-    time: float
 
 
 def read_tidy(
@@ -157,7 +121,7 @@ def read_tidy(
     notes: list[str] = []
     tables = [Table(path) for path in paths]
     _refuse_twice(tables)
-    of_files = [_read_rows(table) for table in tables]
+    of_files = [read_rows(table) for table in tables]
     for table, rows, names in zip(tables, of_files, _run_names(tables, of_files), strict=True):
         own, corrected = _file_readings(table, rows, names, geometry, probe)
         readings += own
@@ -176,7 +140,7 @@ def _refuse_twice(tables: Sequence[Table]) -> None:
         seen[table.sha256] = table
 
 
-def _run_names(tables: Sequence[Table], of_files: Sequence[Sequence[_Row]]) -> list[dict[str, str]]:
+def _run_names(tables: Sequence[Table], of_files: Sequence[Sequence[Row]]) -> list[dict[str, str]]:
     """Return the names that the runs of each file get: their own where no other file has the same."""
     names = [{row.run for row in rows} for rows in of_files]
     short = [Path(table.path).name for table in tables]
@@ -187,158 +151,8 @@ def _run_names(tables: Sequence[Table], of_files: Sequence[Sequence[_Row]]) -> l
     ]
 
 
-def _read_rows(table: Table) -> list[_Row]:
-    """Return the rows of a file, every cell checked by itself."""
-    runs, channels, units = table.texts("run"), table.texts("channel"), table.texts("unit")
-    directions, cycles, poses = _directions(table), _cycles(table), _poses(table)
-    value_column = table.required(("value",), None)[0][0]
-    uncertainty_column = table.column("uncertainty", None)
-    temperatures, air = _temperatures(table), _air(table)
-    times = _optional(table, "time", "time", lambda v: abs(v) <= LATEST, f"±{LATEST:g} s", blank=True)
-    table.refuse_unknown()
-    sizes: dict[tuple[str, str], float] = {}
-    rows = []
-    for n, (line, cells) in enumerate(table.rows):
-        if not runs[n]:
-            raise InputFileError(table.path, f"line {line}, column run", "must be a name")
-        key = (channels[n], units[n])
-        if key not in sizes:
-            sizes[key] = _unit_size(table, line, *key)
-        text = cells[value_column]
-        number = table.number(line, value_column, text)
-        value = (si_from_text(text, number, sizes[key]), exact(text, number), sizes[key])
-        uncertainty = _uncertainty(table, line, cells, uncertainty_column, sizes[key])
-        place = (runs[n], cycles[n], directions[n], poses[n], channels[n])
-        rows.append(_Row(*place, *value, uncertainty, temperatures[n], air[n], line, times[n]))
-    return rows
-
-
-def _uncertainty(table: Table, line: int, cells: Sequence[str], column: tuple[int, float] | None, unit: float) -> float:
-    """Return a standard deviation in SI, NaN where there is none."""
-    if column is None or not cells[column[0]].strip():
-        return math.nan
-    text = cells[column[0]]
-    value = si_from_text(text, table.number(line, column[0], text), unit)
-    if value <= 0.0:
-        raise InputFileError(table.path, f"line {line}, column uncertainty", "must be above zero, or empty", text)
-    return value
-
-
-def _directions(table: Table) -> list[int]:
-    """Return the directions as numbers."""
-    texts = table.texts("direction")
-    for (line, _), text in zip(table.rows, texts, strict=True):
-        if text not in DIRECTIONS:
-            allowed = "must be forward, backward, sequence or empty"
-            raise InputFileError(table.path, f"line {line}, column direction", allowed, text)
-    return [DIRECTIONS[text] for text in texts]
-
-
-def _poses(table: Table) -> list[Pose]:
-    """Return the commanded poses; rows with the same one share the object."""
-    positions, rotations = table.poses()
-    known: dict[bytes, Pose] = {}
-    poses = []
-    for position, rotation in zip(positions, rotations, strict=True):
-        key = position.tobytes() + rotation.tobytes()
-        if key not in known:
-            known[key] = Pose(position, rotation)
-        poses.append(known[key])
-    return poses
-
-
-def _cycles(table: Table) -> list[int]:
-    """Return the numbers of the passes, 1 without a column."""
-    if table.column("cycle", None) is None:
-        return [1] * len(table.rows)
-    cycles = []
-    for (line, _), text in zip(table.rows, table.texts("cycle"), strict=True):
-        if not (text.isascii() and text.isdigit() and int(text[:9]) >= 1 and len(text) < 10):
-            raise InputFileError(table.path, f"line {line}, column cycle", "must be a whole number from 1", text)
-        cycles.append(int(text))
-    return cycles
-
-
-def _optional(
-    table: Table, name: str, dimension: str | None, fits: Callable[[float], bool], allowed: str, blank: bool
-) -> list[float]:
-    """Return a column's numbers in SI; NaN where it is missing, or a cell `blank` where that may be."""
-    column = table.column(name, dimension)
-    if column is None:
-        return [math.nan] * len(table.rows)
-    index, unit = column
-    numbers = []
-    for line, cells in table.rows:
-        text = cells[index]
-        if blank and not text.strip():
-            numbers.append(math.nan)
-            continue
-        numbers.append(si_from_text(text, table.number(line, index, text), unit))
-        if not fits(numbers[-1]):
-            where = f"line {line}, column {table.header[index]}"
-            raise InputFileError(table.path, where, f"must be within {allowed}", text)
-    return numbers
-
-
-def _temperatures(table: Table) -> list[tuple[float, ...]]:
-    """Return the temperatures of struts, base and platform of each row, °C."""
-    low, high = TEMPERATURE_RANGE
-
-    def read(name: str) -> np.ndarray:
-        return np.array(
-            _optional(table, name, "temperature", lambda v: low <= v <= high, f"{low:g}…{high:g} °C", blank=False)
-        )
-
-    everywhere = np.nan_to_num(read("temperature"), nan=REFERENCE_TEMPERATURE)
-    columns = [np.where(np.isnan(own := read(name)), everywhere, own) for name in Temperatures.NAMES]
-    return list(map(tuple, np.stack(columns, axis=1).tolist()))
-
-
-def _air(table: Table) -> list[tuple[float, ...] | None]:
-    """Return instrument index, temperature, pressure and humidity of the rows that have the first."""
-    up_to = LARGEST_INDEX
-    index = _optional(table, "instrument_index", None, lambda v: 1.0 <= v <= up_to, f"1…{up_to:g}", blank=True)
-    wanted = not np.isnan(index).all()
-    columns = [index]
-    for name, dimension in (("temperature", "temperature"), ("pressure", "pressure"), ("humidity", "ratio")):
-        low, high, allowed = AIR_RANGES[name]
-        columns.append(
-            _optional(
-                table,
-                name,
-                dimension,
-                lambda v, low=low, high=high: not wanted or low <= v <= high,  # type: ignore[misc]
-                allowed,
-                blank=True,
-            )
-        )
-    air: list[tuple[float, ...] | None] = []
-    for (line, _), *row in zip(table.rows, *columns, strict=True):
-        if math.isnan(row[0]):
-            air.append(None)
-            continue
-        if any(map(math.isnan, row)):
-            problem = "has an instrument_index, so it needs temperature_degC, pressure_kPa and humidity_percent too"
-            raise InputFileError(table.path, f"line {line}", problem)
-        air.append(tuple(row))
-    return air
-
-
-def _unit_size(table: Table, line: int, channel: str, unit: str) -> float:
-    """Return the size of a unit in SI; refuse unknown channels and units that do not fit them."""
-    if channel not in DIMENSIONS:
-        allowed = f"must be one of {', '.join(DIMENSIONS)}"
-        raise InputFileError(table.path, f"line {line}, column channel", allowed, channel)
-    dimension = DIMENSIONS[channel]
-    units = spellings(dimension) if dimension else {"": 1.0}
-    if unit not in units:
-        allowed = f"must be {' or '.join(UNITS[dimension])}" if dimension else "must be empty"
-        raise InputFileError(table.path, f"line {line}, column unit", f"{allowed} for {channel}", unit)
-    return units[unit]
-
-
 def _file_readings(
-    table: Table, rows: Sequence[_Row], names: dict[str, str], geometry: HexapodGeometry, probe: np.ndarray | None
+    table: Table, rows: Sequence[Row], names: dict[str, str], geometry: HexapodGeometry, probe: np.ndarray | None
 ) -> tuple[list[Reading], int]:
     """Return a file's readings, and how many of them were corrected for the air."""
     file = str(table.path)
@@ -357,18 +171,21 @@ def _file_readings(
             pairs = attitudes.pop(visits[n], [])
         elif row.channel.startswith("position_"):
             pairs = [(row.channel, _minus(row, float(points[n, AXES.index(row.channel[-1])])))]
+        elif row.channel == CHANNELS[LENGTH] and row.centre is not None:
+            pairs = [(row.channel, _minus(row, math.dist(points[n], row.centre)))]
         else:
             pairs = [(_channel(file, row, lines), corrected.get(n, row.value))]
         for channel, value in pairs:
             reading = (names[row.run], row.cycle, row.direction, row.pose, channel, value, row.uncertainty)
             source = FileLine(file, row.line)
-            readings.append(Reading(*reading, row.temperatures, commands.get(visits[n]), source, row.time))
+            state = row.temperatures, commands.get(visits[n]), source, row.time
+            readings.append(Reading(*reading, *state, row.centre, row.known_zero))
     if not readings:
         raise InputFileError(file, "", "holds strut readings only: nothing that was measured")
     return readings, len(corrected)
 
 
-def _visits(rows: Sequence[_Row]) -> list[tuple]:
+def _visits(rows: Sequence[Row]) -> list[tuple]:
     """Return for each row what readings taken together share; a sequence may come back to a place."""
     visits: list[tuple] = []
     count, before = 0, None
@@ -381,17 +198,17 @@ def _visits(rows: Sequence[_Row]) -> list[tuple]:
     return visits
 
 
-def _refuse_duplicates(file: str, rows: Sequence[_Row], visits: Sequence[tuple]) -> None:
+def _refuse_duplicates(file: str, rows: Sequence[Row], visits: Sequence[tuple]) -> None:
     """Raise on a channel read twice in one pass at one place."""
     seen: dict[tuple, int] = {}
     for row, visit in zip(rows, visits, strict=True):
-        first = seen.setdefault((visit, row.channel), row.line)
+        first = seen.setdefault((visit, row.channel, row.centre), row.line)
         if first != row.line:
             problem = f"reads {row.channel} again at the place of line {first}; number repeated passes in column cycle"
             raise InputFileError(file, f"line {row.line}", problem)
 
 
-def _points(rows: Sequence[_Row], geometry: HexapodGeometry, probe: np.ndarray | None) -> np.ndarray:
+def _points(rows: Sequence[Row], geometry: HexapodGeometry, probe: np.ndarray | None) -> np.ndarray:
     """Return the commanded place of the measured point in the work frame, shape (N, 3), m."""
     offset = np.zeros(3)
     if probe is not None:
@@ -408,11 +225,11 @@ class _Line(NamedTuple):
     axis: np.ndarray
 
 
-def _lines(rows: Sequence[_Row], points: np.ndarray) -> dict[str, _Line]:
+def _lines(rows: Sequence[Row], points: np.ndarray) -> dict[str, _Line]:
     """Return the lines of the runs that have channels of lines."""
     members: dict[str, list[int]] = {}
     for n, row in enumerate(rows):
-        if row.channel.partition("_")[0] in LINE_KINDS:
+        if row.channel.partition("_")[0] in ALONG_LINES:
             members.setdefault(row.run, []).append(n)
     lines = {}
     for run, indices in members.items():
@@ -424,9 +241,9 @@ def _lines(rows: Sequence[_Row], points: np.ndarray) -> dict[str, _Line]:
     return lines
 
 
-def _commands(file: str, rows: Sequence[_Row], visits: Sequence[tuple]) -> dict[tuple, tuple[float, ...]]:
+def _commands(file: str, rows: Sequence[Row], visits: Sequence[tuple]) -> dict[tuple, tuple[float, ...]]:
     """Return the strut commands of the visits that have them, m."""
-    by_visit: dict[tuple, dict[str, _Row]] = {}
+    by_visit: dict[tuple, dict[str, Row]] = {}
     for row, visit in zip(rows, visits, strict=True):
         if row.channel in STRUT_NAMES:
             if not math.isnan(row.uncertainty):
@@ -435,7 +252,7 @@ def _commands(file: str, rows: Sequence[_Row], visits: Sequence[tuple]) -> dict[
     return {visit: _whole(file, group, STRUT_NAMES) for visit, group in by_visit.items()}
 
 
-def _whole(file: str, group: dict[str, _Row], channels: Sequence[str]) -> tuple[float, ...]:
+def _whole(file: str, group: dict[str, Row], channels: Sequence[str]) -> tuple[float, ...]:
     """Return the values of channels that only make sense together."""
     for channel in channels:
         if channel not in group:
@@ -445,9 +262,9 @@ def _whole(file: str, group: dict[str, _Row], channels: Sequence[str]) -> tuple[
     return tuple(group[channel].value for channel in channels)
 
 
-def _attitudes(file: str, rows: Sequence[_Row], visits: Sequence[tuple]) -> dict[tuple, list[tuple[str, float]]]:
+def _attitudes(file: str, rows: Sequence[Row], visits: Sequence[tuple]) -> dict[tuple, list[tuple[str, float]]]:
     """Return attitude errors from measured quaternions, rad along the work frame's axes."""
-    by_visit: dict[tuple, dict[str, _Row]] = {}
+    by_visit: dict[tuple, dict[str, Row]] = {}
     for row, visit in zip(rows, visits, strict=True):
         if row.channel in QUATERNION_CHANNELS:
             if not math.isnan(row.uncertainty):
@@ -467,7 +284,7 @@ def _attitudes(file: str, rows: Sequence[_Row], visits: Sequence[tuple]) -> dict
     return errors
 
 
-def _channel(file: str, row: _Row, lines: dict[str, _Line]) -> str:
+def _channel(file: str, row: Row, lines: dict[str, _Line]) -> str:
     """Return the channel of a set for a channel of a file."""
     if row.channel not in TURNS:
         return row.channel
@@ -478,7 +295,7 @@ def _channel(file: str, row: _Row, lines: dict[str, _Line]) -> str:
     return f"rotation_{AXES[TURN_AXES[along[0]][TURNS.index(row.channel)]]}"
 
 
-def _corrected(file: str, rows: Sequence[_Row], lines: dict[str, _Line], points: np.ndarray) -> dict[int, float]:
+def _corrected(file: str, rows: Sequence[Row], lines: dict[str, _Line], points: np.ndarray) -> dict[int, float]:
     """Return the values of the rows that are to be corrected for the air, by the rows' number."""
     chosen = [n for n, row in enumerate(rows) if row.air is not None]
     if not chosen:
@@ -486,7 +303,7 @@ def _corrected(file: str, rows: Sequence[_Row], lines: dict[str, _Line], points:
     commanded = np.zeros(len(chosen))
     for k, n in enumerate(chosen):
         row = rows[n]
-        if row.channel.partition("_")[0] not in LINE_KINDS:
+        if row.channel.partition("_")[0] not in ALONG_LINES:
             problem = f"is for what a laser reads along a line; a {row.channel} must come corrected"
             raise InputFileError(file, f"line {row.line}, column instrument_index", problem)
         if row.channel == "linear":
@@ -497,7 +314,7 @@ def _corrected(file: str, rows: Sequence[_Row], lines: dict[str, _Line], points:
     return dict(zip(chosen, true.tolist(), strict=True))
 
 
-def _minus(row: _Row, commanded: float) -> float:
+def _minus(row: Row, commanded: float) -> float:
     """Return a coordinate minus the commanded one, without losing the digits that both share."""
     power = round(math.log10(row.unit))
     if 10.0**power != row.unit:

@@ -15,8 +15,8 @@ from ..machine.geometry import STRUT_NAMES
 from ..machine.kinematics import Structure, strut_lengths
 from ..machine.model import REFERENCE_TEMPERATURE, Temperatures
 from ..pose import angles_from_rotation
-from .readings import ANGULAR_KINDS, AXES, CHANNELS, FROM_PREVIOUS, MeasurementSet
-from .tidy_csv import DIRECTIONS
+from .readings import ANGULAR_KINDS, AXES, CHANNELS, FROM_PREVIOUS, LENGTH, MeasurementSet
+from .tidy_rows import DIRECTIONS
 
 
 def write_measurements(measurements: MeasurementSet, path: str | Path) -> None:
@@ -50,7 +50,8 @@ def _csv_rows(measurements: MeasurementSet) -> Iterator[list[str]]:
         times = ("" if math.isnan(time) else repr(time) for time in measurements.stations.times.tolist())
         temperatures = [[*cells, time] for cells, time in zip(temperatures, times, strict=True)]
     with_uncertainty = bool(np.isfinite(measurements.uncertainty).any())
-    tail = ["uncertainty"] * with_uncertainty + temperature_names
+    centre_names, centres, of_reading = _centre_cells(measurements)
+    tail = ["uncertainty"] * with_uncertainty + centre_names + temperature_names
     yield ["run", "direction", "cycle", *pose_names, "channel", "value", "unit", *tail]
     struts = _strut_cells(measurements)
     written: set[tuple] = set()
@@ -60,22 +61,30 @@ def _csv_rows(measurements: MeasurementSet) -> Iterator[list[str]]:
         head = [measurements.runs[measurements.run[n]].name, words[direction], str(cycle), *poses[station]]
         visit = (direction, cycle, station)
         if station in struts and (visit not in written or (direction == FROM_PREVIOUS and visit != before)):
+            blank = [""] * (with_uncertainty + len(centre_names))
             for name, length in zip(STRUT_NAMES, struts[station], strict=True):
-                yield [*head, name, length, "mm", *[""] * with_uncertainty, *temperatures[station]]
+                yield [*head, name, length, "mm", *blank, *temperatures[station]]
         written.add(visit)
         before = visit
         channel, value = CHANNELS[measurements.channel[n]], float(measurements.value[n])
-        cells = _value_cells(channel, value, float(measurements.uncertainty[n]), commanded[station])
-        yield [*head, channel, *(cells if with_uncertainty else cells[:2]), *temperatures[station]]
+        at = _commanded(channel, commanded[station], centres[n])
+        cells = _value_cells(channel, value, float(measurements.uncertainty[n]), at)
+        yield [*head, channel, *(cells if with_uncertainty else cells[:2]), *of_reading[n], *temperatures[station]]
 
 
-def _value_cells(channel: str, value: float, uncertainty: float, commanded: np.ndarray) -> list[str]:
-    """Return value, unit and uncertainty as text, with every digit."""
+def _commanded(channel: str, point: np.ndarray, centre: np.ndarray) -> float:
+    """Return what a file's value has on top of the error, m: a coordinate, a distance, or nothing."""
     kind, _, axis = channel.partition("_")
-    unit, digits = ("urad", 6) if kind in ANGULAR_KINDS else ("mm", 3) if kind == "position" else ("um", 6)
-    number = Decimal(repr(value))
     if kind == "position":
-        number += Decimal(repr(float(commanded[AXES.index(axis)])))
+        return float(point[AXES.index(axis)])
+    return math.dist(point, centre) if kind == "length" else 0.0
+
+
+def _value_cells(channel: str, value: float, uncertainty: float, commanded: float) -> list[str]:
+    """Return value, unit and uncertainty as text, with every digit."""
+    kind = channel.partition("_")[0]
+    unit, digits = ("urad", 6) if kind in ANGULAR_KINDS else ("mm", 3) if kind in ("position", "length") else ("um", 6)
+    number = Decimal(repr(value)) + Decimal(repr(commanded))
     return [_moved(number, digits), unit, "" if math.isnan(uncertainty) else _scaled(uncertainty, digits)]
 
 
@@ -115,6 +124,19 @@ def _temperature_cells(measurements: MeasurementSet) -> tuple[list[str], list[li
     if (values == values[:, :1]).all():
         return ["temperature_degC"], [[repr(row[0])] for row in values.tolist()]
     return [f"{name}_degC" for name in Temperatures.NAMES], [list(map(repr, row)) for row in values.tolist()]
+
+
+def _centre_cells(measurements: MeasurementSet) -> tuple[list[str], np.ndarray, list[list[str]]]:
+    """Return columns of centres, the centres in the work frame as the file says them, (N, 3) m, and their cells."""
+    work = measurements.geometry.work
+    centres = ((measurements.centre - work.position) @ work.rotation).round(13)
+    if not (measurements.channel == LENGTH).any():
+        return [], centres, [[] for _ in measurements.station]
+    known = [measurements.runs[run].known_zero for run in measurements.run]
+    names = [f"centre_{axis}_mm" for axis in AXES] + ["zero"] * any(known)
+    texts = [["", "", ""] if np.isnan(c[0]) else [_scaled(float(v), 3) for v in c + 0.0] for c in centres]
+    zeros = [["known" if of else ""] if any(known) else [] for of in known]
+    return names, centres, [text + zero for text, zero in zip(texts, zeros, strict=True)]
 
 
 def _strut_cells(measurements: MeasurementSet) -> dict[int, list[str]]:

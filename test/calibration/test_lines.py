@@ -31,8 +31,8 @@ GRID = tuple(np.round(np.linspace(low, high, n), 9) for low, high, n in zip(*BOX
 POWERS = (5, 5, 3)
 """A third of 17, 17 and 9 points."""
 
-QUIET = Campaign(BOX, 4 * INCH, INCH, instrument="1-D", diagonals=0, noise=(0.0,) * 5, beam_slope=1e-3)
-LASER = replace(QUIET, noise=(1e-6,) * 5)
+QUIET = Campaign(BOX, 4 * INCH, INCH, instrument="1-D", diagonals=0, noise=(0.0,) * 7, beam_slope=1e-3)
+LASER = replace(QUIET, noise=(1e-6,) * 7)
 BOUNDS = ImperfectionBounds(joint=1e-4, strut_offset=1e-4, pitch=1e-4, wave=(4e-6, 4e-6), backlash=(3e-6, 5e-6))
 
 
@@ -113,7 +113,7 @@ def test_what_the_screws_turning_does_is_not_counted_twice(tmp_path, instrument)
     """
     machine = machines()["unit"]
     geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
-    campaign = Campaign(machine.box, 0.01, 0.002, instrument=instrument, diagonals=0, noise=(0.0,) * 5)
+    campaign = Campaign(machine.box, 0.01, 0.002, instrument=instrument, diagonals=0, noise=(0.0,) * 7)
     ideal = RealMachine(geometry, MachineModel(geometry.name))
     measured = measure(template(campaign, geometry), campaign, ideal, 0)
     assert np.abs(measured.value).max() > 1e-6

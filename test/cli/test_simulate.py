@@ -23,7 +23,7 @@ from hexapod_comp.virtual.instruments import compensated, measure, station_error
 
 BOX = np.array([[-0.1, -0.1, 0.4], [0.1, 0.1, 0.55]])
 QUIET = Campaign(BOX, cell=0.1, step=0.05, instrument="6-D", diagonals=4, cycles=2, poses=20, tilt=0.1,
-                 noise=(0.0,) * 5, beam_slope=0.0)  # fmt: skip
+                 noise=(0.0,) * 7, beam_slope=0.0)  # fmt: skip
 
 
 def of_kind(found: MeasurementSet, kind: str) -> np.ndarray:
@@ -83,11 +83,12 @@ def test_backlash_separates_the_directions() -> None:
 
 def test_noise_is_as_the_campaign_says() -> None:
     """Standard deviations of a few hundred draws: within 15 % (four standard errors at 400)."""
-    campaign = replace(QUIET, noise=(1e-6, 2e-6, 3e-6, 4e-6, 5e-6), poses=200)
+    campaign = replace(QUIET, noise=(1e-6, 2e-6, 3e-6, 4e-6, 5e-6, 6e-6, 7e-6), poses=200)
     truth = RealMachine(paper_geometry(), MachineModel("paper"))
     found = filled(campaign, truth)
     for kind, sigma in zip(KINDS, campaign.noise, strict=True):
-        assert found.value[of_kind(found, kind)].std() == pytest.approx(sigma, rel=0.15)
+        if of_kind(found, kind).any():
+            assert found.value[of_kind(found, kind)].std() == pytest.approx(sigma, rel=0.15)
     np.testing.assert_array_equal(filled(campaign, truth).value, found.value)
     assert not np.array_equal(filled(campaign, truth, seed=4).value, found.value)
 
@@ -107,7 +108,7 @@ def test_beam_slopes_bend_straightness_only_and_one_slope_holds_for_a_run() -> N
 
 
 def test_the_machine_stops_elsewhere_at_every_visit_for_all_channels_alike() -> None:
-    campaign = Campaign(BOX, 0.1, 0.05, None, 0, poses=300, noise=(0.0,) * 5, repeatability=2e-6)
+    campaign = Campaign(BOX, 0.1, 0.05, None, 0, poses=300, noise=(0.0,) * 7, repeatability=2e-6)
     found = filled(campaign, RealMachine(paper_geometry(), MachineModel("paper")))
     places = found.value[of_kind(found, "position")]
     assert places.std() == pytest.approx(2e-6, rel=0.15)

@@ -302,7 +302,7 @@ def test_a_joined_set_survives_its_file(tmp_path: Path) -> None:
         ({"value": float("nan")}, "test: line 7: value must be finite"),
         ({"uncertainty": 0.0}, "test: line 7: uncertainty must be finite and above zero"),
         ({"pose": at((0, 0, 950))[0]}, "test: line 7: the commanded pose is out of the machine's reach: strut_1"),
-        ({"channel": "position_x"}, "mixes channels of a line with absolute ones"),
+        ({"channel": "position_x"}, "mixes channels of a line with others"),
         ({"pose": at((5, 1, 400))[0]}, "test: line 7: run line: the commanded point is 1.0000 mm off the run's line"),
         ({"pose": at((0, 0, 400))[0]}, "run line: has one commanded point only"),
     ],

@@ -1,0 +1,193 @@
+"""What the instruments of a run do not know: their zeros, the slopes of their beams, where a length starts from.
+
+A length is read from a centre c to the measured point p + e: it is |p + e − c| − |p − c₀| + zero longer than commanded,
+with c₀ the centre's place in the file. The centres of a run belong to one body, c = m + R·(c₀ − m) + δ, with m their
+mean. δ and R are fitted to the readings wherever the machine's parameters stand (variable projection): a centre may
+be millimetres off its place, and errors need not be small beside the length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..errors import CalibrationError
+from ..machine.size import rms
+from ..measurements.readings import LEAST_TRAVEL
+
+CENTRE = 5e-3
+"""Standard deviation of where a centre is, beside its place in the file, along each axis, m."""
+
+UNMOVED, ACROSS = 1e-3, 0.3e-3
+"""A body that moves without changing its lengths by more than this share, as the centre of a circle across its plane,
+is known so well, m: it only acts together with the machine's error in that direction, and a fit could not tell them
+apart."""
+
+FAR = 5.0
+"""A centre so many standard deviations off its place is refused: coordinates or unit are wrong."""
+
+ROUNDS, SETTLED = 20, 1e-10
+"""Most Gauss–Newton steps to a body's place, and the step, m, after which it has settled."""
+
+
+class Unknown(NamedTuple):
+    """What one channel of one run does not know, in units of the standard deviation of its cells.
+
+    Attributes
+    ----------
+    members : ndarray of int, shape (n,)
+        Its cells.
+    basis : ndarray, shape (n, k)
+        Orthonormal directions of the cells' values that the unknown moves.
+    share : ndarray, shape (k,)
+        How much of each is explained by the unknown, 0…1; the rest is left for the machine. 1: nothing else is known
+        of it.
+    """
+
+    members: np.ndarray
+    basis: np.ndarray
+    share: np.ndarray
+
+    def explained(self, values: np.ndarray) -> np.ndarray:
+        """Return what the unknown most probably adds to its cells' values, shape (n,)."""
+        return self.basis @ (self.share * (self.basis.T @ values[self.members]))
+
+    def project_out(self, values: np.ndarray) -> None:
+        """Take off the cells' values, (C,) or (C, n), in place, what the unknown may explain.
+
+        Values with the covariance I + B·Bᵀ, B the unknown's columns in its standard deviations, become values with the
+        covariance I.
+        """
+        weight = 1.0 - np.sqrt(1.0 - self.share)
+        along = self.basis.T @ values[self.members]
+        values[self.members] -= self.basis @ (weight * along.T).T
+
+
+def of_zero(members: np.ndarray, scale: np.ndarray, along: np.ndarray | None = None) -> Unknown:
+    """Return an unknown zero, and the slope along a line.
+
+    Parameters
+    ----------
+    members : ndarray of int, shape (n,)
+        Cells.
+    scale : ndarray, shape (n,)
+        One over their standard deviations.
+    along : ndarray, shape (n,), optional
+        Their coordinates along the line, m, where its slope is unknown too.
+    """
+    columns = [np.ones(len(members))]
+    if along is not None:
+        columns.append(along - along.mean())
+    basis, _ = np.linalg.qr(scale[:, None] * np.stack(columns, axis=1))
+    return Unknown(members, basis, np.ones(basis.shape[1]))
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """The lengths of one run.
+
+    Attributes
+    ----------
+    name : str
+        Of the run.
+    members : ndarray of int, shape (n,)
+        Cells.
+    points, centres : ndarray, shape (n, 3)
+        Commanded place of the measured point, and from where its length is read, as far as known, m in ``base``.
+    known_zero : bool
+        Whether the lengths are known as a whole.
+    """
+
+    name: str
+    members: np.ndarray
+    points: np.ndarray
+    centres: np.ndarray
+    known_zero: bool
+
+    @property
+    def count(self) -> int:
+        """How many numbers are unknown."""
+        return (not self.known_zero) + (6 if self._arms().any() else 3)
+
+    def _arms(self) -> np.ndarray:
+        """Return the centres from their mean, shape (n, 3), m; exactly zero where there is but one."""
+        arms = self.centres - self.centres.mean(axis=0)
+        return arms if np.abs(arms).max() > LEAST_TRAVEL else np.zeros_like(arms)
+
+    def seen(
+        self, displacement: np.ndarray, value: np.ndarray, scale: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, list[Unknown]]:
+        """Return what these lengths show, once their body has been put where it explains them best.
+
+        What is left of the lengths counts as their noise where it is more: far from the answer a circle's centre would
+        otherwise leave its plane, where it hardly matters, to explain what the machine does.
+
+        Parameters
+        ----------
+        displacement : ndarray, shape (n, 3)
+            Of the measured point, m in ``base``.
+        value, scale : ndarray, shape (n,)
+            Lengths read minus those commanded, m, and one over their standard deviations.
+
+        Returns
+        -------
+        expected, directions : ndarray, shape (n,) and (n, 3)
+            Change of length but for its zero, m; and unit vectors along which the point's displacement changes it.
+        unknowns : list of Unknown
+            The zero (without any direction where it is known), and the body's place.
+
+        Raises
+        ------
+        CalibrationError
+            The body is far from its place in the file.
+        """
+        zero = of_zero(self.members, scale)
+        if self.known_zero:
+            zero = zero._replace(basis=zero.basis[:, :0], share=zero.share[:0])
+        arms = self._arms()
+        size = float(np.linalg.norm(arms, axis=1).max()) or 1.0  # m; turns are counted by how far they move a centre
+        nominal = np.linalg.norm(self.points - self.centres, axis=1)
+        root = self._prior(arms / size)
+        body, turn = np.zeros(6), Rotation.identity()
+        for _ in range(ROUNDS):
+            turned = turn.apply(arms)
+            away = self.points + displacement - self.centres + arms - turned - body[:3]
+            distance = np.linalg.norm(away, axis=1)
+            n = away / distance[:, None]
+            columns = -scale[:, None] * np.hstack([n, np.cross(turned / size, n)]) @ root
+            columns -= zero.basis @ (zero.basis.T @ columns)
+            left = scale * (value - distance + nominal)
+            left -= zero.basis @ (zero.basis.T @ left)
+            noise, off = max(1.0, rms(left)), np.linalg.solve(root, body)
+            weighted = columns.T / noise**2
+            step = root @ np.linalg.solve(weighted @ columns + np.eye(6), weighted @ left - off)
+            if np.abs(step).max() < SETTLED:
+                break
+            turn = Rotation.from_rotvec(step[3:] / size) * turn
+            body = np.concatenate([body[:3] + step[:3], size * turn.as_rotvec()])
+        self._refuse_far(body[:3])
+        u, s, _ = np.linalg.svd(columns / noise, full_matrices=False)
+        # As seen from the file's place, where the prior's mean is: else being off it would cost nothing.
+        seen = distance - nominal - columns @ off / scale
+        return seen, n, [zero, Unknown(self.members, u, s**2 / (1.0 + s**2))]
+
+    def _prior(self, arms: np.ndarray) -> np.ndarray:
+        """Return the root of the covariance of the body's place and turn, shape (6, 6), m; `arms` have the size 1."""
+        n = self.points - self.centres
+        n /= np.linalg.norm(n, axis=1, keepdims=True)
+        columns = np.hstack([n, np.cross(arms, n)])
+        if not self.known_zero:
+            columns -= columns.mean(axis=0)
+        squares, directions = np.linalg.eigh(columns.T @ columns / len(columns))
+        return directions * np.where(squares > UNMOVED**2, CENTRE, ACROSS)
+
+    def _refuse_far(self, place: np.ndarray) -> None:
+        """Raise when the body is at another place, m, than the file's."""
+        if np.abs(place).max() > FAR * CENTRE:
+            shown = ", ".join(f"{v * 1e3:.1f}" for v in place)
+            problem = f"the lengths of run {self.name} put their centre {shown} mm (base) off its place in the file"
+            hint = f"it must be known to {FAR * CENTRE * 1e3:g} mm; do places, units and commanded poses fit?"
+            raise CalibrationError("centre", f"{problem}; {hint}")
