@@ -85,7 +85,7 @@ from .readings import (
     attitude_error,
 )
 from .runs import assemble
-from .tidy_rows import ALONG_LINES, QUATERNION_CHANNELS, TURN_AXES, TURNS, Row, read_rows
+from .tidy_rows import ALONG_LINES, QUATERNION_CHANNELS, TURN_AXES, TURNS, TidyRow, read_rows
 
 PARALLEL = 1e-9
 """Largest cross component of a unit vector that still is parallel to an axis."""
@@ -140,7 +140,7 @@ def _refuse_twice(tables: Sequence[Table]) -> None:
         seen[table.sha256] = table
 
 
-def _run_names(tables: Sequence[Table], of_files: Sequence[Sequence[Row]]) -> list[dict[str, str]]:
+def _run_names(tables: Sequence[Table], of_files: Sequence[Sequence[TidyRow]]) -> list[dict[str, str]]:
     """Return the names that the runs of each file get: their own where no other file has the same."""
     names = [{row.run for row in rows} for rows in of_files]
     short = [Path(table.path).name for table in tables]
@@ -152,7 +152,7 @@ def _run_names(tables: Sequence[Table], of_files: Sequence[Sequence[Row]]) -> li
 
 
 def _file_readings(
-    table: Table, rows: Sequence[Row], names: dict[str, str], geometry: HexapodGeometry, probe: np.ndarray | None
+    table: Table, rows: Sequence[TidyRow], names: dict[str, str], geometry: HexapodGeometry, probe: np.ndarray | None
 ) -> tuple[list[Reading], int]:
     """Return a file's readings, and how many of them were corrected for the air."""
     file = str(table.path)
@@ -185,7 +185,7 @@ def _file_readings(
     return readings, len(corrected)
 
 
-def _visits(rows: Sequence[Row]) -> list[tuple]:
+def _visits(rows: Sequence[TidyRow]) -> list[tuple]:
     """Return for each row what readings taken together share; a sequence may come back to a place."""
     visits: list[tuple] = []
     count, before = 0, None
@@ -198,7 +198,7 @@ def _visits(rows: Sequence[Row]) -> list[tuple]:
     return visits
 
 
-def _refuse_duplicates(file: str, rows: Sequence[Row], visits: Sequence[tuple]) -> None:
+def _refuse_duplicates(file: str, rows: Sequence[TidyRow], visits: Sequence[tuple]) -> None:
     """Raise on a channel read twice in one pass at one place."""
     seen: dict[tuple, int] = {}
     for row, visit in zip(rows, visits, strict=True):
@@ -208,7 +208,7 @@ def _refuse_duplicates(file: str, rows: Sequence[Row], visits: Sequence[tuple]) 
             raise InputFileError(file, f"line {row.line}", problem)
 
 
-def _points(rows: Sequence[Row], geometry: HexapodGeometry, probe: np.ndarray | None) -> np.ndarray:
+def _points(rows: Sequence[TidyRow], geometry: HexapodGeometry, probe: np.ndarray | None) -> np.ndarray:
     """Return the commanded place of the measured point in the work frame, shape (N, 3), m."""
     offset = np.zeros(3)
     if probe is not None:
@@ -225,7 +225,7 @@ class _Line(NamedTuple):
     axis: np.ndarray
 
 
-def _lines(rows: Sequence[Row], points: np.ndarray) -> dict[str, _Line]:
+def _lines(rows: Sequence[TidyRow], points: np.ndarray) -> dict[str, _Line]:
     """Return the lines of the runs that have channels of lines."""
     members: dict[str, list[int]] = {}
     for n, row in enumerate(rows):
@@ -241,9 +241,9 @@ def _lines(rows: Sequence[Row], points: np.ndarray) -> dict[str, _Line]:
     return lines
 
 
-def _commands(file: str, rows: Sequence[Row], visits: Sequence[tuple]) -> dict[tuple, tuple[float, ...]]:
+def _commands(file: str, rows: Sequence[TidyRow], visits: Sequence[tuple]) -> dict[tuple, tuple[float, ...]]:
     """Return the strut commands of the visits that have them, m."""
-    by_visit: dict[tuple, dict[str, Row]] = {}
+    by_visit: dict[tuple, dict[str, TidyRow]] = {}
     for row, visit in zip(rows, visits, strict=True):
         if row.channel in STRUT_NAMES:
             if not math.isnan(row.uncertainty):
@@ -252,7 +252,7 @@ def _commands(file: str, rows: Sequence[Row], visits: Sequence[tuple]) -> dict[t
     return {visit: _whole(file, group, STRUT_NAMES) for visit, group in by_visit.items()}
 
 
-def _whole(file: str, group: dict[str, Row], channels: Sequence[str]) -> tuple[float, ...]:
+def _whole(file: str, group: dict[str, TidyRow], channels: Sequence[str]) -> tuple[float, ...]:
     """Return the values of channels that only make sense together."""
     for channel in channels:
         if channel not in group:
@@ -262,9 +262,9 @@ def _whole(file: str, group: dict[str, Row], channels: Sequence[str]) -> tuple[f
     return tuple(group[channel].value for channel in channels)
 
 
-def _attitudes(file: str, rows: Sequence[Row], visits: Sequence[tuple]) -> dict[tuple, list[tuple[str, float]]]:
+def _attitudes(file: str, rows: Sequence[TidyRow], visits: Sequence[tuple]) -> dict[tuple, list[tuple[str, float]]]:
     """Return attitude errors from measured quaternions, rad along the work frame's axes."""
-    by_visit: dict[tuple, dict[str, Row]] = {}
+    by_visit: dict[tuple, dict[str, TidyRow]] = {}
     for row, visit in zip(rows, visits, strict=True):
         if row.channel in QUATERNION_CHANNELS:
             if not math.isnan(row.uncertainty):
@@ -284,7 +284,7 @@ def _attitudes(file: str, rows: Sequence[Row], visits: Sequence[tuple]) -> dict[
     return errors
 
 
-def _channel(file: str, row: Row, lines: dict[str, _Line]) -> str:
+def _channel(file: str, row: TidyRow, lines: dict[str, _Line]) -> str:
     """Return the channel of a set for a channel of a file."""
     if row.channel not in TURNS:
         return row.channel
@@ -295,7 +295,7 @@ def _channel(file: str, row: Row, lines: dict[str, _Line]) -> str:
     return f"rotation_{AXES[TURN_AXES[along[0]][TURNS.index(row.channel)]]}"
 
 
-def _corrected(file: str, rows: Sequence[Row], lines: dict[str, _Line], points: np.ndarray) -> dict[int, float]:
+def _corrected(file: str, rows: Sequence[TidyRow], lines: dict[str, _Line], points: np.ndarray) -> dict[int, float]:
     """Return the values of the rows that are to be corrected for the air, by the rows' number."""
     chosen = [n for n, row in enumerate(rows) if row.air is not None]
     if not chosen:
@@ -314,7 +314,7 @@ def _corrected(file: str, rows: Sequence[Row], lines: dict[str, _Line], points: 
     return dict(zip(chosen, true.tolist(), strict=True))
 
 
-def _minus(row: Row, commanded: float) -> float:
+def _minus(row: TidyRow, commanded: float) -> float:
     """Return a coordinate minus the commanded one, without losing the digits that both share."""
     power = round(math.log10(row.unit))
     if 10.0**power != row.unit:

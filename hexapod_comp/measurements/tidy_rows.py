@@ -47,7 +47,7 @@ FURTHEST_CENTRE = 100.0
 """No instrument stands further away, m."""
 
 
-class Row(NamedTuple):
+class TidyRow(NamedTuple):
     """A row of a file; value and uncertainty in SI, `decimal` is the value as it stands there, in `unit`."""
 
     run: str
@@ -67,7 +67,7 @@ class Row(NamedTuple):
     time: float
 
 
-def read_rows(table: Table) -> list[Row]:
+def read_rows(table: Table) -> list[TidyRow]:
     """Return the rows of a file, every cell checked by itself."""
     runs, channels, units = table.texts("run"), table.texts("channel"), table.texts("unit")
     directions, cycles, poses = _directions(table), _cycles(table), _poses(table)
@@ -90,7 +90,7 @@ def read_rows(table: Table) -> list[Row]:
         value = (si_from_text(text, number, sizes[key]), exact(text, number), sizes[key])
         uncertainty = _uncertainty(table, line, cells, uncertainty_column, sizes[key])
         place = (runs[n], cycles[n], directions[n], poses[n], channels[n])
-        rows.append(Row(*place, *value, uncertainty, temperatures[n], air[n], centres[n], known[n], line, times[n]))
+        rows.append(TidyRow(*place, *value, uncertainty, temperatures[n], air[n], centres[n], known[n], line, times[n]))
     return rows
 
 
