@@ -308,8 +308,10 @@ def _aligned_rms(points: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np
     return np.sqrt(squares[0].mean(axis=0)), np.sqrt(squares[1].mean(axis=0))
 
 
-def left_in_space(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the RMS error in space that is left at each of some points, shape (n,), m.
+def errors_in_space(
+    space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors in space without compensation, and what RMS error is left with it, at points, shape (n,), m.
 
     As :func:`expected_error`, for a level tool, the datum aligned over these points; NaN where the machine does
     not reach.
@@ -325,15 +327,20 @@ def left_in_space(space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, 
     along_x = np.tile(space.geometry.work.rotation[:, 0], (len(points), 1))
     every = Passes(space.geometry, points - space.level @ space.probe, level, along_x)
     reachable = every.reachable()
-    left = np.full(len(points), np.nan)
+    before, left = np.full((2, len(points)), np.nan)
     if not reachable.any():
-        return left
+        return before, left
     stations = stations_of(every.select(reachable).both_ways())
-    rows = derivatives(space, predict(space, x, stations), stations)[:, :3]
+    prediction = predict(space, x, stations)
     places = np.tile(points[reachable], (2, 1))
-    squares = (without_datum(places, rows @ _drawn(covariance)) ** 2).sum(axis=1).mean(axis=1)
-    left[reachable] = np.sqrt(squares.reshape(2, -1).mean(axis=0))
-    return left
+
+    def sizes(errors: np.ndarray) -> np.ndarray:
+        squares = (without_datum(places, errors) ** 2).sum(axis=1).mean(axis=1)
+        return np.sqrt(squares.reshape(2, -1).mean(axis=0))
+
+    before[reachable] = sizes(prediction.errors[:, :3, None])
+    left[reachable] = sizes(derivatives(space, prediction, stations)[:, :3] @ _drawn(covariance))
+    return before, left
 
 
 def _drawn(covariance: np.ndarray) -> np.ndarray:

@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from ..errors import CalibrationError, ModelError
-from ..formats.figures import SIX_COLOURS, WITH, WITHOUT, picture_text
+from ..formats.figures import NOTHING, SIX_COLOURS, WITH, WITHOUT, picture_text
 from ..kernels.struts import smooth_error
 from ..machine.field import COMPONENTS, CROSS_AXES
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
@@ -20,7 +21,7 @@ from ..measurements.readings import AXES, KINDS
 from ..virtual.trial import Trial
 from .fit import ModelFit
 from .lines import LineFit, LinesFit
-from .observability import left_in_space
+from .observability import errors_in_space
 from .posterior import FittedParameters
 from .prediction import COMPONENTS as PREDICTED
 from .prediction import ErrorPredictor, PredictedError
@@ -229,6 +230,25 @@ def _tool_error_panel(axes: Axes, fit: ModelFit) -> None:
     axes.legend(fontsize=7)
 
 
+def _maps(fit: ModelFit) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return x, y, three heights, m in work, and errors before and after, µm, shape (3, y, x), in the measured box.
+
+    Raises
+    ------
+    CalibrationError
+        The readings span no box.
+    """
+    if fit.model.valid_box is None:
+        raise CalibrationError("picture of the error in space", "needs readings that span a box")
+    low, high = fit.space.work_box
+    x, y = (np.linspace(low[a], high[a], MAP_NODES) for a in range(2))
+    heights = np.linspace(low[2], high[2], 3)
+    points = np.stack(np.meshgrid(heights, y, x, indexing="ij"), axis=-1)[..., ::-1].reshape(-1, 3)
+    errors = errors_in_space(fit.space, fit.solution.x, fit.covariance, fit.space.places(points))
+    before, after = (part.reshape(3, MAP_NODES, MAP_NODES) * 1e6 for part in errors)
+    return x, y, heights, before, after
+
+
 def left_error_figure(fit: ModelFit) -> Figure:
     """Show where in the measured box what error is left after compensation: the RMS to expect, at three heights.
 
@@ -237,14 +257,7 @@ def left_error_figure(fit: ModelFit) -> Figure:
     CalibrationError
         The readings span no box.
     """
-    if fit.model.valid_box is None:
-        raise CalibrationError("picture of the error left", "needs readings that span a box")
-    low, high = fit.space.work_box
-    x, y = (np.linspace(low[a], high[a], MAP_NODES) for a in range(2))
-    heights = np.linspace(low[2], high[2], 3)
-    points = np.stack(np.meshgrid(heights, y, x, indexing="ij"), axis=-1)[..., ::-1].reshape(-1, 3)
-    places = fit.space.places(points)
-    left = left_in_space(fit.space, fit.solution.x, fit.covariance, places).reshape(3, MAP_NODES, MAP_NODES) * 1e6
+    x, y, heights, _, left = _maps(fit)
     figure = Figure(figsize=(11, 3.9), layout="constrained")
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
     levels = np.linspace(np.nanmin(left), np.nanmax(left), 13)
@@ -254,6 +267,52 @@ def left_error_figure(fit: ModelFit) -> Figure:
     panels[0].set_ylabel("y in work, mm")
     figure.colorbar(drawn, ax=panels, label="RMS error in space to expect, µm")
     figure.suptitle("what is left after compensation, level tool, datum aligned")
+    return figure
+
+
+def before_after_figure(fit: ModelFit) -> Figure:
+    """Map the error in space before and after compensation at three heights, in the same colours, by powers of ten.
+
+    Raises
+    ------
+    CalibrationError
+        The readings span no box.
+    """
+    x, y, heights, *maps = _maps(fit)
+    figure = Figure(figsize=(11, 7.2), layout="constrained")
+    rows = figure.subplots(2, 3, sharex=True, sharey=True)
+    sizes = np.maximum(np.array(maps), NOTHING)
+    scale = LogNorm(float(np.nanmin(sizes)), float(np.nanmax(sizes)))
+    for panels, name, values in zip(rows, ("before", "after"), sizes, strict=True):
+        for axes, height, layer in zip(panels, heights, values, strict=True):
+            drawn = axes.pcolormesh(x * 1e3, y * 1e3, np.ma.masked_invalid(layer), norm=scale, cmap="viridis")
+            span = f"{np.nanmin(layer):.3g}…{np.nanmax(layer):.3g} µm" if np.isfinite(layer).any() else "out of reach"
+            axes.set(title=f"{name}, z in work = {height * 1e3:.0f} mm: {span}", aspect="equal")
+            axes.title.set_fontsize(9)
+    for axes in rows[1]:
+        axes.set_xlabel("x in work, mm")
+    for axes in rows[:, 0]:
+        axes.set_ylabel("y in work, mm")
+    figure.colorbar(drawn, ax=rows, label="error in space, level tool, datum aligned, µm")
+    return figure
+
+
+def residuals_by_run_figure(fit: ModelFit) -> Figure:
+    """Show the residuals of each run, over their standard deviation as stated, one panel for each kind of channel."""
+    m = fit.measurements
+    sigmas = fit.solution.residuals / m.stated
+    figure = Figure(figsize=(11, 0.6 + 1.7 * len(fit.channels)), layout="constrained")
+    panels = figure.subplots(len(fit.channels), 1, squeeze=False, sharex=True)[:, 0]
+    for axes, channel in zip(panels, fit.channels, strict=True):
+        members = m.kind == KINDS.index(channel.kind)
+        runs = np.unique(m.run[members])
+        sizes = [np.sqrt((sigmas[members & (m.run == run)] ** 2).mean()) for run in runs]
+        axes.plot(m.run[members] + 1, sigmas[members], ".", color="#9a9a9a", ms=2)
+        axes.plot(runs + 1, sizes, "_", color=WITHOUT, ms=8, mew=2, label="RMS of the run")
+        axes.axhspan(-2.0, 2.0, color=WITH, alpha=0.12, lw=0.0)
+        axes.set(ylabel=f"{channel.kind}, σ")
+    panels[0].legend(fontsize=7, loc="upper right")
+    panels[-1].set_xlabel("run, in the order of the files")
     return figure
 
 

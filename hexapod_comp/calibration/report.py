@@ -54,9 +54,14 @@ def _expected(level: ToolError | None, tilted: ToolError | None, seen: Observabi
     lines.append(f"  level tool:  {tool_error_text(level)}")
     if tilted is not None:
         lines.append(f"  tilted 10°:  {tool_error_text(tilted)}")
-        if seen.structure_rank < seen.structure_size and tilted.after > TRUST * tilted.before:
-            lines.append("  The readings do not show what tilting does: do not trust this model with a tilted tool.")
+        lines += [f"  {doubt}" for doubt in tilt_doubt(tilted, seen)]
     yield "\n".join(lines)
+
+
+def tilt_doubt(tilted: ToolError | None, seen: Observability) -> Iterator[str]:
+    """Yield why a model is not to be trusted with a tilted tool, if it is not."""
+    if tilted is not None and seen.structure_rank < seen.structure_size and tilted.after > TRUST * tilted.before:
+        yield "The readings do not show what tilting does: do not trust this model with a tilted tool."
 
 
 def tool_error_text(error: ToolError) -> str:

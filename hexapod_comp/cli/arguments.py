@@ -126,6 +126,13 @@ def csv_file(text: str) -> str:
     return text
 
 
+def html_file(text: str) -> str:
+    """Read the name of an HTML file to write; a browser makes a PDF of it."""
+    if not text.lower().endswith((".html", ".htm")):
+        raise argparse.ArgumentTypeError(f"writes HTML, which any browser prints to PDF: name it .html (not {text!r})")
+    return text
+
+
 def numbers(text: str) -> tuple[float, ...]:
     """Read finite numbers with commas between them."""
     try:

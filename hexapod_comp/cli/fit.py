@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import common
@@ -14,7 +15,9 @@ from . import common
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from ..calibration.certificate import Details
     from ..calibration.evaluation import Worth
+    from ..calibration.fit import ModelFit
     from ..calibration.parameters import FitSettings
     from ..calibration.posterior import FittedParameters
     from ..machine.model import MachineModel, RealMachine
@@ -70,6 +73,7 @@ def run(args: argparse.Namespace) -> int:
     from ..virtual.named import find_model
 
     _refuse_options_of_the_other_scheme(args)
+    _details(args)  # what is wrong there is better said before a long fit
     geometry = load_geometry(args.machine)
     truth = None if args.truth is None else RealMachine(geometry, find_model(args.truth, geometry))
     settings = fit_settings(args)
@@ -123,7 +127,42 @@ def _write(args: argparse.Namespace, result: _Result, measured: MeasurementSet, 
         print("".join(f"its parameters' covariance, to be kept beside it: {path}\n" for path in beside), end="")
     if args.report is not None:
         write_text(args.report, text)
+    if args.certificate is not None and result.fit is not None:
+        with common.stage("writing the certificate"):
+            _write_certificate(args, result, result.fit, beside, text)
+        common.mention(args, f"certificate: {args.certificate}")
     common.save_pictures(args, result.pictures)
+
+
+def _details(args: argparse.Namespace) -> Details | None:
+    """Return what the details file says, if there is one.
+
+    Raises
+    ------
+    CalibrationError
+        There is no certificate that it could be for.
+    """
+    from ..calibration.certificate import load_details
+    from ..errors import CalibrationError
+
+    if args.details is None:
+        return None
+    if args.certificate is None:
+        raise CalibrationError("--details", "is what a certificate says: --certificate is missing")
+    return load_details(args.details)
+
+
+def _write_certificate(
+    args: argparse.Namespace, result: _Result, fit: ModelFit, beside: list[Path], report: str
+) -> None:
+    """Write the certificate of a model that has been written."""
+    from .. import __version__
+    from ..calibration.certificate import Filed, certificate_text
+    from ..formats.outputs import write_text
+
+    warning = f"{FORCED}: {result.misfit}. {ADVICE}" if result.misfit else ""
+    filed = Filed(result.model.name, (Path(args.out), *beside), report, warning, __version__)
+    write_text(args.certificate, certificate_text(fit, filed, _details(args)))
 
 
 def _refuse_options_of_the_other_scheme(args: argparse.Namespace) -> None:
@@ -131,7 +170,11 @@ def _refuse_options_of_the_other_scheme(args: argparse.Namespace) -> None:
     from ..errors import CalibrationError
 
     of_joint = ("lead_mm", "blocks", "tolerance_um", "field_degree", "expansion_ppm")
-    others = ("order", "every_line") if args.scheme == "joint" else (*of_joint, "separate_joints", "not_robust")
+    others = (
+        ("order", "every_line")
+        if args.scheme == "joint"
+        else (*of_joint, "separate_joints", "not_robust", "certificate")
+    )
     for name in others:
         if getattr(args, name) not in (None, False):
             raise CalibrationError(f"--{name.replace('_', '-')}", f"has no meaning for scheme {args.scheme}")
@@ -147,6 +190,7 @@ class _Result:
     pictures: Callable[[], dict[str, Figure]]
     misfit: str
     fitted: FittedParameters | None = None
+    fit: ModelFit | None = None
 
     @property
     def saved(self) -> MachineModel:
@@ -188,7 +232,7 @@ def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSett
         return made
 
     model = fit.model if args.name is None else replace(fit.model, name=args.name)
-    return _Result(model, fit_report(fit), lambda: as_json(fit), pictures, fit.misfit, fitted)
+    return _Result(model, fit_report(fit), lambda: as_json(fit), pictures, fit.misfit, fitted, fit)
 
 
 def _lines(args: argparse.Namespace, measured: MeasurementSet) -> _Result:

@@ -273,6 +273,9 @@ def _fit(parser: argparse.ArgumentParser) -> None:
     text = f"tool pose in work that stays where it is, {arguments.POSE_HELP} (default: home)"
     add("--datum", type=arguments.pose, metavar="POSE", help=text)
     add("--report", metavar="FILE", help="write the report to a file too")
+    text = "write a calibration certificate, a page to be filed or printed (scheme joint)"
+    add("--certificate", type=arguments.html_file, metavar="FILE.html", help=text)
+    add("--details", metavar="FILE", help="what the certificate says of instruments, place and people (YAML)")
     now = "always written, beside the model, as MODEL.posterior.npz"
     add("--covariance", action=_Renamed, const=now, metavar="FILE.npz", help=argparse.SUPPRESS)
     _pictures(add)

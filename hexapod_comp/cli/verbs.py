@@ -204,6 +204,8 @@ with its line file NAME.rtl.yaml beside it), or with --columns the wide CSV file
 
 --scheme joint fits structure, struts and field to all readings at once. It keeps only what helps on readings that
 the fit did not see. --scheme lines is that of Mou & King 1998: a polynomial per grid line, direction and channel.
+--certificate writes a page to be filed: machine, instruments, environment, errors before and after, figures of
+ISO 230, pictures, hashes of model and readings; any browser prints it to PDF.
 --truth names the errors of the virtual machine that simulate moved: the report then says what the model is worth.
 Errors are reported in µm and µrad. Exit code: 0 written, 1 the readings do not bear the model out (nothing is
 written without --force), 2 bad input.

@@ -19,6 +19,7 @@ READ = (
     "budget",
     "campaign",
     "columns",
+    "details",
     "files",
     "lengths_file",
     "library",
@@ -29,7 +30,7 @@ READ = (
 )
 """Arguments of all verbs that name what is read: files, shipped files, or a bag's folder."""
 
-WRITTEN = ("out", "report", "table")
+WRITTEN = ("certificate", "out", "report", "table")
 """Arguments that name files to write."""
 
 FOLDERS = ("c_folder", "folder", "linuxcnc", "pictures")

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
-from matplotlib.figure import Figure
-
 from ..formats.outputs import write_text
+from ..formats.pages import page, picture
 from ..formats.texts import number
 from .comparing import MET, MISSED, OPEN, SHOWN, VERDICTS, WRONG, Exhibit, NumberTable, Paper, Statement
 from .report import difference_text, headline, summary
-
-RESOLUTION = 110
-"""Of embedded pictures, dots per inch."""
 
 MARKS = {MET: ("✓", "met"), WRONG: ("≠", "wrong"), OPEN: ("?", "open"), MISSED: ("✗", "missed"), SHOWN: ("·", "shown")}
 """Sign and style of each verdict: told apart without colours too."""
@@ -64,10 +58,8 @@ def page_text(papers: Sequence[Paper], note: str) -> str:
         f"<li>{_mark(verdict)} {escape(verdict)}: {escape(MEANINGS[verdict])}</li>" for verdict in VERDICTS
     )
     body = "".join(_paper(p, paper) for p, paper in enumerate(papers))
-    return (
-        f"{HEAD}<h1>{TITLE}</h1><p>{escape(note)}</p><ul class=legend>{legend}</ul>"
-        f"<nav><ol>{contents}</ol></nav>{body}</main></body></html>\n"
-    )
+    top = f"<h1>{TITLE}</h1><p>{escape(note)}</p><ul class=legend>{legend}</ul><nav><ol>{contents}</ol></nav>"
+    return page(TITLE, top + body, OWN_STYLE)
 
 
 def _paper(p: int, paper: Paper) -> str:
@@ -83,7 +75,7 @@ def exhibit_html(exhibit: Exhibit) -> str:
     parts += [_table(table) for table in exhibit.tables]
     if exhibit.statements:
         parts.append(_statements(exhibit.statements))
-    parts += [_figure(title, figure) for title, figure in exhibit.figures.items()]
+    parts += [picture(title, figure) for title, figure in exhibit.figures.items()]
     return "".join(parts)
 
 
@@ -131,47 +123,17 @@ def _mark(verdict: str) -> str:
     return f'<span class="mark {style}" title="{escape(verdict)}">{sign}</span>'
 
 
-def _figure(title: str, figure: Figure) -> str:
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=RESOLUTION, metadata={"Software": None})
-    picture = base64.b64encode(stream.getvalue()).decode("ascii")
-    text = escape(title)
-    return f'<figure><img alt="{text}" src="data:image/png;base64,{picture}"><figcaption>{text}</figcaption></figure>'
-
-
 TITLE = "The papers' tables and figures, computed"
 
-HEAD = f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'; img-src data:">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{TITLE}</title>
-<style>
- body {{ font: 16px/1.45 sans-serif; margin: 0; color: #1b1b1b; background: #fff }}
- main {{ max-width: 1180px; margin: 0 auto; padding: 12px 16px 48px }}
- h1 {{ font-size: 24px; line-height: 1.2 }} h2 {{ font-size: 21px; margin-top: 48px; border-top: 2px solid #1b1b1b;
-  padding-top: 12px }} h3 {{ font-size: 17px; margin: 32px 0 4px }} p {{ max-width: 80ch; margin: 6px 0 }}
- .legend {{ list-style: none; padding: 0 }} nav ol ol {{ padding-left: 20px }} nav li {{ margin: 2px 0 }}
- .wide {{ overflow-x: auto; margin: 8px 0 16px }} table {{ border-collapse: collapse; font-size: 14px }}
- .caption {{ font-size: 14px }}
- th, td {{ border: 1px solid #c8c8c8; padding: 3px 8px; text-align: right; vertical-align: top; white-space: nowrap }}
- td {{ font-variant-numeric: tabular-nums }} th small, td small {{ display: block; font-weight: normal; color: #444 }}
- .text th, .text td {{ text-align: left; white-space: normal; min-width: 9em }}
- .text td:first-child, .text th:first-child {{ min-width: 0 }}
- td.wrong, tr.wrong {{ background: #fdf1d8 }} td.open, tr.open {{ background: #eef1f6 }}
- td.missed, tr.missed {{ background: #f8d7d7 }} .mark {{ font-weight: bold }} .mark.met {{ color: #1f6b3a }}
- .mark.wrong {{ color: #8a5a00 }} .mark.open {{ color: #35507c }} .mark.missed {{ color: #a01515 }}
- figure {{ margin: 16px 0 }} img {{ max-width: 100%; height: auto }} figcaption {{ font-size: 14px; color: #444 }}
- th[scope=row] {{ background: #fafafa }}
- @media (max-width: 700px) {{
-  .text thead {{ display: none }} .text tr {{ display: block; border: 1px solid #c8c8c8; margin-bottom: 8px }}
-  .text td, .text th {{ display: block; border: 0; background: none }} .text td:first-child {{ float: left }}
-  .text td:nth-child(3):not(:empty)::before {{ content: "paper: " }}
-  .text td:nth-child(4):not(:empty)::before {{ content: "found: " }}
- }}
-</style>
-</head>
-<body><main>
+OWN_STYLE = """
+ .legend { list-style: none; padding: 0 } nav ol ol { padding-left: 20px } nav li { margin: 2px 0 }
+ td.wrong, tr.wrong { background: #fdf1d8 } td.open, tr.open { background: #eef1f6 }
+ td.missed, tr.missed { background: #f8d7d7 } .mark { font-weight: bold } .mark.met { color: #1f6b3a }
+ .mark.wrong { color: #8a5a00 } .mark.open { color: #35507c } .mark.missed { color: #a01515 }
+ @media (max-width: 700px) {
+  .text thead { display: none } .text tr { display: block; border: 1px solid #c8c8c8; margin-bottom: 8px }
+  .text td, .text th { display: block; border: 0; background: none } .text td:first-child { float: left }
+  .text td:nth-child(3):not(:empty)::before { content: "paper: " }
+  .text td:nth-child(4):not(:empty)::before { content: "found: " }
+ }
 """

@@ -280,6 +280,45 @@ def test_options_reach_the_fit(
     assert expansions == pytest.approx((11.7e-6, 11e-6, 23e-6))
 
 
+# Certificate.
+
+
+def test_certificate(hexapod: Program, fitted: Calibration) -> None:
+    """After the model: its hash is that of the file as it was written, details are in it, and the whole report."""
+    Path("details.yaml").write_text("format: hexapod_comp/certificate\nversion: 1\noperator: <Jo>\n")
+    options = ("--certificate", "out.html", "--details", "details.yaml", "--name", "Tuesday's")
+    code, out, err = hexapod("fit", fitted.measured, "--out", "model.yaml", *options)
+    assert (code, err) == (0, "")
+    assert out.endswith("certificate: out.html\n")
+    text = Path("out.html").read_text()
+    for name in ("model.yaml", "model.posterior.npz", fitted.measured):
+        assert hashlib.sha256(Path(name).read_bytes()).hexdigest() in text, name
+    for part in ("Tuesday&#x27;s", "&lt;Jo&gt;", "ISO 230-2:2014", "ISO 230-6:2002", "observability indices: O1 "):
+        assert part in text, part
+    assert "class=warning" not in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ("--certificate out.pdf", "writes HTML, which any browser prints to PDF"),
+        ("--certificate nowhere/out.html", "nowhere/out.html: cannot be written: its folder does not exist"),
+        ("--certificate out.html --details gone.yaml", "there is no such file"),
+        ("--details {campaign}", "--details: is what a certificate says: --certificate is missing"),
+        ("--certificate out.html --details {campaign}", "format: must be 'hexapod_comp/certificate'"),
+        ("--certificate out.html --scheme lines", "--certificate: has no meaning for scheme lines"),
+    ],
+)
+def test_a_certificate_that_cannot_be_is_refused_before_the_fit(
+    hexapod: Program, fitted: Calibration, arguments: str, complaint: str
+) -> None:
+    words = arguments.replace("{campaign}", str(fitted.campaign)).split()
+    code, out, err = hexapod("fit", fitted.measured, "--out", "model.yaml", *words)
+    assert (code, out) == (2, "")
+    assert complaint in err
+    assert not list(Path.cwd().iterdir())
+
+
 # Scheme lines.
 
 
@@ -328,7 +367,7 @@ def test_json_of_scheme_lines(hexapod: Program, done: Calibration, tmp_path: Pat
 
 # Readings that do not bear the model out.
 
-ALL = ("--out", "m.yaml", "--report", "r.txt", "--pictures", "p")
+ALL = ("--out", "m.yaml", "--report", "r.txt", "--certificate", "c.html", "--pictures", "p")
 
 
 @pytest.fixture(scope="module")
@@ -371,7 +410,8 @@ def test_a_forced_model_says_so(hexapod: Program, noisy: Path, monkeypatch: pyte
     assert out.startswith(Path("r.txt").read_text())
     model = load_model("m.yaml", load_geometry(config_file("paper")))
     assert model.origin.note.startswith("FORCED: readings are off by more than 10 times their noise: linear by ")
-    assert {path.name for path in tmp_path.iterdir()} == {"m.yaml", "m.posterior.npz", "r.txt"}
+    assert "<p class=warning><b>Warning.</b> WRITTEN BY FORCE: " in Path("c.html").read_text()
+    assert {path.name for path in tmp_path.iterdir()} == {"m.yaml", "m.posterior.npz", "r.txt", "c.html"}
 
 
 def test_noise_that_is_stated_is_welcome(hexapod: Program, noisy: Path, tmp_path: Path) -> None:
