@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import InputFileError
 from ..formats.pages import page, picture, shown, table
-from ..formats.paths import input_file
+from ..formats.paths import input_file, version
 from ..formats.texts import number
 from ..formats.yaml import read_yaml
 from ..machine.model import REFERENCE_TEMPERATURE, Temperatures
@@ -111,15 +111,12 @@ class Filed:
         The fit's report, as printed.
     warning : str
         What a reader must know first; empty when nothing is wrong.
-    version : str
-        Of this package.
     """
 
     model: str
     files: tuple[Path, ...]
     report: str
     warning: str
-    version: str
 
 
 def certificate_text(fit: ModelFit, filed: Filed, details: Details | None = None) -> str:
@@ -172,7 +169,7 @@ def _identity(fit: ModelFit, filed: Filed, details: Details) -> str:
     rows = [(label, details.texts.get(key, "")) for key, label in DETAILS.items()]
     rows[3:3] = [("machine in these files", fit.measurements.geometry.name), ("model", filed.model)]
     rows += [("remarks", text) for text in details.remarks]
-    made = f"hexapod_comp {filed.version}, scheme joint, {fit.model.origin.date}"
+    made = f"hexapod_comp {version()}, scheme joint, {fit.model.origin.date}"
     return table(("", ""), [*rows, ("evaluated with", made)], "text")
 
 

@@ -156,12 +156,11 @@ def _write_certificate(
     args: argparse.Namespace, result: _Result, fit: ModelFit, beside: list[Path], report: str
 ) -> None:
     """Write the certificate of a model that has been written."""
-    from .. import __version__
     from ..calibration.certificate import Filed, certificate_text
     from ..formats.outputs import write_text
 
     warning = f"{FORCED}: {result.misfit}. {ADVICE}" if result.misfit else ""
-    filed = Filed(result.model.name, (Path(args.out), *beside), report, warning, __version__)
+    filed = Filed(result.model.name, (Path(args.out), *beside), report, warning)
     write_text(args.certificate, certificate_text(fit, filed, _details(args)))
 
 

@@ -52,7 +52,7 @@ def fit() -> ModelFit:
 def filed(tmp_path: Path) -> Filed:
     model = tmp_path / "model.yaml"
     model.write_text("the model")
-    return Filed("a model", (model,), "the report\n  of several lines", "", "1.2.3")
+    return Filed("a model", (model,), "the report\n  of several lines", "")
 
 
 @pytest.fixture

@@ -262,7 +262,7 @@ def test_options_reach_the_fit(
     """In SI, and the field's three blocks under one word."""
     given: list[FitSettings] = []
 
-    def spy(measured: object, settings: FitSettings, say: object) -> ModelFit:
+    def spy(measured: object, settings: FitSettings, *_: object) -> ModelFit:
         given.append(settings)
         return done.fit
 
