@@ -19,10 +19,22 @@ from ..formats.texts import number
 from ..formats.yaml import read_yaml
 from ..machine.model import REFERENCE_TEMPERATURE, Temperatures
 from ..measurements.iso230 import PositioningTest
+from ..measurements.iso230_circles import CircularTest
 from ..measurements.readings import ANGULAR_KINDS
-from ..measurements.standards import AXES_STANDARD, COLUMNS, DIAGONALS_STANDARD, Judged, judge, largest
+from ..measurements.standards import (
+    AXES_STANDARD,
+    CIRCLE_COLUMNS,
+    CIRCLES_STANDARD,
+    COLUMNS,
+    DIAGONALS_STANDARD,
+    Judged,
+    judge,
+    largest,
+    notes_of,
+)
 from ..workspace.overview import corners
-from .estimation import Cells, held_out
+from .cells import Cells
+from .estimation import held_out
 from .fit import ModelFit
 from .observability import ToolError
 from .report import tilt_doubt
@@ -50,6 +62,8 @@ INSTRUMENTS = {
     "rotation": "angle optics, or level",
     "position": "tracker, position",
     "attitude": "tracker, attitude",
+    "length": "length from a point: ball bar, probe, station",
+    "displacement": "displacement at a ball: R-test",
 }
 """What reads each kind of channel."""
 
@@ -251,7 +265,7 @@ def _standards(fit: ModelFit) -> Iterator[str]:
     if not before:
         yield (
             "<p>No figures of ISO 230: they need lines with two cycles or more, every target read from both sides "
-            "in each.</p>"
+            "in each, or circles.</p>"
         )
         return
     yield (
@@ -262,6 +276,9 @@ def _standards(fit: ModelFit) -> Iterator[str]:
     for title, old, new in _pairs(before, after):
         yield f"<h3>{shown(title)}, µm</h3>"
         yield from _standard(old, new)
+    if before.circles:
+        yield f"<h3>{CIRCLES_STANDARD}, circles, µm</h3>"
+        yield from _circles(before.circles, after.circles)
 
 
 def _pairs(
@@ -286,10 +303,28 @@ def _standard(before: dict[str, PositioningTest], after: dict[str, PositioningTe
         yield f"<p>And {len(before) - MOST_RUNS} more runs.</p>"
     worst = [largest(tests) for tests in (before, after)]
     ends = [f"{name[0]} {' → '.join(number(w[name] * 1e6, 2) for w in worst)} µm" for name in worst[0]]
-    notes = dict.fromkeys(note for test in before.values() for note in test.notes)
     yield f"<p>Largest: {', '.join(ends)}.</p>"
+    yield from _departures(notes_of(before))
+
+
+def _departures(notes: Sequence[str]) -> Iterator[str]:
+    """Yield where tests depart from the standard's."""
     if notes:
         yield f"<p class=caption>Beside the standard's test: {shown('; '.join(notes), 1500)}.</p>"
+
+
+def _circles(before: dict[str, CircularTest], after: dict[str, CircularTest]) -> Iterator[str]:
+    """Yield a table of circles: each figure before → after, a dash where a test cannot tell."""
+    rows: list[Sequence[str]] = []
+    for name, test in list(before.items())[:MOST_RUNS]:
+        pairs = test.figures, after[name].figures
+        cells = [
+            " → ".join(number(figures[key] * 1e6, 2) for figures in pairs) if key in test.figures else "–"
+            for key in CIRCLE_COLUMNS
+        ]
+        rows.append((name, number(test.radius * 1e3, 1), *cells))
+    yield table(("run", "radius mm", *CIRCLE_COLUMNS.values()), rows)
+    yield from _departures(notes_of(before))
 
 
 def left_out(fit: ModelFit) -> np.ndarray:

@@ -20,7 +20,9 @@ def run(args: argparse.Namespace) -> int:
     common.say_notes(measured.notes)
     judged = judge(measured)
     if not judged:
-        problem = "no linear run has two cycles or more with every target read from both sides in each"
+        problem = (
+            "no linear run has two cycles or more with every target read from both sides in each; no circle either"
+        )
         raise CalibrationError("measurements", problem)
     if args.json:
         common.show(standards_json(judged))

@@ -217,10 +217,11 @@ example:
     ),
     "iso230": Verb(
         "calibration",
-        "the figures of ISO 230-2 and 230-6 (A, E, R, M, B) of measured lines",
+        "the figures of ISO 230-2, 230-6 and 230-4 of measured lines, diagonals and circles",
         """Judges every linear run with two cycles or more, all targets read from both sides in each (the standards ask
 for five cycles; a campaign says how many it makes). Lines along an axis of the work frame come under ISO 230-2:2014,
-all others, as body and face diagonals, under ISO 230-6:2002. Figures are in µm. --targets prints each run target by
+all others, as body and face diagonals, under ISO 230-6:2002: A, E, R, M, B. Lengths read around a circle from its
+middle, as by a ball bar, come under ISO 230-4:2005: G, G(b), and F and D where the length is known. Figures are in µm. --targets prints each run target by
 target. Targets that the machine of --machine does not reach are judged like all others.
 
 example:

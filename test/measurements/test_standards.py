@@ -180,6 +180,53 @@ def um_of(some: dict[str, float], found: dict[str, float]) -> dict[str, object]:
     return {**found, **{f"{name}_m": pytest.approx(value * 1e-6, abs=1e-15) for name, value in some.items()}}
 
 
+def ball_bar(ball: tuple[float, float, float], zero: str = "known") -> str:
+    """Return a file of a ball bar on a circle of 50 mm about (10, 20, 450): ↺ 3 µm and ↻ 1 µm larger than commanded.
+
+    What it reads is the distance of two points, the commanded one moved outwards by so much, and the ball.
+    """
+    rows = "run,direction,cycle,x_mm,y_mm,z_mm,channel,value,unit,centre_x_mm,centre_y_mm,centre_z_mm,zero\n"
+    for sense, larger, cycle in ((1, 3e-3, 1), (-1, 1e-3, 2)):
+        for n in range(12):
+            out = np.array([np.cos(sense * n * np.pi / 6), np.sin(sense * n * np.pi / 6), 0.0])
+            middle = np.array([10.0, 20.0, 450.0])
+            x, y, z = (middle + 50.0 * out).round(6)
+            read = np.linalg.norm(middle + (50.0 + larger) * out - np.array(ball))
+            rows += f"c,sequence,{cycle},{x},{y},{z},length,{read:.9f},mm,10,20,450,{zero}\n"
+    return rows
+
+
+@pytest.mark.parametrize("ball", [(10.0, 20.0, 450.0), (10.3, 19.6, 450.0)])
+def test_circles_of_a_ball_bar(tmp_path: Path, ball: tuple[float, float, float]) -> None:
+    """Each path is round, so G is 0; both lie between circles 3 − 1 = 2 µm apart; 3, 1 and on average 2 µm too large.
+
+    The ball may stand half a millimetre off. Places in the file are rounded to 1 nm.
+    """
+    (tmp_path / "c.csv").write_text(ball_bar(ball))
+    paper = load_geometry(config_file("paper"))
+    found = judge(read_measurements(tmp_path / "c.csv", paper))
+    wanted = {"G_ccw": 0, "G_cw": 0, "G_b": 2, "D": 2}
+    wanted |= {"F_max_ccw": 3, "F_min_ccw": 3, "F_max_cw": 1, "F_min_cw": 1}
+    expected = {f"{name}_m": pytest.approx(value * 1e-6, abs=3e-9) for name, value in wanted.items()}
+    assert standards_json(found) == {"iso230_4": {"c": expected}}
+    assert found.circles["c"].radius == pytest.approx(0.05, abs=1e-9)
+    rows = standards_text(found).splitlines()
+    assert rows[0] == "ISO 230-4:2005, circles"
+    assert rows[2].split()[:3] == ["c", "50.0", "24"]
+    (tmp_path / "c.csv").write_text(ball_bar(ball, ""))
+    assert set(judge(read_measurements(tmp_path / "c.csv", paper)).circles["c"].figures) == {"G_ccw", "G_cw", "G_b"}
+
+
+def test_lengths_that_are_no_circle_are_left_out(tmp_path: Path) -> None:
+    """A point off the circle, and a station a metre away."""
+    paper = load_geometry(config_file("paper"))
+    for old, new in ((",60.0,20.0,450.0,", ",61.0,20.0,450.0,"), (",10,20,450,known", ",10,20,1450,known")):
+        text = ball_bar((10.0, 20.0, 450.0))
+        assert old in text
+        (tmp_path / "c.csv").write_text(text.replace(old, new))
+        assert not judge(read_measurements(tmp_path / "c.csv", paper))
+
+
 def test_axes_are_those_of_the_work_frame(tmp_path: Path) -> None:
     """On a machine whose work frame is turned in its base, a line along its x is no diagonal."""
     framed = load_geometry(machines()["framed"].write(tmp_path / "framed.yaml"))
