@@ -221,8 +221,8 @@ example:
         """Judges every linear run with two cycles or more, all targets read from both sides in each (the standards ask
 for five cycles; a campaign says how many it makes). Lines along an axis of the work frame come under ISO 230-2:2014,
 all others, as body and face diagonals, under ISO 230-6:2002: A, E, R, M, B. Lengths read around a circle from its
-middle, as by a ball bar, come under ISO 230-4:2005: G, G(b), and F and D where the length is known. Figures are in µm. --targets prints each run target by
-target. Targets that the machine of --machine does not reach are judged like all others.
+middle, as by a ball bar, come under ISO 230-4:2005: G, G(b), and F and D where the length is known. Figures are in µm.
+--targets prints each line target by target. Targets that the machine of --machine does not reach are judged too.
 
 example:
   $ hexapod_comp iso230 measured.csv""",
