@@ -29,15 +29,16 @@ def run(args: argparse.Namespace) -> int:
     from ..export.worth import ExportTrial
     from ..machine.model import commanded_box
 
-    if args.linuxcnc is None and args.table is None and args.c_folder is None:
-        raise InputFileError("export", "--linuxcnc, --table, --c", "at least one is needed: nothing to write")
+    wanted = (args.linuxcnc, args.table, args.c_folder, args.urdf, args.mjcf)
+    if all(place is None for place in wanted):
+        raise InputFileError("export", "--linuxcnc, --table, --c, --urdf, --mjcf", "at least one is needed")
     geometry, model = common.load_machine(args)
     common.mention_compiling("model.actual_pose_one")
-    core = [] if args.c_folder is None else _c(args, geometry, model)
+    exact = _descriptions(args, geometry) + ([] if args.c_folder is None else _c(args, geometry, model))
     if args.linuxcnc is None and args.table is None:
-        return _show_core(args, model, core)
+        return _show_exact(args, model, exact)
     box = commanded_box(geometry, model) if args.box is None else np.array(args.box)
-    written, checks = core, []
+    written, checks = exact, []
     with common.stage_line() as say:
         say("the tool's error as the machine is")
         trial = ExportTrial(geometry, model, box, args.poses, args.seed, math.radians(args.tilt_deg))
@@ -58,6 +59,17 @@ def run(args: argparse.Namespace) -> int:
     return 1 if worse else 0
 
 
+def _descriptions(args: argparse.Namespace, geometry: HexapodGeometry) -> list[str]:
+    """Write what robot programs want to know of the machine; return the files."""
+    from ..export.robot_description import mjcf, urdf
+    from ..formats.outputs import write_text
+
+    written = [(file, form) for file, form in ((args.urdf, urdf), (args.mjcf, mjcf)) if file is not None]
+    for file, form in written:
+        write_text(file, form(geometry))
+    return [file for file, _ in written]
+
+
 def _c(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
     """Write the C core with this machine's constants; return the files."""
     from ..compensation.journal import IDEAL_SOURCE, Source
@@ -69,13 +81,14 @@ def _c(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel)
     return [str(file) for file in write_c(args.c_folder, geometry, model, (made_of[0].sha256, made_of[1].sha256))]
 
 
-def _show_core(args: argparse.Namespace, model: MachineModel, written: list[str]) -> int:
-    """Say what was written when that is the C core alone: it gives the very numbers, so nothing is judged."""
+def _show_exact(args: argparse.Namespace, model: MachineModel, written: list[str]) -> int:
+    """Say what was written when all of it gives the very numbers, so that nothing is to be judged."""
     if args.json:
         common.show({"machine": model.machine, "model": model.name, "written": written})
     else:
         print(f"machine {model.machine}, model {model.name}\nwritten: {', '.join(written)}")
-        print("build the self-test and run it on the target: see hexapod_selftest.c")
+        if args.c_folder is not None:
+            print("build the self-test and run it on the target: see hexapod_selftest.c")
     return 0
 
 

@@ -333,6 +333,9 @@ def _export(parser: argparse.ArgumentParser) -> None:
     add("--linuxcnc", metavar="FOLDER", help="folder for LinuxCNC's files; made if it is missing")
     add("--table", type=arguments.csv_file, metavar="FILE.csv", help="CSV file for the trilinear table")
     add("--c", dest="c_folder", metavar="FOLDER", help="folder for the compensator in C with this machine's constants")
+    text = "file for the machine as URDF: robot_state_publisher, RViz, ros2_control; needs no model"
+    add("--urdf", metavar="FILE.urdf", help=text)
+    add("--mjcf", metavar="FILE.xml", help="file for the machine as MuJoCo's MJCF, loops closed; needs no model")
     text = "LinuxCNC's machine unit, [TRAJ]LINEAR_UNITS (default mm)"
     add("--units", choices=("mm", "inch"), default="mm", help=text)
     text = "lowest and highest tool position, mm (default: the model's valid box, else its field's)"

@@ -244,7 +244,7 @@ class CompensatorNode(MachineNode):
 
     def _publish_markers(self) -> None:
         if self._active:
-            self._outputs.markers(corrects=not self._fresh_start)
+            self._outputs.show(corrects=not self._fresh_start)
 
     # ---- state ----
 

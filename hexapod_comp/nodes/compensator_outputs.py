@@ -13,6 +13,8 @@ from std_msgs.msg import Float64MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from ..compensation.compensator import Compensator
+from ..export.robot_description import joint_positions
+from ..pose import Pose
 from .machine_files import MachineFiles
 from .markers import machine_markers
 from .messages import write_pose
@@ -47,6 +49,8 @@ class CompensatorOutputs:
         self._corrections = node.publish_on(JointState, "strut_corrections", COMMAND_QOS, deadline)
         self._estimates = node.publish_on(PoseStamped, "tool_pose_estimate", STATE_QOS)
         self._markers = node.create_publisher(MarkerArray, "~/markers", EVENT_QOS)
+        self._joints = node.create_publisher(JointState, "joint_states", EVENT_QOS)
+        self._names = options["joint_names"]
         self._array: Publisher | None = None
         if options["publish_array"]:
             self._array = node.publish_on(Float64MultiArray, "strut_commands_array", COMMAND_QOS, deadline)
@@ -85,13 +89,19 @@ class CompensatorOutputs:
         self._estimate_out.header.stamp = stamp
         self._estimates.publish(self._estimate_out)
 
-    def markers(self, corrects: bool) -> None:
-        """Publish the machine as it stands, if anybody looks; with zero corrections before the first command."""
-        if not self._markers.get_subscription_count():
-            return
-        correction = self._compensator.correction if corrects else np.zeros(6)
+    def show(self, corrects: bool) -> None:
+        """Publish the machine as it stands to who looks: as markers, before the first command without corrections, and
+        as the joints of its URDF."""
         now, pose = self._node.get_clock().now().to_msg(), self._compensator.platform_estimate
-        self._markers.publish(machine_markers(self._compensator.geometry, *pose, correction, self._frame, now))
+        geometry = self._compensator.geometry
+        if self._markers.get_subscription_count():
+            correction = self._compensator.correction if corrects else np.zeros(6)
+            self._markers.publish(machine_markers(geometry, *pose, correction, self._frame, now))
+        if self._joints.get_subscription_count():
+            positions = joint_positions(geometry, Pose(*pose), self._names)
+            message = JointState(name=list(positions), position=list(positions.values()))
+            message.header.stamp = now
+            self._joints.publish(message)
 
     def wait(self) -> None:
         """Wait until the last command has arrived."""
@@ -102,6 +112,6 @@ class CompensatorOutputs:
         """Destroy the publishers."""
         self._predicted.close()
         self.signs.close()
-        for publisher in (self._commands, self._corrections, self._estimates, self._markers, self._array):
+        for publisher in (self._commands, self._corrections, self._estimates, self._markers, self._joints, self._array):
             if publisher is not None:
                 self._node.destroy_publisher(publisher)

@@ -68,7 +68,7 @@ PARAMETERS = (
         "temperature_timeout", 60.0, "without a temperature for this long a part's is stale, s; 0 = off", 0.0, 86400.0
     ),
     Parameter("heartbeat_rate", 50.0, "heartbeats per second, Hz; 0 = none", 0.0, 1000.0),
-    Parameter("marker_rate", 10.0, "markers per second, Hz; 0 = none", 0.0, 10.0),
+    Parameter("marker_rate", 10.0, "markers and joint states per second, Hz; 0 = none", 0.0, 10.0),
     Parameter("publish_array", False, "also publish strut_commands_array for ros2_controllers"),
 )
 
@@ -84,6 +84,7 @@ out  strut_commands          JointState: compensated strut lengths, m
      ~/predicted_error_aligned  the same with the datum aligned
      ~/stopped               Bool, latched: commands are refused
      ~/heartbeat, ~/validity UInt64, TimeReference: until when the newest command is valid
+     joint_states            JointState: all joints of the machine's URDF
      /diagnostics, ~/markers, ~/journal, ~/files
 ask  ~/enable_compensation   SetBool
      ~/reload_model, ~/reset Trigger

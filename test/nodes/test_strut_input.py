@@ -134,3 +134,17 @@ def test_joints_go_by_the_machine_s_own_names(bench: Bench):
 def test_other_values_are_refused(bench: Bench, parameters: dict[str, object], problem: str):
     with pytest.raises(ParameterError, match=problem):
         bench.compensator(**parameters)
+
+
+def test_joint_states_show_the_machine_where_its_struts_are(bench: Bench):
+    """Truth: closed-form lengths, and the pose that they belong to."""
+    bench.compensator(model_file="ideal", marker_rate=10.0)
+    seen: list[JointState] = []
+    bench.witness.create_subscription(JointState, "joint_states", seen.append, 10)
+    pose = near(HOME, (0.003, -0.002, 0.01), 1.0)
+    bench.feed(closed_form_lengths(pose))
+    bench.until(lambda: seen and abs(seen[-1].position[list(seen[-1].name).index("platform_z")] - 0.41) < SAME, "pose")
+    joints = dict(zip(seen[-1].name, seen[-1].position, strict=True))
+    at = [joints[f"platform_{axis}"] for axis in "xyz"]
+    np.testing.assert_allclose(at, pose.position, rtol=0, atol=SAME)
+    np.testing.assert_allclose([joints[n] for n in STRUT_NAMES], closed_form_lengths(pose), rtol=0, atol=SAME)

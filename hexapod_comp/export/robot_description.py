@@ -1,0 +1,281 @@
+"""The machine as robot programs describe one: URDF for robot_state_publisher and ros2_control, MJCF for MuJoCo.
+
+URDF holds trees alone, and a hexapod has closed loops. So the tree has seven branches: the platform, on six joints that
+give its pose, and six struts, each on two crossed hinges at its base joint and with a slide whose position is its
+length. :func:`joint_positions` gives all of them for one pose, so that each strut ends where its platform joint is.
+MJCF closes the loops by constraints.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..kernels.pose import quaternion_of
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry
+from ..machine.kinematics import strut_lengths
+from ..pose import Pose
+
+PLATFORM_JOINTS = ("platform_x", "platform_y", "platform_z", "platform_beta", "platform_alpha", "platform_gamma")
+"""In their order from base to platform: R = Ry(β)·Rx(α)·Rz(γ) (Song et al., T_BASE^TOP)."""
+
+_AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 0], [1, 0, 0], [0, 0, 1]], dtype=float)
+
+STRUT_RADIUS, JOINT_RADIUS, PLATE = 0.01, 0.018, 0.01
+"""What is drawn, m: struts, joints, and the platform's thickness."""
+
+HARDWARE = (
+    ("joint_commands_topic", "strut_setpoints"),
+    ("joint_states_topic", "strut_states"),
+    ("trigger_joint_command_threshold", "-1"),
+)
+"""Parameters of ros2_control's JointStateTopicSystem; by the last one commands near the readings are sent too."""
+
+LOOSE = 1e3
+"""Limit of effort and speed of joints that no motor moves; readers of URDF want one."""
+
+
+def joint_positions(
+    geometry: HexapodGeometry, platform: Pose, joint_names: Sequence[str] = STRUT_NAMES
+) -> dict[str, float]:
+    """Return the position of every joint of :func:`urdf` at a pose.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        The nominal machine.
+    platform : Pose
+        ``pose_platform_in_base``.
+    joint_names : sequence of str, optional
+        Names of the struts' slides.
+
+    Returns
+    -------
+    dict of str to float
+        m and radians.
+    """
+    alpha, beta, gamma = platform.angles()
+    values = dict(zip(PLATFORM_JOINTS, (*platform.position, beta, alpha, gamma), strict=True))
+    ends = platform.position + geometry.platform_joints @ platform.rotation.T
+    along = (ends - geometry.base_joints) / strut_lengths(geometry, platform)[:, None]
+    x, y, z = np.einsum("nji,nj->in", _foot_frames(geometry), along)
+    for name, about_y, about_x in zip(joint_names, np.arctan2(x, z), -np.arcsin(np.clip(y, -1.0, 1.0)), strict=True):
+        values |= {f"{name}_foot_1": about_y, f"{name}_foot_2": about_x}
+    values |= dict(zip(joint_names, strut_lengths(geometry, platform), strict=True))
+    return {name: float(value) for name, value in values.items()}
+
+
+def urdf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) -> str:
+    """Return the machine as URDF: links ``base``, ``work``, ``platform``, ``tool`` and the struts'.
+
+    Its ``ros2_control`` block says what stands below a controller of struts: the compensator's topics.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        The nominal machine.
+    joint_names : sequence of str, optional
+        Names of the struts' slides.
+    """
+    robot = ET.Element("robot", name=geometry.name)
+    _link(robot, "base", [_ball(joint) for joint in geometry.base_joints])
+    _fixed(robot, "work", geometry.work)
+    _platform(robot, geometry)
+    _fixed(robot, "tool", geometry.tool, "platform")
+    for n, name in enumerate(joint_names):
+        _strut(robot, geometry, n, name)
+    _control(robot, joint_names)
+    return _text(robot)
+
+
+def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) -> str:
+    """Return the machine as MJCF, loops closed: a free platform, each strut's end tied to it, motors on the slides.
+
+    Sites ``base_joint_N``, ``strut_end_N`` and ``platform_joint_N`` mark both ends of a strut, ``tool`` the tool. The
+    reference position is home.
+    """
+    root = ET.Element("mujoco", model=geometry.name)
+    ET.SubElement(root, "compiler", angle="radian", autolimits="true")
+    world = ET.SubElement(root, "worldbody")
+    home = geometry.home
+    platform = _body(world, "platform", home.position, home.rotation)
+    ET.SubElement(platform, "freejoint", name="platform")
+    _plate_geom(platform, geometry)
+    for n, joint in enumerate(geometry.platform_joints):
+        ET.SubElement(platform, "site", name=f"platform_joint_{n + 1}", pos=_numbers(joint))
+    _site(platform, "tool", geometry.tool)
+    equality, actuator = ET.Element("equality"), ET.Element("actuator")
+    for n, (name, length) in enumerate(zip(joint_names, strut_lengths(geometry, home), strict=True)):
+        foot = _body(world, f"{name}_body", geometry.base_joints[n], _foot_frames(geometry)[n])
+        ET.SubElement(foot, "joint", name=f"{name}_foot_1", axis="0 1 0")
+        ET.SubElement(foot, "joint", name=f"{name}_foot_2", axis="1 0 0")
+        short = geometry.limits.stroke[n, 0]
+        ET.SubElement(
+            foot, "geom", type="cylinder", size=f"{STRUT_RADIUS * 1.5}", fromto=f"0 0 0 0 0 {_number(0.5 * short)}"
+        )
+        ET.SubElement(foot, "site", name=f"base_joint_{n + 1}")
+        rod = _body(foot, f"{name}_rod", np.array([0.0, 0.0, length]), np.eye(3))
+        reach = _numbers(geometry.limits.stroke[n])
+        # MuJoCo adds a joint's position to the place of its body: `ref` makes it the length.
+        ET.SubElement(rod, "joint", name=name, type="slide", axis="0 0 1", ref=_number(length), range=reach)
+        ET.SubElement(rod, "geom", type="cylinder", size=f"{STRUT_RADIUS}", fromto=f"0 0 {_number(-0.6 * short)} 0 0 0")
+        ET.SubElement(rod, "site", name=f"strut_end_{n + 1}")
+        ends = f"strut_end_{n + 1}", f"platform_joint_{n + 1}"
+        ET.SubElement(equality, "connect", name=f"{name}_end", site1=ends[0], site2=ends[1])
+        ET.SubElement(actuator, "position", name=name, joint=name, kp="1e5", kv="1e3", ctrlrange=reach)
+    root.extend((equality, actuator))
+    return _text(root)
+
+
+def _foot_frames(geometry: HexapodGeometry) -> np.ndarray:
+    """Return a frame at each base joint, (6, 3, 3), its z along the strut at home: far from where hinges lock."""
+    home = geometry.home
+    along = home.position + geometry.platform_joints @ home.rotation.T - geometry.base_joints
+    z = along / np.linalg.norm(along, axis=1)[:, None]
+    least = np.eye(3)[np.abs(z).argmin(axis=1)]
+    x = np.cross(least, z)
+    x /= np.linalg.norm(x, axis=1)[:, None]
+    return np.stack([x, np.cross(z, x), z], axis=2)
+
+
+# ---- URDF ----
+
+
+def _platform(robot: ET.Element, geometry: HexapodGeometry) -> None:
+    """Add the six joints of the platform's pose, and the platform."""
+    span = float(np.abs(geometry.home.position).max() + geometry.limits.stroke.max())
+    parent = "base"
+    for name, axis, kind in zip(PLATFORM_JOINTS, _AXES, ["prismatic"] * 3 + ["revolute"] * 3, strict=True):
+        child = "platform" if name == PLATFORM_JOINTS[-1] else f"{name}_link"
+        limit = span if kind == "prismatic" else np.pi
+        _joint(robot, name, kind, (parent, child), axis=axis, limits=(-limit, limit))
+        if child != "platform":
+            _link(robot, child)
+        parent = child
+    middle, radius = _plate(geometry)
+    plate = ("cylinder", {"radius": _number(radius), "length": _number(PLATE)}, middle)
+    _link(robot, "platform", [plate, *(_ball(joint) for joint in geometry.platform_joints)])
+
+
+def _strut(robot: ET.Element, geometry: HexapodGeometry, n: int, name: str) -> None:
+    """Add a strut: two hinges at its foot, its body, and its rod, whose frame is the strut's end."""
+    short, long = (float(value) for value in geometry.limits.stroke[n])
+    at = Pose(geometry.base_joints[n], _foot_frames(geometry)[n])
+    hinge, body, rod = f"{name}_hinge", f"{name}_body", f"{name}_rod"
+    half = (-0.5 * np.pi, 0.5 * np.pi)
+    _joint(robot, f"{name}_foot_1", "revolute", ("base", hinge), at, _AXES[1], half)
+    _link(robot, hinge)
+    _joint(robot, f"{name}_foot_2", "revolute", (hinge, body), axis=_AXES[0], limits=half)
+    _link(robot, body, [_rod(1.5 * STRUT_RADIUS, 0.5 * short, 0.25 * short)])
+    _joint(robot, name, "prismatic", (body, rod), axis=_AXES[2], limits=(short, long), speed=geometry.limits.speed)
+    _link(robot, rod, [_rod(STRUT_RADIUS, 0.6 * short, -0.3 * short)])
+
+
+def _control(robot: ET.Element, joint_names: Sequence[str]) -> None:
+    """Add ros2_control's block: the struts' positions, through topics."""
+    control = ET.SubElement(robot, "ros2_control", name=robot.get("name", ""), type="system")
+    system = ET.SubElement(control, "hardware")
+    ET.SubElement(system, "plugin").text = "joint_state_topic_hardware_interface/JointStateTopicSystem"
+    for name, value in HARDWARE:
+        ET.SubElement(system, "param", name=name).text = value
+    for name in joint_names:
+        joint = ET.SubElement(control, "joint", name=name)
+        ET.SubElement(joint, "command_interface", name="position")
+        ET.SubElement(joint, "state_interface", name="position")
+
+
+Shape = tuple[str, dict[str, str], np.ndarray]
+"""Kind, sizes and middle of what is drawn."""
+
+
+def _ball(middle: np.ndarray) -> Shape:
+    return "sphere", {"radius": _number(JOINT_RADIUS)}, middle
+
+
+def _rod(radius: float, length: float, height: float) -> Shape:
+    return "cylinder", {"radius": _number(radius), "length": _number(length)}, np.array([0.0, 0.0, height])
+
+
+def _plate(geometry: HexapodGeometry) -> tuple[np.ndarray, float]:
+    """Return middle and radius of a disc through the platform's joints."""
+    joints = geometry.platform_joints
+    middle = joints.mean(axis=0)
+    return middle, float(np.linalg.norm((joints - middle)[:, :2], axis=1).mean())
+
+
+def _link(robot: ET.Element, name: str, shapes: Sequence[Shape] = ()) -> None:
+    link = ET.SubElement(robot, "link", name=name)
+    for kind, sizes, middle in shapes:
+        visual = ET.SubElement(link, "visual")
+        ET.SubElement(visual, "origin", xyz=_numbers(middle))
+        ET.SubElement(ET.SubElement(visual, "geometry"), kind, sizes)
+
+
+def _fixed(robot: ET.Element, name: str, pose: Pose, parent: str = "base") -> None:
+    _joint(robot, f"{name}_mount", "fixed", (parent, name), pose)
+    _link(robot, name)
+
+
+def _joint(
+    robot: ET.Element,
+    name: str,
+    kind: str,
+    links: tuple[str, str],
+    at: Pose | None = None,
+    axis: np.ndarray | None = None,
+    limits: tuple[float, float] | None = None,
+    speed: float = LOOSE,
+) -> None:
+    joint = ET.SubElement(robot, "joint", name=name, type=kind)
+    if at is not None:
+        from scipy.spatial.transform import Rotation  # 27 MB that a node, which only wants the joints, does without
+
+        angles = Rotation.from_matrix(at.rotation).as_euler("xyz")  # roll, pitch, yaw about fixed axes
+        ET.SubElement(joint, "origin", xyz=_numbers(at.position), rpy=_numbers(angles))
+    for role, link in zip(("parent", "child"), links, strict=True):
+        ET.SubElement(joint, role, link=link)
+    if axis is not None:
+        ET.SubElement(joint, "axis", xyz=_numbers(axis))
+    if limits is not None:
+        low, high = (_number(value) for value in limits)
+        ET.SubElement(joint, "limit", lower=low, upper=high, effort=_number(LOOSE), velocity=_number(min(speed, LOOSE)))
+
+
+# ---- MJCF ----
+
+
+def _body(parent: ET.Element, name: str, position: np.ndarray, rotation: np.ndarray) -> ET.Element:
+    return ET.SubElement(parent, "body", name=name, pos=_numbers(position), quat=_quaternion(rotation))
+
+
+def _site(parent: ET.Element, name: str, pose: Pose) -> None:
+    ET.SubElement(parent, "site", name=name, pos=_numbers(pose.position), quat=_quaternion(pose.rotation))
+
+
+def _plate_geom(platform: ET.Element, geometry: HexapodGeometry) -> None:
+    middle, radius = _plate(geometry)
+    size = f"{_number(radius)} {_number(0.5 * PLATE)}"
+    ET.SubElement(platform, "geom", type="cylinder", size=size, pos=_numbers(middle))
+
+
+def _quaternion(rotation: np.ndarray) -> str:
+    x, y, z, w = quaternion_of(rotation)
+    return _numbers([w, x, y, z])
+
+
+# ---- both ----
+
+
+def _number(value: float) -> str:
+    return repr(float(value))
+
+
+def _numbers(values: Sequence[float] | np.ndarray) -> str:
+    return " ".join(_number(value) for value in values)
+
+
+def _text(root: ET.Element) -> str:
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
