@@ -19,6 +19,7 @@ from .observability import Allowed, Observability, ToolError, expected_error, ob
 from .parameters import FitSettings, ParameterSpace
 from .selection import Decision, select
 from .smooth_field import DIGITS
+from .warming import Warming, seek_time_constants
 
 SURE = 4.0
 """Backlash so many standard deviations below zero is no noise."""
@@ -120,6 +121,8 @@ class ModelFit:
         What the readings do not rule out.
     held : HeldDatum
         Where the tool is held: the model is the solution's machine, shifted and turned as a whole.
+    warming : Warming
+        What they tell of heat.
     """
 
     model: MachineModel
@@ -136,6 +139,7 @@ class ModelFit:
     notes: tuple[str, ...]
     allowed: Allowed
     held: HeldDatum
+    warming: Warming
 
     @property
     def misfit(self) -> str:
@@ -180,6 +184,9 @@ def fit_model(
         settle, forward and backward swapped.
     """
     settings = settings or FitSettings()
+    constants = seek_time_constants(measurements, ParameterSpace(measurements, settings), progress)
+    if constants.values:
+        settings = replace(settings, time_constants=constants.values)
     everything = Estimation(measurements, ParameterSpace(measurements, settings))
     decisions, possible, (space, estimation, solution) = _choose(everything, settings, progress)
     channels = tuple(_channels(estimation, solution))
@@ -207,6 +214,7 @@ def fit_model(
         notes=(*measurements.notes, *notes, *_check_worth(level)),
         allowed=allowed,
         held=held,
+        warming=Warming.of(measurements, space, solution, constants),
     )
 
 
@@ -316,7 +324,7 @@ def _ignored(measurements: MeasurementSet, settings: FitSettings, space: Paramet
     if not np.isfinite(space.periods).all():
         notes.append("the screws' lead is not known: a periodic error of the screws, if they have one, is not fitted")
     warmth = np.abs(measurements.stations.temperatures - REFERENCE_TEMPERATURE).max()
-    if warmth > WARM and not (settings.strut_expansion or settings.base_expansion or settings.platform_expansion):
+    if warmth > WARM and space.block("expansion") is None and not space.stated_expansion.any():
         notes.append(f"read up to {warmth:.1f} K from 20 °C, but no expansion is given: growth is taken for an error")
     return notes
 

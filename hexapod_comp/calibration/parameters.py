@@ -16,9 +16,10 @@ from ..errors import CalibrationError, ModelError
 from ..machine.field import GridField, no_field
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry, first_of_same
 from ..machine.kinematics import Structure, strut_lengths
-from ..machine.model import MachineModel
+from ..machine.late import PARTS, LateGrowth
+from ..machine.model import REFERENCE_TEMPERATURE, MachineModel
 from ..machine.struts import StrutErrors
-from ..measurements.readings import AXES, MeasurementSet, spans
+from ..measurements.readings import AXES, MeasurementSet, Stations, spans
 from .smooth_field import COMPONENT_UNITS, SmoothField
 
 KNOT_DISTANCE = 0.017
@@ -33,6 +34,12 @@ LARGEST_EXPANSION = 100e-6
 MAP_CORRELATION_LENGTH = 0.04
 """How far the errors of a length map are alike, m (Matérn 5/2)."""
 
+LEAST_WARMING = 0.5
+"""Temperatures that change by less, K, show no expansion: 3 µm on half a metre of steel, a sensor's drift included."""
+
+STRUTS_ALIKE = 0.9
+"""Correlation of the struts' expansions: they are built alike, and may be loaded and cooled differently."""
+
 TOLERANCES = {
     "structure": 100e-6,
     "pitch": 100e-6,
@@ -42,8 +49,10 @@ TOLERANCES = {
     "field displacement": 5e-6,
     "field rotation": 20e-6,
     "field reversal": 1e-6,
+    "expansion": 10e-6,
+    "late": 10e-6,
 }
-"""First guess of the blocks' standard deviations, m, m/m or rad; the fit goes on from there."""
+"""First guess of the blocks' standard deviations, m, m/m, rad or 1/K; the fit goes on from there."""
 
 BLOCKS = tuple(TOLERANCES)
 
@@ -67,7 +76,11 @@ class FitSettings:
     field_degree : int
         Degree of the field's polynomials along the longest side of its box.
     strut_expansion, base_expansion, platform_expansion : float
-        Thermal expansion, 1/K: given, never fitted.
+        Thermal expansion as stated, 1/K: where readings were taken while temperatures changed, the fit starts from it.
+    thermometer : str
+        The part whose sensor stands for all; empty: the one that has readings of its own, if only one has.
+    time_constants : tuple of float or None
+        How late parts follow their thermometers, s; None: sought from the readings.
     tolerances : dict
         Standard deviations to start from, by block.
     robust : bool
@@ -81,6 +94,8 @@ class FitSettings:
     strut_expansion: float = 0.0
     base_expansion: float = 0.0
     platform_expansion: float = 0.0
+    thermometer: str = ""
+    time_constants: tuple[float, ...] | None = None
     tolerances: tuple[tuple[str, float], ...] = tuple(TOLERANCES.items())
     robust: bool = True
 
@@ -98,6 +113,8 @@ class FitSettings:
             value = getattr(self, f"{body}_expansion")
             if not 0.0 <= value <= LARGEST_EXPANSION:
                 raise ModelError(f"{body} expansion", f"must be 0…{LARGEST_EXPANSION * 1e6:g} ppm/K", value * 1e6)
+        constants = self.time_constants or ()
+        LateGrowth(tuple(constants), np.zeros((len(PARTS), len(constants))), self.thermometer)  # refuses what cannot be
         if not 1 <= self.field_degree <= 8:
             raise ModelError("field_degree", "must be 1…8", self.field_degree)
 
@@ -200,6 +217,7 @@ class ParameterSpace:
 
     def __init__(self, measurements: MeasurementSet | tuple[HexapodGeometry, Region], settings: FitSettings) -> None:
         if isinstance(measurements, MeasurementSet):
+            settings = as_warmed(settings, measurements.stations)
             measurements = measurements.geometry, Region.of(measurements)
         self.geometry, self.region = geometry, region = measurements
         self.settings = settings
@@ -233,6 +251,8 @@ class ParameterSpace:
             return True
         if name == "wave" and not np.isfinite(self.periods).all():
             return False
+        if name == "late" and not self.settings.time_constants:
+            return False
         return name in self.settings.blocks
 
     def _describe(self, name: str) -> tuple[np.ndarray, tuple[str, ...], str]:
@@ -258,6 +278,12 @@ class ParameterSpace:
             terms = self.field.terms
             labels = [f"{COMPONENT_UNITS[which + c][0]} {t}" for c in range(3) for t in terms]
             return np.diag(np.tile(self.field.prior, 3)), tuple(labels), "m" if which == 0 else "rad"
+        if name == "expansion":
+            return growth_root(1), tuple(f"{part} expansion beyond the stated" for part in PARTS), "1/K"
+        if name == "late":
+            constants = self.settings.time_constants or ()
+            labels = [f"{part} late by {constant:.0f} s" for part in PARTS for constant in constants]
+            return growth_root(len(constants)), tuple(labels), "1/K"
         labels = [f"{s} {name}" for s in STRUT_NAMES]
         return np.eye(6), tuple(labels), "m/m" if name == "pitch" else "m"
 
@@ -310,12 +336,12 @@ class ParameterSpace:
         with_field : bool
             False leaves the field out: the fit adds it from its own basis.
         """
-        s = self.settings
         joints, offset = np.split(self._values(x, "structure"), [-6])
         structure = joints.reshape(-1, 3)
         wave = self._values(x, "wave", 12).reshape(6, 2)
         values = self._values(x, "map", 0).reshape(6, -1)
         has_map = bool(values.size) and bool(values.any())
+        expansion = self.stated_expansion + self._values(x, "expansion", len(PARTS))
         struts = StrutErrors(
             offset=offset,
             pitch=self._values(x, "pitch", 6),
@@ -324,7 +350,7 @@ class ParameterSpace:
             sine=wave[:, 1],
             period=np.where(np.isfinite(self.periods), self.periods, 0.01),
             backlash=np.maximum(self._values(x, "backlash", 6), 0.0),
-            expansion=np.full(6, s.strut_expansion),
+            expansion=expansion[:6],
             map_knots=self.knots if has_map else np.zeros(0),
             map_values=values if has_map else np.zeros((6, 0)),
         )
@@ -335,10 +361,22 @@ class ParameterSpace:
             platform_deviation=structure[6:][self.platform_groups],
             struts=struts,
             field=self._grid_field(x) if with_field else no_field(),
-            base_expansion=s.base_expansion,
-            platform_expansion=s.platform_expansion,
+            base_expansion=float(expansion[6]),
+            platform_expansion=float(expansion[7]),
+            late_growth=self._late_growth(x, bool(expansion.any())),
             valid_box=self.platform_box if spans(self.platform_box) else None,
         )
+
+    @property
+    def stated_expansion(self) -> np.ndarray:
+        """Expansion of struts 1–6, base and platform as stated, 1/K."""
+        s = self.settings
+        return np.array([*[s.strut_expansion] * 6, s.base_expansion, s.platform_expansion])
+
+    def _late_growth(self, x: np.ndarray, grows: bool) -> LateGrowth:
+        values = self._values(x, "late").reshape(len(PARTS), -1)
+        constants = (self.settings.time_constants or ()) if values.size else ()
+        return LateGrowth(tuple(constants), values, self.settings.thermometer if grows or constants else "")
 
     def field_coefficients(self, x: np.ndarray) -> np.ndarray:
         """Return the field's coefficients, shape (6, terms), m and rad."""
@@ -365,6 +403,25 @@ class ParameterSpace:
         """Return the parameters of a block, zeros where there is none."""
         block = self.block(name)
         return x[block.part] if block is not None else np.zeros(missing)
+
+
+def as_warmed(settings: FitSettings, stations: Stations) -> FitSettings:
+    """Return settings for some stations: the thermometer that they had, no expansion where nothing warmed."""
+    temperatures = stations.temperatures
+    seen = np.flatnonzero((temperatures != REFERENCE_TEMPERATURE).any(axis=0))
+    thermometer = settings.thermometer or (PARTS[seen[0]] if len(seen) == 1 else "")
+    seen = np.array([PARTS.index(thermometer)]) if thermometer else np.arange(len(PARTS))
+    warmed = bool(np.ptp(temperatures[:, seen], axis=0).max() >= LEAST_WARMING)
+    fits = {"expansion": warmed, "late": warmed and bool(np.isfinite(stations.times).all())}
+    blocks = tuple(name for name in settings.blocks if fits.get(name, True))
+    return replace(settings, thermometer=thermometer, blocks=blocks)
+
+
+def growth_root(terms: int) -> np.ndarray:
+    """Return the root of the prior's correlation between the parts' growth, shape (8·terms, 8·terms)."""
+    alike = np.eye(len(PARTS))
+    alike[:6, :6] += STRUTS_ALIKE * (1.0 - np.eye(6))
+    return np.kron(np.linalg.cholesky(alike), np.eye(terms))
 
 
 def _groups(geometry: HexapodGeometry, shared: bool) -> np.ndarray:

@@ -9,6 +9,7 @@ from ..measurements.readings import ANGULAR_KINDS, CHANNELS
 from .fit import ChannelFit, ModelFit, Outlier
 from .observability import BlockSight, Observability, ToolError
 from .plan import Plan
+from .warming import warming_json, warming_text
 
 MOST_LISTED = 10
 """Outliers and notes beyond these are counted, not listed."""
@@ -27,6 +28,7 @@ def fit_report(fit: ModelFit) -> str:
         _channel_table(fit),
         _decision_table(fit),
         observability_text(fit.observability, fit.unseen_errors),
+        *filter(None, [warming_text(fit.warming)]),
         *_outliers(fit),
     ]
     return "\n\n".join(parts) + "\n"
@@ -112,7 +114,7 @@ def observability_text(seen: Observability, unseen_errors: tuple[str, ...]) -> s
 
 
 def _sight_row(b: BlockSight) -> tuple[str, ...]:
-    unit = {"m": "um", "rad": "urad", "m/m": "ppm", "m, rad": "um, urad"}[b.unit]
+    unit = {"m": "um", "rad": "urad", "m/m": "ppm", "1/K": "ppm/K", "m, rad": "um, urad"}[b.unit]
     cells = (number(b.determined, 1), number(b.tolerance * 1e6, 2), number(b.error * 1e6, 3))
     return (b.name, str(b.parameters), *cells, unit)
 
@@ -147,6 +149,7 @@ def as_json(fit: ModelFit) -> dict:
         "datum": fit.held.as_json(),
         "outliers": [_outlier_json(o) for o in fit.outliers],
         "notes": fit.notes,
+        "warming": warming_json(fit.warming),
     }
 
 

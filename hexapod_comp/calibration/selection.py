@@ -19,8 +19,9 @@ CLEAR = 2.0
 LEAST_GAIN = 1e-4
 """A block does not help when its gain is below this: it is rounding, which depends on the libraries, or of no use."""
 
-EXPECTED = ("pitch", "wave", "backlash")
-"""Errors that every screw has: they stay when they help at all. Of a length map or a field nobody knows beforehand."""
+EXPECTED = ("pitch", "wave", "backlash", "expansion", "late")
+"""Errors that every screw has, and growth: they stay when they help at all. Of a length map or a field nobody knows
+beforehand."""
 
 
 @dataclass(frozen=True)

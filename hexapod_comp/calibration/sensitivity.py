@@ -7,11 +7,13 @@ differentiated by hand.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..machine.model import MachinesByTemperature
+from ..machine.late import PARTS, LateGrowth, late
+from ..machine.model import REFERENCE_TEMPERATURE, MachinesByTemperature
 from ..measurements.readings import Stations
 from ..virtual.trial import drive
 from .parameters import ParameterSpace
@@ -81,20 +83,107 @@ def derivatives(space: ParameterSpace, prediction: Prediction, stations: Station
     From u_i·(δP + δω × R·t_i + R·δt_i − δb_i) = δl_i: the platform's twist is X·(δl + u·δb − u·R·δt) with
     X the inverse of the Jacobian's rows (u_i, R·t_i × u_i).
     """
-    rotations = prediction.rotations
-    arms = np.einsum("nij,nkj->nki", rotations, prediction.platform_joints)
-    struts = prediction.positions[:, None] + arms - prediction.base_joints
-    u = struts / np.linalg.norm(struts, axis=2, keepdims=True)
-    inverse = np.linalg.inv(np.concatenate([u, np.cross(arms, u)], axis=2))
-    lever = np.einsum("nij,j->ni", rotations, space.probe)
-    per_length = inverse.copy()  # (M, 6, struts): of the measured point, no longer of the platform's origin
-    per_length[:, :3] += np.cross(inverse[:, 3:].transpose(0, 2, 1), lever[:, None]).transpose(0, 2, 1)
+    links = _Links.of(prediction, space.probe)
+    per_length, u, rotations = links.per_length, links.directions, prediction.rotations
     result = np.zeros((len(stations), 6, space.size))
     for block in space.blocks:
         result[:, :, block.part] = _block(space, block.name, per_length, u, rotations, stations)
-    points = prediction.positions + lever
-    _add_field(space, points, stations.sense[:, :3], result)
+    _add_field(space, prediction.positions + links.lever, stations.sense[:, :3], result)
+    _add_growth(space, links.per_growth(), stations, result)
     return result
+
+
+@dataclass(frozen=True)
+class _Links:
+    """The struts at some stations, and what their lengths do to the measured point.
+
+    Attributes
+    ----------
+    arms : ndarray, shape (M, 6, 3)
+        Platform joints from the platform's origin, m in ``base``.
+    base_joints : ndarray, shape (M, 6, 3)
+        m.
+    lengths : ndarray, shape (M, 6)
+        m.
+    directions : ndarray, shape (M, 6, 3)
+        Unit vectors from base to platform.
+    lever : ndarray, shape (M, 3)
+        The measured point from the platform's origin, m in ``base``.
+    per_length : ndarray, shape (M, 6, 6)
+        ∂e by the six lengths.
+    """
+
+    arms: np.ndarray
+    base_joints: np.ndarray
+    lengths: np.ndarray
+    directions: np.ndarray
+    lever: np.ndarray
+    per_length: np.ndarray
+
+    @staticmethod
+    def of(prediction: Prediction, probe: np.ndarray) -> _Links:
+        """Return the struts of predicted stations."""
+        rotations = prediction.rotations
+        arms = np.einsum("nij,nkj->nki", rotations, prediction.platform_joints)
+        struts = prediction.positions[:, None] + arms - prediction.base_joints
+        lengths = np.linalg.norm(struts, axis=2)
+        u = struts / lengths[..., None]
+        inverse = np.linalg.inv(np.concatenate([u, np.cross(arms, u)], axis=2))
+        lever = np.einsum("nij,j->ni", rotations, probe)
+        per_length = inverse.copy()  # of the measured point, no longer of the platform's origin
+        per_length[:, :3] += np.cross(inverse[:, 3:].transpose(0, 2, 1), lever[:, None]).transpose(0, 2, 1)
+        return _Links(arms, prediction.base_joints, lengths, u, lever, per_length)
+
+    def per_growth(self) -> np.ndarray:
+        """Return ∂e by the relative growth of struts 1–6, base and platform, shape (M, 6, 8)."""
+        bodies = ((1.0, self.base_joints), (-1.0, self.arms))
+        along = [sign * np.einsum("mik,mik->mi", self.directions, joints) for sign, joints in bodies]
+        grown = [np.einsum("msi,mi->ms", self.per_length, lengths)[..., None] for lengths in along]
+        return np.concatenate([self.per_length * self.lengths[:, None], *grown], axis=2)
+
+
+def growth_columns(space: ParameterSpace, prediction: Prediction) -> np.ndarray:
+    """Return ∂e by the relative growth of struts 1–6, base and platform at each station, shape (M, 6, 8), m and rad."""
+    return _Links.of(prediction, space.probe).per_growth()
+
+
+def growth_causes(
+    space: ParameterSpace, stations: Stations, time_constants: Sequence[float] | np.ndarray
+) -> np.ndarray:
+    """Return what parts grow by: their thermometers above 20 °C, and how far each lag is behind these.
+
+    Parameters
+    ----------
+    space : ParameterSpace
+        Says which thermometer stands for which part.
+    stations : Stations
+        Temperatures and times.
+    time_constants : sequence or ndarray of K float
+        s.
+
+    Returns
+    -------
+    ndarray, shape (M, 8, 1 + K)
+        K.
+    """
+    sensors = LateGrowth(thermometer=space.settings.thermometer)
+    read = stations.temperatures[:, [sensors.sensor_of(part) for part in range(len(PARTS))]]
+    above = (read - REFERENCE_TEMPERATURE)[..., None]
+    if not len(time_constants) or not np.isfinite(stations.times).all():
+        return np.concatenate([above, np.zeros((*read.shape, len(time_constants)))], axis=2)
+    return np.concatenate([above, late(stations.times, read, time_constants)], axis=2)
+
+
+def _add_growth(space: ParameterSpace, per_growth: np.ndarray, stations: Stations, result: np.ndarray) -> None:
+    """Write the derivatives by expansions, and by those that come late."""
+    blocks = space.block("expansion"), space.block("late")
+    if not any(blocks):
+        return
+    constants = (space.settings.time_constants or ()) if blocks[1] else ()
+    columns = per_growth[..., None] * growth_causes(space, stations, constants)[:, None]
+    for block, part in zip(blocks, (columns[..., :1], columns[..., 1:]), strict=True):
+        if block is not None:
+            result[:, :, block.part] = part.reshape(*result.shape[:2], -1)
 
 
 def _block(
@@ -105,7 +194,7 @@ def _block(
     rotations: np.ndarray,
     stations: Stations,
 ) -> np.ndarray:
-    """Return ∂e/∂x of one block; zeros for the field, which has no part in the struts."""
+    """Return ∂e/∂x of one block; zeros for what is written later: the field, and growth."""
     commands = stations.commands
     if name == "structure":
         base = (per_length[:, :, :, None] * u[:, None]).reshape(len(commands), 6, 18)

@@ -119,7 +119,7 @@ def followed(behind: float, change: float, ages: float) -> float:
     return behind * (1.0 - gone) - change * kept
 
 
-def late(times: np.ndarray, values: np.ndarray, time_constants: Sequence[float]) -> np.ndarray:
+def late(times: np.ndarray, values: np.ndarray, time_constants: Sequence[float] | np.ndarray) -> np.ndarray:
     """Return how far lags are behind at each reading of some thermometers, K.
 
     Parameters

@@ -155,7 +155,8 @@ def test_vector_names_and_sizes(space: ParameterSpace):
     sizes = {block.name: len(block.labels) for block in space.blocks}
     knots, terms, turning = len(space.knots), len(space.field.terms), len(space.field.reversal_terms)
     expected = (33, 6, 12, 6, 6 * knots, 3 * terms, 3 * terms, 18 * turning)
-    assert sizes == dict(zip(BLOCKS, expected, strict=True))
+    cold = [name for name in BLOCKS if name not in ("expansion", "late")]  # nothing has warmed
+    assert sizes == dict(zip(cold, expected, strict=True))
     labels = [label for block in space.blocks for label in block.labels]
     assert len(set(labels)) == space.size == sum(sizes.values())
     assert [block.part.start for block in space.blocks] == np.cumsum([0, *expected[:-1]]).tolist()

@@ -19,6 +19,8 @@ from hexapod_comp.pose import Pose
 PROBE = np.array([0.02, -0.03, -0.06])
 COLD = FitSettings(lead=small.LEAD, field_degree=2)
 WARM = replace(COLD, strut_expansion=12e-6, base_expansion=11e-6, platform_expansion=23e-6)
+LATE = replace(WARM, time_constants=(500.0, 5000.0), blocks=("pitch", "backlash", "expansion", "late"))
+BY_ONE = replace(LATE, thermometer="base")
 SPLIT = replace(WARM, shared_platform_joints=False)
 STRUTS_ONLY = replace(COLD, blocks=("pitch", "wave", "backlash", "map"))
 
@@ -36,6 +38,7 @@ def case(geometry: HexapodGeometry, settings: FitSettings) -> tuple[ParameterSpa
     poses = [Pose(p, r) for p, r in zip(positions, rotations, strict=True)]
     temperatures = [tuple(20.0 + rng.uniform(-8.0, 8.0, 8)) for _ in poses]
     readings = small.scattered(geometry, poses, temperatures, PROBE)
+    readings = replace(readings, stations=replace(readings.stations, times=np.sort(rng.uniform(0.0, 9e3, len(poses)))))
     space = ParameterSpace(readings, settings)
     x = space.physical(space.spread(space.start_tolerances()) * rng.standard_normal(space.size))
     backlash = space.block("backlash").part
@@ -74,10 +77,12 @@ def worst(found: np.ndarray, wanted: np.ndarray) -> float:
         (small.paper, WARM, 2e-3),
         (small.paper, SPLIT, 2e-3),
         (general_machine, WARM, 2e-3),
+        (small.paper, LATE, 2e-3),
+        (general_machine, BY_ONE, 2e-3),
         # A screw that the platform's turning turns: lead/2π times 10 rad per metre of strut.
         (led, STRUTS_ONLY, 3e-2),
     ],
-    ids=["shared joints", "separate joints", "twelve joints", "turning screws"],
+    ids=["shared joints", "separate joints", "twelve joints", "late parts", "one thermometer", "turning screws"],
 )
 def test_every_block_against_finite_differences(
     make: Callable[[], HexapodGeometry], settings: FitSettings, tolerance: float

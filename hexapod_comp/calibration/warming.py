@@ -1,0 +1,288 @@
+"""Growth seen while a machine warms: time constants sought from the readings, and what the readings tell of heat.
+
+For given time constants the growth is linear in what is fitted. So each constant of a logarithmic grid, and each pair,
+is tried on what a fit without late parts leaves: its gain is by how much it raises the logarithm of the readings'
+probability, all other parameters and the late parts' prior integrated out. A parabola through the best three refines
+it, and says how well it is known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from ..formats.texts import number
+from ..machine.late import MOST_TIME_CONSTANTS, PARTS, TIME_CONSTANT_RANGE, LateGrowth
+from ..machine.model import REFERENCE_TEMPERATURE
+from ..measurements.readings import KINDS, MeasurementSet
+from .estimation import Estimation, Posterior, Solution, physical_covariance, solve
+from .parameters import LEAST_WARMING, TOLERANCES, ParameterSpace, growth_root
+from .sensitivity import growth_causes, growth_columns, predict
+
+GRID = 40
+"""Time constants tried, from :data:`SHORTEST` to :data:`LONGEST` times what the readings span: a sixth apart."""
+
+SHORTEST, LONGEST = 1.0 / 200.0, 2.0
+
+CLEAR_GAIN = 10.0
+"""A time constant must make the readings e¹⁰ times as probable."""
+
+SEEN_SHARE = 0.5
+"""A parameter is determined when more than this share of it comes from the readings."""
+
+
+@dataclass(frozen=True)
+class TimeConstants:
+    """Time constants, and how well they are known.
+
+    Attributes
+    ----------
+    values : tuple of float
+        s.
+    deviations : tuple of float
+        Standard deviation of the logarithm of each.
+    """
+
+    values: tuple[float, ...] = ()
+    deviations: tuple[float, ...] = ()
+
+
+def seek_time_constants(
+    measurements: MeasurementSet, space: ParameterSpace, progress: Callable[[str], object]
+) -> TimeConstants:
+    """Return the time constants that the readings show; none where there are none, or nothing tells.
+
+    Parameters
+    ----------
+    measurements : MeasurementSet
+        The readings.
+    space : ParameterSpace
+        Of a fit without late parts.
+    progress : callable
+        Told what goes on.
+    """
+    settings, times = space.settings, measurements.stations.times
+    if "late" not in settings.blocks or settings.time_constants is not None or not np.ptp(times) > 0.0:
+        return TimeConstants()
+    progress("seeking time constants")
+    grid = np.ptp(times) * np.geomspace(SHORTEST, LONGEST, GRID)
+    grid = grid[(grid >= TIME_CONSTANT_RANGE[0]) & (grid <= TIME_CONSTANT_RANGE[1])]
+    if len(grid) < 3:
+        return TimeConstants()
+    estimation = Estimation(measurements, space)
+    scan = _Scan.of(estimation, grid, _tried(estimation))
+    best, gain = scan.best(1)
+    if gain < CLEAR_GAIN:
+        return TimeConstants()
+    # A constant that is left out raises the noise, which hides a second one: once more with the noise that it leaves.
+    with_best = ParameterSpace(measurements, replace(settings, time_constants=tuple(grid[list(best)].tolist())))
+    tried = _tried(Estimation(measurements, with_best))
+    scan = _Scan.of(estimation, grid, replace(tried, tolerances=tried.tolerances[:-1]))
+    (best, gain), (pair, gain_of_pair) = scan.best(1), scan.best(MOST_TIME_CONSTANTS)
+    return scan.refined(pair if gain_of_pair > gain + CLEAR_GAIN else best)
+
+
+def _tried(estimation: Estimation) -> Posterior:
+    """Return the fit linearised at the nominal machine."""
+    space = estimation.space
+    problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(estimation.measurements)))
+    return solve(space, problem, space.start_tolerances(), np.ones(len(KINDS)))
+
+
+class _Scan:
+    """What each time constant of a grid would explain of what a fit without late parts leaves."""
+
+    def __init__(self, grid: np.ndarray, normal: np.ndarray, moment: np.ndarray) -> None:
+        self._grid, self._normal, self._moment = grid, normal, moment
+
+    @staticmethod
+    def of(estimation: Estimation, grid: np.ndarray, known: Posterior) -> _Scan:
+        """Return the scan at the nominal machine with known tolerances and noise."""
+        space, cells, stations = estimation.space, estimation.cells, estimation.measurements.stations
+        nominal = np.zeros(space.size)
+        problem, _ = estimation.linearise(nominal, np.ones(len(estimation.measurements)))
+        posterior = solve(space, problem, known.tolerances, known.noise, rounds=0)
+        per_growth = growth_columns(space, predict(space, nominal, stations))[cells.station]
+        per_growth = np.einsum("ci,cip->cp", cells.directions, per_growth)
+        behind = growth_causes(space, stations, grid)[cells.station, :, 1:]
+        columns = (per_growth[:, :, None] * behind).transpose(0, 2, 1) @ (TOLERANCES["late"] * growth_root(1))
+        columns = estimation.free_of_unknowns(columns.reshape(len(columns), -1))
+        over = 1.0 / posterior.noise[problem.kind]
+        rows, columns = over[:, None] * problem.rows[:, posterior.used], over[:, None] * columns
+        left = over * problem.target - rows @ posterior.y
+        shared = rows.T @ columns
+        return _Scan(grid, columns.T @ columns - shared.T @ posterior.covariance @ shared, columns.T @ left)
+
+    def gain(self, chosen: Sequence[int]) -> float:
+        """Return by how much some constants of the grid raise the logarithm of the readings' probability."""
+        parts = len(PARTS)
+        members = np.concatenate([np.arange(parts * n, parts * (n + 1)) for n in chosen])
+        matrix = np.eye(len(members)) + self._normal[np.ix_(members, members)]
+        moment = self._moment[members]
+        return float(0.5 * moment @ np.linalg.solve(matrix, moment) - 0.5 * np.linalg.slogdet(matrix)[1])
+
+    def best(self, count: int) -> tuple[tuple[int, ...], float]:
+        """Return so many constants of the grid that gain most, and what they gain."""
+        gains = {chosen: self.gain(chosen) for chosen in combinations(range(len(self._grid)), count)}
+        best = max(gains, key=gains.__getitem__)
+        return best, gains[best]
+
+    def refined(self, chosen: tuple[int, ...]) -> TimeConstants:
+        """Return the summits of parabolas through each constant's gain and its neighbours', the others kept."""
+        step = np.log(self._grid[1] / self._grid[0])
+        values, deviations = [], []
+        for place, n in enumerate(chosen):
+            others = chosen[:place] + chosen[place + 1 :]
+            if not 0 < n < len(self._grid) - 1 or {n - 1, n + 1} & {*others}:
+                values.append(float(self._grid[n]))
+                deviations.append(math.inf)
+                continue
+            before, here, after = (self.gain((*others, n + way)) for way in (-1, 0, 1))
+            bend = 2.0 * here - before - after
+            values.append(float(self._grid[n] * np.exp(step * 0.5 * (after - before) / bend)))
+            deviations.append(float(step / np.sqrt(bend)))
+        return TimeConstants(tuple(values), tuple(deviations))
+
+
+@dataclass(frozen=True)
+class PartGrowth:
+    """How one kind of part grows.
+
+    Attributes
+    ----------
+    part : str
+        ``struts`` (their mean), ``base`` or ``platform``.
+    stated, expansion, deviation : float
+        Expansion as stated, as fitted, and its standard deviation, 1/K.
+    determined : float
+        Share of it that comes from the readings.
+    late : tuple of float
+        What of it comes late, by time constant, 1/K.
+    """
+
+    part: str
+    stated: float
+    expansion: float
+    deviation: float
+    determined: float
+    late: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Warming:
+    """What readings tell of heat.
+
+    Attributes
+    ----------
+    changes : tuple of (str, float)
+        By how much each thermometer changed, K; thermometers that nobody read are not here.
+    thermometer : str
+        The one that stands for all parts; empty: each has its own.
+    parts : tuple of PartGrowth
+        Empty where no expansion was fitted.
+    time_constants : TimeConstants
+        None where no part is late.
+    timed : bool
+        Whether the readings have times.
+    """
+
+    changes: tuple[tuple[str, float], ...]
+    thermometer: str
+    parts: tuple[PartGrowth, ...]
+    time_constants: TimeConstants
+    timed: bool
+
+    @staticmethod
+    def of(
+        measurements: MeasurementSet, space: ParameterSpace, solution: Solution, time_constants: TimeConstants
+    ) -> Warming:
+        """Return what a fit tells."""
+        stations, block = measurements.stations, space.block("expansion")
+        read = (stations.temperatures != REFERENCE_TEMPERATURE).any(axis=0)
+        changes = zip(PARTS, np.ptp(stations.temperatures, axis=0).tolist(), read, strict=True)
+        growth = space.model(solution.x, with_field=False).late_growth
+        if growth.time_constants and not time_constants.values:  # given
+            time_constants = TimeConstants(growth.time_constants, (0.0,) * len(growth.time_constants))
+        covariance = physical_covariance(space, solution.posterior)
+        return Warming(
+            changes=tuple((name, change) for name, change, is_read in changes if is_read),
+            thermometer=space.settings.thermometer,
+            parts=() if block is None else tuple(_parts(space, solution, covariance, block.part.start, growth)),
+            time_constants=time_constants if growth.time_constants else TimeConstants(),
+            timed=bool(np.isfinite(stations.times).all()),
+        )
+
+
+MEMBERS = {"struts": slice(0, 6), "base": slice(6, 7), "platform": slice(7, 8)}
+"""Which of :data:`~hexapod_comp.machine.late.PARTS` belong to each kind of part."""
+
+
+def _parts(
+    space: ParameterSpace, solution: Solution, covariance: np.ndarray, start: int, growth: LateGrowth
+) -> Iterator[PartGrowth]:
+    """Yield how each kind of part grows; the expansions stand in the parameters from `start` on."""
+    prior = space.prior_covariance(solution.posterior.tolerances)
+    for name, members in MEMBERS.items():
+        where = slice(start + members.start, start + members.stop)
+        stated, variance = float(space.stated_expansion[members].mean()), float(covariance[where, where].mean())
+        yield PartGrowth(
+            part=name,
+            stated=stated,
+            expansion=stated + float(solution.x[where].mean()),
+            deviation=math.sqrt(variance),
+            determined=1.0 - variance / float(prior[where, where].mean()),
+            late=tuple(growth.expansion[members].mean(axis=0).tolist()),
+        )
+
+
+def warming_text(warming: Warming) -> str:
+    """Return what readings tell of heat, for people; empty where no thermometer was read."""
+    if not warming.changes:
+        return ""
+    listed = ", ".join(f"{name} {change:.2f} K" for name, change in warming.changes)
+    whose = f"; {warming.thermometer} stands for all parts" if warming.thermometer else ""
+    lines = [f"heat; change of each thermometer: {listed}{whose}"]
+    if not warming.parts:
+        least = f"temperatures changed by less than {LEAST_WARMING:g} K, or growth explains nothing"
+        lines.append(f"  expansion is not determined: {least}; what was stated stays")
+    constants = warming.time_constants
+    for p in warming.parts:
+        late = zip(p.late, constants.values, strict=True)
+        listed = "".join(f", {1e6 * value:+.1f} of it late by {number(constant, 0)} s" for value, constant in late)
+        line = (
+            f"  {p.part}: {1e6 * p.expansion:.2f} ± {1e6 * p.deviation:.2f} ppm/K (stated {1e6 * p.stated:g}){listed}"
+        )
+        lines.append(line + ("" if p.determined > SEEN_SHARE else "; these readings do not determine it"))
+    for value, deviation in zip(constants.values, constants.deviations, strict=True):
+        low, high = (number(value * math.exp(2.0 * way * min(deviation, 1.0)), 0) for way in (-1, 1))
+        known = "given" if deviation == 0.0 else f"{low}…{high} s with 95 %" if deviation < 1.0 else "hardly determined"
+        lines.append(f"  time constant {number(value, 0)} s ({known})")
+    if warming.parts and not warming.timed:
+        lines.append("  the readings have no times (time_s): how late parts follow their thermometers is not known")
+    return "\n".join(lines)
+
+
+def warming_json(warming: Warming) -> dict:
+    """Return what readings tell of heat as plain numbers; units are in the keys."""
+    constants = warming.time_constants
+    return {
+        "changes_K": dict(warming.changes),
+        "thermometer": warming.thermometer or None,
+        "parts": [
+            {
+                "part": p.part,
+                "stated_per_K": p.stated,
+                "expansion_per_K": p.expansion,
+                "standard_error_per_K": p.deviation,
+                "determined": p.determined,
+                "late_per_K": p.late,
+            }
+            for p in warming.parts
+        ],
+        "time_constants_s": constants.values,
+        "time_constants_relative_error": constants.deviations,
+    }

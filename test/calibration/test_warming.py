@@ -1,0 +1,123 @@
+"""What a fit tells of heat, on machines whose expansions and time constants are known."""
+
+from dataclasses import replace
+from functools import cache
+
+import calibration_helpers as small
+import numpy as np
+import pytest
+
+from hexapod_comp.calibration.fit import ModelFit, fit_model
+from hexapod_comp.calibration.parameters import FitSettings
+from hexapod_comp.calibration.warming import warming_json, warming_text
+from hexapod_comp.errors import ModelError
+from hexapod_comp.machine.late import LateGrowth
+from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.measurements.campaign import Campaign, template
+from hexapod_comp.measurements.campaign_runs import CampaignRun
+from hexapod_comp.measurements.readings import MeasurementSet
+from hexapod_comp.virtual.instruments import measure
+
+TAU = 1500.0
+SETTINGS = FitSettings(blocks=("expansion", "late"))
+
+
+def truth(thermometer: str = "base") -> RealMachine:
+    """Return a machine without errors but growth; struts run ahead of their thermometer, the platform lags."""
+    expansion = np.array([[-20e-6]] * 6 + [[0.0], [8e-6]])
+    model = MachineModel(
+        "paper", "warm", struts=StrutErrors(expansion=np.full(6, 15e-6)), base_expansion=11e-6,
+        platform_expansion=14e-6, late_growth=LateGrowth((TAU,), expansion, thermometer),
+    )  # fmt: skip
+    return RealMachine(small.paper(), model)
+
+
+@cache
+def measured(rise: float = 3.0, timed: bool = True, parts: tuple[int, ...] = (6,)) -> MeasurementSet:
+    """Return x, y and z lines read in eight rounds, a quarter of an hour apart, while thermometers rise."""
+    runs = []
+    for number in range(8):
+        for axis in range(3):
+            positions = np.tile(small.BOX.mean(axis=0), (5, 1))
+            positions[:, axis] = np.linspace(*small.BOX[:, axis], 5)
+            runs.append(CampaignRun(f"{axis} {number}", "5-D", positions, np.tile(np.eye(3), (5, 1, 1))))
+    plan = Campaign(small.BOX, 0.2, 0.05, None, 0, runs=tuple(runs), noise=(2e-7, 2e-7, 2e-7, 1e-6, 1e-6))
+    planned = template(plan, small.paper())
+    times = 30.0 * np.arange(len(planned.stations))
+    temperatures = np.full((len(times), 8), 20.0)
+    temperatures[:, parts] -= rise * np.expm1(-times / 5400.0)[:, None]
+    stations = replace(planned.stations, temperatures=temperatures, times=times)
+    machine = truth("base" if parts == (6,) else "")
+    read = measure(replace(planned, stations=stations), plan, machine, seed=3)
+    known = stations.times if timed else np.full(len(times), np.nan)
+    return replace(read, stations=replace(stations, times=known))
+
+
+@cache
+def fit() -> ModelFit:
+    return fit_model(measured(), SETTINGS)
+
+
+def test_expansions_and_time_constant_come_back():
+    """Within three of the standard deviations that the fit states; the struts' mean to 1 ppm/K besides."""
+    warming = fit().warming
+    wanted = {"struts": (15e-6, -20e-6), "base": (11e-6, 0.0), "platform": (14e-6, 8e-6)}
+    assert [p.part for p in warming.parts] == list(wanted)
+    for part in warming.parts:
+        assert abs(part.expansion - wanted[part.part][0]) < 3.0 * part.deviation, part
+    assert warming.parts[0].expansion == pytest.approx(15e-6, abs=1e-6)
+    (constant,), (deviation,) = warming.time_constants.values, warming.time_constants.deviations
+    assert abs(np.log(constant / TAU)) < 3.0 * deviation < 0.6
+
+
+def test_the_model_follows_the_one_thermometer():
+    model = fit().model.late_growth
+    assert (model.thermometer, model.time_constants) == ("base", fit().warming.time_constants.values)
+
+
+def test_the_report_says_what_came_out_and_which_thermometers_were_read():
+    text = warming_text(fit().warming)
+    assert "base 2." in text.splitlines()[0]
+    assert "base stands for all parts" in text
+    assert "struts: 1" in text
+    assert "(stated 0)" in text
+    assert "with 95 %" in text
+    assert warming_json(fit().warming)["time_constants_s"] == fit().warming.time_constants.values
+
+
+def test_without_a_warm_up_nothing_is_invented():
+    """0.3 K are below what a sensor's drift may be: stated expansions stay, and the report says so."""
+    cold = fit_model(measured(rise=0.35), replace(SETTINGS, strut_expansion=12e-6))
+    assert cold.warming.parts == ()
+    assert cold.model.late_growth.time_constants == ()
+    np.testing.assert_array_equal(cold.model.struts.expansion, 12e-6)
+    assert "expansion is not determined" in warming_text(cold.warming)
+
+
+def test_readings_without_times_show_no_time_constants():
+    untimed = fit_model(measured(timed=False), SETTINGS)
+    assert untimed.warming.time_constants.values == ()
+    assert "no times (time_s)" in warming_text(untimed.warming)
+
+
+def test_a_part_that_stayed_cold_keeps_what_was_stated():
+    """Struts alone warm, by sensors of their own: base and platform stay at 20 °C, and show nothing."""
+    struts = fit_model(measured(parts=tuple(range(6))), replace(SETTINGS, base_expansion=11e-6))
+    assert struts.model.base_expansion == pytest.approx(11e-6, abs=1e-12)
+    assert "base: 11.00" in warming_text(struts.warming)
+    assert warming_text(struts.warming).count("these readings do not determine it") == 2
+
+
+def test_given_time_constants_are_taken():
+    given = fit_model(measured(), replace(SETTINGS, time_constants=(1200.0,)))
+    assert given.model.late_growth.time_constants == (1200.0,)
+    assert "time constant 1200 s (given)" in warming_text(given.warming)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"time_constants": (5.0,)}, {"time_constants": (90.0, 30.0)}, {"thermometer": "spindle"}]
+)
+def test_settings_in_doubt_are_refused(wrong: dict):
+    with pytest.raises(ModelError, match="thermal"):
+        FitSettings(**wrong)
