@@ -19,7 +19,7 @@ from .observability import Allowed, Observability, ToolError, expected_error, ob
 from .parameters import FitSettings, ParameterSpace
 from .selection import Decision, select
 from .smooth_field import DIGITS
-from .warming import Warming, seek_time_constants
+from .warming import HeatSeen, seek_time_constants
 
 SURE = 4.0
 """Backlash so many standard deviations below zero is no noise."""
@@ -121,7 +121,7 @@ class ModelFit:
         What the readings do not rule out.
     held : HeldDatum
         Where the tool is held: the model is the solution's machine, shifted and turned as a whole.
-    warming : Warming
+    warming : HeatSeen
         What they tell of heat.
     """
 
@@ -139,7 +139,7 @@ class ModelFit:
     notes: tuple[str, ...]
     allowed: Allowed
     held: HeldDatum
-    warming: Warming
+    warming: HeatSeen
 
     @property
     def misfit(self) -> str:
@@ -214,7 +214,7 @@ def fit_model(
         notes=(*measurements.notes, *notes, *_check_worth(level)),
         allowed=allowed,
         held=held,
-        warming=Warming.of(measurements, space, solution, constants),
+        warming=HeatSeen.of(measurements, space, solution, constants),
     )
 
 

@@ -173,7 +173,7 @@ class PartGrowth:
 
 
 @dataclass(frozen=True)
-class Warming:
+class HeatSeen:
     """What readings tell of heat.
 
     Attributes
@@ -199,7 +199,7 @@ class Warming:
     @staticmethod
     def of(
         measurements: MeasurementSet, space: ParameterSpace, solution: Solution, time_constants: TimeConstants
-    ) -> Warming:
+    ) -> HeatSeen:
         """Return what a fit tells."""
         stations, block = measurements.stations, space.block("expansion")
         read = (stations.temperatures != REFERENCE_TEMPERATURE).any(axis=0)
@@ -208,7 +208,7 @@ class Warming:
         if growth.time_constants and not time_constants.values:  # given
             time_constants = TimeConstants(growth.time_constants, (0.0,) * len(growth.time_constants))
         covariance = physical_covariance(space, solution.posterior)
-        return Warming(
+        return HeatSeen(
             changes=tuple((name, change) for name, change, is_read in changes if is_read),
             thermometer=space.settings.thermometer,
             parts=() if block is None else tuple(_parts(space, solution, covariance, block.part.start, growth)),
@@ -239,7 +239,7 @@ def _parts(
         )
 
 
-def warming_text(warming: Warming) -> str:
+def warming_text(warming: HeatSeen) -> str:
     """Return what readings tell of heat, for people; empty where no thermometer was read."""
     if not warming.changes:
         return ""
@@ -266,7 +266,7 @@ def warming_text(warming: Warming) -> str:
     return "\n".join(lines)
 
 
-def warming_json(warming: Warming) -> dict:
+def warming_json(warming: HeatSeen) -> dict:
     """Return what readings tell of heat as plain numbers; units are in the keys."""
     constants = warming.time_constants
     return {
