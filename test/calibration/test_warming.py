@@ -16,7 +16,7 @@ from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.campaign_runs import CampaignRun
-from hexapod_comp.measurements.readings import MeasurementSet
+from hexapod_comp.measurements.readings import KINDS, MeasurementSet
 from hexapod_comp.virtual.instruments import measure
 
 TAU = 1500.0
@@ -42,7 +42,7 @@ def measured(rise: float = 3.0, timed: bool = True, parts: tuple[int, ...] = (6,
             positions = np.tile(small.BOX.mean(axis=0), (5, 1))
             positions[:, axis] = np.linspace(*small.BOX[:, axis], 5)
             runs.append(CampaignRun(f"{axis} {number}", "5-D", positions, np.tile(np.eye(3), (5, 1, 1))))
-    plan = Campaign(small.BOX, 0.2, 0.05, None, 0, runs=tuple(runs), noise=(2e-7, 2e-7, 2e-7, 1e-6, 1e-6))
+    plan = Campaign(small.BOX, 0.2, 0.05, None, 0, runs=tuple(runs), noise=(2e-7,) * len(KINDS))
     planned = template(plan, small.paper())
     times = 30.0 * np.arange(len(planned.stations))
     temperatures = np.full((len(times), 8), 20.0)
