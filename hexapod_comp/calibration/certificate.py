@@ -191,7 +191,7 @@ def _result(fit: ModelFit) -> Iterator[str]:
     """Yield the machine's error before and after compensation."""
     yield "<h2>Result</h2>"
     if fit.level is None:
-        yield "<p>The readings span no box in which an error of the tool could be given.</p>"
+        yield "<p>These readings bear no promise of what error is left.</p>"
         return
     yield (
         f"<p>Error of the tool in space at random places of the measured box, {corners(fit.space.work_box)}, both "

@@ -233,6 +233,8 @@ def _tool_error_panel(axes: Axes, fit: ModelFit) -> None:
 def _maps(fit: ModelFit) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return x, y, three heights, m in work, and errors before and after, µm, shape (3, y, x), in the measured box.
 
+    After: as large in all as the fit promises, or larger.
+
     Raises
     ------
     CalibrationError
@@ -245,8 +247,10 @@ def _maps(fit: ModelFit) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     heights = np.linspace(low[2], high[2], 3)
     points = np.stack(np.meshgrid(heights, y, x, indexing="ij"), axis=-1)[..., ::-1].reshape(-1, 3)
     errors = errors_in_space(fit.space, fit.solution.x, fit.covariance, fit.space.places(points))
-    before, after = (part.reshape(3, MAP_NODES, MAP_NODES) * 1e6 for part in errors)
-    return x, y, heights, before, after
+    before, left = (part.reshape(3, MAP_NODES, MAP_NODES) * 1e6 for part in errors)
+    # What the promise allows for beside the parameters is nowhere in particular, so it is everywhere.
+    beside = 0.0 if fit.level is None else (fit.level.after * 1e6) ** 2 - np.nanmean(left**2)
+    return x, y, heights, before, np.sqrt(left**2 + max(beside, 0.0))
 
 
 def left_error_figure(fit: ModelFit) -> Figure:
