@@ -233,18 +233,18 @@ def _instruments(fit: ModelFit, details: Details) -> Iterator[str]:
     yield table(("instrument", "readings", "u stated (k = 1)", "U stated (k = 2)", "u as fitted", "unit"), rows)
     named = details.instruments or ("",) * len(rows)
     yield table(("", "type, serial number, calibration"), [(str(n), text) for n, text in enumerate(named, 1)], "text")
-    yield table(("", "lowest °C", "highest °C"), _temperatures(fit))
-    settings = fit.space.settings
-    grows = [f"{v * 1e6:g}" for v in (settings.strut_expansion, settings.base_expansion, settings.platform_expansion)]
-    yield f"<p>Growth taken out: struts {grows[0]}, base {grows[1]}, platform {grows[2]} ppm/K from 20 °C.</p>"
+    yield table(("part", "lowest °C", "highest °C", "expansion in the model, ppm/K"), _temperatures(fit))
 
 
-def _temperatures(fit: ModelFit) -> list[tuple[str, str, str]]:
-    values = fit.measurements.stations.temperatures
-    if (values == REFERENCE_TEMPERATURE).all():
-        return [("struts, base, platform", "20 or not recorded", "20 or not recorded")]
-    ends = zip(Temperatures.NAMES, values.min(axis=0), values.max(axis=0), strict=True)
-    return [(name, number(low, 2), number(high, 2)) for name, low, high in ends]
+def _temperatures(fit: ModelFit) -> Iterator[tuple[str, ...]]:
+    """Yield each part with its temperatures while it was measured, and its expansion."""
+    values, model = fit.measurements.stations.temperatures, fit.model
+    expansions = (*model.struts.expansion, model.base_expansion, model.platform_expansion)
+    parts = zip(Temperatures.NAMES, values.T, expansions, strict=True)
+    for name, of_part, expansion in parts:
+        known = (of_part != REFERENCE_TEMPERATURE).any()
+        ends = [number(v, 2) if known else "20 or not recorded" for v in (of_part.min(), of_part.max())]
+        yield name, *ends, number(expansion * 1e6, 2)
 
 
 def _measured(fit: ModelFit) -> str:

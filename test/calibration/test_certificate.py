@@ -182,3 +182,17 @@ def test_the_maps_promise_no_more_than_the_report(fit: ModelFit) -> None:
     after = [axes.collections[0].get_array() for axes in figure.axes if axes.get_title().startswith("after")]
     assert len(after) == 3
     assert np.sqrt(np.mean(np.square(after))) == pytest.approx(5.0, rel=1e-6)
+
+
+@pytest.mark.usefixtures("unpictured")
+def test_temperatures_and_expansions_of_each_part(fit: ModelFit, filed: Filed) -> None:
+    """What the stations felt, at its ends, and what the model does with it."""
+    m = fit.measurements
+    warm = m.stations.temperatures.copy()
+    warm[0, 6], warm[1, 6] = 18.5, 23.25
+    stations = replace(m.stations, temperatures=warm)
+    model = replace(fit.model, base_expansion=11.5e-6)
+    warmed = replace(fit, model=model, measurements=replace(m, stations=stations))
+    rows = {row[0]: row[1:] for row in cells(certificate_text(warmed, filed))}
+    assert rows["base"] == ["18.50", "23.25", "11.50"]
+    assert rows["strut_1"] == ["20 or not recorded", "20 or not recorded", "0.00"]
