@@ -110,6 +110,7 @@ setup(
         "completion": ["argcomplete>=3.1"],  # rosdep: python3-argcomplete; nobody needs it to run anything
     },
     entry_points={
+        "pytest11": [f"{NAME}.testing = {NAME}.testing"],
         "console_scripts": [
             f"hexapod_comp = {NAME}.cli:main",
             f"compensator = {NAME}.nodes:start_compensator",

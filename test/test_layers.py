@@ -11,12 +11,12 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "hexapod_comp"
 ROOMS = (
     "errors", "kernels", "pose", "formats", "machine", "compensation", "measurements", "virtual", "workspace",
-    "calibration", "papers", "export", "replay", "nodes", "linuxcnc", "loop", "cli", "__main__",
+    "calibration", "papers", "export", "replay", "nodes", "linuxcnc", "loop", "cli", "testing", "__main__",
 )  # fmt: skip
 """From the ground up: a room imports from itself and from those before it."""
 
 MODULES = sorted(PACKAGE.rglob("*.py"))
-ROS_ROOMS = ("nodes", "linuxcnc")
+ROS_ROOMS = ("nodes", "linuxcnc", "testing")
 PICTURE_MODULES = ("pictures", "page", "figures")
 PICTURE_LIBRARIES = {"matplotlib", "mpl_toolkits", "plotly"}
 

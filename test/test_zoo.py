@@ -414,10 +414,10 @@ def linuxcnc(folder: Path, tips: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture
-def bench(ros_context, spin_until, capfd) -> Iterator[Any]:
+def bench(ros_context, capfd) -> Iterator[Any]:
     from node_helpers import Bench
 
-    with Bench(ros_context, spin_until, capfd) as made:
+    with Bench(ros_context, capfd) as made:
         yield made
 
 

@@ -190,10 +190,10 @@ def refused_requests(bench: Bench) -> None:
         assert [result.successful for result in results] == [False]
 
 
-def test_over_dds(ros_context: Any, spin_until: Any, capfd: Any) -> None:
+def test_over_dds(ros_context: Any, capfd: Any) -> None:
     """The same through the middleware: any messages at all, then a good command is answered."""
     random = np.random.default_rng(11)
-    with Bench(ros_context, spin_until, capfd) as bench:
+    with Bench(ros_context, capfd) as bench:
         bench.compensator(following_error_limit=0.0)
         for _ in range(200):
             numbers = random.choice([0.0, 1.0, 0.4, math.nan, math.inf, -1e300, 5e-324, 0.1], 7).tolist()

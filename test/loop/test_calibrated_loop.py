@@ -110,8 +110,8 @@ def promise(tmp_path_factory: pytest.TempPathFactory) -> Promise:
 
 
 @pytest.fixture
-def bench(ros_context: Any, spin_until: Any, capfd: pytest.CaptureFixture[str]) -> Iterator[Bench]:
-    with Bench(ros_context, spin_until, capfd) as made:
+def bench(ros_context: Any, capfd: pytest.CaptureFixture[str]) -> Iterator[Bench]:
+    with Bench(ros_context, capfd) as made:
         yield made
 
 

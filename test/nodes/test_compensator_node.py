@@ -1111,8 +1111,8 @@ def test_quality_of_service_can_be_overridden(bench):
     assert ends["/tool_pose_estimate"].reliability == ReliabilityPolicy.BEST_EFFORT
 
 
-def test_two_machines_in_two_namespaces_do_not_mix(ros_context, spin_until, capfd):
-    here = (ros_context, spin_until, capfd)
+def test_two_machines_in_two_namespaces_do_not_mix(ros_context, capfd):
+    here = (ros_context, capfd)
     with Bench(*here, "/left") as left, Bench(*here, "/right") as right:
         left.compensator(model_file="ideal")
         right.compensator()
@@ -1147,6 +1147,7 @@ def test_discovery_stays_on_this_machine_unless_told_otherwise(monkeypatch, envi
 
 
 def test_standard_messages_on_the_topics_of_the_readme(bench):
+    bench.speak("strut_setpoints")
     bench.compensator(publish_array=True)
     found = dict(bench.witness.get_topic_names_and_types())
     for topic, kind in SENT.items():

@@ -279,7 +279,7 @@ def test_who_asked_is_logged(bench, service):
 def test_a_node_keeps_the_clock_that_it_began_with(bench, node):
     """Half of what a node does would go on by the other clock."""
     made = bench.compensator() if node == "compensator" else bench.drive()
-    results = [bench.set_bool(node, USE_SIM_TIME, value) for value in (True, False)]
+    results = [bench.set_parameter(node, USE_SIM_TIME, value) for value in (True, False)]
     assert [result.successful for result in results] == [False, True]
     assert results[0].reason == "parameter use_sim_time: is false for as long as the node runs; set it at the start"
     assert made.get_parameter(USE_SIM_TIME).value is False

@@ -94,11 +94,11 @@ def test_a_start_from_the_last_command_is_replayed_bit_for_bit(bench, tmp_path):
     assert resets[-2:] == [answers[39].lengths.tolist(), answers[58].lengths.tolist()]
 
 
-def test_recording_may_begin_in_motion_and_two_machines_share_a_bag(ros_context, spin_until, capfd, tmp_path):
+def test_recording_may_begin_in_motion_and_two_machines_share_a_bag(ros_context, capfd, tmp_path):
     """A recorder that comes late replays what its first snapshot precedes; each machine has its own namespace."""
     messages = Messages()
     for namespace in ("mill", "lathe"):
-        with Bench(ros_context, spin_until, capfd, namespace) as bench:
+        with Bench(ros_context, capfd, namespace) as bench:
             bench.compensator()
             for n in range(140):
                 bench.ask(along(n))

@@ -11,7 +11,7 @@ import contextlib
 import runpy
 import sys
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -120,11 +120,11 @@ def test_operators_and_thermometers_hear_and_ask_only_what_there_is() -> None:
 
 @pytest.mark.parametrize("name", ["compensator", "strut_drive", "linuxcnc_bridge"])
 def test_lifecycle_nodes_open_what_the_policy_allows(
-    name: str, ros_context: Context, spin_until: Callable[..., None], capfd: pytest.CaptureFixture[str]
+    name: str, ros_context: Context, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Nothing more, nothing less, with every optional topic switched on."""
     namespace = "/guarded"  # of its own: the graph still knows nodes of these names from other tests
-    with Bench(ros_context, spin_until, capfd, namespace) as bench:
+    with Bench(ros_context, capfd, namespace) as bench:
         if name == "compensator":
             bench.compensator(publish_array=True)
         elif name == "strut_drive":
@@ -167,14 +167,12 @@ def tool_nodes(context: Context, machines: tuple[str, ...]) -> Iterator[Node]:
         yield rclpy.create_node(TOOLS.replace("*", f"requester_std_srvs_{kind.__name__}"), context=context)
 
 
-def test_the_operator_may_all_that_the_ros2_tools_open(
-    ros_context: Context, spin_until: Callable[..., None], capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_the_operator_may_all_that_the_ros2_tools_open(ros_context: Context, capfd: pytest.CaptureFixture[str]) -> None:
     """Nothing less: a tool ends when one of its clients cannot be made. Nothing more: what else nobody asks for."""
     operator = read_policy()["operator"].allowed
     machines = ("compensator", "strut_drive", "linuxcnc_bridge")
     wanted: dict[str, set[str]] = {right: set() for right in RIGHTS}
-    with Bench(ros_context, spin_until, capfd) as bench:
+    with Bench(ros_context, capfd) as bench:
         for node in tool_nodes(ros_context, machines):
             bench.until(lambda node=node: "/rosout" in opened(bench.witness, node.get_name(), "")["publish"], "a tool")
             for right, names in opened(bench.witness, node.get_name(), "").items():

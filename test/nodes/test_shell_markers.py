@@ -10,6 +10,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from hexapod_comp.errors import GeometryError
 from hexapod_comp.nodes.shell_markers import SHELL_QOS, TOPIC, publish_shells, shell_markers, triangles
+from hexapod_comp.testing.bench import spin_until
 from hexapod_comp.workspace.layers import TRANSLATION, Layer
 
 STAMP = Time(sec=7)
@@ -61,7 +62,7 @@ def test_no_markers_of_nothing(wrong):
         shell_markers(wrong, TRANSLATION, "", "work", STAMP)
 
 
-def test_who_comes_late_sees_the_shells(ros_context, spin_until):
+def test_who_comes_late_sees_the_shells(ros_context):
     """Truth: a subscription made after the one message was sent receives it."""
     import rclpy
     from rclpy.experimental import EventsExecutor

@@ -436,10 +436,10 @@ def test_feedback_lost(bench):
     drive, _ = loop(bench, command_timeout=0.0)
     bench.settle(HOME)
     bench.until_status(OK, "running")
-    assert bench.call_parameter(DRIVE, "fault_feedback_drop", 1.0)
+    assert bench.set_parameter(DRIVE, "fault_feedback_drop", 1.0).successful
     bench.until_status(WARN, "feedback lost, pose estimated from own commands")
     bench.ask(MOVED)
-    assert bench.call_parameter(DRIVE, "fault_feedback_drop", 0.0)
+    assert bench.set_parameter(DRIVE, "fault_feedback_drop", 0.0).successful
     bench.until_status(OK, "running")
     assert drive.drive.faults.feedback_drop == 0.0
 

@@ -164,11 +164,11 @@ def test_truth_from_a_file(bench, tmp_path):
     bench.until(lambda: abs(true_pose(bench).position[2] - 0.4 - lift) < 1e-7, "the platform to be lifted")
 
 
-def test_random_truth_is_the_seeds(ros_context, spin_until, capfd):
+def test_random_truth_is_the_seeds(ros_context, capfd):
     """Commanded home, three machines of two seeds stand at two places, some 100 µm off."""
     places = []
     for seed in (1, 1, 2):
-        with Bench(ros_context, spin_until, capfd) as bench:
+        with Bench(ros_context, capfd) as bench:
             bench.drive(**{**EXACT, "truth_file": "random"}, truth_seed=seed)
             bench.until(lambda bench=bench: bench.seen["strut_states"], "readings")
             command(bench, closed_form_lengths(HOME))
@@ -426,8 +426,8 @@ def test_quality_of_service(bench):
     assert ends["/diagnostics"].reliability == ReliabilityPolicy.RELIABLE
 
 
-def test_works_in_a_namespace(ros_context, spin_until, capfd):
-    with Bench(ros_context, spin_until, capfd, "/left") as left, Bench(ros_context, spin_until, capfd) as other:
+def test_works_in_a_namespace(ros_context, capfd):
+    with Bench(ros_context, capfd, "/left") as left, Bench(ros_context, capfd) as other:
         left.drive(**EXACT)
         left.until(lambda: left.seen["strut_states"], "readings")
         command(left, closed_form_lengths(TARGET))

@@ -1,0 +1,426 @@
+"""Compensator, strut drive and nodes of one's own on one executor, without launch, processes or sleeps."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters
+from rclpy.context import Context
+from rclpy.executors import Executor
+from rclpy.experimental import EventsExecutor
+from rclpy.lifecycle import LifecycleNode
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
+from sensor_msgs.msg import JointState, Temperature
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import SetBool, Trigger
+from visualization_msgs.msg import MarkerArray
+
+from ..formats.paths import config_file
+from ..machine.geometry import STRUT_NAMES, load_geometry
+from ..machine.model_file import save_model
+from ..nodes.compensator import CompensatorNode
+from ..nodes.messages import message_pose, pose_message
+from ..nodes.running import autostart
+from ..nodes.strut_drive import StrutDriveNode
+from ..pose import Pose
+from ..virtual.named import find_model, is_random
+
+if TYPE_CHECKING:
+    import pytest
+
+RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+WATCHED = {
+    "strut_commands": (JointState, RELIABLE),
+    "strut_corrections": (JointState, RELIABLE),
+    "strut_commands_array": (Float64MultiArray, RELIABLE),
+    "strut_states": (JointState, BEST_EFFORT),
+    "tool_pose_estimate": (PoseStamped, BEST_EFFORT),
+    "tool_pose_true": (PoseStamped, BEST_EFFORT),
+    "compensator/markers": (MarkerArray, RELIABLE),
+    "/diagnostics": (DiagnosticArray, RELIABLE),
+}
+
+SENT = {
+    "tool_pose_command": PoseStamped,
+    "strut_setpoints": JointState,
+    "strut_states": JointState,
+    "strut_commands": JointState,
+    "temperatures": Temperature,
+}
+
+TRANSITIONS = {
+    "configure": Transition.TRANSITION_CONFIGURE,
+    "activate": Transition.TRANSITION_ACTIVATE,
+    "deactivate": Transition.TRANSITION_DEACTIVATE,
+    "cleanup": Transition.TRANSITION_CLEANUP,
+}
+
+LOG_LINE = re.compile(r"\[\w+\] \[[\d.]+\] \[[\w.]+\]: (.*)")
+"""How ROS logs: [WARN] [time] [node]: text."""
+
+
+@dataclass
+class Answer:
+    """What came back for one command.
+
+    Attributes
+    ----------
+    command, correction : JointState
+        The two messages with the command's stamp.
+    sent_at, answered_at : float
+        Monotonic times just before sending and just after both had come, s: the node handled it between.
+    """
+
+    command: JointState
+    correction: JointState
+    sent_at: float
+    answered_at: float
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """Strut commands, m, shape (6,)."""
+        return np.array(self.command.position)
+
+    @property
+    def corrections(self) -> np.ndarray:
+        """Strut corrections, m, shape (6,)."""
+        return np.array(self.correction.position)
+
+
+class Bench:
+    """Nodes under test on one executor in a private context, and a witness that sees and sends everything.
+
+    Parameters
+    ----------
+    context : Context
+        Private context.
+    capture : CaptureFixture, optional
+        pytest's ``capfd``, for :meth:`logged`: what is logged is read where it is written, on stderr. (Fast DDS
+        sometimes delivers only the first message of /rosout to a reader in the same process.)
+    namespace : str
+        Of the witness and of the nodes.
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        capture: pytest.CaptureFixture[str] | None = None,
+        namespace: str = "",
+    ) -> None:
+        self.context, self.namespace = context, namespace
+        self._capture, self._log = capture, ""
+        self._folder = TemporaryDirectory()
+        self.executor = EventsExecutor(context=context)
+        self.nodes: list[Node] = []
+        self.seen: dict[str, list[Any]] = defaultdict(list)
+        self.witness = rclpy.create_node("witness", context=context, namespace=namespace)
+        self.executor.add_node(self.witness)
+        for topic, (kind, qos) in WATCHED.items():
+            self.witness.create_subscription(kind, topic, self.seen[topic].append, qos)
+        self._publishers: dict[str, Any] = {}
+        for topic in SENT.keys() - {"strut_commands", "strut_setpoints"}:  # a test asks for these
+            self.speak(topic)
+        self._clients: dict[str, Any] = {}
+
+    def __enter__(self) -> Bench:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.executor.shutdown()
+        for node in (*self.nodes, self.witness):
+            node.destroy_node()
+        self._folder.cleanup()
+
+    # ---- nodes ----
+
+    def compensator(self, start: bool = True, **parameters: object) -> CompensatorNode:
+        """Add a compensator; `start` configures and activates it and waits until it is connected."""
+        self.hush("strut_commands")
+        return self.add(CompensatorNode, start, parameters)
+
+    def drive(self, start: bool = True, **parameters: object) -> StrutDriveNode:
+        """Add a strut drive, which the witness commands unless there is a compensator to do it; it alone measures."""
+        self.hush("strut_states")
+        if not self.nodes:
+            self.speak("strut_commands")
+        return self.add(StrutDriveNode, start, parameters)
+
+    def machine(self, geometry: str = "paper.yaml", model: str = "ideal", truth: str = "ideal") -> None:
+        """Add a drive with a hidden truth, and a compensator with a model; files, shipped names, ``random:7``."""
+        self.hush("tool_pose_command")
+        self.drive(geometry_file=geometry, truth_file=truth)
+        if is_random(model):
+            drawn = find_model(model, load_geometry(config_file(geometry, "geometry")))
+            model = str(Path(self._folder.name) / "model.yaml")
+            save_model(drawn, model)
+        self.compensator(geometry_file=geometry, model_file=model)
+
+    def host(self, node: Node) -> Node:
+        """Let a node of one's own run with the others; it was made with ``context=bench.context``."""
+        self.nodes.append(node)
+        self.executor.add_node(node)
+        return node
+
+    def add(self, kind: type, start: bool, parameters: dict[str, object], **options: Any) -> Any:
+        """Add a node of a kind with parameter overrides; options are those of rclpy nodes."""
+        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+        node = kind(context=self.context, namespace=self.namespace, parameter_overrides=overrides, **options)
+        self.host(node)
+        if start:
+            if not autostart(node):
+                raise RuntimeError(f"{node.get_name()} does not start: {self.logged('')}")
+            self.until(self.matched, "both directions of discovery")
+        return node
+
+    def matched(self) -> bool:
+        """Return whether what nodes and witness send each other has met, in both directions."""
+        heard = [s.topic_name for node in self.nodes for s in node.subscriptions]
+        ours = [s.topic_name for s in self.witness.subscriptions]
+        theirs = [p for node in self.nodes for p in node.publishers if p.topic_name in ours]
+        return (
+            all(p.get_subscription_count() for p in self._publishers.values() if p.topic_name in heard)
+            and all(p.get_subscription_count() for p in theirs)
+            and all(
+                s.get_publisher_count() >= sum(p.topic_name == s.topic_name for p in theirs)
+                for s in self.witness.subscriptions
+            )
+        )
+
+    # ---- time ----
+
+    def until(self, condition: Callable[[], object], what: str = "", timeout: float = 10.0) -> None:
+        """Handle messages until a condition holds; the timeout is for a computer under load.
+
+        Raises
+        ------
+        TimeoutError
+            It does not; names `what`.
+        """
+        spin_until(self.executor, condition, timeout, what)
+
+    def barrier(self) -> None:
+        """Return when every node has handled what was sent to it before.
+
+        All events of a process pass one queue, so the answer to a question comes after them.
+        """
+        for node in filter(_has_lifecycle, self.nodes):
+            self.call(GetState, f"{node.get_name()}/get_state")
+
+    # ---- services ----
+
+    def call(self, kind: Any, name: str, request: Any = None) -> Any:
+        """Call a service and return its response."""
+        client = self._client(kind, name)
+        future = client.call_async(kind.Request() if request is None else request)
+        self.until(future.done, f"answer of {name}", timeout=30.0)  # one starts a process, and others may be busy
+        return future.result()
+
+    def _client(self, kind: type, name: str) -> Any:
+        """Return a client whose service is there."""
+        if name not in self._clients:
+            self._clients[name] = self.witness.create_client(kind, name)
+        self.until(self._clients[name].service_is_ready, f"service {name}")
+        return self._clients[name]
+
+    def change(self, transition: str, node: str = "compensator") -> bool:
+        """Ask a node for a lifecycle transition; return whether it went well."""
+        request = ChangeState.Request()
+        request.transition.id = TRANSITIONS[transition]
+        return self.call(ChangeState, f"{node}/change_state", request).success
+
+    def state(self, node: str = "compensator") -> str:
+        """Return the lifecycle state of a node."""
+        return self.call(GetState, f"{node}/get_state").current_state.label
+
+    def enable(self, enabled: bool) -> SetBool.Response:
+        """Switch compensation."""
+        return self.call(SetBool, "compensator/enable_compensation", SetBool.Request(data=enabled))
+
+    def trigger(self, name: str) -> Trigger.Response:
+        """Call ``reload_model`` or ``reset``."""
+        return self.call(Trigger, f"compensator/{name}")
+
+    def begin(self, name: str) -> Any:
+        """Call ``reload_model`` or ``reset`` and return the future of its response."""
+        return self._client(Trigger, f"compensator/{name}").call_async(Trigger.Request())
+
+    def set_parameter(self, node: str, name: str, value: object) -> SetParametersResult:
+        """Ask a node to change a parameter; return its answer."""
+        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+        return self.call(SetParameters, f"{node}/set_parameters", request).results[0]
+
+    def fault(self, name: str, value: object) -> None:
+        """Let the drive go wrong by one of its parameters ``fault_…``: ``fault("stuck_strut", 3)``.
+
+        Raises
+        ------
+        ValueError
+            The drive does not take it; says why.
+        """
+        answer = self.set_parameter("strut_drive", f"fault_{name}", value)
+        if not answer.successful:
+            raise ValueError(answer.reason)
+
+    # ---- messages ----
+
+    def speak(self, topic: str) -> None:
+        """Let the witness publish on a topic."""
+        self._publishers[topic] = self.witness.create_publisher(SENT[topic], topic, RELIABLE)
+
+    def hush(self, topic: str) -> None:
+        """Let the witness publish on a topic no longer."""
+        if topic in self._publishers:
+            self.witness.destroy_publisher(self._publishers.pop(topic))
+
+    def publish(self, topic: str, message: Any) -> None:
+        """Publish a message to the nodes under test."""
+        self._publishers[topic].publish(message)
+
+    def send(self, pose: Pose | PoseStamped, frame_id: str = "base") -> PoseStamped:
+        """Send one command, stamped now, and return it; a message is sent as it is."""
+        message = pose
+        if isinstance(pose, Pose):
+            message = pose_message(pose, frame_id)
+            message.header.stamp = self.now()
+        self.publish("tool_pose_command", message)
+        return message
+
+    def ask(self, pose: Pose | PoseStamped, frame_id: str = "base") -> Answer:
+        """Send one command and wait for its answer."""
+        began = time.monotonic()
+        stamp = self.send(pose, frame_id).header.stamp
+
+        def find(topic: str) -> list[JointState]:
+            return [m for m in self.seen[topic][-5:] if m.header.stamp == stamp]
+
+        self.until(
+            lambda: find("strut_commands") and find("strut_corrections"),
+            f"answer to a command; {self.message()}",
+        )
+        return Answer(find("strut_commands")[0], find("strut_corrections")[0], began, time.monotonic())
+
+    def settle(self, pose: Pose) -> Answer:
+        """Hold a pose until the corrections have ramped in: until two answers in turn are alike."""
+        last, answer = self.ask(pose), self.ask(pose)
+        while not (answer.corrections == last.corrections).all():
+            last, answer = answer, self.ask(pose)
+        return answer
+
+    def estimate(self, of: JointState) -> PoseStamped:
+        """Wait for the pose estimate made from a message of commanded or measured struts."""
+
+        def find() -> list[PoseStamped]:
+            return [m for m in self.seen["tool_pose_estimate"][-5:] if m.header.stamp == of.header.stamp]
+
+        self.until(find, "a pose estimate")
+        return find()[0]
+
+    def tool(self) -> Pose:
+        """Return where the drive's tool really is, in ``base``."""
+        self.until(lambda: self.seen["tool_pose_true"], "the drive's true pose")
+        return message_pose(self.seen["tool_pose_true"][-1])
+
+    def feed(self, lengths: np.ndarray, names: tuple[str, ...] = STRUT_NAMES, later: float = 0.0) -> JointState:
+        """Publish measured struts, stamped now, or so many seconds from now, and return the message.
+
+        By a later stamp struts may have moved further since the last reading.
+        """
+        message = JointState(name=list(names), position=[float(v) for v in lengths], velocity=[0.0] * 6)
+        message.header.stamp = self.stamp(later)
+        self.publish("strut_states", message)
+        return message
+
+    def warm(self, part: str, temperature: float) -> None:
+        """Publish a temperature, °C, and wait until it has been handled."""
+        message = Temperature(temperature=temperature)
+        message.header.frame_id = part
+        self.publish("temperatures", message)
+        self.barrier()
+
+    def now(self) -> Any:
+        """Return the ROS time as a stamp."""
+        return self.witness.get_clock().now().to_msg()
+
+    def stamp(self, seconds_from_now: float) -> Any:
+        """Return a stamp some seconds from now."""
+        return Time(nanoseconds=self.witness.get_clock().now().nanoseconds + round(seconds_from_now * 1e9)).to_msg()
+
+    # ---- what they say ----
+
+    def statuses(self, node: str = "compensator") -> list[DiagnosticStatus]:
+        """Return all statuses of a node, oldest first."""
+        prefix = f"{self.namespace.strip('/')}/{node}:".lstrip("/")
+        return [s for array in self.seen["/diagnostics"] for s in array.status if s.name.startswith(prefix)]
+
+    def status(self, node: str = "compensator") -> DiagnosticStatus | None:
+        """Return the newest status of a node."""
+        statuses = self.statuses(node)
+        return statuses[-1] if statuses else None
+
+    def message(self, node: str = "compensator") -> str:
+        """Return what the newest status of a node says, empty before the first."""
+        status = self.status(node)
+        return "" if status is None else status.message
+
+    def values(self, node: str = "compensator") -> dict[str, str]:
+        """Return the values of the newest status of a node."""
+        status = self.status(node)
+        return {} if status is None else {entry.key: entry.value for entry in status.values}
+
+    def until_status(self, level: bytes, message: str, node: str = "compensator") -> dict[str, str]:
+        """Wait until a node's newest status has a level and its message starts so; return the values."""
+
+        def there() -> bool:
+            status = self.status(node)
+            return status is not None and status.level == level and status.message.startswith(message)
+
+        self.until(there, f"status {message!r}")
+        return self.values(node)
+
+    def logged(self, part: str) -> list[str]:
+        """Return what nodes have logged up to now and contains a part, oldest first, without time and name."""
+        self._log += self._capture.readouterr().err if self._capture else ""
+        texts = [match[1] for line in self._log.splitlines() if (match := LOG_LINE.fullmatch(line))]
+        return [text for text in texts if part in text]
+
+
+def _has_lifecycle(node: Node) -> bool:
+    return isinstance(node, LifecycleNode)
+
+
+def spin_until(executor: Executor, condition: Callable[[], object], timeout: float = 5.0, what: str = "") -> None:
+    """Spin until `condition()` holds.
+
+    Raises
+    ------
+    TimeoutError
+        It does not within `timeout` s; names `what`.
+    """
+    end = time.monotonic() + timeout
+    while not condition():
+        if time.monotonic() > end:
+            awaited = what or getattr(condition, "__name__", "condition")
+            raise TimeoutError(f"waited {timeout} s in vain for: {awaited}")
+        executor.spin_once(timeout_sec=0.02)
