@@ -72,7 +72,7 @@ def true_parameters(space: ParameterSpace, truth: MachineModel) -> np.ndarray:
     known = {
         "structure": [truth.base_deviation.ravel(), ball_joints.ravel(), struts.offset],
         "pitch": [struts.pitch],
-        "wave": [np.stack([struts.cosine, struts.sine], axis=1).ravel()],
+        "wave": [np.stack([struts.cosine[:, 0], struts.sine[:, 0]], axis=1).ravel()],
         "backlash": [struts.backlash],
     }
     return np.concatenate([part for block in space.blocks for part in known[block.name]])

@@ -6,6 +6,7 @@ red for everybody.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -82,18 +83,19 @@ def random_field(rng: np.random.Generator, size: float = 20e-6, powers: int = 4,
 
 def random_struts(rng: np.random.Generator) -> StrutErrors:
     """Return strut errors with every term on, each of the size of a bad machine's."""
-    return StrutErrors(
+    struts = StrutErrors(
         offset=rng.uniform(-1e-3, 1e-3, 6),
         pitch=rng.uniform(-1e-3, 1e-3, 6),
         reference_length=rng.uniform(0.3, 0.6, 6),
-        cosine=rng.uniform(-20e-6, 20e-6, 6),
-        sine=rng.uniform(-20e-6, 20e-6, 6),
         period=rng.uniform(2e-3, 10e-3, 6),
         backlash=rng.uniform(0.0, 50e-6, 6),
         expansion=rng.uniform(5e-6, 20e-6, 6),
         map_knots=np.array([0.3, 0.42, 0.5, 0.56, 0.7]),
         map_values=rng.uniform(-50e-6, 50e-6, (6, 5)),
     )
+    harmonics = np.arange(1, rng.integers(1, 5) + 1)
+    waves = rng.uniform(-20e-6, 20e-6, (2, 6, len(harmonics))) / harmonics**2  # steep enough for a screw
+    return replace(struts, cosine=waves[0], sine=waves[1])
 
 
 def random_model(rng: np.random.Generator, machine: str) -> MachineModel:

@@ -9,7 +9,7 @@ beforehand, so it costs no parameters.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
@@ -75,6 +75,10 @@ class LinearProblem:
         Readings minus unknowns projected out.
     least_noise : ndarray, shape (kinds,)
         Smallest noise factors that an instrument can have.
+    per_length : ndarray, shape (C, 6)
+        Derivatives by the struts' lengths, scaled as the rows, with what instruments do not know still in them.
+    unknowns : tuple of Unknown
+        What that is.
     """
 
     target: np.ndarray
@@ -86,6 +90,8 @@ class LinearProblem:
     square: np.ndarray
     freedom: np.ndarray
     least_noise: np.ndarray
+    per_length: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
+    unknowns: tuple[Unknown, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -169,6 +175,7 @@ class Estimation:
         misfit = m.value - expected[c.of_reading]
         mean = np.bincount(c.of_reading, weights * misfit) / total
         target, rows = scale * mean, scale[:, None] * rows
+        per_length = rows[:, self.space.offsets].copy()
         unknown = np.zeros(len(mean))
         for part in unknowns:
             unknown[part.members] += part.explained(target) / scale[part.members]
@@ -178,7 +185,8 @@ class Estimation:
         scatter = np.bincount(m.kind, weights * (misfit - mean[c.of_reading]) ** 2, len(KINDS))
         # Huber's proposal 2: noise comes from the residuals cut off, weight² · residual², or outliers blow it up.
         beyond = np.bincount(m.kind, weights * (1.0 - reading_weights) * residuals**2, len(KINDS))
-        return self._problem(target + rows @ x, self.space.whitened(rows), scatter - beyond, unknowns), residuals
+        problem = self._problem(target + rows @ x, self.space.whitened(rows), scatter - beyond, unknowns)
+        return replace(problem, per_length=per_length, unknowns=tuple(unknowns)), residuals
 
     def free_of_unknowns(self, rows: np.ndarray) -> np.ndarray:
         """Return what is left of cells' derivatives (C, K) beside all that instruments do not know, over their noise.

@@ -14,9 +14,20 @@ from ..machine.size import rms
 from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementSet, refuse_unmoved
 from ..pose import Pose
 from .datum import HeldDatum, hold, unseen_part
-from .estimation import HUBER, OUTLIER, Estimation, Posterior, Solution, held_out, iterate, physical_covariance
+from .estimation import (
+    HUBER,
+    OUTLIER,
+    Estimation,
+    LinearProblem,
+    Posterior,
+    Solution,
+    held_out,
+    iterate,
+    physical_covariance,
+)
+from .lead import ScrewLead, look_for_lead
 from .observability import Allowed, Observability, ToolError, expected_error, observe, without_trace
-from .parameters import FitSettings, ParameterSpace
+from .parameters import WAVES, FitSettings, ParameterSpace
 from .selection import Decision, select
 from .smooth_field import DIGITS
 from .warming import HeatSeen, seek_time_constants
@@ -121,8 +132,13 @@ class ModelFit:
         What the readings do not rule out.
     held : HeldDatum
         Where the tool is held: the model is the solution's machine, shifted and turned as a whole.
+<<<<<<< HEAD
     warming : HeatSeen
         What they tell of heat.
+=======
+    lead : ScrewLead or None
+        What is known of the screws' lead; None where it was not looked for.
+>>>>>>> b6f0032 (Screw waves have up to four harmonics a turn, and their lead is looked for in the readings)
     """
 
     model: MachineModel
@@ -139,7 +155,11 @@ class ModelFit:
     notes: tuple[str, ...]
     allowed: Allowed
     held: HeldDatum
+<<<<<<< HEAD
     warming: HeatSeen
+=======
+    lead: ScrewLead | None
+>>>>>>> b6f0032 (Screw waves have up to four harmonics a turn, and their lead is looked for in the readings)
 
     @property
     def misfit(self) -> str:
@@ -184,13 +204,24 @@ def fit_model(
         settle, forward and backward swapped.
     """
     settings = settings or FitSettings()
+<<<<<<< HEAD
     constants = seek_time_constants(measurements, ParameterSpace(measurements, settings), progress)
     if constants.values:
         settings = replace(settings, time_constants=constants.values)
     everything = Estimation(measurements, ParameterSpace(measurements, settings))
     decisions, possible, (space, estimation, solution) = _choose(everything, settings, progress)
+=======
+    everything, problem, lead = _begin(measurements, settings, progress)
+    settings = everything.space.settings
+    decisions, possible, (space, estimation, solution) = _choose(everything, problem, settings, progress)
+>>>>>>> b6f0032 (Screw waves have up to four harmonics a turn, and their lead is looked for in the readings)
     channels = tuple(_channels(estimation, solution))
-    notes = [*_ignored(measurements, settings, space), *_check_backlash(space, solution), *_check_noise(channels)]
+    notes = [
+        *_about_lead(lead),
+        *_ignored(measurements, settings),
+        *_check_backlash(space, solution),
+        *_check_noise(channels),
+    ]
     progress("what is it worth?")
     covariance = physical_covariance(space, solution.posterior)
     allowed = _allowed(everything.space, possible, (space, solution))
@@ -214,19 +245,45 @@ def fit_model(
         notes=(*measurements.notes, *notes, *_check_worth(level)),
         allowed=allowed,
         held=held,
+<<<<<<< HEAD
         warming=HeatSeen.of(measurements, space, solution, constants),
+=======
+        lead=lead,
+>>>>>>> b6f0032 (Screw waves have up to four harmonics a turn, and their lead is looked for in the readings)
     )
 
 
+def _begin(
+    measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object]
+) -> tuple[Estimation, LinearProblem, ScrewLead | None]:
+    """Return all parameters that may be used, the problem at the nominal machine, and the screws' lead.
+
+    It is not looked for where no screw wave may be fitted, or where the geometry says that screws differ.
+    """
+    everything = Estimation(measurements, ParameterSpace(measurements, settings))
+    nominal, trust = np.zeros(everything.space.size), np.ones(len(measurements))
+    problem, residuals = everything.linearise(nominal, trust)
+    refuse_unmoved(measurements, residuals)
+    known = everything.space.periods[np.isfinite(everything.space.periods)]
+    if not set(settings.blocks) & set(WAVES) or len(np.unique(known)) > 1:
+        return everything, problem, None
+    progress("looking for the screws' lead")
+    lead = look_for_lead(everything, problem)
+    if lead.given is None and lead.used is not None:
+        everything = Estimation(measurements, ParameterSpace(measurements, replace(settings, lead=lead.used)))
+        problem, _ = everything.linearise(np.zeros(everything.space.size), trust)
+    return everything, problem, lead
+
+
 def _choose(
-    everything: Estimation, settings: FitSettings, progress: Callable[[str], object]
+    everything: Estimation, problem: LinearProblem, settings: FitSettings, progress: Callable[[str], object]
 ) -> tuple[list[Decision], Posterior, tuple[ParameterSpace, Estimation, Solution]]:
     """Return what is fitted, what the data allow with all blocks in, and the fit."""
     measurements = everything.measurements
-    decisions, possible = _decide(everything, None, progress)
+    decisions, possible = select(everything.space, problem, np.ones(len(KINDS)), progress)
     space, estimation, solution = _solve(measurements, decisions, settings, None, progress)
     if solution.weights.min() < HUBER / OUTLIER:  # the choice was made with readings that turned out to be wrong
-        again, possible = _decide(everything, (space, solution), progress)
+        again, possible = _decide(everything, space, solution, progress)
         if [d.kept for d in again] != [d.kept for d in decisions]:
             space, estimation, solution = _solve(measurements, again, settings, (space, solution), progress)
         decisions = again
@@ -264,14 +321,11 @@ def _carried_over(
 
 
 def _decide(
-    everything: Estimation, before: tuple[ParameterSpace, Solution] | None, progress: Callable[[str], object]
+    everything: Estimation, space: ParameterSpace, solution: Solution, progress: Callable[[str], object]
 ) -> tuple[list[Decision], Posterior]:
-    """Return what becomes of every block, and what the readings allow if none is ruled out."""
-    x, _, noise = _carried_over(before, everything.space)
-    weights = np.ones(len(everything.measurements)) if before is None else before[1].weights
-    problem, residuals = everything.linearise(x, weights)
-    if before is None:
-        refuse_unmoved(everything.measurements, residuals)
+    """Return what becomes of every block by an answer, and what the readings allow if none is ruled out."""
+    x, _, noise = _carried_over((space, solution), everything.space)
+    problem, _ = everything.linearise(x, solution.weights)
     return select(everything.space, problem, noise, progress)
 
 
@@ -318,11 +372,22 @@ def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
     return [f"strut_{i + 1}: backlash of {values[i] * 1e6:.2f} µm found, taken as none" for i in negative]
 
 
-def _ignored(measurements: MeasurementSet, settings: FitSettings, space: ParameterSpace) -> list[str]:
+def _about_lead(lead: ScrewLead | None) -> list[str]:
+    """Return remarks on a lead that is not known, or not the one that was given."""
+    if lead is None:
+        return []
+    if not lead.agrees:
+        problem = f"the screws' errors repeat every {lead.shown * 1e3:.4g} mm by the readings"  # type: ignore[operator]
+        return [f"{problem}, not with the given lead of {lead.given * 1e3:.6g} mm: is it right?"]  # type: ignore[operator]
+    if lead.used is None:
+        problem = "the screws' lead is not known, and the readings do not show it"
+        return [f"{problem}: a periodic error of the screws, if they have one, is not fitted"]
+    return []
+
+
+def _ignored(measurements: MeasurementSet, settings: FitSettings) -> list[str]:
     """Return remarks on what the fit was not told and therefore takes for something else."""
     notes = []
-    if not np.isfinite(space.periods).all():
-        notes.append("the screws' lead is not known: a periodic error of the screws, if they have one, is not fitted")
     warmth = np.abs(measurements.stations.temperatures - REFERENCE_TEMPERATURE).max()
     if warmth > WARM and space.block("expansion") is None and not space.stated_expansion.any():
         notes.append(f"read up to {warmth:.1f} K from 20 °C, but no expansion is given: growth is taken for an error")

@@ -44,6 +44,9 @@ TOLERANCES = {
     "structure": 100e-6,
     "pitch": 100e-6,
     "wave": 5e-6,
+    "wave 2": 1e-6,
+    "wave 3": 1e-6,
+    "wave 4": 1e-6,
     "backlash": 5e-6,
     "map": 5e-6,
     "field displacement": 5e-6,
@@ -55,6 +58,9 @@ TOLERANCES = {
 """First guess of the blocks' standard deviations, m, m/m, rad or 1/K; the fit goes on from there."""
 
 BLOCKS = tuple(TOLERANCES)
+
+WAVES = {"wave": 1, "wave 2": 2, "wave 3": 3, "wave 4": 4}
+"""Blocks of the screw waves, and how often a turn each repeats."""
 
 SHORTEST_LEAD, LONGEST_LEAD = 0.1e-3, 1.0
 """Leads that a screw can have, m; below them no measuring line could show a period."""
@@ -72,7 +78,8 @@ class FitSettings:
         Platform joints that coincide nominally are one ball joint: the paper's machine then has 33 structure
         parameters instead of 42.
     lead : float or None
-        Period of the screws' errors, m; None: the geometry's leads, and no wave block where there are none.
+        Period of the screws' errors, m; None: the geometry's leads; where there are none, what the readings show, and
+        no wave block when they do not.
     field_degree : int
         Degree of the field's polynomials along the longest side of its box.
     strut_expansion, base_expansion, platform_expansion : float
@@ -249,7 +256,7 @@ class ParameterSpace:
     def _has(self, name: str) -> bool:
         if name == "structure":
             return True
-        if name == "wave" and not np.isfinite(self.periods).all():
+        if name in WAVES and not np.isfinite(self.periods).all():
             return False
         if name == "late" and not self.settings.time_constants:
             return False
@@ -262,8 +269,8 @@ class ParameterSpace:
             labels += [f"platform {g + 1} {a}" for g in range(self.platform_groups.max() + 1) for a in AXES]
             labels += [f"{s} offset" for s in STRUT_NAMES]
             return np.eye(len(labels)), tuple(labels), "m"
-        if name == "wave":
-            labels = [f"{s} wave {part}" for s in STRUT_NAMES for part in ("cosine", "sine")]
+        if name in WAVES:
+            labels = [f"{s} {name} {part}" for s in STRUT_NAMES for part in ("cosine", "sine")]
             return np.eye(12), tuple(labels), "m"
         if name == "map":
             root = np.kron(np.eye(6), _correlation_root(self.knots))
@@ -286,6 +293,12 @@ class ParameterSpace:
             return growth_root(len(constants)), tuple(labels), "1/K"
         labels = [f"{s} {name}" for s in STRUT_NAMES]
         return np.eye(6), tuple(labels), "m/m" if name == "pitch" else "m"
+
+    @property
+    def offsets(self) -> slice:
+        """Where the struts' offsets stand; they move the tool as any error of length does."""
+        end = self.blocks[0].part.stop
+        return slice(end - 6, end)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -338,7 +351,7 @@ class ParameterSpace:
         """
         joints, offset = np.split(self._values(x, "structure"), [-6])
         structure = joints.reshape(-1, 3)
-        wave = self._values(x, "wave", 12).reshape(6, 2)
+        waves = np.stack([self._values(x, name, 12).reshape(6, 2) for name in WAVES], axis=1)
         values = self._values(x, "map", 0).reshape(6, -1)
         has_map = bool(values.size) and bool(values.any())
         expansion = self.stated_expansion + self._values(x, "expansion", len(PARTS))
@@ -346,8 +359,8 @@ class ParameterSpace:
             offset=offset,
             pitch=self._values(x, "pitch", 6),
             reference_length=self.home_lengths,
-            cosine=wave[:, 0],
-            sine=wave[:, 1],
+            cosine=waves[..., 0],
+            sine=waves[..., 1],
             period=np.where(np.isfinite(self.periods), self.periods, 0.01),
             backlash=np.maximum(self._values(x, "backlash", 6), 0.0),
             expansion=expansion[:6],

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from ..formats.texts import aligned, number
 from ..measurements.readings import ANGULAR_KINDS, CHANNELS
 from .fit import ChannelFit, ModelFit, Outlier
+from .lead import ScrewLead
 from .observability import BlockSight, Observability, ToolError
 from .plan import Plan
 from .warming import warming_json, warming_text
@@ -45,6 +46,7 @@ def _headline(fit: ModelFit) -> str:
     return (
         f"machine {m.geometry.name}: {len(m)} readings of {len(m.runs)} runs at {len(m.stations)} stations\n"
         f"scheme joint: {fit.space.size} parameters ({kept}), settled after {fit.solution.steps} steps"
+        + (f"\nscrew lead: {fit.lead}" if fit.lead is not None else "")
     )
 
 
@@ -144,6 +146,7 @@ def as_json(fit: ModelFit) -> dict:
             for (name, unit), v, e in zip(labels, x, errors, strict=True)
         ],
         "blocks": fit.decisions,
+        "screw_lead": _lead_json(fit.lead),
         "channels": [_channel_json(c) for c in fit.channels],
         **_expected_json(fit.level, fit.tilted, fit.observability, fit.unseen_errors),
         "datum": fit.held.as_json(),
@@ -151,6 +154,13 @@ def as_json(fit: ModelFit) -> dict:
         "notes": fit.notes,
         "warming": warming_json(fit.warming),
     }
+
+
+def _lead_json(lead: ScrewLead | None) -> dict | None:
+    if lead is None:
+        return None
+    error = None if lead.shown is None else lead.error
+    return {"given_m": lead.given, "shown_m": lead.shown, "standard_error_m": error, "used_m": lead.used}
 
 
 def _channel_json(channel: ChannelFit) -> dict:

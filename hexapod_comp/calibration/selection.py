@@ -19,9 +19,17 @@ CLEAR = 2.0
 LEAST_GAIN = 1e-4
 """A block does not help when its gain is below this: it is rounding, which depends on the libraries, or of no use."""
 
+<<<<<<< HEAD
 EXPECTED = ("pitch", "wave", "backlash", "expansion", "late")
 """Errors that every screw has, and growth: they stay when they help at all. Of a length map or a field nobody knows
 beforehand."""
+=======
+HARMONICS = ("wave 2", "wave 3", "wave 4")
+"""What not every screw has, and what no general block explains: each stays when it helps clearly beside all others."""
+
+EXPECTED = ("pitch", "wave", "backlash")
+"""Errors that every screw has: they stay when they help at all. Of a length map or a field nobody knows beforehand."""
+>>>>>>> b6f0032 (Screw waves have up to four harmonics a turn, and their lead is looked for in the readings)
 
 
 @dataclass(frozen=True)
@@ -55,8 +63,8 @@ def select(
     Where there is only one, nothing is left to fit without it, and no block is kept.
 
     All blocks start in. The general one that helps least goes, until every one that is left helps clearly;
-    then the expected ones that do not help at all. Taking them in one by one instead can let a field explain
-    what a length map does better.
+    then the screw waves' harmonics that do not; then the expected ones that do not help at all. Taking them in one
+    by one instead can let a field explain what a length map does better.
 
     Parameters
     ----------
@@ -78,7 +86,7 @@ def select(
     names = [b.name for b in space.blocks[1:]]
     kept = list(names)
     gains: dict[str, tuple[float, float]] = {}
-    general = [name for name in names if name not in EXPECTED]
+    general = [name for name in names if name not in (*EXPECTED, *HARMONICS)]
     while True:
         # A block that helps clearly beside all others helps no less when some of them have gone.
         doubtful = [name for name in general if name in kept and not _clear(gains.get(name))]
@@ -87,6 +95,8 @@ def select(
         if not doubtful:
             break
         kept.remove(min(doubtful, key=lambda name: gains[name][0] / max(gains[name][1], 1e-12)))
+    gains |= {name: trials.gain(("structure", *kept), name) for name in kept if name in HARMONICS}
+    kept = [name for name in kept if name not in HARMONICS or _clear(gains[name])]
     for name in (name for name in names if name in EXPECTED):
         gains[name] = trials.gain(("structure", *kept), name)
     useless = [name for name in EXPECTED if name in kept and gains[name][0] <= LEAST_GAIN]

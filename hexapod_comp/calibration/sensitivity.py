@@ -16,7 +16,7 @@ from ..machine.late import PARTS, LateGrowth, late
 from ..machine.model import REFERENCE_TEMPERATURE, MachinesByTemperature
 from ..measurements.readings import Stations
 from ..virtual.trial import drive
-from .parameters import ParameterSpace
+from .parameters import WAVES, ParameterSpace
 
 
 @dataclass(frozen=True)
@@ -204,8 +204,8 @@ def _block(
         for strut, group in enumerate(space.platform_groups):
             joined[:, :, group] += platform[:, :, strut]
         return np.concatenate([base, joined.reshape(len(commands), 6, -1), per_length], axis=2)
-    if name == "wave":
-        phase = 2.0 * np.pi * commands / space.periods
+    if name in WAVES:
+        phase = 2.0 * np.pi * WAVES[name] * commands / space.periods
         parts = np.stack([np.cos(phase), np.sin(phase)], axis=-1)
         return (per_length[..., None] * parts[:, None]).reshape(len(commands), 6, 12)
     if name == "map":

@@ -58,7 +58,10 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
 
 
 def _blocks_called(name: str) -> tuple[str, ...]:
-    return ("field displacement", "field rotation", "field reversal") if name == "field" else (name,)
+    from ..calibration.selection import HARMONICS
+
+    several = {"field": ("field displacement", "field rotation", "field reversal"), "harmonics": HARMONICS}
+    return several.get(name, (name,))
 
 
 def run(args: argparse.Namespace) -> int:

@@ -238,6 +238,7 @@ def _bounds(parser: argparse.ArgumentParser) -> None:
         ("struts-um", arguments.bound, one, "every strut's length, ± µm (default 50)"),
         ("pitch-ppm", arguments.bound, one, "every screw's pitch, ± ppm (default 50)"),
         ("wave-um", arguments.span, spans, "amplitude of the screws' periodic error, µm (default 1,3)"),
+        ("harmonics-um", arguments.span, spans, "the same of those two, three and four times a turn (default 0)"),
         ("wave-period-mm", arguments.above_zero, one, "its period, mm (default: the geometry's lead, else 10)"),
         ("map-um", arguments.bound, one, "smooth length error of every strut, RMS µm (default 1)"),
         ("backlash-um", arguments.span, spans, "backlash of every strut, µm (default 2,4)"),
@@ -308,9 +309,9 @@ def _separate_joints(add: Add) -> None:
 def _estimation(parser: argparse.ArgumentParser) -> None:
     """Add what a fit of scheme joint, or a plan for one, can be given."""
     add = parser.add_argument_group("scheme joint").add_argument
-    text = "period of the screws' errors (default: the geometry's)"
+    text = "period of the screws' errors (default: the geometry's; else what the readings show)"
     add("--lead-mm", type=arguments.bound, metavar="MM", help=text)
-    text = "what may be fitted: pitch, wave, backlash, map, field (default all)"
+    text = "what may be fitted: pitch, wave, harmonics, backlash, map, field (default all)"
     add("--blocks", metavar="A,B,…", help=text)
     _separate_joints(add)
     text = "how well joints are built, to start from, µm (default 100)"

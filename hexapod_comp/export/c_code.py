@@ -17,6 +17,7 @@ import numpy as np
 from ..compensation.compensator import DEFAULT_RAMP_RATE, Compensator
 from ..errors import HexapodError, TooEarlyError
 from ..formats.outputs import write_text
+from ..kernels.struts import GROWTH, MOST_HARMONICS, WAVES
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel, RealMachine, Temperatures
 from ..machine.trajectory import moves
@@ -164,8 +165,9 @@ def _members(
 def _struts(machine: RealMachine, model: MachineModel) -> str:
     """Return the six struts; the columns of the kernels' table stand in the order of hc_strut."""
     table = machine.strut_arrays[0].copy()
-    table[:, -1] = model.struts.expansion  # the core works out the growth from its temperatures
-    return "{\n        " + ",\n        ".join(_values(row) for row in table) + "}"
+    table[:, GROWTH] = model.struts.expansion  # the core works out the growth from its temperatures
+    rows = [f"{{{_row(row[:WAVES])}, {_values(row[WAVES:].reshape(MOST_HARMONICS, 2))}}}" for row in table]
+    return "{\n        " + ",\n        ".join(rows) + "}"
 
 
 def _struct(numbers: dict[str, Any], **others: str) -> str:

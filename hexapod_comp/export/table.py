@@ -180,14 +180,14 @@ def _grid_nodes(box: np.ndarray, step: float) -> tuple[np.ndarray, ...]:
 def _without_fine_waves(model: MachineModel, step: float) -> tuple[MachineModel, list[str]]:
     """Return the model without the screw waves that a grid cannot follow, and what was left out."""
     s = model.struts
-    amplitude = np.hypot(s.cosine, s.sine)
-    fine = (amplitude > 0.0) & (s.period < WAVE_STEPS * step)
+    amplitude, period = np.hypot(s.cosine, s.sine), s.period[:, None] / s.harmonics
+    fine = (amplitude > 0.0) & (period < WAVE_STEPS * step)
     if not fine.any():
         return model, []
     smooth = replace(s, cosine=np.where(fine, 0.0, s.cosine), sine=np.where(fine, 0.0, s.sine))
     text = (
-        f"screw waves of {s.period[fine].min() * 1e3:g} mm period and up to {amplitude.max() * 1e6:.2f} µm are finer "
-        f"than the grid's {step * 1e3:g} mm and left out"
+        f"screw waves of {period[fine].min() * 1e3:g} mm period and up to {amplitude[fine].max() * 1e6:.2f} µm are "
+        f"finer than the grid's {step * 1e3:g} mm and left out"
     )
     return replace(model, struts=smooth), [text]
 

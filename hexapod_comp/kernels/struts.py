@@ -9,11 +9,16 @@ import numpy as np
 from .compiling import compiled
 from .kinematics import strut_vector
 
-OFFSET, PITCH, REFERENCE, COSINE, SINE, WAVENUMBER, BACKLASH, LEAD, TWIST_HOME, GROWTH = range(10)
-"""Columns of the table of strut parameters that the kernels read."""
+OFFSET, PITCH, REFERENCE, WAVENUMBER, HARMONICS, BACKLASH, LEAD, TWIST_HOME, GROWTH, WAVES = range(10)
+"""Columns of the table of strut parameters that the kernels read; from the last one on stand cosine and sine amplitude
+of each harmonic of the screw wave, of which the first HARMONICS count."""
 
+MOST_HARMONICS = 4
 
-PARAMETERS = 10
+PARAMETERS = WAVES + 2 * MOST_HARMONICS
+
+SMALL_ANGLE = 1.0 / 64.0
+"""Up to here, rad, cosine and sine of a sum come from series that are good to 3e-14."""
 
 
 @compiled
@@ -52,15 +57,46 @@ def screw_shift(base, platform, base_axes, platform_axes, position, rotation, ta
 
 
 @compiled
-def smooth_error(command, table, knots, pieces, i):
-    """Return (error, slope) of the part that depends on the command alone: offset, pitch, waves, map."""
-    k = table[i, WAVENUMBER]
+def screw_turn(command, table, i):
+    """Return cosine and sine of the angle that the screw of strut `i` has turned; (1, 0) where it has no wave."""
+    if table[i, HARMONICS] == 0.0:
+        return 1.0, 0.0
+    angle = table[i, WAVENUMBER] * command
+    return math.cos(angle), math.sin(angle)
+
+
+@compiled
+def turned_on(cosine, sine, angle):
+    """Return cosine and sine of an angle increased by a small one."""
+    square = angle * angle
+    c = 1.0 - square * (0.5 - square * (1.0 / 24.0))
+    s = angle * (1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0)))
+    return cosine * c - sine * s, sine * c + cosine * s
+
+
+@compiled
+def wave_error(cosine, sine, table, i):
+    """Return (error, slope) of the screw wave at an angle of the screw; harmonics by the addition theorem."""
+    a, b = table[i, WAVES], table[i, WAVES + 1]
+    error, slope = a * cosine + b * sine, b * cosine - a * sine
+    c, s = cosine, sine
+    for n in range(2, int(table[i, HARMONICS]) + 1):
+        c, s = c * cosine - s * sine, s * cosine + c * sine
+        a, b = table[i, WAVES + 2 * n - 2], table[i, WAVES + 2 * n - 1]
+        error += a * c + b * s
+        slope += n * (b * c - a * s)
+    return error, table[i, WAVENUMBER] * slope
+
+
+@compiled
+def error_at(command, cosine, sine, table, knots, pieces, i):
+    """Return (error, slope) as :func:`smooth_error`, for a screw whose angle is known."""
     error = table[i, OFFSET] + table[i, PITCH] * (command - table[i, REFERENCE])
     slope = table[i, PITCH]
-    if table[i, COSINE] != 0.0 or table[i, SINE] != 0.0:
-        c, s = math.cos(k * command), math.sin(k * command)
-        error += table[i, COSINE] * c + table[i, SINE] * s
-        slope += k * (table[i, SINE] * c - table[i, COSINE] * s)
+    if table[i, HARMONICS] != 0.0:
+        wave, steep = wave_error(cosine, sine, table, i)
+        error += wave
+        slope += steep
     last = knots.shape[0] - 1
     if last > 0:
         held = min(knots[last], max(knots[0], command))
@@ -74,6 +110,13 @@ def smooth_error(command, table, knots, pieces, i):
 
 
 @compiled
+def smooth_error(command, table, knots, pieces, i):
+    """Return (error, slope) of the part that depends on the command alone: offset, pitch, waves, map."""
+    cosine, sine = screw_turn(command, table, i)
+    return error_at(command, cosine, sine, table, knots, pieces, i)
+
+
+@compiled
 def actual_length(command, sense, shift, table, knots, pieces, i):
     """Return the real length of strut `i` for a command, m; `sense` is its direction of motion, −1…1."""
     error, _ = smooth_error(command, table, knots, pieces, i)
@@ -82,15 +125,26 @@ def actual_length(command, sense, shift, table, knots, pieces, i):
 
 @compiled
 def command_for_length(length, sense, shift, table, knots, pieces, i):
-    """Return the command that gives strut `i` a real length, m: the inverse of :func:`actual_length`."""
+    """Return the command that gives strut `i` a real length, m: the inverse of :func:`actual_length`.
+
+    Offset and pitch are undone beforehand: what is left for Newton's method are micrometres, by which the screw hardly
+    turns, so its angle costs one cosine and sine in all.
+    """
     wanted = length / (1.0 + table[i, GROWTH]) + 0.5 * sense * table[i, BACKLASH] + shift
-    command = wanted
+    command = wanted - table[i, OFFSET]
+    command -= table[i, PITCH] * (command - table[i, REFERENCE])
+    cosine, sine = screw_turn(command, table, i)
     for _ in range(8):
-        error, slope = smooth_error(command, table, knots, pieces, i)
+        error, slope = error_at(command, cosine, sine, table, knots, pieces, i)
         step = (wanted - command - error) / (1.0 + slope)
         command += step
         if abs(step) < 1e-9:  # Newton squares it: the rest is below rounding
             break
+        angle = table[i, WAVENUMBER] * step
+        if abs(angle) < SMALL_ANGLE:
+            cosine, sine = turned_on(cosine, sine, angle)
+        else:
+            cosine, sine = screw_turn(command, table, i)
     return command
 
 

@@ -12,7 +12,7 @@ import yaml
 from ..formats.yaml import UNITS, in_si
 from .field import COMPONENTS, GridField, no_field
 from .model import Datum, MachineModel
-from .struts import StrutErrors
+from .struts import WAVE_PARTS, StrutErrors
 
 DIRECTIONS = ("forward", "backward")
 """Order of the directions of motion in a field's arrays."""
@@ -115,13 +115,24 @@ def struts_block(struts: StrutErrors) -> dict[str, Any]:
         if getattr(struts, name).any():
             block[f"{name}_{unit}"] = _per_strut(getattr(struts, name), kind, unit)
     if struts.cosine.any() or struts.sine.any() or (struts.period != StrutErrors().period).any():
-        block["wave"] = {
-            f"{name}_{unit}": _per_strut(getattr(struts, name), "length", unit)
-            for name, unit in (("cosine", "um"), ("sine", "um"), ("period", "mm"))
-        }
+        block["wave"] = _wave_block(struts)
     if len(struts.map_knots):
         knots = written(struts.map_knots, "length", "mm")
         block["map"] = {"knots_mm": knots, "values_um": written(struts.map_values, "length", "um")}
+    return block
+
+
+def _wave_block(struts: StrutErrors) -> dict[str, Any]:
+    """Return the screw waves: the first harmonic, the period, and the others that are not zero."""
+
+    def amplitudes(column: int) -> dict[str, Any]:
+        return {f"{name}_um": _per_strut(getattr(struts, name)[:, column], "length", "um") for name in WAVE_PARTS}
+
+    block = {**amplitudes(0), "period_mm": _per_strut(struts.period, "length", "mm")}
+    columns = range(1, len(struts.harmonics))
+    used = [k for k in columns if struts.cosine[:, k].any() or struts.sine[:, k].any()]
+    if used:
+        block["harmonics"] = [{"times": k + 1, **amplitudes(k)} for k in used]
     return block
 
 

@@ -39,7 +39,11 @@ all six or a list of six. Everything marked optional may be left out and is then
       wave:                           # optional: cosine·cos(2πc/period) + sine·sin(2πc/period), per strut
         cosine_um: 0.0
         sine_um: 0.0
-        period_mm: 5.0                # required in this block
+        period_mm: 5.0                # required in this block: one turn of the screw
+        harmonics:                    # optional: the same several times a turn
+        - times: 2                    # 2, 3 or 4, each once
+          cosine_um: 0.0
+          sine_um: 0.0
       map:                            # optional: natural cubic spline, end values held outside
         knots_mm: [330, 600, 880]     # commands, increasing
         values_um:                    # 6×n, one row per strut
@@ -94,6 +98,7 @@ from ..errors import InputFileError, ModelError
 from ..formats.outputs import write_text
 from ..formats.paths import input_file
 from ..formats.yaml import Section, parse_yaml, read_text
+from ..kernels.struts import MOST_HARMONICS
 from .field import CROSS_AXES, OUTSIDE_POLICIES, GridField, no_field
 from .geometry import HexapodGeometry
 from .late import PARTS, LateGrowth
@@ -112,7 +117,7 @@ from .model_blocks import (
     thermal_block,
     written,
 )
-from .struts import StrutErrors
+from .struts import WAVE_PARTS, StrutErrors
 
 MODEL_FORMAT = "hexapod_comp/model"
 MODEL_VERSION = 1
@@ -356,10 +361,7 @@ def _read_thermal(top: Section) -> dict[str, Any]:
 def _read_struts(section: Section) -> StrutErrors:
     values = {name: section.per_strut(name, kind, 0.0) for name, (kind, _) in STRUT_TERMS.items()}
     if "wave" in section:
-        wave = section.section("wave")
-        values |= {name: wave.per_strut(name, "length", 0.0) for name in ("cosine", "sine")}
-        values["period"] = wave.per_strut("period", "length")
-        wave.finish()
+        values |= _read_wave(section.section("wave"))
     if "map" in section:
         length_map = section.section("map")
         values["map_knots"] = length_map.quantity("knots", "length", (None,))
@@ -367,6 +369,27 @@ def _read_struts(section: Section) -> StrutErrors:
         length_map.finish()
     section.finish()
     return StrutErrors(**values)
+
+
+def _read_wave(section: Section) -> dict[str, np.ndarray]:
+    """Return amplitudes, shape (6, harmonics), and periods, shape (6,), m."""
+    waves = {1: _amplitudes(section)}
+    period = section.per_strut("period", "length")
+    for harmonic in section.sections("harmonics") if "harmonics" in section else ():
+        times = harmonic.take("times")
+        if type(times) is not int or not 2 <= times <= MOST_HARMONICS:
+            raise harmonic.error("times", f"must be a whole number, 2…{MOST_HARMONICS}", times)
+        if times in waves:
+            raise harmonic.error("times", "is given twice", times)
+        waves[times] = _amplitudes(harmonic)
+        harmonic.finish()
+    section.finish()
+    every = np.stack([waves.get(n, np.zeros((2, 6))) for n in range(1, max(waves) + 1)], axis=2)
+    return {"cosine": every[0], "sine": every[1], "period": period}
+
+
+def _amplitudes(section: Section) -> np.ndarray:
+    return np.array([section.per_strut(name, "length", 0.0) for name in WAVE_PARTS])
 
 
 def _read_field(section: Section) -> GridField:

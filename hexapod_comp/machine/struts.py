@@ -2,11 +2,11 @@
 
 One strut, command c (what its encoder counts, m) to actual length L (m):
 
-    L = (1 + g) · (c + o + p·(c − c₀) + A·cos(kc) + B·sin(kc) + map(c) − s·b/2 + l·θ/2π)
+    L = (1 + g) · (c + o + p·(c − c₀) + Σ (Aₙ·cos(nkc) + Bₙ·sin(nkc)) + map(c) − s·b/2 + l·θ/2π)
 
-with offset o, pitch error p about the length c₀, screw waves A, B of period 2π/k, length map, backlash b by
-the sense of motion s, screw lead l times the rotation θ that the cardan joints force on the screw since
-home, and thermal growth g. The compensator solves it for c.
+with offset o, pitch error p about the length c₀, screw waves Aₙ, Bₙ of period 2π/k and its harmonics n = 1…4, length
+map, backlash b by the sense of motion s, screw lead l times the rotation θ that the cardan joints force on the screw
+since home, and thermal growth g. The compensator solves it for c.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ import numpy as np
 from ..errors import ModelError
 from ..kernels.struts import (
     BACKLASH,
-    COSINE,
     GROWTH,
+    HARMONICS,
     LEAD,
+    MOST_HARMONICS,
     OFFSET,
     PARAMETERS,
     PITCH,
     REFERENCE,
-    SINE,
     TWIST_HOME,
     WAVENUMBER,
+    WAVES,
     screw_twist,
 )
 from .geometry import HexapodGeometry
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 
 STEEPEST_ERROR = 0.2
 """Largest slope of the strut error against the command: below it, undoing the error is a contraction."""
+
+WAVE_PARTS, MAP_PARTS = ("cosine", "sine"), ("map_knots", "map_values")
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,9 @@ class StrutErrors:
         Relative pitch error, m per m.
     reference_length : ndarray
         Command at which the pitch error is zero, m.
-    cosine, sine : ndarray
-        Screw wave amplitudes, m.
+    cosine, sine : ndarray, shape (6, n) or (6,)
+        Screw wave amplitudes, m: of the harmonics 1 to n per turn, n up to 4; of shape (6,), of the first alone. They
+        are kept as (6, n).
     period : ndarray
         Screw wave period, usually the lead, m; required above zero where an amplitude is not zero.
     backlash : ndarray
@@ -74,8 +78,8 @@ class StrutErrors:
     offset: np.ndarray = field(default_factory=lambda: np.zeros(6))
     pitch: np.ndarray = field(default_factory=lambda: np.zeros(6))
     reference_length: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    cosine: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    sine: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    cosine: np.ndarray = field(default_factory=lambda: np.zeros((6, 1)))
+    sine: np.ndarray = field(default_factory=lambda: np.zeros((6, 1)))
     period: np.ndarray = field(default_factory=lambda: np.full(6, 0.01))
     backlash: np.ndarray = field(default_factory=lambda: np.zeros(6))
     expansion: np.ndarray = field(default_factory=lambda: np.zeros(6))
@@ -87,7 +91,9 @@ class StrutErrors:
             array = np.array(getattr(self, entry.name), dtype=float)
             if not np.isfinite(array).all():
                 raise ModelError(f"struts.{entry.name}", "must be finite", array.tolist())
-            if not entry.name.startswith("map_") and array.shape != (6,):
+            if entry.name in WAVE_PARTS and array.shape == (6,):
+                array = array[:, None]
+            if entry.name not in (*WAVE_PARTS, *MAP_PARTS) and array.shape != (6,):
                 raise ModelError(f"struts.{entry.name}", f"must have shape (6,), not {array.shape}")
             array.flags.writeable = False
             object.__setattr__(self, entry.name, array)
@@ -95,12 +101,26 @@ class StrutErrors:
             raise ModelError("struts.backlash", "must not be negative", self.backlash.tolist())
         if (self.period <= 0.0).any():
             raise ModelError("struts.period", "must be above zero", self.period.tolist())
+        self._settle_waves()
         self._check_map()
         slope = self._steepest()
         if slope.max() > STEEPEST_ERROR:
             index = int(slope.argmax())
             problem = f"strut error changes by {slope[index]:.3g} m per m, allowed {STEEPEST_ERROR}"
             raise ModelError(f"struts[{index}]", problem)
+
+    def _settle_waves(self) -> None:
+        """Check the waves' shapes; leave out the last harmonics where no strut has them."""
+        shape = self.cosine.shape
+        if len(shape) != 2 or shape[0] != 6 or not 1 <= shape[1] <= MOST_HARMONICS or self.sine.shape != shape:
+            problem = (
+                f"must both have shape (6, n) with n = 1…{MOST_HARMONICS} harmonics, not {shape} and {self.sine.shape}"
+            )
+            raise ModelError("struts.cosine, struts.sine", problem)
+        used = (self.cosine != 0.0).any(axis=0) | (self.sine != 0.0).any(axis=0)
+        count = int((used * self.harmonics).max(initial=1))
+        for name in WAVE_PARTS:
+            object.__setattr__(self, name, getattr(self, name)[:, :count])
 
     def _check_map(self) -> None:
         knots = self.map_knots
@@ -110,9 +130,14 @@ class StrutErrors:
         if len(knots) == 1 or (np.diff(knots) <= 0.0).any():
             raise ModelError("struts.map_knots", "needs at least two increasing lengths", knots.tolist())
 
+    @property
+    def harmonics(self) -> np.ndarray:
+        """How often per turn each column of the screw waves repeats, shape (n,): 1, 2, …."""
+        return np.arange(1, self.cosine.shape[1] + 1)
+
     def _steepest(self) -> np.ndarray:
         """Return a bound of |dL/dc − 1| per strut."""
-        waves = 2.0 * np.pi / self.period * np.hypot(self.cosine, self.sine)
+        waves = 2.0 * np.pi / self.period * (np.hypot(self.cosine, self.sine) @ self.harmonics)
         steep = np.abs(self.pitch) + waves
         if len(self.map_knots):
             spline = self._spline().derivative()
@@ -136,8 +161,10 @@ class StrutErrors:
         """Return the kernels' table, shape (6, PARAMETERS), for a thermal growth (6,) of the struts."""
         table = np.zeros((6, PARAMETERS))
         table[:, OFFSET], table[:, PITCH], table[:, REFERENCE] = self.offset, self.pitch, self.reference_length
-        table[:, COSINE], table[:, SINE] = self.cosine, self.sine
         table[:, WAVENUMBER] = 2.0 * np.pi / self.period
+        table[:, HARMONICS] = (((self.cosine != 0.0) | (self.sine != 0.0)) * self.harmonics).max(axis=1)
+        amplitudes = np.stack([self.cosine, self.sine], axis=2).reshape(6, -1)
+        table[:, WAVES : WAVES + amplitudes.shape[1]] = amplitudes
         table[:, BACKLASH] = self.backlash
         table[:, LEAD] = geometry.screw_lead
         table[:, TWIST_HOME] = home_twists(geometry)

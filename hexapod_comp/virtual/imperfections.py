@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from ..errors import ModelError
+from ..kernels.struts import MOST_HARMONICS
 from ..machine.field import CROSS_AXES, GridField, no_field
 from ..machine.geometry import HexapodGeometry, first_of_same
 from ..machine.kinematics import Structure, strut_lengths
@@ -30,7 +31,7 @@ MAP_WAVES, KNOTS_PER_WAVE = 8, 15
 WAVES_OF_STROKE, LEAST_WAVES = (0.1, 0.35), (0.06, 0.2)
 """Shortest and longest of them where bounds draw them: shares of the stroke, but no shorter than this, m."""
 
-SPANS = {"wave": "m", "backlash": "m", "strut_expansion": "1/K", "body_expansion": "1/K"}
+SPANS = {"wave": "m", "harmonics": "m", "backlash": "m", "strut_expansion": "1/K", "body_expansion": "1/K"}
 """Bounds that have a lowest and a highest value, and their units."""
 
 
@@ -51,8 +52,10 @@ class ImperfectionBounds:
         Bound of every screw's relative pitch error, m per m (±); zero error at the home length.
     wave : (float, float)
         Lowest and highest amplitude of the periodic screw error, m; its phase is drawn too.
+    harmonics : (float, float)
+        The same of the errors that repeat two, three and four times a turn.
     wave_period : float
-        Period of that error, m: the screw's lead.
+        Period of the error, m: the screw's lead.
     backlash : (float, float)
         Lowest and highest lost motion of a strut, m.
     field_displacement, field_rotation : float
@@ -91,6 +94,7 @@ class ImperfectionBounds:
     strut_expansion: tuple[float, float] = (0.0, 0.0)
     body_expansion: tuple[float, float] = (0.0, 0.0)
     shared_platform_joints: bool = True
+    harmonics: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -145,6 +149,8 @@ def draw_model(geometry: HexapodGeometry, bounds: ImperfectionBounds, seed: int,
     if bounds.shared_platform_joints:
         platform = platform[first_of_same(geometry.platform_joints)]
     struts, field = _draw_struts(geometry, bounds, rng), _draw_field(bounds, rng)
+    if any(bounds.harmonics):
+        struts = _with_harmonics(struts, bounds.harmonics, seed)
     expansion, bodies = rng.uniform(*bounds.strut_expansion, 6), rng.uniform(*bounds.body_expansion, 2)
     model = MachineModel(
         machine=geometry.name,
@@ -222,6 +228,14 @@ def _draw_struts(geometry: HexapodGeometry, bounds: ImperfectionBounds, rng: np.
         period=np.full(6, bounds.wave_period),
         backlash=rng.uniform(*bounds.backlash, 6),
     )
+
+
+def _with_harmonics(struts: StrutErrors, bounds: tuple[float, float], seed: int) -> StrutErrors:
+    rng = seeded(seed, "harmonics")
+    shape = 6, MOST_HARMONICS - 1
+    amplitude, phase = rng.uniform(*bounds, shape), rng.uniform(0.0, 2.0 * np.pi, shape)
+    cosine, sine = amplitude * np.cos(phase), amplitude * np.sin(phase)
+    return replace(struts, cosine=np.hstack([struts.cosine, cosine]), sine=np.hstack([struts.sine, sine]))
 
 
 def _draw_field(bounds: ImperfectionBounds, rng: np.random.Generator) -> GridField:

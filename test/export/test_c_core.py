@@ -26,6 +26,7 @@ from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.export.c_code import SOURCES, STATUS, write_c
 from hexapod_comp.export.c_library import CCompensator, CPose
+from hexapod_comp.kernels.struts import GROWTH, PARAMETERS
 from hexapod_comp.machine.field import no_field
 from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.model import MachineModel, RealMachine, Temperatures
@@ -168,7 +169,7 @@ class CModel(Structure):
         ("platform", CBody),
         *((name, CPose) for name in ("home", "work", "tool", "tool_inverse")),
         ("limits", CLimits),
-        ("struts", c_double * 60),
+        ("struts", c_double * (6 * PARAMETERS)),
         ("map", CMap),
         ("field", CField),
         ("axis_threshold", c_double),
@@ -180,7 +181,7 @@ def in_c(geometry: HexapodGeometry, model: MachineModel) -> tuple[CModel, list[n
     """Return a machine as the core takes it, and the arrays that it points to."""
     real = RealMachine(geometry, model)
     table, knots, pieces = real.strut_arrays
-    table[:, 9] = model.struts.expansion
+    table[:, GROWTH] = model.struts.expansion
     lines = [family.swapaxes(3, 4) for family in model.field.lines]
     made, kept = CModel(), [np.ascontiguousarray(a) for a in (knots, pieces, *model.field.grid, *lines)]
     for name, joints, axes in zip(("base", "platform"), geometry.kernel_joints, geometry.kernel_axes, strict=True):

@@ -113,7 +113,7 @@ def test_machine_is_as_bad_as_described(truth):
         (model.struts.pitch, 100e-6),
     ):
         assert 0.5 * bound < np.abs(values).max() <= bound
-    assert np.hypot(model.struts.cosine, model.struts.sine) == pytest.approx(np.full(6, 4e-6), abs=1e-9)
+    assert np.hypot(model.struts.cosine, model.struts.sine) == pytest.approx(np.full((6, 1), 4e-6), abs=1e-9)
     assert (model.struts.backlash >= 3e-6).all()
     assert (model.struts.backlash <= 5e-6).all()
     assert (model.platform_deviation[::2] == model.platform_deviation[1::2]).all()

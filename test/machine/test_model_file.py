@@ -227,7 +227,7 @@ def test_a_file_written_by_hand(tmp_path):
     np.testing.assert_array_equal(struts.pitch, np.full(6, 12e-6))
     np.testing.assert_allclose(struts.reference_length, 0.508, rtol=1e-15)
     assert not struts.cosine.any()
-    np.testing.assert_array_equal(struts.sine, np.full(6, 2e-6))
+    np.testing.assert_array_equal(struts.sine, np.full((6, 1), 2e-6))
     np.testing.assert_array_equal(struts.period, [0.005] * 5 + [0.004])
     np.testing.assert_array_equal(struts.backlash, np.full(6, 1e-5))
     np.testing.assert_array_equal(struts.expansion, np.full(6, 11.7e-6))

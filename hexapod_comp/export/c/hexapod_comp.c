@@ -30,6 +30,7 @@
 #define HIGHEST_TEMPERATURE 120.0
 #define FIELD_ITERATIONS 50
 #define COMMAND_ITERATIONS 8
+#define SMALL_ANGLE (1.0 / 64.0) /* rad */
 #define LEAD_ITERATIONS 20
 
 /* ---- Three-vectors: kernels/linalg.py ------------------------------------------------------------------------ */
@@ -919,18 +920,64 @@ static double screw_shift(const hc_model *model, const hc_pose *pose, const six_
     return -strut->lead * (turns - floor(turns + 0.5));
 }
 
-/* Error and slope of what depends on the command alone: offset, pitch, waves, map. */
-static double smooth_error(const hc_model *model, int i, double command, double *slope)
+/* Cosine and sine of the angle that a screw has turned. */
+typedef struct {
+    double cosine, sine;
+} turn;
+
+/* screw_turn */
+static turn screw_turn(const hc_strut *strut, double command)
+{
+    turn at = {1.0, 0.0};
+    if (strut->harmonics != 0.0) {
+        const double angle = strut->wavenumber * command;
+        at.cosine = cos(angle);
+        at.sine = sin(angle);
+    }
+    return at;
+}
+
+/* turned_on: increased by a small angle */
+static turn turned_on(turn at, double angle)
+{
+    const double square = angle * angle;
+    const double c = 1.0 - square * (0.5 - square * (1.0 / 24.0));
+    const double s = angle * (1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0)));
+    turn on;
+    on.cosine = at.cosine * c - at.sine * s;
+    on.sine = at.sine * c + at.cosine * s;
+    return on;
+}
+
+/* wave_error: error and slope of the periodic error; harmonics by the addition theorem */
+static double wave_error(const hc_strut *strut, turn at, double *slope)
+{
+    const double (*wave)[2] = strut->wave;
+    double error = wave[0][0] * at.cosine + wave[0][1] * at.sine;
+    double c = at.cosine, s = at.sine, steep = wave[0][1] * c - wave[0][0] * s;
+    int n;
+    for (n = 2; n <= strut->harmonics; n++) {
+        const double a = wave[n - 1][0], b = wave[n - 1][1], next = c * at.cosine - s * at.sine;
+        s = s * at.cosine + c * at.sine;
+        c = next;
+        error += a * c + b * s;
+        steep += n * (b * c - a * s);
+    }
+    *slope = strut->wavenumber * steep;
+    return error;
+}
+
+/* error_at: error and slope of what depends on the command alone: offset, pitch, waves, map */
+static double error_at(const hc_model *model, int i, double command, turn at, double *slope)
 {
     const hc_strut *strut = &model->struts[i];
     const hc_map *map = &model->map;
-    const double k = strut->wavenumber;
     double error = strut->offset + strut->pitch * (command - strut->reference);
     *slope = strut->pitch;
-    if (strut->cosine != 0.0 || strut->sine != 0.0) {
-        const double c = cos(k * command), s = sin(k * command);
-        error += strut->cosine * c + strut->sine * s;
-        *slope += k * (strut->sine * c - strut->cosine * s);
+    if (strut->harmonics != 0.0) {
+        double steep;
+        error += wave_error(strut, at, &steep);
+        *slope += steep;
     }
     if (map->knot_count > 1) {
         const int last = map->knot_count - 1;
@@ -958,25 +1005,32 @@ static double smooth_error(const hc_model *model, int i, double command, double 
 
 static double actual_length(const hc_state *state, int i, double command, double sense, double shift)
 {
+    const hc_strut *strut = &state->model->struts[i];
     double slope;
-    const double error = smooth_error(state->model, i, command, &slope);
-    const double play = 0.5 * sense * state->model->struts[i].backlash;
+    const double error = error_at(state->model, i, command, screw_turn(strut, command), &slope);
+    const double play = 0.5 * sense * strut->backlash;
     return (1.0 + state->growth[i]) * (command + error - play - shift);
 }
 
 static double command_for_length(const hc_state *state, int i, double length, double sense, double shift)
 {
-    const double wanted = length / (1.0 + state->growth[i]) + 0.5 * sense * state->model->struts[i].backlash + shift;
-    double command = wanted;
+    const hc_strut *strut = &state->model->struts[i];
+    const double wanted = length / (1.0 + state->growth[i]) + 0.5 * sense * strut->backlash + shift;
+    double command = wanted - strut->offset;
+    turn at;
     int count;
+    command -= strut->pitch * (command - strut->reference);
+    at = screw_turn(strut, command);
     for (count = 0; count < COMMAND_ITERATIONS; count++) {
-        double slope;
-        const double error = smooth_error(state->model, i, command, &slope);
+        double slope, angle;
+        const double error = error_at(state->model, i, command, at, &slope);
         const double step = (wanted - command - error) / (1.0 + slope);
         command += step;
         if (fabs(step) < 1e-9) {
             break;
         }
+        angle = strut->wavenumber * step;
+        at = fabs(angle) < SMALL_ANGLE ? turned_on(at, angle) : screw_turn(strut, command);
     }
     return command;
 }

@@ -63,13 +63,13 @@ typedef struct {
     double offset;     /* m */
     double pitch;      /* m per m, about `reference` */
     double reference;  /* m */
-    double cosine;     /* m, periodic error */
-    double sine;       /* m */
-    double wavenumber; /* rad/m */
+    double wavenumber; /* rad/m, of the screw's turning */
+    double harmonics;  /* how many of `wave` count, 0 to 4 */
     double backlash;   /* m */
     double lead;       /* m per turn, positive for a right-hand screw */
     double twist_home; /* rad */
     double expansion;  /* 1/K */
+    double wave[4][2]; /* m, cosine and sine of the periodic error once, twice, three and four times a turn */
 } hc_strut;
 
 /* Cubic pieces of the struts' length maps; no knots where there is no map. */

@@ -1,0 +1,242 @@
+"""The lead of the screws, looked for in the readings: at which period do the struts' errors repeat?
+
+What a fit without screw waves leaves is looked through for periods: first strut by strut with Fourier transforms over
+the commands, then, about the strongest lines, with all other parameters free. A period counts as shown when the
+readings speak for it, and against every other one, by far more than noise would.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..kernels.struts import MOST_HARMONICS
+from .estimation import HUBER, MEDIAN_TO_SIGMA, Estimation, LinearProblem, Posterior, solve
+from .parameters import WAVES
+
+SHORTEST, LONGEST = 1e-3, 30e-3
+"""Periods that are looked for, m. Above, a wave is as smooth as what a length map is for."""
+
+STEPS_OF_PERIOD = 32
+"""Steps of the transforms' grid to the shortest period: 0.3 % of a wave of that is lost."""
+
+OVERSAMPLED = 4
+"""Points of the spectrum to the width of a line, 1 over the span of the commands."""
+
+AMPLITUDE = 10e-6
+"""Prior of the amplitudes while periods are compared, m: loose."""
+
+RIVALS = 4
+"""Other lines of the spectrum that must be ruled out, the strongest."""
+
+SURE = 25.0
+"""By this natural logarithm of their odds the readings must prefer a period to none, and to any other."""
+
+LEAST_FREEDOM = 200.0
+"""Fewer readings beyond those that the parameters use up show no period."""
+
+REFINEMENTS = 4
+"""Gauss–Newton steps of a period."""
+
+AGREES = 6.0
+"""A given lead agrees with the one shown within so many standard errors."""
+
+ROUND = (0.5e-3, 0.025 * 0.0254)
+"""Screws are made with leads that are whole multiples of one of these, m."""
+
+
+@dataclass(frozen=True)
+class ScrewLead:
+    """What is known of the screws' lead.
+
+    Attributes
+    ----------
+    given : float or None
+        By the settings or the geometry, m.
+    shown : float or None
+        The period that the readings show, m; None: they show none.
+    error : float
+        Its standard error, m.
+    odds : float
+        Natural logarithm of the odds by which they prefer it to any other period and to none.
+    """
+
+    given: float | None
+    shown: float | None
+    error: float
+    odds: float
+
+    @property
+    def used(self) -> float | None:
+        """The period to be fitted, m: the given one; else the one shown, or the round number that it stands for."""
+        if self.given is not None or self.shown is None:
+            return self.given
+        round_ones = [step * round(self.shown / step) for step in ROUND]
+        near = [lead for lead in round_ones if abs(lead - self.shown) < 2.0 * self.error]
+        return near[0] if near else self.shown
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the given lead explains what is shown, as one of its harmonics; True where there is no question."""
+        if self.given is None or self.shown is None:
+            return True
+        misses = [abs(self.given / n - self.shown) for n in range(1, MOST_HARMONICS + 1)]
+        return min(misses) < AGREES * self.error
+
+    def __str__(self) -> str:
+        given = "" if self.given is None else f"{self.given * 1e3:.6g} mm given"
+        if self.shown is None:
+            return f"{given or 'not known'}; the readings do not show it"
+        shown = f"{self.shown * 1e3:.4f} ± {self.error * 1e3:.4f} mm shown by the readings"
+        if self.given is None:
+            return f"{shown}, {self.used * 1e3:.6g} mm taken"  # type: ignore[operator]
+        return f"{given}, {shown}{'' if self.agrees else ': THEY DISAGREE'}"
+
+
+def look_for_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
+    """Return what readings show of the screws' lead, beside what is given.
+
+    Parameters
+    ----------
+    estimation : Estimation
+        The readings, and all parameters that may explain them.
+    problem : LinearProblem
+        Linearised at the nominal machine.
+    """
+    space = estimation.space
+    given = float(space.periods[0]) if np.isfinite(space.periods).all() else None
+    tolerances = np.where([b.name in WAVES for b in space.blocks], 0.0, space.start_tolerances())
+    rest = _Rest(estimation, problem, solve(space, problem, tolerances, np.ones(problem.normal.shape[0])))
+    if rest.freedom < LEAST_FREEDOM:
+        return ScrewLead(given, None, np.inf, 0.0)
+    spectrum = rest.spectrum()
+    best = _fundamental(rest, rest.frequencies[spectrum.argmax()])
+    odds = best.odds
+    for frequency in _rivals(rest.frequencies, spectrum, best.frequency, rest.span):
+        odds = min(odds, best.odds - rest.line(frequency).odds)
+    if odds < SURE:
+        return ScrewLead(given, None, np.inf, odds)
+    return ScrewLead(given, 1.0 / best.frequency, best.error / best.frequency**2, odds)
+
+
+@dataclass(frozen=True)
+class Line:
+    """A frequency of the errors and its harmonics: 1/m, its standard error, and the log odds against no such errors."""
+
+    frequency: float
+    error: float
+    odds: float
+
+
+class _Rest:
+    """What a fit without screw waves leaves of the readings, and how the six lengths move them.
+
+    Attributes
+    ----------
+    left, gains : ndarray, shape (C,) and (C, 6)
+        Residuals of the cells, and their derivatives by the lengths of the struts, over the noise; extreme residuals
+        are cut off.
+    commands : ndarray, shape (C, 6)
+        Of the struts, m.
+    frequencies : ndarray
+        Of the spectrum, 1/m.
+    span : float
+        Of the commands, m.
+    """
+
+    def __init__(self, estimation: Estimation, problem: LinearProblem, posterior: Posterior) -> None:
+        over_noise = 1.0 / posterior.noise[problem.kind]
+        self._problem, self._posterior, self._over_noise = problem, posterior, over_noise
+        self._rows = over_noise[:, None] * problem.rows[:, posterior.used]
+        left = over_noise * problem.target - self._rows @ posterior.y
+        cut = HUBER * MEDIAN_TO_SIGMA * np.median(np.abs(left))
+        self.left = np.clip(left, -cut, cut)
+        self.gains = over_noise[:, None] * problem.per_length
+        self.commands = estimation.measurements.stations.commands[estimation.cells.station]
+        self.span = float(np.ptp(self.commands, axis=0).max())
+        self.square = float(self.left @ self.left)
+        self.freedom = float(problem.freedom.sum() - posterior.determined.sum())
+        self._step = SHORTEST / STEPS_OF_PERIOD
+        self._size = 2 ** int(np.ceil(np.log2(OVERSAMPLED * self.span / self._step + 1.0)))
+        every = np.arange(self._size // 2 + 1) / (self._size * self._step)
+        self._searched = (every >= 1.0 / LONGEST) & (every <= 1.0 / SHORTEST)
+        self.frequencies = every[self._searched]
+
+    def spectrum(self) -> np.ndarray:
+        """Return by how much a wave of each frequency lowers the squares, were struts and readings independent."""
+        power = np.zeros(len(self.frequencies))
+        for gain, commands in zip(self.gains.T, self.commands.T, strict=True):
+            bins = ((commands - commands.min()) / self._step).round().astype(int)
+            line = np.fft.rfft(np.bincount(bins, gain * self.left, self._size), self._size)[self._searched]
+            power += np.abs(line) ** 2 / max(0.5 * gain @ gain, np.finfo(float).tiny)
+        return power
+
+    def line(self, frequency: float) -> Line:
+        """Return the best frequency near one, all other parameters free."""
+        half_width, start = 0.5 / self.span, frequency
+        for _ in range(REFINEMENTS):
+            less, step, error = self._step_to(frequency)
+            step = float(np.clip(step, -half_width, half_width))
+            if abs(frequency + step - start) > half_width or abs(step) < 0.01 * error:
+                break
+            frequency += step
+        return Line(frequency, error, self._odds(less, 12 * self._count(frequency) + 1))
+
+    def _count(self, frequency: float) -> int:
+        """Return how many harmonics of a frequency are in the band that is looked through."""
+        return int(np.clip(1.0 / (SHORTEST * frequency), 1, MOST_HARMONICS))
+
+    def _odds(self, less: float, parameters: int) -> float:
+        """Return the log odds of an explanation that lowers the squares, at the noise that it leaves."""
+        left = max(self.square - less, 1e-6 * self.square)
+        return 0.5 * self.freedom * float(np.log(self.square / left)) - parameters
+
+    def _step_to(self, frequency: float) -> tuple[float, float, float]:
+        """Return by how much waves of a frequency lower the squares, the step to a better one, its standard error."""
+        angle = 2.0 * np.pi * frequency * self.commands
+        orders = np.arange(1, self._count(frequency) + 1)
+        c, s = (self.gains[:, None] * f(orders[:, None] * angle[:, None]) for f in (np.cos, np.sin))
+        waves = self._free(np.concatenate([c, s], axis=1).reshape(len(angle), -1))
+        amplitudes, less, _ = self._solved(waves)
+        a, b = amplitudes.reshape(2, len(orders), 6)
+        turning = 2.0 * np.pi * self.commands[:, None] * orders[:, None]
+        slope = self._free(((b * c - a * s) * turning).sum(axis=(1, 2))[:, None])
+        together, _, covariance = self._solved(np.hstack([waves, slope]), loose=1)
+        left = np.sqrt(max(self.square - less, 1e-6 * self.square) / self.freedom)
+        return less, float(together[-1]), float(np.sqrt(covariance[-1, -1]) * left)
+
+    def _free(self, columns: np.ndarray) -> np.ndarray:
+        """Return columns free of what the instruments do not know."""
+        for members, q in self._problem.zeros:
+            columns[members] -= q @ (q.T @ columns[members])
+        return columns
+
+    def _solved(self, columns: np.ndarray, loose: int = 0) -> tuple[np.ndarray, float, np.ndarray]:
+        """Return factors of columns (C, n), by how much they lower the squares, and their covariance.
+
+        All other parameters are free within their priors; the last `loose` columns have none.
+        """
+        shared = self._rows.T @ columns
+        precision = columns.T @ columns - shared.T @ self._posterior.covariance @ shared
+        tight = len(precision) - loose
+        precision[np.diag_indices(tight)] += AMPLITUDE**-2
+        covariance = np.linalg.pinv(precision, hermitian=True)
+        moment = columns.T @ self.left
+        factors = covariance @ moment
+        return factors, float(moment @ factors), covariance
+
+
+def _fundamental(rest: _Rest, strongest: float) -> Line:
+    """Return the frequency of which the strongest line is a harmonic: the highest that explains as much as any."""
+    lines = [rest.line(strongest / n) for n in range(1, MOST_HARMONICS + 1) if strongest / n >= 1.0 / LONGEST]
+    return next(line for line in lines if line.odds > max(other.odds for other in lines) - SURE)
+
+
+def _rivals(frequencies: np.ndarray, spectrum: np.ndarray, best: float, span: float) -> np.ndarray:
+    """Return the frequencies of the strongest lines that are no harmonics of the best one."""
+    peaks = np.flatnonzero((spectrum[1:-1] >= spectrum[:-2]) & (spectrum[1:-1] >= spectrum[2:])) + 1
+    turns = frequencies[peaks] / best
+    apart = np.abs(turns - np.maximum(np.round(turns), 1.0)) * best * span > 1.5
+    others = peaks[apart]
+    return frequencies[others[np.argsort(-spectrum[others])][:RIVALS]]
