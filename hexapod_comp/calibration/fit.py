@@ -132,13 +132,10 @@ class ModelFit:
         What the readings do not rule out.
     held : HeldDatum
         Where the tool is held: the model is the solution's machine, shifted and turned as a whole.
-<<<<<<< HEAD
     warming : HeatSeen
         What they tell of heat.
-=======
     lead : ScrewLead or None
         What is known of the screws' lead; None where it was not looked for.
->>>>>>> b6f0032 (Screw waves have up to four harmonics a turn, and their lead is looked for in the readings)
     """
 
     model: MachineModel
@@ -155,11 +152,8 @@ class ModelFit:
     notes: tuple[str, ...]
     allowed: Allowed
     held: HeldDatum
-<<<<<<< HEAD
     warming: HeatSeen
-=======
     lead: ScrewLead | None
->>>>>>> b6f0032 (Screw waves have up to four harmonics a turn, and their lead is looked for in the readings)
 
     @property
     def misfit(self) -> str:
@@ -204,17 +198,12 @@ def fit_model(
         settle, forward and backward swapped.
     """
     settings = settings or FitSettings()
-<<<<<<< HEAD
     constants = seek_time_constants(measurements, ParameterSpace(measurements, settings), progress)
     if constants.values:
         settings = replace(settings, time_constants=constants.values)
-    everything = Estimation(measurements, ParameterSpace(measurements, settings))
-    decisions, possible, (space, estimation, solution) = _choose(everything, settings, progress)
-=======
     everything, problem, lead = _begin(measurements, settings, progress)
     settings = everything.space.settings
     decisions, possible, (space, estimation, solution) = _choose(everything, problem, settings, progress)
->>>>>>> b6f0032 (Screw waves have up to four harmonics a turn, and their lead is looked for in the readings)
     channels = tuple(_channels(estimation, solution))
     notes = [
         *_about_lead(lead),
@@ -245,11 +234,8 @@ def fit_model(
         notes=(*measurements.notes, *notes, *_check_worth(level)),
         allowed=allowed,
         held=held,
-<<<<<<< HEAD
         warming=HeatSeen.of(measurements, space, solution, constants),
-=======
         lead=lead,
->>>>>>> b6f0032 (Screw waves have up to four harmonics a turn, and their lead is looked for in the readings)
     )
 
 

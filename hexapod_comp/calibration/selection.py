@@ -19,17 +19,12 @@ CLEAR = 2.0
 LEAST_GAIN = 1e-4
 """A block does not help when its gain is below this: it is rounding, which depends on the libraries, or of no use."""
 
-<<<<<<< HEAD
-EXPECTED = ("pitch", "wave", "backlash", "expansion", "late")
-"""Errors that every screw has, and growth: they stay when they help at all. Of a length map or a field nobody knows
-beforehand."""
-=======
 HARMONICS = ("wave 2", "wave 3", "wave 4")
 """What not every screw has, and what no general block explains: each stays when it helps clearly beside all others."""
 
-EXPECTED = ("pitch", "wave", "backlash")
-"""Errors that every screw has: they stay when they help at all. Of a length map or a field nobody knows beforehand."""
->>>>>>> b6f0032 (Screw waves have up to four harmonics a turn, and their lead is looked for in the readings)
+EXPECTED = ("pitch", "wave", "backlash", "expansion", "late")
+"""Errors that every screw has, and growth: they stay when they help at all. Of a length map or a field nobody knows
+beforehand."""
 
 
 @dataclass(frozen=True)

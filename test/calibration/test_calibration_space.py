@@ -154,14 +154,9 @@ def test_vector_names_and_sizes(space: ParameterSpace):
     """Twelve joints (three shared ones on the platform) and six offsets are 33; every parameter has a name."""
     sizes = {block.name: len(block.labels) for block in space.blocks}
     knots, terms, turning = len(space.knots), len(space.field.terms), len(space.field.reversal_terms)
-<<<<<<< HEAD
-    expected = (33, 6, 12, 6, 6 * knots, 3 * terms, 3 * terms, 18 * turning)
+    expected = (33, 6, 12, 12, 12, 12, 6, 6 * knots, 3 * terms, 3 * terms, 18 * turning)
     cold = [name for name in BLOCKS if name not in ("expansion", "late")]  # nothing has warmed
     assert sizes == dict(zip(cold, expected, strict=True))
-=======
-    expected = (33, 6, 12, 12, 12, 12, 6, 6 * knots, 3 * terms, 3 * terms, 18 * turning)
-    assert sizes == dict(zip(BLOCKS, expected, strict=True))
->>>>>>> b6f0032 (Screw waves have up to four harmonics a turn, and their lead is looked for in the readings)
     labels = [label for block in space.blocks for label in block.labels]
     assert len(set(labels)) == space.size == sum(sizes.values())
     assert [block.part.start for block in space.blocks] == np.cumsum([0, *expected[:-1]]).tolist()
