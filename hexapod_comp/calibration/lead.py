@@ -40,7 +40,7 @@ REFINEMENTS = 4
 """Gauss–Newton steps of a period."""
 
 AGREES = 6.0
-"""A given lead agrees with the one shown within so many standard errors."""
+"""A given lead, or a round one, agrees with the one shown within so many standard errors."""
 
 ROUND = (0.5e-3, 0.025 * 0.0254)
 """Screws are made with leads that are whole multiples of one of these, m."""
@@ -72,8 +72,9 @@ class ScrewLead:
         """The period to be fitted, m: the given one; else the one shown, or the round number that it stands for."""
         if self.given is not None or self.shown is None:
             return self.given
-        round_ones = [step * round(self.shown / step) for step in ROUND]
-        near = [lead for lead in round_ones if abs(lead - self.shown) < 2.0 * self.error]
+        within = AGREES * self.error
+        round_ones = [step * round(self.shown / step) for step in ROUND if within < 0.1 * step]
+        near = [lead for lead in round_ones if abs(lead - self.shown) < within]
         return near[0] if near else self.shown
 
     @property
@@ -107,7 +108,8 @@ def look_for_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
     space = estimation.space
     given = float(space.periods[0]) if np.isfinite(space.periods).all() else None
     tolerances = np.where([b.name in WAVES for b in space.blocks], 0.0, space.start_tolerances())
-    rest = _Rest(estimation, problem, solve(space, problem, tolerances, np.ones(problem.normal.shape[0])))
+    posterior = solve(space, problem, tolerances, np.ones(problem.normal.shape[0]))
+    rest = _Rest(estimation, problem, posterior)
     if rest.freedom < LEAST_FREEDOM:
         return ScrewLead(given, None, np.inf, 0.0)
     spectrum = rest.spectrum()
@@ -117,16 +119,23 @@ def look_for_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
         odds = min(odds, best.odds - rest.line(frequency).odds)
     if odds < SURE:
         return ScrewLead(given, None, np.inf, odds)
-    return ScrewLead(given, 1.0 / best.frequency, best.error / best.frequency**2, odds)
+    # So far the waves counted as noise, which let the priors weigh too much.
+    quiet = solve(space, problem, posterior.tolerances, posterior.noise * best.noise, rounds=0)
+    best = _Rest(estimation, problem, quiet).line(best.frequency)
+    return ScrewLead(given, float(1.0 / best.frequency), float(best.error / best.frequency**2), odds)
 
 
 @dataclass(frozen=True)
 class Line:
-    """A frequency of the errors and its harmonics: 1/m, its standard error, and the log odds against no such errors."""
+    """A frequency of the errors and its harmonics: 1/m, its standard error, and the log odds against no such errors.
+
+    `noise` is what it leaves, over what all else had left.
+    """
 
     frequency: float
     error: float
     odds: float
+    noise: float
 
 
 class _Rest:
@@ -176,12 +185,15 @@ class _Rest:
         """Return the best frequency near one, all other parameters free."""
         half_width, start = 0.5 / self.span, frequency
         for _ in range(REFINEMENTS):
-            less, step, error = self._step_to(frequency)
+            less, step, deviation = self._step_to(frequency)
+            parameters = 12 * self._count(frequency) + 1
+            noise = np.sqrt(max(self.square - less, 1e-6 * self.square) / (self.freedom - parameters))
+            error = noise * deviation
             step = float(np.clip(step, -half_width, half_width))
             if abs(frequency + step - start) > half_width or abs(step) < 0.01 * error:
                 break
             frequency += step
-        return Line(frequency, error, self._odds(less, 12 * self._count(frequency) + 1))
+        return Line(frequency, error, self._odds(less, parameters), noise)
 
     def _count(self, frequency: float) -> int:
         """Return how many harmonics of a frequency are in the band that is looked through."""
@@ -193,7 +205,7 @@ class _Rest:
         return 0.5 * self.freedom * float(np.log(self.square / left)) - parameters
 
     def _step_to(self, frequency: float) -> tuple[float, float, float]:
-        """Return by how much waves of a frequency lower the squares, the step to a better one, its standard error."""
+        """Return by how much waves of a frequency lower the squares, the step to a better one, its deviation at noise 1."""
         angle = 2.0 * np.pi * frequency * self.commands
         orders = np.arange(1, self._count(frequency) + 1)
         c, s = (self.gains[:, None] * f(orders[:, None] * angle[:, None]) for f in (np.cos, np.sin))
@@ -203,8 +215,7 @@ class _Rest:
         turning = 2.0 * np.pi * self.commands[:, None] * orders[:, None]
         slope = self._free(((b * c - a * s) * turning).sum(axis=(1, 2))[:, None])
         together, _, covariance = self._solved(np.hstack([waves, slope]), loose=1)
-        left = np.sqrt(max(self.square - less, 1e-6 * self.square) / self.freedom)
-        return less, float(together[-1]), float(np.sqrt(covariance[-1, -1]) * left)
+        return less, float(together[-1]), float(np.sqrt(covariance[-1, -1]))
 
     def _free(self, columns: np.ndarray) -> np.ndarray:
         """Return columns free of what the instruments do not know."""

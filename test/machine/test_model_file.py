@@ -236,6 +236,42 @@ def test_a_file_written_by_hand(tmp_path):
     assert (model.base_expansion, model.platform_expansion) == (0.0, 23.1e-6)
 
 
+HARMONICS = """    harmonics:
+    - {times: 4, cosine_um: 1}
+    - {times: 2, cosine_um: [1, 2, 3, 4, 5, 6], sine_um: 0.5}
+"""
+
+
+def test_harmonics_of_the_waves(tmp_path):
+    """Truth: the numbers in HARMONICS; their order does not matter, and what is not given is zero."""
+    model = load(tmp_path, BY_HAND.replace("    sine_um: 2\n", f"    sine_um: 2\n{HARMONICS}"))
+    zero, six = np.zeros(6), np.arange(1.0, 7.0)
+    np.testing.assert_allclose(model.struts.cosine.T, np.array([zero, six, zero, zero + 1.0]) * 1e-6, rtol=1e-15)
+    np.testing.assert_allclose(model.struts.sine.T, np.array([zero + 2.0, zero + 0.5, zero, zero]) * 1e-6, rtol=1e-15)
+    assert_equal(there_and_back(model, tmp_path, PAPER), model)
+
+
+@pytest.mark.parametrize(
+    ("harmonic", "said"),
+    [
+        ("{times: 1, cosine_um: 1}", ["struts.wave.harmonics[0].times", "2…4", "found 1"]),
+        ("{times: 5, cosine_um: 1}", ["times", "2…4", "found 5"]),
+        ("{times: 2.0, cosine_um: 1}", ["times", "whole number", "2.0"]),
+        ("{cosine_um: 1}", ["times", "missing"]),
+        ("{times: 2, cosine: 1}", ["cosine", "no unit", "cosine_um"]),
+        ("{times: 2, cosine_m: 1}", ["struts", "allowed 0.2"]),
+        ("{times: 2, period_mm: 1}", ["harmonics[0].period_mm", "not a known key"]),
+        ("{times: 2}\n    - {times: 2}", ["harmonics[1].times", "given twice", "2"]),
+    ],
+)
+def test_harmonics_that_are_none(tmp_path, harmonic, said):
+    text = BY_HAND.replace("    sine_um: 2\n", f"    sine_um: 2\n    harmonics:\n    - {harmonic}\n")
+    with pytest.raises(InputFileError) as refusal:
+        load(tmp_path, text)
+    for word in said:
+        assert word in str(refusal.value)
+
+
 def test_a_field_written_by_hand(tmp_path):
     """Truth: the lines in BY_HAND. Shorter polynomials are filled up with zeros, what is left out is zero."""
     field = load(tmp_path, BY_HAND).field

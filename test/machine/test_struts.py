@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from strategies import fixed, paper_geometry, random_pose, random_struts, seeds, skewed_geometry
 
 from hexapod_comp.errors import ModelError
-from hexapod_comp.kernels.struts import actual_length, command_for_length, screw_twist
+from hexapod_comp.kernels.struts import HARMONICS, actual_length, command_for_length, screw_twist
 from hexapod_comp.machine.model import MachineModel, RealMachine, Temperatures
 from hexapod_comp.machine.motion import MotionState
 from hexapod_comp.machine.struts import STEEPEST_ERROR, StrutErrors
@@ -61,6 +61,20 @@ def on_strut_4(value):
             StrutErrors(sine=on_strut_4(3e-6), period=np.full(6, 0.004)),
             lambda c: 3e-6 * np.sin(2.0 * np.pi * c / 0.004),
             id="sine",
+        ),
+        pytest.param(
+            StrutErrors(
+                cosine=on_strut_4(1.0)[:, None] * [3e-6, 0.0, 2e-6, 0.0],
+                sine=on_strut_4(1.0)[:, None] * [0.0, -1e-6, 0.0, 1e-6],
+                period=np.full(6, 0.005),
+            ),
+            lambda c: (
+                3e-6 * np.cos(400.0 * np.pi * c)
+                - 1e-6 * np.sin(800.0 * np.pi * c)
+                + 2e-6 * np.cos(1200.0 * np.pi * c)
+                + 1e-6 * np.sin(1600.0 * np.pi * c)
+            ),
+            id="harmonics",
         ),
     ],
 )
@@ -165,6 +179,10 @@ def test_undone_also_where_the_error_is_as_steep_as_allowed(period, offset, phas
         ({"period": np.zeros(6)}, "struts.period.*above zero"),
         ({"pitch": on_strut_4(0.5)}, r"struts\[3\].*0.5 m per m, allowed 0.2"),
         ({"sine": np.full(6, 1e-3)}, r"struts\[0\].*allowed 0.2"),
+        ({"sine": np.zeros((6, 2))}, r"cosine.*sine.*\(6, 1\) and \(6, 2\)"),
+        ({"sine": np.zeros((6, 5)), "cosine": np.zeros((6, 5))}, r"n = 1…4 harmonics, not \(6, 5\)"),
+        ({"sine": np.zeros((2, 6)), "cosine": np.zeros((2, 6))}, r"shape \(6, n\).*not \(2, 6\)"),
+        ({"sine": np.full((6, 2), [0, 1.2e-4]), "cosine": np.full((6, 2), [1.2e-4, 0])}, r"struts\[0\].*0.226.*0.2"),
         ({"map_knots": np.array([0.4]), "map_values": np.zeros((6, 1))}, "struts.map_knots.*two"),
         ({"map_knots": np.array([0.4, 0.4]), "map_values": np.zeros((6, 2))}, "struts.map_knots.*increasing"),
         ({"map_knots": np.array([0.4, 0.5]), "map_values": np.zeros((6, 3))}, r"struts.map_values.*\(6, 3\)"),
@@ -173,6 +191,13 @@ def test_undone_also_where_the_error_is_as_steep_as_allowed(period, offset, phas
 def test_refused(bad, message):
     with pytest.raises(ModelError, match=message):
         StrutErrors(**bad)
+
+
+def test_harmonics_that_no_strut_has_are_left_out():
+    """The kernels work for those that a model has; and a model is the same however it was written."""
+    struts = StrutErrors(cosine=on_strut_4(3e-6)[:, None] * [1.0, 0.0, 0.0], sine=np.zeros((6, 3)))
+    assert struts.cosine.shape == struts.sine.shape == (6, 1)
+    np.testing.assert_array_equal(arrays(struts)[0][:, HARMONICS], on_strut_4(1.0))
 
 
 # Rotation of the screws.
