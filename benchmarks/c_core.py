@@ -124,6 +124,7 @@ def machines() -> Iterator[tuple[str, HexapodGeometry, MachineModel]]:
         geometry = replace(geometry, **frames, screw_lead=geometry.screw_lead * (-1.0) ** number)
         box = geometry.home.position + np.array([[-0.2], [0.2]]) * np.ones(3)
         bounds = ImperfectionBounds(50e-6, 50e-6, 1e-4, (1e-6, 5e-6), 5e-3, (0.0, 2e-5), 2e-5, 2e-5, 0.5, box)
+        bounds = replace(bounds, harmonics=(0.5e-6, 2e-6) if number % 2 else (0.0, 0.0))
         model = replace(draw_model(geometry, bounds, number), base_expansion=1.2e-5, platform_expansion=2.3e-5)
         yield geometry.name, geometry, model
 

@@ -39,6 +39,12 @@ LEAST_FREEDOM = 200.0
 REFINEMENTS = 4
 """Gauss–Newton steps of a period."""
 
+PROMISING = 3.0
+"""Lines of so many times the spectrum's median may belong to the strongest one: of noise, one in a thousand does."""
+
+SCALE_ROUNDS = 5
+"""Rounds of estimating tolerances and noise without waves."""
+
 AGREES = 6.0
 """A given lead, or a round one, agrees with the one shown within so many standard errors."""
 
@@ -108,15 +114,15 @@ def look_for_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
     space = estimation.space
     given = float(space.periods[0]) if np.isfinite(space.periods).all() else None
     tolerances = np.where([b.name in WAVES for b in space.blocks], 0.0, space.start_tolerances())
-    posterior = solve(space, problem, tolerances, np.ones(problem.normal.shape[0]))
+    posterior = solve(space, problem, tolerances, np.ones(problem.normal.shape[0]), SCALE_ROUNDS)
     rest = _Rest(estimation, problem, posterior)
     if rest.freedom < LEAST_FREEDOM:
         return ScrewLead(given, None, np.inf, 0.0)
     spectrum = rest.spectrum()
-    best = _fundamental(rest, rest.frequencies[spectrum.argmax()])
+    best = _fundamental(rest, spectrum)
     odds = best.odds
     for frequency in _rivals(rest.frequencies, spectrum, best.frequency, rest.span):
-        odds = min(odds, best.odds - rest.line(frequency).odds)
+        odds = min(odds, best.odds - rest.line(frequency, 1).odds)
     if odds < SURE:
         return ScrewLead(given, None, np.inf, odds)
     # So far the waves counted as noise, which let the priors weigh too much.
@@ -181,12 +187,13 @@ class _Rest:
             power += np.abs(line) ** 2 / max(0.5 * gain @ gain, np.finfo(float).tiny)
         return power
 
-    def line(self, frequency: float) -> Line:
-        """Return the best frequency near one, all other parameters free."""
+    def line(self, frequency: float, harmonics: int = MOST_HARMONICS) -> Line:
+        """Return the best frequency near one, with at most so many harmonics, all other parameters free."""
+        harmonics = int(np.clip(1.0 / (SHORTEST * frequency), 1, harmonics))
+        parameters = 12 * harmonics + 1
         half_width, start = 0.5 / self.span, frequency
         for _ in range(REFINEMENTS):
-            less, step, deviation = self._step_to(frequency)
-            parameters = 12 * self._count(frequency) + 1
+            less, step, deviation = self._step_to(frequency, harmonics)
             noise = np.sqrt(max(self.square - less, 1e-6 * self.square) / (self.freedom - parameters))
             error = noise * deviation
             step = float(np.clip(step, -half_width, half_width))
@@ -195,26 +202,24 @@ class _Rest:
             frequency += step
         return Line(frequency, error, self._odds(less, parameters), noise)
 
-    def _count(self, frequency: float) -> int:
-        """Return how many harmonics of a frequency are in the band that is looked through."""
-        return int(np.clip(1.0 / (SHORTEST * frequency), 1, MOST_HARMONICS))
-
     def _odds(self, less: float, parameters: int) -> float:
         """Return the log odds of an explanation that lowers the squares, at the noise that it leaves."""
         left = max(self.square - less, 1e-6 * self.square)
         return 0.5 * self.freedom * float(np.log(self.square / left)) - parameters
 
-    def _step_to(self, frequency: float) -> tuple[float, float, float]:
-        """Return by how much waves of a frequency lower the squares, the step to a better one, its deviation at noise 1."""
+    def _step_to(self, frequency: float, harmonics: int) -> tuple[float, float, float]:
+        """Return by how much waves of a frequency lower the squares, the step to a better one, its error at noise 1."""
         angle = 2.0 * np.pi * frequency * self.commands
-        orders = np.arange(1, self._count(frequency) + 1)
+        orders = np.arange(1, harmonics + 1)
         c, s = (self.gains[:, None] * f(orders[:, None] * angle[:, None]) for f in (np.cos, np.sin))
         waves = self._free(np.concatenate([c, s], axis=1).reshape(len(angle), -1))
-        amplitudes, less, _ = self._solved(waves)
+        shared = self._rows.T @ waves
+        amplitudes, less, _ = self._solved(waves, shared)
         a, b = amplitudes.reshape(2, len(orders), 6)
         turning = 2.0 * np.pi * self.commands[:, None] * orders[:, None]
         slope = self._free(((b * c - a * s) * turning).sum(axis=(1, 2))[:, None])
-        together, _, covariance = self._solved(np.hstack([waves, slope]), loose=1)
+        every = np.hstack([waves, slope]), np.hstack([shared, self._rows.T @ slope])
+        together, _, covariance = self._solved(*every, loose=1)
         return less, float(together[-1]), float(np.sqrt(covariance[-1, -1]))
 
     def _free(self, columns: np.ndarray) -> np.ndarray:
@@ -223,12 +228,12 @@ class _Rest:
             columns[members] -= q @ (q.T @ columns[members])
         return columns
 
-    def _solved(self, columns: np.ndarray, loose: int = 0) -> tuple[np.ndarray, float, np.ndarray]:
+    def _solved(self, columns: np.ndarray, shared: np.ndarray, loose: int = 0) -> tuple[np.ndarray, float, np.ndarray]:
         """Return factors of columns (C, n), by how much they lower the squares, and their covariance.
 
-        All other parameters are free within their priors; the last `loose` columns have none.
+        `shared` are their products with the derivatives by all other parameters, which are free within their priors;
+        the last `loose` columns have none.
         """
-        shared = self._rows.T @ columns
         precision = columns.T @ columns - shared.T @ self._posterior.covariance @ shared
         tight = len(precision) - loose
         precision[np.diag_indices(tight)] += AMPLITUDE**-2
@@ -238,9 +243,19 @@ class _Rest:
         return factors, float(moment @ factors), covariance
 
 
-def _fundamental(rest: _Rest, strongest: float) -> Line:
-    """Return the frequency of which the strongest line is a harmonic: the highest that explains as much as any."""
-    lines = [rest.line(strongest / n) for n in range(1, MOST_HARMONICS + 1) if strongest / n >= 1.0 / LONGEST]
+def _fundamental(rest: _Rest, spectrum: np.ndarray) -> Line:
+    """Return the frequency of which the strongest line is a harmonic: the highest that explains as much as any.
+
+    Parts of it are tried only where one of their other harmonics stands out of the spectrum.
+    """
+    strongest = rest.frequencies[spectrum.argmax()]
+    lines = [rest.line(strongest)]
+    for n in range(2, MOST_HARMONICS + 1):
+        others = np.array([m * strongest / n for m in range(1, MOST_HARMONICS + 1) if m % n])
+        at = np.searchsorted(rest.frequencies, others[others <= rest.frequencies[-1]])
+        stands_out = spectrum[np.minimum(at, len(spectrum) - 1)].max() > PROMISING * np.median(spectrum)
+        if strongest / n >= 1.0 / LONGEST and stands_out:
+            lines.append(rest.line(strongest / n))
     return next(line for line in lines if line.odds > max(other.odds for other in lines) - SURE)
 
 

@@ -20,7 +20,7 @@ LEAST_GAIN = 1e-4
 """A block does not help when its gain is below this: it is rounding, which depends on the libraries, or of no use."""
 
 HARMONICS = ("wave 2", "wave 3", "wave 4")
-"""What not every screw has, and what no general block explains: each stays when it helps clearly beside all others."""
+"""What not every screw has, and no general block explains."""
 
 EXPECTED = ("pitch", "wave", "backlash", "expansion", "late")
 """Errors that every screw has, and growth: they stay when they help at all. Of a length map or a field nobody knows
@@ -57,9 +57,10 @@ def select(
 
     Where there is only one, nothing is left to fit without it, and no block is kept.
 
-    All blocks start in. The general one that helps least goes, until every one that is left helps clearly;
-    then the screw waves' harmonics that do not; then the expected ones that do not help at all. Taking them in one
-    by one instead can let a field explain what a length map does better.
+    All blocks start in. The screw waves' harmonics go first, if all together do not help clearly, or else each that
+    does not. Then the general block that helps least goes, until every one that is left helps clearly; then the
+    expected ones that do not help at all. Taking them in one by one instead can let a field explain what a length map
+    does better.
 
     Parameters
     ----------
@@ -81,6 +82,7 @@ def select(
     names = [b.name for b in space.blocks[1:]]
     kept = list(names)
     gains: dict[str, tuple[float, float]] = {}
+    kept = _without_harmonics(trials, kept, gains)
     general = [name for name in names if name not in (*EXPECTED, *HARMONICS)]
     while True:
         # A block that helps clearly beside all others helps no less when some of them have gone.
@@ -90,13 +92,23 @@ def select(
         if not doubtful:
             break
         kept.remove(min(doubtful, key=lambda name: gains[name][0] / max(gains[name][1], 1e-12)))
-    gains |= {name: trials.gain(("structure", *kept), name) for name in kept if name in HARMONICS}
-    kept = [name for name in kept if name not in HARMONICS or _clear(gains[name])]
     for name in (name for name in names if name in EXPECTED):
         gains[name] = trials.gain(("structure", *kept), name)
     useless = [name for name in EXPECTED if name in kept and gains[name][0] <= LEAST_GAIN]
     kept = [name for name in kept if name not in useless]
     return [Decision(name, name in kept, *gains[name]) for name in names], trials.everything
+
+
+def _without_harmonics(trials: _Trials, kept: list[str], gains: dict[str, tuple[float, float]]) -> list[str]:
+    """Return the blocks that are left when the harmonics have been decided on; add these blocks' gains."""
+    every, harmonics = ("structure", *kept), [name for name in kept if name in HARMONICS]
+    if not harmonics:
+        return kept
+    together = trials.gain(every, *harmonics)
+    gains |= dict.fromkeys(harmonics, together)
+    if _clear(together) and len(harmonics) > 1:
+        gains |= {name: trials.gain(every, name) for name in harmonics}
+    return [name for name in kept if name not in HARMONICS or (_clear(together) and _clear(gains[name]))]
 
 
 def _clear(gain: tuple[float, float] | None) -> bool:
@@ -113,10 +125,10 @@ class _Trials:
         self._known: dict[frozenset[str], np.ndarray] = {}
         self.everything = self._solve(space.start_tolerances(), FIRST_ROUNDS)
 
-    def gain(self, names: tuple[str, ...], block: str) -> tuple[float, float]:
-        """Return by which share a block among `names` lowers the squared error, and its standard error."""
+    def gain(self, names: tuple[str, ...], *blocks: str) -> tuple[float, float]:
+        """Return by which share blocks among `names` lower the squared error, and its standard error."""
         with_it = self._errors(names)
-        without = self._errors(tuple(name for name in names if name != block))
+        without = self._errors(tuple(name for name in names if name not in blocks))
         if len(without) < 2:
             return 0.0, 0.0
         less = (without - with_it) / max(without.sum(), np.finfo(float).tiny)

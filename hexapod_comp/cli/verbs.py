@@ -212,7 +212,7 @@ written without --force), 2 bad input.
 
 example:
   $ hexapod_comp simulate --campaign campaign_5d --seed 1 --out measured.csv
-  $ hexapod_comp fit measured.csv --lead-mm 10 --out model.yaml --pictures out
+  $ hexapod_comp fit measured.csv --out model.yaml --pictures out
   $ hexapod_comp demo --model model.yaml""",
     ),
     "iso230": Verb(
