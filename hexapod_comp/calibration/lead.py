@@ -224,8 +224,8 @@ class _Rest:
 
     def _free(self, columns: np.ndarray) -> np.ndarray:
         """Return columns free of what the instruments do not know."""
-        for members, q in self._problem.zeros:
-            columns[members] -= q @ (q.T @ columns[members])
+        for part in self._problem.unknowns:
+            part.project_out(columns)
         return columns
 
     def _solved(self, columns: np.ndarray, shared: np.ndarray, loose: int = 0) -> tuple[np.ndarray, float, np.ndarray]:
