@@ -207,7 +207,7 @@ def fit_model(
     channels = tuple(_channels(estimation, solution))
     notes = [
         *_about_lead(lead),
-        *_ignored(measurements, settings),
+        *_ignored(measurements, space),
         *_check_backlash(space, solution),
         *_check_noise(channels),
     ]
@@ -371,7 +371,7 @@ def _about_lead(lead: ScrewLead | None) -> list[str]:
     return []
 
 
-def _ignored(measurements: MeasurementSet, settings: FitSettings) -> list[str]:
+def _ignored(measurements: MeasurementSet, space: ParameterSpace) -> list[str]:
     """Return remarks on what the fit was not told and therefore takes for something else."""
     notes = []
     warmth = np.abs(measurements.stations.temperatures - REFERENCE_TEMPERATURE).max()
