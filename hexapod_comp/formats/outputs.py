@@ -47,7 +47,8 @@ def inputs_protected(args: argparse.Namespace) -> Iterator[None]:
     Raises
     ------
     InputFileError
-        An output is one of the inputs, or its place cannot take it: better now than after a long calculation.
+        An output is one of the inputs, or another output, or its place cannot take it: better now than after a long
+        calculation.
     """
     try:
         for name in READ:
@@ -60,9 +61,21 @@ def inputs_protected(args: argparse.Namespace) -> Iterator[None]:
             if isinstance(value, str):
                 refuse_replacing_input(value)
                 (_refuse_no_folder if name in FOLDERS else _refuse_no_file)(value)
+        _refuse_two_in_one({name: getattr(args, name, None) for name in WRITTEN})
         yield
     finally:
         _protected.clear()
+
+
+def _refuse_two_in_one(outputs: dict[str, str | None]) -> None:
+    """Raise where two options name one file; a pipe or a device takes both."""
+    taken: dict[str, str] = {}
+    for name, path in outputs.items():
+        if path is None or (os.path.exists(path) and not os.path.isfile(path)):
+            continue
+        other = taken.setdefault(os.path.realpath(path), name)
+        if other != name:
+            raise InputFileError(path, "", f"cannot hold both what --{other} and what --{name} write")
 
 
 def refuse_replacing_input(path: str | Path) -> None:

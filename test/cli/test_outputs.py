@@ -32,7 +32,10 @@ def options() -> dict[str, set[str]]:
         verb: {
             a.dest
             for a in parser._actions
-            if a.nargs != 0 and a.type in (None, arguments.csv_file) and a.choices is None and a.help != SUPPRESS
+            if a.nargs != 0
+            and a.type in (None, arguments.csv_file, arguments.html_file)
+            and a.choices is None
+            and a.help != SUPPRESS
         }
         for verb, parser in parsers().items()
     }
@@ -142,3 +145,13 @@ def test_existing_files_that_are_no_inputs_are_replaced_as_before(folder: Path):
     out = folder / "m.csv"
     assert cli.main(["ik", str(folder / "table1.csv"), "--out", str(out)]) == 0
     assert out.read_text().startswith("sequence,L1_mm")
+
+
+def test_two_outputs_in_one_file_are_refused_at_once(folder: Path, capsys):
+    """One would replace the other without a word."""
+    shutil.copy(ROOT / "config" / "table1.csv", folder / "r.csv")
+    (folder / "link.html").symlink_to(folder / "a.html")
+    command = f"fit {folder}/r.csv --out {folder}/a.html --certificate {folder}/link.html"
+    assert cli.main(command.split()) == 2
+    assert "cannot hold both what --certificate and what --out write" in capsys.readouterr().err
+    assert not (folder / "a.html").exists()
