@@ -30,7 +30,7 @@ READ = (
 )
 """Arguments of all verbs that name what is read: files, shipped files, or a bag's folder."""
 
-WRITTEN = ("certificate", "out", "report", "table")
+WRITTEN = ("certificate", "mjcf", "out", "report", "table", "urdf")
 """Arguments that name files to write."""
 
 FOLDERS = ("c_folder", "folder", "linuxcnc", "pictures")
