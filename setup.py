@@ -81,6 +81,7 @@ setup(
         "ros": [
             "ros-jazzy-rclpy[fastrtps]>=7.1.6,<8",
             "ros-jazzy-common-interfaces>=5.3.6,<6",
+            "rosbags>=0.11",  # README's commands record and replay
         ],
         # Linters stay at one minor version, so that a new rule never breaks yesterday's checkout.
         "test": [

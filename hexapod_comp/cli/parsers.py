@@ -184,6 +184,14 @@ def _demo(parser: argparse.ArgumentParser) -> None:
     _pictures(add, "out")
 
 
+def _record(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("--out", required=True, metavar="FOLDER", help="folder for the bag (MCAP); must not be there yet")
+    add("--namespace", default="", metavar="NAME", help="where the machine's nodes are (default: none)")
+    add("--seconds", type=arguments.above_zero, metavar="S", help="end after so long (default: at Ctrl-C)")
+    _json(add)
+
+
 def _replay(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("bag", metavar="BAG", help="folder of a bag, .mcap or .db3 file")
@@ -422,6 +430,7 @@ OPTIONS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     "check": _check,
     "run": _run,
     "demo": _demo,
+    "record": _record,
     "replay": _replay,
     "plan": _plan,
     "imagine": _imagine,

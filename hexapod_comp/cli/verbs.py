@@ -139,6 +139,17 @@ example:
   $ hexapod_comp demo --machine mine.yaml --truth random:7
   $ hexapod_comp demo --model paper_lines_model     (the scheme of Mou & King 1998 on 1-D lines)""",
     ),
+    "record": Verb(
+        "loop",
+        "record a running machine's topics, for replay",
+        """Hears commands, readings, estimates, diagnostics and the compensator's journal in this ROS domain, and writes
+them as ros2 bag does, into a folder with an MCAP file. It ends at Ctrl-C, or after --seconds. It may begin in the
+middle of a motion. Exit code: 0 there is something to replay, 1 no compensator was heard, 2 bad input.
+
+example:
+  $ hexapod_comp record --out run
+  $ hexapod_comp replay run""",
+    ),
     "replay": Verb(
         "loop",
         "run a recorded bag through the compensator again: the same bits?",
@@ -217,7 +228,7 @@ example:
     ),
     "iso230": Verb(
         "calibration",
-        "the figures of ISO 230-2, 230-6 and 230-4 of measured lines, diagonals and circles",
+        "the figures of ISO 230-2, 230-4 and 230-6 of readings",
         """Judges every linear run with two cycles or more, all targets read from both sides in each (the standards ask
 for five cycles; a campaign says how many it makes). Lines along an axis of the work frame come under ISO 230-2:2014,
 all others, as body and face diagonals, under ISO 230-6:2002: A, E, R, M, B. Lengths read around a circle from its

@@ -77,7 +77,7 @@ def test_help_is_fast_and_needs_no_compiler() -> None:
     assert done.returncode == 0, done.stderr
     listed = re.findall(r"^ +(\w+):$|^    (\w+)  ", done.stdout, re.MULTILINE)
     assert " ".join(group + ":" if group else verb for group, verb in listed) == (
-        "kinematics: show ik fk check loop: run demo replay calibration: plan imagine simulate fit iso230 export "
+        "kinematics: show ik fk check loop: run demo record replay calibration: plan imagine simulate fit iso230 export "
         "analysis: assess classify paper"
     )
     assert all(len(line) <= 80 for line in done.stdout.splitlines() if line.startswith("    ")), "one line a verb"
@@ -130,7 +130,7 @@ def test_json_is_printed_and_out_stays_csv(hexapod, tmp_path: Path) -> None:
     ("typed", "offered"),
     [
         ("", set(VERBS)),
-        ("re", {"replay"}),
+        ("re", {"record", "replay"}),
         ("ik --m", {"--machine", "--model"}),
         ("ik --machine pap", {"paper.yaml"}),
         ("ik --machine ", {*MACHINES, "mine.csv", "deep/"}),

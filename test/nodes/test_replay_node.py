@@ -5,6 +5,9 @@ The truth is what the node has sent.
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +17,9 @@ import pytest
 from node_helpers import HOME, Bench, model_file, near
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
+from hexapod_comp.errors import InputFileError
 from hexapod_comp.nodes.messages import pose_message
+from hexapod_comp.nodes.recorder import BagRecorder
 from hexapod_comp.pose import Pose
 
 pytest.importorskip("rosbags")
@@ -71,6 +76,31 @@ def test_a_run_with_everything_is_replayed_bit_for_bit(bench, tmp_path):
     assert {event.entry.what for event in result.changes} == {"temperature", "enable", "model", "reset"}
     assert [event.entry.values["reason"] for event in result.refused] == ["step", "frame_id"]
     assert len(recording.sources) >= 3, "geometry and both models"
+
+
+def test_what_the_verb_records_is_replayed_and_a_folder_that_is_there_is_left_alone(bench, tmp_path):
+    """The recorder runs as a user has it, in a process, beside a compensator that is moving already."""
+    bench.compensator()
+    answers = [bench.ask(along(n)) for n in range(20)]
+    command = [sys.executable, "-m", "hexapod_comp", "record", "--out", str(tmp_path / "run")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    journal = next(p for p in bench.nodes[0].publishers if p.topic_name.endswith("/journal"))
+    bench.until(journal.get_subscription_count, "the recorder", timeout=60.0)
+    commands = next(p for p in bench.nodes[0].publishers if p.topic_name == "/strut_commands")
+    bench.until(lambda: commands.get_subscription_count() > 1, "the recorder of commands")
+    answers += [bench.ask(along(n)) for n in range(20, 60)]
+    pages = len(bench.seen["/diagnostics"])
+    bench.until(lambda: len(bench.seen["/diagnostics"]) > pages + 1, "another page of the journal")
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=30.0)
+    assert process.returncode == 0, errors
+    assert "/compensator/journal" in output
+    recording, result = replayed(tmp_path / "run")
+    assert (result.outcome == IDENTICAL).all()
+    assert len(result.outcome) >= 40
+    assert recording.heard >= 40
+    with pytest.raises(InputFileError, match="is there already"):
+        BagRecorder(tmp_path / "run")
 
 
 def test_a_start_from_the_last_command_is_replayed_bit_for_bit(bench, tmp_path):

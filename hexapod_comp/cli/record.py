@@ -1,0 +1,32 @@
+"""``hexapod_comp record``: a machine's topics into a bag, without ROS 2's own tools."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import signal
+import sys
+import threading
+import time
+
+from . import common
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the verb; 0 when there is something to be replayed."""
+    from ..nodes.recorder import BagRecorder
+
+    stop, end = threading.Event(), time.monotonic() + (args.seconds or math.inf)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    with BagRecorder(args.out, args.namespace) as recorder, common.progress_bar(0, " messages") as bar:
+        print(f"hexapod_comp: recording to {args.out} until Ctrl-C", file=sys.stderr)
+        recorder.run(lambda: not stop.is_set() and time.monotonic() < end, bar.update)
+    if args.json:
+        common.show({"bag": args.out, "messages": recorder.counts})
+    else:
+        print("\n".join([f"{count:8d}  {topic}" for topic, count in sorted(recorder.counts.items())]))
+        print(f"written: {args.out}")
+    if not recorder.journal:
+        common.say_notes(["no compensator was heard: there is nothing to replay"])
+    return 0 if recorder.journal else 1
