@@ -18,7 +18,7 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths
 from ..machine.model import Datum, MachineModel
 from ..pose import Pose
-from .estimation import Estimation, Posterior
+from .estimation import Estimation
 from .sensitivity import carried
 from .smooth_field import DIGITS
 
@@ -128,7 +128,7 @@ def hold(
 
 
 def unseen_part(
-    estimation: Estimation, posterior: Posterior, pose: Pose, before: np.ndarray | None = None
+    estimation: Estimation, tolerance: float, noise: np.ndarray, pose: Pose, before: np.ndarray | None = None
 ) -> np.ndarray:
     """Return which part of the tool's error at a pose is a motion of the whole machine that readings do not show.
 
@@ -136,8 +136,10 @@ def unseen_part(
     ----------
     estimation : Estimation
         The readings and what their instruments do not know.
-    posterior : Posterior
-        Tolerance of the structure and noise of the readings.
+    tolerance : float
+        Of the structure, m.
+    noise : ndarray, shape (kinds,)
+        Factor on the stated standard deviation of each kind's readings.
     pose : Pose
         ``pose_platform_in_base``.
     before : ndarray, shape (6, 6), optional
@@ -154,9 +156,9 @@ def unseen_part(
     arms = measurements.points() - (pose @ geometry.tool).position
     motions = carried(np.tile(np.eye(6), (len(arms), 1, 1)), arms)[cells.station]
     rows = estimation.free_of_unknowns(np.einsum("ci,cip->cp", cells.directions, motions))
-    rows /= posterior.noise[cells.kind, None]
+    rows /= noise[cells.kind, None]
     size = np.repeat([1.0, 1.0 / geometry.characteristic_length], 3)
-    rows *= posterior.tolerances[0] * size
+    rows *= tolerance * size
     hidden = np.eye(6) if before is None else _range(before / size[:, None] * size)
     strength, directions = np.linalg.eigh(hidden.T @ rows.T @ rows @ hidden)
     unseen = hidden @ directions[:, strength <= SEEN**2]

@@ -216,7 +216,7 @@ def fit_model(
     allowed = _allowed(everything.space, possible, (space, solution))
     level, tilted = (expected_error(space, solution.x, covariance, tilt, allowed=allowed) for tilt in (0.0, TILT))
     pose = measurements.geometry.home if datum is None else datum
-    part = unseen_part(estimation, solution.posterior, pose)
+    part = unseen_part(estimation, solution.posterior.tolerances[0], solution.posterior.noise, pose)
     as_solved = _named(space, solution, measurements, channels, len(decisions))
     model, held = hold(measurements.geometry, as_solved, pose, part)
     return ModelFit(

@@ -322,6 +322,10 @@ class ParameterSpace:
         """Return derivatives (n, size) by x as derivatives by y, with x = root·y block by block."""
         return np.hstack([rows[:, b.part] @ b.root for b in self.blocks])
 
+    def unwhitened(self, rows: np.ndarray) -> np.ndarray:
+        """Return derivatives (n, size) by y as derivatives by x: undoes :meth:`whitened`."""
+        return np.hstack([np.linalg.solve(b.root.T, rows[:, b.part].T).T for b in self.blocks])
+
     def physical(self, y: np.ndarray) -> np.ndarray:
         """Return x = root·y for y of shape (size, …)."""
         return np.concatenate([b.root @ y[b.part] for b in self.blocks])

@@ -69,6 +69,10 @@ def run(args: argparse.Namespace) -> int:
     # One fit's matrices are too small for the threads of NumPy's BLAS, which on busy cores wait for each other. It
     # reads this when it is loaded, and nothing has loaded it yet.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if args.update is not None:
+        from .renewal import renew
+
+        return renew(args)
     from ..errors import CalibrationError
     from ..machine.geometry import load_geometry
     from ..machine.model import RealMachine
@@ -172,6 +176,8 @@ def _refuse_options_of_the_other_scheme(args: argparse.Namespace) -> None:
     from ..errors import CalibrationError
 
     of_joint = ("lead_mm", "blocks", "tolerance_um", "field_degree", "expansion_ppm")
+    if args.compensated:
+        raise CalibrationError("--compensated", "is for check readings, of verify or of fit --update")
     others = (
         ("order", "every_line")
         if args.scheme == "joint"

@@ -291,6 +291,8 @@ def _fit(parser: argparse.ArgumentParser) -> None:
     _json(add)
     add("--truth", metavar="FILE", help=f"errors of the virtual machine that was measured: file, shipped name, {WORDS}")
     add("--force", action="store_true", help="write a model that the readings do not bear out")
+    add("--update", metavar="MODEL", help="renew this model from few readings, what its fit knows as the prior")
+    _compensated(add)
     _estimation(parser)
     text = "trust readings that disagree with the rest (scheme joint)"
     add("--not-robust", action="store_true", help=text)
@@ -298,6 +300,19 @@ def _fit(parser: argparse.ArgumentParser) -> None:
     add("--order", choices=("adjusted-r2", "aicc"), help=text)
     text = "report order, R² and residual of each line (scheme lines)"
     add("--every-line", action="store_true", help=text)
+
+
+def _verify(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("model", metavar="MODEL", help="model file that fit has written, MODEL.posterior.npz beside it")
+    _readings(add)
+    _compensated(add)
+    _json(add)
+
+
+def _compensated(add: Add) -> None:
+    text = "check readings: taken with the compensation running, by the model that is checked"
+    add("--compensated", action="store_true", help=text)
 
 
 def _readings(add: Add) -> None:
@@ -436,6 +451,7 @@ OPTIONS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     "imagine": _imagine,
     "simulate": _simulate,
     "fit": _fit,
+    "verify": _verify,
     "iso230": _iso230,
     "export": _export,
     "assess": _assess,

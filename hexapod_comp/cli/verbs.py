@@ -218,6 +218,7 @@ the fit did not see. --scheme lines is that of Mou & King 1998: a polynomial per
 --certificate writes a page to be filed: machine, instruments, environment, errors before and after, figures of
 ISO 230, pictures, hashes of model and readings; any browser prints it to PDF.
 --truth names the errors of the virtual machine that simulate moved: the report then says what the model is worth.
+--update renews a model from the few readings of a check, and writes another one (see verify).
 Errors are reported in µm and µrad. Exit code: 0 written, 1 the readings do not bear the model out (nothing is
 written without --force), 2 bad input.
 
@@ -225,6 +226,23 @@ example:
   $ hexapod_comp simulate --campaign campaign_5d --seed 1 --out measured.csv
   $ hexapod_comp fit measured.csv --out model.yaml --pictures out
   $ hexapod_comp demo --model model.yaml""",
+    ),
+    "verify": Verb(
+        "calibration",
+        "does a model still hold? a few check readings, and what has changed",
+        """Weighs 6 to 20 check readings, spread over the box, against the model and what its fit knows of its
+parameters. If the machine has changed it says what has probably happened: the datum has moved, a strut's offset has
+changed (which, by how much), a temperature acts, the whole has aged, a single reading is wrong, or none of these. One
+machine in a hundred that has not changed is called changed. Where two explanations stay close it says which further
+readings would tell them apart.
+
+The readings are taken as for fit: compensation off, or with the struts' commands in the file, or with this model
+running and --compensated. fit --update renews the model from them. Errors are in µm and µrad. Exit code: 0 valid,
+1 changed, 2 bad input.
+
+example:
+  $ hexapod_comp verify model.yaml check.csv
+  $ hexapod_comp fit check.csv --update model.yaml --out renewed.yaml""",
     ),
     "iso230": Verb(
         "calibration",

@@ -1,0 +1,201 @@
+"""Check readings against a fitted model: what has happened is known, because the test has done it to the machine.
+
+The readings come from the virtual instruments, which never see the fit. Sizes are allowed four of the standard deviations
+that the check itself states.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from calibration_helpers import BOX, FEW, campaign, measured, paper, virtual_machine
+from scipy.stats import multivariate_normal
+
+from hexapod_comp.calibration.changes import DATUM, FAMILIES, OTHER, STRUT, TEMPERATURE, possible_changes, widened
+from hexapod_comp.calibration.evaluation import held_out
+from hexapod_comp.calibration.evidence import Evidence, Hypothesis
+from hexapod_comp.calibration.fit import fit_model
+from hexapod_comp.calibration.posterior import FittedParameters
+from hexapod_comp.calibration.update import refusal, update_model
+from hexapod_comp.calibration.verification import NAMED, UNEXPLAINED, VALID, verify_model
+from hexapod_comp.calibration.verification_report import verification_json, verification_report
+from hexapod_comp.errors import CalibrationError, ModelError
+from hexapod_comp.machine.datum import tool_move
+from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.measurements.readings import CHANNELS, FORWARD, MeasurementSet
+
+RUNS = ("diagonal 1", "diagonal 2", "diagonal 4", "x line at y 0.0, z 350.0", "y line at x 0.0, z 350.0")
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A machine, its model, and what the fit knows."""
+
+    truth: MachineModel
+    model: MachineModel
+    known: FittedParameters
+
+
+@cache
+def fitted() -> Fitted:
+    """Return a machine measured by 5-D lines and four diagonals, and fitted."""
+    truth = virtual_machine(5)
+    fit = fit_model(measured(truth, campaign(), 5), FEW)
+    return Fitted(truth.model, fit.model, FittedParameters.of(fit))
+
+
+def check(truth: MachineModel, seed: int = 9, places: str = "ends") -> MeasurementSet:
+    """Return readings at the ends of three diagonals (linear) and of two lines (linear, pitch, yaw)."""
+    whole = measured(RealMachine(paper(), truth), campaign(), seed)
+    run, along = np.array([run.name for run in whole.runs])[whole.run], whole.along()
+    chosen = np.zeros(len(whole), dtype=bool)
+    for name in RUNS:
+        there = run == name
+        ends = np.isclose(along, along[there].min()) | np.isclose(along, along[there].max())
+        chosen |= there & (ends if places == "ends" else np.isclose(along, along[there].min()))
+    straight = np.array([CHANNELS[c].startswith("straightness") for c in whole.channel])
+    return whole.select(chosen & ~straight & (whole.direction == FORWARD))
+
+
+def crashed(strut: int, size: float) -> MachineModel:
+    """Return the machine with one strut's offset changed, m."""
+    offset = fitted().truth.struts.offset.copy()
+    offset[strut] += size
+    return replace(fitted().truth, struts=replace(fitted().truth.struts, offset=offset))
+
+
+def left(truth: MachineModel, model: MachineModel) -> float:
+    """Return what a model leaves of the tool's error at points nobody measured, the datum aligned, m."""
+    return held_out(RealMachine(paper(), truth), model, BOX, 100).aligned.rms
+
+
+def test_evidence_is_the_ratio_of_two_normal_densities() -> None:
+    """scipy's densities are the truth; rounding of their logarithms, some 100, is 1e-9."""
+    rng = np.random.default_rng(1)
+    root, effect, z = rng.standard_normal((5, 5)), rng.standard_normal((5, 2)), rng.standard_normal(5)
+    covariance = root @ root.T + np.eye(5)
+    evidence = Evidence(covariance)
+    evidence.add(STRUT, "it", effect, (0.5, 3.0))
+    densities = [
+        multivariate_normal.logpdf(z, cov=covariance + s**2 * effect @ effect.T)
+        - multivariate_normal.logpdf(z, cov=covariance)
+        for s in (0.5, 3.0)
+    ]
+    np.testing.assert_allclose(evidence.hypotheses[0].log_ratios(evidence.whitened(z)[None])[0], densities, atol=1e-9)
+
+
+def test_an_effect_that_no_reading_shows_changes_no_probability() -> None:
+    """A change that moves no reading has the evidence of no change: a ratio of one."""
+    unseen = Hypothesis.of(DATUM, "it", np.zeros((4, 3)), (1.0, 10.0))
+    np.testing.assert_array_equal(unseen.log_ratios(np.ones((1, 4))), 0.0)
+    assert unseen.least_gain == 0.0
+
+
+def test_unchanged_machines_look_strange_as_rarely_as_stated() -> None:
+    """Of 100 sets drawn unchanged a tenth has a share below 0.1: 10, standard deviation 3."""
+    rng = np.random.default_rng(2)
+    evidence = Evidence(np.eye(6))
+    evidence.add(STRUT, "one", rng.standard_normal((6, 1)), (3.0, 30.0))
+    evidence.add(OTHER, "all", np.eye(6), (2.0,))
+    rare = sum(evidence.probability_unchanged(z) < 0.1 for z in rng.standard_normal((100, 6)))
+    assert 1 <= rare <= 22
+
+
+def test_a_moved_datum_moves_the_tool_as_a_rigid_body_does() -> None:
+    """Shift and turn about the box's centre, by the closed form; 10 µm make second-order terms below a nanometre."""
+    space = widened(fitted().known).space
+    columns = next(c for c in possible_changes(space, ()) if c.family == DATUM).columns
+    size = 0.5 * np.linalg.norm(np.ptp(space.work_box, axis=0))
+    home = paper().home
+    for n in range(6):
+        base = 1e-5 * columns[:18, n].reshape(6, 3)
+        move = tool_move(paper(), MachineModel("paper", base_deviation=base), home)
+        axis = np.eye(3)[n % 3]
+        turn = axis * 1e-5 / size if n >= 3 else np.zeros(3)
+        shift = axis * 1e-5 if n < 3 else np.cross(turn, home.position - space.work_box.mean(axis=0))
+        np.testing.assert_allclose(move, np.concatenate([shift, turn]), atol=1e-9)
+
+
+def test_a_machine_that_has_not_changed_is_valid() -> None:
+    """Five checks with new noise each; one in a hundred may be called changed, and none of these is."""
+    verdicts = [verify_model(fitted().model, fitted().known, check(fitted().truth, seed)).verdict for seed in range(5)]
+    assert verdicts == [VALID] * 5
+
+
+@pytest.mark.parametrize(("strut", "size"), [(0, 20e-6), (3, -20e-6)])
+def test_a_crashed_strut_is_named_measured_and_repaired(strut: int, size: float) -> None:
+    """The test has moved it; the renewed model leaves no more than half as much again as the fit had left."""
+    truth = crashed(strut, size)
+    readings = check(truth)
+    result = verify_model(fitted().model, fitted().known, readings)
+    best = result.candidates[0]
+    assert (result.verdict, best.family, best.name) == (NAMED, STRUT, f"strut_{strut + 1}")
+    assert abs(best.coefficients[0] - size) < 4.0 * best.deviations[0] < 12e-6
+    renewed = update_model(fitted().model, fitted().known, readings, result)
+    assert left(truth, fitted().model) > 4.0 * left(truth, renewed.model)
+    assert left(truth, renewed.model) < 1.5 * left(fitted().truth, fitted().model)
+    again = verify_model(renewed.model, renewed.fitted, check(truth, seed=10))
+    assert again.verdict == VALID
+
+
+def test_a_renewed_model_keeps_the_datum() -> None:
+    """At home the tool is moved by nothing, before and after: lines do not show where the machine stands."""
+    readings = check(crashed(2, 30e-6))
+    renewed = update_model(
+        fitted().model, fitted().known, readings, verify_model(fitted().model, fitted().known, readings)
+    )
+    for model in (fitted().model, renewed.model):
+        assert np.abs(tool_move(paper(), model, paper().home)).max() < 1e-9
+    assert renewed.fitted.held is not None
+    assert renewed.fitted.held.held == 6
+
+
+def test_growth_of_all_struts_is_a_temperature() -> None:
+    """40 ppm on every strut: steel by three kelvin."""
+    struts = fitted().truth.struts
+    grown = replace(struts, offset=struts.offset + 40e-6 * struts.reference_length, pitch=struts.pitch + 40e-6)
+    result = verify_model(fitted().model, fitted().known, check(replace(fitted().truth, struts=grown)))
+    best = result.candidates[0]
+    assert (result.verdict, best.family) == (NAMED, TEMPERATURE)
+    if best.name == "struts":
+        assert abs(best.coefficients[0] - 40e-6) < 4.0 * best.deviations[0]
+
+
+def test_one_wrong_reading_is_no_change_of_the_machine() -> None:
+    """A reading moved by 50 µm is told from the machine; the model is not renewed from it."""
+    readings = check(fitted().truth)
+    value = readings.value.copy()
+    value[1] += 50e-6
+    result = verify_model(fitted().model, fitted().known, readings.with_values(value))
+    assert result.candidates[0].family == "reading"
+    assert "take it again" in refusal(result)
+
+
+def test_what_is_in_no_hypothesis_is_not_named() -> None:
+    """A platform joint that has moved by 60 µm across its struts is no strut, no datum and no temperature."""
+    moved = fitted().truth.platform_deviation.copy()
+    moved[2:4] += [30e-6, -40e-6, 30e-6]
+    result = verify_model(fitted().model, fitted().known, check(replace(fitted().truth, platform_deviation=moved)))
+    assert result.verdict == UNEXPLAINED
+    assert "fit anew" in refusal(result)
+    assert "none of" not in verification_report(result).splitlines()[0]
+    assert verification_json(result)["verdict"] == "unexplained"
+    assert abs(sum(result.families.values()) - 1.0) < 1e-9
+    assert set(result.families) == set(FAMILIES)
+
+
+def test_readings_that_tell_nothing_are_refused() -> None:
+    """One place of each run: its unknown zero takes it."""
+    with pytest.raises(CalibrationError, match="tell nothing"):
+        verify_model(fitted().model, fitted().known, check(fitted().truth, places="start"))
+
+
+def test_readings_of_another_point_and_no_share_are_refused() -> None:
+    readings = check(fitted().truth)
+    with pytest.raises(CalibrationError, match="probe-mm"):
+        verify_model(fitted().model, fitted().known, replace(readings, probe=readings.probe + 0.01))
+    with pytest.raises(ModelError, match="above 0 and below 1"):
+        verify_model(fitted().model, fitted().known, readings, false_alarms=0.0)
