@@ -21,7 +21,7 @@ from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.motion import MotionState
 from hexapod_comp.machine.passes import Passes
 from hexapod_comp.measurements.campaign import Campaign, template
-from hexapod_comp.measurements.readings import AXES, FROM_PREVIOUS, FileLine, MeasurementSet, Reading
+from hexapod_comp.measurements.readings import AXES, FROM_PREVIOUS, KINDS, FileLine, MeasurementSet, Reading
 from hexapod_comp.measurements.runs import assemble
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
@@ -143,5 +143,7 @@ def fitted_model(folder: Path, offset: float = 30e-6) -> Path:
     model = space.model(x, "fitted")
     model = replace(model, origin=replace(model.origin, date="2026-01-31"))
     covariance = 2e-6**2 * np.eye(space.size)
-    save_with_posterior(model, FittedParameters(space, x, covariance, np.ones(1), np.ones(5)), folder / "fitted.yaml")
+    save_with_posterior(
+        model, FittedParameters(space, x, covariance, np.ones(1), np.ones(len(KINDS))), folder / "fitted.yaml"
+    )
     return folder / "fitted.yaml"

@@ -1,7 +1,7 @@
 """Check readings against a fitted model: what has happened is known, because the test has done it to the machine.
 
-The readings come from the virtual instruments, which never see the fit. Sizes are allowed four of the standard deviations
-that the check itself states.
+The readings come from the virtual instruments, which never see the fit. Sizes are allowed four of the standard
+deviations that the check itself states.
 """
 
 from __future__ import annotations
