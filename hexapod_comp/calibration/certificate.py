@@ -122,15 +122,12 @@ class Filed:
     files : tuple of Path
         The model's file, and those beside it.
     report : str
-        The fit's report, as printed.
-    warning : str
-        What a reader must know first; empty when nothing is wrong.
+        The fit's report, as printed. With what it opens, before it says which machine this is, the certificate opens.
     """
 
     model: str
     files: tuple[Path, ...]
     report: str
-    warning: str
 
 
 def certificate_text(fit: ModelFit, filed: Filed, details: Details | None = None) -> str:
@@ -154,7 +151,7 @@ def certificate_text(fit: ModelFit, filed: Filed, details: Details | None = None
     title = f"Calibration certificate: {fit.measurements.geometry.name}"
     parts = [
         f"<h1>{shown(title)}</h1>",
-        *_warning(filed.warning),
+        *_warning(fit, filed.report),
         _identity(fit, filed, details),
         *_result(fit),
         *_instruments(fit, details),
@@ -174,9 +171,12 @@ def _lines(text: str) -> str:
     return "\n".join(shown(line, 2000) for line in text.splitlines())
 
 
-def _warning(text: str) -> Iterator[str]:
-    if text:
-        yield f"<p class=warning><b>Warning.</b> {shown(text, 4000)}</p>"
+def _warning(fit: ModelFit, report: str) -> Iterator[str]:
+    """Yield what the report says before its headline: what is wrong."""
+    m = fit.measurements
+    opening = report.partition(f"machine {m.geometry.name}: {len(m)} readings")[0].strip()
+    if opening:
+        yield f"<p class=warning><b>Warning.</b> {_lines(opening)}</p>"
 
 
 def _identity(fit: ModelFit, filed: Filed, details: Details) -> str:
@@ -397,7 +397,7 @@ SIGNATURES = """<table class="text sign"><tbody><tr><th scope=row>evaluated by, 
 STYLE = """
  th[scope=row], th:first-child { text-align: left }
  th[scope=row] { white-space: normal; overflow-wrap: anywhere; max-width: 28em }
- .warning { border: 3px solid #a01515; padding: 8px 12px; max-width: none }
+ .warning { border: 3px solid #a01515; padding: 8px 12px; max-width: none; white-space: pre-line }
  .text td:nth-child(2) { min-width: 22em } .sign { margin-top: 48px } .sign td { min-width: 22em; height: 40px }
  .hashes td:last-child { font-family: monospace; word-break: break-all; min-width: 0 }
  pre { font-size: 11px; line-height: 1.3; overflow-x: auto; white-space: pre }

@@ -166,8 +166,7 @@ def _write_certificate(
     from ..calibration.certificate import Filed, certificate_text
     from ..formats.outputs import write_text
 
-    warning = f"{FORCED}: {result.misfit}. {ADVICE}" if result.misfit else ""
-    filed = Filed(result.model.name, (Path(args.out), *beside), report, warning)
+    filed = Filed(result.model.name, (Path(args.out), *beside), report)
     write_text(args.certificate, certificate_text(fit, filed, _details(args)))
 
 

@@ -16,6 +16,7 @@ from calibration_helpers import FEW, campaign, measured, virtual_machine
 from hexapod_comp.calibration import certificate, pictures
 from hexapod_comp.calibration.certificate import Details, Filed, certificate_text, left_out, load_details
 from hexapod_comp.calibration.fit import ModelFit, fit_model
+from hexapod_comp.calibration.report import fit_report
 from hexapod_comp.calibration.sensitivity import predict
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.measurements.readings import FileLine
@@ -50,10 +51,10 @@ def fit() -> ModelFit:
 
 
 @pytest.fixture
-def filed(tmp_path: Path) -> Filed:
+def filed(fit: ModelFit, tmp_path: Path) -> Filed:
     model = tmp_path / "model.yaml"
     model.write_text("the model")
-    return Filed("a model", (model,), "the report\n  of several lines", "")
+    return Filed("a model", (model,), fit_report(fit))
 
 
 @pytest.fixture
@@ -96,9 +97,11 @@ def test_hashes_are_those_of_the_files(fit: ModelFit, filed: Filed) -> None:
 
 @pytest.mark.usefixtures("unpictured")
 def test_what_is_wrong_stands_first(fit: ModelFit, filed: Filed) -> None:
-    text = certificate_text(fit, replace(filed, warning="readings are off by <10 times"))
+    """With what the report opens, word by word."""
+    text = certificate_text(fit, replace(filed, report=f"IN DOUBT: off by <10 times\n  and more\n\n{filed.report}"))
     body = text[text.index("<h1>") :]
-    assert re.match(r"<h1>[^<]*</h1><p class=warning><b>Warning.</b> readings are off by &lt;10 times", body)
+    said = r"<h1>[^<]*</h1><p class=warning><b>Warning\.</b> IN DOUBT: off by &lt;10 times\n  and more</p>"
+    assert re.match(said, body)
     assert "class=warning" not in certificate_text(fit, filed)
 
 
@@ -110,7 +113,7 @@ def test_strangers_names_are_text(fit: ModelFit, filed: Filed) -> None:
     hostile = replace(m, runs=runs, sources=sources, files=((HOSTILE, HOSTILE),))
     stranger = replace(fit, measurements=hostile, notes=(HOSTILE,), unseen_errors=(HOSTILE,))
     details = Details({"customer": HOSTILE}, (HOSTILE,), (HOSTILE,))
-    page = Reader(certificate_text(stranger, replace(filed, model=HOSTILE, report=HOSTILE, warning=HOSTILE), details))
+    page = Reader(certificate_text(stranger, replace(filed, model=HOSTILE, report=HOSTILE), details))
     assert {"script", "link", "iframe", "object", "form"}.isdisjoint(page.tags)
     assert page.sources, "the pictures"
     assert all(source.startswith("data:image/png;base64,") for source in page.sources)
