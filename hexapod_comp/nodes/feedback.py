@@ -18,7 +18,7 @@ from .compensator_status import CompensatorStatus
 from .following import StrokeRange
 from .messages import StrutReader, read_message
 from .plausible import NoJump
-from .runtime import EVENT_QOS, STATE_QOS, MachineNode
+from .runtime import SENSOR_QOS, STATE_QOS, MachineNode
 from .stamps import nanoseconds_of
 
 
@@ -62,7 +62,7 @@ class Feedback:
         self._thermometers = Thermometers(Plausibility(*rules), options["temperature_time_constant_s"])
         several = options["allow_several_publishers"]
         states = node.obey(JointState, "strut_states", self._on_states, look, qos=STATE_QOS)
-        warm = node.obey(Temperature, "temperatures", self._on_temperature, look, qos=EVENT_QOS)
+        warm = node.obey(Temperature, "temperatures", self._on_temperature, look, qos=SENSOR_QOS)
         self._subscriptions = states, warm
         self._measuring = CommandSource(node, states.topic_name, states.get_publisher_count, several)
         several = several or options["allow_several_thermometers"]

@@ -51,6 +51,15 @@ def keep_discovery_local() -> None:
         os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
+def discovery() -> str:
+    """Return who may find this process's nodes, and how to change that."""
+    reach, peers = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", ""), os.environ.get("ROS_STATIC_PEERS", "")
+    hint = " (SUBNET finds other computers)" if reach == "LOCALHOST" else ""
+    also = f" and of {printable(peers)}" if peers else ""
+    domain = printable(os.environ.get("ROS_DOMAIN_ID", "0"))
+    return f"domain {domain}; ROS_AUTOMATIC_DISCOVERY_RANGE={printable(reach)}{hint}{also}"
+
+
 def run(make_node: Callable[[], MachineNode], program: Program, argv: Sequence[str] | None = None) -> int:
     """Run a node until SIGINT or SIGTERM.
 
@@ -117,6 +126,7 @@ def _run_until(
         warming.give_up()
         rclpy.try_shutdown()
         return 1
+    node.get_logger().info(discovery())
     starting = Starting(node, warming)
     executor = EventsExecutor()
     executor.add_node(node)

@@ -38,8 +38,14 @@ COMMAND_QOS = QoSProfile(depth=100, history=HistoryPolicy.KEEP_LAST, reliability
 STATE_QOS = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Measured states: only the newest counts, and an old one is not worth repeating."""
 
+ESTIMATE_QOS = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
+"""The newest only, to reliable listeners too: who subscribes without a thought is one."""
+
+SENSOR_QOS = QoSProfile(depth=10, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Subscriptions of sensors, however they publish."""
+
 EVENT_QOS = QoSProfile(depth=10, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
-"""Rare messages, each of which counts: temperatures, diagnostics, markers."""
+"""Rare messages, each of which counts: diagnostics, markers."""
 
 OVERRIDES = QoSOverridingOptions(
     (
