@@ -107,17 +107,18 @@ def readings(geometry: HexapodGeometry, model: MachineModel, campaign: Campaign,
 def search(name: str, geometry: HexapodGeometry, model: MachineModel, campaign: Campaign, seed: int) -> Search:
     """Look for the lead of one machine."""
     measured = readings(geometry, model, campaign, seed)
-    lead = lead_of(measured)
+    lead, _ = lead_of(measured)
     waves = model.struts.cosine.any() or model.struts.sine.any()
     true = float(model.struts.period[0]) if waves else None
     return Search(name, true, lead.shown, lead.error, lead.odds, _right(true, lead))
 
 
-def lead_of(measured: MeasurementSet, given: float | None = None) -> ScrewLead:
-    """Return what readings say of the lead."""
+def lead_of(measured: MeasurementSet, given: float | None = None) -> tuple[ScrewLead, float]:
+    """Return what readings say of the lead, and what looking for it took of a processor, s."""
     estimation = Estimation(measured, ParameterSpace(measured, FitSettings(lead=given)))
     problem, _ = estimation.linearise(np.zeros(estimation.space.size), np.ones(len(measured)))
-    return look_for_lead(estimation, problem)
+    began = time.process_time()
+    return look_for_lead(estimation, problem), time.process_time() - began
 
 
 def _right(true: float | None, lead: ScrewLead) -> bool:
@@ -174,9 +175,8 @@ def fitted(name: str, geometry: HexapodGeometry, lead: float, seed: int) -> Fitt
     between = time.process_time()
     blocks = tuple(block for block in BLOCKS if block not in HARMONICS)
     without = fit_model(measured, FitSettings(blocks=blocks, lead=lead))
-    ended, began_search = time.process_time(), time.process_time()
-    lead_of(measured, lead)
-    searched = time.process_time() - began_search
+    ended = time.process_time()
+    _, searched = lead_of(measured, lead)
     left = [held_out(truth, m, place.box, level=place.attitude).aligned.rms for m in (None, fit.model, without.model)]
     kept = tuple(block.name for block in fit.space.blocks)
     return Fitted(name, str(fit.lead), kept, *left, between - began, ended - between - searched)
@@ -239,7 +239,8 @@ def main() -> int:
         "the shipped campaigns show theirs": all(s.shown is not None for s in shown[:2]),
         f"harmonics leave {LARGEST_LEFT * 1e6:g} µm at most": all(m.after <= LARGEST_LEFT for m in machines),
         f"a fit costs {LARGEST_COST:g} times at most": ratio <= LARGEST_COST,
-        f"a command with one harmonic {LARGEST_COMMAND:g} times": costs["one harmonic"] / costs["no wave"] <= 1.1,
+        f"a command with one harmonic {LARGEST_COMMAND:g} times": costs["one harmonic"]
+        <= LARGEST_COMMAND * costs["no wave"],
     }
     missed = [bar for bar, held in kept.items() if not held]
     print(f"\nmissed: {'; '.join(missed)}" if missed else "\nbars kept", file=sys.stderr if args.json else sys.stdout)

@@ -55,7 +55,7 @@ def test_what_instruments_do_not_know_changes_nothing():
     space, problem = linearised(ours)
     _, other = linearised(theirs)
     np.testing.assert_allclose(other.target, problem.target, atol=1e-10 * 1e3)
-    noise = np.array([1.0, 1.2, 0.8, 1.0, 1.0])
+    noise = np.resize([1.0, 1.2, 0.8], len(KINDS))
     answers = [solve(space, p, space.start_tolerances(), noise, 0) for p in (problem, other)]
     deviations = np.sqrt(np.diag(answers[0].covariance))
     np.testing.assert_allclose((answers[1].y - answers[0].y) / deviations, 0.0, atol=1e-6)
@@ -123,7 +123,8 @@ def random_problem(seed: int = 3, count: int = 240) -> tuple[ParameterSpace, Lin
     spread = space.spread(space.start_tolerances())
     rows = rng.standard_normal((count, space.size)) / spread * rng.uniform(0.02, 3.0, space.size)
     kind = np.repeat([LINEAR, STRAIGHTNESS, ROTATION], count // 3)
-    factors = np.array([2.0, 3.0, 0.5, 1.0, 1.0])
+    factors = np.ones(len(KINDS))
+    factors[[LINEAR, STRAIGHTNESS, ROTATION]] = [2.0, 3.0, 0.5]
     target = rows @ (spread * rng.standard_normal(space.size)) + factors[kind] * rng.standard_normal(count)
     return space, problem_of(space, rows, target, kind, rng.integers(0, 20, count)), factors
 
