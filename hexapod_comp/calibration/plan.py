@@ -55,7 +55,7 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
     space = ParameterSpace(measurements, settings)
     estimation = Estimation(measurements, space)
     problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(measurements)))
-    noise = np.array([_noise_factor(campaign, kind) for kind in KINDS])
+    noise = np.array([noise_factor(campaign, kind) for kind in KINDS])
     posterior = solve(space, problem, space.start_tolerances(), noise, rounds=0)
     covariance, x = physical_covariance(space, posterior), np.zeros(space.size)
     prior = space.prior_covariance(space.start_tolerances())
@@ -70,7 +70,7 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
     )
 
 
-def _noise_factor(campaign: Campaign, kind: str) -> float:
+def noise_factor(campaign: Campaign, kind: str) -> float:
     """Return the noise of a kind of channel over the default, the machine's repeatability included."""
     noise = campaign.noise[KINDS.index(kind)]
     if kind not in ("rotation", "attitude"):

@@ -13,6 +13,10 @@ POSE_OPTIONS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
 """A pose number by number: the options of ik."""
 
 
+INSTRUMENTS = ("linear", "straightness", "rotation", "5-D", "6-D", "tracker", "tracker_6d")
+"""What plan can propose runs for; a test holds it to the campaign's own list, which is slow to import."""
+
+
 def pose(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Read ``x,y,z[,alpha,beta,gamma]`` in mm and degrees; return position, m, and angles, rad."""
     values = numbers(text)
@@ -131,6 +135,16 @@ def html_file(text: str) -> str:
     if not text.lower().endswith((".html", ".htm")):
         raise argparse.ArgumentTypeError(f"writes HTML, which any browser prints to PDF: name it .html (not {text!r})")
     return text
+
+
+def times(text: str) -> tuple[str, tuple[float, float, float]]:
+    """Read ``NAME=MIN,MIN,S``: the times of an instrument; return its name and s."""
+    name, _, values = text.partition("=")
+    spent = numbers(values)
+    if not name or len(spent) != 3 or min(spent) < 0.0 or spent[2] == 0.0:
+        problem = f"needs a name and three numbers, not negative, the last above zero: linear=20,8,4, not {text!r}"
+        raise argparse.ArgumentTypeError(problem)
+    return name, (60.0 * spent[0], 60.0 * spent[1], spent[2])
 
 
 def numbers(text: str) -> tuple[float, ...]:

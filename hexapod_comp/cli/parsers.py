@@ -214,8 +214,20 @@ def _replay(parser: argparse.ArgumentParser) -> None:
 
 def _plan(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("campaign", metavar="CAMPAIGN", help="campaign file, or the name of a shipped one")
+    text = "campaign file, or the name of a shipped one; with --goal-um optional: whose box and noise count"
+    add("campaign", nargs="?", metavar="CAMPAIGN", help=text)
     _machine(add)
+    goal = parser.add_argument_group("proposing a campaign").add_argument
+    text = "RMS tool error that may be left, the datum aligned: propose a campaign for it"
+    goal("--goal-um", type=arguments.above_zero, metavar="UM", help=text)
+    text = "tilt of the tool at which it must hold too (default 0)"
+    goal("--tilt-deg", type=arguments.bound, metavar="DEG", help=text)
+    text = f"what there is to measure with: {', '.join(arguments.INSTRUMENTS)} (default linear)"
+    goal("--instruments", metavar="A,B,…", help=text)
+    goal("--hours", type=arguments.above_zero, metavar="H", help="how long measuring may take (default 4)")
+    text = "how long an instrument takes: minutes to put it up, minutes a run, seconds a stop; may be repeated"
+    goal("--time", type=arguments.times, action="append", metavar="NAME=MIN,MIN,S", help=text)
+    goal("--out", metavar="CAMPAIGN", help="write the proposed campaign to a file (YAML)")
     _estimation(parser)
     _seed(add, "scattered poses")
     _json(add)

@@ -171,12 +171,18 @@ example:
     ),
     "plan": Verb(
         "calibration",
-        "what a measuring campaign will determine, and what it will not",
+        "what a measuring campaign will determine; or which one a goal needs",
         """Takes a campaign file and says without a single reading which parameters the campaign would determine, which
 it leaves open, and what tool error (µm) a fit of --scheme joint will leave on a machine within the tolerances.
 
+With --goal-um it proposes a campaign: lines and poses in measuring order, within the limits, that bring the tool error
+(µm, RMS, the datum aligned) down to the goal in the time there is. The box and the noise are those of CAMPAIGN, by
+default the machine's own box. Where the goal cannot be met it says what can be had, and what limits it. simulate and
+fit read the file. Exit code: 0 fine, 1 the goal is not met, 2 bad input.
+
 example:
-  $ hexapod_comp plan campaign_1d --lead-mm 10 --blocks pitch,wave,backlash""",
+  $ hexapod_comp plan campaign_1d --lead-mm 10 --blocks pitch,wave,backlash
+  $ hexapod_comp plan --goal-um 3 --tilt-deg 10 --instruments linear,tracker_6d --hours 4 --out mine.yaml""",
     ),
     "imagine": Verb(
         "calibration",

@@ -16,7 +16,8 @@ from ..pose import Pose, angles_from_rotation, rotation_from_angles
 from .readings import AXES, BACKWARD, FORWARD, LEAST_TRAVEL, UNKNOWN, Reading
 
 LINE_INSTRUMENTS = ("linear", "straightness", "rotation", "5-D", "6-D")
-"""What reads a line: a linear laser; straightness, or pitch and yaw, with their optics; all of these; and roll."""
+"""What reads a line: a linear laser; straightness, or pitch and yaw, with their optics; all of these; and roll. Along a
+line that is not parallel to an axis of the work frame the last two read its length alone."""
 
 POSE_INSTRUMENTS = ("tracker", "tracker_6d")
 """What reads scattered poses: a tracker's position alone, and with the attitude."""
@@ -64,8 +65,8 @@ class CampaignRun:
         if self.is_line:
             if np.linalg.norm(self.way) < LEAST_TRAVEL:
                 raise InputFileError("campaign", f"run {self.name}", "starts and ends at the same place")
-            if self.axis is None and self.instrument != "linear":
-                problem = "is not parallel to an axis of the work frame: only a linear instrument reads it"
+            if self.axis is None and self.instrument in ("straightness", "rotation"):
+                problem = "is not parallel to an axis of the work frame: only a linear laser reads it"
                 raise InputFileError("campaign", f"run {self.name}", problem, self.instrument)
 
     @property
@@ -90,16 +91,18 @@ class CampaignRun:
         positions = tuple(f"position_{a}" for a in AXES)
         if not self.is_line:
             return positions if self.instrument == "tracker" else (*positions, *(f"attitude_{a}" for a in AXES))
-        across = [AXES[a] for a in CROSS_AXES[self.axis]] if self.axis is not None else []
-        straight, turning = (tuple(f"{kind}_{a}" for a in across) for kind in ("straightness", "rotation"))
+        if self.axis is None:
+            return ("linear",)
+        straight, turning = (
+            tuple(f"{kind}_{AXES[a]}" for a in CROSS_AXES[self.axis]) for kind in ("straightness", "rotation")
+        )
         five = ("linear", *straight, *turning)
-        roll = () if self.axis is None else (f"rotation_{AXES[self.axis]}",)
         return {
-            "linear": ("linear",),
+            "linear": five[:1],
             "straightness": straight,
             "rotation": turning,
             "5-D": five,
-            "6-D": (*five, *roll),
+            "6-D": (*five, f"rotation_{AXES[self.axis]}"),
         }[self.instrument]
 
     def count(self, cycles: int) -> int:

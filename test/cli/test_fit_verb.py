@@ -717,6 +717,45 @@ def test_a_campaign_out_of_reach_names_its_file(hexapod: Program, tmp_path: Path
     assert_refused(hexapod(*words), "high.yaml")
 
 
+def test_plan_proposes_a_campaign(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
+    """The proposed file is one that plan judges; what it says beforehand is what plan says of it, draws aside."""
+    path = tmp_path / "mine.yaml"
+    goal = ("--goal-um", "2", "--instruments", "linear", "--hours", "3", "--time", "linear=5,2,1")
+    code, out, err = hexapod("plan", done.campaign, *JOINT, *goal, "--out", path, "--json")
+    assert (code, err) == (0, "")
+    content = json.loads(out)
+    assert content["met"]
+    assert content["expected_m"]["level"] <= 2e-6
+    assert content["takes_s"] <= 3.0 * 3600.0
+    assert path.read_text().startswith("# Proposed for machine paper: goal 2.00 µm RMS, with linear in 3 h.\n")
+    judged = json.loads(hexapod("plan", path, *JOINT, "--json")[1])
+    assert judged["readings"] == content["readings"]
+    assert judged["expected_tool_error"]["after_m"] == pytest.approx(content["expected_m"]["level"], rel=0.2)
+
+
+def test_plan_says_when_a_goal_cannot_be_met(hexapod: Program, done: Calibration) -> None:
+    code, out, _ = hexapod("plan", done.campaign, *JOINT, "--goal-um", "0.01", "--hours", "0.6")
+    assert code == 1
+    assert "the goal is NOT met: " in out
+    assert "  what limits it is " in out
+    assert "1: linear, " in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ("", "needs a campaign to be judged, or --goal-um"),
+        ("{campaign} --hours 2", "--hours: needs a goal"),
+        ("{campaign} --goal-um 1 --instruments laser", "instruments: must be one or more of linear"),
+        ("{campaign} --goal-um 1 --hours 0.1", "hours: are too few"),
+        ("{campaign} --goal-um 1 --time laser=1,1,1", "--time: is of one of linear"),
+        ("{campaign} --goal-um 1 --tilt-deg 80", "tilt: must be 0"),
+    ],
+)
+def test_wrong_goals(hexapod: Program, done: Calibration, arguments: str, complaint: str) -> None:
+    assert_refused(hexapod("plan", *arguments.format(campaign=done.campaign).split(), *JOINT), complaint)
+
+
 # iso230.
 
 

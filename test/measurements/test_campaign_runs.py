@@ -54,7 +54,7 @@ def test_readings_come_in_measuring_order() -> None:
     ("change", "complaint"),
     [
         (("instrument: linear", "instrument: laser"), "runs[1].instrument: must be one of linear"),
-        (("instrument: linear", "instrument: 5-D"), "run diagonal: is not parallel to an axis of the work frame"),
+        (("instrument: linear", "instrument: rotation"), "run diagonal: is not parallel to an axis of the work frame"),
         (("points: 3", "points: 1"), "runs[1].points: must be 2 to 10000"),
         (("name: diagonal", "name: backwards"), "runs[1].name: is given to two runs"),
         (("[10.0, 20.0, 460.0]", "[10.0, 20.0, .nan]"), "runs[2].poses_mm[1][2]: must be finite"),

@@ -1,0 +1,141 @@
+"""Proposed campaigns: gains by plain linear algebra, expectations by another way, the limits of each machine."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import calibration_helpers as small
+import numpy as np
+import pytest
+from foreign_machines import machines
+
+from hexapod_comp.calibration.candidates import MeasuringBox, candidates
+from hexapod_comp.calibration.gains import Selection
+from hexapod_comp.calibration.parameters import FitSettings
+from hexapod_comp.calibration.plan import plan
+from hexapod_comp.calibration.proposal import TIMES, Goal, Proposal, Times, propose
+from hexapod_comp.calibration.proposal_report import proposal_report, verdict
+from hexapod_comp.cli.arguments import INSTRUMENTS
+from hexapod_comp.errors import CalibrationError
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.measurements.campaign import campaign_text, load_campaign, template
+from hexapod_comp.measurements.campaign_runs import LISTED_INSTRUMENTS
+
+HOUR = 3600.0
+UM = 1e-6
+
+
+def proposed(error: float, tilt_deg: float, instruments: tuple[str, ...], hours: float) -> Proposal:
+    """Return a plan for the paper's machine in the paper's box; structure, pitch, wave and backlash are fitted."""
+    tilt = float(np.radians(tilt_deg))
+    place = MeasuringBox(small.paper(), small.BOX, np.eye(3), tilt)
+    return propose(place, Goal(error, tilt, instruments, hours * HOUR), small.FEW)
+
+
+def test_gains_are_those_of_the_whole_matrices() -> None:
+    """Each gain is by how much tr(M·C) falls when C is inverted anew with the candidate's rows, to rounding."""
+    rng = np.random.default_rng(1)
+    seen = [rng.standard_normal((k, 9)) for k in (1, 3, 4, 2)]
+    root = rng.standard_normal((9, 5))
+    square = root @ root.T
+    aim = SimpleNamespace(root=root, errors=lambda c: {"level": float(np.sqrt((square * c).sum()))})
+    selection = Selection(seen, aim)
+
+    def left(chosen: list[int]) -> float:
+        rows = np.concatenate([np.zeros((0, 9)), *(seen[n] for n in chosen)])
+        return float(np.trace(square @ np.linalg.inv(np.eye(9) + rows.T @ rows)))
+
+    chosen: list[int] = []
+    for n in (2, 0, 2):
+        wanted = [left(chosen) - left([*chosen, k]) for k in range(4)]
+        np.testing.assert_allclose(selection.gains(), wanted, rtol=1e-9)
+        selection.take(n)
+        chosen.append(n)
+        assert selection.errors()["level"] ** 2 == pytest.approx(left(chosen), rel=1e-9)
+    assert selection.after_all()["level"] ** 2 == pytest.approx(left([0, 1, 2, 3]), rel=1e-9)
+
+
+def test_a_goal_that_can_be_met() -> None:
+    """Its expectation is that of ``plan`` for the same campaign, which draws 300 machines: good to a few percent."""
+    result = proposed(1.5 * UM, 0.0, ("linear",), 6.0)
+    assert result.met
+    assert result.worst <= 1.5 * UM < result.before["level"]
+    assert result.seconds == pytest.approx(sum(result.each))
+    assert result.seconds <= 6.0 * HOUR
+    judged = plan(template(result.campaign, small.paper()), result.campaign, small.FEW).level
+    assert judged is not None
+    assert result.expected["level"] == pytest.approx(judged.after, rel=0.15)
+    assert verdict(result).startswith("the goal is met")
+
+
+def test_what_limits_a_goal() -> None:
+    """Lines have unknown zeros: no linear laser shows where a tilted tool is beside a level one."""
+    blind = proposed(1.0 * UM, 10.0, ("linear",), 3.0)
+    assert not blind.met
+    assert blind.unseen > blind.goal.error
+    assert blind.needed is None
+    assert "do not see" in verdict(blind)
+    short = proposed(1.5 * UM, 0.0, ("linear",), 1.0)
+    assert not short.met
+    assert short.needed is not None
+    assert short.needed > HOUR
+    assert f"{short.needed / HOUR:.1f} h would do" in verdict(short)
+    assert proposed(1.5 * UM, 0.0, ("linear",), short.needed / HOUR + 0.01).met
+    assert "1: linear, " in proposal_report(short)
+
+
+def test_no_time_at_all() -> None:
+    """The laser takes 20 min to put up, 8 min for a run; three points there and back at 4 s are 0.4 min: 0.47 h."""
+    with pytest.raises(CalibrationError, match=r"hours: are too few: the shortest run takes 0\.47 h"):
+        proposed(1.0 * UM, 0.0, ("linear",), 0.2)
+
+
+@pytest.mark.parametrize("name", list(machines()))
+def test_every_machine_of_the_zoo(name: str, tmp_path: Path) -> None:
+    """All candidates are within the limits, as the reader of campaigns judges them, before a file and after it."""
+    machine = machines()[name]
+    geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
+    tilt = float(np.radians(3.0))
+    place = MeasuringBox(geometry, machine.box, np.eye(3), tilt)
+    runs = candidates(place, ("linear", "tracker_6d"))
+    assert {run.instrument for run in runs} == {"linear", "tracker_6d"}
+    assert any("about" in run.name for run in runs)
+    every = {n: Times(0.0, 0.0, 1.0) for n in TIMES}
+    goal = Goal(1e-9, tilt, ("linear", "tracker_6d"), 150.0, every)
+    result = propose(place, goal, FitSettings(blocks=()))
+    path = tmp_path / "campaign.yaml"
+    path.write_text(campaign_text(result.campaign))
+    readings = template(load_campaign(path), geometry)
+    assert len(readings) == result.readings
+    assert result.worst < 0.2 * max(result.before.values())
+
+
+def test_instruments_by_their_names() -> None:
+    """The command line lists what campaigns take, and each has its times."""
+    assert INSTRUMENTS == LISTED_INSTRUMENTS == tuple(TIMES)
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"error": 0.0}, "goal"),
+        ({"error": np.nan}, "goal"),
+        ({"tilt": -0.1}, "tilt"),
+        ({"instruments": ("laser",)}, "instruments: must be one or more of linear"),
+        ({"instruments": ("linear", "linear")}, "instruments"),
+        ({"instruments": ()}, "instruments"),
+        ({"seconds": np.inf}, "hours"),
+        ({"times": {"linear": Times(1.0, -1.0, 1.0)}}, "times of linear"),
+    ],
+)
+def test_wrong_goals(change: dict, complaint: str) -> None:
+    with pytest.raises(CalibrationError, match=complaint):
+        Goal(**{"error": 1.0 * UM, **change})
+
+
+def test_a_tilt_beyond_the_limits_is_refused(tmp_path: Path) -> None:
+    """The positioning unit's base joints end at 18°."""
+    machine = machines()["unit"]
+    geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
+    tilt = float(np.radians(30.0))
+    with pytest.raises(CalibrationError, match="tilt: 30° is within the limits at 0 % of the box only"):
+        propose(MeasuringBox(geometry, machine.box, np.eye(3), tilt), Goal(1.0 * UM, tilt), FitSettings(blocks=()))
