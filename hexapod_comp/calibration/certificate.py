@@ -270,8 +270,9 @@ def _standards(fit: ModelFit) -> Iterator[str]:
         return
     yield (
         "<p>Before: from the readings. After: from the same readings less what the model, fitted <b>without that "
-        "line</b>, predicts there; noise of the instrument included. The uncertainty of one reading stands above; "
-        "scale errors that a whole instrument has are not in these figures.</p>"
+        "line or circle</b> (a circle whose given centre is not its middle: without that place), predicts there; noise "
+        "of the instrument included. The uncertainty of one reading stands above; scale errors that a whole instrument "
+        "has are not in these figures.</p>"
     )
     for title, old, new in _pairs(before, after):
         yield f"<h3>{shown(title)}, µm</h3>"
