@@ -193,12 +193,24 @@ class Estimation:
 
         The noise is the stated one.
         """
-        scale = np.sqrt(np.bincount(self.cells.of_reading, self.uncertainty**-2))
+        scale, unknowns = self._stated_unknowns()
         rows = scale[:, None] * rows
-        values = np.zeros(len(scale))
-        for part in self._unknowns(self.cells.directions.copy(), np.zeros((len(scale), 6)), values, scale)[1]:
+        for part in unknowns:
             part.project_out(rows)
         return rows
+
+    def shares_of_unknowns(self) -> np.ndarray:
+        """Return how much of each cell's value what instruments do not know takes up, shape (C,), 0…1."""
+        shares = np.zeros(len(self.cells.station))
+        for part in self._stated_unknowns()[1]:
+            shares[part.members] += part.basis**2 @ part.share
+        return shares
+
+    def _stated_unknowns(self) -> tuple[np.ndarray, list[Unknown]]:
+        """Return one over the cells' stated noise, (C,), and what instruments do not know, at the nominal machine."""
+        scale = np.sqrt(np.bincount(self.cells.of_reading, self.uncertainty**-2))
+        values = np.zeros(len(scale))
+        return scale, self._unknowns(self.cells.directions.copy(), np.zeros((len(scale), 6)), values, scale)[1]
 
     def _expected(
         self, x: np.ndarray, values: np.ndarray, scale: np.ndarray
@@ -384,6 +396,8 @@ class Solution:
         Of each reading, m or rad; and the trust it got, 0…1.
     steps : int
         Gauss–Newton steps.
+    change : float
+        Largest change of a parameter in the last one, in its standard deviation.
     """
 
     problem: LinearProblem
@@ -392,6 +406,7 @@ class Solution:
     residuals: np.ndarray
     weights: np.ndarray
     steps: int
+    change: float
 
 
 def iterate(
@@ -425,7 +440,7 @@ def iterate(
             weights = estimation.robust_weights(residuals)
     if change > 1.0:
         raise CalibrationError("fit", f"did not settle within {STEPS} steps")
-    return Solution(problem, posterior, x, residuals, weights, step)
+    return Solution(problem, posterior, x, residuals, weights, step, change)
 
 
 def _change(change: np.ndarray, space: ParameterSpace, posterior: Posterior) -> float:

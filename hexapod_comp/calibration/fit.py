@@ -26,10 +26,11 @@ from .estimation import (
     physical_covariance,
 )
 from .lead import ScrewLead, look_for_lead
-from .observability import Allowed, Observability, ToolError, expected_error, observe, without_trace
+from .observability import Allowed, Observability, ToolError, observe, without_trace
 from .parameters import WAVES, FitSettings, ParameterSpace
 from .selection import Decision, select
 from .smooth_field import DIGITS
+from .verdict import Verdict, judge
 from .warming import HeatSeen, seek_time_constants
 
 SURE = 4.0
@@ -41,15 +42,8 @@ LARGEST_NOISE = 0.02
 SCATTERED = 1.5
 """Readings whose noise is found so many times as large as stated are remarked on."""
 
-MISFIT = 10.0
-"""Readings whose noise is found so many times as large as stated are not described: units, instrument or machine
-are others than said."""
-
 WARM = 0.2
 """Readings taken further than this from the reference temperature, K, need an expansion: 1 µm on half a metre."""
-
-TILT = np.radians(10.0)
-"""Tilt at which the report says what the model is worth for a tilted tool."""
 
 
 @dataclass(frozen=True)
@@ -92,12 +86,15 @@ class Outlier:
         m or rad.
     sigmas : float
         The same in standard deviations.
+    run : str
+        Its run.
     """
 
     source: FileLine
     channel: int
     residual: float
     sigmas: float
+    run: str
 
 
 @dataclass(frozen=True)
@@ -122,8 +119,8 @@ class ModelFit:
         What the data determine.
     unseen_errors : tuple of str
         Machine errors that the readings cannot show (:data:`~.observability.MACHINE_ERRORS`).
-    level, tilted : ToolError or None
-        The tool error to expect with this model, for a level tool and for one tilted by :data:`TILT`.
+    verdict : Verdict
+        What the model promises, and what is wrong.
     outliers : tuple of Outlier
         Largest first.
     notes : tuple of str
@@ -146,8 +143,7 @@ class ModelFit:
     channels: tuple[ChannelFit, ...]
     observability: Observability
     unseen_errors: tuple[str, ...]
-    level: ToolError | None
-    tilted: ToolError | None
+    verdict: Verdict
     outliers: tuple[Outlier, ...]
     notes: tuple[str, ...]
     allowed: Allowed
@@ -157,13 +153,23 @@ class ModelFit:
 
     @property
     def misfit(self) -> str:
-        """Why the model is not to be trusted: readings further off than :data:`MISFIT` allows; empty if none is."""
-        return self.measurements.misfit({KINDS.index(c.kind): c.estimated for c in self.channels}, MISFIT)
+        """Why the model is not to be trusted; empty if it is."""
+        return "; ".join(self.verdict.refusals)
+
+    @property
+    def level(self) -> ToolError | None:
+        """The tool error to expect with this model, for a level tool."""
+        return self.verdict.level
+
+    @property
+    def tilted(self) -> ToolError | None:
+        """The same for a tool tilted by :data:`~.verdict.TILT`; None too where nothing can be promised."""
+        return self.verdict.tilted
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance of the parameters, shape (size, size), SI."""
-        return physical_covariance(self.space, self.solution.posterior)
+        """Covariance of the parameters, shape (size, size), SI, widened by :attr:`Unexplained.factor`."""
+        return self.verdict.unexplained.factor**2 * physical_covariance(self.space, self.solution.posterior)
 
     @property
     def standard_errors(self) -> np.ndarray:
@@ -212,12 +218,12 @@ def fit_model(
         *_check_noise(channels),
     ]
     progress("what is it worth?")
-    covariance = physical_covariance(space, solution.posterior)
     allowed = _allowed(everything.space, possible, (space, solution))
-    level, tilted = (expected_error(space, solution.x, covariance, tilt, allowed=allowed) for tilt in (0.0, TILT))
+    noise = {KINDS.index(c.kind): c.estimated for c in channels}
+    verdict = judge(estimation, solution, allowed, settings, noise, progress)
     pose = measurements.geometry.home if datum is None else datum
     part = unseen_part(estimation, solution.posterior.tolerances[0], solution.posterior.noise, pose)
-    as_solved = _named(space, solution, measurements, channels, len(decisions))
+    as_solved = _named(space, solution, measurements, channels, len(decisions), verdict.level)
     model, held = hold(measurements.geometry, as_solved, pose, part)
     return ModelFit(
         model=model,
@@ -228,10 +234,9 @@ def fit_model(
         channels=channels,
         observability=observe(space, solution.problem, solution.posterior),
         unseen_errors=unseen_errors(measurements, settings),
-        level=level,
-        tilted=tilted,
+        verdict=verdict,
         outliers=tuple(_outliers(estimation, solution)),
-        notes=(*measurements.notes, *notes, *_check_worth(level)),
+        notes=(*measurements.notes, *notes, *verdict.remarks),
         allowed=allowed,
         held=held,
         warming=HeatSeen.of(measurements, space, solution, constants),
@@ -380,13 +385,6 @@ def _ignored(measurements: MeasurementSet, space: ParameterSpace) -> list[str]:
     return notes
 
 
-def _check_worth(level: ToolError | None) -> list[str]:
-    """Return a remark on a model that is expected to do harm."""
-    if level is None or level.after <= level.before:
-        return []
-    return ["the model is not expected to help: the readings determine too little of this machine"]
-
-
 def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:
     """Return remarks on readings that scatter more than they should; refuse those that no machine explains.
 
@@ -406,7 +404,7 @@ def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:
     if not noisy:
         return []
     problem = "readings scatter more than stated: something of the machine, or of an instrument, is not in the model"
-    return [f"{problem}, and the expected tool error may be too low ({', '.join(noisy)})"]
+    return [f"{problem} ({', '.join(noisy)}); the expected tool error allows for it"]
 
 
 def _channels(estimation: Estimation, solution: Solution) -> list[ChannelFit]:
@@ -439,7 +437,10 @@ def _outliers(estimation: Estimation, solution: Solution) -> list[Outlier]:
     sigmas = solution.residuals / (estimation.uncertainty * solution.posterior.noise[m.kind])
     worst = np.argsort(-np.abs(sigmas))
     far = worst[np.abs(sigmas[worst]) > OUTLIER]
-    return [Outlier(m.sources[i], int(m.channel[i]), float(solution.residuals[i]), float(sigmas[i])) for i in far]
+    return [
+        Outlier(m.sources[i], int(m.channel[i]), float(solution.residuals[i]), float(sigmas[i]), m.runs[m.run[i]].name)
+        for i in far
+    ]
 
 
 def _named(
@@ -448,11 +449,14 @@ def _named(
     measurements: MeasurementSet,
     channels: tuple[ChannelFit, ...],
     tried: int,
+    level: ToolError | None,
 ) -> MachineModel:
-    """Return the fitted model with its origin."""
+    """Return the fitted model with its origin, and what it promises."""
     kept = ", ".join(block.name for block in space.blocks)
     lengths = [c.held_out for c in channels if c.kind not in ANGULAR_KINDS]
     note = f"scheme joint, {len(measurements)} readings, blocks {kept} (of {tried + 1} tried)"
+    if level is not None:
+        note += f", expected tool error {level.after * 1e6:.3f} µm RMS, up to {level.high * 1e6:.3f} (95 %)"
     residual = rms(lengths) if lengths else None
     origin = ModelOrigin(date.today().isoformat(), measurements.files, residual, note)
     return replace(space.model(solution.x.round(DIGITS)), origin=origin)

@@ -213,6 +213,8 @@ class ToolError:
         readings do not tell whether the machine has them.
     rotation_before, rotation_after : float
         The same of the rotation, rad.
+    radius : float
+        RMS distance of the points from their middle, m: what a scale that is off acts on.
     """
 
     before: float
@@ -221,6 +223,7 @@ class ToolError:
     high: float
     rotation_before: float
     rotation_after: float
+    radius: float
 
 
 Allowed = tuple[ParameterSpace, np.ndarray, np.ndarray]
@@ -264,7 +267,8 @@ def expected_error(
     left, possible = left_errors(space, prediction, stations, covariance, allowed)
     after, rotation_after = _aligned_rms(points, left)
     low, high = interval(after, _aligned_rms(points, possible)[0])
-    return ToolError(rms(before), rms(after), low, high, rms(rotation_before), rms(rotation_after))
+    radius = rms(np.linalg.norm(points - points.mean(axis=0), axis=1))
+    return ToolError(rms(before), rms(after), low, high, rms(rotation_before), rms(rotation_after), radius)
 
 
 def left_errors(

@@ -92,6 +92,9 @@ class FitSettings:
         Standard deviations to start from, by block.
     robust : bool
         Give readings that disagree with the rest less weight.
+    scale, alignment : float or None
+        Standard deviations of what no reading shows: of the instruments' scale, m/m, and of the angle between a laser's
+        beam and its line, rad. None: of their class (:func:`~hexapod_comp.calibration.misfit.stated_scale`).
     """
 
     blocks: tuple[str, ...] = BLOCKS
@@ -105,6 +108,8 @@ class FitSettings:
     time_constants: tuple[float, ...] | None = None
     tolerances: tuple[tuple[str, float], ...] = tuple(TOLERANCES.items())
     robust: bool = True
+    scale: float | None = None
+    alignment: float | None = None
 
     def __post_init__(self) -> None:
         unknown = set(self.blocks) - set(BLOCKS)
@@ -122,6 +127,9 @@ class FitSettings:
                 raise ModelError(f"{body} expansion", f"must be 0…{LARGEST_EXPANSION * 1e6:g} ppm/K", value * 1e6)
         constants = self.time_constants or ()
         LateGrowth(tuple(constants), np.zeros((len(PARTS), len(constants))), self.thermometer)  # refuses what cannot be
+        for name, given, most, unit in (("scale", self.scale, 1e-2, "m/m"), ("alignment", self.alignment, 0.1, "rad")):
+            if given is not None and not 0.0 <= given <= most:
+                raise ModelError(name, f"must be 0…{most:g} {unit}", given)
         if not 1 <= self.field_degree <= 8:
             raise ModelError("field_degree", "must be 1…8", self.field_degree)
 

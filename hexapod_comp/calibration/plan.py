@@ -9,9 +9,10 @@ import numpy as np
 from ..measurements.campaign import Campaign
 from ..measurements.readings import DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
 from .estimation import Estimation, physical_covariance, solve
-from .fit import TILT, unseen_errors
+from .fit import unseen_errors
 from .observability import Observability, ToolError, expected_error, observe
 from .parameters import FitSettings, ParameterSpace
+from .verdict import TILT
 
 
 @dataclass(frozen=True)

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 
 from ..formats.texts import aligned, number
 from ..measurements.readings import ANGULAR_KINDS, CHANNELS
+from .estimation import SETTLED
 from .fit import ChannelFit, ModelFit, Outlier
 from .lead import ScrewLead
 from .observability import BlockSight, Observability, ToolError
 from .plan import Plan
 from .warming import warming_json, warming_text
 
-MOST_LISTED = 10
-"""Outliers and notes beyond these are counted, not listed."""
+MOST_LISTED, MOST_OF_RUN = 10, 3
+"""Runs with outliers, and outliers of a run, beyond these are counted, not listed."""
+
+MOST_RUNS = 5
+"""Runs that are listed as met worst."""
 
 TRUST = 0.1
 """A tilted tool that keeps more than this share of its error is warned of, when parameters are not seen."""
@@ -22,17 +27,25 @@ TRUST = 0.1
 def fit_report(fit: ModelFit) -> str:
     """Return the report of a fit, for people: what is left, what was found, what the readings could not show."""
     parts = [
+        *_doubts(fit),
         _headline(fit),
         *_expected(fit.level, fit.tilted, fit.observability),
         fit.held.report(),
         *_notes(fit),
         _channel_table(fit),
+        *_chi_square_tables(fit),
         _decision_table(fit),
         observability_text(fit.observability, fit.unseen_errors),
         *filter(None, [warming_text(fit.warming)]),
         *_outliers(fit),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _doubts(fit: ModelFit) -> Iterator[str]:
+    """Yield what is wrong, before anything else."""
+    if fit.verdict.doubts or fit.verdict.refusals:
+        yield "IN DOUBT:\n" + "\n".join(f"  {doubt}" for doubt in (*fit.verdict.refusals, *fit.verdict.doubts))
 
 
 def _notes(fit: ModelFit) -> Iterator[str]:
@@ -43,9 +56,10 @@ def _notes(fit: ModelFit) -> Iterator[str]:
 def _headline(fit: ModelFit) -> str:
     m = fit.measurements
     kept = ", ".join(block.name for block in fit.space.blocks)
+    settled = "settled after" if fit.solution.change < SETTLED else "NOT settled after"
     return (
         f"machine {m.geometry.name}: {len(m)} readings of {len(m.runs)} runs at {len(m.stations)} stations\n"
-        f"scheme joint: {fit.space.size} parameters ({kept}), settled after {fit.solution.steps} steps"
+        f"scheme joint: {fit.space.size} parameters ({kept}), {settled} {fit.solution.steps} steps"
         + (f"\nscrew lead: {fit.lead}" if fit.lead is not None else "")
     )
 
@@ -88,6 +102,18 @@ def _channel_table(fit: ModelFit) -> str:
     return "residuals; held out: a line or a pose at a time, noise included\n" + aligned(header, rows)
 
 
+def _chi_square_tables(fit: ModelFit) -> Iterator[str]:
+    """Yield χ² by channel, family of lines and direction; and the runs that were met worst."""
+    parts = list(dict.fromkeys(c.part for c in fit.verdict.chi_squares))
+    known = {(c.kind, c.part): number(c.value, 3) for c in fit.verdict.chi_squares}
+    rows = [(c.kind, *(known.get((c.kind, part), "") for part in parts)) for c in fit.channels]
+    if parts:
+        yield "χ²/freedom by lines and direction; 1: as stated\n" + aligned(("channel", *parts), rows)
+    worst = [(c.part, c.kind, str(c.readings), number(c.value, 3)) for c in fit.verdict.worst_runs[:MOST_RUNS]]
+    if len(fit.verdict.worst_runs) > 1:
+        yield "runs that were met worst\n" + aligned(("run", "channel", "readings", "χ²/freedom"), worst)
+
+
 def _decision_table(fit: ModelFit) -> str:
     header = ("block", "kept", "gain", "±", "")
     rows = [
@@ -126,12 +152,21 @@ def _outliers(fit: ModelFit) -> Iterator[str]:
     if not fit.outliers:
         return
     lines = [f"readings that disagree with all others, and got little weight: {len(fit.outliers)}"]
-    for o in fit.outliers[:MOST_LISTED]:
-        unit = "urad" if CHANNELS[o.channel].partition("_")[0] in ANGULAR_KINDS else "um"
-        lines.append(f"  {o.source}: {CHANNELS[o.channel]} is {o.residual * 1e6:.2f} {unit} off ({o.sigmas:.1f} σ)")
-    if len(fit.outliers) > MOST_LISTED:
-        lines.append(f"  and {len(fit.outliers) - MOST_LISTED} more")
+    runs = Counter(o.run for o in fit.outliers)
+    for run, count in runs.most_common(MOST_LISTED):
+        of_run = [o for o in fit.outliers if o.run == run]
+        lines.append(f"  run {run}: {count}")
+        lines += [f"    {_outlier_line(o)}" for o in of_run[:MOST_OF_RUN]]
+        if count > MOST_OF_RUN:
+            lines.append(f"    and {count - MOST_OF_RUN} more")
+    if len(runs) > MOST_LISTED:
+        lines.append(f"  and {sum(runs.values()) - sum(n for _, n in runs.most_common(MOST_LISTED))} in other runs")
     yield "\n".join(lines)
+
+
+def _outlier_line(o: Outlier) -> str:
+    unit = "urad" if CHANNELS[o.channel].partition("_")[0] in ANGULAR_KINDS else "um"
+    return f"{o.source}: {CHANNELS[o.channel]} is {o.residual * 1e6:.2f} {unit} off ({o.sigmas:.1f} σ)"
 
 
 def as_json(fit: ModelFit) -> dict:
@@ -150,6 +185,11 @@ def as_json(fit: ModelFit) -> dict:
         "channels": [_channel_json(c) for c in fit.channels],
         **_expected_json(fit.level, fit.tilted, fit.observability, fit.unseen_errors),
         "datum": fit.held.as_json(),
+        "settled": fit.solution.change < SETTLED,
+        "doubts": (*fit.verdict.refusals, *fit.verdict.doubts),
+        "unexplained": fit.verdict.unexplained.as_json(),
+        "chi_squares": [vars(c) for c in fit.verdict.chi_squares],
+        "chi_squares_of_runs": [vars(c) for c in fit.verdict.worst_runs],
         "outliers": [_outlier_json(o) for o in fit.outliers],
         "notes": fit.notes,
         "warming": warming_json(fit.warming),
@@ -173,7 +213,7 @@ def _channel_json(channel: ChannelFit) -> dict:
 def _outlier_json(outlier: Outlier) -> dict:
     name = CHANNELS[outlier.channel]
     residual = {f"residual_{_unit(name.partition('_')[0])}": outlier.residual, "sigmas": outlier.sigmas}
-    return {"source": str(outlier.source), "channel": name, **residual}
+    return {"source": str(outlier.source), "run": outlier.run, "channel": name, **residual}
 
 
 def _unit(kind: str) -> str:

@@ -53,6 +53,9 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
         given |= dict(zip(("strut_expansion", "base_expansion", "platform_expansion"), args.expansion_ppm, strict=True))
     if args.tolerance_um is not None:
         given["tolerances"] = tuple({**TOLERANCES, "structure": args.tolerance_um * 1e-6}.items())
+    for name, option, unit in (("scale", "scale_ppm", 1e-6), ("alignment", "alignment_mrad", 1e-3)):
+        if getattr(args, option, None) is not None:
+            given[name] = getattr(args, option) * unit
     robust = not getattr(args, "not_robust", False)
     return FitSettings(shared_platform_joints=not args.separate_joints, robust=robust, **given)
 
@@ -174,7 +177,7 @@ def _refuse_options_of_the_other_scheme(args: argparse.Namespace) -> None:
     """Raise on an option that the scheme would not listen to."""
     from ..errors import CalibrationError
 
-    of_joint = ("lead_mm", "blocks", "tolerance_um", "field_degree", "expansion_ppm")
+    of_joint = ("lead_mm", "blocks", "tolerance_um", "field_degree", "expansion_ppm", "scale_ppm", "alignment_mrad")
     if args.compensated:
         raise CalibrationError("--compensated", "is for check readings, of verify or of fit --update")
     others = (

@@ -306,6 +306,10 @@ def _fit(parser: argparse.ArgumentParser) -> None:
     add("--update", metavar="MODEL", help="renew this model from few readings, what its fit knows as the prior")
     _compensated(add)
     _estimation(parser)
+    text = "scale error of the instrument, 1 σ, ppm (scheme joint; default by its class: laser 0.5, tracker 10)"
+    add("--scale-ppm", type=arguments.bound, metavar="PPM", help=text)
+    text = "angle between a laser's beam and its line, 1 σ, mrad (scheme joint; default 0.5)"
+    add("--alignment-mrad", type=arguments.bound, metavar="MRAD", help=text)
     text = "trust readings that disagree with the rest (scheme joint)"
     add("--not-robust", action="store_true", help=text)
     text = "what picks the polynomials' order (scheme lines; default adjusted-r2)"

@@ -1,0 +1,425 @@
+"""What readings show that no parameter describes, and by how much it widens what a fit promises.
+
+A covariance of parameters is right if the model is. Three things are looked for that break it. Whole lines and whole
+families of lines are left out: the tool error that this makes, beside the one that the covariance expects, says how far
+what is left differs from line to line rather than from reading to reading. What is left beyond the instruments' noise
+is taken for an error of the machine that no parameter describes. And a scale that drifts while the readings are taken
+is fitted to what is left. The scale of an instrument, which no reading shows, is stated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..measurements.readings import ANGULAR_KINDS, BACKWARD, FORWARD, KINDS, MeasurementSet
+from ..virtual.trial import without_datum
+from .estimation import Estimation, Solution
+from .observability import ToolError, box_stations
+from .parameters import FitSettings, ParameterSpace
+from .sensitivity import derivatives, predict
+
+CHANCE = 2.88
+"""Standard deviations of a normal distribution beyond which two of a thousand lie: so rarely readings that the model
+describes look misfitted by chance, in each way of leaving some out."""
+
+CLEAR_DRIFT = 3.0
+"""A drift of the scale is one from so many standard deviations on."""
+
+PARALLEL = 0.999
+"""Cosine from which a line is parallel to an axis of the work frame."""
+
+PLACE = 1e-3
+"""Lines whose middles are closer, m, lie in one plane across an axis."""
+
+QUARTERS = 4
+"""Parts, in the order of the readings, that are left out in turn."""
+
+SCALES = {"linear": 0.5e-6, "length": 0.5e-6, "position": 10e-6}
+"""Standard deviation of the scale of an instrument of each class, m/m: an interferometer whose air is compensated;
+a ball bar or a station that is calibrated as well; a tracker or cameras."""
+
+ALIGNMENT = 0.5e-3
+"""Standard deviation of the angle between a laser's beam and its line, rad: a beam set up over half a metre."""
+
+HELD = 0.5
+"""A promise of which more than this share comes from the priors is none."""
+
+FAMILIES = ("x lines", "y lines", "z lines", "other lines", "other runs")
+"""Families of runs, by direction in the work frame."""
+
+TWICE, LACK_MARGIN = 2.0, 1.5
+"""The upper end of an interval stands so far out: in standard deviations of a scale, and in sizes of a lack."""
+
+CLEAR_LACK = 3.0
+"""What readings share is no chance from so many standard deviations on."""
+
+CUT = 4.0
+"""Residuals count for no more standard deviations than that: a gross error is a single reading's."""
+
+LEAST_FREE = 3.0
+"""A χ² is given for more degrees of freedom only."""
+
+DOUBTFUL_FACTOR = 3.0
+"""Parts of the readings that differ so many times as much as their noise explains put the whole fit in doubt."""
+
+STEEL = 11.5e-6
+"""Expansion of steel, 1/K."""
+
+LEAST_RUNS = 6
+"""A drift is looked for in so many runs of a linear laser, or more."""
+
+LEAST_PAIRS = 30
+"""Pairs of readings there and back from which on their likeness tells the machine's errors from noise."""
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """What widens a promise.
+
+    Attributes
+    ----------
+    factor : float
+        On the standard deviations of all parameters, from 1: what leaving out `without` shows.
+    without : str
+        What was left out in turn where that showed most; empty where the factor is 1.
+    lack : float
+        RMS displacement of the tool that readings show and no parameter describes, m.
+    drift : float
+        Change of the scale from the first to the last reading, m/m; 0 where there is none.
+    scale : float
+        Stated standard deviation of the scale of all readings, m/m.
+    """
+
+    factor: float = 1.0
+    without: str = ""
+    lack: float = 0.0
+    drift: float = 0.0
+    scale: float = 0.0
+
+    def widened(self, error: ToolError | None) -> ToolError | None:
+        """Return a tool error whose expectation and interval allow for all this; its lower end stays."""
+        if error is None:
+            return None
+        stretch = error.radius * np.array([self.scale, 0.5 * self.drift])
+        after = np.sqrt((self.factor * error.after) ** 2 + self.lack**2 + stretch @ stretch)
+        high = np.sqrt((self.factor * error.high) ** 2 + (LACK_MARGIN * self.lack) ** 2 + TWICE**2 * stretch @ stretch)
+        rotation = self.factor * error.rotation_after
+        return replace(error, after=float(after), high=float(high), rotation_after=float(rotation))
+
+    def doubts(self) -> list[str]:
+        """Return what puts a fit in doubt."""
+        listed = []
+        if self.factor > DOUBTFUL_FACTOR:
+            listed.append(f"{self._outcome()}: lines, or what they were read with, disagree with each other")
+        if self.drift:
+            size = f"{self.drift * 1e6:.2g} ppm, as steel's does in {self.drift / STEEL:.2g} K"
+            listed.append(f"the scale of the linear readings changes by {size}, from the first to the last")
+        return listed
+
+    def remarks(self) -> list[str]:
+        """Return what a reader must know of how the promise came about."""
+        listed = []
+        if 1.0 < self.factor <= DOUBTFUL_FACTOR:
+            listed.append(f"{self._outcome()}; the expected tool error allows for it")
+        if self.lack:
+            problem = f"{self.lack * 1e6:.2f} µm RMS of the tool's error, there and back alike, are in no parameter"
+            listed.append(f"{problem}; the expected tool error allows for them")
+        return listed
+
+    def as_json(self) -> dict[str, float | str]:
+        """Return this as plain numbers; units are in the keys."""
+        return {
+            "factor": self.factor,
+            "without": self.without,
+            "lack_m": self.lack,
+            "drift_m_per_m": self.drift,
+            "scale_m_per_m": self.scale,
+        }
+
+    def _outcome(self) -> str:
+        return (
+            f"left out in turn, each {self.without} changes the tool {self.factor:.1f} times as much as noise explains"
+        )
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """A settled fit's residuals, cell by cell, in standard deviations at the noise that was estimated.
+
+    Attributes
+    ----------
+    estimation, solution : Estimation, Solution
+        The fit.
+    rows, residual : ndarray, shape (C, n), (C,)
+        Derivatives by the parameters in use, and what is left.
+    leverage : ndarray, shape (C,)
+        Share of each cell that the parameters take up.
+    run, direction : ndarray of int, shape (C,)
+        Of each cell.
+    rank : ndarray, shape (C,)
+        Place in the order of the readings, −½…½.
+    """
+
+    estimation: Estimation
+    solution: Solution
+    rows: np.ndarray
+    residual: np.ndarray
+    leverage: np.ndarray
+    run: np.ndarray
+    direction: np.ndarray
+    rank: np.ndarray
+
+    @staticmethod
+    def of(estimation: Estimation, solution: Solution) -> Residuals:
+        """Return those of a fit."""
+        problem, posterior, cells = solution.problem, solution.posterior, estimation.cells
+        scale = 1.0 / posterior.noise[problem.kind]
+        rows = scale[:, None] * problem.rows[:, posterior.used]
+        m = estimation.measurements
+        order = np.argsort(np.argsort(cells.first))
+        return Residuals(
+            estimation=estimation,
+            solution=solution,
+            rows=rows,
+            residual=scale * problem.target - rows @ posterior.y,
+            leverage=np.einsum("ci,ij,cj->c", rows, posterior.covariance, rows, optimize=True),
+            run=m.run[cells.first],
+            direction=m.direction[cells.first],
+            rank=order / max(len(order) - 1, 1) - 0.5,
+        )
+
+
+def unexplained(residuals: Residuals, scale: float) -> Unexplained:
+    """Return what a settled fit leaves unexplained.
+
+    Parameters
+    ----------
+    residuals : Residuals
+        Of the fit.
+    scale : float
+        Stated standard deviation of the scale of all readings, m/m.
+    """
+    factor, without = _left_out(residuals)
+    return Unexplained(factor, without, _lack(residuals), _drift(residuals), scale)
+
+
+def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
+    """Return the standard deviation of the scale of all readings, m/m, as stated or as their instruments' class has it.
+
+    The best instrument for lengths counts. A beam that is off its line by an angle θ reads θ²/2 too little.
+    """
+    kinds = {KINDS[k] for k in np.unique(measurements.kind)}
+    known = [value for kind, value in SCALES.items() if kind in kinds]
+    scale = settings.scale if settings.scale is not None else min(known, default=0.0)
+    angle = settings.alignment if settings.alignment is not None else ALIGNMENT
+    return float(np.hypot(scale, 0.5 * angle**2 if "linear" in kinds else 0.0))
+
+
+def held_by_priors(residuals: Residuals) -> bool:
+    """Return whether what a fit expects of the tool comes from the priors rather than from the readings."""
+    r = residuals
+    metric = _tool_metric(r.estimation.space, r.solution)
+    if metric is None:
+        return False
+    posterior = r.solution.posterior
+    spread = r.estimation.space.spread(posterior.tolerances)[posterior.used]
+    prior, left = (np.sqrt(np.trace(metric @ part)) for part in (np.diag(spread**2), posterior.covariance))
+    noise = r.estimation.uncertainty * posterior.noise[r.estimation.measurements.kind]
+    lengths = ~np.isin(r.estimation.measurements.kind, [KINDS.index(kind) for kind in ANGULAR_KINDS])
+    return bool(left > HELD * prior and (not lengths.any() or left > np.median(noise[lengths])))
+
+
+def family_of_run(measurements: MeasurementSet) -> np.ndarray:
+    """Return the index into :data:`FAMILIES` of each run."""
+    axes = np.array([run.axis for run in measurements.runs]).reshape(-1, 3) @ measurements.geometry.work.rotation
+    parallel = np.abs(axes) > PARALLEL
+    family = np.where(parallel.any(axis=1), parallel.argmax(axis=1), 3)
+    return np.where(axes.any(axis=1), family, 4)
+
+
+def _left_out(r: Residuals) -> tuple[float, str]:
+    """Return the largest factor on standard deviations that leaving something out shows, and what that was.
+
+    With group g left out the parameters change by δ, whose covariance is C₋g − C if the model is right. M turns both
+    into the tool's mean squared error in the measured box.
+    """
+    metric = _tool_metric(r.estimation.space, r.solution)
+    if metric is None:
+        return 1.0, ""
+    covariance = r.solution.posterior.covariance
+    information = np.linalg.inv(covariance)
+    worst, name = 1.0, ""
+    for what, groups in _groupings(r).items():
+        shown, expected, freedom = [], [], []
+        for group in np.unique(groups):
+            members = groups == group
+            if members.all():
+                continue
+            rows = r.rows[members]
+            without = np.linalg.inv(information - rows.T @ rows)
+            change = without @ (rows.T @ r.residual[members])
+            spread = metric @ (without - covariance)
+            shown.append(change @ metric @ change)
+            expected.append(np.trace(spread))
+            freedom.append(expected[-1] ** 2 / np.trace(spread @ spread))
+        ratio, limit = _excess(np.array(shown), np.array(expected), np.array(freedom))
+        if ratio > max(limit, worst**2):
+            worst, name = float(np.sqrt(ratio)), what
+    return worst, name
+
+
+def _excess(shown: np.ndarray, expected: np.ndarray, freedom: np.ndarray) -> tuple[float, float]:
+    """Return how many times as large squared changes are as expected, and how many times they may be by chance.
+
+    By Satterthwaite, the sum is about a χ² of as many degrees of freedom as its variance says, and the cube root of
+    that is about normal, by Wilson and Hilferty.
+    """
+    if not expected.sum() > 0.0:
+        return 0.0, np.inf
+    all_freedom = expected.sum() ** 2 / (expected**2 / freedom).sum()
+    width = 2.0 / (9.0 * all_freedom)
+    return float(shown.sum() / expected.sum()), float((1.0 - width + CHANCE * np.sqrt(width)) ** 3)
+
+
+def _tool_metric(space: ParameterSpace, solution: Solution) -> np.ndarray | None:
+    """Return M: yᵀ·M·y is the mean squared error of the tool in the box, the datum aligned, of parameters y in use."""
+    stations = box_stations(space)
+    if stations is None:
+        return None
+    slopes = derivatives(space, predict(space, solution.x, stations), stations)[:, :3]
+    slopes = space.whitened(slopes.reshape(-1, space.size))[:, solution.posterior.used]
+    points = stations.positions + stations.rotations @ space.probe
+    effects = without_datum(points, slopes.reshape(len(points), 3, -1)).reshape(3 * len(points), -1)
+    return effects.T @ effects / len(points)
+
+
+def _groupings(r: Residuals) -> dict[str, np.ndarray]:
+    """Return what is left out together, by name: a number for each cell."""
+    m = r.estimation.measurements
+    family = family_of_run(m)
+    places = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)[0][r.estimation.cells.station]
+    count = np.maximum(np.bincount(r.run, minlength=len(m.runs)), 1)
+    groups = {"line": r.run, "family of lines": family[r.run], "direction": r.direction}
+    for axis, name in enumerate("xyz"):
+        middle = np.bincount(r.run, places[:, axis], len(m.runs)) / count
+        across = (family < 3) & (family != axis)
+        groups[f"plane across {name}"] = np.where(across, np.round(middle / PLACE), np.inf)[r.run]
+    groups["quarter of the time"] = np.floor((r.rank + 0.5) * (QUARTERS - 1e-9))
+    groups["channel"] = r.estimation.cells.kind
+    return groups
+
+
+def _lack(r: Residuals) -> float:
+    """Return the RMS displacement of the tool that is left and is no noise, m.
+
+    Readings there and back at one place share what the machine does there, and no noise. Where there are no such
+    pairs, what is beyond the stated noise counts.
+    """
+    m, cells, posterior = r.estimation.measurements, r.estimation.cells, r.solution.posterior
+    squares, weights = [0.0], [1e-300]
+    for k in np.unique(cells.kind):
+        if KINDS[k] in ANGULAR_KINDS:
+            continue
+        there, back = _pairs(r, k)
+        if len(there) >= LEAST_PAIRS:
+            share = _likeness(r, there, back) * posterior.noise[k] ** 2
+        else:
+            readings = int((m.kind == k).sum())
+            beyond = posterior.noise[k] ** 2 - 1.0
+            share = beyond if beyond > CLEAR_LACK * np.sqrt(2.0 / readings) else 0.0
+        squares.append(share * m.stated_of(k) ** 2 * (cells.kind == k).sum())
+        weights.append(float((cells.kind == k).sum()))
+    return float(np.sqrt(3.0 * sum(squares) / sum(weights)))
+
+
+def _pairs(r: Residuals, kind: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the cells of a kind that were read forward, and those read backward at the same places."""
+    cells, stations = r.estimation.cells, r.estimation.measurements.stations
+    poses = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(9)
+    pose = np.unique(poses, axis=0, return_inverse=True)[1].ravel()[cells.station]
+    keys = np.stack([r.run, cells.channel, pose], axis=1)
+    key = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
+    ways = []
+    for direction in (FORWARD, BACKWARD):
+        members = np.flatnonzero((cells.kind == kind) & (r.direction == direction))
+        ways.append((members, key[members]))
+    (there, a), (back, b) = ways
+    _, first, second = np.intersect1d(a, b, return_indices=True)
+    return there[first], back[second]
+
+
+def _likeness(r: Residuals, there: np.ndarray, back: np.ndarray) -> float:
+    """Return the variance that pairs of cells share, in their estimated noise's; 0 where it may be chance."""
+    cut = np.clip(r.residual, -CUT, CUT)
+    # Fitting alone makes them unlike each other: by what both give to the parameters and to the run's unknowns.
+    fitted = np.einsum("ci,ij,cj->c", r.rows[there], r.solution.posterior.covariance, r.rows[back], optimize=True)
+    groups = r.estimation.cells.group
+    sizes = np.bincount(groups + 1)[groups[there] + 1]
+    shared = cut[there] * cut[back] + fitted + np.where(groups[there] < 0, 0.0, 1.0 / sizes)
+    return max(0.0, float(shared.mean())) if shared.mean() > CLEAR_LACK / np.sqrt(len(there)) else 0.0
+
+
+def _drift(r: Residuals) -> float:
+    """Return by how much the scale of the readings changes from the first to the last one, m/m; 0 if it does not."""
+    estimation, solution = r.estimation, r.solution
+    cells, linear = estimation.cells, estimation.cells.kind == KINDS.index("linear")
+    if not linear.any() or len(np.unique(r.run[linear])) < LEAST_RUNS:
+        return 0.0
+    column = estimation.free_of_unknowns(np.where(linear, cells.along * r.rank, 0.0)[:, None])[:, 0]
+    column /= solution.posterior.noise[cells.kind]
+    free = column - r.rows @ (solution.posterior.covariance @ (r.rows.T @ column))
+    information = float(column @ free)
+    if information <= 0.0:
+        return 0.0
+    size = float(free @ np.clip(r.residual, -CUT, CUT)) / information
+    return abs(size) if abs(size) * np.sqrt(information) > CLEAR_DRIFT else 0.0
+
+
+@dataclass(frozen=True)
+class ChiSquare:
+    """How one part of the readings was met.
+
+    Attributes
+    ----------
+    kind : str
+        Of :data:`~hexapod_comp.measurements.readings.KINDS`.
+    part : str
+        A family of lines, a direction, or a run's name.
+    readings : int
+        How many.
+    value : float
+        Squared residuals over the stated variance, per degree of freedom.
+    """
+
+    kind: str
+    part: str
+    readings: int
+    value: float
+
+
+def chi_squares(r: Residuals) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare, ...]]:
+    """Return χ² by kind of channel for families of lines and for directions, and run by run, the worst first."""
+    m, solution, of_reading = r.estimation.measurements, r.solution, r.estimation.cells.of_reading
+    taken = r.leverage + r.estimation.shares_of_unknowns()
+    freedom = 1.0 - (taken / np.bincount(of_reading))[of_reading]
+    squares = (solution.weights * solution.residuals / r.estimation.uncertainty) ** 2
+    family, runs = family_of_run(m), [run.name for run in m.runs]
+    ways = {FORWARD: "forward", BACKWARD: "backward"}
+    groups = (
+        (family[m.run], dict(enumerate(FAMILIES))),
+        (m.direction, ways),
+        (m.run, dict(enumerate(runs))),
+    )
+    parts: list[list[ChiSquare]] = []
+    for numbers, names in groups:
+        parts.append([])
+        for k in np.unique(m.kind):
+            for number, name in names.items():
+                members = (m.kind == k) & (numbers == number)
+                if freedom[members].sum() > LEAST_FREE:
+                    value = float(squares[members].sum() / freedom[members].sum())
+                    parts[-1].append(ChiSquare(KINDS[k], name, int(members.sum()), value))
+    of_runs = sorted(parts[2], key=lambda part: -part.value)
+    return (*parts[0], *parts[1]), tuple(of_runs)

@@ -1,0 +1,272 @@
+"""Another reading of the data: a sign, a unit, an axis, a direction or a machine that would explain readings better.
+
+Each is tried with a plain model, structure, pitch and backlash, to which it either fits or not; a length map or a field
+could describe nearly any readings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations, product
+
+import numpy as np
+
+from ..errors import HexapodError
+from ..formats.paths import config_file
+from ..machine.geometry import HexapodGeometry, load_geometry
+from ..machine.kinematics import Structure, strut_lengths_batch
+from ..machine.passes import Passes
+from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, MeasurementSet
+from .estimation import Estimation, solve
+from .misfit import FAMILIES, family_of_run
+from .parameters import FitSettings, ParameterSpace
+
+PLAIN = ("pitch", "wave", "backlash")
+"""Blocks beside the structure: what every machine has, and enough to tell one reading of the data from another."""
+
+BETTER, SURELY = 3.0, 1.2
+"""Another reading is named when some kind of channel fits so many times better, and all together so many times."""
+
+AS_GOOD = 1.05
+"""Others that fit all together as well, to this factor, are named too."""
+
+ENOUGH = 1500
+"""So many readings, at random, tell."""
+
+UNITS = {
+    "length": (("µinch", 0.0254), ("0.1 µm", 0.1), ("0.01 mm", 10.0), ("mm", 1e3), ("nm", 1e-3)),
+    "angle": (("arcsec", np.pi / 0.648), ("mrad", 1e3), ("mdeg", np.pi / 0.18)),
+}
+"""Units in which readings may stand that are said to be µm or µrad."""
+
+GEOMETRIES = ("paper.yaml", "example_6_6.yaml", "jugglebot.yaml", "positioning_unit.yaml")
+"""Machines whose readings may have been mixed up: the shipped ones."""
+
+ROUNDS = 3
+"""Rounds in which each run's sign is looked at with the others' as they are."""
+
+
+@dataclass(frozen=True)
+class Reinterpretation:
+    """Readings read differently.
+
+    Attributes
+    ----------
+    name : str
+        As "x lines, linear: sign reversed".
+    measurements : MeasurementSet
+        As they would then be.
+    scale : ndarray, shape (kinds,)
+        By what the values of each kind were multiplied.
+    """
+
+    name: str
+    measurements: MeasurementSet
+    scale: np.ndarray
+
+
+def suspicions(
+    measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object] = lambda text: None
+) -> list[str]:
+    """Return by name what would explain the readings far better than taking them as they are; the best, or none.
+
+    Parameters
+    ----------
+    measurements : MeasurementSet
+        As they are.
+    settings : FitSettings
+        Of their fit.
+    progress : callable
+        Called with what is tried.
+    """
+    rng = np.random.default_rng(0)
+    if len(measurements) > ENOUGH:
+        chosen = np.zeros(len(measurements), dtype=bool)
+        chosen[rng.choice(len(measurements), ENOUGH, replace=False)] = True
+        measurements = measurements.select(chosen)
+    plain = replace(settings, blocks=PLAIN)
+    whole = Reinterpretation("", measurements, np.ones(len(KINDS)))
+    as_they_are = _noise(whole, plain)
+    if as_they_are is None:
+        return []
+    counts = np.bincount(measurements.kind, minlength=len(KINDS))
+    tried = []
+    for other in _others(measurements, plain):
+        progress(f"trying {other.name}")
+        noise = _noise(other, plain)
+        if noise is not None:
+            gains = np.where(counts > 0, as_they_are / noise, 1.0)
+            tried.append((float(np.exp(counts @ np.log(gains) / counts.sum())), float(gains.max()), other.name))
+    clear = sorted((t for t in tried if t[0] > SURELY and t[1] > BETTER), reverse=True)
+    return [f"{name} fits {best:.3g} times better" for total, best, name in clear if total > clear[0][0] / AS_GOOD]
+
+
+def _noise(tried: Reinterpretation, settings: FitSettings) -> np.ndarray | None:
+    """Return what a plain model leaves of each kind, in the values' own scale, (kinds,); None where it cannot be."""
+    try:
+        space = ParameterSpace(tried.measurements, settings)
+        estimation = Estimation(tried.measurements, space, alone=False)
+        problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(tried.measurements)))
+        posterior = solve(space, problem, space.start_tolerances(), np.ones(len(KINDS)))
+    except (HexapodError, np.linalg.LinAlgError):
+        return None
+    stated = np.array([tried.measurements.stated_of(k) for k in range(len(KINDS))])
+    return posterior.noise * stated / tried.scale
+
+
+def _others(m: MeasurementSet, settings: FitSettings) -> Iterator[Reinterpretation]:
+    """Yield other readings of the same data."""
+    for name, members in _parts(m):
+        yield _multiplied(m, f"{name}: sign reversed", members, -1.0)
+    yield from _in_other_units(m)
+    yield from _exchanged_channels(m)
+    as_it_is = np.ones(len(KINDS))
+    swapped = replace(m, direction=-m.direction, stations=replace(m.stations, sense=-m.stations.sense))
+    yield Reinterpretation("forward and backward: swapped", swapped, as_it_is)
+    yield from _reversed_runs(m, settings)
+    if np.allclose(m.stations.commands, _nominal(m.geometry, m), rtol=0.0, atol=1e-9):
+        for a, b in combinations(range(3), 2):
+            yield Reinterpretation(f"{AXES[a]} and {AXES[b]}: exchanged", _exchanged_axes(m, a, b), as_it_is)
+        for name in GEOMETRIES:
+            geometry = load_geometry(config_file(name))
+            if geometry.name != m.geometry.name:
+                yield Reinterpretation(f"the geometry of {geometry.name}", _elsewhere(m, geometry), as_it_is)
+
+
+def _parts(m: MeasurementSet) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield name and mask of parts whose sign somebody may have reversed: families, their kinds, and channels."""
+    family = family_of_run(m)[m.run]
+    for number, name in enumerate(FAMILIES):
+        members = family == number
+        kinds = np.unique(m.kind[members])
+        if members.any() and not members.all():
+            yield name, members
+        if len(kinds) > 1:
+            for k in kinds:
+                yield f"{name}, {KINDS[k]}", members & (m.kind == k)
+    for channel in np.unique(m.channel):
+        members = m.channel == channel
+        if not members.all():
+            yield CHANNELS[channel], members
+        for number in np.unique(family[members]):
+            if KINDS[m.kind[members][0]] != "linear":
+                yield f"{FAMILIES[number]}, {CHANNELS[channel]}", members & (family == number)
+
+
+def _multiplied(m: MeasurementSet, name: str, members: np.ndarray, factor: float) -> Reinterpretation:
+    scale = np.ones(len(KINDS))
+    if factor > 0.0:
+        scale[np.unique(m.kind[members])] = factor
+    return Reinterpretation(name, m.with_values(np.where(members, factor * m.value, m.value)), scale)
+
+
+def _in_other_units(m: MeasurementSet) -> Iterator[Reinterpretation]:
+    """Yield each kind of channel in each other unit."""
+    for k in np.unique(m.kind):
+        which, meant = ("angle", "µrad") if KINDS[k] in ANGULAR_KINDS else ("length", "µm")
+        for unit, factor in UNITS[which]:
+            yield _multiplied(m, f"{KINDS[k]}: {unit} in place of {meant}", m.kind == k, factor)
+
+
+def _exchanged_channels(m: MeasurementSet) -> Iterator[Reinterpretation]:
+    """Yield two channels of a kind exchanged, everywhere and in one family of runs."""
+    family, present = family_of_run(m)[m.run], np.unique(m.channel)
+    for a, b in combinations(present, 2):
+        if CHANNELS[a].partition("_")[0] != CHANNELS[b].partition("_")[0]:
+            continue
+        both = (m.channel == a) | (m.channel == b)
+        common = [n for n in np.unique(family[both]) if {a, b} <= set(m.channel[family == n].tolist())]
+        for name, where in [("", both), *((f"{FAMILIES[n]}, ", both & (family == n)) for n in common)]:
+            channel = np.where(where, a + b - m.channel, m.channel)
+            if where is both and (family[both] < 3).any():
+                continue  # a straightness along its own line is none
+            title = f"{name}{CHANNELS[a]} and {CHANNELS[b]}: exchanged"
+            yield Reinterpretation(title, replace(m, channel=channel), np.ones(len(KINDS)))
+
+
+def _reversed_runs(m: MeasurementSet, settings: FitSettings) -> Iterator[Reinterpretation]:
+    """Yield sets with the signs of some runs reversed, where the runs of a family differ in sign."""
+    family, slopes = family_of_run(m), _slopes(m)
+    present = np.unique(family)
+    for ways in product((1.0, -1.0), repeat=len(present)):
+        way = dict(zip(present.tolist(), ways, strict=True))
+        signs = np.where(slopes < 0.0, -1.0, 1.0) * [way[n] for n in family.tolist()]
+        for _ in range(ROUNDS):
+            unlike = _unlike(m.with_values(m.value * signs[m.run]), settings)
+            signs = np.where(unlike, -signs, signs)
+            if not unlike.any():
+                break
+        names = [r.name for r, sign in zip(m.runs, signs, strict=True) if sign < 0.0]
+        mixed = any(len(np.unique(signs[family == n])) > 1 for n in present)
+        if mixed and 2 * len(names) <= len(m.runs):
+            listed = ", ".join(names[:3]) + (", …" if len(names) > 3 else "")
+            title = f"{len(names)} of {len(m.runs)} runs ({listed}): sign reversed"
+            yield Reinterpretation(title, m.with_values(m.value * signs[m.run]), np.ones(len(KINDS)))
+
+
+def _unlike(m: MeasurementSet, settings: FitSettings) -> np.ndarray:
+    """Return which runs are rather the opposite of what a plain fit to all says, shape (runs,)."""
+    try:
+        space = ParameterSpace(m, settings)
+        estimation = Estimation(m, space, alone=False)
+        problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(m)))
+        y = solve(space, problem, space.start_tolerances(), np.ones(len(KINDS))).y
+    except (HexapodError, np.linalg.LinAlgError):
+        return np.zeros(len(m.runs), dtype=bool)
+    return np.bincount(m.run[estimation.cells.first], problem.target * (problem.rows @ y), len(m.runs)) < 0.0
+
+
+def _slopes(m: MeasurementSet) -> np.ndarray:
+    """Return the slope of each run's linear readings along its line, shape (runs,); 0 where there are none."""
+    along, linear = m.along(), m.kind == KINDS.index("linear")
+    slopes = np.zeros(len(m.runs))
+    for run in np.unique(m.run[linear]):
+        members = linear & (m.run == run)
+        if members.sum() > 2 and np.ptp(along[members]) > 0.0:
+            slopes[run] = np.polyfit(along[members], m.value[members], 1)[0]
+    return slopes
+
+
+def _nominal(geometry: HexapodGeometry, m: MeasurementSet) -> np.ndarray:
+    return strut_lengths_batch(Structure.of(geometry), m.stations.positions, m.stations.rotations)
+
+
+def _exchanged_axes(m: MeasurementSet, a: int, b: int) -> MeasurementSet:
+    """Return a set whose commanded positions, lines and channels have two axes of the work frame exchanged."""
+    order = np.arange(3)
+    order[[a, b]] = b, a
+    work = m.geometry.work
+    turn = work.rotation @ np.eye(3)[order] @ work.rotation.T
+    tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
+    positions, rotations = m.geometry.platform_poses(tips[:, order], tools)
+    runs = tuple(replace(run, axis=turn @ run.axis) for run in m.runs)
+    channels = [CHANNELS.index(_renamed(name, a, b)) for name in CHANNELS]
+    exchanged = replace(m, runs=runs, channel=np.array(channels)[m.channel])
+    return _sent(exchanged, m.geometry, positions, rotations, turn)
+
+
+def _renamed(channel: str, a: int, b: int) -> str:
+    kind, _, axis = channel.partition("_")
+    other = {AXES[a]: AXES[b], AXES[b]: AXES[a]}.get(axis, axis)
+    return f"{kind}_{other}" if axis else channel
+
+
+def _elsewhere(m: MeasurementSet, geometry: HexapodGeometry) -> MeasurementSet:
+    """Return a set as if another machine's tool had gone the same way in its work frame."""
+    tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
+    turn = geometry.work.rotation @ m.geometry.work.rotation.T
+    runs = tuple(replace(run, axis=turn @ run.axis) for run in m.runs)
+    moved = replace(m, runs=runs, geometry=geometry, probe=geometry.tool.position)
+    return _sent(moved, geometry, *geometry.platform_poses(tips, tools), turn)
+
+
+def _sent(
+    m: MeasurementSet, geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, turn: np.ndarray
+) -> MeasurementSet:
+    """Return a set with other poses, the lengths that its machine is sent there with, and directions turned alike."""
+    moving = Passes(geometry, positions, rotations, m.stations.sense[:, :3] @ turn.T)
+    stations = replace(
+        m.stations, positions=positions, rotations=rotations, commands=moving.nominal_commands(), sense=moving.senses()
+    )
+    return replace(m, stations=stations)
