@@ -9,7 +9,7 @@ import numpy as np
 from ..machine.model import REFERENCE_TEMPERATURE, Temperatures
 from ..machine.passes import Passes, random_directions
 from ..machine.size import rms
-from ..measurements.readings import Stations
+from ..measurements.readings import AXES, Stations
 from ..pose import rotation_from_angles
 from ..virtual.trial import without_datum
 from .estimation import LinearProblem, Posterior, physical_covariance
@@ -35,6 +35,7 @@ MACHINE_ERRORS: dict[str, tuple[tuple[str, str], ...]] = {
     "twist dx ~ y z": (("dx", "y1z1"),),
     "twist dy ~ x z": (("dy", "x1z1"),),
     "twist dz ~ x y": (("dz", "x1y1"),),
+    "size": (("dx", "x1"), ("dy", "y1"), ("dz", "z1")),
     "roll of x": (("rx", "x1"),),
     "roll of y": (("ry", "y1"),),
     "roll of z": (("rz", "z1"),),
@@ -188,12 +189,18 @@ def without_trace(space: ParameterSpace, problem: LinearProblem) -> tuple[str, .
         The data's derivatives.
     """
     index = {label: n for n, label in enumerate(space.labels)}
-    scale = space.spread(space.start_tolerances())
+    tolerances, half = space.spread(space.start_tolerances()), np.ptp(space.box, axis=0)
     names = []
     for name, parts in MACHINE_ERRORS.items():
         wanted = [index[label] for label in (f"{c} {term}" for c, term in parts) if label in index]
-        trace = np.sqrt(np.einsum("i,kij,j->", scale[wanted], problem.normal[:, wanted][:, :, wanted], scale[wanted]))
-        if len(wanted) == len(parts) and trace <= SEEN:
+        if len(wanted) < len(parts):
+            continue
+        # A shear or a size is the same per length, and the terms run from -1 to 1 over sides of the box.
+        share = np.array(
+            [np.prod([half[AXES.index(letter)] for letter in term if letter in AXES]) for _, term in parts]
+        )
+        change = tolerances[wanted] * share / share.max()
+        if np.sqrt(np.einsum("i,kij,j->", change, problem.normal[:, wanted][:, :, wanted], change)) <= SEEN:
             names.append(name)
     return tuple(names)
 

@@ -64,6 +64,8 @@ class Campaign:
         Standard deviation of a reading by kind (:data:`KINDS`), m or rad.
     beam_slope : float
         Standard deviation of a straightness beam's unknown slope, rad.
+    centre_off : float
+        Standard deviation of where the centre of lengths is beside its place in the file, along each axis, m.
     repeatability : float
         Standard deviation of where the machine really stops, along each axis, m.
     level : ndarray, shape (3, 3)
@@ -87,6 +89,7 @@ class Campaign:
     tilt: float = 0.0
     noise: tuple[float, ...] = tuple(DEFAULT_UNCERTAINTY.values())
     beam_slope: float = 100e-6
+    centre_off: float = 0.3e-3
     repeatability: float = 0.0
     level: np.ndarray = field(default_factory=lambda: np.eye(3))
     runs: tuple[CampaignRun, ...] = ()
@@ -109,7 +112,7 @@ class Campaign:
             raise InputFileError("campaign", "cycles, poses", problem, [self.cycles, self.poses])
         if not (self.instrument or self.diagonals or self.poses or self.runs):
             raise InputFileError("campaign", "instrument", "or diagonals, poses or runs: nothing is measured")
-        for name in ("tilt", "beam_slope", "repeatability"):
+        for name in ("tilt", "beam_slope", "centre_off", "repeatability"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise InputFileError("campaign", name, "must be finite and not negative", getattr(self, name))
         if len(self.noise) != len(KINDS) or not all(0.0 <= sigma < math.inf for sigma in self.noise):
@@ -178,7 +181,8 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
             poses=top.integer("poses", 0),
             tilt=float(top.quantity("tilt", "angle", default=0.0)),
             noise=_read_noise(top.section("noise")) if "noise" in top else Campaign.noise,
-            beam_slope=float(top.quantity("beam_slope", "angle", default=100e-6)),
+            beam_slope=float(top.quantity("beam_slope", "angle", default=Campaign.beam_slope)),
+            centre_off=float(top.quantity("centre_off", "length", default=Campaign.centre_off)),
             repeatability=float(top.quantity("repeatability", "length", default=0.0)),
             runs=read_runs(top) if "runs" in top else (),
         )
@@ -239,6 +243,7 @@ def campaign_text(campaign: Campaign, remarks: Sequence[str] = ()) -> str:
         "cycles": campaign.cycles,
         "noise": noise,
         "beam_slope_urad": written(campaign.beam_slope, "angle", "urad"),
+        "centre_off_mm": written(campaign.centre_off, "length", "mm"),
         "repeatability_um": written(campaign.repeatability, "length", "um"),
         "runs": [run.content() for run in campaign.runs],
     }

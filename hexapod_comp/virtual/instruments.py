@@ -11,13 +11,14 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..machine.model import MachineModel, MachinesByTemperature, RealMachine
 from ..measurements.campaign import Campaign
-from ..measurements.readings import AXES, CHANNELS, KINDS, MeasurementSet
+from ..measurements.readings import ABSOLUTE_KINDS, AXES, CHANNELS, KINDS, LENGTH, MeasurementSet
 from .trial import drive, model_commands
 
-VISITS, SLOPES, NOISE = range(3)
+VISITS, SLOPES, NOISE, CENTRES = range(4)
 """Streams of random numbers, one per cause: changing one leaves the others' draws alone."""
 
 
@@ -32,7 +33,8 @@ def measure(
 
     value = w · (e + where the machine happened to stop) − the same at the run's first reading of that channel
     + slope of the straightness beam × way along the line + noise of the instrument. Positions and attitudes are
-    absolute: nothing is subtracted.
+    absolute: nothing is subtracted; nor from lengths whose zero is known. Lengths are distances, from centres whose
+    body stands beside its place in the file.
 
     Parameters
     ----------
@@ -55,6 +57,11 @@ def measure(
     errors = station_errors(template, truth, advance)[template.station]
     errors[:, :3] += _stopping(template, campaign.repeatability, np.random.default_rng([seed, VISITS]))
     value = (template.directions() * errors).sum(axis=1)
+    lengths = np.flatnonzero(template.channel == LENGTH)
+    centres = _centres(template, lengths, campaign.centre_off, np.random.default_rng([seed, CENTRES]))
+    points = template.points()[template.station[lengths]]
+    commanded = np.linalg.norm(points - template.centre[lengths], axis=1)
+    value[lengths] = np.linalg.norm(points + errors[lengths, :3] - centres, axis=1) - commanded
     value -= _zeros(template, value)
     value += _slopes(template, campaign.beam_slope, np.random.default_rng([seed, SLOPES])) * template.along()
     sigma = np.array(campaign.noise)[template.kind]
@@ -120,11 +127,30 @@ def _groups(template: MeasurementSet) -> np.ndarray:
     return template.run * len(CHANNELS) + template.channel
 
 
+def _centres(template: MeasurementSet, lengths: np.ndarray, off: float, rng: np.random.Generator) -> np.ndarray:
+    """Return where the centres of some readings really are, shape (n, 3), m in ``base``: one draw per run.
+
+    A body of several centres is shifted, and turned about their mean so that the furthest moves as far.
+    """
+    centres = template.centre[lengths].copy()
+    drawn = off * rng.standard_normal((len(template.runs), 2, 3))
+    for run in np.unique(template.run[lengths]):
+        members = template.run[lengths] == run
+        mean = centres[members].mean(axis=0)
+        arms = centres[members] - mean
+        shift, turn = drawn[run]
+        size = np.linalg.norm(arms, axis=1).max()
+        turned = Rotation.from_rotvec(turn / size).apply(arms) if size > off else arms
+        centres[members] = mean + shift + turned
+    return centres
+
+
 def _zeros(template: MeasurementSet, value: np.ndarray) -> np.ndarray:
     """Return what each reading's instrument showed when it was zeroed, at the first reading, shape (N,)."""
     _, first, group = np.unique(_groups(template), return_index=True, return_inverse=True)
-    of_line = template.kind < KINDS.index("position")
-    return np.where(of_line, value[first][group.ravel()], 0.0)
+    absolute = np.isin(np.array(KINDS)[template.kind], ABSOLUTE_KINDS)
+    absolute |= np.array([run.known_zero for run in template.runs])[template.run]
+    return np.where(absolute, 0.0, value[first][group.ravel()])
 
 
 def _slopes(template: MeasurementSet, slope: float, rng: np.random.Generator) -> np.ndarray:
