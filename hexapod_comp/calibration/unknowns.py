@@ -188,6 +188,6 @@ class Lengths:
         """Raise when the body is at another place, m, than the file's."""
         if np.abs(place).max() > FAR * CENTRE:
             shown = ", ".join(f"{v * 1e3:.1f}" for v in place)
-            problem = f"the lengths of run {self.name} put their centre {shown} mm (base) off its place in the file"
+            problem = f"the lengths of run {self.name} put their centre {shown} mm (in base) off its place in the file"
             hint = f"it must be known to {FAR * CENTRE * 1e3:g} mm; do places, units and commanded poses fit?"
             raise CalibrationError("centre", f"{problem}; {hint}")

@@ -77,7 +77,7 @@ def test_a_centre_at_another_place_is_refused() -> None:
     points = ball(30, 0.2, centre)
     lengths = Lengths("bar 3", np.arange(30), points, np.tile(centre, (30, 1)), False)
     read = np.linalg.norm(points - centre - [0.05, 0.0, 0.0], axis=1)
-    with pytest.raises(CalibrationError, match=r"run bar 3 put their centre 50\.0, .* must be known to 25 mm"):
+    with pytest.raises(CalibrationError, match=r"run bar 3 put their centre .* must be known to 25 mm"):
         left_of(lengths, np.zeros((30, 3)), read - 0.2)
 
 
