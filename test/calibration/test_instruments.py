@@ -136,9 +136,9 @@ def fitted(machine: Machine, truth: Errors, folder: Path, what: str) -> ModelFit
 @pytest.mark.parametrize("what", ["stations", "circles and R-tests"])
 @pytest.mark.parametrize("name", ZOO)
 def test_instruments_mend_machines_of_all_kinds(name: str, what: str, tmp_path: Path) -> None:
-    """Errors of 50 µm, readings of 0.5 µm: a twentieth is left at most at tips that nobody measured, the datum aligned.
+    """Errors of 50 µm, readings of 0.5 µm: a tenth is left at most at tips that nobody measured, the datum aligned.
 
-    Circles that all are about as large do not show how large: the tenth of an error that is left is that.
+    Circles that all are about as large do not show how large: what they leave besides is that.
     """
     machine = foreign_machines.machines()[name]
     truth = Errors.drawn(machine, 3)
@@ -148,7 +148,7 @@ def test_instruments_mend_machines_of_all_kinds(name: str, what: str, tmp_path: 
     error = partial(tool_errors, machine, truth)
     before = aligned_rms(tips, error(None, tips))
     after = aligned_rms(tips, error(Errors.read(tmp_path / "model.yaml"), tips))
-    assert after < (0.05 if what == "stations" else 0.15) * before
+    assert after < (0.1 if what == "stations" else 0.15) * before
     assert all(0.7 < c.chi_square < 1.3 or c.stated == UM for c in fit.channels)
 
 

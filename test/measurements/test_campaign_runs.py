@@ -72,3 +72,45 @@ def test_wrong_runs(tmp_path: Path, change: tuple[str, str], complaint: str) -> 
         load_campaign(path)
     assert complaint in str(refused.value)
     assert "wrong.yaml" in str(refused.value)
+
+
+INSTRUMENTS = """format: hexapod_comp/campaign
+version: 1
+box_mm: [[-100, -100, 400], [100, 100, 500]]
+runs:
+  - {name: circle, instrument: ball_bar, centre_mm: [0, 0, 450], radius_mm: 50, plane: zx, points: 5, zero: known}
+  - {name: place, instrument: r_test, position_mm: [10, 20, 450], tilt_deg: 10, points: 9}
+  - {name: plate, instrument: probe, centres_mm: [[0, 0, 400], [80, 0, 400]], radius_mm: 20, points: 6}
+  - {name: outside, instrument: station, centre_mm: [700, 0, 100], poses_mm: [[0, 0, 450], [50, 0, 450]]}
+"""
+
+
+def test_short_forms_of_instruments(tmp_path: Path) -> None:
+    """A circle there and back keeps its radius in its plane, from z to x; touches theirs; tilts reach their largest."""
+    path = tmp_path / "instruments.yaml"
+    path.write_text(INSTRUMENTS)
+    m = template(load_campaign(path), small.paper())
+    assert np.bincount(m.run).tolist() == [2 * 5, 9 * 3, 2 * 6, 2]
+    assert [run.known_zero for run in m.runs] == [True, False, False, False]
+    tips = m.points()[m.station] - m.geometry.work.position
+    circle = (tips[m.run == 0] - [0.0, 0.0, 0.45]) @ m.geometry.work.rotation
+    quarters = np.array([[0, 0, 1], [1, 0, 0], [0, 0, -1], [-1, 0, 0], [0, 0, 1]]) * 0.05
+    np.testing.assert_allclose(circle, np.vstack([quarters, quarters[::-1]]), atol=1e-9)
+    assert m.cycle[m.run == 0].tolist() == [1] * 5 + [2] * 5
+    touches = np.linalg.norm((m.points()[m.station] - m.centre)[m.run == 2], axis=1)
+    np.testing.assert_allclose(touches, 0.02, atol=1e-9)
+    up = m.stations.rotations[m.station[m.run == 1]][:, 2, 2]
+    assert np.degrees(np.arccos(up.min())) == pytest.approx(10.0, abs=0.1)
+    written = tmp_path / "written.yaml"
+    written.write_text(campaign_text(load_campaign(path)))
+    again = template(load_campaign(written), small.paper())
+    np.testing.assert_allclose(again.centre, m.centre, atol=1e-12)
+    np.testing.assert_allclose(again.stations.commands, m.stations.commands, atol=1e-12)
+    assert [run.known_zero for run in again.runs] == [run.known_zero for run in m.runs]
+
+
+def test_a_length_needs_its_centre(tmp_path: Path) -> None:
+    path = tmp_path / "wrong.yaml"
+    path.write_text(INSTRUMENTS.replace("centre_mm: [700, 0, 100], ", ""))
+    with pytest.raises(InputFileError, match=r"runs\[3\].centre: is missing"):
+        load_campaign(path)
