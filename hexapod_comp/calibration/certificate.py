@@ -34,8 +34,8 @@ from ..measurements.standards import (
 )
 from ..workspace.overview import corners
 from .cells import Cells
-from .estimation import held_out
 from .fit import ModelFit
+from .linear_problem import held_out
 from .observability import ToolError
 from .report import tilt_doubt
 

@@ -8,17 +8,17 @@ beforehand, so it costs no parameters.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from ..errors import CalibrationError, KinematicsError, ModelError
 from ..measurements.readings import KINDS, LEAST_NOISE, MeasurementSet
 from .cells import Cells
+from .linear_problem import LARGE_FOLD, SMALL, FoldSum, LinearProblem, Posterior, physical_covariance, solve
 from .parameters import ParameterSpace
-from .sensitivity import derivatives, predict
+from .sensitivity import Prediction, derivatives, predict
 from .unknowns import Unknown, of_zero
 
 STEPS = 20
@@ -31,95 +31,20 @@ tolerances and parameters that wait for each other could otherwise swing for eve
 SETTLED = 1e-2
 """The fit stops when no parameter moves by more than this share of its standard deviation."""
 
-SCALE_ROUNDS = 12
-"""Rounds of estimating tolerances and noise for one linearisation."""
-
-HYPER = 0.1
-"""How many parameters the first guess of a tolerance is worth."""
-
-LARGEST_TOLERANCE = {"structure": 5e-3}
-"""No machine is built worse than this, m; a misfit that grows the tolerance further has another cause."""
-
-LEAST_FREEDOM = 10.0
-"""Noise is estimated from at least so many readings beyond those that the parameters use up."""
-
 HUBER = 2.5
 """Residuals beyond so many standard deviations lose weight in proportion."""
 
 MEDIAN_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over the median of its absolute values."""
 
+CHUNK = 1024
+"""Stations whose derivatives are worked out together."""
+
+ROUNDING = 1e-12
+"""A direction whose component is below this does not have it: frames turned by right angles are right to rounding."""
+
 OUTLIER = 5.0
 """Residuals beyond so many standard deviations are listed."""
-
-
-@dataclass(frozen=True)
-class LinearProblem:
-    """The fit linearised at one parameter vector x = root·y, free of what instruments do not know.
-
-    Attributes
-    ----------
-    target : ndarray, shape (C,)
-        Cells' values that the parameters explain, over their standard deviation at unit noise factors.
-    rows : ndarray, shape (C, size)
-        Their derivatives by y, alike.
-    kind, fold : ndarray of int, shape (C,)
-        As in :class:`Cells`.
-    normal : ndarray, shape (kinds, size, size)
-        rowsᵀ·rows of each kind.
-    moment : ndarray, shape (kinds, size)
-        rowsᵀ·target of each kind.
-    square : ndarray, shape (kinds,)
-        Sum of squared targets, the scatter of readings about their cell's mean included.
-    freedom : ndarray, shape (kinds,)
-        Readings minus unknowns projected out.
-    least_noise : ndarray, shape (kinds,)
-        Smallest noise factors that an instrument can have.
-    per_length : ndarray, shape (C, 6)
-        Derivatives by the struts' lengths, scaled as the rows, with what instruments do not know still in them.
-    unknowns : tuple of Unknown
-        What that is.
-    """
-
-    target: np.ndarray
-    rows: np.ndarray
-    kind: np.ndarray
-    fold: np.ndarray
-    normal: np.ndarray
-    moment: np.ndarray
-    square: np.ndarray
-    freedom: np.ndarray
-    least_noise: np.ndarray
-    per_length: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
-    unknowns: tuple[Unknown, ...] = ()
-
-
-@dataclass(frozen=True)
-class Posterior:
-    """What a linear problem says about the parameters y that it uses.
-
-    Attributes
-    ----------
-    used : ndarray of int, shape (n,)
-        Which parameters; the others' blocks are out.
-    y : ndarray, shape (n,)
-        The most probable ones.
-    covariance : ndarray, shape (n, n)
-        Theirs.
-    tolerances : ndarray, shape (blocks,)
-        Size of each block's prior; zero: the block is out.
-    noise : ndarray, shape (kinds,)
-        Factor on the standard deviation of each kind's readings.
-    determined : ndarray, shape (n,)
-        Share of each parameter that comes from the data; the rest comes from the prior.
-    """
-
-    used: np.ndarray
-    y: np.ndarray
-    covariance: np.ndarray
-    tolerances: np.ndarray
-    noise: np.ndarray
-    determined: np.ndarray
 
 
 class Estimation:
@@ -145,6 +70,11 @@ class Estimation:
         self.cells = Cells.of(measurements)
         self.uncertainty = measurements.stated
         self._zeros, self._lengths = self.cells.groups(measurements)
+        self._components = np.abs(self.cells.directions) > ROUNDING
+        for lengths in self._lengths:
+            self._components[lengths.members, :3] = True  # their directions change with the answer
+        self._by_station = np.argsort(self.cells.station, kind="stable")
+        self._alike = self._group_alike()
         needed = len(space.blocks[0].labels)
         free = len(self.cells.station) - len(self._zeros) - sum(along is not None for _, along in self._zeros)
         free -= sum(lengths.count for lengths in self._lengths)
@@ -171,22 +101,47 @@ class Estimation:
         weights = reading_weights / self.uncertainty**2
         total = np.bincount(c.of_reading, weights)
         scale = np.sqrt(total)
-        expected, rows, unknowns = self._expected(x, np.bincount(c.of_reading, weights * m.value) / total, scale)
+        values = np.bincount(c.of_reading, weights * m.value) / total
+        prediction, directions = self._predicted(x), c.directions.copy()
+        expected, unknowns = self._unknowns(directions, prediction.errors[c.station], values, scale)
         misfit = m.value - expected[c.of_reading]
         mean = np.bincount(c.of_reading, weights * misfit) / total
-        target, rows = scale * mean, scale[:, None] * rows
+        rows, moved = self._rows(x, prediction, scale[:, None] * directions)
+        target, unknown = scale * mean, np.zeros(len(mean))
         per_length = rows[:, self.space.offsets].copy()
-        unknown = np.zeros(len(mean))
         for part in unknowns:
             unknown[part.members] += part.explained(target) / scale[part.members]
-            part.project_out(target)
-            part.project_out(rows)
+            for projected in (target, moved, rows):
+                part.project_out(projected)
         residuals = misfit - unknown[c.of_reading]
         scatter = np.bincount(m.kind, weights * (misfit - mean[c.of_reading]) ** 2, len(KINDS))
         # Huber's proposal 2: noise comes from the residuals cut off, weight² · residual², or outliers blow it up.
         beyond = np.bincount(m.kind, weights * (1.0 - reading_weights) * residuals**2, len(KINDS))
-        problem = self._problem(target + rows @ x, self.space.whitened(rows), scatter - beyond, unknowns)
+        problem = self._problem(target + moved, rows, scatter - beyond, unknowns)
         return replace(problem, per_length=per_length, unknowns=tuple(unknowns)), residuals
+
+    def _rows(self, x: np.ndarray, prediction: Prediction, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return each cell's derivatives by y, (C, size), and what all parameters do together, (C,).
+
+        Along directions (C, 6), over the standard deviations of the cells' values. Station by station: the derivatives
+        of all six components of an error would not fit into memory together.
+        """
+        c, space, stations = self.cells, self.space, self.measurements.stations
+        rows, moved = np.empty((len(c.station), space.size)), np.empty(len(c.station))
+        ordered = c.station[self._by_station]
+        for first in range(0, len(stations), CHUNK):
+            chosen = slice(first, first + CHUNK)
+            slopes = derivatives(space, prediction.select(chosen), stations.select(chosen))
+            begin, end = np.searchsorted(ordered, (first, first + CHUNK))
+            members = self._by_station[begin:end]
+            at, along = c.station[members] - first, directions[members]
+            moved[members] = np.einsum("ci,ci->c", along, (slopes @ x)[at])
+            part = np.zeros((len(members), space.size))
+            for component in range(6):
+                seen = np.flatnonzero(self._components[members, component])
+                part[seen] += along[seen, component, None] * slopes[at[seen], component]
+            rows[members] = space.whitened(part)
+        return rows, moved
 
     def free_of_unknowns(self, rows: np.ndarray) -> np.ndarray:
         """Return what is left of cells' derivatives (C, K) beside all that instruments do not know, over their noise.
@@ -212,29 +167,20 @@ class Estimation:
         values = np.zeros(len(scale))
         return scale, self._unknowns(self.cells.directions.copy(), np.zeros((len(scale), 6)), values, scale)[1]
 
-    def _expected(
-        self, x: np.ndarray, values: np.ndarray, scale: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, list[Unknown]]:
-        """Return what each cell should read, shape (C,), its derivatives, (C, size), m and rad, and what is unknown.
-
-        Lengths start from where their `values` and `scale`, one over their standard deviations, (C,) each, put it.
+    def _predicted(self, x: np.ndarray) -> Prediction:
+        """Return what the machine of a parameter vector does.
 
         Raises
         ------
         CalibrationError
-            No machine is like that, or it cannot take one of the poses; a length's centre is far from its place.
+            No machine is like that, or it cannot take one of the poses.
         """
-        c, stations = self.cells, self.measurements.stations
         try:
-            prediction = predict(self.space, x, stations)
+            return predict(self.space, x, self.measurements.stations)
         except (ModelError, KinematicsError) as error:
             hint = "do units, directions and commanded poses fit, and are all blocks allowed?"
             problem = f"left the machines that can be ({error}); {hint}"
             raise CalibrationError("fit", problem) from error
-        directions = c.directions.copy()
-        expected, unknowns = self._unknowns(directions, prediction.errors[c.station], values, scale)
-        slopes = derivatives(self.space, prediction, stations)[c.station]
-        return expected, np.einsum("ci,cip->cp", directions, slopes), unknowns
 
     def _unknowns(
         self, directions: np.ndarray, errors: np.ndarray, values: np.ndarray, scale: np.ndarray
@@ -257,13 +203,40 @@ class Estimation:
         freedom = np.bincount(self.measurements.kind, minlength=kinds).astype(float)
         for part in unknowns:
             freedom[kind[part.members[0]]] -= part.share.sum()
+        sums = tuple(self._sums(rows))
+        for one in sums:
+            normal[one.kind][np.ix_(one.columns, one.columns)] += one.normal
         for k in np.unique(kind):
-            part = rows[kind == k]
-            normal[k] = part.T @ part
-            moment[k] = part.T @ target[kind == k]
-            square[k] += target[kind == k] @ target[kind == k]
+            of_kind = np.where(kind == k, target, 0.0)
+            moment[k] = of_kind @ rows
+            square[k] += of_kind @ of_kind
         least_noise = LEAST_NOISE / np.array([self.measurements.stated_of(k) for k in range(kinds)])
-        return LinearProblem(target, rows, kind, self.cells.fold, normal, moment, square, freedom, least_noise)
+        folded = tuple(one for one in sums if one.fold != SMALL)
+        return LinearProblem(
+            target, rows, kind, self.cells.fold, normal, moment, square, freedom, least_noise, sums=folded
+        )
+
+    def _sums(self, rows: np.ndarray) -> Iterator[FoldSum]:
+        """Yield sums of products of rows over cells of one kind and fold that the same parameters move."""
+        for fold, kind, members in self._alike:
+            part = rows[members]
+            columns = np.flatnonzero(part.any(axis=0))
+            part = part[:, columns]
+            yield FoldSum(fold, kind, columns, part.T @ part)
+
+    def _group_alike(self) -> list[tuple[int, int, np.ndarray]]:
+        """Return fold, kind and cells of all that the same components of an error move; small folds together."""
+        c = self.cells
+        large = np.bincount(c.fold)[c.fold] >= LARGE_FOLD
+        key = np.where(large, c.fold, SMALL) * len(KINDS) + c.kind
+        key = key * 64 + self._components @ (1 << np.arange(6))
+        every, group = np.unique(key, return_inverse=True)
+        order, ends = np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))
+        kinds = every // 64
+        return [
+            (int(kind // len(KINDS)), int(kind % len(KINDS)), members)
+            for kind, members in zip(kinds, np.split(order, ends[:-1]), strict=True)
+        ]
 
     def robust_weights(self, residuals: np.ndarray) -> np.ndarray:
         """Return Huber's weights of residuals (N,), 1 for all that are no surprise.
@@ -278,106 +251,6 @@ class Estimation:
             if cut > 0.0:
                 weights[members] = np.minimum(1.0, cut / np.maximum(size[members], cut))
         return weights
-
-
-def solve(
-    space: ParameterSpace,
-    problem: LinearProblem,
-    tolerances: np.ndarray,
-    noise: np.ndarray,
-    rounds: int = SCALE_ROUNDS,
-) -> Posterior:
-    """Return the posterior of a linear problem; tolerances and noise factors are estimated with it.
-
-    Parameters
-    ----------
-    space : ParameterSpace
-        Blocks and their priors' shapes.
-    problem : LinearProblem
-        The data.
-    tolerances : ndarray, shape (blocks,)
-        To start from; a block with zero is left out.
-    noise : ndarray, shape (kinds,)
-        To start from.
-    rounds : int
-        Fixed-point rounds; 0 takes tolerances and noise as they are.
-    """
-    used = np.flatnonzero(space.spread(tolerances))
-    normal = problem.normal[:, used[:, None], used]
-    moment = problem.moment[:, used]
-    for turn in range(rounds + 1):
-        spread = space.spread(tolerances)[used]
-        precision = np.tensordot(noise**-2, normal, 1)
-        whitened = spread[:, None] * precision * spread
-        whitened[np.diag_indices_from(whitened)] += 1.0
-        inverse = _inverse(whitened)
-        z = inverse @ (spread * (noise**-2 @ moment))
-        posterior = Posterior(
-            used, spread * z, spread[:, None] * inverse * spread, tolerances, noise, 1.0 - np.diag(inverse)
-        )
-        if turn < rounds:
-            noise = _noise(problem, normal, moment, posterior)
-            tolerances = _tolerances(space, posterior, z)
-    return posterior
-
-
-def _inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverse of a positive definite matrix.
-
-    Raises
-    ------
-    CalibrationError
-        It is not, to rounding: readings outweigh the priors more than 1e16 times.
-    """
-    try:
-        return cho_solve(cho_factor(matrix, lower=True), np.eye(len(matrix)))
-    except LinAlgError as error:
-        problem = "are too few to tell noise from the machine's errors, or their uncertainty is below any instrument's"
-        raise CalibrationError("measurements", problem) from error
-
-
-def _noise(problem: LinearProblem, normal: np.ndarray, moment: np.ndarray, posterior: Posterior) -> np.ndarray:
-    """Return new noise factors: squared residuals over what freedom the parameters leave."""
-    result, y = posterior.noise.copy(), posterior.y
-    for k in np.flatnonzero(problem.freedom > 0.0):
-        rest = problem.square[k] - 2.0 * y @ moment[k] + y @ normal[k] @ y
-        freedom = problem.freedom[k] - (posterior.covariance * normal[k]).sum() / result[k] ** 2
-        if freedom > LEAST_FREEDOM and rest > 0.0:
-            result[k] = np.sqrt(rest / freedom)
-    return np.maximum(result, problem.least_noise)
-
-
-def _tolerances(space: ParameterSpace, posterior: Posterior, z: np.ndarray) -> np.ndarray:
-    """Return new tolerances: MacKay's fixed point, squared parameters over how many are determined.
-
-    The first guess counts as a tenth of a parameter, which keeps an empty block from collapsing.
-    """
-    result, start = posterior.tolerances.copy(), space.start_tolerances()
-    for n, block in enumerate(space.blocks):
-        members = (posterior.used >= block.part.start) & (posterior.used < block.part.stop)
-        if members.any():
-            first = HYPER * (start[n] / result[n]) ** 2
-            factor = np.sqrt((z[members] @ z[members] + first) / (posterior.determined[members].sum() + HYPER))
-            result[n] = min(result[n] * np.clip(factor, 0.1, 10.0), LARGEST_TOLERANCE.get(block.name, np.inf))
-    return result
-
-
-def held_out(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
-    """Return the errors, in standard deviations, at cells whose fold the fit did not see, shape (C,).
-
-    Leaving fold g out of a linear least-squares fit changes its residuals r to (I − H_gg)⁻¹·r, with H the
-    hat matrix: exact, and no fit is repeated.
-    """
-    scale = 1.0 / posterior.noise[problem.kind]
-    rows = scale[:, None] * problem.rows[:, posterior.used]
-    residual = scale * problem.target - rows @ posterior.y
-    half = rows @ np.linalg.cholesky(posterior.covariance)
-    order = np.argsort(problem.fold, kind="stable")
-    result = np.empty(len(residual))
-    for members in np.split(order, np.flatnonzero(np.diff(problem.fold[order])) + 1):
-        left_out = np.eye(len(members)) - half[members] @ half[members].T
-        result[members] = np.linalg.solve(left_out, residual[members])
-    return result
 
 
 @dataclass(frozen=True)
@@ -431,7 +304,7 @@ def iterate(
         tolerances, noise = posterior.tolerances, posterior.noise
         change = _change(estimation.space.physical(posterior.y) - x, estimation.space, posterior)
         progress(f"step {step}: largest change {change:.2g} standard deviations")
-        if step > 2 and change > SLOW * last:
+        if step > (3 if robust else 2) and change > SLOW * last:  # the third step is the first with weights
             share = max(LEAST_SHARE, 0.5 * share)
         x, last = x + share * (estimation.space.physical(posterior.y) - x), change
         if (change < SETTLED and (step > 2 or not robust)) or step == STEPS:
@@ -447,8 +320,3 @@ def _change(change: np.ndarray, space: ParameterSpace, posterior: Posterior) -> 
     """Return the largest change of a parameter x in its standard deviation."""
     deviations = np.sqrt(np.diag(physical_covariance(space, posterior)))
     return float((np.abs(change) / deviations).max())
-
-
-def physical_covariance(space: ParameterSpace, posterior: Posterior) -> np.ndarray:
-    """Return the covariance of the parameters x, shape (size, size), SI; all blocks must be in use."""
-    return space.physical(space.physical(posterior.covariance).T)

@@ -14,18 +14,9 @@ from ..machine.size import rms
 from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementSet, refuse_unmoved
 from ..pose import Pose
 from .datum import HeldDatum, hold, unseen_part
-from .estimation import (
-    HUBER,
-    OUTLIER,
-    Estimation,
-    LinearProblem,
-    Posterior,
-    Solution,
-    held_out,
-    iterate,
-    physical_covariance,
-)
+from .estimation import HUBER, OUTLIER, Estimation, Solution, iterate
 from .lead import ScrewLead, look_for_lead
+from .linear_problem import LinearProblem, Posterior, held_out, physical_covariance
 from .observability import Allowed, Observability, ToolError, observe, without_trace
 from .parameters import WAVES, FitSettings, ParameterSpace
 from .selection import Decision, select

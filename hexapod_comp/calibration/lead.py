@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..kernels.struts import MOST_HARMONICS
-from .estimation import HUBER, MEDIAN_TO_SIGMA, Estimation, LinearProblem, Posterior, solve
+from .estimation import HUBER, MEDIAN_TO_SIGMA, Estimation
+from .linear_problem import LinearProblem, Posterior, solve
 from .parameters import WAVES
 
 SHORTEST, LONGEST = 1e-3, 30e-3

@@ -12,7 +12,7 @@ from ..machine.size import rms
 from ..measurements.readings import AXES, Stations
 from ..pose import rotation_from_angles
 from ..virtual.trial import without_datum
-from .estimation import LinearProblem, Posterior, physical_covariance
+from .linear_problem import LinearProblem, Posterior, physical_covariance
 from .parameters import ParameterSpace
 from .sensitivity import Prediction, derivatives, predict
 

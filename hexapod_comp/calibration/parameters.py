@@ -328,7 +328,12 @@ class ParameterSpace:
 
     def whitened(self, rows: np.ndarray) -> np.ndarray:
         """Return derivatives (n, size) by x as derivatives by y, with x = root·y block by block."""
-        return np.hstack([rows[:, b.part] @ b.root for b in self.blocks])
+        result = np.empty_like(rows)
+        for block in self.blocks:
+            part, sizes = rows[:, block.part], np.diag(block.root)
+            diagonal = np.count_nonzero(block.root) == np.count_nonzero(sizes)
+            result[:, block.part] = part * sizes if diagonal else part @ block.root
+        return result
 
     def unwhitened(self, rows: np.ndarray) -> np.ndarray:
         """Return derivatives (n, size) by y as derivatives by x: undoes :meth:`whitened`."""

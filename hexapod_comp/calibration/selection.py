@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .estimation import LinearProblem, Posterior, held_out, solve
+from .linear_problem import LinearProblem, Posterior, held_out, solve
 from .parameters import ParameterSpace
 
 FIRST_ROUNDS, ROUNDS = 10, 4

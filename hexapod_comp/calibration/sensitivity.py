@@ -39,6 +39,10 @@ class Prediction:
     base_joints: np.ndarray
     platform_joints: np.ndarray
 
+    def select(self, chosen: np.ndarray | slice) -> Prediction:
+        """Return the machine at some of the stations."""
+        return Prediction(**{name: array[chosen] for name, array in vars(self).items()})
+
 
 def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Prediction:
     """Return where the machine of a parameter vector goes at each station.

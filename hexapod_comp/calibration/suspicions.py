@@ -18,7 +18,8 @@ from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.passes import Passes
 from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, MeasurementSet
-from .estimation import Estimation, solve
+from .estimation import Estimation
+from .linear_problem import solve
 from .misfit import FAMILIES, family_of_run
 from .parameters import FitSettings, ParameterSpace
 

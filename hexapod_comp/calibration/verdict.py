@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..measurements.readings import MeasurementSet, attitude_error
-from .estimation import SETTLED, Estimation, Solution, physical_covariance
+from .estimation import SETTLED, Estimation, Solution
+from .linear_problem import physical_covariance
 from .misfit import (
     ChiSquare,
     Residuals,

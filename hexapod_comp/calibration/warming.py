@@ -19,7 +19,8 @@ from ..formats.texts import number
 from ..machine.late import MOST_TIME_CONSTANTS, PARTS, TIME_CONSTANT_RANGE, LateGrowth
 from ..machine.model import REFERENCE_TEMPERATURE
 from ..measurements.readings import KINDS, MeasurementSet
-from .estimation import Estimation, Posterior, Solution, physical_covariance, solve
+from .estimation import Estimation, Solution
+from .linear_problem import Posterior, physical_covariance, solve
 from .parameters import LEAST_WARMING, TOLERANCES, ParameterSpace, growth_root
 from .sensitivity import growth_causes, growth_columns, predict
 

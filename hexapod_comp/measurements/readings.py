@@ -206,8 +206,8 @@ class Stations:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def select(self, chosen: np.ndarray) -> Stations:
-        """Return those in a mask or at indices."""
+    def select(self, chosen: np.ndarray | slice) -> Stations:
+        """Return those in a mask, at indices or of a slice."""
         return Stations(**{entry.name: getattr(self, entry.name)[chosen] for entry in fields(self)})
 
     def pose(self, index: int) -> Pose:

@@ -29,6 +29,7 @@ from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import Datum, MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model, model_text, parse_model, save_model
 from hexapod_comp.measurements.campaign import Campaign, template
+from hexapod_comp.measurements.readings import KINDS
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.instruments import measure
 
@@ -80,7 +81,7 @@ def laser_fit() -> ModelFit:
 def projection(readings) -> np.ndarray:
     """Return what readings do not show at home, by the fit's own weights at a tolerance of 0.1 mm."""
     estimation = Estimation(readings, laser_fit().space, alone=False)
-    posterior = replace(laser_fit().solution.posterior, tolerances=np.array([1e-4]), noise=np.ones(5))
+    posterior = replace(laser_fit().solution.posterior, tolerances=np.array([1e-4]), noise=np.ones(len(KINDS)))
     return unseen_part(estimation, posterior, small.paper().home)
 
 
@@ -88,7 +89,7 @@ def test_a_tracker_is_believed_and_one_pose_of_it_shows_no_more_than_its_place()
     far = Pose(np.array([0.1, 0.05, 0.45]), np.eye(3))
     poses = [far, Pose(np.array([-0.1, 0.0, 0.4]), np.eye(3)), Pose(np.array([0.0, 0.1, 0.5]), np.eye(3))]
     full = small.scattered(small.paper(), poses)
-    positions = full.select(full.channel < 10)
+    positions = full.select(full.kind == KINDS.index("position"))
     assert np.abs(projection(full)).max() == pytest.approx(0.0, abs=1e-12)
     assert np.abs(projection(positions)).max() == pytest.approx(0.0, abs=1e-12)
     one = positions.select(positions.station == 0)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import gmean
 
-from hexapod_comp.calibration.estimation import Estimation, LinearProblem, Posterior, solve
+from hexapod_comp.calibration.estimation import Estimation
+from hexapod_comp.calibration.linear_problem import LinearProblem, Posterior, solve
 from hexapod_comp.calibration.observability import (
     MACHINE_ERRORS,
     Observability,

@@ -22,6 +22,7 @@ from hexapod_comp.errors import InputFileError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.measurements.readings import KINDS
 from hexapod_comp.pose import Pose
 
 DRAWS = 1500
@@ -37,7 +38,7 @@ def known(machine: Machine, folder: Path) -> FittedParameters:
     rng = np.random.default_rng(2)
     mixing = np.eye(space.size) + 0.3 * rng.standard_normal((space.size, space.size)) / np.sqrt(space.size)
     x, covariance = 50 * UM * rng.uniform(-1.0, 1.0, space.size), (5 * UM) ** 2 * mixing @ mixing.T
-    return FittedParameters(space, x, 0.5 * (covariance + covariance.T), np.full(2, 100 * UM), np.ones(5))
+    return FittedParameters(space, x, 0.5 * (covariance + covariance.T), np.full(2, 100 * UM), np.ones(len(KINDS)))
 
 
 def errors_of(space: ParameterSpace, x: np.ndarray) -> Errors:
