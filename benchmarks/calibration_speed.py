@@ -1,0 +1,73 @@
+"""How long a fit of scheme joint takes: the shipped 5-D campaign on the paper's machine, read more and more finely.
+
+The campaign's 8,046 readings, and the same lines with readings so many times as dense. The processor's time is the
+whole program's, so that a busy computer changes it little; one thread.
+
+Usage: python -m benchmarks.calibration_speed [--dense 1 14] [--json]
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when NumPy is loaded, as by the command line
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from hexapod_comp.calibration.fit import fit_model
+from hexapod_comp.calibration.parameters import FitSettings
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.model import RealMachine
+from hexapod_comp.measurements.campaign import load_campaign, template
+from hexapod_comp.virtual.instruments import measure
+from hexapod_comp.virtual.named import find_model
+
+CONFIG = Path(__file__).resolve().parents[1] / "config"
+
+
+def timed(dense: int) -> dict[str, float]:
+    """Return readings, seconds and what is promised of a fit with readings so many times as dense."""
+    geometry = load_geometry(CONFIG / "paper.yaml")
+    campaign = load_campaign(CONFIG / "campaign_5d.yaml")
+    campaign = replace(campaign, step=campaign.step / dense)
+    truth = RealMachine(geometry, find_model("paper_machine", geometry))
+    readings = measure(template(campaign, geometry), campaign, truth, 1)
+    processor, clock = time.process_time(), time.perf_counter()
+    fit = fit_model(readings, FitSettings(lead=0.01))
+    processor, clock = time.process_time() - processor, time.perf_counter() - clock
+    expected = fit.level.after * 1e6 if fit.level is not None else float("nan")
+    return {
+        "readings": len(readings),
+        "parameters": fit.space.size,
+        "steps": fit.solution.steps,
+        "processor_s": processor,
+        "clock_s": clock,
+        "expected_um": expected,
+    }
+
+
+def main() -> None:
+    """Print a line for each density."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--dense", type=int, nargs="+", default=[1, 14], help="times as many readings (default 1 14)")
+    parser.add_argument("--json", action="store_true", help="JSON instead of a table")
+    args = parser.parse_args()
+    timed(1)  # compiled and loaded
+    rows = [timed(dense) for dense in args.dense]
+    if args.json:
+        print(json.dumps(rows, indent=1))
+        return
+    print("readings  parameters  steps  processor s  clock s  expected µm")
+    for row in rows:
+        print(
+            f"{row['readings']:8.0f}  {row['parameters']:10.0f}  {row['steps']:5.0f}  {row['processor_s']:11.1f}"
+            f"  {row['clock_s']:7.1f}  {row['expected_um']:11.3f}"
+        )
+
+
+if __name__ == "__main__":
+    main()
