@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import CalibrationError, KinematicsError, ModelError
-from ..measurements.readings import KINDS, LEAST_NOISE, MeasurementSet
+from ..measurements.readings import KINDS, LEAST_NOISE, MeasurementSet, refuse_absurd
 from .cells import Cells
 from .linear_problem import LARGE_FOLD, SMALL, FoldSum, LinearProblem, Posterior, physical_covariance, solve
 from .parameters import ParameterSpace
@@ -62,10 +62,11 @@ class Estimation:
     Raises
     ------
     CalibrationError
-        Fewer readings than unknowns: nothing would be determined.
+        Readings that no machine's error can have, or fewer than unknowns: nothing would be determined.
     """
 
     def __init__(self, measurements: MeasurementSet, space: ParameterSpace, alone: bool = True) -> None:
+        refuse_absurd(measurements)
         self.measurements, self.space = measurements, space
         self.cells = Cells.of(measurements)
         self.uncertainty = measurements.stated

@@ -6,7 +6,7 @@ could describe nearly any readings.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 
@@ -68,7 +68,10 @@ class Reinterpretation:
 
 
 def suspicions(
-    measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object] = lambda text: None
+    measurements: MeasurementSet,
+    settings: FitSettings,
+    progress: Callable[[str], object] = lambda text: None,
+    left: Mapping[int, float] | None = None,
 ) -> list[str]:
     """Return by name what would explain the readings far better than taking them as they are; the best, or none.
 
@@ -80,6 +83,9 @@ def suspicions(
         Of their fit.
     progress : callable
         Called with what is tried.
+    left : mapping of int to float, optional
+        Standard deviation that their fit leaves of each kind, m or rad. Where a plain model leaves little more, nothing
+        could be far better, and nothing is tried.
     """
     rng = np.random.default_rng(0)
     if len(measurements) > ENOUGH:
@@ -89,7 +95,7 @@ def suspicions(
     plain = replace(settings, blocks=PLAIN)
     whole = Reinterpretation("", measurements, np.ones(len(KINDS)))
     as_they_are = _noise(whole, plain)
-    if as_they_are is None:
+    if as_they_are is None or (left and all(as_they_are[k] < BETTER * value for k, value in left.items())):
         return []
     counts = np.bincount(measurements.kind, minlength=len(KINDS))
     tried = []

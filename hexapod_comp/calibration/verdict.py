@@ -104,7 +104,8 @@ def judge(
     far_off, doubtful = measurements.misfit(noise, MISFIT), measurements.misfit(noise, DOUBTFUL)
     # A length map or a field can describe nearly anything, also readings that are none of this machine's.
     general = any(block.name not in ("structure", *EXPECTED) for block in space.blocks)
-    suspects = suspicions(measurements, settings, progress) if doubtful or general else []
+    least = {} if doubtful else noise
+    suspects = suspicions(measurements, settings, progress, least) if doubtful or general else []
     doubts = [*([] if far_off else [doubtful]), *suspects, *beyond.doubts(), _unsettled(solution)]
     refusals = [far_off, _useless(level), _held(residuals)]
     remarks = [*beyond.remarks(), NOT_TILTED if level_only else ""]

@@ -74,6 +74,9 @@ LEAST_SIDE = 1e-6
 LEAST_NOISE = 1e-9
 """No instrument reads better, m or rad; also keeps readings without noise from having infinite weight."""
 
+LARGEST_READING = 1.0
+"""No machine errs by more, m or rad."""
+
 LEAST_TRAVEL = 1e-6
 """Components of a line shorter than this, m, are no travel along that axis."""
 
@@ -374,6 +377,23 @@ class MeasurementSet:
     def with_values(self, value: np.ndarray) -> MeasurementSet:
         """Return the same stations with other readings, shape (N,), m or rad."""
         return replace(self, value=value)
+
+
+def refuse_absurd(measurements: MeasurementSet) -> None:
+    """Refuse readings, and uncertainties of readings, that no machine's error can have.
+
+    Raises
+    ------
+    CalibrationError
+        One is beyond :data:`LARGEST_READING`, or no number; names its place.
+    """
+    for name, values in (("value", measurements.value), ("uncertainty", measurements.stated)):
+        absurd = np.flatnonzero(~(np.abs(values) <= LARGEST_READING))
+        if len(absurd):
+            first = absurd[0]
+            where = f"{measurements.sources[first]}, {CHANNELS[measurements.channel[first]]}"
+            problem = f"the {name} is {values[first]:g} m or rad (allowed ±{LARGEST_READING:g}); does the unit fit?"
+            raise CalibrationError(where, problem)
 
 
 def refuse_unmoved(measurements: MeasurementSet, left: np.ndarray) -> None:

@@ -18,7 +18,7 @@ from hexapod_comp.calibration.observability import expected_error
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.report import as_json, fit_report
 from hexapod_comp.calibration.suspicions import suspicions
-from hexapod_comp.errors import ModelError
+from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.measurements.readings import BACKWARD, FORWARD, KINDS, MeasurementSet
 
 LINEAR, STRAIGHTNESS, ROTATION = (KINDS.index(kind) for kind in ("linear", "straightness", "rotation"))
@@ -134,6 +134,15 @@ def test_the_cause_is_named(readings, cause):
 
 def test_nothing_is_suspected_without_a_cause(readings):
     assert suspicions(readings, FEW) == []
+
+
+@pytest.mark.parametrize("value", [1e308, -1e150, 2.0, np.nan])
+def test_a_reading_that_no_machine_can_have_is_named(readings, value):
+    """Squares of the first are no numbers any more."""
+    spoilt = readings.value.copy()
+    spoilt[5] = value
+    with pytest.raises(CalibrationError, match=r"campaign, .*the value is"):
+        fit_model(readings.with_values(spoilt), FEW)
 
 
 def test_families_follow_the_lines(readings):
