@@ -28,8 +28,9 @@ FAMILIES = {
 }
 """Kinds of change, and what each is called."""
 
-PRIOR = {DATUM: 1.0, STRUT: 1.0, TEMPERATURE: 1.0, AGEING: 0.5, READING: 0.5, OTHER: 0.25}
-"""How likely they are beforehand, beside each other."""
+PRIOR = {DATUM: 1.0, STRUT: 1.0, TEMPERATURE: 1.0, AGEING: 0.25, READING: 0.25, OTHER: 0.25}
+"""How likely they are beforehand, beside each other. So are the groups of a kind, equally, and the changes of a group:
+else a bend would count for little beside all joints and screws, and what is one would be called ageing."""
 
 REPAIRABLE = (DATUM, STRUT, TEMPERATURE, AGEING)
 """Kinds that few readings can repair: they are parameters of the model."""
@@ -45,6 +46,9 @@ SHARES = (0.02, 0.05, 0.1, 0.2)
 
 BENDS = (0.5, 2.0, 8.0, 32.0)
 """How large a smooth field may have grown, in its first tolerances (5 µm, 20 µrad)."""
+
+FIELD = ("field displacement", "field rotation")
+"""Blocks of which it is made."""
 
 PITCHES, BACKLASHES = (1e-5, 3e-5, 1e-4, 3e-4), (1e-6, 3e-6, 1e-5, 3e-5)
 """What wear may do to one screw, m/m and m."""
@@ -66,6 +70,8 @@ class Change:
         Standard deviations that the coefficients may have.
     shown : tuple of (str, float, str)
         Label, factor and unit in which each coefficient is shown; empty where they mean nothing one by one.
+    group : str
+        Changes of one kind that are alike; all groups of a kind are equally likely beforehand.
     """
 
     family: str
@@ -73,6 +79,7 @@ class Change:
     columns: np.ndarray
     scales: tuple[float, ...]
     shown: tuple[tuple[str, float, str], ...] = ()
+    group: str = ""
 
 
 def widened(fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS) -> FittedParameters:
@@ -115,7 +122,7 @@ def possible_changes(space: ParameterSpace, modelled: tuple[str, ...]) -> list[C
         Change(AGEING, "all of it, a little", _prior_root(space, modelled), SHARES),
         *_joints(space),
         *_screws(space),
-        Change(OTHER, "a smooth bend in space", _prior_root(space, ("field displacement", "field rotation")), BENDS),
+        Change(OTHER, "a smooth bend in space", _prior_root(space, FIELD), BENDS, group="bend"),
     ]
 
 
@@ -177,7 +184,7 @@ def _joints(space: ParameterSpace) -> Iterator[Change]:
     shown = tuple((axis, 1e6, "µm") for axis in AXES)
     for body, joints in (("base", at.base), ("platform", at.platform)):
         for n, places in enumerate(joints, start=1):
-            yield Change(OTHER, f"{body} joint {n}", at.units(places), LENGTHS, shown)
+            yield Change(OTHER, f"{body} joint {n}", at.units(places), LENGTHS, shown, "joints")
 
 
 def _screws(space: ParameterSpace) -> Iterator[Change]:
@@ -186,7 +193,7 @@ def _screws(space: ParameterSpace) -> Iterator[Change]:
         for n, strut in enumerate(STRUT_NAMES if block else ()):
             column = np.zeros((space.size, 1))
             column[block.part.start + n] = 1.0  # type: ignore[union-attr]
-            yield Change(OTHER, f"{name} of {strut}", column, scales, ((strut, factor, unit),))
+            yield Change(OTHER, f"{name} of {strut}", column, scales, ((strut, factor, unit),), "screws")
 
 
 def _prior_root(space: ParameterSpace, names: tuple[str, ...]) -> np.ndarray:

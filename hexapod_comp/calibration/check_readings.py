@@ -93,12 +93,12 @@ def weigh(
     """Return the evidence of changes, of a single wrong reading, and of readings that scatter more than they did."""
     evidence = Evidence(check.covariance(fitted.covariance))
     for change in changes:
-        evidence.add(change.family, change.name, check.rows @ change.columns, change.scales)
+        evidence.add(change.family, change.name, check.rows @ change.columns, change.scales, change.group)
     for column, reading in zip(check.single.T, check.readings, strict=True):
         channel = CHANNELS[measurements.channel[reading]]
         name = f"{measurements.sources[reading]}: {channel} of run {measurements.runs[measurements.run[reading]].name}"
         evidence.add(READING, name, column[:, None], WRONG_READINGS)
-    evidence.add(OTHER, "each reading by itself", check.single, SCATTERS)
+    evidence.add(OTHER, "each reading by itself", check.single, SCATTERS, "scatter")
     return evidence
 
 

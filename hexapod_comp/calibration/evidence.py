@@ -8,6 +8,7 @@ these are.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,6 +40,8 @@ class Hypothesis:
         Standard deviations that a coefficient may have.
     coefficients : int
         How many coefficients the change has; those beyond the directions move no reading.
+    group : str
+        As of a :class:`~.changes.Change`.
     """
 
     family: str
@@ -47,6 +50,7 @@ class Hypothesis:
     gains: np.ndarray
     scales: np.ndarray
     coefficients: int
+    group: str = ""
 
     @property
     def least_gain(self) -> float:
@@ -54,11 +58,11 @@ class Hypothesis:
         return float(self.gains.min(initial=np.inf)) if len(self.gains) == self.coefficients else 0.0
 
     @staticmethod
-    def of(family: str, name: str, effect: np.ndarray, scales: tuple[float, ...]) -> Hypothesis:
+    def of(family: str, name: str, effect: np.ndarray, scales: tuple[float, ...], group: str = "") -> Hypothesis:
         """Return a hypothesis from its effect (n, k) on whitened readings."""
         directions, gains, _ = np.linalg.svd(effect, full_matrices=False)
         felt = gains > LEAST_GAIN * max(gains.max(initial=0.0), 1.0)
-        return Hypothesis(family, name, directions[:, felt], gains[felt], np.array(scales), effect.shape[1])
+        return Hypothesis(family, name, directions[:, felt], gains[felt], np.array(scales), effect.shape[1], group)
 
     def log_ratios(self, z: np.ndarray) -> np.ndarray:
         """Return log evidence over that of no change for whitened readings (N, n), scale by scale: (N, m)."""
@@ -89,15 +93,15 @@ class Evidence:
         """Return readings or effects (n, …) in coordinates in which those of an unchanged machine are N(0, 1)."""
         return solve_triangular(self._root, effect, lower=True)
 
-    def add(self, family: str, name: str, effect: np.ndarray, scales: tuple[float, ...]) -> None:
+    def add(self, family: str, name: str, effect: np.ndarray, scales: tuple[float, ...], group: str = "") -> None:
         """Add what has an effect (n, k) on readings, for a coefficient of one."""
-        self.hypotheses.append(Hypothesis.of(family, name, self.whitened(effect), scales))
+        self.hypotheses.append(Hypothesis.of(family, name, self.whitened(effect), scales, group))
 
     def weights(self, readings: np.ndarray) -> list[np.ndarray]:
         """Return the log weight of each hypothesis at each of its scales, (m,), over that of no change.
 
-        Kinds of change have their :data:`~.changes.PRIOR`; the hypotheses of a kind are equally likely, as are their
-        scales.
+        Kinds of change have their :data:`~.changes.PRIOR`; the groups of a kind are equally likely, as are the
+        hypotheses of a group, and the scales of each.
         """
         return [logs[0] for logs in self._logs(self.whitened(readings)[None])]
 
@@ -115,6 +119,9 @@ class Evidence:
         return logsumexp(np.concatenate(self._logs(z), axis=1), axis=1)
 
     def _logs(self, z: np.ndarray) -> list[np.ndarray]:
-        families = [h.family for h in self.hypotheses]
-        share = {f: PRIOR[f] / (sum(PRIOR.values()) * families.count(f)) for f in families}
-        return [h.log_ratios(z) + np.log(share[h.family] / len(h.scales)) for h in self.hypotheses]
+        groups = [(h.family, h.group) for h in self.hypotheses]
+        in_kind = Counter(family for family, _ in set(groups))
+        share = {g: PRIOR[g[0]] / (sum(PRIOR.values()) * in_kind[g[0]] * groups.count(g)) for g in set(groups)}
+        return [
+            h.log_ratios(z) + np.log(share[g] / len(h.scales)) for h, g in zip(self.hypotheses, groups, strict=True)
+        ]
