@@ -11,12 +11,20 @@ from ..errors import GeometryError
 from ..kernels.limits import WITHIN
 from ..machine.field import CROSS_AXES
 from ..machine.geometry import HexapodGeometry
-from ..measurements.campaign_runs import LINE_INSTRUMENTS, CampaignRun, line_run
+from ..measurements.campaign_runs import (
+    LINE_INSTRUMENTS,
+    PLANES,
+    POSE_INSTRUMENTS,
+    CampaignRun,
+    circle_run,
+    line_run,
+    tilts,
+)
 from ..measurements.readings import AXES
 from ..pose import rotation_from_angles
 from ..workspace.reach import Examiner
 
-POINTS = {"linear": (3, 7, 21), "5-D": (3, 9), "6-D": (3, 9)}
+POINTS = {"linear": (5, 8, 21), "5-D": (5, 13), "6-D": (5, 13)}
 """Points of a line, by instrument: few at little cost, or enough to see the screws' waves."""
 
 USUAL_POINTS = (13,)
@@ -33,6 +41,15 @@ POSES_A_RUN, POSE_RUNS = 12, 25
 
 SEED = 11
 """Of the scattered poses."""
+
+BAR, BAR_SHARE, CIRCLE_POINTS = 0.1, 0.45, 17
+"""Length of a ball bar, m; it is shorter where it is more than this share of a side of the box; readings each way."""
+
+TILTS = 13
+"""Attitudes of an R-test at one place."""
+
+STATION_OFF = 0.3
+"""How far outside the box, in shares of its sides, a tracking interferometer stands beside a lower corner."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +101,10 @@ def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[Campaign
     for instrument in instruments:
         if instrument in LINE_INSTRUMENTS:
             runs += _read_by(instrument, lines)
+        elif instrument in POSE_INSTRUMENTS:
+            runs += [CampaignRun(f"{instrument}, poses", instrument, *poses) for poses in _sets_of_poses(place)]
         else:
-            runs += _pose_runs(place, instrument)
+            runs += {"ball_bar": _circles, "r_test": _tilted_at, "station": _lengths}[instrument](place)
     if not runs:
         raise GeometryError("limits", "leave nothing to be measured in the box", place.box.tolist())
     return runs
@@ -159,8 +178,8 @@ def _between(box: np.ndarray, start: Sequence[int], stop: Sequence[int]) -> np.n
     return np.array([[box[c, a] for a, c in enumerate(corner)] for corner in (start, stop)])
 
 
-def _pose_runs(place: MeasuringBox, instrument: str) -> Iterator[CampaignRun]:
-    """Yield sets of random poses within the limits."""
+def _sets_of_poses(place: MeasuringBox) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield positions and rotations of sets of random poses within the limits."""
     rng = np.random.default_rng(SEED)
     count = 4 * POSES_A_RUN * POSE_RUNS
     positions = rng.uniform(place.box[0], place.box[1], (count, 3)).round(6)
@@ -169,4 +188,52 @@ def _pose_runs(place: MeasuringBox, instrument: str) -> Iterator[CampaignRun]:
     good = np.flatnonzero(findings == WITHIN)[: POSES_A_RUN * POSE_RUNS]
     for start in range(0, len(good) - POSES_A_RUN + 1, POSES_A_RUN):
         part = good[start : start + POSES_A_RUN]
-        yield CampaignRun(f"{instrument}, poses", instrument, positions[part], rotations[part])
+        yield positions[part], rotations[part]
+
+
+def _circles(place: MeasuringBox) -> Iterator[CampaignRun]:
+    """Yield circles of a ball bar in the box: in three planes each, level and tilted."""
+    examiner, sides = Examiner(place.geometry), np.ptp(place.box, axis=0)
+    for attitude, rotation in place.attitudes():
+        for plane, axes in PLANES.items():
+            radius = min(BAR, BAR_SHARE * float(sides[list(axes)].min()))
+            room = np.where(np.isin(range(3), axes), radius, 0.0)
+            for share in _shares(attitude == "level"):
+                centre = (place.box[0] + room + share * (sides - 2.0 * room)).round(6)
+                where = ", ".join(f"{value * 1e3:.0f}" for value in centre)
+                name = f"ball_bar, {plane} at {where}, {attitude}"
+                run = circle_run(name, centre, radius, CIRCLE_POINTS, np.eye(3)[list(axes)], rotation)
+                if (examiner.findings(run.positions, rotation[None], threads=1)[0] == WITHIN).all():
+                    yield run
+
+
+def _shares(corners: bool) -> Iterator[np.ndarray]:
+    """Yield where in a box, in shares of its sides: its middle, the middles of its faces, and its corners."""
+    for index in np.ndindex(3, 3, 3):
+        off = sum(i != 1 for i in index)
+        if off in (0, 1) or (corners and off == 3):
+            yield 0.5 * np.array(index)
+
+
+def _tilted_at(place: MeasuringBox) -> Iterator[CampaignRun]:
+    """Yield R-tests in the box, for a tool that tilts: one ball, the tool turning about it."""
+    if place.tilt == 0.0:
+        return
+    examiner, rotations = Examiner(place.geometry), tilts(TILTS, place.tilt) @ place.level
+    for share in _shares(True):
+        ball = (place.box[0] + share * np.ptp(place.box, axis=0)).round(6)
+        positions = np.tile(ball, (TILTS, 1))
+        if (examiner.findings(positions, rotations, threads=1)[0] == WITHIN).all():
+            where = ", ".join(f"{value * 1e3:.0f}" for value in ball)
+            yield CampaignRun(f"r_test, at {where}", "r_test", positions, rotations)
+
+
+def _lengths(place: MeasuringBox) -> Iterator[CampaignRun]:
+    """Yield sets of poses read from a tracking interferometer that stands beside a lower corner of the box."""
+    for corner in np.ndindex(2, 2):
+        share = np.array([*(side + STATION_OFF * (2 * side - 1) for side in corner), -STATION_OFF])
+        station = (place.box[0] + share * np.ptp(place.box, axis=0)).round(4)
+        where = ", ".join(f"{value * 1e3:.0f}" for value in station)
+        for positions, rotations in _sets_of_poses(place):
+            centres = np.tile(station, (len(positions), 1))
+            yield CampaignRun(f"station at {where}", "station", positions, rotations, centres)

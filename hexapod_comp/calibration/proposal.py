@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import CalibrationError
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..measurements.campaign import Campaign, template
-from ..measurements.campaign_runs import LISTED_INSTRUMENTS, CampaignRun
+from ..measurements.campaign_runs import CampaignRun
 from .candidates import MeasuringBox, candidates
 from .gains import Aim, Selection, seen_by
 from .parameters import FitSettings, ParameterSpace, Region
@@ -58,8 +58,11 @@ TIMES = {
     "6-D": Times(1500.0, 600.0, 4.0),
     "tracker": Times(1800.0, 30.0, 10.0),
     "tracker_6d": Times(1800.0, 30.0, 15.0),
+    "ball_bar": Times(900.0, 300.0, 1.0),
+    "station": Times(1800.0, 600.0, 5.0),
+    "r_test": Times(1200.0, 600.0, 5.0),
 }
-"""What a practised machinist needs, by instrument."""
+"""What a practised machinist needs, by instrument: those for which there are runs to choose from."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,7 @@ class Goal:
     tilt : float
         Tilt of the tool up to which it holds, rad.
     instruments : tuple of str
-        Which there are, of :data:`~hexapod_comp.measurements.campaign_runs.LISTED_INSTRUMENTS`.
+        Which there are, of :data:`TIMES`.
     seconds : float
         How long measuring may take.
     times : mapping of str to Times
@@ -99,9 +102,9 @@ class Goal:
             raise CalibrationError("tilt", f"must be 0…{allowed}, not {np.degrees(self.tilt):g}°")
         if not 0.0 < self.seconds < np.inf:
             raise CalibrationError("hours", f"must be finite and above zero, not {self.seconds / 3600.0:g}")
-        unknown = set(self.instruments) - set(LISTED_INSTRUMENTS)
+        unknown = set(self.instruments) - set(TIMES)
         if unknown or not self.instruments or len(set(self.instruments)) < len(self.instruments):
-            problem = f"must be one or more of {', '.join(LISTED_INSTRUMENTS)}, each once"
+            problem = f"must be one or more of {', '.join(TIMES)}, each once"
             raise CalibrationError("instruments", f"{problem}, not {', '.join(self.instruments) or 'none'}")
         for name, times in self.times.items():
             numbers = (times.first, times.run, times.stop)

@@ -13,8 +13,19 @@ POSE_OPTIONS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
 """A pose number by number: the options of ik."""
 
 
-INSTRUMENTS = ("linear", "straightness", "rotation", "5-D", "6-D", "tracker", "tracker_6d")
-"""What plan can propose runs for; a test holds it to the campaign's own list, which is slow to import."""
+INSTRUMENTS = (
+    "linear",
+    "straightness",
+    "rotation",
+    "5-D",
+    "6-D",
+    "tracker",
+    "tracker_6d",
+    "ball_bar",
+    "station",
+    "r_test",
+)
+"""What plan can propose runs for; a test holds it to the planner's own list, which is slow to import."""
 
 
 def pose(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
