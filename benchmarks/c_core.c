@@ -37,7 +37,7 @@ static void begin(hc_state *state, const double *warm)
     int i;
     hc_init(state, &hexapod_model, 1e-3);
     for (i = 0; i < 8; i++) {
-        hc_set_temperature(state, i, warm[i]);
+        hc_set_temperature(state, i, warm[i], 0.0);
     }
 }
 

@@ -30,8 +30,9 @@ from hexapod_comp.errors import HexapodError
 from hexapod_comp.export.c_code import write_c
 from hexapod_comp.export.c_library import CCompensator
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.machine.model import MachineModel, Temperatures
+from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.machine.temperatures import Temperatures
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
 

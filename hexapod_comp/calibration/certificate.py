@@ -17,7 +17,7 @@ from ..formats.pages import page, picture, shown, table
 from ..formats.paths import input_file, version
 from ..formats.texts import number
 from ..formats.yaml import read_yaml
-from ..machine.model import REFERENCE_TEMPERATURE, Temperatures
+from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
 from ..measurements.iso230 import PositioningTest
 from ..measurements.iso230_circles import CircularTest
 from ..measurements.readings import ANGULAR_KINDS

@@ -14,9 +14,10 @@ import numpy as np
 from ..errors import ModelError
 from ..machine.field import CROSS_AXES
 from ..machine.geometry import HexapodGeometry
-from ..machine.model import MachineModel, RealMachine, Temperatures
+from ..machine.model import MachineModel, RealMachine
 from ..machine.passes import BOTH_WAYS, Passes, random_passes
 from ..machine.size import Size
+from ..machine.temperatures import Temperatures
 from ..virtual.trial import Trial
 
 INCH = 0.0254

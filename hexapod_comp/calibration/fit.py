@@ -9,8 +9,9 @@ from datetime import date
 import numpy as np
 
 from ..errors import CalibrationError
-from ..machine.model import REFERENCE_TEMPERATURE, MachineModel, ModelOrigin
+from ..machine.model import MachineModel, ModelOrigin
 from ..machine.size import rms
+from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementSet, refuse_unmoved
 from ..pose import Pose
 from .datum import HeldDatum, hold, unseen_part

@@ -11,7 +11,8 @@ import numpy as np
 from ..errors import CalibrationError
 from ..machine.field import COMPONENTS, CROSS_AXES
 from ..machine.kinematics import Structure, strut_lengths_batch
-from ..machine.model import REFERENCE_TEMPERATURE, MachineModel, RealMachine
+from ..machine.model import MachineModel, RealMachine
+from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..measurements.readings import AXES, CHANNELS, KINDS, LEAST_TRAVEL, MeasurementSet
 from ..virtual.instruments import station_errors
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..machine.model import REFERENCE_TEMPERATURE, Temperatures
 from ..machine.passes import Passes, random_directions
 from ..machine.size import rms
+from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
 from ..measurements.readings import AXES, Stations
 from ..pose import rotation_from_angles
 from ..virtual.trial import without_datum

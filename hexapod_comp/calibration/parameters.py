@@ -17,8 +17,9 @@ from ..machine.field import GridField, no_field
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry, first_of_same
 from ..machine.kinematics import Structure, strut_lengths
 from ..machine.late import PARTS, LateGrowth
-from ..machine.model import REFERENCE_TEMPERATURE, MachineModel
+from ..machine.model import MachineModel
 from ..machine.struts import StrutErrors
+from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..measurements.readings import AXES, MeasurementSet, Stations, spans
 from .smooth_field import COMPONENT_UNITS, SmoothField
 

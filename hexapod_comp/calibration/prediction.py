@@ -14,9 +14,10 @@ import numpy as np
 from ..errors import CalibrationError
 from ..kernels.kinematics import OK
 from ..machine.kinematics import Structure, strut_lengths_batch
-from ..machine.model import RealMachine, Temperatures, platform_box
+from ..machine.model import RealMachine, platform_box
 from ..machine.motion import FOLLOWED
 from ..machine.passes import Poses
+from ..machine.temperatures import Temperatures
 from ..measurements.readings import Stations, attitude_error
 from .datum import HeldDatum
 from .parameters import ParameterSpace

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..machine.late import PARTS, LateGrowth, late
-from ..machine.model import REFERENCE_TEMPERATURE, MachinesByTemperature
+from ..machine.model import MachinesByTemperature
+from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..measurements.readings import Stations
 from ..virtual.trial import drive
 from .parameters import WAVES, ParameterSpace

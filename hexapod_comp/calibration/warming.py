@@ -17,7 +17,7 @@ import numpy as np
 
 from ..formats.texts import number
 from ..machine.late import MOST_TIME_CONSTANTS, PARTS, TIME_CONSTANT_RANGE, LateGrowth
-from ..machine.model import REFERENCE_TEMPERATURE
+from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..measurements.readings import KINDS, MeasurementSet
 from .estimation import Estimation, Solution
 from .linear_problem import Posterior, physical_covariance, solve

@@ -75,6 +75,11 @@ def expansions(text: str) -> tuple[float, float, float]:
     return (values[0], *(values[1:] or (0.0, 0.0)))
 
 
+def time_constants(text: str) -> tuple[float, ...]:
+    """Read time constants in s; return them rising."""
+    return tuple(sorted(finite(part) for part in text.split(",")))
+
+
 def finite(text: str) -> float:
     """Read one finite number."""
     if "," in text:

@@ -51,6 +51,10 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
         given["field_degree"] = args.field_degree
     if args.expansion_ppm is not None:
         given |= dict(zip(("strut_expansion", "base_expansion", "platform_expansion"), args.expansion_ppm, strict=True))
+    if args.thermometer is not None:
+        given["thermometer"] = args.thermometer
+    if args.time_constants_s is not None:
+        given["time_constants"] = args.time_constants_s
     if args.tolerance_um is not None:
         given["tolerances"] = tuple({**TOLERANCES, "structure": args.tolerance_um * 1e-6}.items())
     for name, option, unit in (("scale", "scale_ppm", 1e-6), ("alignment", "alignment_mrad", 1e-3)):
@@ -177,7 +181,8 @@ def _refuse_options_of_the_other_scheme(args: argparse.Namespace) -> None:
     """Raise on an option that the scheme would not listen to."""
     from ..errors import CalibrationError
 
-    of_joint = ("lead_mm", "blocks", "tolerance_um", "field_degree", "expansion_ppm", "scale_ppm", "alignment_mrad")
+    heat = ("expansion_ppm", "thermometer", "time_constants_s")
+    of_joint = ("lead_mm", "blocks", "tolerance_um", "field_degree", "scale_ppm", "alignment_mrad", *heat)
     if args.compensated:
         raise CalibrationError("--compensated", "is for check readings, of verify or of fit --update")
     others = (

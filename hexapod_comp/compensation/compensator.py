@@ -19,8 +19,9 @@ from ..kernels import kinematics as kernels
 from ..kernels.compensation import OUTSIDE, compensate_one, compensate_quaternion, estimate_one
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import forward_error, strut_lengths
-from ..machine.model import MachineModel, RealMachine, Temperatures
+from ..machine.model import MachineModel, RealMachine
 from ..machine.motion import MotionState
+from ..machine.temperatures import Temperatures
 from ..pose import Pose
 from .findings import refuse
 from .state import CommandState, pack_machine, pack_nominal, pack_pose, read_state
@@ -110,7 +111,7 @@ class Compensator:
     Attributes
     ----------
     on_change : callable
-        Called after each change from outside, with its name and value: ``temperature`` (name, °C), ``model``,
+        Called after each change from outside, with its name and value: ``temperature`` (name, °C, time), ``model``,
         ``enable`` (bool), ``reset`` (measured struts or None). Together with the commands these decide all answers.
     """
 
@@ -179,7 +180,11 @@ class Compensator:
             What it would correct at the last command, before the first one at home, breaks a limit: the ramp would
             drag the struts there and be refused on its way. The old model stays.
         """
-        self._check_whole(RealMachine(self.geometry, model, self.temperatures))
+        temperatures = self.temperatures
+        if model.late_growth.time_constants != self.model.late_growth.time_constants:
+            temperatures = Temperatures(temperatures.values)  # other lags begin anew, at rest
+        self._check_whole(RealMachine(self.geometry, model, temperatures))
+        self.temperatures = temperatures
         self._renew(model)
         self.on_change("model", model)
 
@@ -230,20 +235,20 @@ class Compensator:
         varied = (*machine.strut_arrays[1:], *machine.field_arrays[1:])
         return pack_machine(machine), self._nominal_numbers, varied
 
-    def set_temperature(self, name: str, value: float) -> None:
+    def set_temperature(self, name: str, value: float, time: float = math.nan) -> None:
         """Take a temperature, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
 
-        A sensor's noise would move the struts: pass its readings through a
-        :class:`~hexapod_comp.compensation.thermal.TemperatureFilter`.
+        Filter it, or its noise moves the struts: :class:`~hexapod_comp.compensation.thermal.TemperatureFilter`.
+        A model with time constants needs the `time`, s, when it was read, on a clock that is never set.
 
         Raises
         ------
         ModelError
-            Unknown name or a value outside the allowed range.
+            Unknown name, a value outside the allowed range, or no time where it is needed.
         """
-        self.temperatures.set(name, value)
+        self.temperatures.follow(name, value, time, self.model.late_growth.time_constants)
         self._renew(self.model)
-        self.on_change("temperature", (name, self.temperatures.values[name]))
+        self.on_change("temperature", (name, self.temperatures.values[name], time))
 
     def enable(self, enabled: bool) -> None:
         """Switch compensation on or off; the corrections ramp.
@@ -287,10 +292,10 @@ class Compensator:
     def snapshot(self) -> dict[str, Any]:
         """Return what, beside geometry and model, decides the next answer, by name.
 
-        ``temperatures``, °C by name, and each field of :class:`~hexapod_comp.kernels.compensation.State`: a list of
-        numbers, matrices by rows.
+        ``temperatures``, °C by name, ``lags`` of what follows them late, and each field of
+        :class:`~hexapod_comp.kernels.compensation.State`: a list of numbers, matrices by rows.
         """
-        return {**self._last.snapshot(), "temperatures": dict(self.temperatures.values)}
+        return {**self._last.snapshot(), **self.temperatures.snapshot()}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Take over a :meth:`snapshot` of a compensator with this geometry and model.
@@ -303,8 +308,9 @@ class Compensator:
         """
         if "temperatures" not in snapshot:
             raise ModelError("snapshot.temperatures", "is missing")
-        temperatures = Temperatures(snapshot["temperatures"])
-        numbers = read_state({name: value for name, value in snapshot.items() if name != "temperatures"})
+        constants = self.model.late_growth.time_constants
+        temperatures = Temperatures.restored(snapshot["temperatures"], snapshot.get("lags", {}), len(constants))
+        numbers = read_state({name: value for name, value in snapshot.items() if name not in ("temperatures", "lags")})
         self._take_machine(RealMachine(self.geometry, self.model, temperatures))
         self.temperatures = temperatures
         self._last.numbers[:] = numbers

@@ -144,8 +144,9 @@ class Entry:
     what : str
         ``temperature``, ``model``, ``enable``, ``reset`` or ``refused``.
     values : dict of str to object
-        ``name`` and ``value`` (°C) of a temperature; ``name`` and ``sha256`` of a model; ``on``;
-        ``measured`` (m, or None) of a reset; ``stamp`` (ns), ``reason`` and ``text`` of a refused command.
+        ``name``, ``value`` (°C) and ``time`` (s; NaN: not known, as in older recordings) of a temperature; ``name`` and
+        ``sha256`` of a model; ``on``; ``measured`` (m, or None) of a reset; ``stamp`` (ns), ``reason`` and ``text`` of
+        a refused command.
     """
 
     after: int
@@ -315,7 +316,7 @@ class Journal:
 
 def _values(what: str, value: Any, sources: Mapping[str, Source]) -> dict[str, Any]:
     if what == "temperature":
-        return {"name": value[0], "value": value[1]}
+        return {"name": value[0], "value": value[1], "time": None if math.isnan(value[2]) else value[2]}
     if what == "model":
         return _identity(value, sources["model"])
     if what == "enable":
@@ -441,8 +442,12 @@ def _measured(content: Any) -> list[float] | None:
     return None if content is None else [float(value) for value in content]
 
 
+def _time(content: Any) -> float:
+    return math.nan if content is None else float(content)
+
+
 ENTRIES: dict[str, dict[str, Callable[[Any], Any]]] = {
-    "temperature": {"name": str, "value": float},
+    "temperature": {"name": str, "value": float, "time": _time},
     "model": {"name": str, "sha256": str},
     "enable": {"on": bool},
     "reset": {"measured": _measured},
@@ -453,7 +458,11 @@ ENTRIES: dict[str, dict[str, Callable[[Any], Any]]] = {
 
 def _read_entry(content: Any) -> Entry:
     what = content["what"]
-    return Entry(int(content["after"]), what, {key: read(content[key]) for key, read in ENTRIES[what].items()})
+    return Entry(
+        int(content["after"]),
+        what,
+        {key: read(content[key] if key != "time" else content.get(key)) for key, read in ENTRIES[what].items()},
+    )
 
 
 def _read_snapshot(content: Any) -> Snapshot:
@@ -461,10 +470,11 @@ def _read_snapshot(content: Any) -> Snapshot:
     arrays = {
         str(name): np.array([math.nan if v is None else float(v) for v in numbers])
         for name, numbers in content["state"].items()
-        if name != "temperatures"
+        if name not in ("temperatures", "lags")
     }
+    lags = {str(name): [float(v) for v in numbers] for name, numbers in content["state"].get("lags", {}).items()}
     return Snapshot(
-        state={**arrays, "temperatures": temperatures},
+        state={**arrays, "temperatures": temperatures, "lags": lags},
         model=_words(content["model"], "name", "sha256"),
         geometry=_words(content["geometry"], "name", "sha256"),
         frames=_words(content["frames"], *ROLES),

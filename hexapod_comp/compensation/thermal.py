@@ -11,7 +11,7 @@ import statistics
 from dataclasses import dataclass
 
 from ..errors import ModelError
-from ..machine.model import REFERENCE_TEMPERATURE, Temperatures
+from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
 
 DEFAULT_TIME_CONSTANT = 30.0
 """Time constant of the filter, s: of a reading a second an eighth of the noise is left, and the drift is
@@ -67,7 +67,7 @@ class TemperatureFilter:
         Raises
         ------
         ModelError
-            As :meth:`~hexapod_comp.machine.model.Temperatures.set`, or a time that is not finite. Nothing was taken.
+            As :meth:`.Temperatures.set`, or a time that is not finite; nothing was taken.
         """
         reading = Temperatures({name: value}).values[name]
         if not math.isfinite(time):

@@ -19,7 +19,9 @@ from ..errors import HexapodError, TooEarlyError
 from ..formats.outputs import write_text
 from ..kernels.struts import GROWTH, MOST_HARMONICS, WAVES
 from ..machine.geometry import HexapodGeometry
-from ..machine.model import MachineModel, RealMachine, Temperatures
+from ..machine.late import MOST_TIME_CONSTANTS, PARTS
+from ..machine.model import MachineModel, RealMachine
+from ..machine.temperatures import Temperatures
 from ..machine.trajectory import moves
 from ..pose import Pose, rotation_from_angles, stacked
 
@@ -158,6 +160,13 @@ def _members(
     pointers = {kind: f"{{{', '.join(f'hexapod_{kind}_{axis}' for axis in 'xyz')}}}" for kind in ("nodes", "lines")}
     flags = {"refuse_outside": int(field.outside == "refuse")}
     yield "field", _struct({"probe": field.probe, **counts, **flags}, **pointers)
+    late = model.late_growth
+    count = len(late.time_constants)
+    constants, expansion = np.zeros(MOST_TIME_CONSTANTS), np.zeros((len(PARTS), MOST_TIME_CONSTANTS))
+    constants[:count], expansion[:, :count] = late.time_constants, late.expansion
+    sensors = [late.sensor_of(part) for part in range(len(PARTS))]
+    numbers = {"count": count, "time_constants": constants, "expansion": expansion, "sensors": sensors}
+    yield "late", _struct(numbers)
     yield "axis_threshold", _number(machine.thresholds[0])
     yield "strut_threshold", _number(machine.thresholds[1])
 
@@ -214,6 +223,7 @@ def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> 
     recorder.take("t", (2.0, 24.5))
     recorder.take("t", (6.0, 21.25))
     recorder.take("t", (7.0, 1e3))
+    recorder.take("t", (6.0, 22.25))
     recorder.commands(stream[quarter : 2 * quarter])
     recorder.take("e", (0.0,))
     recorder.commands(stream[2 * quarter : 3 * quarter])
@@ -276,7 +286,7 @@ class Recorder:
                 pose = compensator.estimate(np.array(values))
                 expected = np.concatenate([pose[:3], pose[9:]])
             elif kind == "t":
-                compensator.set_temperature(Temperatures.NAMES[int(values[0])], values[1])
+                compensator.set_temperature(Temperatures.NAMES[int(values[0])], values[1], self.time)
             elif kind == "e":
                 compensator.enable(bool(values[0]))
             else:

@@ -18,7 +18,9 @@ import numpy as np
 from ..errors import HexapodError, InputFileError, ModelError
 from ..kernels.compensation import SIZES, State
 from ..machine.geometry import HexapodGeometry
-from ..machine.model import REFERENCE_TEMPERATURE, MachineModel, Temperatures
+from ..machine.late import MOST_TIME_CONSTANTS, PARTS
+from ..machine.model import MachineModel
+from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
 from .c_code import STATUS
 
 
@@ -65,6 +67,9 @@ class CState(Structure):
         ("model", c_void_p),
         ("ramp_rate", c_double),
         ("temperatures", c_double * 8),
+        ("began", c_double * 8),
+        ("newest", c_double * 8),
+        ("behind", (c_double * MOST_TIME_CONSTANTS) * 8),
         ("base_joints", c_double * 18),
         ("platform_joints", c_double * 18),
         ("growth", c_double * 6),
@@ -185,10 +190,10 @@ class CCompensator:
         """Switch compensation on or off."""
         self._check(self._library.hc_enable(byref(self.state), int(enabled)))
 
-    def set_temperature(self, name: str, value: float) -> None:
-        """Take a temperature, °C."""
+    def set_temperature(self, name: str, value: float, time: float = math.nan) -> None:
+        """Take a temperature, °C, read at a `time`, s."""
         index = Temperatures.NAMES.index(name)
-        self._check(self._library.hc_set_temperature(byref(self.state), index, c_double(value)))
+        self._check(self._library.hc_set_temperature(byref(self.state), index, c_double(value), c_double(time)))
         self._temperatures[name] = value
 
     def set_model(self, model: MachineModel) -> None:
@@ -210,12 +215,25 @@ class CCompensator:
         for name in ("platform", "model"):
             pose = getattr(last, name)
             parts |= {f"{name}_position": list(pose.position), f"{name}_rotation": list(pose.rotation)}
-        return {**parts, "ramp_rate": [self.state.ramp_rate], "temperatures": dict(self._temperatures)}
+        warmth = {"temperatures": dict(self._temperatures), "lags": self._lags()}
+        return {**parts, "ramp_rate": [self.state.ramp_rate], **warmth}
+
+    def _lags(self) -> dict[str, list[float]]:
+        state, count = self.state, len(self.model.late_growth.time_constants)
+        heard = [n for n in range(len(PARTS)) if count and not math.isnan(state.began[n])]
+        return {PARTS[n]: [state.began[n], state.newest[n], *state.behind[n][:count]] for n in heard}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Take over a snapshot of either compensator."""
-        for name in Temperatures.NAMES:
-            self.set_temperature(name, snapshot["temperatures"].get(name, REFERENCE_TEMPERATURE))
+        values, lags = snapshot["temperatures"], snapshot.get("lags", {})
+        for name in PARTS:
+            self.set_temperature(name, values.get(name, REFERENCE_TEMPERATURE), 0.0)
+        for n, name in enumerate(PARTS):
+            began, newest, *behind = lags.get(name, [math.nan, math.nan])
+            self.state.began[n], self.state.newest[n] = began, newest
+            self.state.behind[n][: len(behind)] = behind
+        for name in lags:  # once more, by nothing and after no time: the core places its machine
+            self.set_temperature(name, values[name], lags[name][1])
         self._temperatures = dict(snapshot["temperatures"])
         last = self.state.last
         for name, size in zip(State._fields, SIZES, strict=True):

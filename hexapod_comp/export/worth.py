@@ -14,9 +14,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..machine.geometry import HexapodGeometry
-from ..machine.model import MachineModel, RealMachine, Temperatures
+from ..machine.model import MachineModel, RealMachine
 from ..machine.passes import Passes
 from ..machine.size import Size
+from ..machine.temperatures import Temperatures
 from ..virtual.trial import ToolErrors, Trial
 
 DIAGONAL = np.ones(3)

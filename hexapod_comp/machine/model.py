@@ -8,7 +8,6 @@ length − nominal strut length.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,18 +23,13 @@ from .kinematics import Structure, forward_error
 from .late import AT_ONCE, PARTS, Lag, LateGrowth, late
 from .motion import MotionState
 from .struts import StrutErrors
-
-REFERENCE_TEMPERATURE = 20.0
-"""Temperature at which geometry and model hold, °C (ISO 1)."""
+from .temperatures import Temperatures
 
 LARGEST_DEVIATION = 0.05
 """Joint deviations above this, m, are a unit error, not a machine."""
 
 LARGEST_TURN = 0.1
 """A base turned by more, rad, is a unit error, or another machine."""
-
-TEMPERATURE_RANGE = (-40.0, 120.0)
-"""Sensor readings outside this, °C, are not a machine shop's."""
 
 
 @dataclass(frozen=True)
@@ -200,68 +194,6 @@ def _checked_box(valid_box: np.ndarray) -> np.ndarray:
         raise ModelError("valid_box", "must be its lowest and its highest corner, m", box.tolist())
     box.flags.writeable = False
     return box
-
-
-class Temperatures:
-    """Temperatures of struts, base and platform, °C; whatever has not been heard of is at 20 °C.
-
-    Attributes
-    ----------
-    values : dict of str to float
-        Readings by ``strut_1`` … ``strut_6``, ``base``, ``platform``.
-    lags : dict of str to Lag
-        How far what follows each of them is behind; whatever is not here is at rest.
-    """
-
-    NAMES = PARTS
-
-    def __init__(self, readings: Mapping[str, float] | None = None, lags: Mapping[str, Lag] | None = None) -> None:
-        self.values: dict[str, float] = {}
-        for name, value in (readings or {}).items():
-            self.set(name, value)
-        self.lags: dict[str, Lag] = dict(lags or {})
-
-    def follow(self, name: str, value: float, time: float, time_constants: tuple[float, ...]) -> None:
-        """Take a reading made at a time, s, on a clock that is never set; late parts follow.
-
-        The first reading finds its followers at rest: what was before nobody knows.
-
-        Raises
-        ------
-        ModelError
-            As :meth:`set`; or there are time constants, and the time is not finite. Nothing was taken.
-        """
-        before = self.values.get(name, REFERENCE_TEMPERATURE)
-        if time_constants and not math.isfinite(time):
-            raise ModelError(f"time of the temperature of {name}", "must be finite, s: the model has time constants")
-        self.set(name, value)
-        if name in self.lags:
-            self.lags[name].take(self.values[name] - before, time, time_constants)
-        elif time_constants:
-            self.lags[name] = Lag(time, time, [0.0] * len(time_constants))
-
-    def set(self, name: str, value: float) -> None:
-        """Take a reading, whenever it was made: late parts stay as far behind as they are.
-
-        Raises
-        ------
-        ModelError
-            Unknown name, not finite, or outside :data:`TEMPERATURE_RANGE`.
-        """
-        if name not in self.NAMES:
-            raise ModelError("temperature", f"must be of one of {', '.join(self.NAMES)}", name)
-        if not TEMPERATURE_RANGE[0] <= value <= TEMPERATURE_RANGE[1]:
-            low, high = TEMPERATURE_RANGE
-            raise ModelError(f"temperature of {name}", f"must lie within {low:g}…{high:g} °C", value)
-        self.values[name] = float(value)
-
-    def at(self, name: str) -> float:
-        """Return a temperature, °C."""
-        return self.values.get(name, REFERENCE_TEMPERATURE)
-
-    def above_reference(self, name: str) -> float:
-        """Return the difference to 20 °C, K."""
-        return self.at(name) - REFERENCE_TEMPERATURE
 
 
 class RealMachine:

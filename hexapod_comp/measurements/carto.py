@@ -39,7 +39,7 @@ from ..errors import InputFileError
 from ..formats.yaml import UNITS, Section, read_yaml
 from ..machine.field import CROSS_AXES
 from ..machine.geometry import HexapodGeometry
-from ..machine.model import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE
+from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE
 from ..pose import Pose
 from .carto_files import Dynamic, Static, is_capture, read_rtl, read_rtx
 from .readings import AXES, BACKWARD, FORWARD, FileLine, MeasurementSet, Reading

@@ -24,8 +24,8 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import CalibrationError
 from ..machine.geometry import HexapodGeometry
-from ..machine.model import REFERENCE_TEMPERATURE, Temperatures
 from ..machine.size import rms
+from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
 from ..pose import Pose
 
 AXES = ("x", "y", "z")

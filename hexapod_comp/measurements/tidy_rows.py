@@ -13,7 +13,7 @@ from ..errors import InputFileError
 from ..formats.csv import Table, exact, si_from_text
 from ..formats.yaml import UNITS, spellings
 from ..machine.geometry import STRUT_NAMES
-from ..machine.model import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
+from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
 from ..pose import Pose
 from .air import AIR_RANGES, LARGEST_INDEX
 from .readings import ANGULAR_KINDS, AXES, BACKWARD, CHANNELS, FORWARD, FROM_PREVIOUS, LINE_KINDS, UNKNOWN

@@ -13,7 +13,7 @@ from ..formats.csv import ANGLE_COLUMNS, POSITION_COLUMNS, csv_text
 from ..formats.outputs import write_text
 from ..machine.geometry import STRUT_NAMES
 from ..machine.kinematics import Structure, strut_lengths
-from ..machine.model import REFERENCE_TEMPERATURE, Temperatures
+from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
 from ..pose import angles_from_rotation
 from .readings import ANGULAR_KINDS, AXES, CHANNELS, FROM_PREVIOUS, LENGTH, MeasurementSet
 from .tidy_rows import DIRECTIONS

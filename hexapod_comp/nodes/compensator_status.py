@@ -179,6 +179,8 @@ class CompensatorStatus:
             "refused_resets": str(sum(self.refused_resets.counts.values())),
         }
         values.update({f"temperature.{k}_degC": f"{v:.2f}" for k, v in compensator.temperatures.values.items()})
+        if (unknown := compensator.temperatures.unknown_for(compensator.model.late_growth, now)) > 0.0:
+            values["late_parts"] = f"not known for another {unknown:.0f} s: the readings began too short ago"
         values.update(self.refusals.values())
         return values
 

@@ -124,7 +124,7 @@ class Feedback:
             self._hear(self._warming, number, now)
             message = read_message(data, Temperature)
             name = message.header.frame_id
-            self._compensator.set_temperature(name, self._thermometers.take(name, message.temperature, now))
+            self._compensator.set_temperature(name, self._thermometers.take(name, message.temperature, now), now)
         except CommandError as error:
             self._ignore("temperatures", error.reason, f"temperature ignored: {error}", str(error), now)
         except HexapodError as error:

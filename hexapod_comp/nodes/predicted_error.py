@@ -173,7 +173,7 @@ class PredictedErrorTopics:
             "position": compensator.platform.position.tolist(),
             "rotation": compensator.platform.rotation.tolist(),
             "sense": compensator.motion.sense.tolist(),
-            "temperatures": dict(compensator.temperatures.values),
+            **compensator.temperatures.snapshot(),
         }
         process.ask(request)
 

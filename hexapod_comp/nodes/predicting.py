@@ -21,7 +21,8 @@ from ..errors import HexapodError
 from ..formats.json import json_text
 from ..formats.paths import confined_opener
 from ..machine.geometry import HexapodGeometry
-from ..machine.model import MachineModel, RealMachine, Temperatures
+from ..machine.model import MachineModel, RealMachine
+from ..machine.temperatures import Temperatures
 
 NICENESS = 10
 """Commands come first."""
@@ -44,13 +45,15 @@ class Predicting:
         self.fitted: FittedParameters | None
         opener = confined_opener(None if setup["folder"] is None else Path(setup["folder"]))
         self.fitted, self.unknown = load_posterior(self.model, self.geometry, sources[1].name, opener)
-        self._at: dict[str, float] | None = None
+        self._at: tuple[dict[str, float], dict[str, list[float]]] | None = None
 
     def result(self, asked: dict[str, Any]) -> dict[str, Any]:
-        """Return the errors at a pose: ``position``, ``rotation``, ``sense`` and ``temperatures``."""
-        if asked["temperatures"] != self._at:
-            machine = RealMachine(self.geometry, self.model, Temperatures(asked["temperatures"]))
-            self._predictor, self._at = ErrorPredictor(machine, self.fitted), asked["temperatures"]
+        """Return the errors at a pose: ``position``, ``rotation``, ``sense``, ``temperatures`` and ``lags``."""
+        warmth = asked["temperatures"], asked["lags"]
+        if warmth != self._at:
+            temperatures = Temperatures.restored(*warmth, len(self.model.late_growth.time_constants))
+            machine = RealMachine(self.geometry, self.model, temperatures)
+            self._predictor, self._at = ErrorPredictor(machine, self.fitted), warmth
         pose = np.array([asked["position"]]), np.array([asked["rotation"]])
         standing, aligned = self._predictor.predict(pose, np.array([asked["sense"]]))
         result = {"standing": _numbers(standing), "aligned": None if aligned is None else _numbers(aligned)}

@@ -188,7 +188,7 @@ class _Run:
         """Make a change that the journal tells of."""
         values = entry.values
         if entry.what == "temperature":
-            self.compensator.set_temperature(values["name"], float(values["value"]))
+            self.compensator.set_temperature(values["name"], float(values["value"]), float(values["time"]))
         elif entry.what == "enable":
             self.compensator.enable(bool(values["on"]))
         elif entry.what == "reset":
@@ -263,6 +263,7 @@ class _AsItWas(_Run):
 
 def _same_state(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Return whether two snapshots are the same, all NaN being one number."""
-    if one.keys() != other.keys() or one["temperatures"] != other["temperatures"]:
+    by_part = ("temperatures", "lags")
+    if one.keys() != other.keys() or any(one[name] != other[name] for name in by_part):
         return False
-    return all(np.array_equal(one[name], other[name], equal_nan=True) for name in one if name != "temperatures")
+    return all(np.array_equal(one[name], other[name], equal_nan=True) for name in one if name not in by_part)

@@ -15,9 +15,10 @@ from ..errors import ModelError, NotConvergedError
 from ..kernels.kinematics import OK
 from ..kernels.model import command_one
 from ..machine.kinematics import forward_error
-from ..machine.model import MachineModel, RealMachine, Temperatures
+from ..machine.model import MachineModel, RealMachine
 from ..machine.motion import FOLLOWED
 from ..machine.passes import Passes, Poses, at
+from ..machine.temperatures import Temperatures
 from ..measurements.readings import attitude_error
 from ..pose import best_motion
 

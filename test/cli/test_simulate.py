@@ -13,9 +13,10 @@ from hexapod_comp import cli
 from hexapod_comp.cli.verbs import VERBS
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.formats.paths import config_file
-from hexapod_comp.machine.model import MachineModel, RealMachine, Temperatures
+from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.machine.temperatures import Temperatures
 from hexapod_comp.measurements.campaign import Campaign, load_campaign, template
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
 from hexapod_comp.measurements.tidy_csv import read_tidy

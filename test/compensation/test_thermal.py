@@ -6,6 +6,7 @@ Sums of up to a few thousand readings of some 20 °C are rounded to about 1e-12 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,9 +14,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
+from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.compensation.thermal import DEFAULT_TIME_CONSTANT, Plausibility, TemperatureFilter, Thermometers
 from hexapod_comp.errors import ModelError
-from hexapod_comp.machine.model import Temperatures
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.late import LateGrowth
+from hexapod_comp.machine.model import MachineModel
+from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.machine.temperatures import Temperatures
 
 ROUNDING = 1e-10
 """°C."""
@@ -229,3 +235,47 @@ def test_what_is_no_temperature_is_refused_before_all(name: str, value: float) -
     with pytest.raises(ModelError):
         made.take(name, value, 0.0)
     assert made.stale(0.0) == ()
+
+
+def late_model() -> MachineModel:
+    """Return a model whose struts follow the base's thermometer with 600 s."""
+    struts = StrutErrors(expansion=np.full(6, 12e-6))
+    late_growth = LateGrowth((600.0,), np.array([[12e-6]] * 6 + [[0.0]] * 2), "base")
+    return MachineModel("paper", "late", struts=struts, late_growth=late_growth)
+
+
+def test_a_compensator_follows_late_and_a_restored_one_goes_on_bit_for_bit():
+    """Struts of 12 ppm/K follow a step of 3 K: after one time constant by 1 − 1/e, whatever was read in between."""
+    geometry = load_geometry("paper.yaml")
+    one, other = (Compensator(geometry, late_model()) for _ in range(2))
+    one.set_temperature("base", 20.0, 100.0)
+    one.set_temperature("base", 23.0, 100.0)
+    for second in range(101, 401):
+        one.set_temperature("base", 23.0, float(second))
+    other.restore(one.snapshot())
+    for second in range(401, 701):
+        for compensator in (one, other):
+            compensator.set_temperature("base", 23.0, float(second))
+    growth = one.machine.strut_arrays[0][:, -1]
+    np.testing.assert_allclose(growth, 12e-6 * 3.0 * -math.expm1(-1.0), rtol=1e-12)
+    assert growth.tobytes() == other.machine.strut_arrays[0][:, -1].tobytes()
+    assert one.snapshot()["lags"] == other.snapshot()["lags"]
+
+
+def test_a_compensator_with_late_parts_needs_the_time_of_a_temperature():
+    compensator = Compensator(load_geometry("paper.yaml"), late_model())
+    with pytest.raises(ModelError, match="time constants"):
+        compensator.set_temperature("base", 21.0)
+    assert compensator.temperatures.values == {}
+
+
+def test_lags_begin_anew_with_a_model_of_other_time_constants():
+    geometry, model = load_geometry("paper.yaml"), late_model()
+    compensator = Compensator(geometry, model)
+    compensator.set_temperature("base", 20.0, 0.0)
+    compensator.set_temperature("base", 22.0, 60.0)
+    compensator.set_model(replace(model, late_growth=replace(model.late_growth, time_constants=(900.0,))))
+    assert compensator.snapshot()["lags"] == {}
+    np.testing.assert_allclose(compensator.machine.strut_arrays[0][:, -1], 24e-6)  # at rest
+    with pytest.raises(ModelError, match=r"snapshot\.lags\.base"):
+        compensator.restore(compensator.snapshot() | {"lags": {"base": [0.0, 1.0]}})

@@ -29,15 +29,17 @@ from hexapod_comp.export.c_library import CCompensator, CPose
 from hexapod_comp.kernels.struts import GROWTH, PARAMETERS
 from hexapod_comp.machine.field import no_field
 from hexapod_comp.machine.geometry import HexapodGeometry
-from hexapod_comp.machine.model import MachineModel, RealMachine, Temperatures
+from hexapod_comp.machine.late import LateGrowth
+from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.machine.temperatures import Temperatures
 
 COMPILER = shutil.which("gcc")
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic", "-O1"]
 PLACES = [f"{what}_{part}" for what in ("platform", "model") for part in ("position", "rotation")]
 """Parts of the state that mean nothing before the first command."""
 
-MATHEMATICS = ["exp", "sqrt", "sin", "cos", "sincos", "acos", "atan2", "floor", "fmin", "fmax"]
+MATHEMATICS = ["exp", "expm1", "sqrt", "sin", "cos", "sincos", "acos", "atan2", "floor", "fmin", "fmax"]
 
 ALLOWED = 2.0 * np.finfo(float).eps
 """Of a length below 1 m: two units in the last place of numbers in [0.5, 1)."""
@@ -160,6 +162,17 @@ class CField(Structure):
     )
 
 
+class CLate(Structure):
+    """hc_late"""
+
+    _fields_ = (
+        ("count", c_int),
+        ("time_constants", c_double * 2),
+        ("expansion", (c_double * 2) * 8),
+        ("sensors", c_int * 8),
+    )
+
+
 class CModel(Structure):
     """hc_model, so that thousands of machines can be tried without a compiler."""
 
@@ -172,6 +185,7 @@ class CModel(Structure):
         ("struts", c_double * (6 * PARAMETERS)),
         ("map", CMap),
         ("field", CField),
+        ("late", CLate),
         ("axis_threshold", c_double),
         ("strut_threshold", c_double),
     )
@@ -207,6 +221,12 @@ def in_c(geometry: HexapodGeometry, model: MachineModel) -> tuple[CModel, list[n
         tuple(at[5:]),
         model.field.outside == "refuse",
     )
+    late = model.late_growth
+    made.late.count = len(late.time_constants)
+    made.late.time_constants[: made.late.count] = late.time_constants
+    for part in range(8):
+        made.late.expansion[part][: made.late.count] = late.expansion[part].tolist()
+        made.late.sensors[part] = late.sensor_of(part)
     made.axis_threshold, made.strut_threshold = real.thresholds
     return made, kept
 
@@ -224,6 +244,11 @@ def drawn_machine(rng: np.random.Generator) -> tuple[HexapodGeometry, MachineMod
         model = replace(model, field=no_field())
     if rng.random() < 0.2:
         model = replace(model, field=replace(model.field, outside="refuse"))
+    if rng.random() < 0.5:
+        constants = ((0.05,), (0.02, 0.5))[rng.integers(2)]  # of some ten commands
+        expansion = 1e-5 * rng.standard_normal((8, len(constants)))
+        late = LateGrowth(tuple(1e3 * c for c in constants), expansion, ("", "base", "strut_2")[rng.integers(3)])
+        model = replace(model, late_growth=late)
     return geometry, model
 
 
@@ -260,7 +285,7 @@ def outcome_of(compensator: Any, kind: str, value: Any, made: float, received: f
         elif kind == "estimate":
             numbers = compensator.estimate(value).copy()
         elif kind == "temperature":
-            compensator.set_temperature(*value)
+            compensator.set_temperature(*value, 1e3 * made)  # as seldom as in a shop
         else:
             getattr(compensator, kind)(value)
     except HexapodError as error:
@@ -289,7 +314,7 @@ def test_drawn_machines_models_and_events_give_the_same_numbers_and_refusals(cor
             at = value
     assert kept  # the core points into them
     ours, theirs = python.snapshot(), core.snapshot()
-    for name in set(ours) - {"temperatures", *PLACES}:
+    for name in set(ours) - {"temperatures", "lags", *PLACES}:
         np.testing.assert_allclose(theirs[name], ours[name], rtol=0.0, atol=ALLOWED, equal_nan=True, err_msg=name)
 
 

@@ -11,9 +11,10 @@ from scipy.integrate import solve_ivp
 
 from hexapod_comp.errors import InputFileError, ModelError
 from hexapod_comp.machine.late import PARTS, LateGrowth, late
-from hexapod_comp.machine.model import MachineModel, MachinesByTemperature, ModelOrigin, RealMachine, Temperatures
+from hexapod_comp.machine.model import MachineModel, MachinesByTemperature, ModelOrigin, RealMachine
 from hexapod_comp.machine.model_file import load_model, save_model
 from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.machine.temperatures import Temperatures
 
 TIMES = np.array([5.0, 65.0, 66.0, 200.0, 900.0, 1000.0])
 VALUES = np.array([20.0, 20.4, 20.4, 21.5, 23.0, 22.1])
@@ -121,3 +122,14 @@ def test_a_reading_without_its_time_is_refused_where_time_counts():
         temperatures.follow("base", 22.0, math.nan, (600.0,))
     assert temperatures.at("base") == 21.0
     assert len(PARTS) == 8
+
+
+def test_a_restart_does_not_know_what_was_before_and_says_for_how_long():
+    """Three time constants of the slowest, 7200 s, from the first reading of the thermometer that counts."""
+    late_growth, temperatures = warming_model().late_growth, Temperatures()
+    assert temperatures.unknown_for(late_growth, 1000.0) == 0.0
+    temperatures.follow("strut_1", 25.0, 900.0, late_growth.time_constants)
+    assert temperatures.unknown_for(late_growth, 1000.0) == 0.0
+    temperatures.follow("base", 25.0, 1000.0, late_growth.time_constants)
+    assert temperatures.unknown_for(late_growth, 2000.0) == 3 * 7200.0 - 1000.0
+    assert temperatures.unknown_for(late_growth, 50_000.0) == 0.0

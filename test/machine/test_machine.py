@@ -25,9 +25,10 @@ from hexapod_comp.errors import ModelError, NotConvergedError, NotFiniteError, U
 from hexapod_comp.kernels.motion import follow
 from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.kinematics import Structure, solve_pose
-from hexapod_comp.machine.model import MachineModel, RealMachine, Temperatures
+from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.motion import MotionState
 from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.machine.temperatures import Temperatures
 from hexapod_comp.pose import Pose
 
 WARM = {"strut_1": 24.0, "strut_4": 18.5, "base": 21.0, "platform": 27.0}

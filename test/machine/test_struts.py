@@ -14,9 +14,10 @@ from strategies import fixed, paper_geometry, random_pose, random_struts, seeds,
 
 from hexapod_comp.errors import ModelError
 from hexapod_comp.kernels.struts import HARMONICS, actual_length, command_for_length, screw_twist
-from hexapod_comp.machine.model import MachineModel, RealMachine, Temperatures
+from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.motion import MotionState
 from hexapod_comp.machine.struts import STEEPEST_ERROR, StrutErrors
+from hexapod_comp.machine.temperatures import Temperatures
 from hexapod_comp.pose import Pose
 
 PAPER = paper_geometry()

@@ -237,15 +237,16 @@ def test_a_node_that_is_restarted_begins_anew(tmp_path):
 
 def test_pages_carry_numbers_exactly():
     machine = RecordedMachine()
-    machine.compensator.set_temperature("strut_2", 20.1)
+    machine.compensator.set_temperature("strut_2", 20.1, 12.5)
     machine.wave(3)
     snapshot, page = machine.compensator.snapshot(), read_page(machine.journal.page(9.0))
     assert page.snapshot is not None
     assert page.snapshot.state.pop("temperatures") == snapshot.pop("temperatures") == {"strut_2": 20.1}
+    assert page.snapshot.state.pop("lags") == snapshot.pop("lags") == {}
     assert page.snapshot.state.keys() == snapshot.keys()
     for name, numbers in snapshot.items():
         np.testing.assert_array_equal(page.snapshot.state[name], np.array(numbers))
-    assert page.entries[0].values == {"name": "strut_2", "value": 20.1}
+    assert page.entries[0].values == {"name": "strut_2", "value": 20.1, "time": 12.5}
     assert page.commands["lengths"].tobytes() == np.array(machine.answers).tobytes()
     assert page.commands["stamp"].tolist() == [BEGAN + n * MILLISECOND for n in (1, 2, 3)]
     np.testing.assert_array_equal(page.commands["pose"][2, :3], wave_pose(2).position)

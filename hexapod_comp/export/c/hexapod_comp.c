@@ -1367,9 +1367,8 @@ hc_status hc_estimate(hc_state *state, const double lengths[6], hc_estimated *es
 
 /* ---- What changes between commands: compensation/compensator.py, machine/model.py ------------------------------ */
 
-static void place_joints(const hc_body *body, double above_reference, double joints[6][3])
+static void place_joints(const hc_body *body, double growth, double joints[6][3])
 {
-    const double growth = body->expansion * above_reference;
     int i, k;
     for (i = 0; i < 6; i++) {
         for (k = 0; k < 3; k++) {
@@ -1379,16 +1378,49 @@ static void place_joints(const hc_body *body, double above_reference, double joi
     }
 }
 
+/* RealMachine._growth: by which share a part has grown since 20 degrees */
+static double part_growth(const hc_state *state, int part, double expansion)
+{
+    const hc_late *late = &state->model->late;
+    const int sensor = late->sensors[part];
+    double growth = expansion * (state->temperatures[sensor] - REFERENCE_TEMPERATURE);
+    int k;
+    for (k = 0; k < late->count && finite_number(state->began[sensor]); k++) {
+        growth += late->expansion[part][k] * state->behind[sensor][k];
+    }
+    return growth;
+}
+
 /* RealMachine: the structure and the struts' growth at the present temperatures */
 static void place_machine(hc_state *state)
 {
-    const double *t = state->temperatures;
     int i;
     for (i = 0; i < 6; i++) {
-        state->growth[i] = state->model->struts[i].expansion * (t[i] - REFERENCE_TEMPERATURE);
+        state->growth[i] = part_growth(state, i, state->model->struts[i].expansion);
     }
-    place_joints(&state->model->base, t[6] - REFERENCE_TEMPERATURE, state->base_joints);
-    place_joints(&state->model->platform, t[7] - REFERENCE_TEMPERATURE, state->platform_joints);
+    place_joints(&state->model->base, part_growth(state, 6, state->model->base.expansion), state->base_joints);
+    place_joints(&state->model->platform, part_growth(state, 7, state->model->platform.expansion), state->platform_joints);
+}
+
+/* Temperatures.follow and Lag.take */
+static void follow_late(hc_state *state, int index, double value, double time)
+{
+    const hc_late *late = &state->model->late;
+    const double change = value - state->temperatures[index];
+    const double elapsed = fmax(0.0, time - state->newest[index]);
+    int k;
+    if (!finite_number(state->began[index])) {
+        state->began[index] = time;
+        state->newest[index] = time;
+        return;
+    }
+    state->newest[index] = fmax(state->newest[index], time);
+    for (k = 0; k < late->count; k++) {
+        const double ages = elapsed / late->time_constants[k];
+        const double gone = -expm1(-ages);
+        const double kept = ages > 0.0 ? gone / ages : 1.0;
+        state->behind[index][k] = state->behind[index][k] * (1.0 - gone) - change * kept;
+    }
 }
 
 /* Compensator._followed: the lengths whose directions are followed, at the last command; 0 where there are none */
@@ -1412,14 +1444,20 @@ static int followed(const hc_state *state, double lengths[6])
     return 1;
 }
 
-hc_status hc_set_temperature(hc_state *state, int index, double value)
+hc_status hc_set_temperature(hc_state *state, int index, double value, double time)
 {
     double before[6], after[6];
     int comparable, i;
     if (index < 0 || index > 7 || !(value >= LOWEST_TEMPERATURE && value <= HIGHEST_TEMPERATURE)) {
         return HC_TEMPERATURE;
     }
+    if (state->model->late.count && !finite_number(time)) {
+        return HC_TEMPERATURE;
+    }
     comparable = followed(state, before);
+    if (state->model->late.count) {
+        follow_late(state, index, value, time);
+    }
     state->temperatures[index] = value;
     place_machine(state);
     comparable = followed(state, after) && comparable;
@@ -1518,6 +1556,10 @@ void hc_init(hc_state *state, const hc_model *model, double ramp_rate)
     state->ramp_rate = ramp_rate;
     for (i = 0; i < 8; i++) {
         state->temperatures[i] = REFERENCE_TEMPERATURE;
+        state->began[i] = NAN;
+        state->newest[i] = NAN;
+        state->behind[i][0] = 0.0;
+        state->behind[i][1] = 0.0;
     }
     for (i = 0; i < 6; i++) {
         state->last.correction[i] = NAN;

@@ -41,6 +41,7 @@ author "The hexapod_comp maintainers";
 ;;
 
 #define RAMP_RATE 1e-3 /* m/s */
+#define LATE_PERIOD 1.0 /* s: late parts move on though their thermometers stand still */
 
 static void begin_once(hc_state *state, int *has_begun, double temperatures[8])
 {
@@ -87,8 +88,9 @@ FUNCTION(correct)
         standing[i] = correction(i) * unit;
     }
     for (i = 0; i < 8; i++) {
-        if (fabs(temperature(i) - temperature_now[i]) >= temperature_step
-            && hc_set_temperature(&core, i, temperature(i)) == HC_OK) {
+        const int late = hexapod_model.late.count && !(elapsed_time - core.newest[i] < LATE_PERIOD);
+        if ((late || fabs(temperature(i) - temperature_now[i]) >= temperature_step)
+            && hc_set_temperature(&core, i, temperature(i), elapsed_time) == HC_OK) {
             temperature_now[i] = temperature(i);
         }
     }

@@ -35,7 +35,7 @@ static hc_status take(hc_state *state, const hexapod_vector *vector, double leng
     hc_status status = HC_OK;
     int i;
     switch (vector->kind) {
-    case 't': return hc_set_temperature(state, (int)vector->input[0], vector->input[1]);
+    case 't': return hc_set_temperature(state, (int)vector->input[0], vector->input[1], vector->time);
     case 'e': return hc_enable(state, (int)vector->input[0]);
     case 'f': return hc_reset(state, NULL);
     case 'r': return hc_reset(state, vector->input);

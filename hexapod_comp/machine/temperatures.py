@@ -1,0 +1,109 @@
+"""Temperatures of a machine's parts, and what follows them late."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ..errors import ModelError
+from .late import PARTS, REST, Lag, LateGrowth
+
+REFERENCE_TEMPERATURE = 20.0
+"""Temperature at which geometry and model hold, °C (ISO 1)."""
+
+TEMPERATURE_RANGE = (-40.0, 120.0)
+"""Sensor readings outside this, °C, are not a machine shop's."""
+
+
+class Temperatures:
+    """Temperatures of struts, base and platform, °C; whatever has not been heard of is at 20 °C.
+
+    Attributes
+    ----------
+    values : dict of str to float
+        Readings by ``strut_1`` … ``strut_6``, ``base``, ``platform``.
+    lags : dict of str to Lag
+        How far what follows each of them is behind; whatever is not here is at rest.
+    """
+
+    NAMES = PARTS
+
+    def __init__(self, readings: Mapping[str, float] | None = None, lags: Mapping[str, Lag] | None = None) -> None:
+        self.values: dict[str, float] = {}
+        for name, value in (readings or {}).items():
+            self.set(name, value)
+        self.lags: dict[str, Lag] = dict(lags or {})
+
+    @classmethod
+    def restored(
+        cls, values: Mapping[str, float], lags: Mapping[str, Sequence[float]], time_constants: int
+    ) -> Temperatures:
+        """Return what a :meth:`snapshot` holds, for a model with so many time constants.
+
+        Raises
+        ------
+        ModelError
+            A temperature is not allowed, or a lag is not of such a model.
+        """
+        for name, numbers in lags.items():
+            if name not in values or len(numbers) != 2 + time_constants:
+                raise ModelError(f"snapshot.lags.{name}", f"must be {2 + time_constants} numbers", list(numbers))
+        return cls(values, {name: Lag(began, newest, behind) for name, (began, newest, *behind) in lags.items()})
+
+    def snapshot(self) -> dict[str, dict[str, Any]]:
+        """Return ``temperatures``, °C, and ``lags``: began and newest, s, and how far behind, K; each by name."""
+        lags = {name: [lag.began, lag.newest, *lag.behind] for name, lag in self.lags.items()}
+        return {"temperatures": dict(self.values), "lags": lags}
+
+    def follow(self, name: str, value: float, time: float, time_constants: tuple[float, ...]) -> None:
+        """Take a reading made at a time, s, on a clock that is never set; late parts follow.
+
+        The first reading finds its followers at rest: what was before nobody knows.
+
+        Raises
+        ------
+        ModelError
+            As :meth:`set`; or there are time constants, and the time is not finite. Nothing was taken.
+        """
+        before = self.values.get(name, REFERENCE_TEMPERATURE)
+        if time_constants and not math.isfinite(time):
+            raise ModelError(f"time of the temperature of {name}", "must be finite, s: the model has time constants")
+        self.set(name, value)
+        if name in self.lags:
+            self.lags[name].take(self.values[name] - before, time, time_constants)
+        elif time_constants:
+            self.lags[name] = Lag(time, time, [0.0] * len(time_constants))
+
+    def unknown_for(self, late_growth: LateGrowth, time: float) -> float:
+        """Return for how long, s, late parts are still not known at a `time`, s: the readings began too short ago.
+
+        A first reading finds them at rest. What it did not know is forgotten after three time constants.
+        """
+        begun = [lag.began for name, lag in self.lags.items() if late_growth.thermometer in ("", name)]
+        if not begun or not late_growth.time_constants:
+            return 0.0
+        return max(0.0, max(begun) + REST * late_growth.time_constants[-1] - time)
+
+    def set(self, name: str, value: float) -> None:
+        """Take a reading, whenever it was made: late parts stay as far behind as they are.
+
+        Raises
+        ------
+        ModelError
+            Unknown name, not finite, or outside :data:`TEMPERATURE_RANGE`.
+        """
+        if name not in self.NAMES:
+            raise ModelError("temperature", f"must be of one of {', '.join(self.NAMES)}", name)
+        if not TEMPERATURE_RANGE[0] <= value <= TEMPERATURE_RANGE[1]:
+            low, high = TEMPERATURE_RANGE
+            raise ModelError(f"temperature of {name}", f"must lie within {low:g}…{high:g} °C", value)
+        self.values[name] = float(value)
+
+    def at(self, name: str) -> float:
+        """Return a temperature, °C."""
+        return self.values.get(name, REFERENCE_TEMPERATURE)
+
+    def above_reference(self, name: str) -> float:
+        """Return the difference to 20 °C, K."""
+        return self.at(name) - REFERENCE_TEMPERATURE
