@@ -186,7 +186,8 @@ def _demo(parser: argparse.ArgumentParser) -> None:
 
 def _record(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--out", required=True, metavar="FOLDER", help="folder for the bag (MCAP); must not be there yet")
+    text = "folder for the bag (MCAP); must not be there yet"
+    add("--out", dest="folder", required=True, metavar="FOLDER", help=text)
     add("--namespace", default="", metavar="NAME", help="where the machine's nodes are (default: none)")
     add("--seconds", type=arguments.above_zero, metavar="S", help="end after so long (default: at Ctrl-C)")
     _json(add)

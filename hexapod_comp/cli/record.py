@@ -19,14 +19,14 @@ def run(args: argparse.Namespace) -> int:
     stop, end = threading.Event(), time.monotonic() + (args.seconds or math.inf)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    with BagRecorder(args.out, args.namespace) as recorder, common.progress_bar(0, " messages") as bar:
-        print(f"hexapod_comp: recording to {args.out} until Ctrl-C", file=sys.stderr)
+    with BagRecorder(args.folder, args.namespace) as recorder, common.progress_bar(0, " messages") as bar:
+        print(f"hexapod_comp: recording to {args.folder} until Ctrl-C", file=sys.stderr)
         recorder.run(lambda: not stop.is_set() and time.monotonic() < end, bar.update)
     if args.json:
-        common.show({"bag": args.out, "messages": recorder.counts})
+        common.show({"bag": args.folder, "messages": recorder.counts})
     else:
         print("\n".join([f"{count:8d}  {topic}" for topic, count in sorted(recorder.counts.items())]))
-        print(f"written: {args.out}")
+        print(f"written: {args.folder}")
     if not recorder.journal:
         common.say_notes(["no compensator was heard: there is nothing to replay"])
     return 0 if recorder.journal else 1

@@ -16,7 +16,7 @@ from hexapod_comp.errors import InputFileError
 from hexapod_comp.formats import outputs
 
 ROOT = Path(__file__).resolve().parents[2]
-WORDS = {"name", "namespace", "blocks", "order", "scheme", "method", "scheduler"}
+WORDS = {"name", "namespace", "blocks", "instruments", "order", "scheme", "method", "scheduler"}
 """Options whose text is no file's name."""
 
 
@@ -54,7 +54,7 @@ def test_three_options_mean_the_same_in_all_verbs():
     for verb, parser in parsers().items():
         named = {a.dest: a for a in parser._actions if a.help != SUPPRESS}
         assert named["json"].nargs == 0, verb
-        assert "out" not in named or named["out"].metavar in ("FILE", "MODEL"), verb
+        assert "out" not in named or named["out"].metavar in ("CAMPAIGN", "FILE", "MODEL"), verb
         assert "pictures" not in named or named["pictures"].metavar == "FOLDER", verb
         assert "plot" not in named, verb
 
