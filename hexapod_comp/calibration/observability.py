@@ -196,11 +196,11 @@ def without_trace(space: ParameterSpace, problem: LinearProblem) -> tuple[str, .
         if len(wanted) < len(parts):
             continue
         # A shear or a size is the same per length, and the terms run from -1 to 1 over sides of the box.
-        share = np.array(
-            [np.prod([half[AXES.index(letter)] for letter in term if letter in AXES]) for _, term in parts]
-        )
-        change = tolerances[wanted] * share / share.max()
-        if np.sqrt(np.einsum("i,kij,j->", change, problem.normal[:, wanted][:, :, wanted], change)) <= SEEN:
+        x = np.zeros(space.size)
+        x[wanted] = [np.prod([half[AXES.index(letter)] for letter in term if letter in AXES]) for _, term in parts]
+        y = np.concatenate([np.linalg.solve(block.root, x[block.part]) for block in space.blocks])
+        y *= (tolerances / np.abs(y).max())[np.abs(y).argmax()]
+        if np.sqrt(np.einsum("i,kij,j->", y, problem.normal, y)) <= SEEN:
             names.append(name)
     return tuple(names)
 
