@@ -66,8 +66,8 @@ class Datum:
     @staticmethod
     def at(pose: Pose, held: int) -> Datum:
         """Return the datum at a ``pose_platform_in_base``."""
-        x, y, z = pose.position.tolist()
-        alpha, beta, gamma = pose.angles().tolist()
+        x, y, z = (pose.position + 0.0).tolist()  # no minus in front of zero
+        alpha, beta, gamma = (pose.angles() + 0.0).tolist()
         return Datum((x, y, z), (alpha, beta, gamma), held)
 
     @property
