@@ -171,7 +171,7 @@ example:
     ),
     "plan": Verb(
         "calibration",
-        "what a measuring campaign will determine; or which one a goal needs",
+        "what a campaign will determine; or which one a goal needs",
         """Takes a campaign file and says without a single reading which parameters the campaign would determine, which
 it leaves open, and what tool error (µm) a fit of --scheme joint will leave on a machine within the tolerances.
 
@@ -235,7 +235,7 @@ example:
     ),
     "verify": Verb(
         "calibration",
-        "does a model still hold? a few check readings, and what has changed",
+        "does a model still hold, by a few readings; what has changed",
         """Weighs 6 to 20 check readings, spread over the box, against the model and what its fit knows of its
 parameters. If the machine has changed it says what has probably happened: the datum has moved, a strut's offset has
 changed (which, by how much), a temperature acts, the whole has aged, a single reading is wrong, or none of these. One
