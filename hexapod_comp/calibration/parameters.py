@@ -38,8 +38,9 @@ MAP_CORRELATION_LENGTH = 0.04
 LEAST_WARMING = 0.5
 """Temperatures that change by less, K, show no expansion: 3 µm on half a metre of steel, a sensor's drift included."""
 
-STRUTS_ALIKE = 0.9
-"""Correlation of the struts' expansions: they are built alike, and may be loaded and cooled differently."""
+STRUTS_ALIKE, STRUTS_WARMED_ALIKE = 0.998, 0.9
+"""Correlation of the struts' expansions by their own thermometers, of one material; and by another part's, late or not,
+since they may be loaded and cooled differently."""
 
 TOLERANCES = {
     "structure": 100e-6,
@@ -295,7 +296,8 @@ class ParameterSpace:
             labels = [f"{COMPONENT_UNITS[which + c][0]} {t}" for c in range(3) for t in terms]
             return np.diag(np.tile(self.field.prior, 3)), tuple(labels), "m" if which == 0 else "rad"
         if name == "expansion":
-            return growth_root(1), tuple(f"{part} expansion beyond the stated" for part in PARTS), "1/K"
+            alike = STRUTS_WARMED_ALIKE if self.settings.thermometer else STRUTS_ALIKE
+            return growth_root(1, alike), tuple(f"{part} expansion beyond the stated" for part in PARTS), "1/K"
         if name == "late":
             constants = self.settings.time_constants or ()
             labels = [f"{part} late by {constant:.0f} s" for part in PARTS for constant in constants]
@@ -448,10 +450,10 @@ def as_warmed(settings: FitSettings, stations: Stations) -> FitSettings:
     return replace(settings, thermometer=thermometer, blocks=blocks)
 
 
-def growth_root(terms: int) -> np.ndarray:
+def growth_root(terms: int, struts: float = STRUTS_WARMED_ALIKE) -> np.ndarray:
     """Return the root of the prior's correlation between the parts' growth, shape (8·terms, 8·terms)."""
     alike = np.eye(len(PARTS))
-    alike[:6, :6] += STRUTS_ALIKE * (1.0 - np.eye(6))
+    alike[:6, :6] += struts * (1.0 - np.eye(6))
     return np.kron(np.linalg.cholesky(alike), np.eye(terms))
 
 
