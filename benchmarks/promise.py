@@ -7,7 +7,7 @@ fields) show that neither is bought by widening everything; the others carry wha
 higher harmonics of the screws, joints whose error of 20 µm depends on their angle, beams 1.5 mrad off, a drift of
 0.5 K that nobody wrote down, gross errors with an instrument that slips, and all of these together.
 
-Usage: python -m benchmarks.promise [--machines 12] [--workers 2] [--kind NAME ...] [--json]
+Usage: python -m benchmarks.promise [--machines 12] [--first 100] [--workers 2] [--kind NAME ...] [--json]
 
 Exits 1 when a bar is missed: 93 % kept or refused; of the own class none refused, and a median width of at most 1.3.
 """
@@ -274,6 +274,7 @@ def main() -> int:
     """Run the kinds and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--machines", type=int, default=12, help="machines of each kind (default 12)")
+    parser.add_argument("--first", type=int, default=100, help="seed of the first machine (default 100)")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: all cores)")
     parser.add_argument("--kind", action="append", choices=(*OWN, *FOREIGN), help="only this; may be repeated")
     parser.add_argument("--json", action="store_true", help="JSON instead of a table")
@@ -288,7 +289,7 @@ def main() -> int:
     with pool, tqdm(total=len(kinds) * args.machines, disable=None) as bar:
         for kind in kinds:
             outcomes = []
-            for outcome in pool.map(one_machine, [kind] * args.machines, range(args.machines)):
+            for outcome in pool.map(one_machine, [kind] * args.machines, range(args.first, args.first + args.machines)):
                 outcomes.append(outcome)
                 bar.update()
             rows.append(summed_up(kind, outcomes))
