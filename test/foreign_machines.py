@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
 MM, INCH = 1e-3, 0.0254
 UM = 1e-6
@@ -268,13 +269,14 @@ def tool_errors(machine: Machine, truth: Errors, believed: Errors | None, tips: 
 
 
 def aligned_rms(tips: np.ndarray, errors: np.ndarray) -> float:
-    """Return the RMS length of errors after the best small shift and rotation, by least squares."""
-    x, y, z = (tips - tips.mean(axis=0)).T
-    o, i = np.zeros_like(x), np.ones_like(x)
-    rows = np.stack([[i, o, o, o, z, -y], [o, i, o, -z, o, x], [o, o, i, y, -x, o]]).transpose(2, 0, 1).reshape(-1, 6)
-    flat = errors.ravel()
-    left = flat - rows @ np.linalg.lstsq(rows, flat, rcond=None)[0]
-    return float(np.sqrt((left @ left) / len(tips)))
+    """Return the RMS length of errors after the best shift and rotation, by least squares.
+
+    By Kabsch's method (SciPy's), not to first order: a turn of 0.5 mrad alone would leave 12 nm at 0.1 m.
+    """
+    there = tips + errors
+    onto, moved = tips - tips.mean(axis=0), there - there.mean(axis=0)
+    left = Rotation.align_vectors(onto, moved)[0].apply(moved) - onto
+    return float(np.sqrt((left**2).sum(axis=1).mean()))
 
 
 def _paper() -> tuple[np.ndarray, np.ndarray]:

@@ -132,7 +132,7 @@ def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
     if (geometry.screw_lead != lead).any():
         problem = "must be the same for all struts: genhexkins has one screw-lead"
         raise GeometryError("screw.lead", problem, geometry.screw_lead.tolist())
-    base_axes, platform_axes = geometry.kernel_axes
+    _, _, base_axes, platform_axes = machine.body
     # genhexkins' arcsine has the sign of a right-hand thread where the axis vectors point apart (theory, 8).
     turned = -_side(machine, box)[:, None]
     work, tool = geometry.work, geometry.tool

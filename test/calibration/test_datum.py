@@ -81,8 +81,7 @@ def laser_fit() -> ModelFit:
 def projection(readings) -> np.ndarray:
     """Return what readings do not show at home, by the fit's own weights at a tolerance of 0.1 mm."""
     estimation = Estimation(readings, laser_fit().space, alone=False)
-    posterior = replace(laser_fit().solution.posterior, tolerances=np.array([1e-4]), noise=np.ones(len(KINDS)))
-    return unseen_part(estimation, posterior, small.paper().home)
+    return unseen_part(estimation, 1e-4, np.ones(len(KINDS)), small.paper().home)
 
 
 def test_a_tracker_is_believed_and_one_pose_of_it_shows_no_more_than_its_place() -> None:

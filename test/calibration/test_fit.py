@@ -405,7 +405,7 @@ def test_too_few_readings_are_refused_with_their_numbers():
 def test_wrong_units_are_a_calibration_error(factor: float):
     """38 µm read as 38 mm or 38 m: no machine is like that."""
     ours = readings()
-    with pytest.raises(CalibrationError, match="units"):
+    with pytest.raises(CalibrationError, match=r"units|does the unit fit\?"):
         fit_model(ours.with_values(factor * ours.value), FEW)
 
 

@@ -16,7 +16,7 @@ from hexapod_comp.errors import InputFileError
 from hexapod_comp.formats import outputs
 
 ROOT = Path(__file__).resolve().parents[2]
-WORDS = {"name", "namespace", "blocks", "instruments", "order", "scheme", "method", "scheduler"}
+WORDS = {"name", "namespace", "blocks", "instruments", "order", "scheme", "method", "scheduler", "thermometer"}
 """Options whose text is no file's name."""
 
 

@@ -301,7 +301,8 @@ def test_campaign(folder: Path, changes: list) -> None:
         assert getattr(found, name) == number_of(tree.get(name, default))
     assert (found.instrument or "none") == tree.get("instrument", "none")
     noise = tree.get("noise", {"": None})
-    kinds = (("linear", 1e-6), ("straightness", 1e-6), ("rotation", 1e-6), ("position", 10e-6), ("attitude", 10e-6))
+    kinds = [("linear", 1e-6), ("straightness", 1e-6), ("rotation", 1e-6), ("position", 10e-6), ("attitude", 10e-6)]
+    kinds += [("length", 1e-6), ("displacement", 1e-6)]
     for sigma, (name, default) in zip(found.noise, kinds, strict=True):
         same(sigma, quantity(noise, name, "angle" if name in ("rotation", "attitude") else "length", default))
 

@@ -287,7 +287,7 @@ def test_snapshot_takes_another_compensator_to_the_same_place():
     ):
         with pytest.raises(ModelError, match=complaint):
             other.restore(whole | change)
-    for name in whole:
+    for name in whole.keys() - {"lags"}:  # earlier releases had none
         with pytest.raises(ModelError, match=rf"snapshot\.{name}: is missing"):
             other.restore({key: value for key, value in whole.items() if key != name})
     assert repr(other.snapshot()) == before, "what is refused changes nothing"
