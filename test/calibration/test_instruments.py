@@ -136,7 +136,7 @@ def fitted(machine: Machine, truth: Errors, folder: Path, what: str) -> ModelFit
 @pytest.mark.parametrize("what", ["stations", "circles and R-tests"])
 @pytest.mark.parametrize("name", ZOO)
 def test_instruments_mend_machines_of_all_kinds(name: str, what: str, tmp_path: Path) -> None:
-    """Errors of 50 µm, readings of 0.5 µm: a tenth is left at most at tips that nobody measured, the datum aligned.
+    """Errors of 50 µm, readings of 0.5 µm: a quarter is left at most at tips that nobody measured, the datum aligned.
 
     Circles that all are about as large do not show how large: what they leave besides is that.
     """
