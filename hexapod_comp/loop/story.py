@@ -256,7 +256,13 @@ def promises(fit: ModelFit, poses: Sequence[Pose], path: Path) -> tuple[tuple[fl
         across = aligned - along[:, :, None] * np.einsum("ni,nid->nd", along, aligned)[:, None]
         sizes.append([np.sqrt((e**2).sum(axis=1).mean(axis=0)) for e in (aligned[rest], across[len(poses) :])])
     (rest_left, path_left), (rest_possible, path_possible) = sizes
-    return interval(rest_left, rest_possible), interval(path_left, path_possible)
+    # What widens a promise leaves its lower end where it is, here as in the fit's report.
+    widened = fit.verdict.unexplained.factor
+    (rest_low, rest_high), (path_low, path_high) = (
+        interval(rest_left, rest_possible),
+        interval(path_left, path_possible),
+    )
+    return (rest_low / widened, rest_high), (path_low / widened, path_high)
 
 
 def left_by_drives(
