@@ -129,6 +129,8 @@ def look_for_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
     # So far the waves counted as noise, which let the priors weigh too much.
     quiet = solve(space, problem, posterior.tolerances, posterior.noise * best.noise, rounds=0)
     best = _Rest(estimation, problem, quiet).line(best.frequency)
+    if not np.isfinite(best.error):
+        return ScrewLead(given, None, np.inf, odds)
     return ScrewLead(given, float(1.0 / best.frequency), float(best.error / best.frequency**2), odds)
 
 
@@ -209,7 +211,10 @@ class _Rest:
         return 0.5 * self.freedom * float(np.log(self.square / left)) - parameters
 
     def _step_to(self, frequency: float, harmonics: int) -> tuple[float, float, float]:
-        """Return by how much waves of a frequency lower the squares, the step to a better one, its error at noise 1."""
+        """Return by how much waves of a frequency lower the squares, the step to a better one, its error at noise 1.
+
+        Readings that cannot tell a frequency from all else, to rounding, ask for no step, with an infinite error.
+        """
         angle = 2.0 * np.pi * frequency * self.commands
         orders = np.arange(1, harmonics + 1)
         c, s = (self.gains[:, None] * f(orders[:, None] * angle[:, None]) for f in (np.cos, np.sin))
@@ -221,6 +226,8 @@ class _Rest:
         slope = self._free(((b * c - a * s) * turning).sum(axis=(1, 2))[:, None])
         every = np.hstack([waves, slope]), np.hstack([shared, self._rows.T @ slope])
         together, _, covariance = self._solved(*every, loose=1)
+        if not covariance[-1, -1] > 0.0:
+            return less, 0.0, np.inf
         return less, float(together[-1]), float(np.sqrt(covariance[-1, -1]))
 
     def _free(self, columns: np.ndarray) -> np.ndarray:

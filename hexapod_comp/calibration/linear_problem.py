@@ -255,7 +255,7 @@ def held_out(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
         sums.setdefault(part.fold, []).append(part)
     order = np.argsort(problem.fold, kind="stable")
     folds = np.split(order, np.flatnonzero(np.diff(problem.fold[order])) + 1)
-    root, precision = np.linalg.cholesky(posterior.covariance), _whitened_precision(problem, posterior)
+    root, precision = np.linalg.cholesky(posterior.covariance), whitened_precision(problem, posterior)
     result = np.empty(len(residual))
     for members in folds:
         parts = sums.get(int(problem.fold[members[0]]))
@@ -272,7 +272,7 @@ def held_out(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
     return result
 
 
-def _whitened_precision(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
+def whitened_precision(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
     """Return the precision of y over the prior's spread, shape (n, n)."""
     precision = np.tensordot(posterior.noise**-2, problem.normal[:, posterior.used[:, None], posterior.used], 1)
     precision *= posterior.spread[:, None] * posterior.spread

@@ -9,13 +9,16 @@ is fitted to what is left. The scale of an instrument, which no reading shows, i
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg.lapack import dtrtrs
 
 from ..measurements.readings import ANGULAR_KINDS, BACKWARD, FORWARD, KINDS, MeasurementSet
 from ..virtual.trial import without_datum
 from .estimation import Estimation, Solution
+from .linear_problem import whitened_precision
 from .observability import ToolError, box_stations
 from .parameters import FitSettings, ParameterSpace
 from .sensitivity import derivatives, predict
@@ -69,6 +72,9 @@ STEEL = 11.5e-6
 
 LEAST_RUNS = 6
 """A drift is looked for in so many runs of a linear laser, or more."""
+
+NEGLIGIBLE = 1e-4
+"""Effects on the tool that together are below this share of its squared error cannot matter, whatever is left out."""
 
 LEAST_PAIRS = 30
 """Pairs of readings there and back from which on their likeness tells the machine's errors from noise."""
@@ -240,34 +246,105 @@ def family_of_run(measurements: MeasurementSet) -> np.ndarray:
 
 
 def _left_out(r: Residuals) -> tuple[float, str]:
-    """Return the largest factor on standard deviations that leaving something out shows, and what that was.
-
-    With group g left out the parameters change by δ, whose covariance is C₋g − C if the model is right. M turns both
-    into the tool's mean squared error in the measured box.
-    """
+    """Return the largest factor on standard deviations that leaving something out shows, and what that was."""
     metric = _tool_metric(r.estimation.space, r.solution)
     if metric is None:
         return 1.0, ""
-    covariance = r.solution.posterior.covariance
-    information = np.linalg.inv(covariance)
+    leaving = _Leaving(metric, r.solution)
+    changes: dict[str, list[tuple[float, float, float]]] = {}
+    for what, information in _groups(r):
+        changes.setdefault(what, []).append(leaving.change(information))
     worst, name = 1.0, ""
-    for what, groups in _groupings(r).items():
-        shown, expected, freedom = [], [], []
-        for group in np.unique(groups):
-            members = groups == group
-            if members.all():
-                continue
-            rows = r.rows[members]
-            without = np.linalg.inv(information - rows.T @ rows)
-            change = without @ (rows.T @ r.residual[members])
-            spread = metric @ (without - covariance)
-            shown.append(change @ metric @ change)
-            expected.append(np.trace(spread))
-            freedom.append(expected[-1] ** 2 / np.trace(spread @ spread))
-        ratio, limit = _excess(np.array(shown), np.array(expected), np.array(freedom))
+    for what, listed in changes.items():
+        ratio, limit = _excess(*np.transpose(listed))
         if ratio > max(limit, worst**2):
             worst, name = float(np.sqrt(ratio)), what
     return worst, name
+
+
+@dataclass
+class _Information:
+    """What some cells say of the parameters in use: rowsᵀ·rows, (n, n), and rowsᵀ·residual, (n,)."""
+
+    normal: np.ndarray
+    moment: np.ndarray
+
+    @staticmethod
+    def of(r: Residuals, members: np.ndarray) -> _Information:
+        """Return that of cells given by their mask; only the parameters that a channel sees are multiplied."""
+        size = r.rows.shape[1]
+        result, channels = _Information(np.zeros((size, size)), np.zeros(size)), r.estimation.cells.channel
+        for channel in np.unique(channels[members]):
+            chosen = np.flatnonzero(members & (channels == channel))
+            rows = r.rows[chosen]
+            seen = np.flatnonzero(rows.any(axis=0))
+            rows = rows[:, seen]
+            result.normal[np.ix_(seen, seen)] += rows.T @ rows
+            result.moment[seen] += r.residual[chosen] @ rows
+        return result
+
+    def add(self, other: _Information) -> None:
+        """Add other cells."""
+        self.normal += other.normal
+        self.moment += other.moment
+
+
+class _Leaving:
+    """What the tool's error becomes where some cells are left out of a fit.
+
+    With group g left out the parameters change by δ, whose covariance is C₋g − C if the model is right. M turns both
+    into the tool's mean squared error in the measured box; M = FᵀF, F without what no prior lets happen.
+    """
+
+    def __init__(self, metric: np.ndarray, solution: Solution) -> None:
+        posterior = solution.posterior
+        self._spread = posterior.spread
+        self._precision = whitened_precision(solution.problem, posterior)
+        values, vectors = np.linalg.eigh(self._spread[:, None] * metric * self._spread)
+        unheeded = NEGLIGIBLE * np.vdot(metric, posterior.covariance)
+        kept = np.cumsum(values) > unheeded  # ascending
+        self._effects = np.asfortranarray(vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0)))
+        whole = self._halved(self._precision)[0]
+        self._expected = whole.T @ whole
+
+    def change(self, group: _Information) -> tuple[float, float, float]:
+        """Return the squared change that leaving a group out makes, what it should be, and its degrees of freedom."""
+        left = self._precision - self._spread[:, None] * group.normal * self._spread
+        half, moment = self._halved(left, self._spread * group.moment)
+        spread = half.T @ half - self._expected
+        moved, expected = half.T @ moment, float(np.trace(spread))
+        return float(moved @ moved), expected, expected**2 / float(np.vdot(spread, spread))
+
+    def _halved(self, precision: np.ndarray, moment: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return K⁻¹·F and K⁻¹·moment, with K·Kᵀ a whitened precision."""
+        factor = np.linalg.cholesky(precision)
+        moment = np.zeros(len(factor)) if moment is None else moment
+        half, _ = dtrtrs(factor, self._effects, lower=1)
+        return half, dtrtrs(factor, moment, lower=1)[0]
+
+
+def _groups(r: Residuals) -> Iterator[tuple[str, _Information]]:
+    """Yield what is left out in turn, by name, as what it says; nothing where it would be all."""
+    of_runs, runs = _groupings_of_runs(r), np.unique(r.run)
+    sums: dict[tuple[str, float], _Information] = {}
+    for run in runs if len(runs) > 1 else ():
+        information = _Information.of(r, r.run == run)
+        yield "line", information
+        for what, groups in of_runs.items():
+            if len(np.unique(groups[runs])) == 1:
+                continue
+            key = what, float(groups[run])
+            if key in sums:
+                sums[key].add(information)
+            else:
+                sums[key] = replace(information, normal=information.normal.copy(), moment=information.moment.copy())
+    yield from ((what, information) for (what, _), information in sums.items())
+    quarter = np.floor((r.rank + 0.5) * (QUARTERS - 1e-9))
+    cut = {"direction": r.direction, "quarter of the time": quarter, "channel": r.estimation.cells.kind}
+    for what, groups in cut.items():
+        different = np.unique(groups)
+        for group in different if len(different) > 1 else ():
+            yield what, _Information.of(r, groups == group)
 
 
 def _excess(shown: np.ndarray, expected: np.ndarray, freedom: np.ndarray) -> tuple[float, float]:
@@ -295,19 +372,17 @@ def _tool_metric(space: ParameterSpace, solution: Solution) -> np.ndarray | None
     return effects.T @ effects / len(points)
 
 
-def _groupings(r: Residuals) -> dict[str, np.ndarray]:
-    """Return what is left out together, by name: a number for each cell."""
+def _groupings_of_runs(r: Residuals) -> dict[str, np.ndarray]:
+    """Return which runs are left out together, by name: a number for each run."""
     m = r.estimation.measurements
     family = family_of_run(m)
     places = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)[0][r.estimation.cells.station]
     count = np.maximum(np.bincount(r.run, minlength=len(m.runs)), 1)
-    groups = {"line": r.run, "family of lines": family[r.run], "direction": r.direction}
+    groups = {"family of lines": family}
     for axis, name in enumerate("xyz"):
         middle = np.bincount(r.run, places[:, axis], len(m.runs)) / count
         across = (family < 3) & (family != axis)
-        groups[f"plane across {name}"] = np.where(across, np.round(middle / PLACE), np.inf)[r.run]
-    groups["quarter of the time"] = np.floor((r.rank + 0.5) * (QUARTERS - 1e-9))
-    groups["channel"] = r.estimation.cells.kind
+        groups[f"plane across {name}"] = np.where(across, np.round(middle / PLACE), np.inf)
     return groups
 
 

@@ -111,6 +111,7 @@ def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, pa
 def _content(fitted: FittedParameters) -> bytes:
     space, stream = fitted.space, io.BytesIO()
     head = {"format": FORMAT, "version": VERSION, "machine": space.geometry.name, "settings": asdict(space.settings)}
+    head["kinds"] = KINDS
     arrays = {name: getattr(fitted, name) for name in ("x", "tolerances", "noise")}
     arrays["covariance"] = fitted.covariance[np.tril_indices(space.size)]  # it is symmetric
     arrays |= {f"region_{name}": value for name, value in vars(space.region).items()}
@@ -192,7 +193,8 @@ def _parsed(content: bytes, path: Path, geometry: HexapodGeometry) -> FittedPara
         covariance = np.zeros((space.size, space.size))
         covariance[np.tril_indices(space.size)] = arrays["covariance"]
         covariance += np.tril(covariance, -1).T
-        fitted = FittedParameters(space, arrays["x"], covariance, arrays["tolerances"], arrays["noise"], _held(arrays))
+        noise = _noise(arrays["noise"], head.get("kinds"))
+        fitted = FittedParameters(space, arrays["x"], covariance, arrays["tolerances"], noise, _held(arrays))
     except (KeyError, TypeError, ValueError, zipfile.BadZipFile, ModelError, PoseError) as error:
         raise InputFileError(path, "", f"is no file of a fit's posterior: {error}") from error
     shapes = {"x": (space.size,), "covariance": (space.size,) * 2}
@@ -202,6 +204,19 @@ def _parsed(content: bytes, path: Path, geometry: HexapodGeometry) -> FittedPara
         if array.shape != shape or not np.isfinite(array).all():
             raise InputFileError(path, name, f"must be finite, of shape {shape}", list(array.shape))
     return fitted
+
+
+def _noise(factors: np.ndarray, kinds: list[str] | None) -> np.ndarray:
+    """Return a file's noise factors in the order of :data:`KINDS`; 1 for kinds that it does not know.
+
+    Files that do not name the kinds are older, and have the first ones.
+    """
+    names = KINDS[: len(factors)] if kinds is None else kinds
+    known = dict(zip(names, factors, strict=True))
+    unknown = [name for name in known if name not in KINDS]
+    if unknown:
+        raise ValueError(f"kinds {unknown} are unknown; allowed are {list(KINDS)}")
+    return np.array([known.get(name, 1.0) for name in KINDS])
 
 
 def _held(arrays: dict[str, np.ndarray]) -> HeldDatum | None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import json
 from pathlib import Path
 
 import calibration_helpers as small
@@ -182,6 +183,41 @@ def test_what_a_fit_knows_comes_back_from_its_file(tmp_path: Path) -> None:
     again, first = found.space.model(found.x), fitted.space.model(fitted.x)
     np.testing.assert_array_equal(again.platform_deviation, first.platform_deviation)
     np.testing.assert_array_equal(again.struts.pitch, first.struts.pitch)
+
+
+def rewritten(path: Path, noise: np.ndarray, **head: object) -> None:
+    """Replace noise and entries of the head, None: without it, in the file beside a model; the model knows its hash."""
+    beside = path.with_name("after the crash.posterior.npz")
+    with np.load(beside) as archive:
+        arrays = dict(archive)
+    changed = json.loads(str(arrays["head"])) | head
+    arrays["head"] = np.array(json.dumps({name: value for name, value in changed.items() if value is not None}))
+    before = hashlib.sha256(beside.read_bytes()).hexdigest()
+    np.savez_compressed(beside, **(arrays | {"noise": noise}))
+    path.write_text(path.read_text().replace(before, hashlib.sha256(beside.read_bytes()).hexdigest()))
+
+
+def test_noise_goes_by_the_names_of_its_kinds(tmp_path: Path) -> None:
+    """Files from before lengths and displacements have five kinds without names; later kinds have another order."""
+    fitted, path = saved(tmp_path)
+    geometry = fitted.space.geometry
+    factors = np.linspace(2.0, 3.0, len(KINDS))
+
+    def stored() -> tuple[FittedParameters | None, str]:
+        return load_posterior(load_model(path, geometry), geometry, path)
+
+    rewritten(path, factors[:5], kinds=None)
+    parameters, why = stored()
+    assert parameters is not None, why
+    np.testing.assert_array_equal(parameters.noise, [*factors[:5], 1.0, 1.0])
+    rewritten(path, factors[::-1], kinds=KINDS[::-1])
+    parameters, why = stored()
+    assert parameters is not None, why
+    np.testing.assert_array_equal(parameters.noise, factors)
+    rewritten(path, factors[:1], kinds=["taste"])
+    assert "kinds ['taste'] are unknown" in stored()[1]
+    rewritten(path, factors[:1], kinds=KINDS)
+    assert "is no file of a fit's posterior" in stored()[1]
 
 
 def test_what_is_not_the_models_own_is_not_known(tmp_path: Path) -> None:
