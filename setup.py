@@ -99,15 +99,17 @@ setup(
             "plotly>=5.18",
             "distributed>=2023.12",
             "rosbags>=0.11",
+            "viser>=1.0",
             "argcomplete>=3.1",
         ],
         # The site: `make docs`. Formulas become MathML, which needs no script from elsewhere.
         "docs": ["sphinx>=8.1", "myst-nb>=1.1", "furo>=2024.8", "latex2mathml>=3.77"],
         "bench": ["mujoco>=3.1", "pin>=2.7"],
-        # Imported where used. The first three have no rosdep keys, and a clear message says when one is missing.
+        # Imported where used. The first four have no rosdep keys, and a clear message says when one is missing.
         "pages": ["plotly>=5.18"],
         "cluster": ["distributed>=2023.12"],
         "bags": ["rosbags>=0.11"],
+        "watch": ["viser>=1.0"],
         "completion": ["argcomplete>=3.1"],  # rosdep: python3-argcomplete; nobody needs it to run anything
     },
     entry_points={

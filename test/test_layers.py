@@ -18,7 +18,7 @@ ROOMS = (
 MODULES = sorted(PACKAGE.rglob("*.py"))
 ROS_ROOMS = ("nodes", "linuxcnc", "testing")
 PICTURE_MODULES = ("pictures", "page", "figures")
-PICTURE_LIBRARIES = {"matplotlib", "mpl_toolkits", "plotly"}
+PICTURE_LIBRARIES = {"matplotlib", "mpl_toolkits", "plotly", "viser"}
 
 
 def loaded(path: Path) -> Iterator[tuple[int, list[str]]]:

@@ -38,7 +38,7 @@ PYPI_NAMES = {"yaml": "pyyaml"}
 # and lz4 with rosbags, hal and linuxcnc with LinuxCNC, benchmarks are the source tree's; the others are optional
 # extras, what only `pytest -n` needs, and benchmark tools.
 COMING_WITH = {"setuptools", "mpl_toolkits", "llvmlite", "apsw", "lz4", "hal", "linuxcnc", "benchmarks"}
-EXEMPT = COMING_WITH | {"xdist", "argcomplete", "plotly", "distributed", "rosbags", "mujoco", "pinocchio"}
+EXEMPT = COMING_WITH | {"xdist", "argcomplete", "plotly", "distributed", "rosbags", "mujoco", "pinocchio", "viser"}
 WITHOUT_ROS = """
 import importlib, sys
 

@@ -119,6 +119,11 @@ def count(text: str, most: int = 10_000_000) -> int:
     return int(text)
 
 
+def port(text: str) -> int:
+    """Read a port's number."""
+    return count(text, 65535)
+
+
 def trials(text: str) -> int:
     """Read how many poses to check: a thousand or more."""
     value = count(text)

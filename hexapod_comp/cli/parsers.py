@@ -184,6 +184,15 @@ def _demo(parser: argparse.ArgumentParser) -> None:
     _pictures(add, "out")
 
 
+def _watch(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    _machine(add)
+    add("--namespace", default="", metavar="NAME", help="where the machine's nodes are (default: none)")
+    text = "address to serve on (default 127.0.0.1: this computer alone; 0.0.0.0: all that reach it)"
+    add("--host", default="127.0.0.1", metavar="ADDRESS", help=text)
+    add("--port", type=arguments.port, default=8080, metavar="N", help="port to serve on (default 8080)")
+
+
 def _record(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     text = "folder for the bag (MCAP); must not be there yet"
@@ -466,6 +475,7 @@ OPTIONS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     "check": _check,
     "run": _run,
     "demo": _demo,
+    "watch": _watch,
     "record": _record,
     "replay": _replay,
     "plan": _plan,

@@ -139,6 +139,18 @@ example:
   $ hexapod_comp demo --machine mine.yaml --truth random:7
   $ hexapod_comp demo --model paper_lines_model     (the scheme of Mou & King 1998 on 1-D lines)""",
     ),
+    "watch": Verb(
+        "loop",
+        "show a running machine in the browser: 3-D, errors, refusals",
+        """Serves a page on this computer alone, unless --host says otherwise: the machine in 3-D, its struts coloured
+by correction, the tool's error (µm, µrad) as predicted and as left, what compensator and drive say of themselves,
+refusals, strut lengths (mm), and latencies (ms). It only listens in this ROS domain: nothing on the page moves or
+changes anything. It ends at Ctrl-C. It needs viser: pip install hexapod_comp[watch].
+
+example:
+  $ hexapod_comp watch --machine mine.yaml
+  hexapod_comp: mine is shown on http://127.0.0.1:8080 until Ctrl-C""",
+    ),
     "record": Verb(
         "loop",
         "record a running machine's topics, for replay",

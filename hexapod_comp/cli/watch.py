@@ -1,0 +1,27 @@
+"""``hexapod_comp watch``: a local page that shows a running machine."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the verb until Ctrl-C."""
+    from ..machine.geometry import load_geometry
+    from ..nodes.page import WatchPage
+    from ..nodes.watching import watch
+
+    geometry = load_geometry(args.machine)
+    stop = threading.Event()
+    page = WatchPage(geometry, args.host, args.port)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    print(f"hexapod_comp: {geometry.name} is shown on {page.address} until Ctrl-C", file=sys.stderr)
+    try:
+        watch(geometry, page.show, lambda: not stop.is_set(), args.namespace)
+    finally:
+        page.close()
+    return 0

@@ -1,0 +1,239 @@
+"""The page on which a person watches a machine, served by viser: the machine in 3-D, and its state in words."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import socket
+from html import escape
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from ..errors import HexapodError
+from ..machine.geometry import HexapodGeometry
+from ..pose import Pose
+from .health import ERROR, OK, WARN
+from .markers import correction_colour
+from .watching import NODES, WINDOW, Latency, View, WatchedError
+
+GREY = (128, 128, 140)
+UNKNOWN = (50, 50, 55)
+"""Struts of a machine that is not heard; viser shows the ends' own colours lighter than a line's one colour."""
+
+STEEL = (110, 150, 210)
+GOLD = (240, 190, 60)
+COLOURS = {OK: "#3fb950", WARN: "#d9a520", ERROR: "#f85149"}
+SILENT = "#8b949e"
+
+TITLES = dict(zip(NODES, ("Compensator", "Drive"), strict=True))
+
+KEYS = {
+    "commanded_by": "commanded by",
+    "command_rate_hz": "commands per second",
+    "refused": "refused",
+    "last_refusal": "last refusal",
+    "model": "model",
+    "compensation": "compensation",
+}
+"""What of the diagnostics' values is shown, and its name."""
+
+
+class WatchPage:
+    """A page that shows views of a machine; nothing on it changes anything.
+
+    Parameters
+    ----------
+    geometry : HexapodGeometry
+        The machine.
+    host : str
+        Address on which the page is served.
+    port : int
+        Its port.
+
+    Raises
+    ------
+    HexapodError
+        viser is not installed, or the address cannot be had.
+
+    Attributes
+    ----------
+    address : str
+        What to open in a browser.
+    """
+
+    def __init__(self, geometry: HexapodGeometry, host: str = "127.0.0.1", port: int = 8080) -> None:
+        self._geometry = geometry
+        self._server = _serve(host, port)
+        shown = f"[{host}]" if ":" in host else host
+        self.address = f"http://{shown}:{self._server.get_port()}"
+        self._size = geometry.characteristic_length
+        self._camera()
+        scene, home = self._server.scene, geometry.home
+        thick = 0.06 * self._size
+        base = _outline(geometry.base_joints)
+        scene.add_line_segments("/base", base, GREY, thickness=0.5 * thick)
+        platform = _outline(geometry.platform_joints)
+        self._platform = scene.add_line_segments("/platform", platform, STEEL, thickness=thick)
+        tool = np.array([[np.zeros(3), geometry.tool.position]])
+        scene.add_line_segments("/platform/spindle", tool, GOLD, thickness=thick)
+        for name, pose in (("/platform/tool", geometry.tool), ("/work", geometry.work)):
+            frame = scene.add_frame(name, axes_length=0.4 * self._size, axes_radius=0.2 * thick)
+            frame.position, frame.wxyz = pose.position, np.roll(pose.quaternion(), 1)
+        self._struts = scene.add_line_segments(
+            "/struts", strut_ends(geometry, home), strut_colours(None), thickness=thick
+        )
+        self._words = self._server.gui.add_html("")
+        self._shown = ""
+        self.show(View())
+
+    def close(self) -> None:
+        """Serve no more."""
+        with contextlib.redirect_stdout(io.StringIO()):  # its farewell
+            self._server.stop()
+
+    def show(self, view: View) -> None:
+        """Show a view; the machine stays where it was last, in grey, while nothing is heard of it."""
+        server = self._server
+        with server.atomic():
+            if view.platform is not None:
+                self._struts.points = strut_ends(self._geometry, view.platform).astype(np.float32)
+                self._platform.position = view.platform.position
+                self._platform.wxyz = np.roll(view.platform.quaternion(), 1)
+            alive = view.platform is not None
+            self._struts.colors = strut_colours(view.corrections if alive else None)
+            text = words(view, self._geometry.name)
+            if text != self._shown:
+                self._words.content = self._shown = text
+
+    def _camera(self) -> None:
+        """Look at the machine from the side and a little from above."""
+        ends = strut_ends(self._geometry, self._geometry.home).reshape(-1, 3)
+        self._server.scene.set_up_direction("+z")
+        centre = 0.5 * (ends.min(axis=0) + ends.max(axis=0))
+        distance = 1.3 * float(np.linalg.norm(np.ptp(ends, axis=0)))
+        view = self._server.initial_camera
+        view.position = centre + distance * np.array([0.8, -0.6, 0.35])
+        view.look_at = centre
+
+
+def strut_ends(geometry: HexapodGeometry, platform: Pose) -> np.ndarray:
+    """Return both ends of each strut in ``base`` for a ``pose_platform_in_base``, shape (6, 2, 3), m."""
+    tops = platform.position + geometry.platform_joints @ platform.rotation.T
+    return np.stack([geometry.base_joints, tops], axis=1)
+
+
+def strut_colours(corrections: np.ndarray | None) -> np.ndarray:
+    """Return the struts' colours, shape (6, 2, 3), 0 … 255: as the markers', grey where not known."""
+    if corrections is None:
+        return np.full((6, 2, 3), UNKNOWN, dtype=np.uint8)
+    colours = [correction_colour(correction) for correction in corrections]
+    return np.array([[[round(255 * c) for c in (colour.r, colour.g, colour.b)]] * 2 for colour in colours], np.uint8)
+
+
+def words(view: View, machine: str) -> str:
+    """Return what is known as HTML: states and refusals, errors, corrections, latencies. All of it is escaped."""
+    parts = [_heading(escape(machine))]
+    parts += [_state(name, view.states.get(name), machine) for name in NODES]
+    errors = {
+        "without compensation, by the model": view.predicted,
+        "left, by the estimate": view.left,
+        "left, by tool_pose_true": view.seen,
+    }
+    parts.append(_heading("Tool error, axes of work"))
+    parts.append(_table({name: _error(error) for name, error in errors.items()}))
+    parts.append("<small>Left is tool − command: while the machine moves it holds the drives' lag too.</small>")
+    parts.append(_heading("Struts"))
+    parts.append(_struts(view))
+    parts.append("<small>blue −100 µm, white 0, red +100 µm; grey: not heard</small>")
+    parts.append(_heading("Latency, stamp of a command to its answer here"))
+    parts.append(f"<div>{_latency(view.latency)}</div>")
+    return f'<div style="padding: 0 1em 1em; font-size: 0.85em; line-height: 1.35">{"".join(parts)}</div>'
+
+
+def _state(name: str, status: DiagnosticStatus | None, machine: str) -> str:
+    if status is None:
+        return f'{_heading(TITLES[name])}<div style="color: {SILENT}">not heard</div>'
+    values = {entry.key: entry.value for entry in status.values}
+    shown = {title: escape(values[key]) for key, title in KEYS.items() if values.get(key)}
+    shown.update(
+        {f"refused: {escape(key[8:])}": escape(value) for key, value in values.items() if key.startswith("refused.")}
+    )
+    colour = COLOURS.get(status.level, SILENT)
+    text = f'{_heading(TITLES[name])}<div style="color: {colour}"><b>{escape(status.message)}</b></div>{_table(shown)}'
+    runs = status.name.partition(": ")[2]
+    if runs not in ("", "starting", machine):
+        text += f'<div style="color: {COLOURS[ERROR]}">runs the machine {escape(runs)}, not {escape(machine)}</div>'
+    return text
+
+
+def _error(error: WatchedError | None) -> str:
+    """Return an error in words, µm and µrad."""
+    if error is None:
+        return "not known"
+    x, y, z = 1e6 * error.displacement
+    spread = f" ± {1e6 * error.deviation:.1f}" if np.isfinite(error.deviation) else ""
+    length = 1e6 * float(np.linalg.norm(error.displacement))
+    return f"<b>{length:.1f}{spread} µm</b>, {1e6 * error.turn:.0f} µrad<br>{x:+.1f}, {y:+.1f}, {z:+.1f} µm"
+
+
+def _struts(view: View) -> str:
+    """Return measured lengths, mm, and corrections, µm."""
+    rows = {}
+    for number in range(6):
+        measured = "–" if view.measured is None else f"{1e3 * view.measured[number]:.4f} mm"
+        correction = "–" if view.corrections is None else f"{1e6 * view.corrections[number]:+.1f} µm"
+        rows[str(number + 1)] = f"{measured} &nbsp; {correction}"
+    return _table(rows)
+
+
+def _latency(latency: Latency | None) -> str:
+    if latency is None:
+        return "no commands"
+    median, largest = 1e3 * latency.median, 1e3 * latency.largest
+    return f"median {median:.2f} ms, largest {largest:.2f} ms, of {latency.count} in {WINDOW:g} s"
+
+
+def _heading(text: str) -> str:
+    return f'<h4 style="margin: 0.7em 0 0.2em">{text}</h4>'
+
+
+def _table(rows: dict[str, str]) -> str:
+    first = '<td style="padding-right: 1em">'
+    cells = "".join(f"<tr>{first}{name}</td><td>{text}</td></tr>" for name, text in rows.items())
+    return f'<table style="vertical-align: top">{cells}</table>'
+
+
+def _outline(joints: np.ndarray) -> np.ndarray:
+    """Return the sides of a closed line through the joints, shape (6, 2, 3)."""
+    return np.stack([joints, np.roll(joints, -1, axis=0)], axis=1)
+
+
+def _serve(host: str, port: int) -> Any:
+    """Return a running server of an empty page.
+
+    viser waits for ever where an address cannot be had, takes another port where one is taken, and lets a visitor ask
+    for a tunnel that makes the page public: none of that here.
+    """
+    try:
+        from viser import ViserServer
+    except ImportError as error:
+        text = "watching needs viser, which is not installed: pip install hexapod_comp[watch]"
+        raise HexapodError(text) from error
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        socket.create_server((host, port), family=family).close()
+    except (OSError, OverflowError) as error:
+        raise HexapodError(f"cannot serve on {host}, port {port}: {error}; --host and --port name others") from error
+
+    class PrivateServer(ViserServer):  # type: ignore[misc, unused-ignore]
+        def request_share_url(self, verbose: bool = True) -> None:
+            """Make nothing public."""
+
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # browsers open connections in vain
+    with contextlib.redirect_stdout(io.StringIO()):  # its greeting
+        server = PrivateServer(host=host, port=port, verbose=False)
+    server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
+    return server
