@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from ..errors import CalibrationError
@@ -255,7 +256,10 @@ def held_out(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
         sums.setdefault(part.fold, []).append(part)
     order = np.argsort(problem.fold, kind="stable")
     folds = np.split(order, np.flatnonzero(np.diff(problem.fold[order])) + 1)
-    root, precision = np.linalg.cholesky(posterior.covariance), whitened_precision(problem, posterior)
+    precision = whitened_precision(problem, posterior)
+    # A root of the covariance, by way of the precision: a block of next to no tolerance leaves the former singular.
+    lower = np.linalg.cholesky(precision)
+    root = posterior.spread[:, None] * solve_triangular(lower, np.eye(len(lower)), lower=True).T
     result = np.empty(len(residual))
     for members in folds:
         parts = sums.get(int(problem.fold[members[0]]))
