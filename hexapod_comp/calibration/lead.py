@@ -49,6 +49,10 @@ SCALE_ROUNDS = 5
 AGREES = 6.0
 """A given lead, or a round one, agrees with the one shown within so many standard errors."""
 
+CLOSE = 5e-3
+"""Share of a lead by which another one agrees all the same: no two kinds of screws are as near, and with few readings a
+turn the standard error is too small."""
+
 ROUND = (0.5e-3, 0.025 * 0.0254)
 """Screws are made with leads that are whole multiples of one of these, m."""
 
@@ -90,7 +94,7 @@ class ScrewLead:
         if self.given is None or self.shown is None:
             return True
         misses = [abs(self.given / n - self.shown) for n in range(1, MOST_HARMONICS + 1)]
-        return min(misses) < AGREES * self.error
+        return min(misses) < max(AGREES * self.error, CLOSE * self.shown)
 
     def __str__(self) -> str:
         given = "" if self.given is None else f"{self.given * 1e3:.6g} mm given"

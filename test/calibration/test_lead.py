@@ -123,3 +123,9 @@ def test_drawn_machines_stay_as_they_are_without_harmonics():
     assert sizes.max() <= 2e-6
     with pytest.raises(ModelError, match=r"bounds\.harmonics"):
         ImperfectionBounds(harmonics=(2e-6, 1e-6))
+
+
+def test_a_lead_that_differs_by_less_than_screws_do_agrees():
+    """Few readings a turn have shown 9.979 ± 0.0025 mm for a true 10 mm: no other screw has that lead."""
+    assert ScrewLead(given=10e-3, shown=9.979e-3, error=2.5e-6, odds=100.0).agrees
+    assert not ScrewLead(given=10.16e-3, shown=9.979e-3, error=2.5e-6, odds=100.0).agrees  # 0.4 inch
