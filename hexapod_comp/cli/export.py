@@ -75,10 +75,17 @@ def _c(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel)
     from ..compensation.journal import IDEAL_SOURCE, Source
     from ..export.c_code import write_c
     from ..formats.paths import input_file
-    from ..machine.model_file import IDEAL
+    from ..machine.model_file import IDEAL, model_text
+    from ..virtual.named import is_random
 
-    made_of = [IDEAL_SOURCE if name == IDEAL else Source.read(input_file(name)) for name in (args.machine, args.model)]
-    return [str(file) for file in write_c(args.c_folder, geometry, model, (made_of[0].sha256, made_of[1].sha256))]
+    machine = Source.read(input_file(args.machine))
+    if args.model == IDEAL:
+        source = IDEAL_SOURCE
+    elif is_random(args.model):
+        source = Source.of(args.model, model_text(model))
+    else:
+        source = Source.read(input_file(args.model))
+    return [str(file) for file in write_c(args.c_folder, geometry, model, (machine.sha256, source.sha256))]
 
 
 def _show_exact(args: argparse.Namespace, model: MachineModel, written: list[str]) -> int:

@@ -112,3 +112,8 @@ def test_export_writes_both_without_a_model(tmp_path: Path, capsys: pytest.Captu
     robot, mujoco = (ET.parse(file).getroot() for file in files)
     assert [joint.get("name") for joint in robot.find("ros2_control").findall("joint")] == list(STRUT_NAMES)
     assert [connect.get("name") for connect in mujoco.find("equality")] == [f"{strut}_end" for strut in STRUT_NAMES]
+
+
+def test_a_machine_that_is_drawn_becomes_c_too(tmp_path: Path):
+    assert main(["export", "--model", "random:7", "--c", str(tmp_path)]) == 0
+    assert "hexapod_model.h" in {path.name for path in tmp_path.iterdir()}
