@@ -120,7 +120,9 @@ def test_a_start_from_the_last_command_is_replayed_bit_for_bit(bench, tmp_path):
     assert (result.outcome == IDENTICAL).all()
     assert result.lengths[:, 0].tobytes() == np.array([answer.lengths for answer in answers]).tobytes()
     assert [event.entry.values["reason"] for event in result.refused] == ["step"]
+    # A reset that forgets all comes before each of them, on a page of its own where a page was due in between.
     resets = [event.entry.values["measured"] for event in result.changes if event.entry.what == "reset"]
+    resets = [measured for measured in resets if measured is not None]
     assert resets[-2:] == [answers[39].lengths.tolist(), answers[58].lengths.tolist()]
 
 
