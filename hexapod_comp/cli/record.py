@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-import signal
 import sys
-import threading
 import time
 
 from . import common
@@ -16,9 +14,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the verb; 0 when there is something to be replayed."""
     from ..nodes.recorder import BagRecorder
 
-    stop, end = threading.Event(), time.monotonic() + (args.seconds or math.inf)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop, end = common.until_interrupted(), time.monotonic() + (args.seconds or math.inf)
     with BagRecorder(args.folder, args.namespace) as recorder, common.progress_bar(0, " messages") as bar:
         print(f"hexapod_comp: recording to {args.folder} until Ctrl-C", file=sys.stderr)
         recorder.run(lambda: not stop.is_set() and time.monotonic() < end, bar.update)

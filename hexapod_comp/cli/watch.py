@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
-import threading
+
+from . import common
 
 
 def run(args: argparse.Namespace) -> int:
@@ -15,10 +15,8 @@ def run(args: argparse.Namespace) -> int:
     from ..nodes.watching import watch
 
     geometry = load_geometry(args.machine)
-    stop = threading.Event()
     page = WatchPage(geometry, args.host, args.port)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = common.until_interrupted()
     print(f"hexapod_comp: {geometry.name} is shown on {page.address} until Ctrl-C", file=sys.stderr)
     try:
         watch(geometry, page.show, lambda: not stop.is_set(), args.namespace)

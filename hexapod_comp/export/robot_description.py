@@ -59,11 +59,12 @@ def joint_positions(
     alpha, beta, gamma = platform.angles()
     values = dict(zip(PLATFORM_JOINTS, (*platform.position, beta, alpha, gamma), strict=True))
     ends = platform.position + geometry.platform_joints @ platform.rotation.T
-    along = (ends - geometry.base_joints) / strut_lengths(geometry, platform)[:, None]
+    lengths = strut_lengths(geometry, platform)
+    along = (ends - geometry.base_joints) / lengths[:, None]
     x, y, z = np.einsum("nji,nj->in", _foot_frames(geometry), along)
     for name, about_y, about_x in zip(joint_names, np.arctan2(x, z), -np.arcsin(np.clip(y, -1.0, 1.0)), strict=True):
         values |= {f"{name}_foot_1": about_y, f"{name}_foot_2": about_x}
-    values |= dict(zip(joint_names, strut_lengths(geometry, platform), strict=True))
+    values |= dict(zip(joint_names, lengths, strict=True))
     return {name: float(value) for name, value in values.items()}
 
 

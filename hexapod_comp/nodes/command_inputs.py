@@ -77,10 +77,11 @@ class StrutInput(PoseInput):
         """
         message = read_message(data, JointState)
         stamp = command_stamp(message.header.stamp)
-        if np.isnan(self._reader.pick(message)).all():
+        lengths = self._reader.pick(message)
+        if np.isnan(lengths).all():
             return stamp, self._frame_id, None
-        self._reader.read(message)
-        tool = self._pose(self._reader.lengths) @ self._compensator.geometry.tool
+        self._reader.keep(lengths)
+        tool = self._pose(lengths) @ self._compensator.geometry.tool
         return stamp, self._frame_id, (*tool.position.tolist(), *quaternion_of(tool.rotation))
 
     def _pose(self, lengths: np.ndarray) -> Pose:

@@ -137,7 +137,16 @@ class StrutReader:
         CommandError
             ``strut_names``, ``strut_count`` or ``not_finite``; the lengths last read stay.
         """
-        lengths = self.pick(message)
+        self.keep(self.pick(message))
+
+    def keep(self, lengths: np.ndarray) -> None:
+        """Take lengths as those last read.
+
+        Raises
+        ------
+        CommandError
+            ``not_finite``; the lengths last read stay.
+        """
         if not all(abs(length) < LARGEST_LENGTH for length in lengths.tolist()):
             allowed = f"finite and below {LARGEST_LENGTH:g} m"
             raise CommandError("not_finite", f"strut lengths must be {allowed}, not {lengths.tolist()}")
