@@ -107,11 +107,15 @@ def test_a_node_that_is_shut_down_while_its_kernels_are_compiled_is_not_started(
     assert not bench.nodes[0].unconfigured
 
 
+HEARS_SIGINT = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+"""The background jobs of a shell, these tests perhaps, ignore it, and so do their children."""
+
+
 def script(text: str, folder: Path, **environment: str) -> subprocess.Popen[str]:
     """Start a program of ours, with an empty cache of kernels unless `environment` has another."""
     paths = {"NUMBA_CACHE_DIR": str(folder), "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'test'}"}
     environment = {**os.environ, **paths, **environment}
-    command = [sys.executable, "-c", textwrap.dedent(text)]
+    command = [sys.executable, "-c", HEARS_SIGINT + textwrap.dedent(text)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     return subprocess.Popen(command, cwd=folder, env=environment, **pipes)
 
