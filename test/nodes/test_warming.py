@@ -270,7 +270,7 @@ class Hanging(MachineNode):
         self.every(0.05, self.speak)
 
     def speak(self):
-        print("alive", flush=True)
+        print("alive\\n", end="", flush=True)  # in one piece: the log writes beside it
 
     def destroy_node(self):
         {hangs}
