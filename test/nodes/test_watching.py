@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import matplotlib.image
 import numpy as np
@@ -190,7 +191,14 @@ def free_port() -> int:
         return int(server.getsockname()[1])
 
 
-@pytest.mark.timeout(300)
+def screenshot(browser: str, folder: Path, address: str, patience: int) -> list[str]:
+    """Return the command that writes page.png, as the page is after some of the browser's seconds."""
+    options = "--headless --no-sandbox --disable-dev-shm-usage --use-angle=swiftshader --enable-unsafe-swiftshader"
+    command = [browser, *options.split(), f"--user-data-dir={folder / 'profile'}", "--window-size=1200,1200"]
+    return [*command, f"--virtual-time-budget={patience * 1000}", f"--screenshot={folder / 'page.png'}", address]
+
+
+@pytest.mark.timeout(700)
 def test_the_page_in_a_browser(bench, tmp_path):
     """Truth: strut 1 is corrected by +100 µm and struts 5 and 6 by −100 and −200 µm, red and blue
     by the legend, and the compensator
@@ -204,11 +212,6 @@ def test_the_page_in_a_browser(bench, tmp_path):
     patient = {"max_command_age": 0.0, "command_timeout": 0.0, "max_reading_age": 0.0, "feedback_timeout": 60.0}
     bench.compensator(model_file=model, **patient)  # the browser takes all there is of the processor
     watcher, page = watched(bench), WatchPage(load_geometry("paper.yaml"), port=free_port())
-    picture = tmp_path / "page.png"
-    options = "--headless --no-sandbox --disable-dev-shm-usage --use-angle=swiftshader --enable-unsafe-swiftshader"
-    command = [browser, *options.split(), f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1200,1200"]
-    command += ["--virtual-time-budget=8000", f"--screenshot={picture}", page.address]
-
     newest, due = View(), 0.0
 
     def shown() -> View:
@@ -222,13 +225,17 @@ def test_the_page_in_a_browser(bench, tmp_path):
     try:
         bench.settle(HOME)
         bench.until(lambda: shown().platform is not None and bench.message() == "running", "the machine", 30.0)
-        with subprocess.Popen(command, stderr=subprocess.PIPE) as process:
-            bench.until(lambda: shown() and process.poll() is not None, "the screenshot", 200.0)
+        for patience in (8, 40, 120):  # on a busy computer the scene comes later than the page
+            command = screenshot(browser, tmp_path, page.address, patience)
+            with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+                bench.until(lambda process=process: shown() and process.poll() is not None, "the screenshot", 200.0)
+            pixels = np.rint(255 * matplotlib.image.imread(tmp_path / "page.png")[..., :3]).astype(int)
+            scene, panel = pixels[:, :800], pixels[:, 800:]
+            others = np.stack([np.delete(scene, hue, axis=2).max(axis=2) for hue in (0, 2)], axis=2)
+            coloured = ((scene[..., [0, 2]] > 60) & (scene[..., [0, 2]] > 2 * others)).sum(axis=(0, 1))
+            if (coloured > 400).all():
+                break
     finally:
         page.close()
-    pixels = np.rint(255 * matplotlib.image.imread(picture)[..., :3]).astype(int)
-    scene, panel = pixels[:, :800], pixels[:, 800:]
-    for hue in (0, 2):
-        others = np.delete(scene, hue, axis=2).max(axis=2)
-        assert ((scene[..., hue] > 60) & (scene[..., hue] > 2 * others)).sum() > 400
+    assert (coloured > 400).all(), coloured
     assert (np.abs(panel - [0x3F, 0xB9, 0x50]).max(axis=2) < 30).sum() > 20
