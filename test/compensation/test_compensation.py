@@ -414,6 +414,20 @@ def test_after_a_reset_the_correction_ramps_to_that_of_a_fresh_start() -> None:
     assert_same_records(record, fresh)
 
 
+def test_a_reset_at_rest_does_not_step_the_struts() -> None:
+    """It forgets which side of its backlash each strut is on; the correction that stood for it ramps out."""
+    model = MachineModel("paper", struts=StrutErrors(backlash=np.full(6, 20e-6)))
+    compensator = Compensator(PAPER, model, RAMP)
+    for n in range(10):
+        pose = shifted(PAPER.home, 0.0, 0.0, 1e-4 * n)
+        stands_at = compensator.correct(pose, n / RATE).command
+    compensator.reset()
+    sent = [stands_at] + [compensator.correct(pose, 7.0 + n / RATE).command for n in range(500)]
+    assert (np.abs(np.diff(sent, axis=0)) <= RAMP / RATE + 1e-15).all()
+    np.testing.assert_allclose(sent[-1], Compensator(PAPER, model).correct(pose).command, rtol=0.0, atol=1e-15)
+    assert np.abs(sent[-1] - stands_at).max() > 5e-6, "else there was nothing to ramp"
+
+
 @pytest.mark.parametrize("backlash", [0.0, 20e-6], ids=["none", "backlash"])
 def test_a_restarted_compensator_starts_from_the_measured_struts(backlash: float) -> None:
     """Its first command is what was measured, the way from there no faster than the ramp, its end a fresh start's.
