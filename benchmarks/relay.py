@@ -18,7 +18,7 @@ from sensor_msgs.msg import JointState
 
 from hexapod_comp.nodes.arguments import Program
 from hexapod_comp.nodes.messages import StrutMessage
-from hexapod_comp.nodes.parameters import Parameter, declare
+from hexapod_comp.nodes.parameters import read_table
 from hexapod_comp.nodes.running import run
 from hexapod_comp.nodes.runtime import COMMAND_QOS, STATE_QOS, MachineNode
 
@@ -28,15 +28,15 @@ STAMP = slice(4, 12)
 ESTIMATE_PERIOD = 0.02
 """The compensator's, s."""
 
-PARAMETERS = (Parameter("serialized", False, "take and publish bytes"),)
+PARAMETERS = read_table("serialized | false | | start | take and publish bytes")
 
 
 class RelayNode(MachineNode):
     """Answers every pose command with two strut messages, constant but for the stamp."""
 
     def __init__(self) -> None:
-        super().__init__("relay")
-        self._serialized = declare(self, PARAMETERS)["serialized"]
+        super().__init__("relay", PARAMETERS)
+        self._serialized = self._options["serialized"]
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Open topics."""

@@ -112,7 +112,8 @@ class Compensator:
     ----------
     on_change : callable
         Called after each change from outside, with its name and value: ``temperature`` (name, °C, time), ``model``,
-        ``enable`` (bool), ``reset`` (measured struts or None). Together with the commands these decide all answers.
+        ``enable`` (bool), ``ramp_rate`` (m/s), ``reset`` (measured struts or None). Together with the commands these
+        decide all answers.
     """
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, ramp_rate: float = DEFAULT_RAMP_RATE) -> None:
@@ -264,6 +265,20 @@ class Compensator:
             self._last.state.enabled[:] = float(enabled)
             self._last.must_ramp()
             self.on_change("enable", enabled)
+
+    def set_ramp_rate(self, ramp_rate: float) -> None:
+        """Let ramps go on at another speed, m/s.
+
+        Raises
+        ------
+        HexapodError
+            It is not positive and finite.
+        """
+        if not 0.0 < ramp_rate < math.inf:
+            raise HexapodError(f"ramp_rate must be positive and finite, m/s, not {ramp_rate!r}")
+        if ramp_rate != self._last.state.ramp_rate[0]:
+            self._last.state.ramp_rate[:] = ramp_rate
+            self.on_change("ramp_rate", ramp_rate)
 
     def reset(self, measured: np.ndarray | None = None) -> None:
         """Forget the last command and all directions of motion.

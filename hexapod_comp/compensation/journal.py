@@ -142,11 +142,11 @@ class Entry:
     after : int
         Commands answered before it since the session began.
     what : str
-        ``temperature``, ``model``, ``enable``, ``reset`` or ``refused``.
+        ``temperature``, ``model``, ``enable``, ``ramp_rate``, ``reset`` or ``refused``.
     values : dict of str to object
         ``name``, ``value`` (°C) and ``time`` (s; NaN: not known, as in older recordings) of a temperature; ``name`` and
-        ``sha256`` of a model; ``on``; ``measured`` (m, or None) of a reset; ``stamp`` (ns), ``reason`` and ``text`` of
-        a refused command.
+        ``sha256`` of a model; ``on``; ``value`` (m/s) of a ramp rate; ``measured`` (m, or None) of a reset; ``stamp``
+        (ns), ``reason`` and ``text`` of a refused command.
     """
 
     after: int
@@ -321,6 +321,8 @@ def _values(what: str, value: Any, sources: Mapping[str, Source]) -> dict[str, A
         return _identity(value, sources["model"])
     if what == "enable":
         return {"on": bool(value)}
+    if what == "ramp_rate":
+        return {"value": float(value)}
     if what == "reset":
         return {"measured": None if value is None else value.tolist()}
     raise JournalError(f"the journal knows no change called {what!r}")
@@ -450,6 +452,7 @@ ENTRIES: dict[str, dict[str, Callable[[Any], Any]]] = {
     "temperature": {"name": str, "value": float, "time": _time},
     "model": {"name": str, "sha256": str},
     "enable": {"on": bool},
+    "ramp_rate": {"value": float},
     "reset": {"measured": _measured},
     "refused": {"stamp": int, "reason": str, "text": str},
 }

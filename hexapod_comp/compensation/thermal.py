@@ -124,6 +124,10 @@ class Thermometers:
         self._rules, self._filter = rules, TemperatureFilter(time_constant)
         self._last: dict[str, tuple[float, float]] = {}
 
+    def follow(self, rules: Plausibility, time_constant: float) -> None:
+        """Take other rules and another time constant, s, from the next reading on."""
+        self._rules, self._filter.time_constant = rules, time_constant
+
     def take(self, name: str, value: float, time: float) -> float:
         """Take a reading and return what counts from now on, °C; arguments and errors as those of the filter.
 

@@ -190,6 +190,10 @@ class CCompensator:
         """Switch compensation on or off."""
         self._check(self._library.hc_enable(byref(self.state), int(enabled)))
 
+    def set_ramp_rate(self, ramp_rate: float) -> None:
+        """Let ramps go on at another speed, m/s."""
+        self.state.ramp_rate = ramp_rate
+
     def set_temperature(self, name: str, value: float, time: float = math.nan) -> None:
         """Take a temperature, °C, read at a `time`, s."""
         index = Temperatures.NAMES.index(name)

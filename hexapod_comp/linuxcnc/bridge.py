@@ -27,16 +27,18 @@ from ..errors import CommandError
 from ..nodes.command_source import CommandSource
 from ..nodes.health import OK
 from ..nodes.messages import StrutMessage, StrutReader
-from ..nodes.parameters import ParameterError, declare
 from ..nodes.running import keep_discovery_local, run
 from ..nodes.runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, STATE_QOS, MachineNode
 from ..nodes.stamps import nanoseconds_of, stamp_of
 from .bridge_status import BridgeStatus
-from .guard import ON_LOSS, CorrectionGuard, GuardStatus
+from .guard import CorrectionGuard, GuardStatus
 from .hal import COUNTS, METRES, HalComponent, pose_from_axes
 from .parameters import AXES, CORRECTIONS, COUNTERS, FEEDBACK, FLAGS, PARAMETERS, PINS, PROGRAM, SWITCHES
 from .restarting import CompensatorReset
 from .stop_input import StopInput
+
+GUARDED = ("limit", "ramp_rate", "timeout", "on_loss")
+"""The guard's parameters."""
 
 CHECK_PERIOD = 0.05
 """How often the node looks whether its state has changed, s."""
@@ -71,17 +73,12 @@ class LinuxcncBridgeNode(MachineNode):
     """
 
     def __init__(self, hal: Any = None, **options: Any) -> None:
-        super().__init__("linuxcnc_bridge", **options)
-        self._options = declare(self, PARAMETERS)
-        self.wants_autostart = self._options["autostart"]
-        self._metres = METRES[self._choice("units", tuple(METRES))]
-        self._choice("on_loss", ON_LOSS)
-        self._guard = CorrectionGuard(*(self._options[name] for name in ("limit", "ramp_rate", "timeout", "on_loss")))
+        super().__init__("linuxcnc_bridge", PARAMETERS, **options)
+        self._metres = METRES[self._options["units"]]
+        self._guard = CorrectionGuard(*(self._options[name] for name in GUARDED))
         self._status = status = BridgeStatus(self._guard)
         self._sent, self._states, self._heard = status.sent, status.states, status.heard
         self._refusals = status.refusals
-        # Half a cycle less, since cycles come a little early or late.
-        self._states_period = 1.0 / self._options["states_rate"] - 0.5 / self._options["rate"]
         self._reader = StrutReader()
         self._streaming_since, self._moved_at = math.inf, -math.inf
         self._beat, self._last_text = False, ""
@@ -89,16 +86,9 @@ class LinuxcncBridgeNode(MachineNode):
         self._hal: HalComponent | None = HalComponent(self._options["component"], PINS, hal)
         self._open_pins(self._hal)
         self._pose_out, self._states_out = PoseStamped(), StrutMessage()
-        self._pose_out.header.frame_id = self._options["frame_id"]
-        self._stop = StopInput(self, self._options["timeout"])
+        self._stop = StopInput(self, self._options)
         self._hal.ready()
         self._loop = self.every(1.0 / self._options["rate"], self._cycle)
-
-    def _choice(self, name: str, allowed: Sequence[str]) -> str:
-        value = self._options[name]
-        if value not in allowed:
-            raise ParameterError(f"parameter {name}: must be {' or '.join(allowed)}, not {value!r}")
-        return value
 
     def _open_pins(self, hal: HalComponent) -> None:
         self._read_axes, self._read_feedback = hal.reader(*AXES), hal.reader(*FEEDBACK)
@@ -111,13 +101,15 @@ class LinuxcncBridgeNode(MachineNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Open topics."""
+        self.on_parameters(set())
+        self._pose_out.header.frame_id = self._options["frame_id"]
         self._pose_pub = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS, self._options["timeout"])
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
         self.speak_for(self._options["component"])
         self._subscription = self.obey(JointState, "strut_corrections", self._on_correction, self._look_at_publishers)
         topic, count = self._subscription.topic_name, self._subscription.get_publisher_count
         self._source = CommandSource(self, topic, count, self._options["allow_several_publishers"])
-        self._reset = CompensatorReset(self, self._status, self._options["timeout"])
+        self._reset = CompensatorReset(self, self._status, self._options)
         self._check = self.every(CHECK_PERIOD, self._check_state)
         return super().on_configure(state)
 
@@ -138,6 +130,10 @@ class LinuxcncBridgeNode(MachineNode):
         for publisher in (self._pose_pub, self._states_pub):
             self.destroy_publisher(publisher)
         return super().on_cleanup(state)
+
+    def on_parameters(self, names: set[str]) -> None:
+        """Take what has been set while the node runs; the rest is looked up where it is needed."""
+        self._guard.follow(*(self._options[name] for name in GUARDED))
 
     def say_goodbye(self) -> None:
         """Ramp the corrections out if that is quick, and publish a last status."""
@@ -194,7 +190,8 @@ class LinuxcncBridgeNode(MachineNode):
     def _send(self, now: float) -> None:
         """Publish measured struts and commanded pose, each only if all its pins are usable."""
         stamp = stamp_of(time.time_ns())
-        if self._states.age(now) >= self._states_period:
+        # Half a cycle less, since cycles come a little early or late.
+        if self._states.age(now) >= 1.0 / self._options["states_rate"] - 0.5 / self._options["rate"]:
             feedback = self._read_feedback()
             if self._usable(FEEDBACK, feedback, now):
                 self._send_states(feedback, stamp, now)

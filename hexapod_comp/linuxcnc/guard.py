@@ -69,6 +69,15 @@ class CorrectionGuard:
     """
 
     def __init__(self, limit: float, ramp_rate: float, timeout: float, on_loss: str = "zero") -> None:
+        self.follow(limit, ramp_rate, timeout, on_loss)
+        self.output: list[float] = list(ZERO)
+        self.status = GuardStatus.OFF
+        self.accepted = self.rejected = 0
+        self._newest: list[float] = list(ZERO)
+        self._accepted_at = self._updated_at = -math.inf
+
+    def follow(self, limit: float, ramp_rate: float, timeout: float, on_loss: str) -> None:
+        """Go by other rules from now on; what has been accepted stays so. Arguments and errors as for the class."""
         for name, value in (("limit", limit), ("ramp_rate", ramp_rate), ("timeout", timeout)):
             if not 0.0 < value < math.inf:
                 raise HexapodError(f"{name} must be positive and finite, not {value!r}")
@@ -76,11 +85,6 @@ class CorrectionGuard:
             raise HexapodError(f"on_loss must be {' or '.join(ON_LOSS)}, not {on_loss!r}")
         self._limit, self._ramp_rate, self._timeout = limit, ramp_rate, timeout
         self._holds = on_loss == "hold"
-        self.output: list[float] = list(ZERO)
-        self.status = GuardStatus.OFF
-        self.accepted = self.rejected = 0
-        self._newest: list[float] = list(ZERO)
-        self._accepted_at = self._updated_at = -math.inf
 
     def age(self, now: float) -> float:
         """Return the time since the last accepted correction, s; infinite before the first."""

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from ..nodes.arguments import Program
-from ..nodes.parameters import Parameter
+from ..nodes.parameters import read_table
 from .hal import pins
 
-PARAMETERS = (
-    Parameter("autostart", True, "configure and activate at start"),
-    Parameter("component", "hexapod_comp", "name of the HAL component"),
-    Parameter("units", "mm", "LinuxCNC's length unit: mm or inch"),
-    Parameter("rate", 1000.0, "cycles per second, Hz", 10.0, 2000.0),
-    Parameter("states_rate", 200.0, "measured struts published per second at most, Hz", 1.0, 2000.0),
-    Parameter("frame_id", "work", "frame_id of the commanded poses: the compensator's work_frame or base_frame"),
-    Parameter("allow_several_publishers", False, "obey though several nodes publish corrections"),
-    Parameter("limit", 500e-6, "a correction larger than this is never applied, m", 1e-9, 1.0),
-    Parameter("ramp_rate", 1e-3, "largest speed of a correction, m/s", 1e-6, 1.0),
-    Parameter("timeout", 0.1, "without a correction for this long the compensator is lost, s", 1e-3, 3600.0),
-    Parameter("on_loss", "zero", "what the corrections do when the compensator is lost: zero or hold"),
-)
+PARAMETERS = read_table("""
+autostart | true |  | start | configure and activate at the start
+component | hexapod_comp |  | start | name of the HAL component
+units | mm | mm, inch | start | LinuxCNC's length unit
+rate | 1000.0 | 10 to 2000 Hz | start | cycles per second
+states_rate | 200.0 | 1 to 2000 Hz | always | measured struts published per second at most
+frame_id | work |  | configure | frame_id of the commanded poses: the compensator's work_frame or base_frame
+allow_several_publishers | false |  | configure | obey though several nodes publish `strut_corrections`
+limit | 0.0005 | 1e-09 to 1 m | configure | a correction larger than this is never applied
+ramp_rate | 0.001 | 1e-06 to 1 m/s | always | largest speed of a correction (0.001 is 1 µm per ms)
+timeout | 0.1 | 0.001 to 3600 s | always | without an accepted correction for this long the compensator is lost
+on_loss | zero | zero, hold | configure | then ramp the corrections to `zero`, or `hold` them
+""")
 
 AXES = ("x", "y", "z", "a", "b", "c", "tool-offset")
 """Commanded axes, and the tool length that LinuxCNC's kinematics take off them."""

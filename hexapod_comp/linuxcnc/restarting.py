@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.task import Future
@@ -35,12 +36,12 @@ class CompensatorReset:
         Listens to the diagnostics, and calls.
     status : BridgeStatus
         Counts the requests.
-    patience : float
-        Silence that is normal, s.
+    options : dict
+        The node's parameter ``timeout``: silence that is normal, s.
     """
 
-    def __init__(self, node: MachineNode, status: BridgeStatus, patience: float) -> None:
-        self._node, self._status, self._patience = node, status, patience
+    def __init__(self, node: MachineNode, status: BridgeStatus, options: dict[str, Any]) -> None:
+        self._node, self._status, self._options = node, status, options
         self._name = f"{node.get_namespace()}/compensator:".lstrip("/")
         self._asked_at = self._complained_at = -math.inf
         self._in_vain = 0
@@ -68,7 +69,7 @@ class CompensatorReset:
         if heard_at > self._asked_at:
             self._in_vain = 0
         waited = now - max(streaming_since, heard_at)
-        if waited < self._patience + RESET_AFTER or now - self._asked_at < RESET_PERIOD:
+        if waited < self._options["timeout"] + RESET_AFTER or now - self._asked_at < RESET_PERIOD:
             return
         if self._complained_at < heard_at or now - self._complained_at > COMPLAINT_COUNTS_FOR:
             return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from typing import Any
 
 from std_msgs.msg import Bool, UInt64
 
@@ -18,18 +19,18 @@ class StopInput:
     ----------
     node : MachineNode
         Listens.
-    patience : float
-        Without a heartbeat for longer, the compensator counts as stopped, s.
+    options : dict
+        Its parameter ``timeout``: without a heartbeat for longer, the compensator counts as stopped, s.
     """
 
-    def __init__(self, node: MachineNode, patience: float) -> None:
-        self._stopped, self._beat_at, self._patience = True, -math.inf, patience
+    def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:
+        self._stopped, self._beat_at, self._options = True, -math.inf, options
         node.listen_to(Bool, "compensator/stopped", self._on_stopped, LATCHED_QOS)
         node.listen_to(UInt64, "compensator/heartbeat", self._on_beat, EVENT_QOS)
 
     def stopped(self, now: float) -> bool:
         """Return whether it refuses commands, or is not heard, at the monotonic time `now`, s."""
-        return self._stopped or now - self._beat_at > self._patience
+        return self._stopped or now - self._beat_at > self._options["timeout"]
 
     def _on_stopped(self, message: Bool) -> None:
         self._stopped = message.data

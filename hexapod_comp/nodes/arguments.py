@@ -12,7 +12,7 @@ from rclpy.utilities import remove_ros_args
 
 from ..errors import LONGEST_TEXT, printable
 from ..formats.texts import run_with_plain_streams
-from .parameters import Parameter, described
+from .parameters import Parameter
 
 ROS_ARGUMENTS, END_OF_ROS_ARGUMENTS = "--ros-args", "--"
 
@@ -84,7 +84,7 @@ class Program:
     def _epilog(self) -> str:
         lines = ["parameters (-p NAME:=VALUE behind --ros-args; default in brackets):"]
         for parameter in self.parameters:
-            text = f"{parameter.name}  [{_shown(parameter.default)}]  {described(parameter)}"
+            text = f"{parameter.name}  [{_shown(parameter.default)}]  {parameter.described()}"
             lines += textwrap.wrap(text, WIDTH, initial_indent="  ", subsequent_indent="      ")
         topics = ["", "topics and services:", *textwrap.indent(self.topics.strip(), "  ").splitlines()]
         example = ["", f"example: {self.name} {ROS_ARGUMENTS} {self.example}"]

@@ -30,7 +30,6 @@ from .journal import JournalTopics
 from .machine_files import MachineFiles
 from .operating import OperatorServices
 from .pacing import Pacing
-from .parameters import ParameterError, declare
 from .reloading import ReloadService
 from .running import keep_discovery_local, run
 from .runtime import ACKNOWLEDGED_WITHIN, MachineNode
@@ -48,12 +47,8 @@ class CompensatorNode(MachineNode):
     """Lifecycle node around one :class:`Compensator`; arguments are those of ``rclpy`` nodes."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("compensator", **options)
-        self._options = declare(self, PARAMETERS)
-        self.wants_autostart = self._options["autostart"]
+        super().__init__("compensator", PARAMETERS, **options)
         self._files = MachineFiles(self._options)
-        if self._options["base_frame"] == self._options["work_frame"]:
-            raise ParameterError(f"parameter work_frame: must differ from base_frame, {self._options['base_frame']!r}")
         simulated = bool(self.get_parameter("use_sim_time").value)
         clock = (lambda: self.get_clock().now().nanoseconds) if simulated else None
         self._stamps = StampCheck(self._options["max_command_age"], clock)
@@ -81,6 +76,7 @@ class CompensatorNode(MachineNode):
             self._compensator = Compensator(geometry, self._files.model(geometry), self._options["ramp_rate"])
             warm_up(self._compensator)
             self._compensator.enable(self._options["enable_compensation"])
+            self._status.take_parameters()
         except HexapodError as error:
             self._compensator = None
             self.get_logger().error(f"cannot configure: {error}")
@@ -114,6 +110,14 @@ class CompensatorNode(MachineNode):
         self._compensator = None
         return super().on_cleanup(state)
 
+    def on_parameters(self, names: set[str]) -> None:
+        """Take what has been set while the node runs; the rest is looked up where it is needed."""
+        self._status.take_parameters()
+        if self._compensator is not None:
+            self._feedback.take_parameters()
+            self._compensator.set_ramp_rate(self._options["ramp_rate"])
+            self._look_closer()
+
     def say_goodbye(self) -> None:
         """Publish a last status and wait until it has arrived."""
         if self._compensator is None:
@@ -133,7 +137,7 @@ class CompensatorNode(MachineNode):
         commands = self.obey(asked.kind, asked.topic, self._on_command, self._look_at_publishers)
         self._subscription = commands
         allowed = self._options["allow_several_publishers"]
-        self._pacing = Pacing(self, self._options["catch_up_within"], self._take, self._refuse_waiting)
+        self._pacing = Pacing(self, self._options, self._take, self._refuse_waiting)
         self._status.watch(
             CommandSource(self, commands.topic_name, commands.get_publisher_count, allowed),
             OwnTopic(self, outputs.command_topic, allowed),
@@ -145,9 +149,8 @@ class CompensatorNode(MachineNode):
         self._timers_open = [
             self.every(CHECK_PERIOD, self._check_state),
             self.every(ESTIMATE_PERIOD, self._estimate_from_commands),
+            self.at_rate("marker_rate", self._publish_markers),
         ]
-        if self._options["marker_rate"] > 0.0:
-            self._timers_open.append(self.every(1.0 / self._options["marker_rate"], self._publish_markers))
 
     def _close_topics(self) -> None:
         for timer in self._timers_open:

@@ -1,76 +1,59 @@
-"""Parameters of the compensator node, which are fixed when it starts, and its help."""
+"""Parameters of the compensator node, and its help."""
 
 from __future__ import annotations
 
+from ..compensation.compensator import DEFAULT_RAMP_RATE
 from ..compensation.thermal import DEFAULT_TIME_CONSTANT
 from .arguments import Program
-from .command_inputs import POSES, STRUTS
-from .parameters import JOINT_NAMES, Parameter
+from .parameters import read_table
 
-PARAMETERS = (
-    Parameter("autostart", True, "configure and activate at start"),
-    Parameter("geometry_file", "paper.yaml", "geometry file: a path or the name of a shipped one"),
-    Parameter("model_file", "ideal", "model file: a path or the name of a shipped one; ideal = corrects nothing"),
-    Parameter("model_folder", "", "folder from which both files may be read; empty: each one's own at the start"),
-    Parameter("base_frame", "base", "frame_id of poses in the machine base"),
-    Parameter("work_frame", "work", "frame_id of poses in the geometry file's work frame"),
-    Parameter(
-        "command_input",
-        POSES,
-        f"what commands: {POSES} on tool_pose_command, or {STRUTS} (nominal lengths) on strut_setpoints",
-        choices=(POSES, STRUTS),
-    ),
-    JOINT_NAMES,
-    Parameter("command_timeout", 0.1, "without a command for this long the state is stale, s; 0 = off", 0.0, 3600.0),
-    Parameter("max_command_age", 0.5, "older (or newer) stamps are refused, s; 0 = off", 0.0, 3600.0),
-    Parameter("feedback_timeout", 0.1, "without measured struts for this long there is no feedback, s", 1e-3, 3600.0),
-    Parameter("max_reading_age", 0.5, "measured struts stamped older (or newer) are refused, s; 0 = off", 0.0, 3600.0),
-    Parameter("require_feedback", False, "refuse commands while there is no feedback"),
-    Parameter(
-        "start_without_feedback_after",
-        0.0,
-        "without measured struts for this long after the start the first command may be anywhere, s; 0 = never",
-        0.0,
-        3600.0,
-    ),
-    Parameter(
-        "following_error_limit",
-        2e-3,
-        "measured struts further than this from their commands stop the machine, m; 0 = off",
-        0.0,
-        1.0,
-    ),
-    Parameter(
-        "catch_up_within",
-        0.1,
-        "commands that come sooner than the struts may move wait so long, s, in order; 0 = only the newest waits",
-        0.0,
-        3600.0,
-    ),
-    Parameter("allow_several_publishers", False, "obey though several nodes publish commands or readings"),
-    Parameter("allow_several_thermometers", False, "take temperatures though several nodes publish them"),
-    Parameter("ramp_rate", 1e-3, "strut speed at which a change of model or enabling is taken up, m/s", 1e-6, 1.0),
-    Parameter("enable_compensation", True, "compensate from the start"),
-    Parameter(
-        "temperature_time_constant_s", DEFAULT_TIME_CONSTANT, "low pass of temperatures, s; 0 = off", 0.0, 3600.0
-    ),
-    Parameter(
-        "temperature_rate_limit", 0.2, "a part's temperature that jumps faster is refused, K/s; 0 = off", 0.0, 1000.0
-    ),
-    Parameter(
-        "temperature_spread_limit",
-        40.0,
-        "a temperature further than this from the other parts' is refused, K; 0 = off",
-        0.0,
-        1000.0,
-    ),
-    Parameter(
-        "temperature_timeout", 60.0, "without a temperature for this long a part's is stale, s; 0 = off", 0.0, 86400.0
-    ),
-    Parameter("heartbeat_rate", 50.0, "heartbeats per second, Hz; 0 = none", 0.0, 1000.0),
-    Parameter("marker_rate", 10.0, "markers and joint states per second, Hz; 0 = none", 0.0, 10.0),
-    Parameter("publish_array", False, "also publish strut_commands_array for ros2_controllers"),
-)
+PARAMETERS = read_table(f"""
+autostart | true |  | start | configure and activate at the start
+geometry_file | paper.yaml |  | configure | geometry file: a path or the name of a shipped one
+model_file | ideal |  | reload | model file: a path or the name of a shipped one; `ideal` corrects nothing, and the
+    log says so
+model_folder | '' |  | start | folder from which geometry and model may be read, with all below it, beside the shipped
+    ones; empty: each file's own folder at the start. What leads out by `..` or a link is refused, as is what is no
+    regular file or larger than 8 MB
+base_frame | base |  | configure | frame_id of poses in the machine base
+work_frame | work | not base_frame | configure | frame_id of poses in the geometry file's work frame
+command_input | poses | poses, struts | configure | what commands: `poses` on `tool_pose_command`, or `struts`
+    (nominal lengths) on `strut_setpoints`; the other topic is not heard
+joint_names | [strut_1, strut_2, strut_3, strut_4, strut_5, strut_6] |  | configure | the struts' names in JointState
+    messages, in strut order
+command_timeout | 0.1 | 0 to 3600 s | always | a command is valid for this long, without another one the state is
+    stale; 0 = off. The deadline that the publishers offer is the one at configure
+max_command_age | 0.5 | 0 to 3600 s | always | older, or newer, stamps are refused; 0 = off; a zero stamp means now
+feedback_timeout | 0.1 | 0.001 to 3600 s | always | without measured struts for this long there is no feedback
+max_reading_age | 0.5 | 0 to 3600 s | always | measured struts stamped older, or newer, are refused; 0 = off; a zero
+    stamp means now
+require_feedback | false |  | always | refuse commands while there is no feedback
+start_without_feedback_after | 0.0 | 0 to 3600 s | configure | for a machine without feedback: when no struts have
+    been measured for this long after the start, the first command may be anywhere within the limits; 0 = never, a
+    start waits for `strut_states`
+following_error_limit | 0.002 | 0 to 1 m | configure | measured struts further than this from all that was commanded
+    in the last 0.1 s stop the machine until `~/reset`; 0 = off
+catch_up_within | 0.1 | 0 to 3600 s | always | commands that come sooner than the struts may move wait for so long, in
+    their order; 0 = only the newest waits
+allow_several_publishers | false |  | configure | obey though several nodes publish commands or `strut_states`, or
+    others `strut_commands`
+allow_several_thermometers | false |  | configure | take temperatures though several nodes publish them, one for each
+    part for instance
+enable_compensation | true |  | configure | compensate from the start; `~/enable_compensation` switches
+ramp_rate | {DEFAULT_RAMP_RATE} | 1e-06 to 1 m/s | always | how fast a change of model or switch, or the way from the
+    measured struts to the first command, moves a strut
+temperature_time_constant_s | {DEFAULT_TIME_CONSTANT} | 0 to 3600 s | always | low pass of each part's temperatures; 0
+    = off
+temperature_rate_limit | 0.2 | 0 to 1000 K/s | always | a part's temperature that jumps by more than 1 K and this rate
+    is refused; 0 = off
+temperature_spread_limit | 40.0 | 0 to 1000 K | always | a temperature further than this from the median of the other
+    parts' is refused, from 20 °C while no other is known; 0 = off
+temperature_timeout | 60.0 | 0 to 86400 s | always | a part without a temperature for this long is stale: said, and
+    its last one stays; 0 = off
+heartbeat_rate | 50.0 | 0 to 1000 Hz | always | heartbeats per second; 0 = none
+marker_rate | 10.0 | 0 to 10 Hz | always | markers and joint states per second; 0 = none
+publish_array | false |  | configure | also publish `strut_commands_array` for ros2_controllers
+""")
 
 TOPICS = """
 in   tool_pose_command       PoseStamped: commanded tool pose, frame_id base or work; or, by command_input,

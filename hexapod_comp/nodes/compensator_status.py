@@ -72,14 +72,24 @@ class CompensatorStatus:
 
     def __init__(self, options: dict[str, Any], stamps: StampCheck) -> None:
         self._options, self._stamps = options, stamps
-        self.reading_stamps = stamps.for_readings(options["max_reading_age"])
+        self.reading_stamps = stamps.for_readings()
         self.commands, self.feedback = Flow(), Flow()
         self.refusals, self.bad_feedback = Refusals(), Refusals()
         self.failed_reloads, self.refused_resets = Refusals(), Refusals()
-        self.following = Following(options["following_error_limit"])
+        self.following, self.last_known = Following(), LastKnown()
         self.standing = Standing(self.following.commands)
-        self.last_known = LastKnown(options["start_without_feedback_after"])
         self.log_space = LogSpace()
+        self.take_parameters()
+
+    def take_parameters(self) -> None:
+        """Take the parameters as they are now; others are looked up where they are needed."""
+        options = self._options
+        self._stamps.largest_age, self.reading_stamps.largest_age = (
+            options["max_command_age"],
+            options["max_reading_age"],
+        )
+        self.following.limit = options["following_error_limit"]
+        self.last_known.anywhere_after = options["start_without_feedback_after"]
 
     def watch(self, source: CommandSource, own_topic: OwnTopic, pacing: Pacing) -> None:
         """Take the guards of the topics of a configured node, and what lets its commands wait."""

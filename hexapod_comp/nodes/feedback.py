@@ -58,8 +58,7 @@ class Feedback:
         self._publish, self._look = publish, look
         self._reader, self._range = StrutReader(options["joint_names"]), StrokeRange(compensator.geometry)
         self._stamps, self._jumps = status.reading_stamps, NoJump(compensator.geometry)
-        rules = (options[f"temperature_{name}"] for name in ("rate_limit", "spread_limit", "timeout"))
-        self._thermometers = Thermometers(Plausibility(*rules), options["temperature_time_constant_s"])
+        self._options, self._thermometers = options, Thermometers(*_temperature_rules(options))
         several = options["allow_several_publishers"]
         states = node.obey(JointState, "strut_states", self._on_states, look, qos=STATE_QOS)
         warm = node.obey(Temperature, "temperatures", self._on_temperature, look, qos=SENSOR_QOS)
@@ -68,6 +67,10 @@ class Feedback:
         several = several or options["allow_several_thermometers"]
         self._warming = CommandSource(node, warm.topic_name, warm.get_publisher_count, several)
         status.watch_readings(self._measuring, self._warming, self._thermometers)
+
+    def take_parameters(self) -> None:
+        """Take the parameters as they are now."""
+        self._thermometers.follow(*_temperature_rules(self._options))
 
     def close(self) -> None:
         """Destroy the subscriptions."""
@@ -135,3 +138,8 @@ class Feedback:
         if self._node.active:
             self._status.bad_feedback.add(reason, text, now)
             self._node.warn_of(cause, warning)
+
+
+def _temperature_rules(options: dict[str, Any]) -> tuple[Plausibility, float]:
+    rules = Plausibility(*(options[f"temperature_{name}"] for name in ("rate_limit", "spread_limit", "timeout")))
+    return rules, options["temperature_time_constant_s"]

@@ -94,11 +94,13 @@ class Following:
 
     Parameters
     ----------
-    limit : float
+    limit : float, optional
         Allowed difference, m; 0 switches the guard off.
 
     Attributes
     ----------
+    limit : float
+        As given; may be set.
     problem : str
         Which strut, where, how far off and what is allowed, as it was first found; empty while all is well.
     commands : Recent
@@ -107,8 +109,8 @@ class Following:
 
     reason = "following_error"
 
-    def __init__(self, limit: float) -> None:
-        self._limit = limit
+    def __init__(self, limit: float = 0.0) -> None:
+        self.limit = limit
         self.commands = Recent()
         self.problem = ""
 
@@ -126,17 +128,17 @@ class Following:
 
     def check(self, measured: np.ndarray, arrived: float) -> None:
         """Compare measured struts, shape (6,), m, that arrived at the monotonic time `arrived`, s."""
-        if self.problem or not (self.commands and self._limit):
+        if self.problem or not (self.commands and self.limit):
             return
-        if within(measured, self.commands.last, self._limit):  # as they nearly always are
+        if within(measured, self.commands.last, self.limit):  # as they nearly always are
             return
         low, high = self.commands.range(arrived - FOLLOWED_WITHIN)
         off = np.maximum(low - measured, measured - high)
         strut = int(off.argmax())
-        if off[strut] > self._limit:
+        if off[strut] > self.limit:
             self.problem = (
                 f"{STRUT_NAMES[strut]} is at {measured[strut] * 1e3:.3f} mm, {off[strut] * 1e3:.3f} mm from its "
-                f"command, allowed {self._limit * 1e3:g} mm; until ~/reset"
+                f"command, allowed {self.limit * 1e3:g} mm; until ~/reset"
             )
 
 
@@ -175,13 +177,18 @@ class LastKnown:
 
     Parameters
     ----------
-    anywhere_after : float
+    anywhere_after : float, optional
         For a machine without feedback: when nothing has become known so long after the start, the first command
         may be anywhere, s; 0 = never.
+
+    Attributes
+    ----------
+    anywhere_after : float
+        As given; may be set.
     """
 
-    def __init__(self, anywhere_after: float) -> None:
-        self._anywhere_after, self._began = anywhere_after, math.inf
+    def __init__(self, anywhere_after: float = 0.0) -> None:
+        self.anywhere_after, self._began = anywhere_after, math.inf
         self._measured, self._commanded = np.empty(6), np.empty(6)
         self._measured_at = self._commanded_at = -math.inf
 
@@ -200,7 +207,7 @@ class LastKnown:
     def waits(self, now: float) -> bool:
         """Return whether a start must wait until something is known."""
         unknown = self._measured_at == self._commanded_at == -math.inf
-        return unknown and not 0.0 < self._anywhere_after <= now - self._began
+        return unknown and not 0.0 < self.anywhere_after <= now - self._began
 
     def struts(self, now: float, fresh: bool) -> np.ndarray | None:
         """Return where the struts stand, shape (6,), m; None when nobody knows and the start may be anywhere.
@@ -226,6 +233,6 @@ class LastKnown:
         return self._commanded if self._commanded_at > -math.inf else None
 
     def _hint(self) -> str:
-        if self._anywhere_after:
-            return f"; from {self._anywhere_after:g} s after the start on the first command may be anywhere"
+        if self.anywhere_after:
+            return f"; from {self.anywhere_after:g} s after the start on the first command may be anywhere"
         return "; a machine without feedback needs start_without_feedback_after"

@@ -16,7 +16,7 @@ from .parameters import ParameterError
 
 
 class MachineFiles:
-    """Files of a machine, each from its own folder at the start, or from ``model_folder``.
+    """Files of a machine, as its parameters name them now, each from its folder at the start or from ``model_folder``.
 
     Parameters
     ----------
@@ -35,40 +35,39 @@ class MachineFiles:
     """
 
     def __init__(self, options: dict[str, Any]) -> None:
-        self._geometry_file, self._model_file = options["geometry_file"], options["model_file"]
-        self._folders = {name: _folder(name, options) for name in (self._geometry_file, self._model_file)}
+        self._options = options
+        self._folders = {kind: _folder(options[f"{kind}_file"], options) for kind in ("geometry", "model")}
         self.sources: dict[str, Source] = {}
 
     def geometry(self) -> HexapodGeometry:
         """Read the geometry."""
-        self.sources["geometry"] = self._read(self._geometry_file, "geometry")
+        self.sources["geometry"] = self._read("geometry")
         return self.sources["geometry"].geometry()
 
     def model(self, geometry: HexapodGeometry) -> MachineModel:
         """Read the model; the ideal one has no file."""
-        ideal = self._model_file == IDEAL
-        self.sources["model"] = IDEAL_SOURCE if ideal else self._read(self._model_file, "model")
+        self.sources["model"] = IDEAL_SOURCE if self._options["model_file"] == IDEAL else self._read("model")
         return self.sources["model"].model(geometry.name)
 
     def begin_loading(self, machine: str) -> Loading:
         """Begin to read the model of a machine again, elsewhere."""
-        name = self._model_file
-        return Loading(None if name == IDEAL else ModelName(name, _place(), self._folders[name]), machine)
+        name = self._options["model_file"]
+        return Loading(None if name == IDEAL else ModelName(name, _place(), self._folders["model"]), machine)
 
     def handed_on(self) -> dict[str, Any]:
         """Return what another process needs to make geometry and model of the same texts, for JSON."""
-        folder = self._folders[self._model_file]
+        folder = self._folders["model"]
         return {**{name: vars(source) for name, source in self.sources.items()}, "folder": folder and str(folder)}
 
     def described(self, model: MachineModel) -> str:
         """Return what to say of the model at the start."""
-        if self._model_file == IDEAL:
+        if self._options["model_file"] == IDEAL:
             return "the ideal model, which corrects nothing (parameter model_file)"
         return f"model {model.name!r}"
 
-    def _read(self, name: str, kind: str) -> Source:
-        folder = self._folders[name]
-        return Source.read(confined_file(name, folder, kind), confined_opener(folder))
+    def _read(self, kind: str) -> Source:
+        folder = self._folders[kind]
+        return Source.read(confined_file(self._options[f"{kind}_file"], folder, kind), confined_opener(folder))
 
 
 def _place() -> str:

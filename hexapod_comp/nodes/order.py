@@ -24,10 +24,15 @@ class InOrder:
         Of what, for the text.
     valid_for : float
         Refused as well is what is older than this by this computer's clock, s; 0: nothing.
+
+    Attributes
+    ----------
+    valid_for : float
+        As given; may be set.
     """
 
     def __init__(self, what: str, valid_for: float = 0.0) -> None:
-        self._what, self._valid_for = what, valid_for
+        self._what, self.valid_for = what, valid_for
         self._last, self._at = 0, -float("inf")
 
     def check(self, stamp: int, now: float) -> None:
@@ -38,8 +43,8 @@ class InOrder:
         CommandError
             ``stamp_order``, ``stamp_past``.
         """
-        if stamp and 0.0 < self._valid_for < (age := (time.time_ns() - stamp) * 1e-9):
-            raise CommandError("stamp_past", f"{self._what} is {age:.3f} s old, valid for {self._valid_for:g} s")
+        if stamp and 0.0 < self.valid_for < (age := (time.time_ns() - stamp) * 1e-9):
+            raise CommandError("stamp_past", f"{self._what} is {age:.3f} s old, valid for {self.valid_for:g} s")
         late = self._last - stamp
         if stamp and 0 < late < OVERTAKEN_BY and now - self._at < FORGET_ORDER_AFTER:
             raise CommandError("stamp_order", f"{self._what} is {late * 1e-6:.1f} ms older than the one before")

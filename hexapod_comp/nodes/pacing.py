@@ -5,12 +5,10 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 from ..errors import HexapodError, LimitError
-from .runtime import COMMAND_QOS, MachineNode
-
-NEVER = 3600.0
-"""Period of the timer while nothing waits, s: it is stopped then."""
+from .runtime import COMMAND_QOS, NEVER, MachineNode
 
 SHOWN_FOR = 1.0
 """That commands are taken late is spoken of for this long, s."""
@@ -26,9 +24,9 @@ class Pacing:
     ----------
     node : MachineNode
         Whose timer it is.
-    longest : float
-        How long a command may wait, s: all that wait are refused when one has waited longer. 0: only the newest
-        waits, and those that it replaces are dropped.
+    options : dict
+        The node's parameter ``catch_up_within``: how long a command may wait, s; all that wait are refused when one
+        has waited longer. 0: only the newest waits, and those that it replaces are dropped.
     take : callable
         Takes a message at a monotonic time, s; returns how long it must wait still, s, 0 when it is settled.
     refuse : callable
@@ -43,17 +41,20 @@ class Pacing:
     def __init__(
         self,
         node: MachineNode,
-        longest: float,
+        options: dict[str, Any],
         take: Callable[[bytes, float], float],
         refuse: Callable[[bytes, HexapodError, float], None],
     ) -> None:
-        self._node, self._longest, self._take, self._refuse = node, longest, take, refuse
+        self._node, self._options, self._take, self._refuse = node, options, take, refuse
         self._waiting: deque[tuple[float, bytes]] = deque()
-        self._most = COMMAND_QOS.depth if longest else 1
         self._behind_at = -float("inf")
         self.waited = self.dropped = 0
         self._timer = node.every(NEVER, self._go_on)
         self._timer.cancel()
+
+    @property
+    def _longest(self) -> float:
+        return float(self._options["catch_up_within"])
 
     def command(self, message: bytes, now: float) -> None:
         """Take a command that comes at the monotonic time `now`, s, now or in its turn."""
@@ -63,13 +64,12 @@ class Pacing:
                 self.waited += 1
                 self._wait(wait)
             return
-        if len(self._waiting) == self._most:
-            if self._longest:
-                self._refuse_all(now)
-            else:
-                self._waiting.clear()
-                self.dropped += 1
-                self._behind_at = now
+        if not self._longest:
+            self.dropped += len(self._waiting)
+            self._waiting.clear()
+            self._behind_at = now
+        elif len(self._waiting) == COMMAND_QOS.depth:
+            self._refuse_all(now)
         self._waiting.append((now, message))
         self.waited += 1
 

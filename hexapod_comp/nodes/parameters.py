@@ -1,29 +1,46 @@
-"""Parameters of a node: their table, their check, and what is said of those that nobody knows."""
+"""Parameters of a node: its table, from which all else follows, and the values in force."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any
 
 import rclpy
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+import yaml
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.lifecycle import LifecycleNode
+from rclpy.parameter import Parameter as RosParameter
 
-from ..errors import HexapodError
-from ..machine.geometry import STRUT_NAMES
+from ..errors import HexapodError, shorten
+
+USE_SIM_TIME = "use_sim_time"
 
 
 class ParameterError(HexapodError):
-    """A parameter's value is not allowed."""
+    """A parameter's value is not allowed, or not now."""
 
     reason = "bad_parameter"
 
 
+class Taken(Enum):
+    """When a node takes a parameter's value; the text is what is said of it."""
+
+    ALWAYS = "at any time"
+    RELOAD = "at configure and at ~/reload_model"
+    CONFIGURE = "at configure"
+    START = "at the start"
+
+
+RANGE = re.compile(r"(\S+) to (\S+) ?(\S*)")
+
+
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of a node.
+    """One parameter of a node: a row of its table.
 
     Parameters
     ----------
@@ -31,101 +48,192 @@ class Parameter:
         Its name.
     default : bool, int, float, str or list of str
         Default, which also fixes the type; an int is accepted for a float. A list holds as many different names.
-    description : str
-        What it means, with its unit.
-    low, high : float, optional
-        Allowed range of a number.
-    read_only : bool
-        Fixed at start; the others may be set while the node runs.
-    choices : tuple of str, optional
-        All that is allowed.
+    allowed : str
+        A number's range and unit, ``0 to 1 m``; choices, ``zero, hold``; ``not`` and the name of the parameter from
+        which it must differ; empty: any value of the type.
+    taken : Taken
+        When a value counts. One that counts at configure may be set while the node is not configured.
+    meaning : str
+        What it means.
     """
 
     name: str
     default: bool | int | float | str | list[str]
-    description: str
-    low: float | None = None
-    high: float | None = None
-    read_only: bool = True
-    choices: tuple[str, ...] = ()
+    allowed: str
+    taken: Taken
+    meaning: str
+
+    @property
+    def range(self) -> tuple[float, float] | None:
+        """Least and largest value of a number."""
+        match = RANGE.fullmatch(self.allowed)
+        return (float(match[1]), float(match[2])) if match else None
+
+    @property
+    def differs_from(self) -> str:
+        """Name of the parameter that must have another value; empty: there is none."""
+        return self.allowed.removeprefix("not ") if self.allowed.startswith("not ") else ""
+
+    @property
+    def choices(self) -> list[str]:
+        """All values that are allowed; empty: there is no such list."""
+        return [] if self.range or self.differs_from or not self.allowed else self.allowed.split(", ")
+
+    def described(self) -> str:
+        """Return what it means and what is allowed, as plain text."""
+        text = f"{self.meaning} ({self.allowed})" if self.allowed else self.meaning
+        return text.replace("`", "")
+
+    def descriptor(self) -> ParameterDescriptor:
+        """Return what ROS tells of it."""
+        result = ParameterDescriptor(
+            description=self.meaning.replace("`", ""),
+            additional_constraints="; ".join(filter(None, (self.allowed, f"taken {self.taken.value}"))),
+            read_only=self.taken is Taken.START,
+            dynamic_typing=True,
+        )
+        if self.range and isinstance(self.default, float):
+            result.floating_point_range = [FloatingPointRange(from_value=self.range[0], to_value=self.range[1])]
+        elif self.range:
+            result.integer_range = [IntegerRange(from_value=int(self.range[0]), to_value=int(self.range[1]))]
+        return result
+
+    def checked(self, value: Any) -> Any:
+        """Return `value` as the parameter's type, or refuse it.
+
+        Raises
+        ------
+        ParameterError
+            Wrong type or out of range; an int is taken for a float.
+        """
+        wanted: Any = type(self.default)
+        if wanted is list:
+            return self._checked_names(value)
+        if wanted is float and type(value) is int:
+            value = float(value)
+        if type(value) is not wanted:
+            raise self.refusal(f"must be {wanted.__name__}, not {shorten(value)}")
+        if self.choices and value not in self.choices:
+            raise self.refusal(f"must be one of {self.allowed}, not {shorten(value)}")
+        low, high = self.range or (value, value)
+        if not low <= value <= high:
+            raise self.refusal(f"must lie in {self.allowed}, not {value!r}")
+        return value
+
+    def _checked_names(self, value: Any) -> list[str]:
+        """Return a list of names, or refuse it."""
+        names = list(value) if isinstance(value, list | tuple) else []
+        count = len(self.default) if isinstance(self.default, list) else 0
+        if len(set(names)) != count or len(names) != count or not all(isinstance(name, str) and name for name in names):
+            raise self.refusal(f"must be {count} different names, not {shorten(value)}")
+        return names
+
+    def refusal(self, problem: str) -> ParameterError:
+        """Return the error that says what is wrong with a value."""
+        return ParameterError(f"parameter {self.name}: {problem}")
 
 
-JOINT_NAMES = Parameter("joint_names", list(STRUT_NAMES), "the struts' names in JointState messages, in strut order")
+def read_table(text: str) -> tuple[Parameter, ...]:
+    """Return the parameters that a table declares.
+
+    Parameters
+    ----------
+    text : str
+        One parameter a line, its cells between bars: name, default as YAML, what is allowed, when it is taken (a name
+        of :class:`Taken`), meaning. An indented line goes on with the one before.
+    """
+    rows = re.sub(r"\n\s+", " ", text.strip()).splitlines()
+    cells = ([cell.strip() for cell in row.split("|")] for row in rows)
+    return tuple(
+        Parameter(name, yaml.safe_load(default), allowed, Taken[taken.upper()], meaning)
+        for name, default, allowed, taken, meaning in cells
+    )
 
 
-def declare(node: LifecycleNode, parameters: Sequence[Parameter]) -> dict[str, Any]:
-    """Declare parameters and return their checked values.
+class Parameters(dict[str, Any]):
+    """The values of a node's parameters, by name, checked; where they may change they are always those in force.
+
+    Parameters
+    ----------
+    node : LifecycleNode
+        Declares them.
+    table : sequence of Parameter
+        All of them.
+    changed : callable
+        Called with the names after some have been set while the node runs, be it to the same values.
 
     Raises
     ------
     ParameterError
         Wrong type or out of range; names parameter, value and what is allowed.
     """
-    values = {}
-    for parameter in parameters:
-        descriptor = ParameterDescriptor(
-            description=described(parameter), read_only=parameter.read_only, dynamic_typing=True
-        )
-        if isinstance(parameter.default, float) and parameter.low is not None:
-            bounds = FloatingPointRange(from_value=float(parameter.low), to_value=float(parameter.high or 1e9))
-            descriptor.floating_point_range = [bounds]
+
+    def __init__(
+        self, node: LifecycleNode, table: Sequence[Parameter], changed: Callable[[set[str]], None] = lambda names: None
+    ) -> None:
+        self._node, self._changed = node, changed
+        self._table = {parameter.name: parameter for parameter in table}
+        super().__init__({parameter.name: self._declared(parameter) for parameter in table})
+        self._check_differences(self)
+        self._warn_of_strangers()
+        node.add_on_set_parameters_callback(self._judge)  # asked before rclpy's own, which switches the clock at once
+        node.add_post_set_parameters_callback(self._take)
+
+    def _declared(self, parameter: Parameter) -> Any:
         try:
-            value = node.declare_parameter(parameter.name, parameter.default, descriptor).value
+            value = self._node.declare_parameter(parameter.name, parameter.default, parameter.descriptor()).value
         except rclpy.exceptions.InvalidParameterValueException as error:
-            raise ParameterError(f"parameter {parameter.name}: {error}") from error
-        values[parameter.name] = checked(parameter, value)
-    _warn_of_strangers(node)
-    return values
+            raise parameter.refusal(str(error)) from error
+        return parameter.checked(value)
 
+    def _warn_of_strangers(self) -> None:
+        """Warn of overrides that no declared parameter takes: most likely misspelt."""
+        declared = set(self._node.get_parameters_by_prefix(""))
+        for name in getattr(self._node, "_parameter_overrides", {}):
+            if name not in declared and not name.startswith("qos_overrides."):
+                near = difflib.get_close_matches(name, declared, 1)
+                hint = f"; did you mean {near[0]}?" if near else ""
+                self._node.get_logger().warning(f"there is no parameter {name}, it is ignored{hint}")
 
-def described(parameter: Parameter) -> str:
-    """Return what a parameter means, with its allowed range."""
-    if parameter.low is None:
-        return parameter.description
-    upper = "" if parameter.high is None else f" to {parameter.high:g}"
-    return f"{parameter.description} (from {parameter.low:g}{upper})"
+    def _check_differences(self, values: dict[str, Any]) -> None:
+        for parameter in self._table.values():
+            other = parameter.differs_from
+            if other and values[parameter.name] == values[other]:
+                raise parameter.refusal(f"must differ from {other}, {shorten(values[other])}")
 
+    def _known(self, parameters: Iterable[RosParameter]) -> dict[str, Any]:
+        """Return the checked values of those that stand in the table."""
+        return {p.name: self._table[p.name].checked(p.value) for p in parameters if p.name in self._table}
 
-def checked(parameter: Parameter, value: Any) -> Any:
-    """Return `value` as the parameter's type, or refuse it.
+    def _judge(self, parameters: list[RosParameter]) -> SetParametersResult:
+        """Refuse what is not allowed, or not now."""
+        try:
+            wanted = self._known(parameters)
+            for name, value in wanted.items():
+                if value != self[name]:
+                    self._check_now(self._table[name])
+            self._check_differences({**self, **wanted})
+            for parameter in parameters:
+                self._check_clock(parameter)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
 
-    Raises
-    ------
-    ParameterError
-        Wrong type or out of range; an int is taken for a float.
-    """
-    wanted = type(parameter.default)
-    if wanted is list:
-        return _checked_names(parameter, value)
-    if wanted is float and type(value) is int:
-        value = float(value)
-    if type(value) is not wanted:
-        raise ParameterError(f"parameter {parameter.name}: must be {wanted.__name__}, not {value!r}")
-    if parameter.choices and value not in parameter.choices:
-        allowed = ", ".join(parameter.choices)
-        raise ParameterError(f"parameter {parameter.name}: must be one of {allowed}, not {value!r}")
-    if isinstance(value, int | float) and wanted is not bool:
-        low = -float("inf") if parameter.low is None else parameter.low
-        high = float("inf") if parameter.high is None else parameter.high
-        if not low <= value <= high:
-            raise ParameterError(f"parameter {parameter.name}: must lie in {low:g}…{high:g}, not {value!r}")
-    return value
+    def _check_now(self, parameter: Parameter) -> None:
+        """Refuse a change that would have no effect before the node is configured again."""
+        machine = self._node._state_machine
+        if parameter.taken is Taken.CONFIGURE and machine.current_state[1] != "unconfigured":
+            problem = f"is taken at configure, and the node is {machine.current_state[1]}; set it after a cleanup"
+            raise parameter.refusal(problem)
 
+    def _check_clock(self, parameter: RosParameter) -> None:
+        """Refuse another clock: stamps, ramps and the order of commands hang on the one that the node began with."""
+        now = self._node.get_parameter(USE_SIM_TIME).value
+        if parameter.name == USE_SIM_TIME and parameter.value is not now:
+            problem = f"is {str(now).lower()} for as long as the node runs; set it at the start"
+            raise ParameterError(f"parameter {USE_SIM_TIME}: {problem}")
 
-def _checked_names(parameter: Parameter, value: Any) -> list[str]:
-    """Return a list of names, or refuse it."""
-    names = list(value) if isinstance(value, list | tuple) else []
-    count = len(parameter.default) if isinstance(parameter.default, list) else 0
-    if len(set(names)) != count or len(names) != count or not all(isinstance(name, str) and name for name in names):
-        raise ParameterError(f"parameter {parameter.name}: must be {count} different names, not {value!r}")
-    return names
-
-
-def _warn_of_strangers(node: LifecycleNode) -> None:
-    """Warn of overrides that no declared parameter takes: most likely misspelt."""
-    declared = set(node.get_parameters_by_prefix(""))
-    for name in getattr(node, "_parameter_overrides", {}):
-        if name not in declared and not name.startswith("qos_overrides."):
-            near = difflib.get_close_matches(name, declared, 1)
-            hint = f"; did you mean {near[0]}?" if near else ""
-            node.get_logger().warning(f"there is no parameter {name}, it is ignored{hint}")
+    def _take(self, parameters: list[RosParameter]) -> None:
+        if taken := self._known(parameters):  # ROS also declares parameters of its own
+            self.update(taken)
+            self._changed(set(taken))

@@ -6,18 +6,16 @@ import copy
 import functools
 import inspect
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import ChangeState
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -29,8 +27,10 @@ from ..errors import CommandError, shorten
 from .guarding import CallbackGuard, PlainLogger, Throttle
 from .health import HealthReport, joined
 from .messages import read_message
+from .parameters import Parameter, Parameters
 
-USE_SIM_TIME = "use_sim_time"
+NEVER = 3600.0
+"""Period of a timer that rests, s: it is stopped then."""
 
 COMMAND_QOS = QoSProfile(depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 """Commands: each must arrive. A hundred wait while a busy processor pauses for 0.1 s at 1 kHz, or a cable repeats."""
@@ -68,11 +68,23 @@ class MachineNode(LifecycleNode):
     Whatever ROS calls here, it calls through a :class:`~.guarding.CallbackGuard`. Topics have a QoS that a user may
     override by parameters. rclpy writes the overrides into the profile that it is given, so every topic gets a copy of
     its own.
+
+    Parameters
+    ----------
+    name : str
+        Of the node.
+    table : sequence of Parameter
+        Its parameters.
+    **options
+        Those of ``rclpy`` nodes.
+
+    Raises
+    ------
+    ParameterError
+        A parameter's value is not allowed.
     """
 
-    wants_autostart = True
-
-    def __init__(self, name: str, **options: Any) -> None:
+    def __init__(self, name: str, table: Sequence[Parameter] = (), **options: Any) -> None:
         self._active = False
         self._throttle = Throttle()
         self.guard = CallbackGuard(self.warn_of, self.complain_of)
@@ -84,16 +96,17 @@ class MachineNode(LifecycleNode):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", EVENT_QOS)
         self.speak_for("starting")
-        self.add_on_set_parameters_callback(self._keep_clock)  # asked before rclpy's own, which switches at once
+        self._at_rate: dict[str, Timer] = {}
+        self._options = Parameters(self, table, self._on_parameters)
+        self.wants_autostart = bool(self._options.get("autostart", True))
 
-    def _keep_clock(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Refuse another clock: stamps, ramps and the order of commands hang on the one that the node began with."""
-        now = self.get_parameter(USE_SIM_TIME).value
-        wanted = [parameter.value for parameter in parameters if parameter.name == USE_SIM_TIME]
-        if all(value is now for value in wanted):
-            return SetParametersResult(successful=True)
-        reason = f"parameter {USE_SIM_TIME}: is {str(now).lower()} for as long as the node runs; set it at the start"
-        return SetParametersResult(successful=False, reason=reason)
+    def _on_parameters(self, names: set[str]) -> None:
+        for name in names & self._at_rate.keys():
+            self._set_rate(name)
+        self.on_parameters(names)
+
+    def on_parameters(self, names: set[str]) -> None:
+        """Take what has been set while the node runs; called at other times too, with no names."""
 
     def _if_possible(self, change: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
         """Return the callback of ``change_state`` for possible transitions only: of others rcl logs each request."""
@@ -186,6 +199,24 @@ class MachineNode(LifecycleNode):
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
         """Return a timer on a clock that nobody can set: the node's own stops for as long as it is set back."""
         return self.create_timer(period, callback, clock=self._steady)
+
+    def at_rate(self, name: str, callback: Callable[[], None]) -> Timer:
+        """Return a timer that runs as many times a second as a parameter says, also when that is set anew; 0: none."""
+        self._at_rate[name] = timer = self.every(NEVER, callback)
+        self._set_rate(name)
+        return timer
+
+    def destroy_timer(self, timer: Timer) -> bool:
+        """Destroy a timer."""
+        self._at_rate = {name: other for name, other in self._at_rate.items() if other is not timer}
+        return bool(super().destroy_timer(timer))
+
+    def _set_rate(self, name: str) -> None:
+        timer, rate = self._at_rate[name], self._options[name]
+        timer.cancel()
+        if rate:
+            timer.timer_period_ns = round(1e9 / rate)
+            timer.reset()
 
     def listen_to(
         self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile

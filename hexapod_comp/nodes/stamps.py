@@ -65,14 +65,14 @@ class StampCheck:
     def __init__(self, largest_age: float, simulated: Callable[[], int] | None = None, capped: bool = False) -> None:
         # ROS reads the system's clock too, but takes a dozen microseconds longer.
         self._clock = time.time_ns if simulated is None else simulated
-        self._simulated, self._largest_age, self._capped = simulated is not None, largest_age, capped
+        self._simulated, self.largest_age, self._capped = simulated is not None, largest_age, capped
         self._last = self._clock_now = self._clock_then = 0
         self._then = -float("inf")
         self.clock_set_back = 0
 
-    def for_readings(self, largest_age: float) -> StampCheck:
+    def for_readings(self) -> StampCheck:
         """Return a check of readings' stamps by the same clock."""
-        return StampCheck(largest_age, self._clock if self._simulated else None, capped=True)
+        return StampCheck(self.largest_age, self._clock if self._simulated else None, capped=True)
 
     def check(self, nanoseconds: int, now: float) -> None:
         """Check a stamp at the monotonic time `now`, s.
@@ -84,9 +84,9 @@ class StampCheck:
         """
         clock = self._clock_now = self._clock()
         age = (clock - nanoseconds) * 1e-9
-        if abs(age) > self._largest_age > 0.0:
+        if abs(age) > self.largest_age > 0.0:
             reason, word = ("stamp_past", "old") if age > 0.0 else ("stamp_future", "in the future")
-            raise CommandError(reason, f"stamp is {abs(age):.3f} s {word}, allowed {self._largest_age:g} s")
+            raise CommandError(reason, f"stamp is {abs(age):.3f} s {word}, allowed {self.largest_age:g} s")
         if nanoseconds < self._last and now - self._then < FORGET_ORDER_AFTER and not self._was_set_back(clock, now):
             raise CommandError("stamp_order", "stamp is earlier than the last one's")
 

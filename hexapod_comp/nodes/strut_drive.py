@@ -14,9 +14,7 @@ from dataclasses import replace
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
-from rclpy.parameter import Parameter as RosParameter
 from sensor_msgs.msg import JointState
 
 from ..errors import CommandError, HexapodError, KinematicsError
@@ -30,11 +28,10 @@ from .health import ERROR, OK, WARN, Flow, Refusals, joined, seconds
 from .log_space import LogSpace
 from .messages import StrutMessage, StrutReader, write_pose
 from .order import InOrder, NoStep
-from .parameters import checked, declare
 from .running import keep_discovery_local, run
 from .runtime import ACKNOWLEDGED_WITHIN, STATE_QOS, MachineNode
 from .stamps import nanoseconds_of
-from .strut_drive_parameters import FAULT_PARAMETERS, PARAMETERS, PROGRAM
+from .strut_drive_parameters import PARAMETERS, PROGRAM
 
 LONGEST_PAUSE = 0.25
 """After a longer pause (a stopped process), the machine has moved on by no more than this, s."""
@@ -46,15 +43,9 @@ class StrutDriveNode(MachineNode):
     """Lifecycle node around one :class:`StrutDrive`; arguments are those of ``rclpy`` nodes."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("strut_drive", **options)
-        self._options = declare(self, PARAMETERS + FAULT_PARAMETERS)
-        self.wants_autostart = self._options["autostart"]
+        super().__init__("strut_drive", PARAMETERS, **options)
         self._refusals, self._commands = Refusals(), Flow()
-        names = self._options["joint_names"]
-        self._reader, self._states_out, self._true_out = StrutReader(names), StrutMessage(names=names), PoseStamped()
-        self._true_out.header.frame_id = self._options["base_frame"]
         self._drive: StrutDrive | None = None
-        self.add_on_set_parameters_callback(self._on_parameters)
 
     @property
     def drive(self) -> StrutDrive:
@@ -67,12 +58,14 @@ class StrutDriveNode(MachineNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Build the machine and open topics."""
-        options = self._options
+        options, names = self._options, self._options["joint_names"]
+        self._reader, self._states_out, self._true_out = StrutReader(names), StrutMessage(names=names), PoseStamped()
+        self._true_out.header.frame_id = options["base_frame"]
         try:
             geometry = load_geometry(config_file(options["geometry_file"], "geometry"))
             machine = RealMachine(geometry, self._truth(geometry))
             self._drive = StrutDrive(machine, self._drive_parameters(), options["noise_seed"])
-            self.drive.faults = self._faults(options)
+            self.drive.faults = self._faults()
             self.drive.advance(1.0 / options["rate"])
             self._tool_in_base()
         except HexapodError as error:
@@ -137,29 +130,18 @@ class StrutDriveNode(MachineNode):
 
     # ---- faults ----
 
-    def _on_parameters(self, parameters: list[RosParameter]) -> SetParametersResult:
-        wanted = dict(self._options)
-        known = {parameter.name: parameter for parameter in FAULT_PARAMETERS}
-        try:
-            for parameter in parameters:
-                if parameter.name in known:
-                    wanted[parameter.name] = checked(known[parameter.name], parameter.value)
-            faults = self._faults(wanted)
-        except HexapodError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        if not any(parameter.name == "fault_jump" for parameter in parameters):
-            faults = replace(faults, jump=None)
-        self._options = wanted
+    def on_parameters(self, names: set[str]) -> None:
+        """Take what has been set while the node runs; a knock only where it has been asked for anew."""
         if self._drive is not None:
-            self.drive.faults = faults
-        return SetParametersResult(successful=True)
+            self._order.valid_for = self._options["command_validity"]
+            faults = self._faults()
+            self._drive.faults = faults if "fault_jump" in names else replace(faults, jump=None)
 
-    @staticmethod
-    def _faults(options: dict[str, Any]) -> Faults:
+    def _faults(self) -> Faults:
         def index(number: int) -> int | None:
             return number - 1 if number else None
 
-        jump = options["fault_jump"]
+        options, jump = self._options, self._options["fault_jump"]
         return Faults(
             stuck=index(options["fault_stuck_strut"]),
             encoder_lost=index(options["fault_encoder_lost"]),

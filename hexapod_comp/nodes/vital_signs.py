@@ -45,17 +45,15 @@ class VitalSigns:
     """
 
     def __init__(self, node: MachineNode, options: dict[str, Any], topic: str, newest: Callable[[], int]) -> None:
-        self._node, self._newest = node, newest
+        self._node, self._options, self._newest = node, options, newest
         self._heartbeats = node.create_publisher(UInt64, "~/heartbeat", EVENT_QOS)
         self._validities = node.create_publisher(TimeReference, "~/validity", EVENT_QOS)
         self._stops = node.create_publisher(Bool, "~/stopped", LATCHED_QOS)
         self._beat, self._validity = UInt64(), TimeReference(source=topic)
-        self._lasting = round(options["command_timeout"] * 1e9)
         self._stopped: bool | None = None
         self._published_at = 0.0
         self.stop(True)
-        rate = options["heartbeat_rate"]
-        self._timer = node.every(1.0 / rate, self._beats) if rate else None
+        self._timer = node.at_rate("heartbeat_rate", self._beats)
 
     def stop(self, stopped: bool) -> None:
         """Say whether the node stops the machine, where that has changed or has not been said for a while."""
@@ -70,16 +68,15 @@ class VitalSigns:
 
     def close(self) -> None:
         """Stop beating."""
-        if self._timer is not None:
-            self._node.destroy_timer(self._timer)
+        self._node.destroy_timer(self._timer)
         for publisher in (self._heartbeats, self._validities, self._stops):
             self._node.destroy_publisher(publisher)
 
     def _beats(self) -> None:
         self._beat.data = (self._beat.data + 1) % 2**64
         self._heartbeats.publish(self._beat)
-        stamp = self._newest()
-        if stamp and self._lasting:
+        stamp, lasting = self._newest(), round(self._options["command_timeout"] * 1e9)
+        if stamp and lasting:
             self._validity.header.stamp = stamp_of(stamp)
-            self._validity.time_ref = stamp_of(min(stamp + self._lasting, LAST_STAMP))
+            self._validity.time_ref = stamp_of(min(stamp + lasting, LAST_STAMP))
             self._validities.publish(self._validity)

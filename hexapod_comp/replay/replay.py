@@ -191,6 +191,8 @@ class _Run:
             self.compensator.set_temperature(values["name"], float(values["value"]), float(values["time"]))
         elif entry.what == "enable":
             self.compensator.enable(bool(values["on"]))
+        elif entry.what == "ramp_rate":
+            self.compensator.set_ramp_rate(values["value"])
         elif entry.what == "reset":
             measured = values["measured"]
             self.compensator.reset(None if measured is None else np.array(measured, dtype=float))

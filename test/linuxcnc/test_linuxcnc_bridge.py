@@ -473,8 +473,8 @@ def test_leaves_hal_with_the_node(ros_context):
 @pytest.mark.parametrize(
     ("name", "value", "text"),
     [
-        ("units", "cm", "parameter units: must be mm or inch, not 'cm'"),
-        ("on_loss", "jump", "parameter on_loss: must be zero or hold, not 'jump'"),
+        ("units", "cm", "parameter units: must be one of mm, inch, not 'cm'"),
+        ("on_loss", "jump", "parameter on_loss: must be one of zero, hold, not 'jump'"),
         ("limit", -1.0, "limit"),
     ],
 )

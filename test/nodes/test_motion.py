@@ -21,7 +21,7 @@ from hexapod_comp.nodes import health, pacing
 from hexapod_comp.nodes.following import FOLLOWED_WITHIN, Recent, Standing
 from hexapod_comp.nodes.health import ERROR, OK, WARN
 from hexapod_comp.nodes.messages import pose_message
-from hexapod_comp.nodes.runtime import USE_SIM_TIME
+from hexapod_comp.nodes.parameters import USE_SIM_TIME
 from hexapod_comp.nodes.stamps import nanoseconds_of, stamp_of
 
 SPEED = 0.25
