@@ -12,7 +12,7 @@ from rclpy.utilities import remove_ros_args
 
 from ..errors import LONGEST_TEXT, printable
 from ..formats.texts import run_with_plain_streams
-from .parameters import Parameter
+from .parameters import Parameter, shown
 
 ROS_ARGUMENTS, END_OF_ROS_ARGUMENTS = "--ros-args", "--"
 
@@ -84,20 +84,11 @@ class Program:
     def _epilog(self) -> str:
         lines = ["parameters (-p NAME:=VALUE behind --ros-args; default in brackets):"]
         for parameter in self.parameters:
-            text = f"{parameter.name}  [{_shown(parameter.default)}]  {parameter.described()}"
+            text = f"{parameter.name}  [{shown(parameter.default)}]  {parameter.described()}"
             lines += textwrap.wrap(text, WIDTH, initial_indent="  ", subsequent_indent="      ")
         topics = ["", "topics and services:", *textwrap.indent(self.topics.strip(), "  ").splitlines()]
         example = ["", f"example: {self.name} {ROS_ARGUMENTS} {self.example}"]
         return "\n".join([*lines, *(topics if self.topics else ()), *example])
-
-
-def _shown(value: bool | int | float | str | list[str]) -> str:
-    """Return a default as a parameter's value is written."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, list):
-        return "[" + ", ".join(value) + "]"
-    return f"{value:g}" if isinstance(value, float) else str(value) or "''"
 
 
 def outside_ros(arguments: Sequence[str]) -> list[str]:

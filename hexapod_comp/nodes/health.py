@@ -85,7 +85,7 @@ class HealthReport:
     name : str
         Status name, ``node: machine``.
     hardware_id : str
-        Machine name.
+        Which machine it is.
     period : float
         Longest time between two messages, s.
     """

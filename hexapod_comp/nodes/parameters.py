@@ -150,6 +150,15 @@ def read_table(text: str) -> tuple[Parameter, ...]:
     )
 
 
+def shown(value: bool | int | float | str | list[str]) -> str:
+    """Return a default as a parameter's value is written."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return "[" + ", ".join(value) + "]"
+    return f"{value:g}" if isinstance(value, float) else str(value) or "''"
+
+
 class Parameters(dict[str, Any]):
     """The values of a node's parameters, by name, checked; where they may change they are always those in force.
 

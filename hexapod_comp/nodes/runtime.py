@@ -158,8 +158,10 @@ class MachineNode(LifecycleNode):
         return super().on_deactivate(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop acting for good."""
-        self._active = False
+        """Stop acting for good: say so, then close what is open, so that nothing more is published."""
+        self.say_goodbye()
+        if state.state_id != State.PRIMARY_STATE_UNCONFIGURED:
+            self.on_cleanup(state)
         return super().on_shutdown(state)
 
     def warn_of(self, cause: str, text: str) -> None:
@@ -179,7 +181,8 @@ class MachineNode(LifecycleNode):
 
     def speak_for(self, what: str) -> None:
         """Name the machine or component that this node serves from now on in its status."""
-        self._report = HealthReport(f"{self.get_fully_qualified_name()[1:]}: {what}", what)
+        hardware = f"{self.get_namespace()}/{what}".lstrip("/")  # two machines of a kind differ by their namespaces
+        self._report = HealthReport(f"{self.get_fully_qualified_name()[1:]}: {what}", hardware)
 
     def tell(self, level: bytes, text: str, values: Callable[[], dict[str, str]]) -> None:
         """Publish level, text and values when they are due, with what the guard has caught."""

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import runpy
+from typing import Any
+
 import numpy as np
 import pytest
-from node_helpers import HOME, Bench, closed_form_lengths, model_file
+import yaml
+from node_helpers import CONFIG, HOME, Bench, closed_form_lengths, launched, model_file
 from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import DescribeParameters
-from rclpy.parameter import Parameter
 from std_msgs.msg import UInt64
 
-from hexapod_comp.nodes import compensator, strut_drive
+from hexapod_comp.nodes.compensator import CompensatorNode
 from hexapod_comp.nodes.parameters import Taken
+from hexapod_comp.nodes.strut_drive import StrutDriveNode
+
+MAKER = runpy.run_path(str(CONFIG.parent / "tools" / "make_parameter_files.py"))
+TABLES = MAKER["TABLES"]
+KINDS = {"compensator": CompensatorNode, "strut_drive": StrutDriveNode}
 
 COMPENSATOR = "compensator"
 
@@ -113,7 +121,8 @@ def test_another_model_is_taken_by_reload(bench, tmp_path):
 def test_descriptors_say_range_and_when(bench):
     bench.compensator(start=False)
     bench.drive(start=False)
-    for name, table in ((COMPENSATOR, compensator.PARAMETERS), ("strut_drive", strut_drive.PARAMETERS)):
+    for name in KINDS:
+        table = TABLES[name]
         request = DescribeParameters.Request(names=[p.name for p in table])
         told = bench.call(DescribeParameters, f"{name}/describe_parameters", request).descriptors
         for parameter, descriptor in zip(table, told, strict=True):
@@ -126,9 +135,60 @@ def test_descriptors_say_range_and_when(bench):
             assert all(r.from_value <= parameter.default <= r.to_value for r in ranges)
 
 
+def test_page_and_file_are_those_of_the_tables():
+    """``python tools/make_parameter_files.py`` makes them so."""
+    for path, made in ((MAKER["PAGE"], MAKER["page"](MAKER["PAGE"].read_text())), (MAKER["FILE"], MAKER["file"]())):
+        assert path.read_text(encoding="utf-8") == made, path
+
+
+def in_force(node: Any) -> dict[str, Any]:
+    """Return a node's parameters as ROS has them."""
+    return {p.name: node.get_parameter(p.name).value for p in TABLES[node.get_name()]}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_the_shipped_file_gives_the_defaults_in_any_namespace(ros_context, capfd, name):
+    with Bench(ros_context, capfd, "/left/cell") as bench:
+        node = bench.add(KINDS[name], False, {}, cli_args=["--ros-args", "--params-file", str(MAKER["FILE"])])
+        assert in_force(node) == {p.name: p.default for p in TABLES[name]}
+        assert not bench.logged("there is no parameter")
+
+
+def other_value(parameter: Any) -> Any:
+    """Return an allowed value that is not the default."""
+    if parameter.range:
+        low, high = (type(parameter.default)(end) for end in parameter.range)
+        return high if parameter.default != high else low
+    if parameter.choices:
+        return parameter.choices[-1]
+    if isinstance(parameter.default, list):
+        return parameter.default[::-1]
+    return not parameter.default if isinstance(parameter.default, bool) else f"{parameter.default}x"
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_file_of_other_values_is_loaded_also_through_the_launch_file(bench, monkeypatch, tmp_path, name):
+    """The launch file gives its own arguments after the file; launch_ros writes them into files, as here."""
+    others = {p.name: other_value(p) for p in TABLES[name] if p.name != "model_folder"}
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump({f"/**/{name}": {"ros__parameters": others}}))
+    node = bench.add(KINDS[name], False, {}, cli_args=["--ros-args", "--params-file", str(path)])
+    assert {key: value for key, value in in_force(node).items() if key in others} == others
+    given = {n["name"]: n["parameters"] for n in launched(monkeypatch, params_file=str(path), model="table.yaml")}[name]
+    arguments = ["--ros-args"]
+    for number, part in enumerate(given):
+        if isinstance(part, dict):
+            (tmp_path / f"{number}.yaml").write_text(yaml.safe_dump({"/**": {"ros__parameters": part}}))
+            part = str(tmp_path / f"{number}.yaml")
+        arguments += ["--params-file", part]
+    values = in_force(bench.add(KINDS[name], False, {}, cli_args=arguments))
+    assert values == in_force(node) | {k: v for k, v in given[-1].items() if k in others}
+    assert values["command_timeout"] == 3600.0
+    assert values.get("model_file", "table.yaml") == "table.yaml"
+
+
 def test_tables_hold_their_own_defaults():
     """A default outside its own range, or one that is no choice, would refuse every start."""
-    for table in (compensator.PARAMETERS, strut_drive.PARAMETERS):
+    for table in TABLES.values():
         assert len({p.name for p in table}) == len(table)
         assert all(p.checked(p.default) == p.default for p in table)
-        assert all(Parameter(p.name, value=p.default) for p in table)

@@ -45,7 +45,7 @@ def along(n: int) -> Pose:
 
 
 def test_a_run_with_everything_is_replayed_bit_for_bit(bench, tmp_path):
-    """Ramps in and out, a temperature, another model, a reset to measured struts, refused commands."""
+    """Ramps in and out and at another rate, a temperature, another model, a reset to measured struts, refusals."""
     model = model_file(tmp_path, struts={"offset_um": 30.0, "backlash_um": 8.0, "expansion_ppm_per_K": 11.0})
     bench.compensator(model_file=model, temperature_time_constant_s=0.0)
     recorder = Recorder(bench)
@@ -53,8 +53,11 @@ def test_a_run_with_everything_is_replayed_bit_for_bit(bench, tmp_path):
     bench.warm("strut_3", 24.7)
     answers += [bench.ask(along(n)) for n in range(40, 60)]
     bench.enable(False)
-    answers += [bench.ask(along(n)) for n in range(60, 80)]
-    model_file(tmp_path, struts={"offset_um": -20.0, "pitch_ppm": 40.0})
+    answers += [bench.ask(along(n)) for n in range(60, 70)]
+    assert bench.set_parameter("compensator", "ramp_rate", 2.5e-3).successful
+    answers += [bench.ask(along(n)) for n in range(70, 80)]
+    other = model_file(tmp_path, "other.yaml", struts={"offset_um": -20.0, "pitch_ppm": 40.0})
+    assert bench.set_parameter("compensator", "model_file", other).successful
     assert bench.trigger("reload_model").success
     bench.enable(True)
     answers += [bench.ask(along(n)) for n in range(80, 120)]
@@ -73,7 +76,7 @@ def test_a_run_with_everything_is_replayed_bit_for_bit(bench, tmp_path):
     sent = np.array([answer.lengths for answer in answers])
     assert result.lengths[:, 0].tobytes() == sent.tobytes(), "the truth is what the node sent, not what the bag says"
     assert not result.states_differ
-    assert {event.entry.what for event in result.changes} == {"temperature", "enable", "model", "reset"}
+    assert {event.entry.what for event in result.changes} == {"temperature", "enable", "ramp_rate", "model", "reset"}
     assert [event.entry.values["reason"] for event in result.refused] == ["step", "frame_id"]
     assert len(recording.sources) >= 3, "geometry and both models"
 

@@ -8,21 +8,17 @@ from __future__ import annotations
 
 import ast
 import contextlib
-import runpy
-import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
-from typing import Any
 
 import pytest
 import rclpy
 from hal_stand_in import StandInHal
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
-from node_helpers import Bench
+from node_helpers import Bench, launched
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
@@ -185,30 +181,11 @@ def test_the_operator_may_all_that_the_ros2_tools_open(ros_context: Context, cap
 
 
 def test_the_launch_file_names_the_enclaves_of_the_policy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each node's ``--enclave`` is in the policy, by default. Stand-ins for launch, which PyPI has not."""
-    defaults: dict[str, Any] = {}
-    parts = {
-        "launch": {"LaunchContext": dict, "LaunchDescription": list},
-        "launch.actions": {
-            "DeclareLaunchArgument": lambda name, default_value, **_: defaults.update({name: default_value}),
-            "OpaqueFunction": lambda function: function,
-        },
-        "launch.substitutions": {
-            "EnvironmentVariable": lambda _, default_value: default_value,
-            "LaunchConfiguration": lambda name: SimpleNamespace(perform=lambda context: context[name]),
-        },
-        "launch_ros": {},
-        "launch_ros.actions": {"Node": lambda **options: options},
-    }
-    for name, content in parts.items():
-        module = ModuleType(name)
-        module.__dict__.update(content)
-        monkeypatch.setitem(sys.modules, name, module)
-    nodes = runpy.run_path(str(PACKAGE.parent / "launch" / "machine.launch.py"))["generate_launch_description"]()[-1]
+    """Each node's ``--enclave`` is in the policy, by default."""
     root = ET.parse(POLICY).getroot()
     paths = {enclave.get("path") for enclave in root.iter("enclave")}
-    for folder, known in ((defaults["enclaves"], True), ("/mine", False)):
-        arguments = [node["ros_arguments"] for node in nodes({**defaults, "enclaves": folder})]
+    for given, folder, known in (({}, "/hexapod_comp", True), ({"enclaves": "/mine"}, "/mine", False)):
+        arguments = [node["ros_arguments"] for node in launched(monkeypatch, **given)]
         asked = [words[words.index("--enclave") + 1] for words in arguments]
         assert asked == [f"{folder}/compensator", f"{folder}/strut_drive"]
         assert paths.issuperset(asked) is known

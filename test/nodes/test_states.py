@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rclpy
+from lifecycle_msgs.srv import ChangeState
 from node_helpers import CONFIG, HOME, RELIABLE, Bench, closed_form_lengths, geometry_file, model_file, near
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
@@ -677,3 +678,37 @@ def test_shipped_models_survive_the_way_through_the_loading_process():
             np.testing.assert_array_equal(one, other)
         np.testing.assert_array_equal(again.struts.map_values, model.struts.map_values)
         assert again.origin == model.origin
+
+
+@pytest.mark.parametrize("active", [True, False], ids=["active", "inactive"])
+def test_after_a_shutdown_nothing_is_published(bench, active):
+    """Before, heartbeats, journal, diagnostics and readings went on. Without a timer nothing comes by itself."""
+    nodes = bench.drive(), bench.compensator()
+    bench.ask(HOME)
+    for node in nodes:
+        name = node.get_name()
+        if not active:
+            assert bench.change("deactivate", name)
+        request = ChangeState.Request()
+        request.transition.label = "shutdown"
+        assert bench.call(ChangeState, f"{name}/change_state", request).success
+        assert bench.state(name) == "finalized"
+        assert not list(node.timers)
+        bench.until(lambda name=name: bench.message(name).startswith("not active"), "a last status")
+        theirs = {p.topic_name for p in node.publishers}
+        assert theirs <= {"/rosout", "/parameter_events", "/diagnostics", f"/{name}/transition_event"}
+    seen = {topic: len(messages) for topic, messages in bench.seen.items()}
+    bench.send(HOME)
+    bench.barrier()
+    assert seen == {topic: len(messages) for topic, messages in bench.seen.items()}
+
+
+def test_two_machines_of_a_kind_have_other_hardware_ids(ros_context, capfd):
+    """What monitors of a whole plant tell machines apart by."""
+    with Bench(ros_context, capfd, "/left") as left, Bench(ros_context, capfd, "/hall/right") as right:
+        for bench in (left, right):
+            bench.drive()
+            bench.compensator()
+        for bench, place in ((left, "left"), (right, "hall/right")):
+            bench.until(lambda b=bench: b.values("strut_drive") and b.values(), "statuses")
+            assert {bench.status(name).hardware_id for name in ("compensator", "strut_drive")} == {f"{place}/paper"}

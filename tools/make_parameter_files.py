@@ -1,0 +1,71 @@
+"""Write config/parameters.yaml and the tables of doc/parameters.md from the nodes' own tables of parameters.
+
+Run it after a change of a table: ``python tools/make_parameter_files.py``. A test holds both against the tables.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import textwrap
+from pathlib import Path
+
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from hexapod_comp.linuxcnc import parameters as linuxcnc_bridge  # noqa: E402
+from hexapod_comp.nodes import compensator_parameters, strut_drive_parameters  # noqa: E402
+from hexapod_comp.nodes.parameters import Parameter, shown  # noqa: E402
+
+PAGE, FILE = ROOT / "doc" / "parameters.md", ROOT / "config" / "parameters.yaml"
+
+TABLES = {
+    "compensator": compensator_parameters.PARAMETERS,
+    "strut_drive": strut_drive_parameters.PARAMETERS,
+    "linuxcnc_bridge": linuxcnc_bridge.PARAMETERS,
+}
+
+HEAD = """\
+# All parameters of the nodes with their defaults. Copy the file, keep what differs on your machine, and start a node
+# with --ros-args --params-file mine.yaml, or the launch file with params_file:=mine.yaml.
+"""
+
+
+def table(parameters: tuple[Parameter, ...]) -> str:
+    """Return a table of parameters as Markdown."""
+    rows = [
+        f"| `{p.name}` | `{shown(p.default)}` | {_allowed(p)} | {p.taken.name.lower()} | {p.meaning} |"
+        for p in parameters
+    ]
+    return "\n".join(["| parameter | default | allowed | taken | meaning |", "|---|---|---|---|---|", *rows])
+
+
+def _allowed(parameter: Parameter) -> str:
+    return parameter.allowed or {bool: "true, false", str: "text", list: "names"}[type(parameter.default)]
+
+
+def page(text: str) -> str:
+    """Return the page with the tables as they should be, each below the heading with its node's name."""
+    for node, parameters in TABLES.items():
+        text = re.sub(rf"(?<=\n## {node}\n)[^#]*", lambda _, p=parameters: f"\n{table(p)}\n\n", text)
+    return text.rstrip() + "\n"
+
+
+def file() -> str:
+    """Return the file of parameters, for nodes in any namespace."""
+    text = HEAD
+    for node, parameters in TABLES.items():
+        lines: list[str] = []
+        for p in parameters:
+            lines += textwrap.wrap(f"# {p.described()}; taken {p.taken.value}", 110, subsequent_indent="# ")
+            value = yaml.safe_dump([p.default], default_flow_style=True, width=200).strip()
+            lines.append(f"{p.name}: {value[1:-1]}")
+        text += f"\n/**/{node}:\n  ros__parameters:\n" + textwrap.indent("\n".join(lines), "    ") + "\n"
+    return text
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    FILE.write_text(file(), encoding="utf-8")
