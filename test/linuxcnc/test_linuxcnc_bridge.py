@@ -450,12 +450,24 @@ def test_end_ramps_out_what_is_quick(bench, speak, ramp_rate, left):
         return machine.hal["status"] == GuardStatus.COMPENSATING
 
     bench.until(compensating, "compensation")
-    machine.node._options["ramp_rate"] = ramp_rate
-    machine.node._guard._ramp_rate = ramp_rate
+    assert bench.set_parameter(NODE, "ramp_rate", ramp_rate).successful
     machine.node.say_goodbye()
     np.testing.assert_allclose(machine.hal.corrections, left, rtol=1e-9)
     assert bool(bench.logged("corrections stay as they are")) is bool(left)
     assert_never_steps(machine.hal)
+
+
+def test_what_guards_the_drives_is_taken_at_configure(bench, speak):
+    machine = Machine(bench).start()
+    refused = bench.set_parameter(NODE, "limit", 20e-6)
+    assert refused.reason == "parameter limit: is taken at configure, and the node is active; set it after a cleanup"
+    for transition in ("deactivate", "cleanup"):
+        assert bench.change(transition, NODE)
+    assert bench.set_parameter(NODE, "limit", 20e-6).successful
+    for transition in ("configure", "activate"):
+        assert bench.change(transition, NODE)
+    bench.until(lambda: speak.steadily([50e-6] * 6) or machine.hal["rejected"], "a correction that is too large")
+    assert not machine.hal.corrections.any()
 
 
 def test_ends_without_ever_having_been_configured(bench):
