@@ -71,7 +71,7 @@ class CheckReadings:
             problem = f"{len(kinds)} readings at distinct places are no check (at most {MOST_PLACES}); fit them"
             raise CalibrationError("measurements", problem)
         linear, _ = estimation.linearise(fitted.x if x is None else x, np.ones(len(measurements)))
-        rows, seen = fitted.space.unwhitened(linear.rows), _seen(estimation)
+        rows, seen = fitted.space.unwhitened(linear.rows.dense()), _seen(estimation)
         if not seen.shape[1]:
             problem = "tell nothing: the unknown zeros of their runs take all of them; read more places of each run"
             raise CalibrationError("measurements", problem)

@@ -8,17 +8,19 @@ beforehand, so it costs no parameters.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from ..errors import CalibrationError, KinematicsError, ModelError
 from ..measurements.readings import KINDS, LEAST_NOISE, MeasurementSet, refuse_absurd
+from .cell_rows import Alike, CellRows
 from .cells import Cells
 from .linear_problem import LARGE_FOLD, SMALL, FoldSum, LinearProblem, Posterior, physical_covariance, solve
 from .parameters import ParameterSpace
-from .sensitivity import Prediction, derivatives, predict
+from .sensitivity import Prediction, Slopes, predict
 from .unknowns import Unknown, of_zero
 
 STEPS = 20
@@ -36,9 +38,6 @@ HUBER = 2.5
 
 MEDIAN_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over the median of its absolute values."""
-
-CHUNK = 1024
-"""Stations whose derivatives are worked out together."""
 
 ROUNDING = 1e-12
 """A direction whose component is below this does not have it: frames turned by right angles are right to rounding."""
@@ -74,7 +73,6 @@ class Estimation:
         self._components = np.abs(self.cells.directions) > ROUNDING
         for lengths in self._lengths:
             self._components[lengths.members, :3] = True  # their directions change with the answer
-        self._by_station = np.argsort(self.cells.station, kind="stable")
         self._alike = self._group_alike()
         needed = len(space.blocks[0].labels)
         free = len(self.cells.station) - len(self._zeros) - sum(along is not None for _, along in self._zeros)
@@ -109,11 +107,12 @@ class Estimation:
         mean = np.bincount(c.of_reading, weights * misfit) / total
         rows, moved = self._rows(x, prediction, scale[:, None] * directions)
         target, unknown = scale * mean, np.zeros(len(mean))
-        per_length = rows[:, self.space.offsets].copy()
+        per_length = rows.using(np.arange(self.space.size)[self.space.offsets], np.ones(len(mean))).dense()
         for part in unknowns:
             unknown[part.members] += part.explained(target) / scale[part.members]
-            for projected in (target, moved, rows):
-                part.project_out(projected)
+            part.project_out(target)
+            part.project_out(moved)
+            rows.project_out(part)
         residuals = misfit - unknown[c.of_reading]
         scatter = np.bincount(m.kind, weights * (misfit - mean[c.of_reading]) ** 2, len(KINDS))
         # Huber's proposal 2: noise comes from the residuals cut off, weight² · residual², or outliers blow it up.
@@ -121,28 +120,18 @@ class Estimation:
         problem = self._problem(target + moved, rows, scatter - beyond, unknowns)
         return replace(problem, per_length=per_length, unknowns=tuple(unknowns)), residuals
 
-    def _rows(self, x: np.ndarray, prediction: Prediction, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return each cell's derivatives by y, (C, size), and what all parameters do together, (C,).
+    def _rows(self, x: np.ndarray, prediction: Prediction, directions: np.ndarray) -> tuple[CellRows, np.ndarray]:
+        """Return each cell's derivatives by y, and what all parameters do together, (C,).
 
-        Along directions (C, 6), over the standard deviations of the cells' values. Station by station: the derivatives
-        of all six components of an error would not fit into memory together.
+        Along directions (C, 6), over the standard deviations of the cells' values.
         """
-        c, space, stations = self.cells, self.space, self.measurements.stations
-        rows, moved = np.empty((len(c.station), space.size)), np.empty(len(c.station))
-        ordered = c.station[self._by_station]
-        for first in range(0, len(stations), CHUNK):
-            chosen = slice(first, first + CHUNK)
-            slopes = derivatives(space, prediction.select(chosen), stations.select(chosen))
-            begin, end = np.searchsorted(ordered, (first, first + CHUNK))
-            members = self._by_station[begin:end]
-            at, along = c.station[members] - first, directions[members]
-            moved[members] = np.einsum("ci,ci->c", along, (slopes @ x)[at])
-            part = np.zeros((len(members), space.size))
-            for component in range(6):
-                seen = np.flatnonzero(self._components[members, component])
-                part[seen] += along[seen, component, None] * slopes[at[seen], component]
-            rows[members] = space.whitened(part)
-        return rows, moved
+        c, space = self.cells, self.space
+        slopes, moved, parts = Slopes(space, prediction, self.measurements.stations), np.empty(len(c.station)), []
+        for _, components, cells, _ in self._alike:
+            rows, columns = slopes.along(c.station[cells], directions[cells], components)
+            moved[cells] = rows @ x[columns]
+            parts.append(Alike(cells, columns, space.whiten(rows, columns)))
+        return CellRows((len(moved), space.size), parts), moved
 
     def free_of_unknowns(self, rows: np.ndarray) -> np.ndarray:
         """Return what is left of cells' derivatives (C, K) beside all that instruments do not know, over their noise.
@@ -196,7 +185,7 @@ class Estimation:
         return expected, unknowns
 
     def _problem(
-        self, target: np.ndarray, rows: np.ndarray, scatter: np.ndarray, unknowns: list[Unknown]
+        self, target: np.ndarray, rows: CellRows, scatter: np.ndarray, unknowns: list[Unknown]
     ) -> LinearProblem:
         """Gather the sums that everything later needs."""
         kind, size, kinds = self.cells.kind, self.space.size, len(KINDS)
@@ -204,40 +193,38 @@ class Estimation:
         freedom = np.bincount(self.measurements.kind, minlength=kinds).astype(float)
         for part in unknowns:
             freedom[kind[part.members[0]]] -= part.share.sum()
-        sums = tuple(self._sums(rows))
-        for one in sums:
-            normal[one.kind][np.ix_(one.columns, one.columns)] += one.normal
-        for k in np.unique(kind):
-            of_kind = np.where(kind == k, target, 0.0)
-            moment[k] = of_kind @ rows
-            square[k] += of_kind @ of_kind
+        sums = []
+        for n, (k, _, cells, folds) in enumerate(self._alike):
+            _, columns, values = rows.parts[n]
+            for fold, where in folds:
+                sums.append(FoldSum(fold, n, where, values[where].T @ values[where]))
+                normal[k][np.ix_(columns, columns)] += sums[-1].normal
+            moment[k][columns] += target[cells] @ values
+            square[k] += target[cells] @ target[cells]
         least_noise = LEAST_NOISE / np.array([self.measurements.stated_of(k) for k in range(kinds)])
         folded = tuple(one for one in sums if one.fold != SMALL)
         return LinearProblem(
             target, rows, kind, self.cells.fold, normal, moment, square, freedom, least_noise, sums=folded
         )
 
-    def _sums(self, rows: np.ndarray) -> Iterator[FoldSum]:
-        """Yield sums of products of rows over cells of one kind and fold that the same parameters move."""
-        for fold, kind, members in self._alike:
-            part = rows[members]
-            columns = np.flatnonzero(part.any(axis=0))
-            part = part[:, columns]
-            yield FoldSum(fold, kind, columns, part.T @ part)
+    def _group_alike(self) -> list[tuple[int, np.ndarray, np.ndarray, list[tuple[int, slice]]]]:
+        """Return cells of a kind whose errors have the same components: kind, components, cells, and where folds stand.
 
-    def _group_alike(self) -> list[tuple[int, int, np.ndarray]]:
-        """Return fold, kind and cells of all that the same components of an error move; small folds together."""
+        Large folds stand together, and in them what shares an unknown; small folds stand together, marked as such.
+        """
         c = self.cells
-        large = np.bincount(c.fold)[c.fold] >= LARGE_FOLD
-        key = np.where(large, c.fold, SMALL) * len(KINDS) + c.kind
-        key = key * 64 + self._components @ (1 << np.arange(6))
-        every, group = np.unique(key, return_inverse=True)
-        order, ends = np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))
-        kinds = every // 64
-        return [
-            (int(kind // len(KINDS)), int(kind % len(KINDS)), members)
-            for kind, members in zip(kinds, np.split(order, ends[:-1]), strict=True)
-        ]
+        for members in [members for members, _ in self._zeros] + [lengths.members for lengths in self._lengths]:
+            self._components[members] |= self._components[members].any(axis=0)
+        fold = np.where(np.bincount(c.fold)[c.fold] >= LARGE_FOLD, c.fold, SMALL)
+        key = c.kind * 64 + self._components @ (1 << np.arange(6))
+        order = np.lexsort((c.group, fold, key))
+        result = []
+        for cells in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
+            ends = [0, *(np.flatnonzero(np.diff(fold[cells])) + 1).tolist(), len(cells)]
+            folds = [(int(fold[cells[a]]), slice(a, b)) for a, b in pairwise(ends)]
+            components = np.flatnonzero(self._components[cells[0]])
+            result.append((int(c.kind[cells[0]]), components, cells, folds))
+        return result
 
     def robust_weights(self, residuals: np.ndarray) -> np.ndarray:
         """Return Huber's weights of residuals (N,), 1 for all that are no surprise.

@@ -89,7 +89,7 @@ def seen_by(space: ParameterSpace, campaign: Campaign, measured: MeasurementSet)
     estimation = Estimation(measured, space, alone=False)
     problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(measured)))
     noise = np.array([noise_factor(campaign, kind) for kind in KINDS])
-    rows = problem.rows * space.spread(space.start_tolerances()) / noise[problem.kind][:, None]
+    rows = problem.rows.dense() * space.spread(space.start_tolerances()) / noise[problem.kind][:, None]
     run_of_station = np.empty(len(measured.stations), dtype=int)
     run_of_station[measured.station] = measured.run
     run = run_of_station[estimation.cells.station]

@@ -170,8 +170,8 @@ class _Rest:
     def __init__(self, estimation: Estimation, problem: LinearProblem, posterior: Posterior) -> None:
         over_noise = 1.0 / posterior.noise[problem.kind]
         self._problem, self._posterior, self._over_noise = problem, posterior, over_noise
-        self._rows = over_noise[:, None] * problem.rows[:, posterior.used]
-        left = over_noise * problem.target - self._rows @ posterior.y
+        self._rows = problem.rows.using(posterior.used, over_noise)
+        left = over_noise * problem.target - self._rows.times(posterior.y)
         cut = HUBER * MEDIAN_TO_SIGMA * np.median(np.abs(left))
         self.left = np.clip(left, -cut, cut)
         self.gains = over_noise[:, None] * problem.per_length
@@ -223,12 +223,12 @@ class _Rest:
         orders = np.arange(1, harmonics + 1)
         c, s = (self.gains[:, None] * f(orders[:, None] * angle[:, None]) for f in (np.cos, np.sin))
         waves = self._free(np.concatenate([c, s], axis=1).reshape(len(angle), -1))
-        shared = self._rows.T @ waves
+        shared = self._rows.transposed_times(waves)
         amplitudes, less, _ = self._solved(waves, shared)
         a, b = amplitudes.reshape(2, len(orders), 6)
         turning = 2.0 * np.pi * self.commands[:, None] * orders[:, None]
         slope = self._free(((b * c - a * s) * turning).sum(axis=(1, 2))[:, None])
-        every = np.hstack([waves, slope]), np.hstack([shared, self._rows.T @ slope])
+        every = np.hstack([waves, slope]), np.hstack([shared, self._rows.transposed_times(slope)])
         together, _, covariance = self._solved(*every, loose=1)
         if not covariance[-1, -1] > 0.0:
             return less, 0.0, np.inf

@@ -6,21 +6,23 @@ often tolerances and noise are estimated anew.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from ..errors import CalibrationError
+from .cell_rows import CellRows
 from .parameters import ParameterSpace
 from .unknowns import Unknown
 
 SCALE_ROUNDS = 12
 """Rounds of estimating tolerances and noise for one linearisation."""
 
-SCALE_SETTLED = 1e-9
+SCALE_SETTLED = 1e-6
 """The rounds stop when no tolerance and no noise changes by more than this share."""
 
 LONGEST_STRIDE = 16.0
@@ -35,26 +37,31 @@ LARGEST_TOLERANCE = {"structure": 5e-3}
 LEAST_FREEDOM = 10.0
 """Noise is estimated from at least so many readings beyond those that the parameters use up."""
 
+TOGETHER = 1000
+"""Cells of small folds that are looked at together."""
+
 LARGE_FOLD, SMALL = 300, -1
 """Cells from which a fold is left out by its sums, not cell by cell; and the mark of all smaller folds together."""
 
 
 class FoldSum(NamedTuple):
-    """Sum of products of the derivatives of one fold's cells of one kind that the same parameters move.
+    """Sum of products of the derivatives of one fold's cells that the same parameters move.
 
     Attributes
     ----------
-    fold, kind : int
+    fold : int
         As in :class:`Cells`; :data:`SMALL` for all small folds together.
-    columns : ndarray of int, shape (m,)
-        These parameters.
+    part : int
+        Which part of the rows.
+    where : slice
+        Where they stand in it.
     normal : ndarray, shape (m, m)
         rowsᵀ·rows.
     """
 
     fold: int
-    kind: int
-    columns: np.ndarray
+    part: int
+    where: slice
     normal: np.ndarray
 
 
@@ -66,7 +73,7 @@ class LinearProblem:
     ----------
     target : ndarray, shape (C,)
         Cells' values that the parameters explain, over their standard deviation at unit noise factors.
-    rows : ndarray, shape (C, size)
+    rows : CellRows, shape (C, size)
         Their derivatives by y, alike.
     kind, fold : ndarray of int, shape (C,)
         As in :class:`Cells`.
@@ -89,7 +96,7 @@ class LinearProblem:
     """
 
     target: np.ndarray
-    rows: np.ndarray
+    rows: CellRows
     kind: np.ndarray
     fold: np.ndarray
     normal: np.ndarray
@@ -156,22 +163,22 @@ def solve(
         Fixed-point rounds; 0 takes tolerances and noise as they are.
     """
     used = np.flatnonzero(space.spread(tolerances))
-    normal = np.ascontiguousarray(problem.normal[:, used[:, None], used])
-    moment = problem.moment[:, used]
+    kinds = np.unique(problem.kind)
+    normal, moment = problem.normal[np.ix_(kinds, used, used)], problem.moment[np.ix_(kinds, used)]
     scales = [np.concatenate([tolerances, noise])]
     for turn in range(rounds + 1):
         tolerances, noise = scales[-1][: len(tolerances)], scales[-1][len(tolerances) :]
         spread = space.spread(tolerances)[used]
-        whitened = np.tensordot(noise**-2, normal, 1)
+        whitened = np.tensordot(noise[kinds] ** -2, normal, 1)
         whitened *= spread[:, None] * spread
         whitened[np.diag_indices_from(whitened)] += 1.0
         inverse = _inverse(whitened)
-        z = inverse @ (spread * (noise**-2 @ moment))
+        z = inverse @ (spread * (noise[kinds] ** -2 @ moment))
         determined = 1.0 - np.diag(inverse)
         inverse *= spread[:, None] * spread
         posterior = Posterior(used, spread * z, inverse, tolerances, noise, determined, spread)
         if turn < rounds:
-            noise, tolerances = _noise(problem, normal, moment, posterior), _tolerances(space, posterior, z)
+            noise, tolerances = _noise(problem, kinds, normal, moment, posterior), _tolerances(space, posterior, z)
             scales.append(np.concatenate([tolerances, noise]))
             ratio = scales[-1][scales[-1] > 0.0] / scales[-2][scales[-1] > 0.0]
             if np.abs(np.log(ratio)).max() < SCALE_SETTLED:
@@ -197,29 +204,31 @@ def _extrapolated(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> n
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverse of a positive definite matrix.
+    """Return the inverse of a positive definite matrix, which is overwritten.
 
     Raises
     ------
     CalibrationError
         It is not, to rounding: readings outweigh the priors more than 1e16 times.
     """
-    factor, failed = dpotrf(matrix, lower=1)
+    factor, failed = dpotrf(matrix.T, lower=1, overwrite_a=1)
     if failed:
         problem = "are too few to tell noise from the machine's errors, or their uncertainty is below any instrument's"
         raise CalibrationError("measurements", problem)
     lower, _ = dpotri(factor, lower=1, overwrite_c=1)
-    lower = np.tril(lower)
-    lower += np.tril(lower, -1).T
-    return lower
+    inverse = lower.T + lower  # dpotrf has left zeros above
+    inverse[np.diag_indices_from(inverse)] *= 0.5
+    return inverse
 
 
-def _noise(problem: LinearProblem, normal: np.ndarray, moment: np.ndarray, posterior: Posterior) -> np.ndarray:
-    """Return new noise factors: squared residuals over what freedom the parameters leave."""
+def _noise(
+    problem: LinearProblem, kinds: np.ndarray, normal: np.ndarray, moment: np.ndarray, posterior: Posterior
+) -> np.ndarray:
+    """Return new noise factors: squared residuals over what freedom the parameters leave; sums of some kinds."""
     result, y = posterior.noise.copy(), posterior.y
-    for k in np.flatnonzero(problem.freedom > 0.0):
-        rest = problem.square[k] - 2.0 * y @ moment[k] + y @ normal[k] @ y
-        freedom = problem.freedom[k] - np.vdot(posterior.covariance, normal[k]) / result[k] ** 2
+    for k, information, sums in zip(kinds, normal, moment, strict=True):
+        rest = problem.square[k] - 2.0 * y @ sums + y @ information @ y
+        freedom = problem.freedom[k] - np.vdot(posterior.covariance, information) / result[k] ** 2
         if freedom > LEAST_FREEDOM and rest > 0.0:
             result[k] = np.sqrt(rest / freedom)
     return np.maximum(result, problem.least_noise)
@@ -250,51 +259,63 @@ def held_out(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
     scale = 1.0 / posterior.noise[problem.kind]
     full = np.zeros(problem.rows.shape[1])
     full[posterior.used] = posterior.y
-    residual = scale * (problem.target - problem.rows @ full)
+    residual = scale * (problem.target - problem.rows.times(full))
+    result = residual.copy()
     sums: dict[int, list[FoldSum]] = {}
-    for part in problem.sums:
-        sums.setdefault(part.fold, []).append(part)
-    order = np.argsort(problem.fold, kind="stable")
-    folds = np.split(order, np.flatnonzero(np.diff(problem.fold[order])) + 1)
-    precision = whitened_precision(problem, posterior)
-    # A root of the covariance, by way of the precision: a block of next to no tolerance leaves the former singular.
-    lower = np.linalg.cholesky(precision)
-    root = posterior.spread[:, None] * solve_triangular(lower, np.eye(len(lower)), lower=True).T
-    result = np.empty(len(residual))
-    for members in folds:
-        parts = sums.get(int(problem.fold[members[0]]))
-        if parts is None:
-            half = scale[members, None] * problem.rows[members][:, posterior.used] @ root
-            result[members] = np.linalg.solve(np.eye(len(members)) - half @ half.T, residual[members])
-            continue
-        in_row = members[-1] - members[0] == len(members) - 1  # as a rule: then nothing is copied
-        rows = problem.rows[members[0] : members[-1] + 1] if in_row else problem.rows[members]
-        missing = posterior.spread * ((scale[members] * residual[members]) @ rows)[posterior.used]
-        factor, _ = dpotrf(_without(precision, parts, posterior), lower=1, overwrite_a=1)
-        full[posterior.used] = posterior.spread * dpotrs(factor, missing, lower=1)[0]
-        result[members] = residual[members] + scale[members] * (rows @ full)
+    for one in problem.sums:
+        sums.setdefault(one.fold, []).append(one)
+    precision = whitened_precision(problem, posterior) if sums else np.zeros((0, 0))
+    for parts in sums.values():
+        missing = np.zeros(len(full))
+        seen = [(problem.rows.parts[one.part], one.where) for one in parts]
+        for (cells, columns, values), where in seen:
+            missing[columns] += (scale * residual)[cells[where]] @ values[where]
+        factor, _ = dpotrf(_without(precision, problem, parts, posterior), lower=1, overwrite_a=1)
+        full[posterior.used] = posterior.spread * dpotrs(factor, posterior.spread * missing[posterior.used], lower=1)[0]
+        for (cells, columns, values), where in seen:
+            result[cells[where]] += scale[cells[where]] * (values[where] @ full[columns])
+    for cells, ends in _small_folds(problem.fold, [*sums]):
+        rows = problem.rows.select(cells).using(posterior.used, scale[cells])
+        shared, whole = rows.times(posterior.covariance), rows.dense()
+        for a, b in pairwise(ends):
+            kept = np.eye(b - a) - shared[a:b] @ whole[a:b].T
+            result[cells[a:b]] = np.linalg.solve(kept, residual[cells[a:b]])
     return result
+
+
+def _small_folds(fold: np.ndarray, large: list[int]) -> Iterator[tuple[np.ndarray, list[int]]]:
+    """Yield the cells of small folds, a thousand or so at a time, in the order of their folds, and where these end."""
+    order = np.argsort(fold, kind="stable")
+    order = order[~np.isin(fold[order], large)]
+    ends = [0, *(np.flatnonzero(np.diff(fold[order])) + 1).tolist(), len(order)]
+    first = 0
+    for n, end in enumerate(ends):
+        if end - ends[first] >= TOGETHER or n == len(ends) - 1:
+            yield order[ends[first] : end], [e - ends[first] for e in ends[first : n + 1]]
+            first = n
 
 
 def whitened_precision(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
     """Return the precision of y over the prior's spread, shape (n, n)."""
-    precision = np.tensordot(posterior.noise**-2, problem.normal[:, posterior.used[:, None], posterior.used], 1)
+    kinds = np.unique(problem.kind)
+    information = problem.normal[np.ix_(kinds, posterior.used, posterior.used)]
+    precision = np.tensordot(posterior.noise[kinds] ** -2, information, 1)
     precision *= posterior.spread[:, None] * posterior.spread
     precision[np.diag_indices_from(precision)] += 1.0
     return precision
 
 
-def _without(precision: np.ndarray, parts: list[FoldSum], posterior: Posterior) -> np.ndarray:
+def _without(precision: np.ndarray, problem: LinearProblem, parts: list[FoldSum], posterior: Posterior) -> np.ndarray:
     """Return a whitened precision, Fortran's order, without what the cells of one fold tell."""
-    place = np.full(int(posterior.used.max()) + 1, -1)
+    place = np.full(problem.rows.shape[1], -1)
     place[posterior.used] = np.arange(len(posterior.used))
     left = np.array(precision, order="F")
-    for part in parts:
-        known = part.columns <= posterior.used[-1]
-        known[known] = place[part.columns[known]] >= 0
-        at = place[part.columns[known]]
-        size = posterior.spread[at] / posterior.noise[part.kind]
-        left[np.ix_(at, at)] -= size[:, None] * part.normal[np.ix_(known, known)] * size
+    for one in parts:
+        cells, columns, _ = problem.rows.parts[one.part]
+        known = np.flatnonzero(place[columns] >= 0)
+        at = place[columns[known]]
+        size = posterior.spread[at] / posterior.noise[problem.kind[cells[0]]]
+        left[np.ix_(at, at)] -= size[:, None] * one.normal[np.ix_(known, known)] * size
     return left
 
 

@@ -17,8 +17,9 @@ from scipy.linalg.lapack import dtrtrs
 
 from ..measurements.readings import ANGULAR_KINDS, BACKWARD, FORWARD, KINDS, MeasurementSet
 from ..virtual.trial import without_datum
+from .cell_rows import CellRows
 from .estimation import Estimation, Solution
-from .linear_problem import whitened_precision
+from .linear_problem import LARGE_FOLD, whitened_precision
 from .observability import ToolError, box_stations
 from .parameters import FitSettings, ParameterSpace
 from .sensitivity import derivatives, predict
@@ -158,8 +159,10 @@ class Residuals:
     ----------
     estimation, solution : Estimation, Solution
         The fit.
-    rows, residual : ndarray, shape (C, n), (C,)
-        Derivatives by the parameters in use, and what is left.
+    rows : CellRows, shape (C, n)
+        Derivatives by the parameters in use.
+    residual : ndarray, shape (C,)
+        What is left.
     leverage : ndarray, shape (C,)
         Share of each cell that the parameters take up.
     run, direction : ndarray of int, shape (C,)
@@ -170,7 +173,7 @@ class Residuals:
 
     estimation: Estimation
     solution: Solution
-    rows: np.ndarray
+    rows: CellRows
     residual: np.ndarray
     leverage: np.ndarray
     run: np.ndarray
@@ -182,15 +185,15 @@ class Residuals:
         """Return those of a fit."""
         problem, posterior, cells = solution.problem, solution.posterior, estimation.cells
         scale = 1.0 / posterior.noise[problem.kind]
-        rows = scale[:, None] * problem.rows[:, posterior.used]
+        rows, every = problem.rows.using(posterior.used, scale), np.arange(len(scale))
         m = estimation.measurements
         order = np.argsort(np.argsort(cells.first))
         return Residuals(
             estimation=estimation,
             solution=solution,
             rows=rows,
-            residual=scale * problem.target - rows @ posterior.y,
-            leverage=np.einsum("ci,ij,cj->c", rows, posterior.covariance, rows, optimize=True),
+            residual=scale * problem.target - rows.times(posterior.y),
+            leverage=rows.between(posterior.covariance, every, every),
             run=m.run[cells.first],
             direction=m.direction[cells.first],
             rank=order / max(len(order) - 1, 1) - 0.5,
@@ -250,10 +253,10 @@ def _left_out(r: Residuals) -> tuple[float, str]:
     metric = _tool_metric(r.estimation.space, r.solution)
     if metric is None:
         return 1.0, ""
-    leaving = _Leaving(metric, r.solution)
+    leaving = _Leaving(metric, r)
     changes: dict[str, list[tuple[float, float, float]]] = {}
-    for what, information in _groups(r):
-        changes.setdefault(what, []).append(leaving.change(information))
+    for what, cells in _groups(r):
+        changes.setdefault(what, []).append(leaving.change(cells))
     worst, name = 1.0, ""
     for what, listed in changes.items():
         ratio, limit = _excess(*np.transpose(listed))
@@ -262,89 +265,54 @@ def _left_out(r: Residuals) -> tuple[float, str]:
     return worst, name
 
 
-@dataclass
-class _Information:
-    """What some cells say of the parameters in use: rowsᵀ·rows, (n, n), and rowsᵀ·residual, (n,)."""
-
-    normal: np.ndarray
-    moment: np.ndarray
-
-    @staticmethod
-    def of(r: Residuals, members: np.ndarray) -> _Information:
-        """Return that of cells given by their mask; only the parameters that a channel sees are multiplied."""
-        size = r.rows.shape[1]
-        result, channels = _Information(np.zeros((size, size)), np.zeros(size)), r.estimation.cells.channel
-        for channel in np.unique(channels[members]):
-            chosen = np.flatnonzero(members & (channels == channel))
-            rows = r.rows[chosen]
-            seen = np.flatnonzero(rows.any(axis=0))
-            rows = rows[:, seen]
-            result.normal[np.ix_(seen, seen)] += rows.T @ rows
-            result.moment[seen] += r.residual[chosen] @ rows
-        return result
-
-    def add(self, other: _Information) -> None:
-        """Add other cells."""
-        self.normal += other.normal
-        self.moment += other.moment
-
-
 class _Leaving:
     """What the tool's error becomes where some cells are left out of a fit.
 
     With group g left out the parameters change by δ, whose covariance is C₋g − C if the model is right. M turns both
-    into the tool's mean squared error in the measured box; M = FᵀF, F without what no prior lets happen.
+    into the tool's mean squared error in the measured box; M = F·Fᵀ, F without what no prior lets happen.
     """
 
-    def __init__(self, metric: np.ndarray, solution: Solution) -> None:
-        posterior = solution.posterior
-        self._spread = posterior.spread
-        self._precision = whitened_precision(solution.problem, posterior)
+    def __init__(self, metric: np.ndarray, residuals: Residuals) -> None:
+        self._residuals, self._posterior = residuals, residuals.solution.posterior
+        self._spread = self._posterior.spread
+        self._precision = whitened_precision(residuals.solution.problem, self._posterior)
         values, vectors = np.linalg.eigh(self._spread[:, None] * metric * self._spread)
-        unheeded = NEGLIGIBLE * np.vdot(metric, posterior.covariance)
+        unheeded = NEGLIGIBLE * np.vdot(metric, self._posterior.covariance)
         kept = np.cumsum(values) > unheeded  # ascending
-        self._effects = np.asfortranarray(vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0)))
-        whole = self._halved(self._precision)[0]
-        self._expected = whole.T @ whole
+        self._effects = vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0))
+        self._reached = self._posterior.covariance @ (self._effects / self._spread[:, None])  # C·F
+        self._expected = (self._effects / self._spread[:, None]).T @ self._reached
 
-    def change(self, group: _Information) -> tuple[float, float, float]:
-        """Return the squared change that leaving a group out makes, what it should be, and its degrees of freedom."""
-        left = self._precision - self._spread[:, None] * group.normal * self._spread
-        half, moment = self._halved(left, self._spread * group.moment)
-        spread = half.T @ half - self._expected
-        moved, expected = half.T @ moment, float(np.trace(spread))
+    def change(self, cells: np.ndarray) -> tuple[float, float, float]:
+        """Return the squared change that leaving cells out makes, what it should be, and its degrees of freedom.
+
+        With R and r the cells' rows and residuals, C₋g = (P − Rᵀ·R)⁻¹ = C + C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·R·C: a matrix of the
+        parameters' size, or of the cells'. Half of either side is enough.
+        """
+        rows, left = self._residuals.rows.select(cells), self._residuals.residual[cells]
+        if len(cells) < LARGE_FOLD:
+            matrix = np.eye(len(cells)) - rows.times(rows.times(self._posterior.covariance).T)
+            sides, before = (rows.times(self._reached), left), 0.0
+        else:
+            matrix = self._precision - self._spread[:, None] * rows.normal() * self._spread
+            sides, before = (self._effects, self._spread * rows.transposed_times(left)), self._expected
+        factor = np.linalg.cholesky(matrix)
+        half, moment = (dtrtrs(factor, side, lower=1)[0] for side in sides)
+        spread, moved = half.T @ half - before, half.T @ moment
+        expected = float(np.trace(spread))
         return float(moved @ moved), expected, expected**2 / float(np.vdot(spread, spread))
 
-    def _halved(self, precision: np.ndarray, moment: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return K⁻¹·F and K⁻¹·moment, with K·Kᵀ a whitened precision."""
-        factor = np.linalg.cholesky(precision)
-        moment = np.zeros(len(factor)) if moment is None else moment
-        half, _ = dtrtrs(factor, self._effects, lower=1)
-        return half, dtrtrs(factor, moment, lower=1)[0]
 
-
-def _groups(r: Residuals) -> Iterator[tuple[str, _Information]]:
-    """Yield what is left out in turn, by name, as what it says; nothing where it would be all."""
-    of_runs, runs = _groupings_of_runs(r), np.unique(r.run)
-    sums: dict[tuple[str, float], _Information] = {}
-    for run in runs if len(runs) > 1 else ():
-        information = _Information.of(r, r.run == run)
-        yield "line", information
-        for what, groups in of_runs.items():
-            if len(np.unique(groups[runs])) == 1:
-                continue
-            key = what, float(groups[run])
-            if key in sums:
-                sums[key].add(information)
-            else:
-                sums[key] = replace(information, normal=information.normal.copy(), moment=information.moment.copy())
-    yield from ((what, information) for (what, _), information in sums.items())
-    quarter = np.floor((r.rank + 0.5) * (QUARTERS - 1e-9))
-    cut = {"direction": r.direction, "quarter of the time": quarter, "channel": r.estimation.cells.kind}
-    for what, groups in cut.items():
+def _groups(r: Residuals) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the cells that are left out in turn, by name; nothing where it would be all."""
+    groupings = {"line": r.run} | {what: groups[r.run] for what, groups in _groupings_of_runs(r).items()}
+    groupings["direction"] = r.direction
+    groupings["quarter of the time"] = np.floor((r.rank + 0.5) * (QUARTERS - 1e-9))
+    groupings["channel"] = r.estimation.cells.kind
+    for what, groups in groupings.items():
         different = np.unique(groups)
         for group in different if len(different) > 1 else ():
-            yield what, _Information.of(r, groups == group)
+            yield what, np.flatnonzero(groups == group)
 
 
 def _excess(shown: np.ndarray, expected: np.ndarray, freedom: np.ndarray) -> tuple[float, float]:
@@ -429,7 +397,7 @@ def _likeness(r: Residuals, there: np.ndarray, back: np.ndarray) -> float:
     """Return the variance that pairs of cells share, in their estimated noise's; 0 where it may be chance."""
     cut = np.clip(r.residual, -CUT, CUT)
     # Fitting alone makes them unlike each other: by what both give to the parameters and to the run's unknowns.
-    fitted = np.einsum("ci,ij,cj->c", r.rows[there], r.solution.posterior.covariance, r.rows[back], optimize=True)
+    fitted = r.rows.between(r.solution.posterior.covariance, there, back)
     groups = r.estimation.cells.group
     sizes = np.bincount(groups + 1)[groups[there] + 1]
     shared = cut[there] * cut[back] + fitted + np.where(groups[there] < 0, 0.0, 1.0 / sizes)
@@ -444,7 +412,7 @@ def _drift(r: Residuals) -> float:
         return 0.0
     column = estimation.free_of_unknowns(np.where(linear, cells.along * r.rank, 0.0)[:, None])[:, 0]
     column /= solution.posterior.noise[cells.kind]
-    free = column - r.rows @ (solution.posterior.covariance @ (r.rows.T @ column))
+    free = column - r.rows.times(solution.posterior.covariance @ r.rows.transposed_times(column))
     information = float(column @ free)
     if information <= 0.0:
         return 0.0

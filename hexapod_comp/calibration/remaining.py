@@ -237,7 +237,7 @@ def _rows(readings: MeasurementSet, fitted: FittedParameters) -> tuple[np.ndarra
     """Return derivatives by the parameters, (cells, size), over the noise, free of zeros; and each reading's cell."""
     estimation = Estimation(readings, fitted.space, alone=False)
     problem, _ = estimation.linearise(fitted.x, np.ones(len(readings)))
-    return fitted.space.unwhitened(problem.rows), estimation.cells.of_reading
+    return fitted.space.unwhitened(problem.rows.dense()), estimation.cells.of_reading
 
 
 # What is printed.

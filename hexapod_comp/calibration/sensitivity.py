@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from ..machine.model import MachinesByTemperature
 from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..measurements.readings import Stations
 from ..virtual.trial import drive
-from .parameters import WAVES, ParameterSpace
+from .parameters import WAVES, Block, ParameterSpace
 
 
 @dataclass(frozen=True)
@@ -83,19 +84,103 @@ def _without_negative_backlash(
 
 
 def derivatives(space: ParameterSpace, prediction: Prediction, stations: Stations) -> np.ndarray:
-    """Return ∂e/∂x at each station, shape (M, 6, size).
+    """Return ∂e/∂x at each station, shape (M, 6, size)."""
+    count = len(stations)
+    at, directions = np.repeat(np.arange(count), 6), np.tile(np.eye(6), (count, 1))
+    rows, _ = Slopes(space, prediction, stations).along(at, directions, np.arange(6))
+    return rows.reshape(count, 6, space.size)
+
+
+class Slopes:
+    """How parameters move a machine at some stations.
 
     From u_i·(δP + δω × R·t_i + R·δt_i − δb_i) = δl_i: the platform's twist is X·(δl + u·δb − u·R·δt) with
     X the inverse of the Jacobian's rows (u_i, R·t_i × u_i).
     """
-    links = _Links.of(prediction, space.probe)
-    per_length, u, rotations = links.per_length, links.directions, prediction.rotations
-    result = np.zeros((len(stations), 6, space.size))
-    for block in space.blocks:
-        result[:, :, block.part] = _block(space, block.name, per_length, u, rotations, stations)
-    _add_field(space, prediction.positions + links.lever, stations.sense[:, :3], result)
-    _add_growth(space, links.per_growth(), stations, result)
-    return result
+
+    def __init__(self, space: ParameterSpace, prediction: Prediction, stations: Stations) -> None:
+        self._space, self._sense = space, stations.sense[:, :3]
+        self._links = links = _Links.of(prediction, space.probe)
+        self._factors = {block.name: _factors(space, block.name, links, stations) for block in space.blocks}
+        self._causes = _growth_factors(space, stations)
+        points = prediction.positions + links.lever
+        self._field = {
+            "field": space.field.basis(points),
+            "field reversal": space.field.reversal_basis(points) if space.block("field reversal") else np.zeros((0, 0)),
+        }
+
+    def along(self, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return derivatives of errors at stations `at`, (n,), along directions (n, 6), and by which m parameters.
+
+        They have the shape (n, m). By the others, of the field's components that are not among `components`, they
+        are zero.
+        """
+        columns = np.concatenate([self._columns(block, components) for block in self._space.blocks])
+        rows = np.empty((len(at), len(columns)))
+        gains = np.einsum("nc,ncs->ns", directions, self._links.per_length[at])
+        start = 0
+        for block in self._space.blocks:
+            width = len(self._columns(block, components))
+            part, start = rows[:, start : start + width], start + width
+            if block.name.startswith("field"):
+                self._write_field(block.name, part, at, directions[:, components], components)
+            elif block.name in self._causes:
+                grown = np.einsum("nc,ncp->np", directions, self._per_growth[at])
+                part[:] = (grown[..., None] * self._causes[block.name][at]).reshape(len(at), -1)
+            else:
+                moved = gains[..., None] * self._factors[block.name][at]
+                part[:] = self._joined(moved) if block.name == "structure" else moved.reshape(len(at), -1)
+        return rows, columns
+
+    @cached_property
+    def _per_growth(self) -> np.ndarray:
+        return self._links.per_growth()
+
+    def _columns(self, block: Block, components: np.ndarray) -> np.ndarray:
+        """Return which parameters of a block move an error with some components."""
+        every = np.arange(block.part.start, block.part.stop)
+        if not block.name.startswith("field"):
+            return every
+        of_component = {"field displacement": [0, 1, 2], "field rotation": [3, 4, 5]}.get(block.name, [*range(6)] * 3)
+        return every[np.repeat(np.isin(of_component, components), len(every) // len(of_component))]
+
+    def _write_field(
+        self, name: str, part: np.ndarray, at: np.ndarray, directions: np.ndarray, components: np.ndarray
+    ) -> None:
+        """Write a field block's derivatives: each component has the basis to itself."""
+        if name == "field reversal":
+            basis, senses = self._field[name][at], 0.5 * self._sense[at].T
+            weights = [sense * along for sense in senses for along in directions.T]
+        else:
+            first = 0 if name == "field displacement" else 3
+            basis = self._field["field"][at]
+            weights = [along for c, along in zip(components, directions.T, strict=True) if first <= c < first + 3]
+        for n, weight in enumerate(weights):
+            np.multiply(weight[:, None], basis, out=part[:, n * basis.shape[1] : (n + 1) * basis.shape[1]])
+
+    def _joined(self, moved: np.ndarray) -> np.ndarray:
+        """Return derivatives by the structure from those by each strut's base joint, platform joint and offset."""
+        groups = self._space.platform_groups
+        joined = np.zeros((len(moved), groups.max() + 1, 3))
+        for strut, group in enumerate(groups):
+            joined[:, group] += moved[:, strut, 3:6]
+        parts = moved[:, :, :3], joined, moved[:, :, 6:]
+        return np.concatenate([part.reshape(len(moved), -1) for part in parts], axis=1)
+
+
+def _factors(space: ParameterSpace, name: str, links: _Links, stations: Stations) -> np.ndarray:
+    """Return by how much each strut's parameters of a block lengthen it, (M, 6, k); none for the field and growth."""
+    commands = stations.commands
+    if name == "structure":
+        in_platform = -np.einsum("nij,nki->nkj", links.rotations, links.directions)
+        return np.concatenate([links.directions, in_platform, np.ones((*commands.shape, 1))], axis=2)
+    if name in WAVES:
+        phase = 2.0 * np.pi * WAVES[name] * commands / space.periods
+        return np.stack([np.cos(phase), np.sin(phase)], axis=-1)
+    if name == "map":
+        return space.spline_weights(commands)
+    factors = {"pitch": commands - space.home_lengths, "backlash": -0.5 * stations.sense[:, 3:]}
+    return factors.get(name, np.zeros((0, 0)))[..., None]
 
 
 @dataclass(frozen=True)
@@ -110,6 +195,8 @@ class _Links:
         m.
     lengths : ndarray, shape (M, 6)
         m.
+    rotations : ndarray, shape (M, 3, 3)
+        Of the platform, in ``base``.
     directions : ndarray, shape (M, 6, 3)
         Unit vectors from base to platform.
     lever : ndarray, shape (M, 3)
@@ -121,6 +208,7 @@ class _Links:
     arms: np.ndarray
     base_joints: np.ndarray
     lengths: np.ndarray
+    rotations: np.ndarray
     directions: np.ndarray
     lever: np.ndarray
     per_length: np.ndarray
@@ -137,7 +225,7 @@ class _Links:
         lever = np.einsum("nij,j->ni", rotations, probe)
         per_length = inverse.copy()  # of the measured point, no longer of the platform's origin
         per_length[:, :3] += np.cross(inverse[:, 3:].transpose(0, 2, 1), lever[:, None]).transpose(0, 2, 1)
-        return _Links(arms, prediction.base_joints, lengths, u, lever, per_length)
+        return _Links(arms, prediction.base_joints, lengths, rotations, u, lever, per_length)
 
     def per_growth(self) -> np.ndarray:
         """Return ∂e by the relative growth of struts 1–6, base and platform, shape (M, 6, 8)."""
@@ -179,68 +267,14 @@ def growth_causes(
     return np.concatenate([above, late(stations.times, read, time_constants)], axis=2)
 
 
-def _add_growth(space: ParameterSpace, per_growth: np.ndarray, stations: Stations, result: np.ndarray) -> None:
-    """Write the derivatives by expansions, and by those that come late."""
-    blocks = space.block("expansion"), space.block("late")
-    if not any(blocks):
-        return
-    constants = (space.settings.time_constants or ()) if blocks[1] else ()
-    columns = per_growth[..., None] * growth_causes(space, stations, constants)[:, None]
-    for block, part in zip(blocks, (columns[..., :1], columns[..., 1:]), strict=True):
-        if block is not None:
-            result[:, :, block.part] = part.reshape(*result.shape[:2], -1)
-
-
-def _block(
-    space: ParameterSpace,
-    name: str,
-    per_length: np.ndarray,
-    u: np.ndarray,
-    rotations: np.ndarray,
-    stations: Stations,
-) -> np.ndarray:
-    """Return ∂e/∂x of one block; zeros for what is written later: the field, and growth."""
-    commands = stations.commands
-    if name == "structure":
-        base = (per_length[:, :, :, None] * u[:, None]).reshape(len(commands), 6, 18)
-        in_platform = np.einsum("nij,nki->nkj", rotations, u)
-        platform = -per_length[:, :, :, None] * in_platform[:, None]
-        joined = np.zeros((len(commands), 6, space.platform_groups.max() + 1, 3))
-        for strut, group in enumerate(space.platform_groups):
-            joined[:, :, group] += platform[:, :, strut]
-        return np.concatenate([base, joined.reshape(len(commands), 6, -1), per_length], axis=2)
-    if name in WAVES:
-        phase = 2.0 * np.pi * WAVES[name] * commands / space.periods
-        parts = np.stack([np.cos(phase), np.sin(phase)], axis=-1)
-        return (per_length[..., None] * parts[:, None]).reshape(len(commands), 6, 12)
-    if name == "map":
-        weights = space.spline_weights(commands)
-        return (per_length[..., None] * weights[:, None]).reshape(len(commands), 6, -1)
-    factors = {
-        "pitch": commands - space.home_lengths,
-        "backlash": -0.5 * stations.sense[:, 3:],
-    }
-    if name in factors:
-        return per_length * factors[name][:, None]
-    block = space.block(name)
-    return np.zeros((len(commands), 6, block.part.stop - block.part.start if block else 0))
-
-
-def _add_field(space: ParameterSpace, points: np.ndarray, sense: np.ndarray, result: np.ndarray) -> None:
-    """Write the field blocks' derivatives: each component has the basis to itself."""
-    basis, turning = space.field.basis(points), space.field.reversal_basis(points)
-    for name, first in (("field displacement", 0), ("field rotation", 3)):
-        block = space.block(name)
-        for c in range(3 if block else 0):
-            start = block.part.start + c * basis.shape[1]  # type: ignore[union-attr]
-            result[:, first + c, start : start + basis.shape[1]] = basis
-    block = space.block("field reversal")
-    if block is not None:
-        count = turning.shape[1]
-        for n in range(18):
-            axis, c = divmod(n, 6)
-            start = block.part.start + n * count
-            result[:, c, start : start + count] = 0.5 * sense[:, axis, None] * turning
+def _growth_factors(space: ParameterSpace, stations: Stations) -> dict[str, np.ndarray]:
+    """Return what parts grow by, (M, 8, 1 or K): for expansions, and for those that come late."""
+    late = space.block("late")
+    if late is None and space.block("expansion") is None:
+        return {}
+    constants = (space.settings.time_constants or ()) if late else ()
+    causes = growth_causes(space, stations, constants)
+    return {"expansion": causes[..., :1], "late": causes[..., 1:]}
 
 
 def carried(motions: np.ndarray, arms: np.ndarray) -> np.ndarray:

@@ -63,7 +63,7 @@ def settle(
     for readings in filter(len, _candidates(fitted, np.unique(measured.kind))):
         estimation = Estimation(readings, fitted.space, alone=False)
         problem, _ = estimation.linearise(fitted.x, np.ones(len(readings)))
-        rows, cells = fitted.space.unwhitened(problem.rows), estimation.cells
+        rows, cells = fitted.space.unwhitened(problem.rows.dense()), estimation.cells
         first = np.unique(cells.of_reading, return_index=True)[1]
         by_pose = np.isin(cells.kind, ABSOLUTE)
         groups = np.where(by_pose, cells.station, -1 - readings.run[first])

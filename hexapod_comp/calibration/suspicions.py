@@ -221,7 +221,7 @@ def _unlike(m: MeasurementSet, settings: FitSettings) -> np.ndarray:
         y = solve(space, problem, space.start_tolerances(), np.ones(len(KINDS))).y
     except (HexapodError, np.linalg.LinAlgError):
         return np.zeros(len(m.runs), dtype=bool)
-    return np.bincount(m.run[estimation.cells.first], problem.target * (problem.rows @ y), len(m.runs)) < 0.0
+    return np.bincount(m.run[estimation.cells.first], problem.target * problem.rows.times(y), len(m.runs)) < 0.0
 
 
 def _slopes(m: MeasurementSet) -> np.ndarray:

@@ -55,15 +55,16 @@ class Unknown(NamedTuple):
         """Return what the unknown most probably adds to its cells' values, shape (n,)."""
         return self.basis @ (self.share * (self.basis.T @ values[self.members]))
 
-    def project_out(self, values: np.ndarray) -> None:
+    def project_out(self, values: np.ndarray, where: np.ndarray | slice | None = None) -> None:
         """Take off the cells' values, (C,) or (C, n), in place, what the unknown may explain.
 
         Values with the covariance I + B·Bᵀ, B the unknown's columns in its standard deviations, become values with the
-        covariance I.
+        covariance I. `where` the cells' values stand if that is not at their numbers.
         """
+        where = self.members if where is None else where
         weight = 1.0 - np.sqrt(1.0 - self.share)
-        along = self.basis.T @ values[self.members]
-        values[self.members] -= self.basis @ (weight * along.T).T
+        along = self.basis.T @ values[where]
+        values[where] -= self.basis @ (weight * along.T).T
 
 
 def of_zero(members: np.ndarray, scale: np.ndarray, along: np.ndarray | None = None) -> Unknown:

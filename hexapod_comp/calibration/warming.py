@@ -113,9 +113,9 @@ class _Scan:
         columns = (per_growth[:, :, None] * behind).transpose(0, 2, 1) @ (TOLERANCES["late"] * growth_root(1))
         columns = estimation.free_of_unknowns(columns.reshape(len(columns), -1))
         over = 1.0 / posterior.noise[problem.kind]
-        rows, columns = over[:, None] * problem.rows[:, posterior.used], over[:, None] * columns
-        left = over * problem.target - rows @ posterior.y
-        shared = rows.T @ columns
+        rows, columns = problem.rows.using(posterior.used, over), over[:, None] * columns
+        left = over * problem.target - rows.times(posterior.y)
+        shared = rows.transposed_times(columns)
         return _Scan(grid, columns.T @ columns - shared.T @ posterior.covariance @ shared, columns.T @ left)
 
     def gain(self, chosen: Sequence[int]) -> float:

@@ -117,10 +117,10 @@ def mention(args: argparse.Namespace, text: str) -> None:
 
 def save_pictures(args: argparse.Namespace, pictures: Callable[[], Mapping[str, Figure]]) -> None:
     """Draw pictures and write them into the folder of ``--pictures``, if there is one, and say where they are."""
-    from ..formats.figures import save
-
     if args.pictures is None:
         return
+    from ..formats.figures import save
+
     with stage("drawing pictures"):
         figures = pictures()
     for name, figure in figures.items():

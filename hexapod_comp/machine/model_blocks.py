@@ -29,10 +29,13 @@ STRUT_TERMS = {
 LATE_PARTS = ("late_struts", "late_base", "late_platform")
 """What follows a thermometer late, in the order of the rows of :class:`~.late.LateGrowth`."""
 
+LONGEST_LINE = 2**30
+"""Characters: LibYAML, unlike PyYAML's own writer, takes no infinity."""
+
 COMPONENT_UNITS = {name: ("length", "um") if name[0] == "d" else ("angle", "urad") for name in COMPONENTS}
 
 
-class ModelDumper(yaml.SafeDumper):
+class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
     """Rows of numbers on one line, everything else in blocks, nothing by reference."""
 
     def ignore_aliases(self, data: Any) -> bool:
@@ -44,7 +47,12 @@ def _represent_list(dumper: yaml.SafeDumper, data: list) -> yaml.Node:
     return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=row)
 
 
-ModelDumper.add_representer(list, _represent_list)
+_Dumper.add_representer(list, _represent_list)
+
+
+def block_text(content: dict[str, Any]) -> str:
+    """Return content as YAML, in its order, each row of numbers on one line however long."""
+    return str(yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=LONGEST_LINE))
 
 
 def written(values: Any, kind: str, unit: str) -> Any:

@@ -92,7 +92,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from ..errors import InputFileError, ModelError
 from ..formats.outputs import write_text
@@ -109,7 +108,7 @@ from .model_blocks import (
     DIRECTIONS,
     LATE_PARTS,
     STRUT_TERMS,
-    ModelDumper,
+    block_text,
     datum_block,
     field_block,
     structure_block,
@@ -245,7 +244,7 @@ def model_text(model: MachineModel) -> str:
         "field": field_block(model.field),
     }
     content |= {name: block for name, block in blocks.items() if block} | {"end": True}
-    return yaml.dump(content, Dumper=ModelDumper, sort_keys=False, allow_unicode=True, width=math.inf)
+    return block_text(content)
 
 
 # Reading

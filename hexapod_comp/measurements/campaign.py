@@ -12,14 +12,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from ..errors import InputFileError
 from ..formats.paths import input_file
 from ..formats.yaml import Section, read_yaml
 from ..machine.field import CROSS_AXES
 from ..machine.geometry import HexapodGeometry
-from ..machine.model_blocks import ModelDumper, written
+from ..machine.model_blocks import block_text, written
 from ..pose import Pose, rotation_from_angles
 from .campaign_runs import CampaignRun, line_readings, read_runs
 from .readings import ANGULAR_KINDS, AXES, DEFAULT_UNCERTAINTY, KINDS, UNKNOWN, FileLine, MeasurementSet, Reading
@@ -247,8 +246,7 @@ def campaign_text(campaign: Campaign, remarks: Sequence[str] = ()) -> str:
         "repeatability_um": written(campaign.repeatability, "length", "um"),
         "runs": [run.content() for run in campaign.runs],
     }
-    text = yaml.dump(content, Dumper=ModelDumper, sort_keys=False, allow_unicode=True, width=math.inf)
-    return "".join(f"# {line}\n" for line in remarks) + text
+    return "".join(f"# {line}\n" for line in remarks) + block_text(content)
 
 
 def template(campaign: Campaign, geometry: HexapodGeometry, seed: int = 0, name: str = "campaign") -> MeasurementSet:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, multivariate_normal
 
+from hexapod_comp.calibration.cell_rows import CellRows
 from hexapod_comp.calibration.estimation import Estimation
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.linear_problem import HYPER, LinearProblem, held_out, physical_covariance, solve
@@ -137,7 +138,7 @@ def problem_of(
     parts = [np.flatnonzero(kind == k) for k in range(len(KINDS))]
     return LinearProblem(
         target=target,
-        rows=rows,
+        rows=CellRows.of(rows),
         kind=kind,
         fold=fold,
         normal=np.array([rows[p].T @ rows[p] for p in parts]),
@@ -154,7 +155,7 @@ def dense(
     """Return the textbook's answer and covariance: least squares with the priors as further rows."""
     spread = space.spread(tolerances)
     scale = 1.0 / noise[problem.kind[keep]]
-    rows = np.vstack([scale[:, None] * problem.rows[keep], np.diag(1.0 / spread)])
+    rows = np.vstack([scale[:, None] * problem.rows.dense()[keep], np.diag(1.0 / spread)])
     target = np.concatenate([scale * problem.target[keep], np.zeros(space.size)])
     z = np.linalg.lstsq(rows * spread, target, rcond=None)[0]
     inverse = np.linalg.pinv(rows * spread)
@@ -190,7 +191,7 @@ def test_held_out_errors_are_those_of_fits_that_left_a_fold_out():
     for fold in range(20):
         out = problem.fold == fold
         y, _ = dense(space, problem, tolerances, noise, np.flatnonzero(~out))
-        wanted = (problem.target[out] - problem.rows[out] @ y) / noise[problem.kind[out]]
+        wanted = (problem.target[out] - problem.rows.dense()[out] @ y) / noise[problem.kind[out]]
         np.testing.assert_allclose(errors[out], wanted, atol=1e-8)
 
 
@@ -210,13 +211,13 @@ def test_held_out_lines_are_those_of_fits_without_the_line(large: int, monkeypat
         rest = Estimation(ours.select(~out[estimation.cells.of_reading]), space)
         less, _ = rest.linearise(np.zeros(space.size), np.ones(len(rest.measurements)))
         answer = solve(space, less, space.start_tolerances(), ONES, 0)
-        np.testing.assert_allclose(errors[out], problem.target[out] - problem.rows[out] @ answer.y, atol=1e-6)
+        np.testing.assert_allclose(errors[out], problem.target[out] - problem.rows.dense()[out] @ answer.y, atol=1e-6)
 
 
 def log_evidence(space: ParameterSpace, problem: LinearProblem, tolerances: np.ndarray, noise: np.ndarray) -> float:
     """Return the logarithm of the readings' probability with all parameters integrated out."""
     spread = space.spread(tolerances)
-    covariance = (problem.rows * spread**2) @ problem.rows.T + np.diag(noise[problem.kind] ** 2)
+    covariance = (problem.rows.dense() * spread**2) @ problem.rows.dense().T + np.diag(noise[problem.kind] ** 2)
     return float(multivariate_normal.logpdf(problem.target, cov=covariance))
 
 
@@ -248,7 +249,10 @@ def test_noise_is_found_with_the_right_freedom():
     answer = solve(space, problem, space.start_tolerances(), ONES, 400)
     y, covariance = dense(space, problem, answer.tolerances, answer.noise, np.arange(len(problem.target)))
     for k in (LINEAR, STRAIGHTNESS, ROTATION):
-        rows, residual = problem.rows[problem.kind == k], (problem.target - problem.rows @ y)[problem.kind == k]
+        rows, residual = (
+            problem.rows.dense()[problem.kind == k],
+            (problem.target - problem.rows.dense() @ y)[problem.kind == k],
+        )
         freedom = len(rows) - np.trace(rows @ covariance @ rows.T) / answer.noise[k] ** 2
         assert answer.noise[k] ** 2 == pytest.approx(residual @ residual / freedom, rel=1e-6)
         # A standard deviation from n free numbers is known to 1/√(2n); three of these.

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import gmean
 
+from hexapod_comp.calibration.cell_rows import CellRows
 from hexapod_comp.calibration.estimation import Estimation
 from hexapod_comp.calibration.linear_problem import LinearProblem, Posterior, solve
 from hexapod_comp.calibration.observability import (
@@ -54,7 +55,7 @@ def sight(space: ParameterSpace, problem: LinearProblem) -> Observability:
 
 def rank(space: ParameterSpace, problem: LinearProblem) -> int:
     """Return how many structure parameters readings of 1 µm tell from ±100 µm, by NumPy's singular values."""
-    singular = np.linalg.svd(problem.rows[:, space.blocks[0].part] * 100e-6, compute_uv=False)
+    singular = np.linalg.svd(problem.rows.dense()[:, space.blocks[0].part] * 100e-6, compute_uv=False)
     return int((singular > 1.0).sum())
 
 
@@ -143,7 +144,9 @@ def by_hand(singular: np.ndarray) -> tuple[ParameterSpace, LinearProblem, Poster
     normal[0], moment[0] = rows.T @ rows, rows.T @ target
     square, freedom = np.array([target @ target, 0, 0, 0, 0]), np.array([100.0, 0, 0, 0, 0])
     kind = np.zeros(100, dtype=int)
-    problem = LinearProblem(target, rows, kind, np.arange(100), normal, moment, square, freedom, np.zeros(len(KINDS)))
+    problem = LinearProblem(
+        target, CellRows.of(rows), kind, np.arange(100), normal, moment, square, freedom, np.zeros(len(KINDS))
+    )
     return space, problem, solve(space, problem, space.start_tolerances(), ONES, 0)
 
 

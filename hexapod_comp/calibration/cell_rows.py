@@ -1,0 +1,131 @@
+"""Derivatives of the cells' values by the parameters: of each cell only those that may differ from zero.
+
+A reading along x knows nothing of the field's other five components. Cells that the same parameters move stand
+together in a dense matrix, which is a third of the whole or less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from .unknowns import Unknown
+
+
+class Alike(NamedTuple):
+    """Cells that the same parameters move.
+
+    Attributes
+    ----------
+    cells : ndarray of int, shape (n,)
+        Which.
+    columns : ndarray of int, shape (m,)
+        These parameters, ascending.
+    values : ndarray, shape (n, m)
+        Derivatives.
+    """
+
+    cells: np.ndarray
+    columns: np.ndarray
+    values: np.ndarray
+
+
+class CellRows:
+    """A matrix of a row for each cell and a column for each parameter.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Cells and parameters.
+    parts : sequence of Alike
+        Each cell stands in one of them.
+    """
+
+    def __init__(self, shape: tuple[int, int], parts: Sequence[Alike]) -> None:
+        self.shape, self.parts = shape, tuple(parts)
+        self._part, self._place = np.zeros(shape[0], dtype=int), np.zeros(shape[0], dtype=int)
+        for n, part in enumerate(self.parts):
+            self._part[part.cells], self._place[part.cells] = n, np.arange(len(part.cells))
+
+    @staticmethod
+    def of(matrix: np.ndarray) -> CellRows:
+        """Return a dense matrix as such rows."""
+        return CellRows(matrix.shape, [Alike(np.arange(len(matrix)), np.arange(matrix.shape[1]), matrix)])
+
+    def dense(self) -> np.ndarray:
+        """Return the whole matrix."""
+        result = np.zeros(self.shape)
+        for part in self.parts:
+            result[np.ix_(part.cells, part.columns)] = part.values
+        return result
+
+    def times(self, y: np.ndarray) -> np.ndarray:
+        """Return the product with y, (size,) or (size, k)."""
+        result = np.zeros((self.shape[0], *y.shape[1:]))
+        for part in self.parts:
+            result[part.cells] = part.values @ y[part.columns]
+        return result
+
+    def transposed_times(self, v: np.ndarray) -> np.ndarray:
+        """Return the transposed matrix's product with v, (C,) or (C, k)."""
+        result = np.zeros((self.shape[1], *v.shape[1:]))
+        for part in self.parts:
+            result[part.columns] += part.values.T @ v[part.cells]
+        return result
+
+    def normal(self) -> np.ndarray:
+        """Return rowsᵀ·rows, shape (size, size)."""
+        result = np.zeros((self.shape[1], self.shape[1]))
+        for part in self.parts:
+            result[np.ix_(part.columns, part.columns)] += part.values.T @ part.values
+        return result
+
+    def between(self, matrix: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Return aᵀ·M·b for the rows a and b of pairs of cells, shape (pairs,)."""
+        result = np.empty(len(first))
+        for (p, q), pairs in _alike(self._part[first], self._part[second]):
+            a, b = self.parts[p], self.parts[q]
+            reached = a.values[self._place[first[pairs]]] @ matrix[np.ix_(a.columns, b.columns)]
+            result[pairs] = np.einsum("ci,ci->c", reached, b.values[self._place[second[pairs]]])
+        return result
+
+    def select(self, cells: np.ndarray) -> CellRows:
+        """Return the rows of some cells, in their order; without copying where they stand in a row."""
+        owner, parts = self._part[cells], []
+        for n in np.unique(owner):
+            at = np.flatnonzero(owner == n)
+            part = self.parts[n]
+            parts.append(Alike(at, part.columns, part.values[in_a_row(self._place[cells[at]])]))
+        return CellRows((len(cells), self.shape[1]), parts)
+
+    def using(self, used: np.ndarray, factors: np.ndarray) -> CellRows:
+        """Return the rows times a factor each, (C,), with the columns of some parameters only."""
+        place = np.full(self.shape[1], -1)
+        place[used] = np.arange(len(used))
+        parts = []
+        for part in self.parts:
+            kept = np.flatnonzero(place[part.columns] >= 0)
+            values = factors[part.cells, None] * part.values[:, in_a_row(kept)]
+            parts.append(Alike(part.cells, place[part.columns[kept]], values))
+        return CellRows((self.shape[0], len(used)), parts)
+
+    def project_out(self, unknown: Unknown) -> None:
+        """Take off, in place, what an unknown of an instrument may explain; its cells stand in one part."""
+        values = self.parts[self._part[unknown.members[0]]].values
+        unknown.project_out(values, in_a_row(self._place[unknown.members]))
+
+
+def in_a_row(indices: np.ndarray) -> np.ndarray | slice:
+    """Return indices as a slice where they follow each other: then indexing copies nothing."""
+    if len(indices) and indices[-1] - indices[0] == len(indices) - 1 and (np.diff(indices) == 1).all():
+        return slice(int(indices[0]), int(indices[-1]) + 1)
+    return indices
+
+
+def _alike(first: np.ndarray, second: np.ndarray) -> Iterator[tuple[tuple[int, int], np.ndarray]]:
+    """Yield each pair of numbers that occurs, and where."""
+    pairs, group = np.unique(np.stack([first, second], axis=1), axis=0, return_inverse=True)
+    for n, (p, q) in enumerate(pairs.tolist()):
+        yield (p, q), np.flatnonzero(group.ravel() == n)
