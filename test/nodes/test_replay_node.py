@@ -81,6 +81,12 @@ def test_a_run_with_everything_is_replayed_bit_for_bit(bench, tmp_path):
     assert len(recording.sources) >= 3, "geometry and both models"
 
 
+def wait_for_page(bench: Bench) -> None:
+    """Wait until a page of the journal has come that was begun from now on; it comes with the diagnostics."""
+    pages = len(bench.seen["/diagnostics"])
+    bench.until(lambda: len(bench.seen["/diagnostics"]) > pages + 1, "another page of the journal")
+
+
 def test_what_the_verb_records_is_replayed_and_a_folder_that_is_there_is_left_alone(bench, tmp_path):
     """The recorder runs as a user has it, in a process, beside a compensator that is moving already."""
     bench.compensator()
@@ -91,9 +97,9 @@ def test_what_the_verb_records_is_replayed_and_a_folder_that_is_there_is_left_al
     bench.until(journal.get_subscription_count, "the recorder", timeout=60.0)
     commands = next(p for p in bench.nodes[0].publishers if p.topic_name == "/strut_commands")
     bench.until(lambda: commands.get_subscription_count() > 1, "the recorder of commands")
+    wait_for_page(bench)  # what was commanded before the first one that it has cannot be replayed
     answers += [bench.ask(along(n)) for n in range(20, 60)]
-    pages = len(bench.seen["/diagnostics"])
-    bench.until(lambda: len(bench.seen["/diagnostics"]) > pages + 1, "another page of the journal")
+    wait_for_page(bench)
     process.send_signal(signal.SIGINT)
     output, errors = process.communicate(timeout=30.0)
     assert process.returncode == 0, errors
