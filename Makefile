@@ -11,6 +11,8 @@ unexport RMW_IMPLEMENTATION _ROS_WHEELS_BOOTSTRAP_COMPLETE PIP_USER PIP_TARGET P
 ifdef AMENT_PREFIX_PATH
 unexport LD_LIBRARY_PATH
 endif
+# Tests start hundreds of processes, each of which would compile all that it imports again.
+unexport PYTHONDONTWRITEBYTECODE
 
 # A moved or copied tree carries a .venv that still runs the code at the old place, and an upgrade of the
 # system may have taken its Python away: make it anew.
@@ -31,7 +33,7 @@ VERSIONS ?= 3.10 3.11 3.12 3.13
 
 help:
 	@echo 'make demo    measure, fit and run a machine with hidden errors; figures, out/demo.png'
-	@echo 'make test    ruff, mypy and the tests, in two processes'
+	@echo 'make test    ruff, mypy and the tests, in three processes for two cores'
 	@echo 'make test-all     the same with every Python found here, each in .venv-3.x; VERSIONS="3.10 3.13" for some'
 	@echo 'make docs    the pages of doc/ as a site with a search and the Python reference, in out/doc'
 	@echo 'make constraints  renew constraints.txt: the versions of all that is installed'
@@ -50,9 +52,9 @@ test: $(VENV)/with-ros,test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
-	@# Two processes, each with a ROS domain of its own. The matrices of the tests are small: more threads of OpenBLAS
-	@# would only wait for each other.
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile --ignore=test/linuxcnc/test_linuxcnc.py \
+	@# Three processes, each with a ROS domain of its own: the first takes the tests that wait for nodes (test/conftest.py).
+	@# The matrices of the tests are small: more threads of OpenBLAS would only wait for each other.
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile --ignore=test/linuxcnc/test_linuxcnc.py \
 	    --ignore=test/linuxcnc/test_linuxcnc_rt.py
 
 test-all:

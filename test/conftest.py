@@ -18,6 +18,9 @@ pytest_plugins = ("hexapod_comp.testing",)  # where the package is not installed
 
 OWN_NODE_FIXTURES = {"ros_context", "module_context", "client"}
 
+WAITING = ("test/loop/", "test/benchmarks/", "test/linuxcnc/", "test/nodes/")
+"""Folders of tests that wait for nodes more than they compute, those of the longest tests first."""
+
 
 def pytest_configure() -> None:
     """Let the kit clear up behind our own fixtures too."""
@@ -41,7 +44,10 @@ def _has_nodes(item: pytest.Item) -> bool:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
-    """Keep a file's tests in one process, as ``--dist loadfile`` does, but those of the zoo machine by machine."""
+    """Keep a file's tests in one process, as ``--dist loadfile`` does, but those of the zoo machine by machine.
+
+    The first process takes the files whose tests wait for nodes, the others those that compute, as long as there are.
+    """
     if config.getvalue("dist") != "loadfile":
         return None
     from xdist.scheduler import LoadFileScheduling
@@ -50,6 +56,13 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
         def _split_scope(self, nodeid: str) -> str:
             file = super()._split_scope(nodeid)
             return nodeid[nodeid.rindex("[") :] if file.endswith("test_zoo.py") else file
+
+        def _assign_work_unit(self, node: Any) -> None:
+            waiting = [file for folder in WAITING for file in self.workqueue if file.startswith(folder)]
+            computing = [file for file in self.workqueue if file not in waiting]
+            wanted = waiting + computing if node is self.nodes[0] else computing + waiting
+            self.workqueue.move_to_end(wanted[0], last=False)
+            super()._assign_work_unit(node)
 
     return Scheduling(config, log)
 

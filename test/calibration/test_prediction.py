@@ -43,11 +43,19 @@ def known(machine: Machine, folder: Path) -> FittedParameters:
 
 
 def errors_of(space: ParameterSpace, x: np.ndarray) -> Errors:
-    """Return what a parameter vector means, in the words of the tests' own machines."""
-    base, rest = x[:18].reshape(6, 3), x[18:]
-    groups = space.platform_groups
-    joints, offset, pitch = np.split(rest, [3 * (groups.max() + 1), 3 * (groups.max() + 1) + 6])
-    return Errors(base, joints.reshape(-1, 3)[groups], offset, pitch, space.home_lengths)
+    """Return what parameter vectors (size,) or (N, size) mean, in the words of the tests' own machines."""
+    shape, groups = x.shape[:-1], space.platform_groups
+    end = 18 + 3 * (groups.max() + 1)
+    base, joints, offset, pitch = np.split(x, [18, end, end + 6], axis=-1)
+    joints = joints.reshape(*shape, -1, 3)[..., groups, :]
+    return Errors(base.reshape(*shape, 6, 3), joints, offset, pitch, space.home_lengths)
+
+
+def motions(machine: Machine, space: ParameterSpace, drawn: np.ndarray, poses: tuple) -> np.ndarray:
+    """Return what :func:`tool_motion` does for each of D parameter vectors at each of N poses, (D, N, 6)."""
+    count = len(poses[0])
+    each = errors_of(space, np.repeat(drawn, count, axis=0))
+    return tool_motion(machine, each, *(np.concatenate([part] * len(drawn)) for part in poses)).reshape(-1, count, 6)
 
 
 def tool_motion(machine: Machine, errors: Errors, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
@@ -76,7 +84,7 @@ def test_errors_spread_as_those_of_machines_that_are_drawn(name: str, tmp_path: 
     np.testing.assert_allclose(standing.values, expected, rtol=0.0, atol=1e-12)
 
     drawn = rng.multivariate_normal(fitted.x, fitted.covariance, DRAWS)
-    spread = np.array([tool_motion(machine, errors_of(space, x), positions, rotations) for x in drawn])
+    spread = motions(machine, space, drawn, (positions, rotations))
     assert standing.deviations is not None
     np.testing.assert_allclose(standing.deviations, spread.std(axis=0), rtol=0.08)
     assert standing.covariance is not None
@@ -88,26 +96,33 @@ def test_errors_spread_as_those_of_machines_that_are_drawn(name: str, tmp_path: 
     assert aligned is not None
     told = np.stack(np.meshgrid(*(np.linspace(*side, 3) for side in space.platform_box.T)), -1).reshape(-1, 3)
     level = np.tile(machine.level(), (len(told), 1, 1))
-    sets = [
-        aligned_by_kabsch(machine, errors_of(space, x), (told, level), (positions, rotations)) for x in drawn[:1000]
-    ]
+    reference = machine.tips(told, level), motions(machine, space, drawn[:1000], (told, level))
+    sets = aligned_by_kabsch(*reference, machine.tips(positions, rotations), spread[:1000])
     assert aligned.deviations is not None
     np.testing.assert_allclose(aligned.deviations, np.std(sets, axis=0), rtol=0.17)  # 300 machines, four times 4.1 %
-    at_x = aligned_by_kabsch(machine, errors_of(space, fitted.x), (told, level), (positions, rotations))
+    (at_x,) = aligned_by_kabsch(
+        reference[0],
+        motions(machine, space, fitted.x[None], (told, level)),
+        machine.tips(positions, rotations),
+        expected[None],
+    )
     np.testing.assert_allclose(aligned.values, at_x, rtol=0.0, atol=0.1 * UM)  # 100 µm squared over 0.1 m
     assert aligned.deviations[:, :3].mean() < 0.5 * standing.deviations[:, :3].mean()
 
 
-def aligned_by_kabsch(machine: Machine, errors: Errors, reference: tuple, poses: tuple) -> np.ndarray:
-    """Return errors at poses, (N, 6), less the rigid motion that best maps reference tips to where they went."""
-    before = machine.tips(*reference)
-    moved = tool_motion(machine, errors, *reference)
-    after = before + moved[:, :3]
-    centre, mean = before.mean(axis=0), after.mean(axis=0)
-    turn, _ = Rotation.align_vectors(after - mean, before - centre)
-    found, tips = tool_motion(machine, errors, *poses), machine.tips(*poses)
-    displacements = tips + found[:, :3] - (turn.apply(tips - centre) + mean)
-    return np.hstack([displacements, found[:, 3:] - moved[:, 3:].mean(axis=0)])
+def aligned_by_kabsch(before: np.ndarray, moved: np.ndarray, tips: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """Return motions `found` (D, N, 6) at `tips` (N, 3), less the rigid motion that best maps the reference tips.
+
+    These stood at `before` (R, 3), and went by `moved` (D, R, 6).
+    """
+    aligned = []
+    for motion, way in zip(found, moved, strict=True):
+        after = before + way[:, :3]
+        centre, mean = before.mean(axis=0), after.mean(axis=0)
+        turn, _ = Rotation.align_vectors(after - mean, before - centre)
+        displacements = tips + motion[:, :3] - (turn.apply(tips - centre) + mean)
+        aligned.append(np.hstack([displacements, motion[:, 3:] - way[:, 3:].mean(axis=0)]))
+    return np.array(aligned)
 
 
 def test_a_pose_that_the_machine_cannot_take_has_no_error_and_spoils_no_other(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.measurements.files import read_measurements
+from hexapod_comp.measurements.readings import MeasurementSet
 
 CAMPAIGN = """format: hexapod_comp/campaign
 version: 1
@@ -98,10 +99,10 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
         simulate_said = said_by("simulate", "--campaign", campaign, "--seed", 1, "--out", measured)
         files = {"--out": "model.yaml", "--report": "report.txt"}
         written = [word for option, name in files.items() for word in (option, folder / name)]
-        shown = ("--pictures", folder / "pictures", "--truth", "paper_machine", "--name", "Tuesday's")
-        fit_said = said_by("fit", measured, *JOINT, *written, *shown)
+        judged = ("--truth", "paper_machine", "--name", "Tuesday's")
+        fit_said = said_by("fit", measured, *JOINT, *written, *judged, "--pictures", folder / "pictures")
         patch.setattr(fit_module, "fit_model", lambda *arguments: fits[0])
-        again = said_by("fit", measured, *JOINT, "--out", folder / "model.yaml", *shown, "--json")
+        again = said_by("fit", measured, *JOINT, "--out", folder / "model.yaml", *judged, "--json")
         (folder / "fit.json").write_text(again)
     return Calibration(folder, campaign, measured, fits[0], simulate_said, fit_said)
 
@@ -382,8 +383,27 @@ def noisy(done: Calibration) -> Path:
     return measured
 
 
+@pytest.fixture(scope="module")
+def noisy_fits() -> dict[FitSettings, ModelFit]:
+    """Keep the fits of these readings."""
+    return {}
+
+
+@pytest.fixture
+def fitted_once(noisy_fits: dict[FitSettings, ModelFit], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let only the first who asks with some settings wait for the fit."""
+    real = fit_module.fit_model
+
+    def fit(measured: MeasurementSet, settings: FitSettings, *rest: object) -> ModelFit:
+        if settings not in noisy_fits:
+            noisy_fits[settings] = real(measured, settings, *rest)  # type: ignore[arg-type]
+        return noisy_fits[settings]
+
+    monkeypatch.setattr(fit_module, "fit_model", fit)
+
+
 def test_noise_far_above_the_stated_writes_nothing(
-    hexapod: Program, noisy: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    hexapod: Program, noisy: Path, fitted_once: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Exit code 1, what is wrong at the top of the report, no file of any kind."""
     monkeypatch.chdir(tmp_path)
@@ -403,7 +423,9 @@ def test_noise_far_above_the_stated_writes_nothing(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_forced_model_says_so(hexapod: Program, noisy: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_forced_model_says_so(
+    hexapod: Program, noisy: Path, fitted_once: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """At the top of the report, in its file, and in the model for whoever runs it."""
     monkeypatch.chdir(tmp_path)
     code, out, err = hexapod("fit", noisy, "--lead-mm", 10, "--blocks", "pitch", "--force", *ALL[:-2])
