@@ -294,16 +294,21 @@ class TestTruth:
         assert np.abs(found.position - expected.position).max() < 1e-15
         assert np.abs(found.rotation - expected.rotation).max() < 1e-15
 
-    def test_field_direction_is_that_of_the_commanded_motion(self, geometry):
+    @pytest.mark.parametrize("turn", [0.0, 15.0], ids=["level", "the platform back, its point forth"])
+    def test_field_direction_is_that_of_the_commanded_motion(self, geometry, turn):
         """Forward motion along x must show the forward field, backward the backward one, and both stand when
-        nothing moves; the truth is the model's forward run with these senses.
+        nothing moves; the truth is the model's forward run with these senses. It is the measured point that
+        counts: 0.1 m above a platform that turns about y, rad/m, it moves along x while the platform moves back.
         """
         bounds = ImperfectionBounds(0.0, 0.0, field_displacement=8e-6, field_reversal=1.0, field_box=BOX)
-        truth = RealMachine(geometry, draw_model(geometry, bounds, 11))
+        model = draw_model(geometry, bounds, 11)
+        arm = 0.1 if turn else 0.0
+        truth = RealMachine(geometry, replace(model, field=replace(model.field, probe=np.array([0.0, 0.0, arm]))))
         drive = StrutDrive(truth, DriveParameters.ideal())
         for direction in (1.0, -1.0):
             for x in direction * np.linspace(-0.02, 0.02, 201):
-                target = Pose(np.array([x, 0.3 * x + 0.01, 0.45 + 0.2 * x]), np.eye(3))
+                position = np.array([x * (-0.5 if turn else 1.0), 0.3 * x + 0.01, 0.45 - arm + (0.2 + 8.0 * arm) * x])
+                target = Pose.from_angles(position, [0.0, turn * x, 0.0])
                 drive.set_command(strut_lengths(Structure.of(geometry), target))
                 drive.advance(4e-3)
             for _ in range(10):
