@@ -3,9 +3,13 @@
 ``--show-args`` lists the arguments. With a real machine: ``simulate:=false geometry:=/path/mine.yaml``.
 """
 
+import sys
 from collections.abc import Callable
+from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any
 
+import yaml
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import EnvironmentVariable, LaunchConfiguration
@@ -23,29 +27,42 @@ LOCAL_UNLESS_SET = EnvironmentVariable("ROS_AUTOMATIC_DISCOVERY_RANGE", default_
 def generate_launch_description() -> LaunchDescription:
     """Return the launch description: its arguments, then the nodes."""
     argument = DeclareLaunchArgument
+    arguments = [
+        argument("namespace", default_value="", description="Holds this machine's nodes and topics."),
+        argument("geometry", default_value="", description="Geometry file; empty: as in the node."),
+        argument("model", default_value="", description="Model file; empty: ideal, corrects nothing."),
+        argument("truth", default_value="", description="What strut_drive hides; empty: as in the node."),
+        argument("params_file", default_value="", description="Parameters of both nodes (YAML)."),
+        argument(
+            "autostart", default_value="", choices=["", *FLAG], description="Activate unasked; empty: as in the node."
+        ),
+        argument("simulate", default_value="true", choices=FLAG, description="Start strut_drive too."),
+        argument("description", default_value="false", choices=FLAG, description="Start robot_state_publisher."),
+        argument("rviz", default_value="false", choices=FLAG, description="Start RViz and robot_state_publisher."),
+        argument("frame_prefix", default_value="", description="In front of all frames, as left/ of left/base."),
+        argument("use_sim_time", default_value="false", choices=FLAG, description="Take time from /clock."),
+        argument("log_level", default_value="info", description="debug, info, warn or error."),
+        argument("enclaves", default_value="/hexapod_comp", description="Folder of the nodes' SROS 2 enclaves."),
+        argument(
+            "discovery_range",
+            default_value=LOCAL_UNLESS_SET,
+            choices=RANGES,
+            description="Who may find the nodes: what the environment says, else LOCALHOST.",
+        ),
+    ]
+    known = {declared.name for declared in arguments}
     return LaunchDescription(
-        [
-            argument("namespace", default_value="", description="Holds this machine's nodes and topics."),
-            argument("geometry", default_value="", description="Geometry file; empty: as in the node."),
-            argument("model", default_value="", description="Model file; empty: ideal, corrects nothing."),
-            argument("truth", default_value="", description="What strut_drive hides; empty: as in the node."),
-            argument("params_file", default_value="", description="Parameters of both nodes (YAML)."),
-            argument("autostart", default_value="true", choices=FLAG, description="Activate unasked."),
-            argument("simulate", default_value="true", choices=FLAG, description="Start strut_drive too."),
-            argument("description", default_value="false", choices=FLAG, description="Start robot_state_publisher."),
-            argument("frame_prefix", default_value="", description="In front of all frames, as left_ of left_base."),
-            argument("use_sim_time", default_value="false", choices=FLAG, description="Take time from /clock."),
-            argument("log_level", default_value="info", description="debug, info, warn or error."),
-            argument("enclaves", default_value="/hexapod_comp", description="Folder of the nodes' SROS 2 enclaves."),
-            argument(
-                "discovery_range",
-                default_value=LOCAL_UNLESS_SET,
-                choices=RANGES,
-                description="Who may find the nodes: what the environment says, else LOCALHOST.",
-            ),
-            OpaqueFunction(function=_nodes),
-        ]
+        [OpaqueFunction(function=_refuse_unknown, args=[known]), *arguments, OpaqueFunction(function=_nodes)]
     )
+
+
+def _refuse_unknown(context: LaunchContext, known: set[str]) -> None:
+    """Refuse arguments of a command line that starts this file and that nobody would read: misspelt ones."""
+    if not any(Path(word).name == Path(__file__).name for word in sys.argv):
+        return  # another launch file includes this one: the arguments are its own
+    unknown = sorted({word.partition(":=")[0] for word in context.argv if ":=" in word} - known)
+    if unknown:
+        raise ValueError(f"no argument {', '.join(unknown)}; there are {', '.join(sorted(known))}")
 
 
 def _nodes(context: LaunchContext) -> list[Node]:
@@ -56,7 +73,8 @@ def _nodes(context: LaunchContext) -> list[Node]:
 
     files = [str(config_file(given("params_file")))] if given("params_file") else []
     clock = {"use_sim_time": True} if given("use_sim_time") == "true" else {}
-    common: dict[str, Any] = {"autostart": given("autostart") == "true", **clock}
+    common: dict[str, Any] = {"autostart": given("autostart") == "true"} if given("autostart") else {}
+    common |= clock
     if prefix := given("frame_prefix"):
         common |= {"base_frame": f"{prefix}base"}
     common |= {"geometry_file": given("geometry")} if given("geometry") else {}
@@ -66,8 +84,12 @@ def _nodes(context: LaunchContext) -> list[Node]:
     nodes = [_node("compensator", given, [*files, common | model])]
     if given("simulate") == "true":
         nodes.append(_node("strut_drive", given, [*files, common | truth]))
-    if given("description") == "true":
-        nodes.append(_publisher(given, {"frame_prefix": prefix, **clock}))
+    if "true" in (given("description"), given("rviz")):
+        geometry = load_geometry(config_file(given("geometry") or "paper.yaml", "geometry"))
+        description = {"robot_description": urdf(geometry), "frame_prefix": prefix, **clock}
+        nodes.append(_helper("robot_state_publisher", given, [description]))
+    if given("rviz") == "true":
+        nodes.append(_helper("rviz2", given, [clock], ["-d", _view(prefix)]))
     return nodes
 
 
@@ -85,14 +107,31 @@ def _node(executable: str, given: Callable[[str], str], parameters: list) -> Nod
     )
 
 
-def _publisher(given: Callable[[str], str], parameters: dict[str, Any]) -> Node:
-    """Return the action that starts robot_state_publisher, a package of its own, with the machine's URDF."""
-    geometry = load_geometry(config_file(given("geometry") or "paper.yaml", "geometry"))
+def _helper(package: str, given: Callable[[str], str], parameters: list, arguments: list[str] | None = None) -> Node:
+    """Return the action that starts another package's node of the same name, beside the machine's."""
     return Node(
-        package="robot_state_publisher",
-        executable="robot_state_publisher",
+        package=package,
+        executable=package,
         namespace=given("namespace"),
-        parameters=[{"robot_description": urdf(geometry), **parameters}],
+        parameters=parameters,
+        arguments=arguments,
         additional_env={"ROS_AUTOMATIC_DISCOVERY_RANGE": given("discovery_range")},
         output="screen",
     )
+
+
+def _view(prefix: str) -> str:
+    """Return a file for RViz: the shipped one, with a prefix a copy whose frames have it."""
+    shipped = config_file("views/machine.rviz")
+    if not prefix:
+        return str(shipped)
+    view = yaml.safe_load(shipped.read_text(encoding="utf-8"))
+    view["Visualization Manager"]["Global Options"]["Fixed Frame"] = f"{prefix}base"
+    for display in view["Visualization Manager"]["Displays"]:
+        if "TF Prefix" in display:
+            display["TF Prefix"] = prefix.removesuffix("/")  # RViz puts the slash itself
+        if "Frames" in display:
+            display["Frames"] = {name if " " in name else prefix + name: on for name, on in display["Frames"].items()}
+    with NamedTemporaryFile("w", suffix=".rviz", delete=False, encoding="utf-8") as copy:
+        yaml.safe_dump(view, copy, sort_keys=False)
+    return copy.name

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import runpy
-import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
-from typing import Any
 
 import numpy as np
-import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
@@ -80,28 +75,3 @@ def model_file(folder: Path, name: str = "model.yaml", **sections: object) -> st
     path = folder / name
     path.write_text(yaml.safe_dump(data), encoding="utf-8")
     return str(path)
-
-
-def launched(monkeypatch: pytest.MonkeyPatch, **given: str) -> list[dict[str, Any]]:
-    """Return the nodes that the launch file starts for some arguments. Stand-ins for launch, which PyPI has not."""
-    defaults: dict[str, Any] = {}
-    parts = {
-        "launch": {"LaunchContext": dict, "LaunchDescription": list},
-        "launch.actions": {
-            "DeclareLaunchArgument": lambda name, default_value, **_: defaults.update({name: default_value}),
-            "OpaqueFunction": lambda function: function,
-        },
-        "launch.substitutions": {
-            "EnvironmentVariable": lambda _, default_value: default_value,
-            "LaunchConfiguration": lambda name: SimpleNamespace(perform=lambda context: context[name]),
-        },
-        "launch_ros": {},
-        "launch_ros.actions": {"Node": lambda **options: options},
-    }
-    for name, content in parts.items():
-        module = ModuleType(name)
-        module.__dict__.update(content)
-        monkeypatch.setitem(sys.modules, name, module)
-    nodes = runpy.run_path(str(CONFIG.parent / "launch" / "machine.launch.py"))["generate_launch_description"]()[-1]
-    assert defaults.keys() >= given.keys()
-    return nodes({**defaults, **given})

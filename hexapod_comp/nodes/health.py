@@ -83,9 +83,9 @@ class HealthReport:
     Parameters
     ----------
     name : str
-        Status name, ``node: machine``.
+        Status name, ``node: state``.
     hardware_id : str
-        Which machine it is.
+        The machine's name, behind its namespace.
     period : float
         Longest time between two messages, s.
     """

@@ -163,8 +163,8 @@ def _state(name: str, status: DiagnosticStatus | None, machine: str) -> str:
     )
     colour = COLOURS.get(status.level, SILENT)
     text = f'{_heading(TITLES[name])}<div style="color: {colour}"><b>{escape(status.message)}</b></div>{_table(shown)}'
-    runs = status.name.partition(": ")[2]
-    if runs not in ("", "starting", machine):
+    runs = status.hardware_id  # empty before the machine is known, and behind the namespace
+    if runs and not f"/{runs}".endswith(f"/{machine}"):
         text += f'<div style="color: {COLOURS[ERROR]}">runs the machine {escape(runs)}, not {escape(machine)}</div>'
     return text
 

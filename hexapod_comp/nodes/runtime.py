@@ -95,7 +95,7 @@ class MachineNode(LifecycleNode):
             service.callback = self.guard.answering(service.srv_name, service.srv_type, callback)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", EVENT_QOS)
-        self.speak_for("starting")
+        self.speak_for("")
         self._at_rate: dict[str, Timer] = {}
         self._options = Parameters(self, table, self._on_parameters)
         self.wants_autostart = bool(self._options.get("autostart", True))
@@ -180,9 +180,10 @@ class MachineNode(LifecycleNode):
             self.get_logger().info(line)
 
     def speak_for(self, what: str) -> None:
-        """Name the machine or component that this node serves from now on in its status."""
-        hardware = f"{self.get_namespace()}/{what}".lstrip("/")  # two machines of a kind differ by their namespaces
-        self._report = HealthReport(f"{self.get_fully_qualified_name()[1:]}: {what}", hardware)
+        """Name the machine or component that this node serves from now on in its status: within its namespace, so that
+        two of a kind are told apart. The status's name stays: an aggregator would wait for the old one for ever."""
+        hardware_id = f"{self.get_namespace()}/{what}".strip("/")
+        self._report = HealthReport(f"{self.get_fully_qualified_name()[1:]}: state", hardware_id)
 
     def tell(self, level: bytes, text: str, values: Callable[[], dict[str, str]]) -> None:
         """Publish level, text and values when they are due, with what the guard has caught."""

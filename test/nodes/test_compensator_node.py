@@ -942,7 +942,7 @@ def test_diagnostics_once_a_second_and_complete(bench):
     first, second = (stamp.sec + 1e-9 * stamp.nanosec for stamp in stamps)
     assert 0.95 < second - first < 1.5, "on a machine under load"
     status = bench.status()
-    assert (status.name, status.hardware_id) == ("compensator: paper", "paper")
+    assert (status.name, status.hardware_id) == ("compensator: state", "paper")
     assert (status.level, status.message) == (OK, "waiting for the first command")
     expected = {"model": "virtual machine", "compensation": "on", "ramping": "false", "commands": "0", "refused": "0"}
     assert expected.items() <= bench.values().items()
@@ -1113,7 +1113,8 @@ def test_two_machines_in_two_namespaces_do_not_mix(ros_context, capfd):
         assert (len(left.seen["strut_commands"]), len(right.seen["strut_commands"])) == (2, 1)
         assert right.until_status(OK, "running")["model"] == "virtual machine"
         assert left.until_status(OK, "running")["model"] == "ideal"
-        assert left.status().name == "left/compensator: paper"
+        status = left.status()
+        assert (status.name, status.hardware_id) == ("left/compensator: state", "left/paper")
 
 
 @pytest.mark.parametrize(

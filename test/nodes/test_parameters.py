@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from node_helpers import CONFIG, HOME, Bench, closed_form_lengths, launched, model_file
+from launch_stand_in import LaunchFile
+from node_helpers import CONFIG, HOME, Bench, closed_form_lengths, model_file
 from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import DescribeParameters
 from std_msgs.msg import UInt64
@@ -174,7 +175,7 @@ def test_a_file_of_other_values_is_loaded_also_through_the_launch_file(bench, mo
     path.write_text(yaml.safe_dump({f"/**/{name}": {"ros__parameters": others}}))
     node = bench.add(KINDS[name], False, {}, cli_args=["--ros-args", "--params-file", str(path)])
     assert {key: value for key, value in in_force(node).items() if key in others} == others
-    given = {n["name"]: n["parameters"] for n in launched(monkeypatch, params_file=str(path), model="table.yaml")}[name]
+    given = LaunchFile(monkeypatch).start(f"params_file:={path}", "model:=table.yaml")[name]["parameters"]
     arguments = ["--ros-args"]
     for number, part in enumerate(given):
         if isinstance(part, dict):

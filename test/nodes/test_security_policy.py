@@ -17,8 +17,9 @@ from pathlib import Path
 import pytest
 import rclpy
 from hal_stand_in import StandInHal
+from launch_stand_in import LaunchFile
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
-from node_helpers import Bench, launched
+from node_helpers import Bench
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
@@ -182,10 +183,11 @@ def test_the_operator_may_all_that_the_ros2_tools_open(ros_context: Context, cap
 
 def test_the_launch_file_names_the_enclaves_of_the_policy(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each node's ``--enclave`` is in the policy, by default."""
+    launch_file = LaunchFile(monkeypatch)
     root = ET.parse(POLICY).getroot()
     paths = {enclave.get("path") for enclave in root.iter("enclave")}
-    for given, folder, known in (({}, "/hexapod_comp", True), ({"enclaves": "/mine"}, "/mine", False)):
-        arguments = [node["ros_arguments"] for node in launched(monkeypatch, **given)]
+    for folder, known in ((launch_file.defaults["enclaves"], True), ("/mine", False)):
+        arguments = [node["ros_arguments"] for node in launch_file.start(f"enclaves:={folder}").values()]
         asked = [words[words.index("--enclave") + 1] for words in arguments]
         assert asked == [f"{folder}/compensator", f"{folder}/strut_drive"]
         assert paths.issuperset(asked) is known

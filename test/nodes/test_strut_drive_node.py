@@ -433,4 +433,5 @@ def test_works_in_a_namespace(ros_context, capfd):
         command(left, closed_form_lengths(TARGET))
         until_at(left, closed_form_lengths(TARGET), 1e-12)
         assert not other.seen["strut_states"]
-        assert left.status(NODE).name == "left/strut_drive: paper"
+        status = left.status(NODE)
+        assert (status.name, status.hardware_id) == ("left/strut_drive: state", "left/paper")

@@ -139,13 +139,17 @@ def test_what_is_old_or_no_machine_is_not_known(bench, monkeypatch):
 
 def test_words_are_escaped_and_another_machine_is_named():
     values = [KeyValue(key="model", value="<script>alert(1)</script>"), KeyValue(key="refused.<b>", value="3")]
-    status = DiagnosticStatus(level=b"\2", name="compensator: other", message="<img src=x>", values=values)
+    status = DiagnosticStatus(level=b"\2", name="compensator: state", message="<img src=x>", values=values)
+    status.hardware_id = "left/other"
     text = words(View(states={"compensator": status}), "paper")
     assert "<script" not in text
     assert "<img" not in text
     assert "&lt;script&gt;" in text
     assert "refused: &lt;b&gt;" in text
-    assert "runs the machine other, not paper" in text
+    assert "runs the machine left/other, not paper" in text
+    for same in ("left/paper", "paper", ""):
+        status.hardware_id = same
+        assert "runs the machine" not in words(View(states={"compensator": status}), "paper")
 
 
 def test_colours_of_corrections():
