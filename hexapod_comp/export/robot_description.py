@@ -28,7 +28,7 @@ STRUT_RADIUS, JOINT_RADIUS, PLATE = 0.01, 0.018, 0.01
 
 HARDWARE = (
     ("joint_commands_topic", "strut_setpoints"),
-    ("joint_states_topic", "strut_states"),
+    ("joint_states_topic", "nominal_strut_states"),
     ("trigger_joint_command_threshold", "-1"),
 )
 """Parameters of ros2_control's JointStateTopicSystem; by the last one commands near the readings are sent too."""

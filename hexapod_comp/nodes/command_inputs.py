@@ -1,7 +1,7 @@
 """What commands a compensator: tool poses, or the nominal strut lengths of a controller that plans struts itself.
 
 Strut setpoints become the tool pose of the machine without errors at once. What comes after, limits, stamps, journal
-and replay, knows poses alone.
+and replay, knows poses alone. What such a controller hears of the struts is nominal too.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState
 from ..compensation.compensator import Compensator
 from ..errors import HexapodError
 from ..kernels.pose import quaternion_of
-from ..machine.kinematics import Structure, forward_error, solve_poses
+from ..machine.kinematics import Structure, forward_error, solve_poses, strut_lengths
 from ..pose import Pose
 from .messages import StrutReader, read_message
 from .wire import command_stamp, read_pose_bytes
@@ -94,6 +94,34 @@ class StrutInput(PoseInput):
             if solved.ok[0]:
                 return Pose(solved.positions[0], solved.rotations[0])
         raise forward_error(int(solved.outcomes[0]), float(solved.conditions[0]), self._structure.max_condition)
+
+
+def nominal_lengths(compensator: Compensator, measured: np.ndarray, tool: np.ndarray) -> np.ndarray:
+    """Return measured struts as a controller of nominal lengths must see them: less what is corrected.
+
+    Told the measured ones, it would hold the corrections for a way that it has yet to go, and each time that it starts
+    from where the struts are they would be corrected once more.
+
+    Parameters
+    ----------
+    compensator : Compensator
+        Its correction counts; before its first command its model's, where it corrects.
+    measured : ndarray, shape (6,)
+        Strut lengths, m.
+    tool : ndarray, shape (12,)
+        The tool pose estimated from them.
+
+    Returns
+    -------
+    ndarray, shape (6,)
+        m.
+    """
+    if np.isfinite(compensator.correction).all():
+        return measured - compensator.correction
+    if not compensator.enabled:
+        return measured
+    pose = Pose(tool[:3], tool[3:].reshape((3, 3)))
+    return strut_lengths(compensator.geometry, pose @ compensator.geometry.tool.inverse())
 
 
 def command_input(compensator: Compensator, options: dict[str, Any]) -> PoseInput:

@@ -132,7 +132,7 @@ class CompensatorNode(MachineNode):
         self.speak_for(self.compensator.geometry.name)
         self._outputs = outputs = CompensatorOutputs(self, self.compensator, self._options, self._files)
         inputs = (self.compensator, self._status, self._options)
-        self._feedback = Feedback(self, *inputs, outputs.estimate, self._look_at_publishers)
+        self._feedback = Feedback(self, *inputs, outputs.measured, self._look_at_publishers)
         self._input = asked = command_input(self.compensator, self._options)
         commands = self.obey(asked.kind, asked.topic, self._on_command, self._look_at_publishers)
         self._subscription = commands

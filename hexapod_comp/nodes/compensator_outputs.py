@@ -15,12 +15,13 @@ from visualization_msgs.msg import MarkerArray
 from ..compensation.compensator import Compensator
 from ..export.robot_description import joint_positions
 from ..pose import Pose
+from .command_inputs import STRUTS, nominal_lengths
 from .machine_files import MachineFiles
 from .markers import machine_markers
 from .messages import write_pose
 from .predicted_error import PredictedErrorTopics
-from .runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, ESTIMATE_QOS, EVENT_QOS, MachineNode
-from .stamps import period
+from .runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, ESTIMATE_QOS, EVENT_QOS, STATE_QOS, MachineNode
+from .stamps import nanoseconds_of, period
 from .vital_signs import VitalSigns
 from .wire import StrutBytes
 
@@ -52,11 +53,15 @@ class CompensatorOutputs:
         self._joints = node.create_publisher(JointState, "joint_states", EVENT_QOS)
         self._names = options["joint_names"]
         self._array: Publisher | None = None
+        self._nominal: Publisher | None = None
+        if options["command_input"] == STRUTS:
+            self._nominal = node.publish_on(JointState, "nominal_strut_states", STATE_QOS)
         if options["publish_array"]:
             self._array = node.publish_on(Float64MultiArray, "strut_commands_array", COMMAND_QOS, deadline)
         self._array_out = Float64MultiArray(data=[0.0] * 6)
         self._array_view = np.frombuffer(self._array_out.data, dtype=float)
         self._command_out, self._correction_out = (StrutBytes(names=options["joint_names"]) for _ in range(2))
+        self._nominal_out = StrutBytes(names=options["joint_names"])
         self._estimate_out = PoseStamped()
         self._estimate_out.header.frame_id = self._frame
         self._answered, self._fastest = 0, compensator.geometry.limits.speed
@@ -82,6 +87,14 @@ class CompensatorOutputs:
     def forget(self) -> None:
         """Take the next command as the first: its velocity is zero."""
         self._answered = 0
+
+    def measured(self, struts: np.ndarray, pose: np.ndarray, stamp: Time) -> None:
+        """Publish what follows from a reading of the struts, shape (6,), m, and the tool pose estimated from it."""
+        self.estimate(pose, stamp)
+        if self._nominal is not None:
+            out, when = self._nominal_out, nanoseconds_of(stamp)
+            out.write(nominal_lengths(self._compensator, struts, pose), period(out.stamp, when), self._fastest)
+            self._nominal.publish(out.stamped(when))
 
     def estimate(self, pose: np.ndarray, stamp: Time) -> None:
         """Publish a pose, shape (12,): position, m, and rotation matrix, row by row."""
@@ -112,6 +125,7 @@ class CompensatorOutputs:
         """Destroy the publishers."""
         self._predicted.close()
         self.signs.close()
-        for publisher in (self._commands, self._corrections, self._estimates, self._markers, self._joints, self._array):
+        always = self._commands, self._corrections, self._estimates, self._markers, self._joints
+        for publisher in (*always, self._array, self._nominal):
             if publisher is not None:
                 self._node.destroy_publisher(publisher)

@@ -62,6 +62,7 @@ in   tool_pose_command       PoseStamped: commanded tool pose, frame_id base or 
      temperatures            Temperature: °C; frame_id names strut_1 to strut_6, base or platform
 out  strut_commands          JointState: compensated strut lengths, m
      strut_corrections       JointState: command − nominal, m
+     nominal_strut_states    JointState: with strut_setpoints, measured struts less the corrections, m
      tool_pose_estimate      PoseStamped: from measured struts, in base
      ~/predicted_error       PoseWithCovarianceStamped: the tool's error without compensation, in work;
      ~/predicted_error_aligned  the same with the datum aligned

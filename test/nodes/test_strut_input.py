@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foreign_machines import machines
-from node_helpers import HOME, Bench, closed_form_lengths, near
+from node_helpers import BEST_EFFORT, HOME, Bench, closed_form_lengths, near
 from rclpy.serialization import serialize_message
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 
-from hexapod_comp.compensation.compensator import NO_SHIFT, Compensator
+from benchmarks.strut_input import difference
+from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.errors import CommandError, KinematicsError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
@@ -39,21 +39,9 @@ def setpoints(lengths: np.ndarray, names: tuple[str, ...] = STRUT_NAMES) -> Join
 
 @pytest.mark.parametrize("name", machines())
 def test_lengths_and_the_pose_they_belong_to_are_answered_alike(name: str, tmp_path: Path):
-    machine, rng = machines()[name], np.random.default_rng(5)
-    geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
-    model = find_model("random:3", geometry)
-    by_pose, by_struts = (Compensator(geometry, model) for _ in range(2))
-    read = StrutInput(by_struts, STRUT_NAMES, "base").read
-    tips = machine.middle + np.cumsum(rng.normal(0.0, 1e-4, (POSES, 3)), axis=0)
-    tools = Rotation.from_rotvec(np.cumsum(rng.normal(0.0, 1e-4, (POSES, 3)), axis=0))
-    lengths = machine.lengths(*machine.platform_poses(tips, tools.as_matrix()))
-    for tip, tool, length in zip(tips, tools.as_quat(), lengths, strict=True):
-        wanted = by_pose.step((*tip, *tool), math.nan)  # in work
-        _, frame, numbers = read(serialize_message(setpoints(length)))
-        answer = by_struts.step(numbers, math.nan, NO_SHIFT)
-        assert frame == "base"
-        np.testing.assert_allclose(answer, wanted, rtol=0, atol=SAME)
-        np.testing.assert_allclose(by_struts.nominal, length, rtol=0, atol=SAME)
+    row = difference(machines()[name], POSES, 3, tmp_path)  # kinematics of the zoo's own
+    assert row.taken == POSES
+    assert max(row.largest, row.nominal) <= SAME
 
 
 def test_who_cannot_be_told_is_refused_with_the_reason(paper: Compensator):
@@ -94,7 +82,7 @@ def ask(bench: Bench, lengths: np.ndarray, **others: float) -> JointState:
 
 def test_a_controller_of_struts_commands_the_node(bench: Bench):
     bench.speak("strut_setpoints")
-    bench.compensator(command_input=STRUTS, enable_compensation=False)
+    bench.compensator(command_input=STRUTS, enable_compensation=False, max_command_age=60.0)
     at_home = closed_form_lengths(HOME)
     for _ in range(3):  # as ros2_control does until a controller is active
         bench.publish("strut_setpoints", setpoints([math.nan] * 6))
@@ -112,9 +100,45 @@ def test_a_controller_of_struts_commands_the_node(bench: Bench):
     bench.until_status(WARN, "no new command")
 
 
+def told(bench: Bench, measured: np.ndarray) -> np.ndarray:
+    """Measure struts and return what a controller of nominal lengths is told of them."""
+    seen: list[JointState] = []
+    listener = bench.witness.create_subscription(JointState, "nominal_strut_states", seen.append, BEST_EFFORT)
+    bench.until(lambda: listener.get_publisher_count() == 1 and bench.matched(), "the compensator's publisher")
+    sent = bench.feed(measured)
+    bench.until(lambda: [m for m in seen if m.header.stamp == sent.header.stamp], "nominal lengths of a reading")
+    bench.witness.destroy_subscription(listener)
+    assert tuple(seen[-1].name) == STRUT_NAMES
+    return np.array(seen[-1].position)
+
+
+def test_a_controller_that_starts_again_moves_no_strut(bench: Bench):
+    """It commands what it is told it stands at. Truth: closed-form lengths, and that told again nothing changes."""
+    bench.speak("strut_setpoints")
+    bench.compensator(command_input=STRUTS, ramp_rate=1.0)
+    at_home = closed_form_lengths(HOME)
+    standing = told(bench, at_home)  # before any command: less what the model would correct there
+    assert np.abs(standing - at_home).max() > 5e-6
+    np.testing.assert_allclose(ask(bench, standing).position, at_home, rtol=0, atol=SAME)
+    for _ in range(3):
+        command = np.array(ask(bench, at_home).position)
+    assert np.abs(command - at_home).max() > 5e-6
+    for _ in range(3):  # each time that it starts from the readings
+        standing = told(bench, command)
+        np.testing.assert_allclose(standing, at_home, rtol=0, atol=SAME)
+        np.testing.assert_allclose(ask(bench, standing).position, command, rtol=0, atol=SAME)
+    np.testing.assert_allclose(told(bench, command + 1e-5), at_home + 1e-5, rtol=0, atol=SAME)  # the struts lag
+
+
+def test_readings_are_nominal_where_nothing_is_corrected(bench: Bench):
+    bench.compensator(command_input=STRUTS, enable_compensation=False)
+    at_home = closed_form_lengths(HOME)
+    np.testing.assert_allclose(told(bench, at_home), at_home, rtol=0, atol=SAME)
+
+
 def test_joints_go_by_the_machine_s_own_names(bench: Bench):
     names = [f"left_leg_{n}" for n in range(1, 7)]
-    bench.compensator(joint_names=names, enable_compensation=False)
+    bench.compensator(joint_names=names, enable_compensation=False, feedback_timeout=60.0)  # on a busy computer too
     bench.feed(closed_form_lengths(HOME))  # under the usual names: nobody's
     bench.until(lambda: bench.logged("left_leg_1 missing"), "a warning")
     answer = bench.ask(HOME)
