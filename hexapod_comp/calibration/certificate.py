@@ -234,6 +234,11 @@ def _instruments(fit: ModelFit, details: Details) -> Iterator[str]:
     named = details.instruments or ("",) * len(rows)
     yield table(("", "type, serial number, calibration"), [(str(n), text) for n, text in enumerate(named, 1)], "text")
     yield table(("part", "lowest °C", "highest °C", "expansion in the model, ppm/K"), _temperatures(fit))
+    humidity = fit.measurements.stations.humidity
+    if np.isfinite(humidity).any():
+        ends = [number(100.0 * v, 1) for v in (np.nanmin(humidity), np.nanmax(humidity))]
+        grown = number(1e4 * fit.model.struts.moisture.max(), 2)
+        yield table(("", "lowest %", "highest %", "growth of struts, ppm per %"), [("relative humidity", *ends, grown)])
 
 
 def _temperatures(fit: ModelFit) -> Iterator[tuple[str, ...]]:

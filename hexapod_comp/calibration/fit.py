@@ -374,6 +374,8 @@ def _ignored(measurements: MeasurementSet, space: ParameterSpace) -> list[str]:
     warmth = np.abs(measurements.stations.temperatures - REFERENCE_TEMPERATURE).max()
     if warmth > WARM and space.block("expansion") is None and not space.stated_expansion.any():
         notes.append(f"read up to {warmth:.1f} K from 20 °C, but no expansion is given: growth is taken for an error")
+    if space.swells and not np.isfinite(measurements.stations.humidity).all():
+        notes.append("the struts swell, but not every reading has its humidity (humidity_percent): 50 % is taken there")
     return notes
 
 

@@ -388,4 +388,5 @@ def stations_of(passes: Passes) -> Stations:
         sense=passes.senses(),
         temperatures=np.full((len(passes), len(Temperatures.NAMES)), REFERENCE_TEMPERATURE),
         times=np.full(len(passes), np.nan),
+        humidity=np.full(len(passes), np.nan),
     )

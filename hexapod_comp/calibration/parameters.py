@@ -19,24 +19,21 @@ from ..machine.kinematics import Structure, strut_lengths
 from ..machine.late import PARTS, LateGrowth
 from ..machine.model import MachineModel
 from ..machine.struts import StrutErrors
-from ..machine.temperatures import REFERENCE_TEMPERATURE
+from ..machine.temperatures import REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE
 from ..measurements.readings import AXES, MeasurementSet, Stations, spans
-from .smooth_field import COMPONENT_UNITS, SmoothField
-
-KNOT_DISTANCE = 0.017
-"""Largest distance of the length map's knots, m: a wave of 60 mm has then three and a half knots."""
+from .smooth_field import COMPONENT_UNITS, SmoothField, map_knots, map_root
 
 MOST_BEYOND = 0.05
 """Encoders may read this far beyond the stroke, m: their zeros are not the geometry's."""
 
-LARGEST_EXPANSION = 100e-6
-"""No machine is built of anything that grows more, 1/K."""
-
-MAP_CORRELATION_LENGTH = 0.04
-"""How far the errors of a length map are alike, m (Matérn 5/2)."""
+LARGEST_EXPANSION, LARGEST_MOISTURE = 100e-6, 1e-2
+"""No machine is built of anything that grows more, 1/K, or from dry air to damp, m/m."""
 
 LEAST_WARMING = 0.5
 """Temperatures that change by less, K, show no expansion: 3 µm on half a metre of steel, a sensor's drift included."""
+
+LEAST_DAMPING = 0.1
+"""Humidity that changes by less shows no swelling: 5 µm on half a metre of carbon fibre of 1 ppm per %."""
 
 STRUTS_ALIKE, STRUTS_WARMED_ALIKE = 0.998, 0.9
 """Correlation of the struts' expansions by their own thermometers, of one material; and by another part's, late or not,
@@ -55,6 +52,7 @@ TOLERANCES = {
     "field rotation": 20e-6,
     "field reversal": 1e-6,
     "expansion": 10e-6,
+    "moisture": 1e-4,
     "late": 10e-6,
 }
 """First guess of the blocks' standard deviations, m, m/m, rad or 1/K; the fit goes on from there."""
@@ -86,6 +84,8 @@ class FitSettings:
         Degree of the field's polynomials along the longest side of its box.
     strut_expansion, base_expansion, platform_expansion : float
         Thermal expansion as stated, 1/K: where readings were taken while temperatures changed, the fit starts from it.
+    strut_moisture : float or None
+        Growth of the struts by relative humidity, m/m from 0 to 1: as `strut_expansion`; None: they do not swell.
     thermometer : str
         The part whose sensor stands for all; empty: the one that has readings of its own, if only one has.
     time_constants : tuple of float or None
@@ -106,6 +106,7 @@ class FitSettings:
     strut_expansion: float = 0.0
     base_expansion: float = 0.0
     platform_expansion: float = 0.0
+    strut_moisture: float | None = None
     thermometer: str = ""
     time_constants: tuple[float, ...] | None = None
     tolerances: tuple[tuple[str, float], ...] = tuple(TOLERANCES.items())
@@ -123,10 +124,12 @@ class FitSettings:
         for name, value in self.tolerances:
             if not 0.0 < value < np.inf:
                 raise ModelError(f"tolerance of {name}", "must be finite and above zero", value)
-        for body in ("strut", "base", "platform"):
-            value = getattr(self, f"{body}_expansion")
-            if not 0.0 <= value <= LARGEST_EXPANSION:
-                raise ModelError(f"{body} expansion", f"must be 0…{LARGEST_EXPANSION * 1e6:g} ppm/K", value * 1e6)
+        growths = {f"{body}_expansion": (LARGEST_EXPANSION, 1e6, "ppm/K") for body in ("strut", "base", "platform")}
+        growths["strut_moisture"] = LARGEST_MOISTURE, 1e4, "ppm per % of relative humidity"
+        for name, (largest, factor, unit) in growths.items():
+            value = getattr(self, name) or 0.0
+            if not 0.0 <= value <= largest:
+                raise ModelError(name.replace("_", " "), f"must be 0…{largest * factor:g} {unit}", value * factor)
         constants = self.time_constants or ()
         LateGrowth(tuple(constants), np.zeros((len(PARTS), len(constants))), self.thermometer)  # refuses what cannot be
         for name, given, most, unit in (("scale", self.scale, 1e-2, "m/m"), ("alignment", self.alignment, 0.1, "rad")):
@@ -241,7 +244,7 @@ class ParameterSpace:
         self.home_lengths = strut_lengths(Structure.of(geometry), geometry.home)
         self.platform_groups = _groups(geometry, settings.shared_platform_joints)
         self.periods = _periods(geometry, settings.lead)
-        self.knots = _knots(*region.commands)
+        self.knots = map_knots(*region.commands)
         self.box, self.platform_box, self.work_box = region.box, region.platform_box, region.work_box
         self.level, self.probe = region.level, region.probe
         self.field = SmoothField(self.box, settings.field_degree)
@@ -268,7 +271,7 @@ class ParameterSpace:
             return True
         if name in WAVES and not np.isfinite(self.periods).all():
             return False
-        if name == "late" and not self.settings.time_constants:
+        if (name == "late" and not self.settings.time_constants) or (name == "moisture" and not self.swells):
             return False
         return name in self.settings.blocks
 
@@ -283,7 +286,7 @@ class ParameterSpace:
             labels = [f"{s} {name} {part}" for s in STRUT_NAMES for part in ("cosine", "sine")]
             return np.eye(12), tuple(labels), "m"
         if name == "map":
-            root = np.kron(np.eye(6), _correlation_root(self.knots))
+            root = np.kron(np.eye(6), map_root(self.knots))
             labels = [f"{s} map at {1e3 * k:.0f} mm" for s in STRUT_NAMES for k in self.knots]
             return root, tuple(labels), "m"
         if name == "field reversal":
@@ -302,6 +305,8 @@ class ParameterSpace:
             constants = self.settings.time_constants or ()
             labels = [f"{part} late by {constant:.0f} s" for part in PARTS for constant in constants]
             return growth_root(len(constants)), tuple(labels), "1/K"
+        if name == "moisture":
+            return np.eye(1), ("moisture of the struts beyond the stated",), "1"
         labels = [f"{s} {name}" for s in STRUT_NAMES]
         return np.eye(6), tuple(labels), "m/m" if name == "pitch" else "m"
 
@@ -390,6 +395,7 @@ class ParameterSpace:
             period=np.where(np.isfinite(self.periods), self.periods, 0.01),
             backlash=np.maximum(self._values(x, "backlash", 6), 0.0),
             expansion=expansion[:6],
+            moisture=np.full(6, (self.settings.strut_moisture or 0.0) + self._values(x, "moisture", 1)[0]),
             map_knots=self.knots if has_map else np.zeros(0),
             map_values=values if has_map else np.zeros((6, 0)),
         )
@@ -405,6 +411,11 @@ class ParameterSpace:
             late_growth=self._late_growth(x, bool(expansion.any())),
             valid_box=self.platform_box if spans(self.platform_box) else None,
         )
+
+    @property
+    def swells(self) -> bool:
+        """Whether humidity acts on the struts."""
+        return self.settings.strut_moisture is not None
 
     @property
     def stated_expansion(self) -> np.ndarray:
@@ -445,13 +456,15 @@ class ParameterSpace:
 
 
 def as_warmed(settings: FitSettings, stations: Stations) -> FitSettings:
-    """Return settings for some stations: the thermometer that they had, no expansion where nothing warmed."""
+    """Return settings for some stations: the thermometer that they had; no growth that they did not show."""
     temperatures = stations.temperatures
     seen = np.flatnonzero((temperatures != REFERENCE_TEMPERATURE).any(axis=0))
     thermometer = settings.thermometer or (PARTS[seen[0]] if len(seen) == 1 else "")
     seen = np.array([PARTS.index(thermometer)]) if thermometer else np.arange(len(PARTS))
     warmed = bool(np.ptp(temperatures[:, seen], axis=0).max() >= LEAST_WARMING)
-    fits = {"expansion": warmed, "late": warmed and bool(np.isfinite(stations.times).all())}
+    damped = bool(np.ptp(np.nan_to_num(stations.humidity, nan=REFERENCE_HUMIDITY)) >= LEAST_DAMPING)
+    timed = bool(np.isfinite(stations.times).all())
+    fits = {"expansion": warmed, "moisture": damped, "late": warmed and timed}
     blocks = tuple(name for name in settings.blocks if fits.get(name, True))
     return replace(settings, thermometer=thermometer, blocks=blocks)
 
@@ -484,15 +497,3 @@ def _check_commands(geometry: HexapodGeometry, commands: np.ndarray) -> None:
         span = f"{commands.min():.4g}…{commands.max():.4g} m"
         problem = f"run over {span}, the struts over {low:.4g}…{high:.4g} m; do units fit?"
         raise CalibrationError("strut readings", problem)
-
-
-def _knots(low: float, high: float) -> np.ndarray:
-    """Return equidistant knots over the commands seen, at most :data:`KNOT_DISTANCE` apart."""
-    span = max(high - low, KNOT_DISTANCE)
-    return np.linspace(low, low + span, int(np.ceil(span / KNOT_DISTANCE)) + 1)
-
-
-def _correlation_root(knots: np.ndarray) -> np.ndarray:
-    """Return a root of the Matérn 5/2 correlation between the knots of one strut, shape (n, n)."""
-    d = np.sqrt(5.0) * np.abs(knots[:, None] - knots) / MAP_CORRELATION_LENGTH
-    return np.linalg.cholesky((1.0 + d + d * d / 3.0) * np.exp(-d) + 1e-9 * np.eye(len(knots)))

@@ -17,7 +17,7 @@ from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import RealMachine, platform_box
 from ..machine.motion import FOLLOWED
 from ..machine.passes import Poses
-from ..machine.temperatures import Temperatures
+from ..machine.temperatures import HUMIDITY, Temperatures
 from ..measurements.readings import Stations, attitude_error
 from .datum import HeldDatum
 from .parameters import ParameterSpace
@@ -234,7 +234,8 @@ def _stations(machine: RealMachine, poses: Poses, senses: np.ndarray) -> Station
     nominal = strut_lengths_batch(Structure.of(machine.geometry), positions, rotations)
     warmth = np.array([machine.temperatures.at(name) for name in Temperatures.NAMES])
     count = len(positions)
-    return Stations(positions, rotations, nominal, senses, np.tile(warmth, (count, 1)), np.full(count, np.nan))
+    air = np.full(count, np.nan), np.full(count, machine.temperatures.at(HUMIDITY))
+    return Stations(positions, rotations, nominal, senses, np.tile(warmth, (count, 1)), *air)
 
 
 def _first_order(machine: RealMachine, fitted: FittedParameters | None, stations: Stations) -> _FirstOrder:

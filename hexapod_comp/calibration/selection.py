@@ -22,7 +22,7 @@ LEAST_GAIN = 1e-4
 HARMONICS = ("wave 2", "wave 3", "wave 4")
 """What not every screw has, and no general block explains."""
 
-EXPECTED = ("pitch", "wave", "backlash", "expansion", "late")
+EXPECTED = ("pitch", "wave", "backlash", "expansion", "moisture", "late")
 """Errors that every screw has, and growth: they stay when they help at all. Of a length map or a field nobody knows
 beforehand."""
 

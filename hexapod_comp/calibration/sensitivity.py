@@ -15,7 +15,7 @@ import numpy as np
 
 from ..machine.late import PARTS, LateGrowth, late
 from ..machine.model import MachinesByTemperature
-from ..machine.temperatures import REFERENCE_TEMPERATURE
+from ..machine.temperatures import REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE
 from ..measurements.readings import Stations
 from ..virtual.trial import drive
 from .parameters import WAVES, Block, ParameterSpace
@@ -56,7 +56,8 @@ def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Predict
     """
     positive, sense = _without_negative_backlash(space, x, stations.sense)
     model = space.model(positive, with_field=False)
-    machines = MachinesByTemperature(space.geometry, model).at_each(stations.temperatures, stations.times)
+    air = stations.temperatures, stations.times, stations.humidity
+    machines = MachinesByTemperature(space.geometry, model).at_each(*air)
     commanded = stations.positions, stations.rotations
     driven = drive(machines, commanded, sense, stations.commands)
     errors = driven.errors(commanded, space.probe).as_array()
@@ -129,7 +130,10 @@ class Slopes:
                 part[:] = (grown[..., None] * self._causes[block.name][at]).reshape(len(at), -1)
             else:
                 moved = gains[..., None] * self._factors[block.name][at]
-                part[:] = self._joined(moved) if block.name == "structure" else moved.reshape(len(at), -1)
+                if block.name == "structure":
+                    part[:] = self._joined(moved)
+                else:  # struts of one material swell alike
+                    part[:] = moved.sum(axis=1) if block.name == "moisture" else moved.reshape(len(at), -1)
         return rows, columns
 
     @cached_property
@@ -180,6 +184,7 @@ def _factors(space: ParameterSpace, name: str, links: _Links, stations: Stations
     if name == "map":
         return space.spline_weights(commands)
     factors = {"pitch": commands - space.home_lengths, "backlash": -0.5 * stations.sense[:, 3:]}
+    factors["moisture"] = links.lengths * np.nan_to_num(stations.humidity - REFERENCE_HUMIDITY)[:, None]
     return factors.get(name, np.zeros((0, 0)))[..., None]
 
 

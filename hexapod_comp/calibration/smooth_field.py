@@ -1,4 +1,6 @@
-"""A smooth six-component field as polynomials over the measured box, and its way into a :class:`GridField`."""
+"""What is smooth: a six-component field as polynomials over the measured box, with its way into a :class:`GridField`,
+and the errors of a length map.
+"""
 
 from __future__ import annotations
 
@@ -29,6 +31,24 @@ CHECKED = 400
 
 MOST_NODES = 17
 """Nodes along the longest axis at most: more make the model file too long to read."""
+
+KNOT_DISTANCE = 0.017
+"""Largest distance of the length map's knots, m: a wave of 60 mm has then three and a half knots."""
+
+MAP_CORRELATION_LENGTH = 0.04
+"""How far the errors of a length map are alike, m (Matérn 5/2)."""
+
+
+def map_knots(low: float, high: float) -> np.ndarray:
+    """Return equidistant knots over the commands seen, at most :data:`KNOT_DISTANCE` apart."""
+    span = max(high - low, KNOT_DISTANCE)
+    return np.linspace(low, low + span, int(np.ceil(span / KNOT_DISTANCE)) + 1)
+
+
+def map_root(knots: np.ndarray) -> np.ndarray:
+    """Return a root of the Matérn 5/2 correlation between the knots of one strut, shape (n, n)."""
+    d = np.sqrt(5.0) * np.abs(knots[:, None] - knots) / MAP_CORRELATION_LENGTH
+    return np.linalg.cholesky((1.0 + d + d * d / 3.0) * np.exp(-d) + 1e-9 * np.eye(len(knots)))
 
 
 class SmoothField:

@@ -17,11 +17,11 @@ import numpy as np
 
 from ..formats.texts import number
 from ..machine.late import MOST_TIME_CONSTANTS, PARTS, TIME_CONSTANT_RANGE, LateGrowth
-from ..machine.temperatures import REFERENCE_TEMPERATURE
+from ..machine.temperatures import REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE
 from ..measurements.readings import KINDS, MeasurementSet
 from .estimation import Estimation, Solution
 from .linear_problem import Posterior, physical_covariance, solve
-from .parameters import LEAST_WARMING, TOLERANCES, ParameterSpace, growth_root
+from .parameters import LEAST_DAMPING, LEAST_WARMING, TOLERANCES, ParameterSpace, growth_root
 from .sensitivity import growth_causes, growth_columns, predict
 
 GRID = 40
@@ -174,8 +174,30 @@ class PartGrowth:
 
 
 @dataclass(frozen=True)
+class Swelling:
+    """What readings tell of the struts' growth by humidity.
+
+    Attributes
+    ----------
+    change : float
+        By how much the relative humidity changed.
+    stated, moisture, deviation : float
+        Growth as stated, as fitted, and its standard deviation, m/m from 0 to 1; the deviation is NaN where nothing was
+        fitted.
+    determined : float
+        Share of it that comes from the readings.
+    """
+
+    change: float
+    stated: float
+    moisture: float
+    deviation: float
+    determined: float
+
+
+@dataclass(frozen=True)
 class HeatSeen:
-    """What readings tell of heat.
+    """What readings tell of heat, and of humidity.
 
     Attributes
     ----------
@@ -189,6 +211,8 @@ class HeatSeen:
         None where no part is late.
     timed : bool
         Whether the readings have times.
+    swelling : Swelling or None
+        What humidity does to the struts; None where they do not swell.
     """
 
     changes: tuple[tuple[str, float], ...]
@@ -196,6 +220,7 @@ class HeatSeen:
     parts: tuple[PartGrowth, ...]
     time_constants: TimeConstants
     timed: bool
+    swelling: Swelling | None
 
     @staticmethod
     def of(
@@ -215,7 +240,21 @@ class HeatSeen:
             parts=() if block is None else tuple(_parts(space, solution, covariance, block.part.start, growth)),
             time_constants=time_constants if growth.time_constants else TimeConstants(),
             timed=bool(np.isfinite(stations.times).all()),
+            swelling=_swelling(measurements, space, solution, covariance) if space.swells else None,
         )
+
+
+def _swelling(
+    measurements: MeasurementSet, space: ParameterSpace, solution: Solution, covariance: np.ndarray
+) -> Swelling:
+    humidity = np.nan_to_num(measurements.stations.humidity, nan=REFERENCE_HUMIDITY)
+    change, stated, block = float(np.ptp(humidity)), space.settings.strut_moisture or 0.0, space.block("moisture")
+    if block is None:
+        return Swelling(change, stated, stated, math.nan, 0.0)
+    at = block.part.start
+    variance = float(covariance[at, at])
+    determined = 1.0 - variance / float(space.prior_covariance(solution.posterior.tolerances)[at, at])
+    return Swelling(change, stated, stated + float(solution.x[at]), math.sqrt(variance), determined)
 
 
 MEMBERS = {"struts": slice(0, 6), "base": slice(6, 7), "platform": slice(7, 8)}
@@ -241,9 +280,22 @@ def _parts(
 
 
 def warming_text(warming: HeatSeen) -> str:
-    """Return what readings tell of heat, for people; empty where no thermometer was read."""
-    if not warming.changes:
-        return ""
+    """Return what readings tell of heat and humidity, for people; empty where neither was read."""
+    parts = [_heat_text(warming)] if warming.changes else []
+    return "\n".join([*parts, *([] if warming.swelling is None else [_swelling_text(warming.swelling)])])
+
+
+def _swelling_text(swelling: Swelling) -> str:
+    head = f"humidity; changed by {100.0 * swelling.change:.1f} %: struts grow by {1e4 * swelling.moisture:.2f}"
+    stated = f"ppm per % (stated {1e4 * swelling.stated:g})"
+    if math.isnan(swelling.deviation):
+        least = f"it changed by less than {100.0 * LEAST_DAMPING:g} %, or growth explains nothing"
+        return f"{head} {stated}, as stated: {least}"
+    unsure = "" if swelling.determined > SEEN_SHARE else "; these readings do not determine it"
+    return f"{head} ± {1e4 * swelling.deviation:.2f} {stated}{unsure}"
+
+
+def _heat_text(warming: HeatSeen) -> str:
     listed = ", ".join(f"{name} {change:.2f} K" for name, change in warming.changes)
     whose = f"; {warming.thermometer} stands for all parts" if warming.thermometer else ""
     lines = [f"heat; change of each thermometer: {listed}{whose}"]
@@ -286,4 +338,13 @@ def warming_json(warming: HeatSeen) -> dict:
         ],
         "time_constants_s": constants.values,
         "time_constants_relative_error": constants.deviations,
+        "swelling": None
+        if warming.swelling is None
+        else {
+            "humidity_change": warming.swelling.change,
+            "stated": warming.swelling.stated,
+            "moisture": warming.swelling.moisture,
+            "standard_error": None if math.isnan(warming.swelling.deviation) else warming.swelling.deviation,
+            "determined": warming.swelling.determined,
+        },
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -168,7 +169,7 @@ def _report(
             lines.append(f"  {name}, tool tilted by {args.tilt_deg:g}°: no such pose is within the machine's limits")
         else:
             lines.append(f"  {name}, tool tilted by {args.tilt_deg:g}°: {_change(check.tilted)}")
-        lines += [f"    not carried: {note}" for note in [*notes, _thermal(check)]]
+        lines += [f"    not carried: {note}" for note in [*notes, *_growth(check)]]
     return "\n".join(lines)
 
 
@@ -182,10 +183,14 @@ def _change(comparison: Comparison) -> str:
     return f"{text}, {b:.3f} → {d:.3f} µm at most, {turned}"
 
 
-def _thermal(check: ExportCheck) -> str:
+def _growth(check: ExportCheck) -> Iterator[str]:
+    """Yield what is not carried of heat, and of humidity where that acts."""
     if check.per_kelvin is None:
-        return "thermal growth (the model has none)"
-    return f"thermal growth: 1 K on struts, base and platform moves the tool by {_size(check.per_kelvin)}"
+        yield "thermal growth (the model has none)"
+    else:
+        yield f"thermal growth: 1 K on struts, base and platform moves the tool by {_size(check.per_kelvin)}"
+    if check.per_humidity is not None:
+        yield f"growth of the struts by humidity: 10 % moves the tool by {_size(check.per_humidity)}"
 
 
 def _as_json(
@@ -209,6 +214,10 @@ def _as_json(
                 "field_max_um": check.field.largest * 1e6,
                 "per_kelvin_rms_um": None if check.per_kelvin is None else check.per_kelvin.rms * 1e6,
                 "per_kelvin_max_um": None if check.per_kelvin is None else check.per_kelvin.largest * 1e6,
+                "per_10_percent_humidity_rms_um": None if check.per_humidity is None else check.per_humidity.rms * 1e6,
+                "per_10_percent_humidity_max_um": None
+                if check.per_humidity is None
+                else check.per_humidity.largest * 1e6,
                 "not_carried": notes,
             }
             for name, check, notes in checks

@@ -51,6 +51,8 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
         given["field_degree"] = args.field_degree
     if args.expansion_ppm is not None:
         given |= dict(zip(("strut_expansion", "base_expansion", "platform_expansion"), args.expansion_ppm, strict=True))
+    if args.moisture_ppm is not None:
+        given["strut_moisture"] = args.moisture_ppm * 1e-4
     if args.thermometer is not None:
         given["thermometer"] = args.thermometer
     if args.time_constants_s is not None:
@@ -181,7 +183,7 @@ def _refuse_options_of_the_other_scheme(args: argparse.Namespace) -> None:
     """Raise on an option that the scheme would not listen to."""
     from ..errors import CalibrationError
 
-    heat = ("expansion_ppm", "thermometer", "time_constants_s")
+    heat = ("expansion_ppm", "moisture_ppm", "thermometer", "time_constants_s")
     of_joint = ("lead_mm", "blocks", "tolerance_um", "field_degree", "scale_ppm", "alignment_mrad", *heat)
     if args.compensated:
         raise CalibrationError("--compensated", "is for check readings, of verify or of fit --update")

@@ -360,7 +360,7 @@ def _estimation(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("scheme joint").add_argument
     text = "period of the screws' errors (default: the geometry's; else what the readings show)"
     add("--lead-mm", type=arguments.bound, metavar="MM", help=text)
-    text = "what may be fitted: pitch, wave, harmonics, backlash, map, field, expansion, late (default all)"
+    text = "what may be fitted: pitch, wave, harmonics, backlash, map, field, expansion, moisture, late (default all)"
     add("--blocks", metavar="A,B,…", help=text)
     _separate_joints(add)
     text = "how well joints are built, to start from, µm (default 100)"
@@ -368,6 +368,8 @@ def _estimation(parser: argparse.ArgumentParser) -> None:
     add("--field-degree", type=arguments.count, metavar="N", help="degree of the field (default 6)")
     text = "thermal expansion of struts, or of struts, base and platform, ppm/K; a warm-up starts there (default 0)"
     add("--expansion-ppm", type=arguments.expansions, metavar="S[,B,P]", help=text)
+    text = "growth of the struts by humidity, ppm per % (carbon fibre: 1 to 5); readings start there (default: none)"
+    add("--moisture-ppm", type=arguments.bound, metavar="PPM", help=text)
     text = "part whose sensor stands for all (default: the one that alone was read)"
     add("--thermometer", metavar="PART", help=text)
     text = "how late parts follow their sensors (default: sought from the readings)"

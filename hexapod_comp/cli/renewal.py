@@ -12,8 +12,9 @@ from .verify import checked
 
 NOT_FITTED = {
     "scheme": "joint", "lead_mm": None, "blocks": None, "tolerance_um": None, "field_degree": None,
-    "expansion_ppm": None, "order": None, "every_line": False, "separate_joints": False, "not_robust": False,
-    "pictures": None, "truth": None, "datum": None, "certificate": None, "details": None,
+    "expansion_ppm": None, "moisture_ppm": None, "order": None, "every_line": False, "separate_joints": False,
+    "not_robust": False, "pictures": None, "truth": None, "datum": None, "certificate": None,
+    "details": None,
 }  # fmt: skip
 """Options that say something of a whole fit, and what they are when nobody gives them."""
 

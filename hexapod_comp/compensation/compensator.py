@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,69 +20,17 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import forward_error, strut_lengths
 from ..machine.model import MachineModel, RealMachine
 from ..machine.motion import MotionState
-from ..machine.temperatures import Temperatures
+from ..machine.temperatures import HUMIDITY, Temperatures, check_part
 from ..pose import Pose
 from .findings import refuse
 from .state import CommandState, pack_machine, pack_nominal, pack_pose, read_state
+from .state import Correction as Correction
 
 DEFAULT_RAMP_RATE = 1e-3
 """How fast a change of model, temperature or enabling moves a strut, m/s."""
 
 NO_SHIFT = np.concatenate([np.zeros(3), np.eye(3).ravel()])  # as pack_pose, but nothing compiles while modules load
 """Frame of poses that are in ``base`` already."""
-
-
-@dataclass(frozen=True)
-class Correction:
-    """Everything about one compensated command.
-
-    Attributes
-    ----------
-    tool_pose : Pose
-        Commanded ``pose_tool_in_work``.
-    platform_pose : Pose
-        The same as ``pose_platform_in_base``.
-    model_pose : Pose
-        Pose q with q ∘ E(q) = platform_pose, for which the real structure's lengths were taken.
-    sense : ndarray, shape (9,)
-        Directions of motion used: x, y, z of the measured point, six struts.
-    temperatures : dict of str to float
-        Readings used, °C; parts without one are at 20 °C.
-    nominal : ndarray, shape (6,)
-        Strut lengths of the nominal machine, m.
-    correction : ndarray, shape (6,)
-        command − nominal, m.
-    command : ndarray, shape (6,)
-        What the struts are told, m.
-    predicted_error : ndarray, shape (6,)
-        Displacement (m) and rotation (rad) of the tool along the axes of ``base`` that nominal lengths
-        would leave, to first order in the corrections: J⁻¹ times minus the model's correction.
-    condition : float
-        Condition number of the nominal pose.
-    enabled : bool
-        Compensation was on.
-    ramping : bool
-        A change of model, temperature or enabling has not been fully taken up yet.
-    outside_field : bool
-        The field's value was held at the boundary of its box.
-    outside_box : bool
-        The platform is outside the box for which the model was measured.
-    """
-
-    tool_pose: Pose
-    platform_pose: Pose
-    model_pose: Pose
-    sense: np.ndarray
-    temperatures: dict[str, float]
-    nominal: np.ndarray
-    correction: np.ndarray
-    command: np.ndarray
-    predicted_error: np.ndarray
-    condition: float
-    enabled: bool
-    ramping: bool
-    outside_field: bool
-    outside_box: bool
 
 
 class Compensator:
@@ -111,9 +58,9 @@ class Compensator:
     Attributes
     ----------
     on_change : callable
-        Called after each change from outside, with its name and value: ``temperature`` (name, °C, time), ``model``,
-        ``enable`` (bool), ``ramp_rate`` (m/s), ``reset`` (measured struts or None). Together with the commands these
-        decide all answers.
+        Called after each change from outside, with its name and value: ``temperature`` (name, °C, time), ``humidity``
+        (fraction, time), ``model``, ``enable`` (bool), ``ramp_rate`` (m/s), ``reset`` (measured struts or None).
+        Together with the commands these decide all answers.
     """
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, ramp_rate: float = DEFAULT_RAMP_RATE) -> None:
@@ -247,9 +194,24 @@ class Compensator:
         ModelError
             Unknown name, a value outside the allowed range, or no time where it is needed.
         """
+        check_part(name)
+        self._take_reading(name, value, time)
+        self.on_change("temperature", (name, self.temperatures.values[name], time))
+
+    def set_humidity(self, value: float, time: float = math.nan) -> None:
+        """Take the air's relative humidity, a fraction, read at a time, s; its effect on struts that swell ramps in.
+
+        Raises
+        ------
+        ModelError
+            A value outside the allowed range.
+        """
+        self._take_reading(HUMIDITY, value, time)
+        self.on_change("humidity", (self.temperatures.values[HUMIDITY], time))
+
+    def _take_reading(self, name: str, value: float, time: float) -> None:
         self.temperatures.follow(name, value, time, self.model.late_growth.time_constants)
         self._renew(self.model)
-        self.on_change("temperature", (name, self.temperatures.values[name], time))
 
     def enable(self, enabled: bool) -> None:
         """Switch compensation on or off; the corrections ramp.
@@ -307,7 +269,7 @@ class Compensator:
     def snapshot(self) -> dict[str, Any]:
         """Return what, beside geometry and model, decides the next answer, by name.
 
-        ``temperatures``, °C by name, ``lags`` of what follows them late, and each field of
+        ``temperatures``, °C by name, and ``humidity`` among them, ``lags`` of what follows them late, and each field of
         :class:`~hexapod_comp.kernels.compensation.State`: a list of numbers, matrices by rows.
         """
         return {**self._last.snapshot(), **self.temperatures.snapshot()}

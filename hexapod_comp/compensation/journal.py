@@ -142,11 +142,11 @@ class Entry:
     after : int
         Commands answered before it since the session began.
     what : str
-        ``temperature``, ``model``, ``enable``, ``ramp_rate``, ``reset`` or ``refused``.
+        ``temperature``, ``humidity``, ``model``, ``enable``, ``ramp_rate``, ``reset`` or ``refused``.
     values : dict of str to object
-        ``name``, ``value`` (°C) and ``time`` (s; NaN: not known, as in older recordings) of a temperature; ``name`` and
-        ``sha256`` of a model; ``on``; ``value`` (m/s) of a ramp rate; ``measured`` (m, or None) of a reset; ``stamp``
-        (ns), ``reason`` and ``text`` of a refused command.
+        ``name``, ``value`` (°C) and ``time`` (s; NaN: not known, as in older recordings) of a temperature; ``value`` (a
+        fraction) and ``time`` of a humidity; ``name`` and ``sha256`` of a model; ``on``; ``value`` (m/s) of a ramp
+        rate; ``measured`` (m, or None) of a reset; ``stamp`` (ns), ``reason`` and ``text`` of a refused command.
     """
 
     after: int
@@ -316,7 +316,9 @@ class Journal:
 
 def _values(what: str, value: Any, sources: Mapping[str, Source]) -> dict[str, Any]:
     if what == "temperature":
-        return {"name": value[0], "value": value[1], "time": None if math.isnan(value[2]) else value[2]}
+        return {"name": value[0], **_values("humidity", value[1:], sources)}
+    if what == "humidity":
+        return {"value": value[0], "time": None if math.isnan(value[1]) else value[1]}
     if what == "model":
         return _identity(value, sources["model"])
     if what == "enable":
@@ -450,6 +452,7 @@ def _time(content: Any) -> float:
 
 ENTRIES: dict[str, dict[str, Callable[[Any], Any]]] = {
     "temperature": {"name": str, "value": float, "time": _time},
+    "humidity": {"value": float, "time": _time},
     "model": {"name": str, "sha256": str},
     "enable": {"on": bool},
     "ramp_rate": {"value": float},

@@ -1,9 +1,10 @@
-"""The state of a compensator, by name, and the vectors in which machine and state reach the kernels."""
+"""A compensator's state by name, the vectors in which machine and state reach the kernels, one command's record."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,59 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.model import RealMachine
 from ..machine.motion import MotionState
 from ..pose import Pose
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Everything about one compensated command.
+
+    Attributes
+    ----------
+    tool_pose : Pose
+        Commanded ``pose_tool_in_work``.
+    platform_pose : Pose
+        The same as ``pose_platform_in_base``.
+    model_pose : Pose
+        Pose q with q ∘ E(q) = platform_pose, for which the real structure's lengths were taken.
+    sense : ndarray, shape (9,)
+        Directions of motion used: x, y, z of the measured point, six struts.
+    temperatures : dict of str to float
+        Readings used, °C; parts without one are at 20 °C. ``humidity``, a fraction, is 0.5 without one.
+    nominal : ndarray, shape (6,)
+        Strut lengths of the nominal machine, m.
+    correction : ndarray, shape (6,)
+        command − nominal, m.
+    command : ndarray, shape (6,)
+        What the struts are told, m.
+    predicted_error : ndarray, shape (6,)
+        Displacement (m) and rotation (rad) of the tool along the axes of ``base`` that nominal lengths
+        would leave, to first order in the corrections: J⁻¹ times minus the model's correction.
+    condition : float
+        Condition number of the nominal pose.
+    enabled : bool
+        Compensation was on.
+    ramping : bool
+        A change of model, temperature or enabling has not been fully taken up yet.
+    outside_field : bool
+        The field's value was held at the boundary of its box.
+    outside_box : bool
+        The platform is outside the box for which the model was measured.
+    """
+
+    tool_pose: Pose
+    platform_pose: Pose
+    model_pose: Pose
+    sense: np.ndarray
+    temperatures: dict[str, float]
+    nominal: np.ndarray
+    correction: np.ndarray
+    command: np.ndarray
+    predicted_error: np.ndarray
+    condition: float
+    enabled: bool
+    ramping: bool
+    outside_field: bool
+    outside_box: bool
 
 
 def pack_machine(machine: RealMachine) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Temperature readings judged and made smooth: a machine warms over minutes, a sensor jitters within a second.
+"""Readings of temperature and humidity judged and made smooth: a machine warms over minutes, a sensor jitters.
 
 Unfiltered, a sensor that reads ±0.05 K moves a steel strut of 0.5 m by ±0.3 µm at every reading; one that reads 119 °C
 once moves it by 0.6 mm.
@@ -11,7 +11,7 @@ import statistics
 from dataclasses import dataclass
 
 from ..errors import ModelError
-from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
+from ..machine.temperatures import HUMIDITY, REFERENCE_TEMPERATURE, Temperatures, quantity_of
 
 DEFAULT_TIME_CONSTANT = 30.0
 """Time constant of the filter, s: of a reading a second an eighth of the noise is left, and the drift is
@@ -20,7 +20,7 @@ followed 30 s late, by 1/60 K when it is 1 K in half an hour."""
 
 @dataclass
 class _Mean:
-    """Weighted mean of a sensor's readings, °C, the sum of their weights, and the time of the newest, s."""
+    """Weighted mean of a sensor's readings, the sum of their weights, and the time of the newest, s."""
 
     value: float
     weight: float
@@ -53,14 +53,14 @@ class TemperatureFilter:
         self._means: dict[str, _Mean] = {}
 
     def take(self, name: str, value: float, time: float) -> float:
-        """Take a reading and return the mean, °C.
+        """Take a reading and return the mean.
 
         Parameters
         ----------
         name : str
-            ``strut_1`` … ``strut_6``, ``base`` or ``platform``.
+            ``strut_1`` … ``strut_6``, ``base``, ``platform`` or ``humidity``.
         value : float
-            Reading, °C.
+            Reading, °C; of humidity a fraction.
         time : float
             When it was taken, s, on a clock that is never set: a clock put back makes all that follows late.
 
@@ -71,7 +71,7 @@ class TemperatureFilter:
         """
         reading = Temperatures({name: value}).values[name]
         if not math.isfinite(time):
-            raise ModelError(f"time of the temperature of {name}", "must be finite, s", time)
+            raise ModelError(f"time of the {quantity_of(name).title.format(name)}", "must be finite, s", time)
         mean = self._means.get(name)
         if mean is None or self.time_constant == 0.0:
             mean = self._means[name] = _Mean(reading, 1.0, time)
@@ -84,8 +84,11 @@ class TemperatureFilter:
         return mean.value
 
 
-JITTER = 1.0
-"""Two readings of a sensor may differ by this at once, K: noise, and the last digit of a coarse one."""
+JITTER, HUMIDITY_JITTER = 1.0, 0.05
+"""Two readings of a sensor may differ by this at once, K or a fraction: noise, and the last digit of a coarse one."""
+
+HUMIDITY_RATE = 0.02
+"""Fastest change of a shop's humidity, 1/s: a gate that opens."""
 
 
 @dataclass(frozen=True)
@@ -102,15 +105,19 @@ class Plausibility:
         where parts that nobody has measured count as being.
     timeout : float
         A part without a good reading for longer, s, is stale: its last one stays in use, but is no neighbour's measure.
+        The same of humidity.
+    humidity_rate : float
+        As `rate`, of the relative humidity, 1/s, beyond :data:`HUMIDITY_JITTER`.
     """
 
     rate: float
     spread: float
     timeout: float
+    humidity_rate: float = HUMIDITY_RATE
 
 
 class Thermometers:
-    """The temperatures of a machine's parts: readings that are plausible, smoothed.
+    """The temperatures of a machine's parts, and the air's humidity: readings that are plausible, smoothed.
 
     Parameters
     ----------
@@ -129,7 +136,7 @@ class Thermometers:
         self._rules, self._filter.time_constant = rules, time_constant
 
     def take(self, name: str, value: float, time: float) -> float:
-        """Take a reading and return what counts from now on, °C; arguments and errors as those of the filter.
+        """Take a reading and return what counts from now on; arguments and errors as those of the filter.
 
         Raises
         ------
@@ -144,23 +151,32 @@ class Thermometers:
         return mean
 
     def stale(self, time: float) -> tuple[str, ...]:
-        """Return the parts that no longer tell, at a time, s."""
-        return tuple(name for name in Temperatures.NAMES if name in self._last and self._is_stale(name, time))
+        """Return the parts, and ``humidity``, that no longer tell, at a time, s."""
+        return tuple(
+            name for name in (*Temperatures.NAMES, HUMIDITY) if name in self._last and self._is_stale(name, time)
+        )
 
     def _is_stale(self, name: str, time: float) -> bool:
         return 0.0 < self._rules.timeout < time - self._last[name][1]
 
     def _check_rate(self, name: str, reading: float, time: float) -> None:
-        if name not in self._last or not self._rules.rate:
+        of_air = name == HUMIDITY
+        rate, jitter = (self._rules.humidity_rate, HUMIDITY_JITTER) if of_air else (self._rules.rate, JITTER)
+        if name not in self._last or not rate:
             return
         last, then = self._last[name]
-        allowed = JITTER + self._rules.rate * max(0.0, time - then)
+        allowed = jitter + rate * max(0.0, time - then)
         if abs(reading - last) > allowed:
-            problem = f"has jumped from {last:.2f} to {reading:.2f} °C in {time - then:.1f} s, allowed {allowed:.1f} K"
-            raise ModelError(f"temperature of {name}", problem)
+            quantity = quantity_of(name)
+            way = f"from {last:.2f} to {reading:.2f}{quantity.unit} in {time - then:.1f} s"
+            problem = f"has jumped {way}, allowed {allowed:.3g}{quantity.difference}"
+            raise ModelError(quantity.title.format(name), problem)
 
     def _check_spread(self, name: str, reading: float, time: float) -> None:
-        others = [last for other, (last, _) in self._last.items() if other != name and not self._is_stale(other, time)]
+        if name == HUMIDITY:
+            return
+        parts = ((other, last) for other, (last, _) in self._last.items() if other not in (name, HUMIDITY))
+        others = [last for other, last in parts if not self._is_stale(other, time)]
         middle = statistics.median(others or [REFERENCE_TEMPERATURE])
         if 0.0 < self._rules.spread < abs(reading - middle):
             whose = f"the other parts' {middle:.2f} °C" if others else f"{middle:g} °C, and no other part is known"

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..compensation.compensator import DEFAULT_RAMP_RATE, Compensator
-from ..errors import HexapodError, TooEarlyError
+from ..errors import HexapodError, ModelError, TooEarlyError
 from ..formats.outputs import write_text
 from ..kernels.struts import GROWTH, MOST_HARMONICS, WAVES
 from ..machine.geometry import HexapodGeometry
@@ -102,18 +102,27 @@ def write_c(folder: str | Path, geometry: HexapodGeometry, model: MachineModel, 
     list of Path
         The files.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     files = {path.name: path.read_text(encoding="utf-8") for path in sorted(SOURCES.iterdir())}
     files[MODEL_FILE] = model_header(geometry, model, hashes)
     files[VECTORS_FILE] = vectors_header(self_test(geometry, model))
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
     for name, text in files.items():
         write_text(folder / name, text)
     return [folder / name for name in files]
 
 
 def model_header(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str]) -> str:
-    """Return ``hexapod_model.h``: geometry, limits and model as one constant of type hc_model."""
+    """Return ``hexapod_model.h``: geometry, limits and model as one constant of type hc_model.
+
+    Raises
+    ------
+    ModelError
+        The struts swell by humidity, of which the C core knows nothing.
+    """
+    if model.struts.moisture.any():
+        problem = "cannot be carried to C: its core has no humidity. Leave it out, or let the compensator node run it"
+        raise ModelError("struts.moisture", problem, model.struts.moisture.tolist())
     machine = RealMachine(geometry, model)
     _, knots, pieces = machine.strut_arrays
     arrays = {"hexapod_knots": knots, "hexapod_pieces": pieces}

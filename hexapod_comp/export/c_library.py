@@ -20,7 +20,7 @@ from ..kernels.compensation import SIZES, State
 from ..machine.geometry import HexapodGeometry
 from ..machine.late import MOST_TIME_CONSTANTS, PARTS
 from ..machine.model import MachineModel
-from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
+from ..machine.temperatures import HUMIDITY, REFERENCE_TEMPERATURE, Temperatures
 from .c_code import STATUS
 
 
@@ -199,6 +199,10 @@ class CCompensator:
         index = Temperatures.NAMES.index(name)
         self._check(self._library.hc_set_temperature(byref(self.state), index, c_double(value), c_double(time)))
         self._temperatures[name] = value
+
+    def set_humidity(self, value: float, time: float = math.nan) -> None:
+        """Take a relative humidity, a fraction: it acts on nothing, since struts that swell are not exported."""
+        self._temperatures[HUMIDITY] = value
 
     def set_model(self, model: MachineModel) -> None:
         """Refuse: the model is compiled in."""

@@ -14,11 +14,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..machine.geometry import HexapodGeometry
+from ..machine.late import PARTS
 from ..machine.model import MachineModel, RealMachine
 from ..machine.passes import Passes
 from ..machine.size import Size
-from ..machine.temperatures import Temperatures
+from ..machine.temperatures import HUMIDITY, REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE, Temperatures
 from ..virtual.trial import ToolErrors, Trial
+
+WARMER, DAMPER = dict.fromkeys(PARTS, REFERENCE_TEMPERATURE + 1.0), {HUMIDITY: REFERENCE_HUMIDITY + 0.1}
+"""Readings of a machine that is 1 K warmer, and of one in damper air."""
 
 DIAGONAL = np.ones(3)
 """Direction of travel, forward; backward is its opposite."""
@@ -61,15 +65,16 @@ class ExportCheck:
         The same places with the tool tilted; None where no such pose is within the machine's limits.
     field : Size
         Displacement of the tool by the model's error field, m.
-    per_kelvin : Size or None
-        Displacement of the tool when struts, base and platform are 1 K warmer, m; None for a model without
-        thermal expansion.
+    per_kelvin, per_humidity : Size or None
+        Displacement of the tool when struts, base and platform are 1 K warmer, and when the air is damper by 0.1, m;
+        None for a model that this does not act on.
     """
 
     level: Comparison
     tilted: Comparison | None
     field: Size
     per_kelvin: Size | None
+    per_humidity: Size | None
 
 
 def diagonal_passes(geometry: HexapodGeometry, box: np.ndarray, count: int, seed: int, tilt: float = 0.0) -> Passes:
@@ -150,8 +155,8 @@ class ExportTrial:
         commands = [commands_of(trial.passes) for trial in self._trials]
         after = [trial.errors(lengths) for trial, lengths in zip(self._trials, commands, strict=True)]
         level, *tilted = (_comparison(*pair) for pair in zip(self._before, after, strict=True))
-        warmer = _warmer(self._trials[0], commands[0], after[0])
-        return ExportCheck(level, tilted[0] if tilted else None, Size.of(after[0].field_share), warmer)
+        grown = [_grown(self._trials[0], commands[0], after[0], readings) for readings in (WARMER, DAMPER)]
+        return ExportCheck(level, tilted[0] if tilted else None, Size.of(after[0].field_share), *grown)
 
 
 def _comparison(before: ToolErrors, after: ToolErrors) -> Comparison:
@@ -159,11 +164,11 @@ def _comparison(before: ToolErrors, after: ToolErrors) -> Comparison:
     return Comparison(len(after.displacement), *sizes)
 
 
-def _warmer(trial: Trial, commands: np.ndarray, driven: ToolErrors) -> Size | None:
-    """Return how far 1 K on struts, base and platform moves the tool, None without any expansion."""
-    model = trial.machine.model
-    if not (model.struts.expansion.any() or model.base_expansion or model.platform_expansion):
+def _grown(trial: Trial, commands: np.ndarray, driven: ToolErrors, readings: dict[str, float]) -> Size | None:
+    """Return how far readings of the sensors move the tool, None where nothing grows by them."""
+    grown = RealMachine(trial.machine.geometry, trial.machine.model, Temperatures(readings))
+    if np.array_equal(grown.strut_arrays[0], trial.machine.strut_arrays[0]) and all(
+        np.array_equal(*joints) for joints in zip(grown.body[:2], trial.machine.body[:2], strict=True)
+    ):
         return None
-    readings = Temperatures(dict.fromkeys(Temperatures.NAMES, 21.0))
-    warm = Trial(RealMachine(trial.machine.geometry, model, readings), trial.passes).errors(commands)
-    return Size.of(warm.displacement - driven.displacement)
+    return Size.of(Trial(grown, trial.passes).errors(commands).displacement - driven.displacement)

@@ -36,6 +36,7 @@ UNITS: dict[str, dict[str, float]] = {
     "angle": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": np.pi / 180.0, "arcsec": np.pi / 648000.0},
     "ratio": {"ppm": 1e-6, "percent": 1e-2},
     "expansion": {"ppm_per_K": 1e-6},
+    "moisture": {"ppm_per_percent": 1e-4},
     "temperature": {"degC": 1.0},
     "speed": {"m_s": 1.0, "mm_s": 1e-3, "m_min": 1.0 / 60.0},
     "acceleration": {"m_s2": 1.0, "mm_s2": 1e-3},

@@ -16,6 +16,9 @@ STRUT_LENGTH = 0.1
 EXPANSION = 1e-3
 """Largest expansion, 1/K: five times that of soft plastics."""
 
+MOISTURE = 0.1
+"""Largest growth from dry air to damp: three times that of nylon; carbon fibre in resin has some hundred ppm."""
+
 ROTATION = 0.1
 """Largest rotation of a field, rad: its three rotations count as small. Displacements are as those of the joints."""
 
@@ -37,6 +40,7 @@ def check_magnitudes(model: MachineModel) -> None:
     expansions["thermal.late"] = model.late_growth.expansion
     for name, value in {"struts.expansion": model.struts.expansion, **expansions}.items():
         _check(name, np.asarray(value), EXPANSION, f"{EXPANSION * 1e6:g} ppm per K")
+    _check("struts.moisture", model.struts.moisture, MOISTURE, f"{MOISTURE * 1e4:g} ppm per % of relative humidity")
     for axis, family in zip("xyz", model.field.lines, strict=True):
         for component, largest in zip(COMPONENTS, _largest(family), strict=True):
             length = component.startswith("d")

@@ -23,7 +23,7 @@ from .kinematics import Structure, forward_error
 from .late import AT_ONCE, PARTS, Lag, LateGrowth, late
 from .motion import MotionState
 from .struts import StrutErrors
-from .temperatures import Temperatures
+from .temperatures import HUMIDITY, Temperatures
 
 LARGEST_DEVIATION = 0.05
 """Joint deviations above this, m, are a unit error, not a machine."""
@@ -206,7 +206,7 @@ class RealMachine:
     model : MachineModel
         Its errors.
     temperatures : Temperatures, optional
-        Readings; 20 °C everywhere by default.
+        Readings; 20 °C everywhere, and 50 % of humidity, by default.
 
     Raises
     ------
@@ -225,6 +225,7 @@ class RealMachine:
         base, platform = geometry.kernel_joints
         expansions = (*model.struts.expansion.tolist(), model.base_expansion, model.platform_expansion)
         *growth, of_base, of_platform = (self._growth(n, expansion) for n, expansion in enumerate(expansions))
+        swelling = model.struts.moisture * self.temperatures.above_reference(HUMIDITY)
         self.structure = structure = Structure.of(geometry).moved(
             _displacement(base, model.base_deviation, of_base),
             _displacement(platform, model.platform_deviation, of_platform),
@@ -237,7 +238,7 @@ class RealMachine:
         self.body = (*structure.joints, base_axes, platform_axes)
         self.solver = structure.solver
         self.strut_arrays = (
-            model.struts.parameter_table(geometry, np.array(growth)),
+            model.struts.parameter_table(geometry, growth + swelling),
             model.struts.map_knots.copy(),
             model.struts.spline_coefficients(),
         )
@@ -372,29 +373,31 @@ class MachinesByTemperature:
         self._geometry, self._model = geometry, model
         self._known: dict[tuple[float, ...], RealMachine] = {}
 
-    def at(self, values: np.ndarray, behind: np.ndarray | None = None) -> RealMachine:
-        """Return the machine at the temperatures of struts 1–6, base and platform, °C, shape (8,).
+    def at(self, values: np.ndarray, behind: np.ndarray | None = None, humidity: float = math.nan) -> RealMachine:
+        """Return the machine at the temperatures of struts 1–6, base and platform, °C, shape (8,), and a humidity.
 
-        Late parts are `behind` these, K, shape (8, time constants); by default they are at rest.
+        A humidity that is not known, NaN, is 50 %. Late parts are `behind` the temperatures, K, shape (8, time
+        constants); by default they are at rest.
         """
-        key = (*values.tolist(), *(() if behind is None else behind.ravel().tolist()))
+        swells = math.isfinite(humidity) and bool(self._model.struts.moisture.any())
+        air = {HUMIDITY: humidity} if swells else {}
+        key = (*values.tolist(), *air.values(), *(() if behind is None else behind.ravel().tolist()))
         if key not in self._known:
             late_parts = {} if behind is None else dict(zip(PARTS, behind.tolist(), strict=True))
             lags = {name: Lag(math.nan, math.nan, row) for name, row in late_parts.items()}
-            temperatures = Temperatures(dict(zip(PARTS, values.tolist(), strict=True)), lags)
-            self._known[key] = RealMachine(self._geometry, self._model, temperatures)
+            readings = dict(zip(PARTS, values.tolist(), strict=True)) | air
+            self._known[key] = RealMachine(self._geometry, self._model, Temperatures(readings, lags))
         return self._known[key]
 
-    def at_each(self, temperatures: np.ndarray, times: np.ndarray) -> list[RealMachine]:
-        """Return the machine at each row of temperatures, °C, shape (N, 8), read at some times, s, shape (N,).
+    def at_each(self, temperatures: np.ndarray, times: np.ndarray, humidities: np.ndarray) -> list[RealMachine]:
+        """Return the machine at rows of temperatures, °C, shape (N, 8), read at some times, s, and humidities, (N,).
 
         Where a time is not known, late parts are at rest.
         """
         constants = self._model.late_growth.time_constants
-        if not constants or not np.isfinite(times).all():
-            return [self.at(values) for values in temperatures]
-        behind = late(times, temperatures, constants)
-        return [self.at(*row) for row in zip(temperatures, behind, strict=True)]
+        timed = bool(constants) and bool(np.isfinite(times).all())
+        behind = late(times, temperatures, constants) if timed else [None] * len(times)
+        return [self.at(*row) for row in zip(temperatures, behind, humidities.tolist(), strict=True)]
 
 
 def platform_box(model: MachineModel, level: np.ndarray) -> np.ndarray | None:

@@ -23,6 +23,7 @@ STRUT_TERMS = {
     "reference_length": ("length", "mm"),
     "backlash": ("length", "um"),
     "expansion": ("expansion", "ppm_per_K"),
+    "moisture": ("moisture", "ppm_per_percent"),
 }
 """Per-strut terms: kind of quantity, and the unit in which they are written."""
 

@@ -36,6 +36,7 @@ all six or a list of six. Everything marked optional may be left out and is then
       reference_length_mm: 0.0        # command at which the pitch error is zero
       backlash_um: 0.0                # lost motion on reversal
       expansion_ppm_per_K: 0.0
+      moisture_ppm_per_percent: 0.0   # growth by relative humidity above 50 %: struts of carbon fibre
       wave:                           # optional: cosine·cos(2πc/period) + sine·sin(2πc/period), per strut
         cosine_um: 0.0
         sine_um: 0.0
@@ -74,7 +75,8 @@ all six or a list of six. Everything marked optional may be left out and is then
     end: true                         # of a closed file: everything above has arrived
 
 What no machine has is refused as an error of units: joints more than 50 mm away, strut lengths more than 100 mm wrong,
-expansions above 1000 ppm/K; a field of more than 50 mm or 100 mrad anywhere on one of its lines.
+expansions above 1000 ppm/K or 1000 ppm per % of humidity; a field of more than 50 mm or 100 mrad anywhere on one of
+its lines.
 
 A family of lines (all along one axis) is whole or absent: every pair of nodes in both directions.
 

@@ -6,7 +6,7 @@ One strut, command c (what its encoder counts, m) to actual length L (m):
 
 with offset o, pitch error p about the length c₀, screw waves Aₙ, Bₙ of period 2π/k and its harmonics n = 1…4, length
 map, backlash b by the sense of motion s, screw lead l times the rotation θ that the cardan joints force on the screw
-since home, and thermal growth g. The compensator solves it for c.
+since home, and growth g, by heat and by humidity. The compensator solves it for c.
 """
 
 from __future__ import annotations
@@ -64,6 +64,8 @@ class StrutErrors:
         Lost motion on reversal, m.
     expansion : ndarray
         Thermal expansion of the struts, 1/K.
+    moisture : ndarray
+        Growth of the struts by the air's relative humidity, m/m from 0 to 1.
     map_knots : ndarray, shape (n,)
         Commands of the length map, m, increasing; empty for none.
     map_values : ndarray, shape (6, n)
@@ -83,6 +85,7 @@ class StrutErrors:
     period: np.ndarray = field(default_factory=lambda: np.full(6, 0.01))
     backlash: np.ndarray = field(default_factory=lambda: np.zeros(6))
     expansion: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    moisture: np.ndarray = field(default_factory=lambda: np.zeros(6))
     map_knots: np.ndarray = field(default_factory=lambda: np.zeros(0))
     map_values: np.ndarray = field(default_factory=lambda: np.zeros((6, 0)))
 
@@ -158,7 +161,7 @@ class StrutErrors:
         return np.ascontiguousarray(np.transpose(spline.c, (2, 1, 0)))
 
     def parameter_table(self, geometry: HexapodGeometry, growth: np.ndarray) -> np.ndarray:
-        """Return the kernels' table, shape (6, PARAMETERS), for a thermal growth (6,) of the struts."""
+        """Return the kernels' table, shape (6, PARAMETERS), for a growth (6,) of the struts."""
         table = np.zeros((6, PARAMETERS))
         table[:, OFFSET], table[:, PITCH], table[:, REFERENCE] = self.offset, self.pitch, self.reference_length
         table[:, WAVENUMBER] = 2.0 * np.pi / self.period

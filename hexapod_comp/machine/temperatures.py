@@ -1,9 +1,10 @@
-"""Temperatures of a machine's parts, and what follows them late."""
+"""Temperatures of a machine's parts, what follows them late, and the humidity by which struts swell."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from ..errors import ModelError
@@ -15,14 +16,74 @@ REFERENCE_TEMPERATURE = 20.0
 TEMPERATURE_RANGE = (-40.0, 120.0)
 """Sensor readings outside this, °C, are not a machine shop's."""
 
+HUMIDITY = "humidity"
+"""Name of the air's relative humidity among a machine's readings."""
+
+REFERENCE_HUMIDITY = 0.5
+"""Relative humidity at which geometry and model hold, a fraction."""
+
+HUMIDITY_RANGE = (0.01, 1.0)
+"""Relative humidity outside this is not a machine shop's: percent for a fraction, a fraction for percent, or a broken
+sensor's zero."""
+
+
+@dataclass(frozen=True)
+class Sensed:
+    """What a sensor reads.
+
+    Attributes
+    ----------
+    title : str
+        For messages; ``{}`` stands for the sensor's name.
+    reference : float
+        What counts while nobody has told.
+    range : (float, float)
+        Readings outside are refused.
+    allowed : str
+        The same for people.
+    unit, difference : str
+        Unit of a reading, and of a difference of two, after a space.
+    """
+
+    title: str
+    reference: float
+    range: tuple[float, float]
+    allowed: str
+    unit: str = ""
+    difference: str = ""
+
+
+TEMPERATURE = Sensed(
+    "temperature of {}",
+    REFERENCE_TEMPERATURE,
+    TEMPERATURE_RANGE,
+    "{:g}…{:g} °C".format(*TEMPERATURE_RANGE),
+    " °C",
+    " K",
+)
+RELATIVE_HUMIDITY = Sensed(
+    HUMIDITY, REFERENCE_HUMIDITY, HUMIDITY_RANGE, "{:g}…{:g}, as a fraction".format(*HUMIDITY_RANGE)
+)
+
+
+def quantity_of(name: str) -> Sensed:
+    """Return what the sensor of a name reads."""
+    return RELATIVE_HUMIDITY if name == HUMIDITY else TEMPERATURE
+
+
+def check_part(name: str) -> None:
+    """Raise ModelError on what is no name of a part that has a temperature."""
+    if name not in PARTS:
+        raise ModelError("temperature", f"must be of one of {', '.join(PARTS)}", name)
+
 
 class Temperatures:
-    """Temperatures of struts, base and platform, °C; whatever has not been heard of is at 20 °C.
+    """Temperatures of struts, base and platform, °C, and the air's humidity; of what nobody has told: 20 °C, 50 %.
 
     Attributes
     ----------
     values : dict of str to float
-        Readings by ``strut_1`` … ``strut_6``, ``base``, ``platform``.
+        Readings by ``strut_1`` … ``strut_6``, ``base``, ``platform``, °C; ``humidity``, a fraction.
     lags : dict of str to Lag
         How far what follows each of them is behind; whatever is not here is at rest.
     """
@@ -66,13 +127,14 @@ class Temperatures:
         ModelError
             As :meth:`set`; or there are time constants, and the time is not finite. Nothing was taken.
         """
-        before = self.values.get(name, REFERENCE_TEMPERATURE)
-        if time_constants and not math.isfinite(time):
+        before = self.at(name)
+        late_parts = bool(time_constants) and name != HUMIDITY
+        if late_parts and not math.isfinite(time):
             raise ModelError(f"time of the temperature of {name}", "must be finite, s: the model has time constants")
         self.set(name, value)
         if name in self.lags:
             self.lags[name].take(self.values[name] - before, time, time_constants)
-        elif time_constants:
+        elif late_parts:
             self.lags[name] = Lag(time, time, [0.0] * len(time_constants))
 
     def unknown_for(self, late_growth: LateGrowth, time: float) -> float:
@@ -91,19 +153,20 @@ class Temperatures:
         Raises
         ------
         ModelError
-            Unknown name, not finite, or outside :data:`TEMPERATURE_RANGE`.
+            Unknown name, not finite, or outside :data:`TEMPERATURE_RANGE` or :data:`HUMIDITY_RANGE`.
         """
-        if name not in self.NAMES:
-            raise ModelError("temperature", f"must be of one of {', '.join(self.NAMES)}", name)
-        if not TEMPERATURE_RANGE[0] <= value <= TEMPERATURE_RANGE[1]:
-            low, high = TEMPERATURE_RANGE
-            raise ModelError(f"temperature of {name}", f"must lie within {low:g}…{high:g} °C", value)
+        if name != HUMIDITY:
+            check_part(name)
+        quantity = quantity_of(name)
+        low, high = quantity.range
+        if not low <= value <= high:
+            raise ModelError(quantity.title.format(name), f"must lie within {quantity.allowed}", value)
         self.values[name] = float(value)
 
     def at(self, name: str) -> float:
-        """Return a temperature, °C."""
-        return self.values.get(name, REFERENCE_TEMPERATURE)
+        """Return a temperature, °C, or the humidity."""
+        return self.values.get(name, quantity_of(name).reference)
 
     def above_reference(self, name: str) -> float:
-        """Return the difference to 20 °C, K."""
-        return self.at(name) - REFERENCE_TEMPERATURE
+        """Return the difference to 20 °C, K, or to 50 %."""
+        return self.at(name) - quantity_of(name).reference

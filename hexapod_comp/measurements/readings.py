@@ -130,6 +130,8 @@ class Reading(NamedTuple):
         From where a length is read: a place in the work frame, m, known to some millimetres; None for others.
     known_zero : bool
         A length that is known as a whole, as with a calibrated bar.
+    humidity : float
+        Relative humidity of the air, a fraction; NaN when not known.
     """
 
     run: str
@@ -145,6 +147,7 @@ class Reading(NamedTuple):
     time: float = np.nan
     centre: tuple[float, ...] | None = None
     known_zero: bool = False
+    humidity: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -197,6 +200,8 @@ class Stations:
         Struts 1–6, base, platform, °C.
     times : ndarray, shape (M,)
         When these were read, s; NaN where that is not known.
+    humidity : ndarray, shape (M,)
+        Relative humidity of the air, a fraction; NaN where that is not known.
     """
 
     positions: np.ndarray
@@ -205,6 +210,7 @@ class Stations:
     sense: np.ndarray
     temperatures: np.ndarray
     times: np.ndarray
+    humidity: np.ndarray
 
     def __len__(self) -> int:
         return len(self.positions)

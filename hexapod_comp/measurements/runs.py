@@ -227,7 +227,7 @@ def _collect_stations(
         # A station belongs to a run: lines that cross at a point pass it in different ways.
         came_from = rows[before] if before is not None and r.direction == FROM_PREVIOUS else None
         time = r.time if warming else np.nan
-        key = (place, r.direction, None if came_from is None else before, r.temperatures, str(time))
+        key = (place, r.direction, None if came_from is None else before, r.temperatures, str(time), str(r.humidity))
         if key not in known:
             lengths = strut_lengths(nominal, pose)
             if in_reach:
@@ -235,7 +235,7 @@ def _collect_stations(
             commands = np.array(lengths if r.commands is None else r.commands, dtype=float)
             sense = _sense(geometry, r.direction, run, pose, commands, came_from)
             known[key] = len(rows)
-            rows.append((pose.position, pose.rotation, commands, sense, r.temperatures, time))
+            rows.append((pose.position, pose.rotation, commands, sense, r.temperatures, time, r.humidity))
         index[n] = known[key]
     columns = [np.array(column, dtype=float) for column in zip(*rows, strict=True)]
     return Stations(*columns), index

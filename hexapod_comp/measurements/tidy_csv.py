@@ -30,7 +30,8 @@ Columns
 ``instrument_index``, ``pressure_kPa``, ``humidity_percent`` (optional)
     The refractive index with which the instrument turned its counts into lengths; 1 when it counts vacuum
     wavelengths. A row that has one is corrected to the air of that row (Ciddor), which needs its temperature,
-    pressure and humidity. Empty: the instrument has corrected itself, nothing is done.
+    pressure and relative humidity. Empty: the instrument has corrected itself, nothing is done. The humidity also acts
+    on struts that swell, with or without an index.
 
 Channels
 --------
@@ -179,7 +180,7 @@ def _file_readings(
             reading = (names[row.run], row.cycle, row.direction, row.pose, channel, value, row.uncertainty)
             source = FileLine(file, row.line)
             state = row.temperatures, commands.get(visits[n]), source, row.time
-            readings.append(Reading(*reading, *state, row.centre, row.known_zero))
+            readings.append(Reading(*reading, *state, row.centre, row.known_zero, row.humidity))
     if not readings:
         raise InputFileError(file, "", "holds strut readings only: nothing that was measured")
     return readings, len(corrected)

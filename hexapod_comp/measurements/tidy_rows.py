@@ -65,6 +65,7 @@ class TidyRow(NamedTuple):
     known_zero: bool
     line: int
     time: float
+    humidity: float
 
 
 def read_rows(table: Table) -> list[TidyRow]:
@@ -73,7 +74,7 @@ def read_rows(table: Table) -> list[TidyRow]:
     directions, cycles, poses = _directions(table), _cycles(table), _poses(table)
     value_column = table.required(("value",), None)[0][0]
     uncertainty_column = table.column("uncertainty", None)
-    temperatures, air = _temperatures(table), _air(table)
+    temperatures, (air, humidity) = _temperatures(table), _air(table)
     centres, known = _centres(table), _known_zeros(table)
     times = _optional(table, "time", "time", lambda v: abs(v) <= LATEST, f"±{LATEST:g} s", blank=True)
     table.refuse_unknown()
@@ -90,7 +91,8 @@ def read_rows(table: Table) -> list[TidyRow]:
         value = (si_from_text(text, number, sizes[key]), exact(text, number), sizes[key])
         uncertainty = _uncertainty(table, line, cells, uncertainty_column, sizes[key])
         place = (runs[n], cycles[n], directions[n], poses[n], channels[n])
-        rows.append(TidyRow(*place, *value, uncertainty, temperatures[n], air[n], centres[n], known[n], line, times[n]))
+        set_up = air[n], centres[n], known[n]
+        rows.append(TidyRow(*place, *value, uncertainty, temperatures[n], *set_up, line, times[n], humidity[n]))
     return rows
 
 
@@ -175,11 +177,11 @@ def _temperatures(table: Table) -> list[tuple[float, ...]]:
     return list(map(tuple, np.stack(columns, axis=1).tolist()))
 
 
-def _air(table: Table) -> list[tuple[float, ...] | None]:
-    """Return instrument index, temperature, pressure and humidity of the rows that have the first."""
+def _air(table: Table) -> tuple[list[tuple[float, ...] | None], list[float]]:
+    """Return instrument index, temperature, pressure and humidity of rows that have the first; and all humidities."""
     up_to = LARGEST_INDEX
     index = _optional(table, "instrument_index", None, lambda v: 1.0 <= v <= up_to, f"1…{up_to:g}", blank=True)
-    wanted = not np.isnan(index).all()
+    wanted = {"humidity"} if np.isnan(index).all() else {*AIR_RANGES}
     columns = [index]
     for name, dimension in (("temperature", "temperature"), ("pressure", "pressure"), ("humidity", "ratio")):
         low, high, allowed = AIR_RANGES[name]
@@ -188,7 +190,7 @@ def _air(table: Table) -> list[tuple[float, ...] | None]:
                 table,
                 name,
                 dimension,
-                lambda v, low=low, high=high: not wanted or low <= v <= high,  # type: ignore[misc]
+                lambda v, name=name, low=low, high=high: name not in wanted or low <= v <= high,  # type: ignore[misc]
                 allowed,
                 blank=True,
             )
@@ -202,7 +204,7 @@ def _air(table: Table) -> list[tuple[float, ...] | None]:
             problem = "has an instrument_index, so it needs temperature_degC, pressure_kPa and humidity_percent too"
             raise InputFileError(table.path, f"line {line}", problem)
         air.append(tuple(row))
-    return air
+    return air, columns[-1]
 
 
 def _centres(table: Table) -> list[tuple[float, ...] | None]:

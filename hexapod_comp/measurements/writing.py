@@ -40,15 +40,16 @@ def write_measurements(measurements: MeasurementSet, path: str | Path) -> None:
 def _csv_rows(measurements: MeasurementSet) -> Iterator[list[str]]:
     """Yield the header and the rows of a set."""
     words = {number: word for word, number in DIRECTIONS.items()}
-    positions, rotations = _tool_poses(measurements)
+    stations, (positions, rotations) = measurements.stations, _tool_poses(measurements)
     offset = measurements.geometry.tool.rotation.T @ (measurements.probe - measurements.geometry.tool.position)
     commanded = positions + rotations @ offset if offset.any() else positions
     pose_names, poses = _pose_cells(positions, rotations)
     temperature_names, temperatures = _temperature_cells(measurements)
-    if np.isfinite(measurements.stations.times).any():
-        temperature_names = [*temperature_names, "time_s"]
-        times = ("" if math.isnan(time) else repr(time) for time in measurements.stations.times.tolist())
-        temperatures = [[*cells, time] for cells, time in zip(temperatures, times, strict=True)]
+    for name, values, digits in (("humidity_percent", stations.humidity, 2), ("time_s", stations.times, 0)):
+        if np.isfinite(values).any():
+            temperature_names = [*temperature_names, name]
+            texts = ("" if math.isnan(value) else _scaled(value, digits) for value in values.tolist())
+            temperatures = [[*cells, text] for cells, text in zip(temperatures, texts, strict=True)]
     with_uncertainty = bool(np.isfinite(measurements.uncertainty).any())
     centre_names, centres, of_reading = _centre_cells(measurements)
     tail = ["uncertainty"] * with_uncertainty + centre_names + temperature_names

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..compensation.compensator import DEFAULT_RAMP_RATE
-from ..compensation.thermal import DEFAULT_TIME_CONSTANT
+from ..compensation.thermal import DEFAULT_TIME_CONSTANT, HUMIDITY_RATE
 from .arguments import Program
 from .parameters import read_table
 
@@ -37,19 +37,21 @@ catch_up_within | 0.1 | 0 to 3600 s | always | commands that come sooner than th
     their order; 0 = only the newest waits
 allow_several_publishers | false |  | configure | obey though several nodes publish commands or `strut_states`, or
     others `strut_commands`
-allow_several_thermometers | false |  | configure | take temperatures though several nodes publish them, one for each
-    part for instance
+allow_several_thermometers | false |  | configure | take temperatures, and humidity, though several nodes publish them,
+    one for each part for instance
 enable_compensation | true |  | configure | compensate from the start; `~/enable_compensation` switches
 ramp_rate | {DEFAULT_RAMP_RATE} | 1e-06 to 1 m/s | always | how fast a change of model or switch, or the way from the
     measured struts to the first command, moves a strut
-temperature_time_constant_s | {DEFAULT_TIME_CONSTANT} | 0 to 3600 s | always | low pass of each part's temperatures; 0
-    = off
+temperature_time_constant_s | {DEFAULT_TIME_CONSTANT} | 0 to 3600 s | always | low pass of each part's temperatures, and
+    of humidity; 0 = off
 temperature_rate_limit | 0.2 | 0 to 1000 K/s | always | a part's temperature that jumps by more than 1 K and this rate
     is refused; 0 = off
 temperature_spread_limit | 40.0 | 0 to 1000 K | always | a temperature further than this from the median of the other
     parts' is refused, from 20 °C while no other is known; 0 = off
 temperature_timeout | 60.0 | 0 to 86400 s | always | a part without a temperature for this long is stale: said, and
-    its last one stays; 0 = off
+    its last one stays; the same of humidity; 0 = off
+humidity_rate_limit | {HUMIDITY_RATE} | 0 to 1 1/s | always | a humidity that jumps by more than 0.05 and this rate is
+    refused; 0 = off
 heartbeat_rate | 50.0 | 0 to 1000 Hz | always | heartbeats per second; 0 = none
 marker_rate | 10.0 | 0 to 10 Hz | always | markers and joint states per second; 0 = none
 publish_array | false |  | configure | also publish `strut_commands_array` for ros2_controllers
@@ -60,6 +62,7 @@ in   tool_pose_command       PoseStamped: commanded tool pose, frame_id base or 
      strut_setpoints         JointState: nominal strut lengths, m; NaN while the controller is not active
      strut_states            JointState: measured strut lengths, m
      temperatures            Temperature: °C; frame_id names strut_1 to strut_6, base or platform
+     humidity                RelativeHumidity: 0 to 1; for struts that swell
 out  strut_commands          JointState: compensated strut lengths, m
      strut_corrections       JointState: command − nominal, m
      nominal_strut_states    JointState: with strut_setpoints, measured struts less the corrections, m

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..compensation.compensator import Compensator
 from ..compensation.thermal import Thermometers
+from ..machine.temperatures import HUMIDITY, REFERENCE_HUMIDITY
 from .command_source import CommandSource, OwnTopic
 from .following import Following, LastKnown, Standing
 from .health import ERROR, OK, WARN, Flow, Refusals, joined, seconds
@@ -52,8 +53,10 @@ class CompensatorStatus:
         Who commands.
     own_topic : OwnTopic
         Who else publishes strut commands.
-    measuring, warming : CommandSource
-        Who publishes measured struts and temperatures.
+    measuring : CommandSource
+        Who publishes measured struts.
+    sensing : dict of str to CommandSource
+        Who publishes temperatures and humidity, by topic.
     thermometers : Thermometers
         Which of them no longer tell.
     reading_stamps : StampCheck
@@ -95,13 +98,16 @@ class CompensatorStatus:
         """Take the guards of the topics of a configured node, and what lets its commands wait."""
         self.source, self.own_topic, self.pacing = source, own_topic, pacing
 
-    def watch_readings(self, measuring: CommandSource, warming: CommandSource, thermometers: Thermometers) -> None:
+    def watch_readings(
+        self, measuring: CommandSource, sensing: dict[str, CommandSource], thermometers: Thermometers
+    ) -> None:
         """Take the guards of the readings of a configured node."""
-        self.measuring, self.warming, self.thermometers = measuring, warming, thermometers
+        self.measuring, self.sensing, self.thermometers = measuring, sensing, thermometers
 
     def look(self, now: float) -> None:
         """Look who publishes, at the monotonic time `now`, s."""
-        for topic in (self.source, self.own_topic, self.measuring, self.warming):
+        topics: list[CommandSource | OwnTopic] = [self.source, self.own_topic, self.measuring, *self.sensing.values()]
+        for topic in topics:
             topic.look(now)
 
     def problem(self) -> Guard | None:
@@ -128,11 +134,12 @@ class CompensatorStatus:
             yield ERROR, f"refusing commands: {guard.reason}: {guard.problem}"
         if reasons := self.refusals.reasons(now, guard.reason if guard is not None else ""):
             yield ERROR, f"refusing commands: {reasons}"
-        disputed = next((owner.reason for owner in (self.measuring, self.warming) if owner.problem), "")
+        disputed = next((owner.reason for owner in (self.measuring, *self.sensing.values()) if owner.problem), "")
         if reasons := self.bad_feedback.reasons(now, disputed):
             yield ERROR, f"bad feedback: {reasons}"
-        if self.warming.problem:
-            yield ERROR, f"temperatures ignored: {self.warming.reason}: {self.warming.problem}"
+        for topic, owner in self.sensing.items():
+            if owner.problem:
+                yield ERROR, f"{topic} ignored: {owner.reason}: {owner.problem}"
         if self.failed_reloads.recent(now):
             yield WARN, "the old model stays"
         if self.refused_resets.recent(now):
@@ -157,12 +164,17 @@ class CompensatorStatus:
             yield WARN, "no new command"
         if self.feedback.count and not self.fed(now):
             yield WARN, "feedback lost, pose estimated from own commands"
-        if stale := ", ".join(self.thermometers.stale(now)):
+        if stale := ", ".join(self._stale_parts(now)):
             yield WARN, f"temperatures stale: {stale}"
+        if HUMIDITY in self.thermometers.stale(now):
+            yield WARN, "humidity stale"
         if not silent and self.source.sequence.missing(now):
             yield WARN, "running, commands are being missed"
         if self.pacing.behind(now):
             yield WARN, "running, catching up with commands that came late"
+
+    def _stale_parts(self, now: float) -> list[str]:
+        return [name for name in self.thermometers.stale(now) if name != HUMIDITY]
 
     def values(self, compensator: Compensator, fresh_start: bool, now: float) -> dict[str, str]:
         """Return everything else as key and value; before the first command nothing is corrected."""
@@ -175,8 +187,8 @@ class CompensatorStatus:
             "pose_estimated_from": "strut_states" if self.fed(now) else "own commands",
             "commanded_by": ", ".join(self.source.names),
             "measured_by": ", ".join(self.measuring.names),
-            "temperatures_by": ", ".join(self.warming.names),
-            "stale_temperatures": ", ".join(self.thermometers.stale(now)),
+            **{f"{topic}_by": ", ".join(owner.names) for topic, owner in self.sensing.items()},
+            "stale_temperatures": ", ".join(self._stale_parts(now)),
             **self._flows(now),
             "largest_correction_m": f"{correction:.9f}",
             "condition_number": f"{compensator.condition:.3f}",
@@ -188,7 +200,12 @@ class CompensatorStatus:
             "last_failed_reload": self.failed_reloads.last_text,
             "refused_resets": str(sum(self.refused_resets.counts.values())),
         }
-        values.update({f"temperature.{k}_degC": f"{v:.2f}" for k, v in compensator.temperatures.values.items()})
+        heard = dict(compensator.temperatures.values)
+        if (humidity := heard.pop(HUMIDITY, None)) is not None:
+            values["humidity_percent"] = f"{100.0 * humidity:.1f}"
+        elif compensator.model.struts.moisture.any():
+            values["humidity_percent"] = f"not known, taken as {100.0 * REFERENCE_HUMIDITY:g}"
+        values.update({f"temperature.{k}_degC": f"{v:.2f}" for k, v in heard.items()})
         if (unknown := compensator.temperatures.unknown_for(compensator.model.late_growth, now)) > 0.0:
             values["late_parts"] = f"not known for another {unknown:.0f} s: the readings began too short ago"
         values.update(self.refusals.values())

@@ -1,18 +1,20 @@
-"""What a machine tells a compensator: measured struts and temperatures, each by one node, and only what can be."""
+"""What a machine tells a compensator: struts, temperatures, humidity, each by one node, and only what can be."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from sensor_msgs.msg import JointState, Temperature
+from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
 
 from ..compensation.compensator import Compensator
 from ..compensation.thermal import Plausibility, Thermometers
 from ..errors import CommandError, HexapodError
+from ..machine.temperatures import HUMIDITY, check_part
 from .command_source import CommandSource
 from .compensator_status import CompensatorStatus
 from .following import StrokeRange
@@ -33,7 +35,7 @@ class Feedback:
     node : MachineNode
         Subscribes and warns.
     compensator : Compensator
-        Estimates poses, and takes temperatures.
+        Estimates poses, and takes temperatures and humidity.
     status : CompensatorStatus
         Counters and guards.
     options : dict
@@ -61,12 +63,19 @@ class Feedback:
         self._options, self._thermometers = options, Thermometers(*_temperature_rules(options))
         several = options["allow_several_publishers"]
         states = node.obey(JointState, "strut_states", self._on_states, look, qos=STATE_QOS)
-        warm = node.obey(Temperature, "temperatures", self._on_temperature, look, qos=SENSOR_QOS)
-        self._subscriptions = states, warm
+        self._subscriptions = [states]
         self._measuring = CommandSource(node, states.topic_name, states.get_publisher_count, several)
         several = several or options["allow_several_thermometers"]
-        self._warming = CommandSource(node, warm.topic_name, warm.get_publisher_count, several)
-        status.watch_readings(self._measuring, self._warming, self._thermometers)
+        self._sensing: dict[str, CommandSource] = {}
+        sensors = (
+            ("temperatures", Temperature, self._take_temperature),
+            (HUMIDITY, RelativeHumidity, self._take_humidity),
+        )
+        for topic, kind, take in sensors:
+            heard = node.obey(kind, topic, partial(self._on_sensor, topic, kind, take), look, qos=SENSOR_QOS)
+            self._subscriptions.append(heard)
+            self._sensing[topic] = CommandSource(node, heard.topic_name, heard.get_publisher_count, several)
+        status.watch_readings(self._measuring, self._sensing, self._thermometers)
 
     def take_parameters(self) -> None:
         """Take the parameters as they are now."""
@@ -119,19 +128,28 @@ class Feedback:
             self._look()
             self._status.bad_feedback.add(following.reason, following.problem, now)
 
-    def _on_temperature(self, data: bytes, number: int | None) -> None:
+    def _on_sensor(
+        self, topic: str, kind: type, take: Callable[[Any, float], None], data: bytes, number: int | None
+    ) -> None:
         # Dated by arrival: sensors need not stamp, clocks may be set, and what a transport delays a drift does not
         # notice.
-        now = time.monotonic()
+        now, what = time.monotonic(), topic.removesuffix("s")
         try:
-            self._hear(self._warming, number, now)
-            message = read_message(data, Temperature)
-            name = message.header.frame_id
-            self._compensator.set_temperature(name, self._thermometers.take(name, message.temperature, now), now)
+            self._hear(self._sensing[topic], number, now)
+            take(read_message(data, kind), now)
         except CommandError as error:
-            self._ignore("temperatures", error.reason, f"temperature ignored: {error}", str(error), now)
+            self._ignore(topic, error.reason, f"{what} ignored: {error}", str(error), now)
         except HexapodError as error:
-            self._ignore("temperature", "temperature", f"temperature ignored: {error}", str(error), now)
+            self._ignore(what, what, f"{what} ignored: {error}", str(error), now)
+
+    def _take_temperature(self, message: Temperature, now: float) -> None:
+        name = message.header.frame_id
+        check_part(name)
+        self._compensator.set_temperature(name, self._thermometers.take(name, message.temperature, now), now)
+
+    def _take_humidity(self, message: RelativeHumidity, now: float) -> None:
+        humidity = self._thermometers.take(HUMIDITY, message.relative_humidity, now)
+        self._compensator.set_humidity(humidity, now)
 
     def _ignore(self, cause: str, reason: str, warning: str, text: str, now: float) -> None:
         """Count and say what was not usable."""
@@ -141,5 +159,10 @@ class Feedback:
 
 
 def _temperature_rules(options: dict[str, Any]) -> tuple[Plausibility, float]:
-    rules = Plausibility(*(options[f"temperature_{name}"] for name in ("rate_limit", "spread_limit", "timeout")))
+    rules = Plausibility(
+        rate=options["temperature_rate_limit"],
+        spread=options["temperature_spread_limit"],
+        timeout=options["temperature_timeout"],
+        humidity_rate=options["humidity_rate_limit"],
+    )
     return rules, options["temperature_time_constant_s"]

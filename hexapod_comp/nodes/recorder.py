@@ -14,7 +14,7 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.experimental import EventsExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
-from sensor_msgs.msg import JointState, Temperature
+from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
 from std_msgs.msg import String
 
 from ..errors import HexapodError, InputFileError
@@ -32,6 +32,7 @@ TOPICS = {
     "tool_pose_estimate": (PoseStamped, False),
     "tool_pose_true": (PoseStamped, False),
     "temperatures": (Temperature, False),
+    "humidity": (RelativeHumidity, False),
     "/diagnostics": (DiagnosticArray, True),
 }
 """What is recorded, its type, and whether it is offered reliably."""

@@ -14,7 +14,9 @@ from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from .replay import BEFORE, DIFFERENT, LOST
 from .report import LONGEST_GAP, Report, following_error, since, tool_positions
 
-EVENT_COLOURS = {"temperature": "#8a6d3b", "model": "#7b3294", "enable": "#2e8b57", "reset": "#555555"}
+EVENT_COLOURS = {
+    "temperature": "#8a6d3b", "humidity": "#1f78b4", "model": "#7b3294", "enable": "#2e8b57", "reset": "#555555",
+}  # fmt: skip
 
 MOST_LABELS = 12
 """More changes than this are drawn without their names."""

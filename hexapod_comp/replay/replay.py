@@ -127,7 +127,7 @@ def what_if(
 ) -> Replay:
     """Run the recorded commands through another model, or another geometry.
 
-    Temperatures, switching and starts are those of the recording; its own models are not. The corrections
+    Temperatures, humidity, switching and starts are those of the recording; its own models are not. The corrections
     begin at the other model's: nothing ramps. All answers are run; nothing is left out after lost pages.
     """
     run = _Run(recording, progress)
@@ -189,6 +189,8 @@ class _Run:
         values = entry.values
         if entry.what == "temperature":
             self.compensator.set_temperature(values["name"], float(values["value"]), float(values["time"]))
+        elif entry.what == "humidity":
+            self.compensator.set_humidity(float(values["value"]), float(values["time"]))
         elif entry.what == "enable":
             self.compensator.enable(bool(values["on"]))
         elif entry.what == "ramp_rate":

@@ -28,7 +28,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
-from sensor_msgs.msg import JointState, Temperature
+from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
@@ -66,6 +66,7 @@ SENT = {
     "strut_states": JointState,
     "strut_commands": JointState,
     "temperatures": Temperature,
+    "humidity": RelativeHumidity,
 }
 
 TRANSITIONS = {
@@ -357,6 +358,11 @@ class Bench:
         message = Temperature(temperature=temperature)
         message.header.frame_id = part
         self.publish("temperatures", message)
+        self.barrier()
+
+    def moisten(self, humidity: float) -> None:
+        """Publish a relative humidity, a fraction, and wait until it has been handled."""
+        self.publish("humidity", RelativeHumidity(relative_humidity=humidity))
         self.barrier()
 
     def now(self) -> Any:

@@ -75,10 +75,12 @@ def station_errors(
     """Return the real error of the measured point at each station, shape (M, 6), m and rad along ``base``.
 
     Displacement of the point and rotation of the platform, actual minus commanded, under the stations'
-    commands, directions of motion and temperatures.
+    commands, directions of motion, temperatures and humidity.
     """
     stations, name_of = measurements.stations, partial(_station_name, measurements)
-    machines = MachinesByTemperature(truth.geometry, truth.model).at_each(stations.temperatures, stations.times)
+    machines = MachinesByTemperature(truth.geometry, truth.model).at_each(
+        stations.temperatures, stations.times, stations.humidity
+    )
     commanded = stations.positions, stations.rotations
     driven = drive(machines, commanded, stations.sense, stations.commands, name_of, advance)
     return driven.errors(commanded, measurements.probe).as_array()
@@ -100,7 +102,9 @@ def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet
         A pose at which the model cannot be undone; names the reading.
     """
     stations = template.stations
-    machines = MachinesByTemperature(template.geometry, model).at_each(stations.temperatures, stations.times)
+    machines = MachinesByTemperature(template.geometry, model).at_each(
+        stations.temperatures, stations.times, stations.humidity
+    )
     targets, name_of = (stations.positions, stations.rotations), partial(_station_name, template)
     commands, _ = model_commands(machines, targets, stations.sense, name_of)
     return replace(template, stations=replace(stations, commands=commands))

@@ -34,7 +34,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from node_helpers import AT_ONCE, HOME, Bench, closed_form_lengths
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import JointState, Temperature
+from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
 from std_srvs.srv import Trigger
 from strategies import paper_geometry
 
@@ -63,6 +63,7 @@ actions_on_compensator = st.one_of(
     st.tuples(st.just("message"), st.just("tool_pose_command"), any_message(PoseStamped)),
     st.tuples(st.just("message"), st.just("strut_states"), any_message(JointState)),
     st.tuples(st.just("message"), st.just("temperatures"), any_message(Temperature)),
+    st.tuples(st.just("message"), st.just("humidity"), any_message(RelativeHumidity)),
 )
 
 

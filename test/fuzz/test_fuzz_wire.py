@@ -44,7 +44,10 @@ PEAK, COPIES = 250, 60
 middleware's, rclpy's, the one that is looked at, and others that wait; 55 is the most in 200,000 messages. A node
 begins with 210 to 240, half of it pages of libraries that all processes share."""
 
-TOPICS = {"compensator": ("tool_pose_command", "strut_states", "temperatures"), "strut_drive": ("strut_commands",)}
+TOPICS = {
+    "compensator": ("tool_pose_command", "strut_states", "temperatures", "humidity"),
+    "strut_drive": ("strut_commands",),
+}
 AT_HOME = closed_form_lengths(HOME)
 HALVES = (0.0, -0.0, 0.5, 1.0, 1e308, 5e-324, math.nan, -math.inf)
 
@@ -67,6 +70,8 @@ def message(topic: str, random: np.random.Generator) -> Any:
         p.x, p.y, p.z, q.x, q.y, q.z, q.w = random.choice([*HALVES, 0.0, 0.0, 0.4], 7).tolist()
     elif topic == "temperatures":
         made.temperature = float(random.choice([*HALVES, 21.0, 119.0]))
+    elif topic == "humidity":
+        made.relative_humidity = float(random.choice([*HALVES, 0.45, 45.0]))
     else:
         made.name = list(random.permutation([*STRUT_NAMES, "x"])[: random.integers(8)])
         made.position = random.choice([*HALVES, *AT_HOME], random.integers(8)).tolist()

@@ -1081,7 +1081,7 @@ def test_quality_of_service(bench):
         assert (qos.depth, qos.history) == (100 if name in reliable else 1, HistoryPolicy.KEEP_LAST), name
     for name in reliable:
         assert ends[f"/{name}"].reliability == ReliabilityPolicy.RELIABLE, name
-    for name in ("strut_states", "temperatures"):
+    for name in ("strut_states", "temperatures", "humidity"):
         assert ends[f"/{name}"].reliability == ReliabilityPolicy.BEST_EFFORT, f"{name}: both kinds of sensor are heard"
     for name in ("tool_pose_estimate", "diagnostics", "compensator/markers"):
         assert ends[f"/{name}"].reliability == ReliabilityPolicy.RELIABLE, name

@@ -1,4 +1,4 @@
-"""Whose readings count, and which: measured struts and temperatures have one owner, and must be such as can be.
+"""Whose readings count, and which: struts, temperatures and humidity have one owner, and must be such as can be.
 
 Truth: the shipped geometry's limits (2 mm a command, 250 mm/s, twice that for what is measured), and the arithmetic of
 temperatures beside each test.
@@ -6,6 +6,7 @@ temperatures beside each test.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -268,3 +269,50 @@ def test_a_thermometer_that_falls_silent_is_said_and_its_last_word_stays(bench):
     values: dict[str, Any] = bench.until_status(WARN, "temperatures stale: strut_3, base")
     assert values["stale_temperatures"] == "strut_3, base"
     assert values["temperature.base_degC"] == "24.00"
+
+
+# ---- humidity ----
+
+
+def test_struts_that_swell_follow_the_humidity(bench, tmp_path):
+    """From 50 to 60 % a strut of 2 ppm per % grows by 20 ppm: its command is L/(1 + 20e-6). Rounding: 1e-15 m."""
+    bench.compensator(
+        model_file=model_file(tmp_path, struts={"moisture_ppm_per_percent": 2.0}), command_timeout=0.0, ramp_rate=1.0
+    )
+    dry = bench.ask(HOME)
+    assert not dry.corrections.any()
+    unknown = "not known, taken as 50"
+    bench.until(lambda: bench.values().get("humidity_percent") == unknown, "that nobody tells the humidity")
+    bench.moisten(0.6)
+    bench.settle(HOME)
+    np.testing.assert_allclose(bench.ask(HOME).lengths, dry.lengths / (1.0 + 20e-6), rtol=0.0, atol=1e-15)
+    bench.until(lambda: bench.values().get("humidity_percent") == "60.0", "the humidity")
+    assert bench.values()["humidity_by"] == "/witness"
+
+
+@pytest.mark.parametrize("wrong", [45.0, 0.0045, math.nan], ids=["percent", "twice a fraction", "NaN"])
+def test_a_humidity_that_cannot_be_is_refused(bench, wrong):
+    bench.compensator(command_timeout=0.0)
+    bench.moisten(wrong)
+    values = bench.until_status(ERROR, "bad feedback: humidity")
+    assert "humidity: must lie within 0.01…1, as a fraction" in values["last_bad_feedback"]
+    assert "humidity_percent" not in values
+
+
+def test_a_temperature_called_humidity_is_refused(bench):
+    bench.compensator(command_timeout=0.0)
+    bench.warm("humidity", 0.5)
+    values = bench.until_status(ERROR, "bad feedback: temperature")
+    assert "must be of one of strut_1" in values["last_bad_feedback"]
+
+
+def test_a_hygrometer_that_jumps_is_refused_and_one_that_falls_silent_is_said(bench):
+    bench.compensator(command_timeout=0.0, temperature_timeout=0.3)
+    bench.ask(HOME)
+    bench.moisten(0.4)
+    bench.moisten(0.9)
+    assert (
+        "humidity: has jumped from 0.40 to 0.90"
+        in bench.until_status(ERROR, "bad feedback: humidity")["last_bad_feedback"]
+    )
+    assert bench.until_status(WARN, "humidity stale")["humidity_percent"] == "40.0"

@@ -71,9 +71,9 @@ JOINT_STATE, TEXT = "sensor_msgs/msg/JointState", "std_msgs/msg/String"
 
 
 def warm_model(folder: Path) -> Path:
-    """Write the shipped machine's model with expansions added, so that temperatures matter."""
+    """Write the shipped machine's model with growth added, so that temperatures and humidity matter."""
     model = load_model(CONFIG / "paper_machine.yaml", load_geometry(CONFIG / "paper.yaml"))
-    struts = replace(model.struts, expansion=np.full(6, 11e-6))
+    struts = replace(model.struts, expansion=np.full(6, 11e-6), moisture=np.full(6, 2e-4))
     save_model(replace(model, struts=struts, base_expansion=12e-6), folder / "warm.yaml")
     return folder / "warm.yaml"
 
@@ -85,6 +85,7 @@ def full_run(folder: Path, namespace: str = "") -> RecordedMachine:
     happenings: dict[int, Callable[[], object]] = {
         150: lambda: core.set_temperature("strut_1", 23.4),
         151: lambda: core.set_temperature("base", 21.1),
+        152: lambda: core.set_humidity(0.63),
         350: lambda: core.enable(False),
         650: lambda: core.enable(True),
         900: lambda: core.reset(core.command + 1e-6),
@@ -146,9 +147,9 @@ def test_everything_comes_back_bit_for_bit(run, tmp_path, storage):
         assert not result.states_differ
         assert not result.lost
         assert [event.entry.what for event in result.changes] == [
-            "temperature", "temperature", "enable", "enable", "reset", "model", "reset",
+            "temperature", "temperature", "humidity", "enable", "enable", "reset", "model", "reset",
         ]  # fmt: skip
-        assert [event.row for event in result.changes] == [150, 151, 350, 650, 900, 950, 1001]
+        assert [event.row for event in result.changes] == [150, 151, 152, 350, 650, 900, 950, 1001]
         assert [(event.row, event.entry.values["reason"]) for event in result.refused] == [(1000, "step")]
         assert recording.heard == 1201
         assert not recording.notes
@@ -487,7 +488,7 @@ def test_verb_writes_report_pictures_and_json(run, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "1201 commands taken, 1200 answered, 1 refused; the recorder heard 1201" in said
     assert "replayed 1200 of 1200 answers: identical bit for bit" in said
-    assert "changes between commands: 2 × enable, 1 × model, 2 × reset, 2 × temperature" in said
+    assert "changes between commands: 2 × enable, 1 × humidity, 1 × model, 2 × reset, 2 × temperature" in said
     pictures = {path.name for path in (tmp_path / "pictures").iterdir()}
     assert pictures == {"corrections.png", "commands.png", "tool.png", "refused.png"}
     capsys.readouterr()
