@@ -16,6 +16,7 @@ import numpy as np
 from ..errors import HexapodError, ModelError, NotConvergedError, NotFiniteError
 from ..kernels import kinematics as kernels
 from ..kernels.compensation import OUTSIDE, compensate_one, compensate_quaternion, estimate_one
+from ..kernels.pose import quaternion_of
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import forward_error, strut_lengths
 from ..machine.model import MachineModel, RealMachine
@@ -155,8 +156,9 @@ class Compensator:
         trial.motion.copy_from(self.motion)
         tool = platform @ self.geometry.tool
         fixed = self._pack(machine)
-        pose, times = (tool.position, tool.rotation), (math.nan, math.nan)
-        outcome = compensate_one(*pose, *times, NO_SHIFT, fixed, trial.numbers, tried.numbers)
+        # By the kernel of :meth:`step`, which is loaded anyway: each costs a node 4 MB.
+        pose, times = (*tool.position, *quaternion_of(tool.rotation)), (math.nan, math.nan)
+        outcome = compensate_quaternion(*pose, *times, NO_SHIFT, fixed, trial.numbers, tried.numbers)
         refuse(outcome, tried, machine)
 
     def _followed(self, machine: RealMachine) -> np.ndarray | None:

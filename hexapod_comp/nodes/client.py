@@ -7,12 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from rclpy.experimental import EventsExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 
@@ -20,7 +17,7 @@ from ..errors import NoAnswerError
 from ..machine.trajectory import Path
 from ..pose import Pose
 from .messages import StrutReader, message_pose, pose_message
-from .middleware import avoid_shared_memory
+from .middleware import RosSession
 from .runtime import COMMAND_QOS, EVENT_QOS, STATE_QOS
 from .stamps import nanoseconds_of
 
@@ -63,12 +60,8 @@ class LoopClient:
     """
 
     def __init__(self, frame_id: str = "base", namespace: str = "") -> None:
-        avoid_shared_memory()
-        self.context = rclpy.Context()
-        rclpy.init(args=[], context=self.context, signal_handler_options=SignalHandlerOptions.NO)
-        self.node = rclpy.create_node("hexapod_comp_client", namespace=namespace, context=self.context)
-        self._executor = EventsExecutor(context=self.context)
-        self._executor.add_node(self.node)
+        self._session = RosSession("hexapod_comp_client", namespace)
+        self.node, self._spin_once = self._session.node, self._session.spin_once
         self._message = pose_message(Pose.identity(), frame_id)
         self._commands, self._corrections = StrutReader(), StrutReader()
         self.sent: dict[int, Sent] = {}
@@ -91,9 +84,7 @@ class LoopClient:
 
     def close(self) -> None:
         """Leave ROS."""
-        self._executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
+        self._session.close()
 
     def _on_command(self, message: JointState) -> None:
         entry = self.sent.get(nanoseconds_of(message.header.stamp))
@@ -156,7 +147,7 @@ class LoopClient:
             left = end - time.monotonic()
             if left <= 0.0:
                 raise NoAnswerError(f"waited {timeout:g} s in vain for {what}")
-            self._executor.spin_once(timeout_sec=min(left, 0.02))
+            self._spin_once(min(left, 0.02))
 
     def connected(self) -> bool:
         """Return whether commands reach a compensator and its answers and pose estimates come back."""
@@ -184,7 +175,7 @@ class LoopClient:
             accepted, refused = accepted - accepted_before, refused - refused_before
             if accepted + refused >= len(self.sent) or time.monotonic() > end:
                 return accepted, refused
-            self._executor.spin_once(timeout_sec=0.05)
+            self._spin_once(0.05)
 
     def enable(self, enabled: bool) -> None:
         """Switch compensation on or off."""
@@ -215,7 +206,7 @@ class LoopClient:
             if time.monotonic() > end:
                 refusal = self.diagnostics.get("last_refusal") or "none"
                 raise NoAnswerError(f"no answer to a command within {timeout:g} s; last refusal: {refusal}")
-            self._executor.spin_once(timeout_sec=0.01)
+            self._spin_once(0.01)
 
     def stream(self, path: Path, each: Callable[[int], None] | None = None) -> list[Sent]:
         """Send a path at its rate and return the records; :attr:`track` then holds where the tool went.
@@ -241,7 +232,7 @@ class LoopClient:
         due = time.monotonic()
         for index, message in enumerate(messages):
             while (left := due - time.monotonic()) > 0.0:
-                self._executor.spin_once(timeout_sec=left)
+                self._spin_once(left)
             if entries:
                 self.wait_for_answer(entries[-1])
             entries.append(self._send(message))
@@ -261,7 +252,7 @@ class LoopClient:
             self.wait_for_answer(entry)
             next_due = entry.sent_at + 1.0 / rate
             while (left := next_due - time.monotonic()) > 0.0:
-                self._executor.spin_once(timeout_sec=left)
+                self._spin_once(left)
             if until():
                 return entry
             if time.monotonic() > end:

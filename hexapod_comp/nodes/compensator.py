@@ -34,7 +34,7 @@ from .reloading import ReloadService
 from .running import keep_discovery_local, run
 from .runtime import ACKNOWLEDGED_WITHIN, MachineNode
 from .stamps import StampCheck, stamp_of
-from .warming import warm_up
+from .warming import warm_compensator, warm_up
 
 CHECK_PERIOD = 0.05
 """How often the node looks whether its state has changed, s."""
@@ -296,7 +296,7 @@ class CompensatorNode(MachineNode):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; the entry of the executable ``compensator``."""
     keep_discovery_local()
-    return run(CompensatorNode, PROGRAM, argv)
+    return run(CompensatorNode, PROGRAM, argv, warm_compensator)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,15 @@
-"""How the nodes' DDS is set up; must be done before ROS is initialised in a process."""
+"""How the nodes' DDS is set up, before ROS is initialised in a process; and a private end of ROS for who is no node."""
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import os
+from types import TracebackType
+from typing import Any
+
+import rclpy
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from ..formats.paths import config_folder
 
@@ -15,10 +20,6 @@ PROFILE = "fastdds.xml"
 
 TAKE_PROFILE_WHOLE = "RMW_FASTRTPS_USE_QOS_FROM_XML"
 """Without it ROS overrules what a profile says of memory."""
-
-M_MMAP_THRESHOLD, LARGEST_KEPT = -3, 1 << 20
-"""Parameter of glibc's ``mallopt``; blocks from this size on, byte, go back to the system when they are freed. Left
-alone, the threshold grows with the largest block that was ever freed, and long messages leave holes in the heap."""
 
 
 def avoid_shared_memory() -> None:
@@ -32,7 +33,41 @@ def avoid_shared_memory() -> None:
         os.environ.setdefault(TAKE_PROFILE_WHOLE, "1")
 
 
-def give_memory_back() -> None:
-    """Let large blocks go back to the system at once, where the C library is glibc."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, LARGEST_KEPT)
+class RosSession:
+    """A private context of ROS with an executor and one node: for programs that speak with nodes; signals are theirs.
+
+    Parameters
+    ----------
+    name : str
+        Of the node.
+    namespace : str
+        Of the node.
+    **options
+        Others of ``rclpy.create_node``.
+    """
+
+    def __init__(self, name: str, namespace: str = "", **options: Any) -> None:
+        avoid_shared_memory()
+        self._context = rclpy.Context()
+        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self.node: Node = rclpy.create_node(name, namespace=namespace, context=self._context, **options)
+        self._executor = EventsExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def __enter__(self) -> RosSession:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def spin_once(self, timeout: float) -> None:
+        """Handle what has come, or the first to come within so many seconds."""
+        self._executor.spin_once(timeout_sec=timeout)
+
+    def close(self) -> None:
+        """Leave ROS."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self._context)

@@ -8,17 +8,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from rclpy.experimental import EventsExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
 from std_msgs.msg import String
 
 from ..errors import HexapodError, InputFileError
-from .middleware import avoid_shared_memory
+from .middleware import RosSession
 from .running import SPIN_PERIOD
 
 COMPENSATOR = "compensator"
@@ -71,12 +68,7 @@ class BagRecorder:
         self.counts: dict[str, int] = {}
         self._connections: dict[str, Any] = {}
         self._writer, self._store = _open(Path(folder))
-        avoid_shared_memory()
-        self._context = rclpy.Context()
-        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node("hexapod_comp_recorder", namespace=namespace, context=self._context)
-        self._executor = EventsExecutor(context=self._context)
-        self._executor.add_node(self._node)
+        self._session = RosSession("hexapod_comp_recorder", namespace)
         for topic, (kind, reliable) in TOPICS.items():
             self._hear(topic, kind, QoSProfile(depth=DEPTH, reliability=_reliability(reliable)))
         for topic in KEPT:
@@ -89,16 +81,14 @@ class BagRecorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._executor.shutdown()
-        self._node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
+        self._session.close()
         self._writer.close()
 
     def run(self, going_on: Callable[[], bool], progress: Callable[[int], object] = lambda messages: None) -> None:
         """Record while something holds, at least looked at every 0.1 s."""
         reported = 0
         while going_on():
-            self._executor.spin_once(timeout_sec=SPIN_PERIOD)
+            self._session.spin_once(SPIN_PERIOD)
             total = sum(self.counts.values())
             progress(total - reported)
             reported = total
@@ -109,7 +99,7 @@ class BagRecorder:
         return sum(count for topic, count in self.counts.items() if topic.endswith(KEPT[0]))
 
     def _hear(self, topic: str, kind: Any, qos: QoSProfile) -> None:
-        name = self._node.resolve_topic_name(topic)
+        name = self._session.node.resolve_topic_name(topic)
         text = f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
 
         def keep(data: bytes) -> None:
@@ -118,7 +108,7 @@ class BagRecorder:
             self._writer.write(self._connections[name], time.time_ns(), bytes(data))
             self.counts[name] = self.counts.get(name, 0) + 1
 
-        self._node.create_subscription(kind, topic, keep, qos, raw=True)
+        self._session.node.create_subscription(kind, topic, keep, qos, raw=True)
 
 
 def _reliability(reliable: bool) -> ReliabilityPolicy:

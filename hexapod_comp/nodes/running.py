@@ -21,7 +21,8 @@ from rclpy.signals import SignalHandlerOptions
 from ..errors import LONGEST_TEXT, HexapodError, printable
 from .arguments import Program
 from .log_relay import LogRelay
-from .middleware import avoid_shared_memory, give_memory_back
+from .memory import give_blocks_back, give_code_back
+from .middleware import avoid_shared_memory
 from .runtime import MachineNode
 from .starting import Starting
 from .warming import Warming
@@ -60,7 +61,12 @@ def discovery() -> str:
     return f"domain {domain}; ROS_AUTOMATIC_DISCOVERY_RANGE={printable(reach)}{hint}{also}"
 
 
-def run(make_node: Callable[[], MachineNode], program: Program, argv: Sequence[str] | None = None) -> int:
+def run(
+    make_node: Callable[[], MachineNode],
+    program: Program,
+    argv: Sequence[str] | None = None,
+    kernels: Callable[[], None] = lambda: None,
+) -> int:
     """Run a node until SIGINT or SIGTERM.
 
     Signals only set a flag, since rclpy's own handling loses the last message and exits non-zero on a
@@ -74,6 +80,8 @@ def run(make_node: Callable[[], MachineNode], program: Program, argv: Sequence[s
         What its arguments may be.
     argv : sequence of str, optional
         Arguments after the program's name; those of this process by default.
+    kernels : callable
+        Runs every kernel that the node uses, so that none compiles later.
 
     Returns
     -------
@@ -84,13 +92,13 @@ def run(make_node: Callable[[], MachineNode], program: Program, argv: Sequence[s
     refusal = program.refusal(arguments)
     if refusal is not None:
         return refusal
-    give_memory_back()
+    give_blocks_back()
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     with _own_stderr() as stderr:
         with LogRelay():
-            code = _run_until(stop, make_node, arguments, stderr)
+            code = _run_until(stop, make_node, kernels, arguments, stderr)
         if argv is None:
             # Python's own end waits for threads of DDS, which now and then never end, though all has been closed.
             for stream in filter(None, (sys.stdout, sys.stderr)):  # None: it was closed from the beginning
@@ -111,14 +119,18 @@ def _own_stderr() -> TextIO:
 
 
 def _run_until(
-    stop: threading.Event, make_node: Callable[[], MachineNode], arguments: list[str], stderr: TextIO
+    stop: threading.Event,
+    make_node: Callable[[], MachineNode],
+    kernels: Callable[[], None],
+    arguments: list[str],
+    stderr: TextIO,
 ) -> int:
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except (rclpy.exceptions.ROSInterruptException, RuntimeError, ValueError) as error:
         print(printable(f"cannot start ROS: {error}", LONGEST_TEXT), file=sys.stderr)
         return 1
-    warming = Warming()
+    warming = Warming(kernels)
     try:
         node = make_node()
     except HexapodError as error:
@@ -142,6 +154,7 @@ def _run_until(
         # What is loaded by now stays; the collector need not look at it again while the machine moves.
         gc.collect()
         gc.freeze()
+        give_code_back()
         while not stop.is_set() and rclpy.ok():
             spin()
     return 0

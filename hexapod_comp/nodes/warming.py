@@ -15,9 +15,11 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 
 import numba
+import numpy as np
 from geometry_msgs.msg import PoseStamped
 from rclpy.serialization import serialize_message
 
@@ -32,7 +34,7 @@ from ..machine.struts import home_twists
 from ..virtual.machine import StrutDrive
 from .children import end_with_parent
 from .following import Following
-from .messages import write_pose
+from .messages import StrutMessage, write_pose
 from .wire import StrutBytes, read_pose_bytes
 
 LOCK = "compiling.lock"
@@ -40,17 +42,38 @@ LOCK = "compiling.lock"
 
 
 def warm() -> None:
-    """Run every kernel that the nodes use, on a machine of every block, so that none compiles later."""
-    geometry = load_geometry(config_file("paper.yaml"))
-    home_twists(load_geometry(config_file("example_6_6.yaml")))  # its screws have a lead
-    model = load_model(config_file("paper_machine.yaml"), geometry)
-    warm_up(Compensator(geometry, model))
-    drive = StrutDrive(RealMachine(geometry, model))
+    """Run every kernel that the nodes use."""
+    warm_compensator()
+    warm_drive()
+
+
+def warm_compensator() -> None:
+    """Run every kernel that the compensator uses, on a machine of every block, so that none compiles later."""
+    machine = _every_block()
+    warm_up(compensator := Compensator(machine.geometry, machine.model))
+    following = Following(1.0)
+    following.note(compensator.command, 0.0)
+    following.check(compensator.command, 0.0)
+
+
+def warm_drive() -> None:
+    """Run every kernel that the strut drive uses, in the same way."""
+    drive = StrutDrive(_every_block())
     drive.advance(0.01)
     drive.tracker_pose()
-    following = Following(1.0)
-    following.note(drive.commands, 0.0)
-    following.check(drive.encoder_lengths(), 0.0)
+    warm_messages()
+
+
+def warm_messages() -> None:
+    """Run every kernel that writes messages."""
+    write_pose(PoseStamped(), np.zeros(3), np.eye(3))
+    StrutMessage().write(np.zeros(6))
+
+
+def _every_block() -> RealMachine:
+    home_twists(load_geometry(config_file("example_6_6.yaml")))  # its screws have a lead
+    geometry = load_geometry(config_file("paper.yaml"))
+    return RealMachine(geometry, load_model(config_file("paper_machine.yaml"), geometry))
 
 
 def warm_up(compensator: Compensator) -> None:
@@ -69,6 +92,11 @@ def warm_up(compensator: Compensator) -> None:
 class Warming:
     """Kernels on their way, in a thread that waits for the process which compiles them where that is needed.
 
+    Parameters
+    ----------
+    kernels : callable
+        Runs all that this process needs; the other process compiles those of all nodes.
+
     Attributes
     ----------
     compiling : bool
@@ -77,7 +105,8 @@ class Warming:
         Why the process could not do it, empty otherwise: the kernels were then compiled here.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, kernels: Callable[[], None] = warm) -> None:
+        self._kernels = kernels
         self.compiling, self.problem = False, ""
         self._began = time.monotonic()
         self._process: subprocess.Popen[bytes] | None = None
@@ -104,7 +133,7 @@ class Warming:
     def _run(self) -> None:
         try:
             with from_cache_only():
-                warm()
+                self._kernels()
             return
         except NotCompiledError:
             self.compiling = True
@@ -113,7 +142,7 @@ class Warming:
         except OSError as error:
             self.problem = f"no process to compile in: {error}"
         if not self._given_up.is_set():
-            warm()
+            self._kernels()
 
     def _compile(self) -> None:
         root = str(cache_folder(numba.config.CACHE_DIR).parent.absolute())

@@ -9,15 +9,11 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from rclpy.context import Context
-from rclpy.executors import Executor
-from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
 from ..errors import HexapodError
@@ -25,9 +21,17 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import solve_pose
 from ..pose import Pose, rotation_angle
 from .messages import StrutReader, message_pose, read_message
+from .middleware import RosSession
 from .running import SPIN_PERIOD, keep_discovery_local
 from .runtime import EVENT_QOS, STATE_QOS
 from .stamps import nanoseconds_of
+
+QUIET: dict[str, Any] = {
+    "start_parameter_services": False,
+    "enable_rosout": False,
+    "parameter_overrides": [Parameter("start_type_description_service", value=False)],
+}
+"""Options of a node that publishes nothing and offers nothing."""
 
 STREAM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Best effort, so that nobody waits for a slow witness; deep enough that the latencies are those of all commands."""
@@ -107,40 +111,26 @@ T = TypeVar("T")
 
 
 class Watcher:
-    """Hears a machine's topics; its node has no publisher of its own, no service, no client.
+    """Hears a machine's topics.
 
     Parameters
     ----------
     geometry : HexapodGeometry
         The machine that is watched.
-    context : Context
-        Of rclpy.
-    namespace : str
-        Where the machine's nodes are.
-
-    Attributes
-    ----------
     node : Node
-        To be put on an executor.
+        That listens, in the namespace where the machine's nodes are; made with the options :data:`QUIET`.
     """
 
-    def __init__(self, geometry: HexapodGeometry, context: Context, namespace: str = "") -> None:
+    def __init__(self, geometry: HexapodGeometry, node: Node) -> None:
         self._geometry, self._reader = geometry, StrutReader()
         self._guess = geometry.home
         self._newest: dict[str, tuple[bytes, float]] = {}
         self._states: dict[str, tuple[DiagnosticStatus, float]] = {}
         self._delays: deque[tuple[float, float]] = deque()
-        self.node = rclpy.create_node(
-            "hexapod_comp_watch",
-            namespace=namespace,
-            context=context,
-            start_parameter_services=False,
-            enable_rosout=False,
-            parameter_overrides=[Parameter("start_type_description_service", value=False)],
-        )
-        self._prefix = f"{self.node.get_namespace()}/".lstrip("/")
-        self.node.create_subscription(JointState, "strut_commands", self._on_command, STREAM_QOS, raw=True)
-        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
+        self.node = node
+        self._prefix = f"{node.get_namespace()}/".lstrip("/")
+        node.create_subscription(JointState, "strut_commands", self._on_command, STREAM_QOS, raw=True)
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
         for topic, kind in (
             ("strut_corrections", JointState),
             ("strut_states", JointState),
@@ -148,11 +138,7 @@ class Watcher:
             ("tool_pose_true", PoseStamped),
             ("compensator/predicted_error", PoseWithCovarianceStamped),
         ):
-            self.node.create_subscription(kind, topic, self._keeper(topic), STATE_QOS, raw=True)
-
-    def close(self) -> None:
-        """Leave ROS."""
-        self.node.destroy_node()
+            node.create_subscription(kind, topic, self._keeper(topic), STATE_QOS, raw=True)
 
     def view(self) -> View:
         """Return what is known now."""
@@ -253,22 +239,13 @@ def watch(
         Looked at every 0.1 s at least.
     """
     keep_discovery_local()
-    context = Context()
-    rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
-    watcher = Watcher(geometry, context, namespace)
-    executor: Executor = EventsExecutor(context=context)
-    executor.add_node(watcher.node)
-    try:
-        due = time.monotonic()
+    with RosSession("hexapod_comp_watch", namespace, **QUIET) as session:
+        watcher, due = Watcher(geometry, session.node), time.monotonic()
         while going_on():
-            executor.spin_once(timeout_sec=min(SPIN_PERIOD, max(0.0, due - time.monotonic())))
+            session.spin_once(min(SPIN_PERIOD, max(0.0, due - time.monotonic())))
             if time.monotonic() >= due:
                 show(watcher.view())
                 due = time.monotonic() + UPDATE_PERIOD
-    finally:
-        executor.shutdown()
-        watcher.close()
-        rclpy.try_shutdown(context=context)
 
 
 def _tool(data: bytes) -> Pose:

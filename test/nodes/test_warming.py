@@ -344,3 +344,29 @@ print(*sorted(spared & set(sys.modules)))
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
     assert (done.returncode, done.stdout) == (0, "\n"), done.stderr
+
+
+def test_the_compilers_code_leaves_memory_and_comes_back_where_it_is_needed():
+    """By what the system counts for LLVM's library: over 20 MB before; what relocations have written is kept."""
+    program = """
+import re
+import llvmlite.binding as llvm
+from pathlib import Path
+from hexapod_comp.nodes.memory import give_code_back
+
+def resident():
+    areas = re.split(r"\\n(?=[0-9a-f]+-[0-9a-f]+ )", Path("/proc/self/smaps").read_text())
+    return sum(int(re.search(r"Rss: +(\\d+)", area)[1]) for area in areas if "libllvmlite" in area)
+
+before = resident()
+give_code_back()
+after = resident()
+llvm.parse_assembly("define i64 @one() { ret i64 1 }").verify()
+print(before, after, resident())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60.0, cwd=ROOT
+    )
+    before, after, again = map(int, done.stdout.split())
+    assert before > 20_000 > 4_000 > after
+    assert again > after

@@ -12,6 +12,7 @@ from pathlib import Path
 import matplotlib.image
 import numpy as np
 import pytest
+import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from node_helpers import HOME, closed_form_lengths, model_file, near
 from sensor_msgs.msg import JointState
@@ -21,7 +22,7 @@ from hexapod_comp.errors import HexapodError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.nodes import watching
 from hexapod_comp.nodes.page import WatchPage, strut_colours, strut_ends, words
-from hexapod_comp.nodes.watching import View, Watcher
+from hexapod_comp.nodes.watching import QUIET, View, Watcher
 from hexapod_comp.pose import Pose
 
 OFFSETS = np.array([-100.0, -50.0, 0.0, 50.0, 100.0, 200.0])
@@ -30,9 +31,8 @@ OFFSETS = np.array([-100.0, -50.0, 0.0, 50.0, 100.0, 200.0])
 
 def watched(bench, geometry: str = "paper.yaml") -> Watcher:
     """Return a watcher on the bench's executor."""
-    watcher = Watcher(load_geometry(geometry), bench.context, bench.namespace)
-    bench.host(watcher.node)
-    return watcher
+    node = rclpy.create_node("hexapod_comp_watch", context=bench.context, namespace=bench.namespace, **QUIET)
+    return Watcher(load_geometry(geometry), bench.host(node))
 
 
 def test_what_is_heard_becomes_the_picture(bench, tmp_path):
