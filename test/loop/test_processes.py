@@ -22,6 +22,7 @@ from hexapod_comp.loop.processes import NodeProcess
 from hexapod_comp.loop.session import connect
 from hexapod_comp.nodes.arguments import outside_ros
 from hexapod_comp.nodes.client import LISTENER_QOS, LoopClient, Sent
+from hexapod_comp.nodes.compensator_parameters import PROGRAM as COMPENSATOR
 from hexapod_comp.nodes.middleware import PROFILE_VARIABLES, avoid_shared_memory
 from hexapod_comp.pose import Pose
 
@@ -240,15 +241,16 @@ def run_program(name: str, *arguments: str, **environment: str) -> subprocess.Co
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
-def test_help_lists_every_parameter_and_the_topics(name):
-    done = run_program(name, "--help")
-    assert done.returncode == 0
-    assert done.stderr == ""
-    assert done.stdout.startswith(f"usage: {name} ")
-    assert all(text in done.stdout for text in PROGRAMS[name][1:])
+def test_help_lists_every_parameter_and_the_topics(name, capsys):
+    """That a process ends so, the test of all programs shows."""
     module = importlib.import_module(f"hexapod_comp.{PROGRAMS[name][0]}")
-    assert all(f"  {parameter.name}  [" in done.stdout for parameter in module.PARAMETERS)
-    assert max(map(len, done.stdout.splitlines())) <= 120
+    assert module.PROGRAM.refusal(["--help"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert out.startswith(f"usage: {name} ")
+    assert all(text in out for text in PROGRAMS[name][1:])
+    assert all(f"  {parameter.name}  [" in out for parameter in module.PARAMETERS)
+    assert max(map(len, out.splitlines())) <= 120
 
 
 @pytest.mark.parametrize(
@@ -265,12 +267,12 @@ def test_help_lists_every_parameter_and_the_topics(name):
     ],
     ids=["-p without --ros-args", "ROS 1", "option", "shortened", "forged", "behind --", "no value", "unknown to ROS"],
 )
-def test_an_argument_that_nobody_reads_ends_with_2_and_is_named(arguments):
-    """Before, all but the last two started the node with its defaults."""
-    done = run_program("compensator", *arguments)
-    assert done.returncode == 2
-    assert done.stdout == ""
-    said = done.stderr.splitlines()[-1]
+def test_an_argument_that_nobody_reads_ends_with_2_and_is_named(arguments, capsys):
+    """Before, all but the last two started the node with its defaults. That its process ends so, the next test shows."""
+    assert COMPENSATOR.refusal(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    said = err.splitlines()[-1]
     assert said.startswith("compensator: error: ")
     assert said.isprintable()
     assert printable(arguments[-1]) in said
