@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
@@ -45,6 +47,22 @@ def table_lengths() -> np.ndarray:
     """Return the ideal strut lengths of 000, Table 2, shape (10, 6), m."""
     table = read_table("table2_strut_lengths_ideal.csv")
     return np.stack([table[f"L{i}"] for i in range(1, 7)], axis=1)
+
+
+@contextmanager
+def quick_pictures() -> Iterator[None]:
+    """Draw pictures small, and once instead of three times to make room for texts, where nobody looks at them."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    def savefig(figure: Figure, stream: object, **options: object) -> None:
+        figure.set_layout_engine("none")
+        figure.set_dpi(40)
+        FigureCanvasAgg(figure).print_png(stream)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", savefig)
+        yield
 
 
 def nominal_error(machine: RealMachine, target: Pose, sense: np.ndarray) -> Pose:

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 import yaml
 from foreign_machines import MM, UM, Errors, Machine, aligned_rms, commands, goes_to, machines, rotation, tool_errors
+from helpers import quick_pictures
 
 from hexapod_comp import cli
 from hexapod_comp.calibration.posterior import load_posterior
@@ -87,7 +88,8 @@ def animal(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     files = ["--machine", folder / "machine.yaml", "--truth", folder / "truth.yaml"]
     hexapod("simulate", "--campaign", folder / "campaign.yaml", "--out", folder / "readings.csv", *files)
     out = ["--out", folder / "model.yaml", "--pictures", folder / "pictures", "--json"]
-    said = hexapod("fit", folder / "readings.csv", "--blocks", "pitch", *out, *files)
+    with quick_pictures():
+        said = hexapod("fit", folder / "readings.csv", "--blocks", "pitch", *out, *files)
     return Animal(machine, truth, folder, json.loads(said))
 
 

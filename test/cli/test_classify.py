@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calibration_helpers import fitted_model
+from helpers import quick_pictures
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp import cli
@@ -327,7 +328,9 @@ def test_a_model_in_place_of_a_budget_says_what_is_left_and_what_to_measure(tmp_
     parts += ("if these parameters were known exactly", "linear laser, body diagonals", "roll, lines along z")
     for part in parts:
         assert part in out, part
-    content = json.loads(classify(*machine, "--json", "--out", tmp_path / "r.csv", "--pictures", tmp_path / "p")[1])
+    written = ("--out", tmp_path / "r.csv", "--pictures", tmp_path / "p")
+    with quick_pictures():
+        content = json.loads(classify(*machine, "--json", *written)[1])
     assert content["frame"] == "work"
     assert [part["where"] for part in content["left"]] == ["measured box, level tool", "workspace, α and β of 0°"]
     assert 0.2e-6 < content["left"][0]["rms_m"] < 4e-6

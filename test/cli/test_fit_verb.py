@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import quick_pictures
 
 from hexapod_comp import cli
 from hexapod_comp.calibration import fit as fit_module
@@ -290,7 +291,8 @@ def test_certificate(hexapod: Program, fitted: Calibration) -> None:
     """After the model: its hash is that of the file as it was written, details are in it, and the whole report."""
     Path("details.yaml").write_text("format: hexapod_comp/certificate\nversion: 1\noperator: <Jo>\n")
     options = ("--certificate", "out.html", "--details", "details.yaml", "--name", "Tuesday's")
-    code, out, err = hexapod("fit", fitted.measured, "--out", "model.yaml", *options)
+    with quick_pictures():
+        code, out, err = hexapod("fit", fitted.measured, "--out", "model.yaml", *options)
     assert (code, err) == (0, "")
     assert out.endswith("certificate: out.html\n")
     text = Path("out.html").read_text()
@@ -356,7 +358,8 @@ def test_scheme_lines_knows_no_covariance(hexapod: Program, done: Calibration, t
 def test_json_of_scheme_lines(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
     """Alone on stdout, what was written on stderr; numbers with their units: a straight line's slope is R² of 1."""
     options = ("--scheme", "lines", "--json", "--out", tmp_path / "m.yaml", "--pictures", tmp_path / "pictures")
-    code, out, err = hexapod("fit", done.measured, *options)
+    with quick_pictures():
+        code, out, err = hexapod("fit", done.measured, *options)
     assert code == 0
     assert err.splitlines() == [
         f"picture: {tmp_path / 'pictures' / n}" for n in ("lines.png", "strut_errors.png", "predicted_error.png")
@@ -428,7 +431,8 @@ def test_a_forced_model_says_so(
 ) -> None:
     """At the top of the report, in its file, and in the model for whoever runs it."""
     monkeypatch.chdir(tmp_path)
-    code, out, err = hexapod("fit", noisy, "--lead-mm", 10, "--blocks", "pitch", "--force", *ALL[:-2])
+    with quick_pictures():
+        code, out, err = hexapod("fit", noisy, "--lead-mm", 10, "--blocks", "pitch", "--force", *ALL[:-2])
     assert (code, err) == (0, "")
     assert out.startswith("WRITTEN BY FORCE: this model is not to be trusted: readings are off by more than 10 times")
     assert out.startswith(Path("r.txt").read_text())
