@@ -268,7 +268,7 @@ def test_help_lists_every_parameter_and_the_topics(name, capsys):
     ids=["-p without --ros-args", "ROS 1", "option", "shortened", "forged", "behind --", "no value", "unknown to ROS"],
 )
 def test_an_argument_that_nobody_reads_ends_with_2_and_is_named(arguments, capsys):
-    """Before, all but the last two started the node with its defaults. That its process ends so, the next test shows."""
+    """Before, all but the last two started the node with its defaults. That a process ends so shows the next test."""
     assert COMPENSATOR.refusal(arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
