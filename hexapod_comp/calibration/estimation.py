@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,6 +47,18 @@ OUTLIER = 5.0
 """Residuals beyond so many standard deviations are listed."""
 
 
+class _Group(NamedTuple):
+    """Cells of one kind whose errors have the same components.
+
+    Large folds stand together, and in them what shares an unknown; small folds stand together, marked as such.
+    """
+
+    kind: int
+    components: np.ndarray
+    cells: np.ndarray
+    folds: list[tuple[int, slice]]
+
+
 class Estimation:
     """Readings against parameters.
 
@@ -73,7 +86,7 @@ class Estimation:
         self._components = np.abs(self.cells.directions) > ROUNDING
         for lengths in self._lengths:
             self._components[lengths.members, :3] = True  # their directions change with the answer
-        self._alike = self._group_alike()
+        self._groups = self._group_alike()
         needed = len(space.blocks[0].labels)
         free = len(self.cells.station) - len(self._zeros) - sum(along is not None for _, along in self._zeros)
         free -= sum(lengths.count for lengths in self._lengths)
@@ -125,12 +138,12 @@ class Estimation:
 
         Along directions (C, 6), over the standard deviations of the cells' values.
         """
-        c, space = self.cells, self.space
-        slopes, moved, parts = Slopes(space, prediction, self.measurements.stations), np.empty(len(c.station)), []
-        for _, components, cells, _ in self._alike:
-            rows, columns = slopes.along(c.station[cells], directions[cells], components)
-            moved[cells] = rows @ x[columns]
-            parts.append(Alike(cells, columns, space.whiten(rows, columns)))
+        c, space, moved, parts = self.cells, self.space, np.empty(len(self.cells.station)), []
+        slopes = Slopes(space, prediction, self.measurements.stations)
+        for group in self._groups:
+            rows, columns = slopes.along(c.station[group.cells], directions[group.cells], group.components)
+            moved[group.cells] = rows @ x[columns]
+            parts.append(Alike(group.cells, columns, space.whiten(rows, columns)))
         return CellRows((len(moved), space.size), parts), moved
 
     def free_of_unknowns(self, rows: np.ndarray) -> np.ndarray:
@@ -194,24 +207,20 @@ class Estimation:
         for part in unknowns:
             freedom[kind[part.members[0]]] -= part.share.sum()
         sums = []
-        for n, (k, _, cells, folds) in enumerate(self._alike):
-            _, columns, values = rows.parts[n]
-            for fold, where in folds:
-                sums.append(FoldSum(fold, n, where, values[where].T @ values[where]))
-                normal[k][np.ix_(columns, columns)] += sums[-1].normal
-            moment[k][columns] += target[cells] @ values
-            square[k] += target[cells] @ target[cells]
+        for n, (group, part) in enumerate(zip(self._groups, rows.parts, strict=True)):
+            for fold, where in group.folds:
+                sums.append(FoldSum(fold, n, where, part.values[where].T @ part.values[where]))
+                normal[group.kind][np.ix_(part.columns, part.columns)] += sums[-1].normal
+            moment[group.kind][part.columns] += target[group.cells] @ part.values
+            square[group.kind] += target[group.cells] @ target[group.cells]
         least_noise = LEAST_NOISE / np.array([self.measurements.stated_of(k) for k in range(kinds)])
         folded = tuple(one for one in sums if one.fold != SMALL)
         return LinearProblem(
             target, rows, kind, self.cells.fold, normal, moment, square, freedom, least_noise, sums=folded
         )
 
-    def _group_alike(self) -> list[tuple[int, np.ndarray, np.ndarray, list[tuple[int, slice]]]]:
-        """Return cells of a kind whose errors have the same components: kind, components, cells, and where folds stand.
-
-        Large folds stand together, and in them what shares an unknown; small folds stand together, marked as such.
-        """
+    def _group_alike(self) -> list[_Group]:
+        """Return the cells in groups of one kind whose errors have the same components."""
         c = self.cells
         for members in [members for members, _ in self._zeros] + [lengths.members for lengths in self._lengths]:
             self._components[members] |= self._components[members].any(axis=0)
@@ -223,7 +232,7 @@ class Estimation:
             ends = [0, *(np.flatnonzero(np.diff(fold[cells])) + 1).tolist(), len(cells)]
             folds = [(int(fold[cells[a]]), slice(a, b)) for a, b in pairwise(ends)]
             components = np.flatnonzero(self._components[cells[0]])
-            result.append((int(c.kind[cells[0]]), components, cells, folds))
+            result.append(_Group(int(c.kind[cells[0]]), components, cells, folds))
         return result
 
     def robust_weights(self, residuals: np.ndarray) -> np.ndarray:

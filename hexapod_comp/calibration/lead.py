@@ -43,6 +43,9 @@ REFINEMENTS = 4
 PROMISING = 3.0
 """Lines of so many times the spectrum's median may belong to the strongest one: of noise, one in a thousand does."""
 
+PLENTY = 10_000
+"""A period is looked for in so many readings, at random, and in all only where these do not show it."""
+
 SCALE_ROUNDS = 5
 """Rounds of estimating tolerances and noise without waves."""
 
@@ -116,26 +119,38 @@ def look_for_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
     problem : LinearProblem
         Linearised at the nominal machine.
     """
-    space = estimation.space
+    space, measurements = estimation.space, estimation.measurements
     given = float(space.periods[0]) if np.isfinite(space.periods).all() else None
-    tolerances = np.where([b.name in WAVES for b in space.blocks], 0.0, space.start_tolerances())
-    posterior = solve(space, problem, tolerances, np.ones(problem.normal.shape[0]), SCALE_ROUNDS)
-    rest = _Rest(estimation, problem, posterior)
-    if rest.freedom < LEAST_FREEDOM:
-        return ScrewLead(given, None, np.inf, 0.0)
-    spectrum = rest.spectrum()
-    best = _fundamental(rest, spectrum)
-    odds = best.odds
-    for frequency in _rivals(rest.frequencies, spectrum, best.frequency, rest.span):
-        odds = min(odds, best.odds - rest.line(frequency, 1).odds)
+    odds, best, scales = 0.0, None, None
+    if len(measurements) > PLENTY:
+        some = np.zeros(len(measurements), dtype=bool)
+        some[np.random.default_rng(0).choice(len(measurements), PLENTY, replace=False)] = True
+        few = Estimation(measurements.select(some), space, alone=False)
+        odds, best, scales = _strongest(few, few.linearise(np.zeros(space.size), np.ones(PLENTY))[0])
     if odds < SURE:
+        odds, best, scales = _strongest(estimation, problem)
+    if best is None or scales is None or odds < SURE:
         return ScrewLead(given, None, np.inf, odds)
     # So far the waves counted as noise, which let the priors weigh too much.
-    quiet = solve(space, problem, posterior.tolerances, posterior.noise * best.noise, rounds=0)
+    quiet = solve(space, problem, scales.tolerances, scales.noise * best.noise, rounds=0)
     best = _Rest(estimation, problem, quiet).line(best.frequency)
     if not np.isfinite(best.error):
         return ScrewLead(given, None, np.inf, odds)
     return ScrewLead(given, float(1.0 / best.frequency), float(best.error / best.frequency**2), odds)
+
+
+def _strongest(estimation: Estimation, problem: LinearProblem) -> tuple[float, Line | None, Posterior]:
+    """Return the odds of the period that readings speak for most, that period, and the fit without waves."""
+    space = estimation.space
+    tolerances = np.where([b.name in WAVES for b in space.blocks], 0.0, space.start_tolerances())
+    posterior = solve(space, problem, tolerances, np.ones(problem.normal.shape[0]), SCALE_ROUNDS)
+    rest = _Rest(estimation, problem, posterior)
+    if rest.freedom < LEAST_FREEDOM:
+        return 0.0, None, posterior
+    spectrum = rest.spectrum()
+    best = _fundamental(rest, spectrum)
+    others = _rivals(rest.frequencies, spectrum, best.frequency, rest.span)
+    return min([best.odds, *(best.odds - rest.line(f, 1).odds for f in others)]), best, posterior
 
 
 @dataclass(frozen=True)
@@ -219,10 +234,11 @@ class _Rest:
 
         Readings that cannot tell a frequency from all else, to rounding, ask for no step, with an infinite error.
         """
-        angle = 2.0 * np.pi * frequency * self.commands
         orders = np.arange(1, harmonics + 1)
-        c, s = (self.gains[:, None] * f(orders[:, None] * angle[:, None]) for f in (np.cos, np.sin))
-        waves = self._free(np.concatenate([c, s], axis=1).reshape(len(angle), -1))
+        first = np.exp(2.0j * np.pi * frequency * self.commands)[:, None]
+        turns = np.cumprod(np.repeat(first, harmonics, axis=1), axis=1)
+        c, s = self.gains[:, None] * turns.real, self.gains[:, None] * turns.imag
+        waves = self._free(np.concatenate([c, s], axis=1).reshape(len(c), -1))
         shared = self._rows.transposed_times(waves)
         amplitudes, less, _ = self._solved(waves, shared)
         a, b = amplitudes.reshape(2, len(orders), 6)

@@ -256,37 +256,58 @@ def held_out(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
     hat matrix: exact, and no fit is repeated. In a fold of many cells the same is r + R_g·(P − R_gᵀ·R_g)⁻¹·R_gᵀ·r, with
     R_g its rows and P the precision of all: a matrix of the parameters' size.
     """
-    scale = 1.0 / posterior.noise[problem.kind]
     full = np.zeros(problem.rows.shape[1])
     full[posterior.used] = posterior.y
-    residual = scale * (problem.target - problem.rows.times(full))
-    result = residual.copy()
+    residual = (problem.target - problem.rows.times(full)) / posterior.noise[problem.kind]
     sums: dict[int, list[FoldSum]] = {}
     for one in problem.sums:
         sums.setdefault(one.fold, []).append(one)
     precision = whitened_precision(problem, posterior) if sums else np.zeros((0, 0))
-    for parts in sums.values():
-        missing = np.zeros(len(full))
-        seen = [(problem.rows.parts[one.part], one.where) for one in parts]
-        for (cells, columns, values), where in seen:
-            missing[columns] += (scale * residual)[cells[where]] @ values[where]
-        factor, _ = dpotrf(_without(precision, problem, parts, posterior), lower=1, overwrite_a=1)
-        full[posterior.used] = posterior.spread * dpotrs(factor, posterior.spread * missing[posterior.used], lower=1)[0]
-        for (cells, columns, values), where in seen:
-            result[cells[where]] += scale[cells[where]] * (values[where] @ full[columns])
-    for cells, ends in _small_folds(problem.fold, [*sums]):
-        rows = problem.rows.select(cells).using(posterior.used, scale[cells])
-        shared, whole = rows.times(posterior.covariance), rows.dense()
-        for a, b in pairwise(ends):
-            kept = np.eye(b - a) - shared[a:b] @ whole[a:b].T
-            result[cells[a:b]] = np.linalg.solve(kept, residual[cells[a:b]])
+    folds = _Folds(problem, posterior, residual, precision)
+    result = residual.copy()
+    for cells, change in map(folds.large, sums.values()):
+        result[cells] += change
+    for cells, change in map(folds.small, _small_folds(problem.fold, [*sums])):
+        result[cells] += change
     return result
+
+
+class _Folds(NamedTuple):
+    """What leaving out folds needs; either way returns cells, and by how much their residuals change without them."""
+
+    problem: LinearProblem
+    posterior: Posterior
+    residual: np.ndarray
+    precision: np.ndarray
+
+    def large(self, sums: list[FoldSum]) -> tuple[np.ndarray, np.ndarray]:
+        """Leave out a fold of many cells, given its sums."""
+        cells = np.concatenate([self.problem.rows.parts[one.part].cells[one.where] for one in sums])
+        posterior, rows = self.posterior, self.problem.rows.select(cells)
+        scale, change = 1.0 / posterior.noise[self.problem.kind[cells]], np.zeros(rows.shape[1])
+        missing = rows.transposed_times(scale * self.residual[cells])[posterior.used]
+        factor = np.linalg.cholesky(_without(self.precision, self.problem, sums, posterior))
+        change[posterior.used] = posterior.spread * dpotrs(factor, posterior.spread * missing, lower=1)[0]
+        return cells, scale * rows.times(change)
+
+    def small(self, folds: tuple[np.ndarray, list[int]]) -> tuple[np.ndarray, np.ndarray]:
+        """Leave out folds of few cells in turn, given all their cells and where each ends."""
+        cells, ends = folds
+        rows = self.problem.rows.select(cells)
+        rows = rows.using(self.posterior.used, 1.0 / self.posterior.noise[self.problem.kind[cells]])
+        shared, whole, left = rows.times(self.posterior.covariance), rows.dense(), self.residual[cells]
+        result = np.empty(len(cells))
+        for a, b in pairwise(ends):
+            result[a:b] = np.linalg.solve(np.eye(b - a) - shared[a:b] @ whole[a:b].T, left[a:b])
+        return cells, result - left
 
 
 def _small_folds(fold: np.ndarray, large: list[int]) -> Iterator[tuple[np.ndarray, list[int]]]:
     """Yield the cells of small folds, a thousand or so at a time, in the order of their folds, and where these end."""
     order = np.argsort(fold, kind="stable")
     order = order[~np.isin(fold[order], large)]
+    if not len(order):
+        return
     ends = [0, *(np.flatnonzero(np.diff(fold[order])) + 1).tolist(), len(order)]
     first = 0
     for n, end in enumerate(ends):
@@ -306,10 +327,10 @@ def whitened_precision(problem: LinearProblem, posterior: Posterior) -> np.ndarr
 
 
 def _without(precision: np.ndarray, problem: LinearProblem, parts: list[FoldSum], posterior: Posterior) -> np.ndarray:
-    """Return a whitened precision, Fortran's order, without what the cells of one fold tell."""
+    """Return a whitened precision without what the cells of one fold tell."""
     place = np.full(problem.rows.shape[1], -1)
     place[posterior.used] = np.arange(len(posterior.used))
-    left = np.array(precision, order="F")
+    left = precision.copy()
     for one in parts:
         cells, columns, _ = problem.rows.parts[one.part]
         known = np.flatnonzero(place[columns] >= 0)

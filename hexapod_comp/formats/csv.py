@@ -200,9 +200,13 @@ class Table:
     def numbers(self, columns: list[tuple[int, float]]) -> np.ndarray:
         """Return the finite numbers of some columns in SI, shape (rows, columns)."""
         values = np.empty((len(self.rows), len(columns)))
+        known: list[dict[str, float]] = [{} for _ in columns]  # places come again and again
         for n, (line, row) in enumerate(self.rows):
             for k, (index, unit) in enumerate(columns):
-                values[n, k] = si_from_text(row[index], self.number(line, index, row[index]), unit)
+                text = row[index]
+                if text not in known[k]:
+                    known[k][text] = si_from_text(text, self.number(line, index, text), unit)
+                values[n, k] = known[k][text]
         return values
 
     def texts(self, name: str) -> list[str]:

@@ -214,6 +214,7 @@ def _collect_stations(
     """Return the distinct stations and each reading's index among them; poses and runs per reading."""
     known: dict[tuple, int] = {}
     rows: list[tuple] = []
+    ways: list[np.ndarray] = []  # of travel, where a run is a line that is passed forward or backward
     index = np.empty(len(readings), dtype=int)
     nominal = Structure.of(geometry)
     warming = len({r.temperatures for r in readings}) > 1  # else when it was does not matter, and passes are alike
@@ -233,11 +234,14 @@ def _collect_stations(
             if in_reach:
                 _check_reach(geometry, pose, lengths, r)
             commands = np.array(lengths if r.commands is None else r.commands, dtype=float)
-            sense = _sense(geometry, r.direction, run, pose, commands, came_from)
             known[key] = len(rows)
+            sense = _sense(pose, commands, came_from)
             rows.append((pose.position, pose.rotation, commands, sense, r.temperatures, time, r.humidity))
+            ways.append(r.direction * run.axis if r.direction in (FORWARD, BACKWARD) else np.zeros(3))
         index[n] = known[key]
     columns = [np.array(column, dtype=float) for column in zip(*rows, strict=True)]
+    along = np.array(ways).any(axis=1)
+    columns[3][along] = Passes(geometry, *(part[along] for part in (*columns[:2], np.array(ways)))).senses()
     return Stations(*columns), index
 
 
@@ -249,12 +253,8 @@ def _check_reach(geometry: HexapodGeometry, pose: Pose, lengths: np.ndarray, rea
         raise InputFileError(reading.source.file, _line(reading), problem)
 
 
-def _sense(
-    geometry: HexapodGeometry, direction: int, run: Run, pose: Pose, commands: np.ndarray, came_from: tuple | None
-) -> np.ndarray:
-    """Return the directions of motion at a station, shape (9,); `came_from` is the station before."""
-    if direction in (FORWARD, BACKWARD):
-        return Passes(geometry, pose.position[None], pose.rotation[None], direction * run.axis[None]).senses()[0]
+def _sense(pose: Pose, commands: np.ndarray, came_from: tuple | None) -> np.ndarray:
+    """Return the directions of motion at a station that is reached from the one before, shape (9,)."""
     if came_from is not None:
         change = np.concatenate([pose.position - came_from[0], commands - came_from[2]])
         return np.sign(change) * (np.abs(change) > SAME)
