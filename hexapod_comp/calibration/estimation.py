@@ -40,6 +40,9 @@ HUBER = 2.5
 MEDIAN_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over the median of its absolute values."""
 
+CHUNK = 512
+"""Cells whose derivatives are worked out together: a processor's cache holds them."""
+
 ROUNDING = 1e-12
 """A direction whose component is below this does not have it: frames turned by right angles are right to rounding."""
 
@@ -139,11 +142,15 @@ class Estimation:
         Along directions (C, 6), over the standard deviations of the cells' values.
         """
         c, space, moved, parts = self.cells, self.space, np.empty(len(self.cells.station)), []
-        slopes = Slopes(space, prediction, self.measurements.stations)
+        slopes, y = Slopes(space, prediction, self.measurements.stations, whitened=True), space.whitened_parameters(x)
         for group in self._groups:
-            rows, columns = slopes.along(c.station[group.cells], directions[group.cells], group.components)
-            moved[group.cells] = rows @ x[columns]
-            parts.append(Alike(group.cells, columns, space.whiten(rows, columns)))
+            columns = slopes.columns(group.components)
+            rows = np.empty((len(group.cells), len(columns)))
+            for first in range(0, len(rows), CHUNK):
+                part, cells = rows[first : first + CHUNK], group.cells[first : first + CHUNK]
+                slopes.write(part, columns, c.station[cells], directions[cells], group.components)
+                moved[cells] = part @ y[columns]
+            parts.append(Alike(group.cells, columns, rows))
         return CellRows((len(moved), space.size), parts), moved
 
     def free_of_unknowns(self, rows: np.ndarray) -> np.ndarray:
@@ -206,18 +213,16 @@ class Estimation:
         freedom = np.bincount(self.measurements.kind, minlength=kinds).astype(float)
         for part in unknowns:
             freedom[kind[part.members[0]]] -= part.share.sum()
-        sums = []
-        for n, (group, part) in enumerate(zip(self._groups, rows.parts, strict=True)):
-            for fold, where in group.folds:
-                sums.append(FoldSum(fold, n, where, part.values[where].T @ part.values[where]))
-                normal[group.kind][np.ix_(part.columns, part.columns)] += sums[-1].normal
-            moment[group.kind][part.columns] += target[group.cells] @ part.values
+        sums: list[FoldSum] = []
+        for n, (group, (_, columns, values)) in enumerate(zip(self._groups, rows.parts, strict=True)):
+            own = [FoldSum(fold, n, where, values[where].T @ values[where]) for fold, where in group.folds]
+            normal[group.kind][np.ix_(columns, columns)] += sum(one.normal for one in own)
+            moment[group.kind][columns] += target[group.cells] @ values
+            sums += [one for one in own if one.fold != SMALL]
             square[group.kind] += target[group.cells] @ target[group.cells]
         least_noise = LEAST_NOISE / np.array([self.measurements.stated_of(k) for k in range(kinds)])
-        folded = tuple(one for one in sums if one.fold != SMALL)
-        return LinearProblem(
-            target, rows, kind, self.cells.fold, normal, moment, square, freedom, least_noise, sums=folded
-        )
+        fold = self.cells.fold
+        return LinearProblem(target, rows, kind, fold, normal, moment, square, freedom, least_noise, sums=tuple(sums))
 
     def _group_alike(self) -> list[_Group]:
         """Return the cells in groups of one kind whose errors have the same components."""
@@ -286,7 +291,7 @@ def iterate(
     noise: np.ndarray,
     progress: Callable[[str], object],
 ) -> Solution:
-    """Run Gauss–Newton steps until the parameters settle.
+    """Run Gauss–Newton steps until the parameters settle, from the nominal machine or from an answer.
 
     Raises
     ------
@@ -295,18 +300,19 @@ def iterate(
     """
     weights, robust = np.ones(len(estimation.measurements)), estimation.space.settings.robust
     share, last = 1.0, np.inf
+    all_alike = 0 if x.any() else 1  # steps whose residuals are the machine's errors: they weigh no reading
     for step in range(1, STEPS + 1):
         problem, residuals = estimation.linearise(x, weights)
         posterior = solve(estimation.space, problem, tolerances, noise)
         tolerances, noise = posterior.tolerances, posterior.noise
         change = _change(estimation.space.physical(posterior.y) - x, estimation.space, posterior)
         progress(f"step {step}: largest change {change:.2g} standard deviations")
-        if step > (3 if robust else 2) and change > SLOW * last:  # the third step is the first with weights
+        if step > all_alike + (2 if robust else 1) and change > SLOW * last:  # the first with weights may change more
             share = max(LEAST_SHARE, 0.5 * share)
         x, last = x + share * (estimation.space.physical(posterior.y) - x), change
-        if (change < SETTLED and (step > 2 or not robust)) or step == STEPS:
+        if (change < SETTLED and (step > all_alike + 1 or not robust)) or step == STEPS:
             break
-        if robust and step > 1:
+        if robust and step > all_alike:
             weights = estimation.robust_weights(residuals)
     if change > 1.0:
         raise CalibrationError("fit", f"did not settle within {STEPS} steps")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import date
+from typing import NamedTuple
 
 import numpy as np
 
@@ -262,59 +263,66 @@ def _choose(
     everything: Estimation, problem: LinearProblem, settings: FitSettings, progress: Callable[[str], object]
 ) -> tuple[list[Decision], Posterior, tuple[ParameterSpace, Estimation, Solution]]:
     """Return what is fitted, what the data allow with all blocks in, and the fit."""
-    measurements = everything.measurements
-    decisions, possible = select(everything.space, problem, np.ones(len(KINDS)), progress)
-    space, estimation, solution = _solve(measurements, decisions, settings, None, progress)
-    if solution.weights.min() < HUBER / OUTLIER:  # the choice was made with readings that turned out to be wrong
-        again, possible = _decide(everything, space, solution, progress)
+    space, measurements = everything.space, everything.measurements
+    decisions, possible, kept = select(space, problem, np.ones(len(KINDS)), progress)
+    y = np.zeros(space.size)
+    y[kept.used] = kept.y
+    start = _Start(space, space.physical(y), kept.tolerances, kept.noise)
+    if not any(d.kept for d in decisions):  # too few runs to leave one out, or none that shows anything: from the start
+        start = _Start(space, 0.0 * y, space.start_tolerances(), np.ones(len(KINDS)))
+    answer = _solve(measurements, decisions, settings, start, progress)
+    if answer[-1].weights.min() < HUBER / OUTLIER:  # the choice was made with readings that turned out to be wrong
+        start = _Start.of(answer[0], answer[-1])
+        x, _, noise = _carried_over(start, space)
+        problem, _ = everything.linearise(x, answer[-1].weights)
+        again, possible, _ = select(space, problem, noise, progress)
         if [d.kept for d in again] != [d.kept for d in decisions]:
-            space, estimation, solution = _solve(measurements, again, settings, (space, solution), progress)
+            answer = _solve(measurements, again, settings, start, progress)
         decisions = again
-    return decisions, possible, (space, estimation, solution)
+    return decisions, possible, answer
+
+
+class _Start(NamedTuple):
+    """An answer from which a fit with other blocks starts: parameters, tolerances and noise."""
+
+    space: ParameterSpace
+    x: np.ndarray
+    tolerances: np.ndarray
+    noise: np.ndarray
+
+    @staticmethod
+    def of(space: ParameterSpace, solution: Solution) -> _Start:
+        """Return a settled fit as a start."""
+        return _Start(space, solution.x, solution.posterior.tolerances, solution.posterior.noise)
 
 
 def _solve(
     measurements: MeasurementSet,
     decisions: list[Decision],
     settings: FitSettings,
-    before: tuple[ParameterSpace, Solution] | None,
+    start: _Start,
     progress: Callable[[str], object],
 ) -> tuple[ParameterSpace, Estimation, Solution]:
-    """Return a settled fit with the blocks decided on, starting from another one's answer."""
+    """Return a settled fit with the blocks decided on."""
     space = ParameterSpace(measurements, replace(settings, blocks=tuple(d.block for d in decisions if d.kept)))
     estimation = Estimation(measurements, space)
-    x, tolerances, noise = _carried_over(before, space)
-    return space, estimation, iterate(estimation, x, tolerances, noise, progress)
+    return space, estimation, iterate(estimation, *_carried_over(start, space), progress)
 
 
-def _carried_over(
-    before: tuple[ParameterSpace, Solution] | None, space: ParameterSpace
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return parameters, tolerances and noise to start from: another answer's, or the nominal machine's."""
+def _carried_over(start: _Start, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return parameters, tolerances and noise of a start in another space; what it lacks is zero, and as at first."""
     x, tolerances = np.zeros(space.size), space.start_tolerances()
-    if before is None:
-        return x, tolerances, np.ones(len(KINDS))
-    old_space, solution = before
     for n, block in enumerate(space.blocks):
-        for m, old in enumerate(old_space.blocks):
+        for m, old in enumerate(start.space.blocks):
             if old.name == block.name:
-                x[block.part] = solution.x[old.part]
-                tolerances[n] = solution.posterior.tolerances[m]
-    return x, tolerances, solution.posterior.noise
-
-
-def _decide(
-    everything: Estimation, space: ParameterSpace, solution: Solution, progress: Callable[[str], object]
-) -> tuple[list[Decision], Posterior]:
-    """Return what becomes of every block by an answer, and what the readings allow if none is ruled out."""
-    x, _, noise = _carried_over((space, solution), everything.space)
-    problem, _ = everything.linearise(x, solution.weights)
-    return select(everything.space, problem, noise, progress)
+                x[block.part] = start.x[old.part]
+                tolerances[n] = start.tolerances[m]
+    return x, tolerances, start.noise
 
 
 def _allowed(everything: ParameterSpace, possible: Posterior, answer: tuple[ParameterSpace, Solution]) -> Allowed:
     """Return what the readings allow, as :func:`expected_error` wants it, seen from an answer."""
-    x, _, _ = _carried_over(answer, everything)
+    x, _, _ = _carried_over(_Start.of(*answer), everything)
     return everything, everything.physical(possible.y) - x, physical_covariance(everything, possible)
 
 

@@ -121,32 +121,40 @@ def look_for_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
     """
     space, measurements = estimation.space, estimation.measurements
     given = float(space.periods[0]) if np.isfinite(space.periods).all() else None
-    odds, best, scales = 0.0, None, None
+    nominal, odds, near = np.zeros(space.size), 0.0, None
     if len(measurements) > PLENTY:
         some = np.zeros(len(measurements), dtype=bool)
         some[np.random.default_rng(0).choice(len(measurements), PLENTY, replace=False)] = True
         few = Estimation(measurements.select(some), space, alone=False)
-        odds, best, scales = _strongest(few, few.linearise(np.zeros(space.size), np.ones(PLENTY))[0])
-    if odds < SURE:
-        odds, best, scales = _strongest(estimation, problem)
-    if best is None or scales is None or odds < SURE:
+        odds, near, _ = _strongest(few, few.linearise(nominal, np.ones(PLENTY))[0])
+    shown, best, posterior = _strongest(estimation, problem, near if odds >= SURE else None)
+    odds = odds if odds >= SURE else shown
+    if best is None or odds < SURE:
         return ScrewLead(given, None, np.inf, odds)
     # So far the waves counted as noise, which let the priors weigh too much.
-    quiet = solve(space, problem, scales.tolerances, scales.noise * best.noise, rounds=0)
+    quiet = solve(space, problem, posterior.tolerances, posterior.noise * best.noise, rounds=0)
     best = _Rest(estimation, problem, quiet).line(best.frequency)
     if not np.isfinite(best.error):
         return ScrewLead(given, None, np.inf, odds)
     return ScrewLead(given, float(1.0 / best.frequency), float(best.error / best.frequency**2), odds)
 
 
-def _strongest(estimation: Estimation, problem: LinearProblem) -> tuple[float, Line | None, Posterior]:
-    """Return the odds of the period that readings speak for most, that period, and the fit without waves."""
+def _strongest(
+    estimation: Estimation, problem: LinearProblem, near: Line | None = None
+) -> tuple[float, Line | None, Posterior]:
+    """Return the odds of the period that readings speak for most, that period, and the fit without waves.
+
+    Where others have shown one already, only that is looked at, and against none.
+    """
     space = estimation.space
     tolerances = np.where([b.name in WAVES for b in space.blocks], 0.0, space.start_tolerances())
     posterior = solve(space, problem, tolerances, np.ones(problem.normal.shape[0]), SCALE_ROUNDS)
     rest = _Rest(estimation, problem, posterior)
     if rest.freedom < LEAST_FREEDOM:
         return 0.0, None, posterior
+    if near is not None:
+        best = rest.line(near.frequency)
+        return best.odds, best, posterior
     spectrum = rest.spectrum()
     best = _fundamental(rest, spectrum)
     others = _rivals(rest.frequencies, spectrum, best.frequency, rest.span)

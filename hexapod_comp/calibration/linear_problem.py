@@ -28,6 +28,9 @@ SCALE_SETTLED = 1e-6
 LONGEST_STRIDE = 16.0
 """An extrapolation goes no further than so many rounds squared would."""
 
+LEAP = np.log(10.0)
+"""It changes no tolerance and no noise by more than this logarithm: rounds that still gain speed lead nowhere."""
+
 HYPER = 0.1
 """How many parameters the first guess of a tolerance is worth."""
 
@@ -199,7 +202,8 @@ def _extrapolated(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> n
     step, bend = logs[1] - logs[0], logs[2] - 2.0 * logs[1] + logs[0]
     stride = float(np.clip(np.linalg.norm(step) / max(float(np.linalg.norm(bend)), 1e-12), 1.0, LONGEST_STRIDE))
     result = third.copy()
-    result[live] = np.exp(logs[0] + 2.0 * stride * step + stride**2 * bend)
+    led = logs[0] + 2.0 * stride * step + stride**2 * bend
+    result[live] = np.exp(np.clip(led, logs[2] - LEAP, logs[2] + LEAP))
     return result
 
 
@@ -336,7 +340,8 @@ def _without(precision: np.ndarray, problem: LinearProblem, parts: list[FoldSum]
         known = np.flatnonzero(place[columns] >= 0)
         at = place[columns[known]]
         size = posterior.spread[at] / posterior.noise[problem.kind[cells[0]]]
-        left[np.ix_(at, at)] -= size[:, None] * one.normal[np.ix_(known, known)] * size
+        information = one.normal if len(known) == len(columns) else one.normal[np.ix_(known, known)]
+        left[np.ix_(at, at)] -= size[:, None] * information * size
     return left
 
 

@@ -198,7 +198,7 @@ def without_trace(space: ParameterSpace, problem: LinearProblem) -> tuple[str, .
         # A shear or a size is the same per length, and the terms run from -1 to 1 over sides of the box.
         x = np.zeros(space.size)
         x[wanted] = [np.prod([half[AXES.index(letter)] for letter in term if letter in AXES]) for _, term in parts]
-        y = np.concatenate([np.linalg.solve(block.root, x[block.part]) for block in space.blocks])
+        y = space.whitened_parameters(x)
         y *= (tolerances / np.abs(y).max())[np.abs(y).argmax()]
         if np.sqrt(np.einsum("i,kij,j->", y, problem.normal, y)) <= SEEN:
             names.append(name)

@@ -336,18 +336,12 @@ class ParameterSpace:
 
     def whitened(self, rows: np.ndarray) -> np.ndarray:
         """Return derivatives (n, size) by x as derivatives by y, with x = root·y block by block."""
-        return self.whiten(rows.copy(), np.arange(self.size))
-
-    def whiten(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Do the same in place with some columns' derivatives: of a block that is not diagonal, with all."""
-        ends = np.searchsorted(columns, [(b.part.start, b.part.stop) for b in self.blocks])
-        for block, (start, stop) in zip(self.blocks, ends, strict=True):
-            sizes = np.diag(block.root)
-            if np.count_nonzero(block.root) > len(sizes):
-                rows[:, start:stop] = rows[:, start:stop] @ block.root
-            elif (sizes != 1.0).any():
-                rows[:, start:stop] *= sizes[columns[start:stop] - block.part.start]
-        return rows
+        result = np.empty_like(rows)
+        for block in self.blocks:
+            part, sizes = rows[:, block.part], np.diag(block.root)
+            diagonal = np.count_nonzero(block.root) == np.count_nonzero(sizes)
+            result[:, block.part] = part * sizes if diagonal else part @ block.root
+        return result
 
     def unwhitened(self, rows: np.ndarray) -> np.ndarray:
         """Return derivatives (n, size) by y as derivatives by x: undoes :meth:`whitened`."""
@@ -356,6 +350,10 @@ class ParameterSpace:
     def physical(self, y: np.ndarray) -> np.ndarray:
         """Return x = root·y for y of shape (size, …)."""
         return np.concatenate([b.root @ y[b.part] for b in self.blocks])
+
+    def whitened_parameters(self, x: np.ndarray) -> np.ndarray:
+        """Return y of x = root·y: undoes :meth:`physical`."""
+        return np.concatenate([np.linalg.solve(b.root, x[b.part]) for b in self.blocks])
 
     def prior_covariance(self, tolerances: np.ndarray) -> np.ndarray:
         """Return the prior's covariance of x, shape (size, size), SI."""

@@ -52,7 +52,7 @@ class Decision:
 
 def select(
     space: ParameterSpace, problem: LinearProblem, noise: np.ndarray, progress: Callable[[str], object]
-) -> tuple[list[Decision], Posterior]:
+) -> tuple[list[Decision], Posterior, Posterior]:
     """Decide on each block by leaving out one line, or one scattered pose, after the other.
 
     Where there is only one, nothing is left to fit without it, and no block is kept.
@@ -75,8 +75,9 @@ def select(
 
     Returns
     -------
-    list of Decision, Posterior
-        One decision for each block but the structure; and with all blocks in, what the data allow if nothing is out.
+    list of Decision, Posterior, Posterior
+        One decision for each block but the structure; with all blocks in, what the data allow if nothing is out; and
+        the fit with the blocks that stay.
     """
     trials = _Trials(space, problem, noise, progress)
     names = [b.name for b in space.blocks[1:]]
@@ -96,7 +97,8 @@ def select(
         gains[name] = trials.gain(("structure", *kept), name)
     useless = [name for name in EXPECTED if name in kept and gains[name][0] <= LEAST_GAIN]
     kept = [name for name in kept if name not in useless]
-    return [Decision(name, name in kept, *gains[name]) for name in names], trials.everything
+    decisions = [Decision(name, name in kept, *gains[name]) for name in names]
+    return decisions, trials.everything, trials.fit(("structure", *kept))
 
 
 def _without_harmonics(trials: _Trials, kept: list[str], gains: dict[str, tuple[float, float]]) -> list[str]:
@@ -116,12 +118,13 @@ def _clear(gain: tuple[float, float] | None) -> bool:
 
 
 class _Trials:
-    """Held-out errors of sets of blocks, each computed once."""
+    """Fits with sets of blocks and their held-out errors, each computed once."""
 
     def __init__(
         self, space: ParameterSpace, problem: LinearProblem, noise: np.ndarray, progress: Callable[[str], object]
     ) -> None:
         self._space, self._problem, self._noise, self._progress = space, problem, noise, progress
+        self._fits: dict[frozenset[str], Posterior] = {}
         self._known: dict[frozenset[str], np.ndarray] = {}
         self.everything = self._solve(space.start_tolerances(), FIRST_ROUNDS)
 
@@ -137,13 +140,20 @@ class _Trials:
     def _solve(self, tolerances: np.ndarray, rounds: int) -> Posterior:
         return solve(self._space, self._problem, tolerances, self._noise, rounds)
 
+    def fit(self, names: tuple[str, ...]) -> Posterior:
+        """Return the fit with a set of blocks."""
+        key = frozenset(names)
+        if key not in self._fits:
+            tolerances = np.where([b.name in key for b in self._space.blocks], self.everything.tolerances, 0.0)
+            self._fits[key] = self._solve(tolerances, ROUNDS)
+        return self._fits[key]
+
     def _errors(self, names: tuple[str, ...]) -> np.ndarray:
         """Return the summed squared errors of each fold, in fixed units, under a set of blocks."""
         key = frozenset(names)
         if key not in self._known:
             self._progress(f"trying {', '.join(names)}")
-            tolerances = np.where([b.name in key for b in self._space.blocks], self.everything.tolerances, 0.0)
-            posterior = self._solve(tolerances, ROUNDS)
+            posterior = self.fit(names)
             errors = held_out(self._problem, posterior) * (posterior.noise / self._noise)[self._problem.kind]
             self._known[key] = np.bincount(self._problem.fold, errors**2)
         return self._known[key]

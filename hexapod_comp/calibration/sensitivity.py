@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from ..machine.temperatures import REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE
 from ..measurements.readings import Stations
 from ..virtual.trial import drive
 from .parameters import WAVES, Block, ParameterSpace
+
+JOINTS = ("base_joints", "platform_joints")
 
 
 @dataclass(frozen=True)
@@ -62,8 +65,10 @@ def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Predict
     driven = drive(machines, commanded, sense, stations.commands)
     errors = driven.errors(commanded, space.probe).as_array()
     errors += space.field_errors(x, driven.actual[0] + driven.actual[1] @ space.probe, stations.sense[:, :3])
-    base = np.array([machine.structure.base_joints for machine in machines])
-    platform = np.array([machine.structure.platform_joints for machine in machines])
+    each = {id(machine): machine.structure for machine in machines}
+    number = {key: n for n, key in enumerate(each)}
+    which = np.array([number[id(machine)] for machine in machines])
+    base, platform = (np.array([getattr(s, name) for s in each.values()])[which] for name in JOINTS)
     return Prediction(errors, *driven.actual, base, platform)
 
 
@@ -88,53 +93,67 @@ def derivatives(space: ParameterSpace, prediction: Prediction, stations: Station
     """Return ∂e/∂x at each station, shape (M, 6, size)."""
     count = len(stations)
     at, directions = np.repeat(np.arange(count), 6), np.tile(np.eye(6), (count, 1))
-    rows, _ = Slopes(space, prediction, stations).along(at, directions, np.arange(6))
+    rows = np.empty((6 * count, space.size))
+    Slopes(space, prediction, stations).write(rows, np.arange(space.size), at, directions, np.arange(6))
     return rows.reshape(count, 6, space.size)
 
 
 class Slopes:
-    """How parameters move a machine at some stations.
+    """How parameters move a machine at some stations: those of the model, x, or `whitened` ones, y of x = root·y.
 
     From u_i·(δP + δω × R·t_i + R·δt_i − δb_i) = δl_i: the platform's twist is X·(δl + u·δb − u·R·δt) with
     X the inverse of the Jacobian's rows (u_i, R·t_i × u_i).
     """
 
-    def __init__(self, space: ParameterSpace, prediction: Prediction, stations: Stations) -> None:
-        self._space, self._sense = space, stations.sense[:, :3]
+    def __init__(
+        self, space: ParameterSpace, prediction: Prediction, stations: Stations, whitened: bool = False
+    ) -> None:
+        self._space, self._sense, self._whitened = space, stations.sense[:, :3], whitened
         self._links = links = _Links.of(prediction, space.probe)
-        self._factors = {block.name: _factors(space, block.name, links, stations) for block in space.blocks}
         self._causes = _growth_factors(space, stations)
-        points = prediction.positions + links.lever
-        self._field = {
-            "field": space.field.basis(points),
-            "field reversal": space.field.reversal_basis(points) if space.block("field reversal") else np.zeros((0, 0)),
-        }
+        self._factors: dict[str, np.ndarray] = {}
+        for block in space.blocks:
+            if block.name not in self._causes and not block.name.startswith("field"):
+                factors = _factors(space, block.name, links, stations)
+                if whitened and factors.shape[2] > 1:  # each strut's parameters correlate with each other alone
+                    factors = factors @ block.root[: factors.shape[2], : factors.shape[2]]
+                self._factors[block.name] = factors.reshape(len(factors), -1)
+        points, field = prediction.positions + links.lever, space.field
+        self._field = {"field": field.basis(points) * (field.prior if whitened else 1.0)}
+        if space.block("field reversal"):
+            basis = field.reversal_basis(points) * (field.reversal_prior if whitened else 1.0)
+            self._field["field reversal"] = basis
 
-    def along(self, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return derivatives of errors at stations `at`, (n,), along directions (n, 6), and by which m parameters.
+    def columns(self, components: np.ndarray) -> np.ndarray:
+        """Return which parameters move an error that has some of the six components only."""
+        return np.concatenate([self._columns(block, components) for block in self._space.blocks])
 
-        They have the shape (n, m). By the others, of the field's components that are not among `components`, they
-        are zero.
+    def write(
+        self, rows: np.ndarray, columns: np.ndarray, at: np.ndarray, directions: np.ndarray, components: np.ndarray
+    ) -> None:
+        """Write derivatives of errors at stations `at`, (n,), along directions (n, 6) that have some components only.
+
+        `columns` are those of these components, and the shape of `rows` is (n, columns).
         """
-        columns = np.concatenate([self._columns(block, components) for block in self._space.blocks])
-        rows = np.empty((len(at), len(columns)))
         gains = np.einsum("nc,ncs->ns", directions, self._links.per_length[at])
-        start = 0
-        for block in self._space.blocks:
-            width = len(self._columns(block, components))
-            part, start = rows[:, start : start + width], start + width
+        ends = np.searchsorted(columns, [*(block.part.start for block in self._space.blocks), self._space.size])
+        for block, (start, stop) in zip(self._space.blocks, pairwise(ends), strict=True):
+            part = rows[:, start:stop]
             if block.name.startswith("field"):
                 self._write_field(block.name, part, at, directions[:, components], components)
             elif block.name in self._causes:
                 grown = np.einsum("nc,ncp->np", directions, self._per_growth[at])
-                part[:] = (grown[..., None] * self._causes[block.name][at]).reshape(len(at), -1)
+                grown = (grown[..., None] * self._causes[block.name][at]).reshape(len(at), -1)
+                part[:] = grown @ block.root if self._whitened else grown
             else:
-                moved = gains[..., None] * self._factors[block.name][at]
+                factors = self._factors[block.name][at]
+                each = gains[:, np.repeat(np.arange(6), factors.shape[1] // 6)]
                 if block.name == "structure":
-                    part[:] = self._joined(moved)
-                else:  # struts of one material swell alike
-                    part[:] = moved.sum(axis=1) if block.name == "moisture" else moved.reshape(len(at), -1)
-        return rows, columns
+                    part[:] = self._joined((each * factors).reshape(len(at), 6, -1))
+                elif block.name == "moisture":  # struts of one material swell alike
+                    part[:, 0] = np.einsum("ns,ns->n", each, factors)
+                else:
+                    np.multiply(each, factors, out=part)
 
     @cached_property
     def _per_growth(self) -> np.ndarray:
@@ -173,7 +192,7 @@ class Slopes:
 
 
 def _factors(space: ParameterSpace, name: str, links: _Links, stations: Stations) -> np.ndarray:
-    """Return by how much each strut's parameters of a block lengthen it, (M, 6, k); none for the field and growth."""
+    """Return by how much each strut's parameters of a block lengthen it, shape (M, 6, k)."""
     commands = stations.commands
     if name == "structure":
         in_platform = -np.einsum("nij,nki->nkj", links.rotations, links.directions)
@@ -185,7 +204,7 @@ def _factors(space: ParameterSpace, name: str, links: _Links, stations: Stations
         return space.spline_weights(commands)
     factors = {"pitch": commands - space.home_lengths, "backlash": -0.5 * stations.sense[:, 3:]}
     factors["moisture"] = links.lengths * np.nan_to_num(stations.humidity - REFERENCE_HUMIDITY)[:, None]
-    return factors.get(name, np.zeros((0, 0)))[..., None]
+    return factors[name][..., None]
 
 
 @dataclass(frozen=True)

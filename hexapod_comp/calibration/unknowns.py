@@ -79,11 +79,12 @@ def of_zero(members: np.ndarray, scale: np.ndarray, along: np.ndarray | None = N
     along : ndarray, shape (n,), optional
         Their coordinates along the line, m, where its slope is unknown too.
     """
-    columns = [np.ones(len(members))]
+    columns = [scale / np.linalg.norm(scale)]
     if along is not None:
-        columns.append(along - along.mean())
-    basis, _ = np.linalg.qr(scale[:, None] * np.stack(columns, axis=1))
-    return Unknown(members, basis, np.ones(basis.shape[1]))
+        slope = scale * (along - along.mean())
+        slope -= columns[0] * (columns[0] @ slope)
+        columns.append(slope / np.linalg.norm(slope))
+    return Unknown(members, np.stack(columns, axis=1), np.ones(len(columns)))
 
 
 @dataclass(frozen=True)
