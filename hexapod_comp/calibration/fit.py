@@ -24,7 +24,7 @@ from .parameters import WAVES, FitSettings, ParameterSpace
 from .selection import Decision, select
 from .smooth_field import DIGITS
 from .verdict import Verdict, judge
-from .warming import HeatSeen, seek_time_constants
+from .warming import HeatSeen, TimeConstants, seek_time_constants
 
 SURE = 4.0
 """Backlash so many standard deviations below zero is no noise."""
@@ -196,11 +196,7 @@ def fit_model(
         A datum that the machine does not reach, too few readings, or such that show nothing, a fit that does not
         settle, forward and backward swapped.
     """
-    settings = settings or FitSettings()
-    constants = seek_time_constants(measurements, ParameterSpace(measurements, settings), progress)
-    if constants.values:
-        settings = replace(settings, time_constants=constants.values)
-    everything, problem, lead = _begin(measurements, settings, progress)
+    everything, problem, lead, constants = _begin(measurements, settings or FitSettings(), progress)
     settings = everything.space.settings
     decisions, possible, (space, estimation, solution) = _choose(everything, problem, settings, progress)
     channels = tuple(_channels(estimation, solution))
@@ -214,10 +210,8 @@ def fit_model(
     allowed = _allowed(everything.space, possible, (space, solution))
     noise = {KINDS.index(c.kind): c.estimated for c in channels}
     verdict = judge(estimation, solution, allowed, settings, noise, progress)
-    pose = measurements.geometry.home if datum is None else datum
-    part = unseen_part(estimation, solution.posterior.tolerances[0], solution.posterior.noise, pose)
     as_solved = _named(space, solution, measurements, channels, len(decisions), verdict.level)
-    model, held = hold(measurements.geometry, as_solved, pose, part)
+    model, held = _held(as_solved, estimation, solution.posterior, datum)
     return ModelFit(
         model=model,
         measurements=measurements,
@@ -239,24 +233,27 @@ def fit_model(
 
 def _begin(
     measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object]
-) -> tuple[Estimation, LinearProblem, ScrewLead | None]:
-    """Return all parameters that may be used, the problem at the nominal machine, and the screws' lead.
+) -> tuple[Estimation, LinearProblem, ScrewLead | None, TimeConstants]:
+    """Return all parameters that may be used, the problem at the nominal machine, the screws' lead, time constants.
 
-    It is not looked for where no screw wave may be fitted, or where the geometry says that screws differ.
+    The lead is not looked for where no screw wave may be fitted, or where the geometry says that screws differ.
     """
+    constants = seek_time_constants(measurements, ParameterSpace(measurements, settings), progress)
+    if constants.values:
+        settings = replace(settings, time_constants=constants.values)
     everything = Estimation(measurements, ParameterSpace(measurements, settings))
     nominal, trust = np.zeros(everything.space.size), np.ones(len(measurements))
     problem, residuals = everything.linearise(nominal, trust)
     refuse_unmoved(measurements, residuals)
     known = everything.space.periods[np.isfinite(everything.space.periods)]
     if not set(settings.blocks) & set(WAVES) or len(np.unique(known)) > 1:
-        return everything, problem, None
+        return everything, problem, None, constants
     progress("looking for the screws' lead")
     lead = look_for_lead(everything, problem)
     if lead.given is None and lead.used is not None:
         everything = Estimation(measurements, ParameterSpace(measurements, replace(settings, lead=lead.used)))
         problem, _ = everything.linearise(np.zeros(everything.space.size), trust)
-    return everything, problem, lead
+    return everything, problem, lead, constants
 
 
 def _choose(
@@ -443,6 +440,15 @@ def _outliers(estimation: Estimation, solution: Solution) -> list[Outlier]:
         Outlier(m.sources[i], int(m.channel[i]), float(solution.residuals[i]), float(sigmas[i]), m.runs[m.run[i]].name)
         for i in far
     ]
+
+
+def _held(
+    model: MachineModel, estimation: Estimation, posterior: Posterior, datum: Pose | None
+) -> tuple[MachineModel, HeldDatum]:
+    """Return a model that leaves the tool where it is at a datum, as far as the readings do not show more."""
+    geometry = estimation.measurements.geometry
+    pose = geometry.home if datum is None else datum
+    return hold(geometry, model, pose, unseen_part(estimation, posterior.tolerances[0], posterior.noise, pose))
 
 
 def _named(

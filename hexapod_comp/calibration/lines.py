@@ -185,8 +185,7 @@ def fit_lines(
         No grid lines, a line or channel missing, readings that do not reach the grid's edge, fewer points
         than a straight line needs, lines at different attitudes, a work frame turned against ``base``.
     """
-    if not (order in ("adjusted-r2", "aicc") or (isinstance(order, int) and order >= 1)):
-        raise CalibrationError("order", f"must be adjusted-r2, aicc or a whole number from 1, not {order!r}")
+    _check_order(order)
     readings, notes = grid_readings(measurements)
     grid = grid_of(readings)
     readings = readings._replace(node=nearest_nodes(readings.point, grid))
@@ -208,6 +207,12 @@ def fit_lines(
     notes = list(dict.fromkeys((*measurements.notes, *notes)))
     model, held = hold(measurements.geometry, model, measurements.geometry.home if datum is None else datum, np.eye(6))
     return LinesFit(model, tuple(fits), tuple(notes), held, _misfit(measurements, fits))
+
+
+def _check_order(order: object) -> None:
+    """Raise on a rule that is none."""
+    if not (order in ("adjusted-r2", "aicc") or (isinstance(order, int) and order >= 1)):
+        raise CalibrationError("order", f"must be adjusted-r2, aicc or a whole number from 1, not {order!r}")
 
 
 def _without_means(measurements: MeasurementSet) -> np.ndarray:

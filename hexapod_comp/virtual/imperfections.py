@@ -165,9 +165,14 @@ def draw_model(geometry: HexapodGeometry, bounds: ImperfectionBounds, seed: int,
     )
     if not bounds.length_map:
         return model
+    return with_length_map(model, geometry, seed, bounds.length_map, _waves_of(geometry))
+
+
+def _waves_of(geometry: HexapodGeometry) -> tuple[float, float]:
+    """Return the shortest and the longest wave of a length map on a machine, m."""
     stroke = float(np.ptp(geometry.limits.stroke))
     shortest, longest = (max(share * stroke, least) for share, least in zip(WAVES_OF_STROKE, LEAST_WAVES, strict=True))
-    return with_length_map(model, geometry, seed, bounds.length_map, (shortest, longest))
+    return shortest, longest
 
 
 def with_length_map(
