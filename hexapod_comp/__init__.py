@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from .compensation.checks import CheckResult as CheckResult
     from .compensation.checks import check as check
     from .compensation.compensator import Compensator as Compensator
-    from .compensation.compensator import Correction as Correction
+    from .compensation.state import Correction as Correction
     from .errors import HexapodError as HexapodError
     from .formats.csv import read_poses as read_poses
     from .formats.json import json_text as json_text
@@ -66,7 +66,8 @@ _HOMES = {
     "calibration.update": ("update_model",),
     "calibration.verification": ("Verification", "verify_model"),
     "compensation.checks": ("CheckResult", "check"),
-    "compensation.compensator": ("Compensator", "Correction"),
+    "compensation.compensator": ("Compensator",),
+    "compensation.state": ("Correction",),
     "errors": ("HexapodError",),
     "formats.csv": ("read_poses",),
     "formats.json": ("json_text",),

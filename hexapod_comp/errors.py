@@ -90,6 +90,12 @@ class GeometryError(HexapodError):
         super().__init__(f"{key}: {problem}{suffix}")
 
 
+class FrameError(HexapodError):
+    """A machine has no tool or work frame of that name; lists those that there are."""
+
+    reason = "unknown_frame"
+
+
 class ModelError(GeometryError):
     """A machine model whose numbers cannot describe a machine."""
 

@@ -79,7 +79,7 @@ def _nodes(context: LaunchContext) -> list[Node]:
         common |= {"base_frame": f"{prefix}base"}
     common |= {"geometry_file": given("geometry")} if given("geometry") else {}
     model = {"model_file": given("model")} if given("model") else {}
-    model |= {"work_frame": f"{prefix}work"} if prefix else {}
+    model |= {"work_frame": f"{prefix}work", "frame_prefix": prefix} if prefix else {}
     truth = {"truth_file": given("truth")} if given("truth") else {}
     nodes = [_node("compensator", given, [*files, common | model])]
     if given("simulate") == "true":

@@ -7,7 +7,7 @@ method with the textbook Jacobian, rows (u, R·p × u). Lengths are m, positions
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +58,12 @@ class Machine:
     lead: float = 0.0
     axes: tuple[np.ndarray, np.ndarray] | None = None
     limits: dict[str, float] = field(default_factory=dict)
+    tools: dict[str, Frame] = field(default_factory=dict)
+    work_frames: dict[str, Frame] = field(default_factory=dict)
+
+    def using(self, tool: str | None = None, work: str | None = None) -> Machine:
+        """Return the machine as it is with a named tool and work frame; None: the usual one."""
+        return replace(self, tool=self.tools.get(tool, self.tool), work=self.work_frames.get(work, self.work))
 
     def lengths(self, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
         """Return the nominal distances between the joints of each strut, (N, 6)."""
@@ -122,6 +128,9 @@ class Machine:
                 **self.limits,
             },
         }
+        for key in ("tools", "work_frames"):
+            if named := getattr(self, key):
+                content[key] = {name: pose(frame) for name, frame in named.items()}
         if self.axes is not None:
             for body, axes in zip(("base", "platform"), self.axes, strict=True):
                 content[body]["joint_axes"] = axes.tolist()
@@ -355,3 +364,13 @@ def machines() -> dict[str, Machine]:
         ),
     ]  # fmt: skip
     return {machine.name: machine for machine in zoo}
+
+
+def with_frames(name: str) -> Machine:
+    """Return a machine of the zoo with two tools and a work frame more, all turned."""
+    machine = machines()[name]
+    (x, y, z), (a, b, c) = machine.tool.position, machine.work.position
+    longer = Frame((x + 0.013, y - 0.007, z + float(np.copysign(0.031, z))), (4.0, -3.0, 35.0))
+    tools = {"probe": longer, "stub": Frame((0.004, 0.002, 0.0), (0.0, 2.0, -20.0))}
+    fixture = Frame((a + 0.04, b - 0.06, c + 0.02), (-2.0, 1.5, 48.0))
+    return replace(machine, tools=tools, work_frames={"fixture": fixture})

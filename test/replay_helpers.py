@@ -96,19 +96,24 @@ class RecordedMachine:
     ----------
     namespace : str
         ``/mill`` or nothing.
-    model : str or Path
-        Model file.
+    model, geometry : str or Path
+        Model file and geometry file.
     """
 
-    def __init__(self, namespace: str = "", model: str | Path = CONFIG / "paper_machine.yaml") -> None:
+    def __init__(
+        self,
+        namespace: str = "",
+        model: str | Path = CONFIG / "paper_machine.yaml",
+        geometry: str | Path = CONFIG / "paper.yaml",
+    ) -> None:
         self.namespace, self.messages = namespace, Messages()
-        geometry_source = Source.read(CONFIG / "paper.yaml")
+        geometry_source = Source.read(geometry)
         self.geometry = geometry_source.geometry()
         self.sources = {"geometry": geometry_source}
         self.now, self.answers = BEGAN, list[np.ndarray]()
         self.compensator = Compensator(self.geometry, self.load(model))
-        self.frames = {"base": pack_pose(Pose.identity()), "work": pack_pose(self.geometry.work)}
-        self.journal = Journal(self.compensator, self.sources, {"base": "base", "work": "work"})
+        self.frames = {name: pack_pose(pose) for name, pose in self.geometry.work_frames.items()}
+        self.journal = Journal(self.compensator, self.sources, {name: name for name in self.frames})
         self.elapsed = 0.0
         self.page()
 

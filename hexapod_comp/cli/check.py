@@ -77,7 +77,7 @@ def _report(
 
 
 def _title(geometry: HexapodGeometry, model: MachineModel, rows: list[Row], result: CheckResult) -> str:
-    counted = f"{len(rows)} pose{'s' * (len(rows) != 1)} of the tool in work"
+    counted = f"{len(rows)} pose{'s' * (len(rows) != 1)} of {common.whose(geometry)}"
     what = {
         "moves": f"{counted} as targets joined by moves at {result.rate:g} Hz",
         "stream": f"{counted} as a stream at {result.rate:g} Hz",
@@ -225,7 +225,7 @@ def _as_json(geometry: HexapodGeometry, model: MachineModel, rows: list[Row], re
     return {
         "machine": geometry.name,
         "model": model.name,
-        "frame": "work",
+        **common.frames(geometry),
         "mode": result.mode,
         "rate_hz": result.rate,
         "within_limits": result.ok,

@@ -29,11 +29,11 @@ DECIMALS = {"mm": 9, "deg": 9, "um": 6, "urad": 6}
 
 
 def load_machine(args: argparse.Namespace) -> tuple[HexapodGeometry, MachineModel]:
-    """Return the geometry and the model that the options name."""
+    """Return the geometry, with the tool and the work frame, and the model that the options name."""
     from ..machine.geometry import load_geometry
     from ..virtual.named import find_model
 
-    geometry = load_geometry(args.machine)
+    geometry = load_geometry(args.machine).using(getattr(args, "tool", None), getattr(args, "work", None))
     return geometry, find_model(getattr(args, "model", "ideal"), geometry)
 
 
@@ -52,6 +52,16 @@ def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campai
         return largest.box, largest.rotation
 
     return load_campaign(args.campaign, own_box)
+
+
+def frames(geometry: HexapodGeometry) -> dict[str, str]:
+    """Return what JSON says of poses: whose they are, and in which frame."""
+    return {"tool": geometry.tool_name, "frame": geometry.work_name}
+
+
+def whose(geometry: HexapodGeometry) -> str:
+    """Return the same in words: ``the tool in work``."""
+    return f"the {geometry.tool_name} in {geometry.work_name}"
 
 
 def machine_title(geometry: HexapodGeometry, model: MachineModel) -> str:

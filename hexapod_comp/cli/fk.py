@@ -81,12 +81,12 @@ def _poses(
     ]
     common.write_table(args, table)
     if args.json:
-        common.show({"machine": geometry.name, "model": model.name, "frame": "work", "rows": table})
+        common.show({"machine": geometry.name, "model": model.name, **common.frames(geometry), "rows": table})
     elif args.out is None and args.lengths is None:
         common.show(common.csv_text(table))
     elif args.out is None:
         header = list(table[0])[1:]
-        title = f"{common.machine_title(geometry, model)}: pose of the tool in work"
+        title = f"{common.machine_title(geometry, model)}: pose of {common.whose(geometry)}"
         common.show(f"{title}\n{texts.aligned(header, [[texts.number(table[0][name], 6) for name in header]])}")
 
 
@@ -164,7 +164,7 @@ def _all_modes(args: argparse.Namespace, geometry: HexapodGeometry, lengths: np.
     joined = [{**m, "working": int(m["working"]), "objections": "; ".join(m["objections"])} for m in listed]
     common.write_table(args, joined)
     if args.json:
-        common.show({"machine": geometry.name, "frame": "work", "modes": listed, "no_working_mode": reason})
+        common.show({"machine": geometry.name, **common.frames(geometry), "modes": listed, "no_working_mode": reason})
     elif args.out is None:
         numbers = MODE_COLUMNS[1:7]
         body = [[str(m["mode"]), *(texts.number(m[name], 6) for name in numbers), _verdict(m)] for m in listed]

@@ -162,9 +162,9 @@ def _show(
         table = [{**columns, **predicted.columns(n)} for n, columns in enumerate(table)]
     common.write_table(args, table)
     if args.json:
-        content: dict[str, Any] = {"machine": geometry.name, "model": model.name, "frame": "work"}
+        content: dict[str, Any] = {"machine": geometry.name, "model": model.name, **common.frames(geometry)}
         if predicted is not None:
-            content |= {"error_frame": "work", "error_sd_not_known": predicted.unknown or None}
+            content |= {"error_frame": geometry.work_name, "error_sd_not_known": predicted.unknown or None}
         common.show({**content, "rows": table})
     elif args.out is None:
         one = args.poses is None
@@ -200,5 +200,5 @@ def _one_pose(geometry: HexapodGeometry, model: MachineModel, lengths: np.ndarra
         [name, *(texts.number(float(c[i]), d) for c, d in zip(columns, digits, strict=False))]
         for i, name in enumerate(STRUT_NAMES)
     ]
-    title = common.machine_title(geometry, model) + ": strut lengths for a pose of the tool in work"
+    title = common.machine_title(geometry, model) + f": strut lengths for a pose of {common.whose(geometry)}"
     return f"{title}\n{texts.aligned(header, body)}\n" + (f"\n{predicted.text()}" if predicted is not None else "")

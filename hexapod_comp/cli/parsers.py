@@ -13,18 +13,9 @@ from itertools import groupby
 from typing import Any, NoReturn
 
 from . import arguments
-from .verbs import VERBS
+from .verbs import DESCRIPTION, EPILOG, VERBS
 
 PROGRAM = "hexapod_comp"
-
-DESCRIPTION = """Error compensation for hexapod machine tools: tool poses in, compensated strut lengths out.
-
-Lengths are shown in mm, corrections in µm, angles in degrees. A pose is the tool's pose in the work frame:
-x, y, z and the angles α, β, γ with R = Ry(β)·Rx(α)·Rz(γ). A machine or model is a file, or the name of a
-shipped one (paper, paper_machine, …)."""
-
-EPILOG = """Verbs, options and files complete in the shell: pip install hexapod_comp[completion], then
-eval "$(register-python-argcomplete hexapod_comp)"."""
 
 ALIASES = {"simulate": ("measure",)}
 """Old names of verbs, which still work."""
@@ -93,6 +84,12 @@ def _machine_and_model(add: Add) -> None:
     add("--model", metavar="FILE", default="ideal", help=text)
 
 
+def _machine_model_frames(add: Add) -> None:
+    _machine_and_model(add)
+    add("--tool", metavar="NAME", help="one of the geometry file's `tools` (default: its `tool`)")
+    add("--work", metavar="NAME", help="the poses' frame: one of its `work_frames`, or base (default: its `work`)")
+
+
 def _json(add: Add) -> None:
     add("--json", action="store_true", help="print JSON, for programs, in place of text; units are in the keys")
 
@@ -125,7 +122,7 @@ def _ik(parser: argparse.ArgumentParser) -> None:
         unit = "mm" if name.endswith("mm") else "degrees"
         text = f"the pose number by number, {unit}"
         add(f"--{name.replace('_', '-')}", type=arguments.finite, metavar="NUMBER", help=text)
-    _machine_and_model(add)
+    _machine_model_frames(add)
     _table_out(add, "the lengths")
     _json(add)
 
@@ -138,7 +135,7 @@ def _fk(parser: argparse.ArgumentParser) -> None:
     start("--guess", type=arguments.pose, metavar=SHAPE, help=f"{arguments.POSE_HELP}; default home")
     start("--cold", action="store_true", help="no guess: pick the working assembly mode")
     start("--all-modes", action="store_true", help="list every assembly mode of the nominal machine")
-    _machine_and_model(add)
+    _machine_model_frames(add)
     _table_out(add, "the poses")
     _json(add)
 
@@ -149,8 +146,15 @@ def _check(parser: argparse.ArgumentParser) -> None:
     add("--stream", action="store_true", help="rows are consecutive commands")
     text = "commands per second (default 250)"
     add("--rate-hz", type=arguments.finite, default=250.0, metavar="HZ", help=text)
-    _machine_and_model(add)
+    _machine_model_frames(add)
     _table_out(add, "all margins")
+    _json(add)
+
+
+def _travel(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("--pose", type=arguments.pose, metavar=SHAPE, help=f"where the tool is, {arguments.POSE_HELP} (default: home)")
+    _machine_model_frames(add)
     _json(add)
 
 
@@ -475,6 +479,7 @@ OPTIONS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     "ik": _ik,
     "fk": _fk,
     "check": _check,
+    "travel": _travel,
     "run": _run,
     "demo": _demo,
     "watch": _watch,

@@ -57,7 +57,7 @@ def _replayed(args: argparse.Namespace, recording: Recording) -> tuple[Report, H
             report.other = what_if(recording, *other, bar.update)
             report.other_name = f"machine {other[0].name}, model {other[1].name}"
     geometry = files.geometry(recording.first.geometry) if as_it_was or other is None else other[0]
-    report.work = geometry.work
+    report.work_frames = geometry.work_frames
     return report, geometry
 
 

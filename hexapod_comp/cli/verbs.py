@@ -23,6 +23,15 @@ class Verb(NamedTuple):
     text: str
 
 
+DESCRIPTION = """Error compensation for hexapod machine tools: tool poses in, compensated strut lengths out.
+
+Lengths are shown in mm, corrections in µm, angles in degrees. A pose is the tool's pose in the work frame:
+x, y, z and the angles α, β, γ with R = Ry(β)·Rx(α)·Rz(γ). A machine or model is a file, or the name of a
+shipped one (paper, paper_machine, …)."""
+
+EPILOG = """Verbs, options and files complete in the shell: pip install hexapod_comp[completion], then
+eval "$(register-python-argcomplete hexapod_comp)"."""
+
 VERBS = {
     "show": Verb(
         "kinematics",
@@ -103,6 +112,17 @@ example:
          stroke  149.137  479.137  330.000    mm      3      nominal    9    10  at the pose
   …
   all within limits""",
+    ),
+    "travel": Verb(
+        "kinematics",
+        "how far the tool may go from a pose, each way, and what stops it",
+        """Goes from the pose along x, y and z of the work frame, mm, and by each of its angles, degrees, the others
+as they are, forward and backward, until a limit stands: stroke, joint cones, clearance of the struts, condition number,
+correction, the field's box. Limits hold for nominal and for compensated values (--model); turns end at 180°.
+What is narrower than a five-hundredth of the longest strut, or half a degree, may be stepped over.
+
+example:
+  $ hexapod_comp travel --pose 0,0,400,0,0,5 --model paper_machine.yaml""",
     ),
     "run": Verb(
         "loop",

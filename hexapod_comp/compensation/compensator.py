@@ -17,15 +17,15 @@ from ..errors import HexapodError, ModelError, NotConvergedError, NotFiniteError
 from ..kernels import kinematics as kernels
 from ..kernels.compensation import OUTSIDE, compensate_one, compensate_quaternion, estimate_one
 from ..kernels.pose import quaternion_of
+from ..machine.frames import TOOL
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import forward_error, strut_lengths
 from ..machine.model import MachineModel, RealMachine
 from ..machine.motion import MotionState
 from ..machine.temperatures import HUMIDITY, Temperatures, check_part
 from ..pose import Pose
-from .findings import refuse
-from .state import CommandState, pack_machine, pack_nominal, pack_pose, read_state
-from .state import Correction as Correction
+from .findings import refuse, refuse_motion
+from .state import TOOL_CHANGED, CommandState, Correction, pack_fixed, pack_pose, read_state
 
 DEFAULT_RAMP_RATE = 1e-3
 """How fast a change of model, temperature or enabling moves a strut, m/s."""
@@ -58,10 +58,12 @@ class Compensator:
 
     Attributes
     ----------
+    geometry : HexapodGeometry
+        The machine with the tool in use.
     on_change : callable
         Called after each change from outside, with its name and value: ``temperature`` (name, °C, time), ``humidity``
-        (fraction, time), ``model``, ``enable`` (bool), ``ramp_rate`` (m/s), ``reset`` (measured struts or None).
-        Together with the commands these decide all answers.
+        (fraction, time), ``model``, ``enable`` (bool), ``tool`` (name), ``ramp_rate`` (m/s), ``reset`` (measured struts
+        or None). Together with the commands these decide all answers.
     """
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, ramp_rate: float = DEFAULT_RAMP_RATE) -> None:
@@ -70,7 +72,6 @@ class Compensator:
         self.machine = RealMachine(geometry, model)
         self.condition = math.nan
         self.outside_field = False
-        self._nominal_numbers = pack_nominal(geometry)
         self._work = pack_pose(geometry.work)
         self._last, self._next = CommandState(ramp_rate), CommandState(ramp_rate)
         self._take_machine(RealMachine(geometry, model))
@@ -155,10 +156,9 @@ class Compensator:
         platform = self.geometry.home if home else self._last.platform
         trial.motion.copy_from(self.motion)
         tool = platform @ self.geometry.tool
-        fixed = self._pack(machine)
         # By the kernel of :meth:`step`, which is loaded anyway: each costs a node 4 MB.
         pose, times = (*tool.position, *quaternion_of(tool.rotation)), (math.nan, math.nan)
-        outcome = compensate_quaternion(*pose, *times, NO_SHIFT, fixed, trial.numbers, tried.numbers)
+        outcome = compensate_quaternion(*pose, *times, NO_SHIFT, pack_fixed(machine), trial.numbers, tried.numbers)
         refuse(outcome, tried, machine)
 
     def _followed(self, machine: RealMachine) -> np.ndarray | None:
@@ -178,12 +178,7 @@ class Compensator:
         return np.concatenate([point, strut_lengths(machine.structure, model_pose)])
 
     def _take_machine(self, machine: RealMachine) -> None:
-        self.machine, self._fixed = machine, self._pack(machine)
-
-    def _pack(self, machine: RealMachine) -> tuple:
-        """Return what the kernels take of a machine."""
-        varied = (*machine.strut_arrays[1:], *machine.field_arrays[1:])
-        return pack_machine(machine), self._nominal_numbers, varied
+        self.machine, self._fixed = machine, pack_fixed(machine)
 
     def set_temperature(self, name: str, value: float, time: float = math.nan) -> None:
         """Take a temperature, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
@@ -214,6 +209,26 @@ class Compensator:
     def _take_reading(self, name: str, value: float, time: float) -> None:
         self.temperatures.follow(name, value, time, self.model.late_growth.time_constants)
         self._renew(self.model)
+
+    def set_tool(self, name: str) -> None:
+        """Take another tool by its name; nothing moves, nothing ramps.
+
+        The next command must be where the struts are, with this tool. Until one is, and another tool or a reset may
+        come first, each is refused: what was on its way for the old tool cannot step the struts.
+
+        Raises
+        ------
+        FrameError
+            The machine has no such tool; the old one stays.
+        """
+        self._use(self.geometry.using(tool=name))
+        if np.isfinite(self.nominal).all():
+            self._last.state.resumes[:] = TOOL_CHANGED
+        self.on_change("tool", name)
+
+    def _use(self, geometry: HexapodGeometry) -> None:
+        self.geometry = geometry
+        self._take_machine(RealMachine(self.geometry, self.model, self.temperatures))
 
     def enable(self, enabled: bool) -> None:
         """Switch compensation on or off; the corrections ramp.
@@ -271,10 +286,10 @@ class Compensator:
     def snapshot(self) -> dict[str, Any]:
         """Return what, beside geometry and model, decides the next answer, by name.
 
-        ``temperatures``, °C by name, and ``humidity`` among them, ``lags`` of what follows them late, and each field of
-        :class:`~hexapod_comp.kernels.compensation.State`: a list of numbers, matrices by rows.
+        ``temperatures``, °C by name, and ``humidity`` among them, ``lags`` of what follows them late, ``tool``, and
+        each field of :class:`~hexapod_comp.kernels.compensation.State`: a list of numbers, matrices by rows.
         """
-        return {**self._last.snapshot(), **self.temperatures.snapshot()}
+        return {**self._last.snapshot(), **self.temperatures.snapshot(), "tool": self.geometry.tool_name}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Take over a :meth:`snapshot` of a compensator with this geometry and model.
@@ -284,14 +299,16 @@ class Compensator:
         ModelError
             It does not have the names that a snapshot has, or under one of them not as many numbers; or a
             temperature is not allowed.
+        FrameError
+            The machine has not its tool.
         """
         if "temperatures" not in snapshot:
             raise ModelError("snapshot.temperatures", "is missing")
         constants = self.model.late_growth.time_constants
         temperatures = Temperatures.restored(snapshot["temperatures"], snapshot.get("lags", {}), len(constants))
-        numbers = read_state({name: value for name, value in snapshot.items() if name not in ("temperatures", "lags")})
-        self._take_machine(RealMachine(self.geometry, self.model, temperatures))
+        numbers, geometry = read_state(snapshot), self.geometry.using(tool=snapshot.get("tool", TOOL))
         self.temperatures = temperatures
+        self._use(geometry)
         self._last.numbers[:] = numbers
 
     def _forget(self) -> None:
@@ -349,13 +366,16 @@ class Compensator:
         return compensate_quaternion(*numbers, time, received, frame, self._fixed, *states)
 
     def _resume(self, run: Callable[[], tuple], numbers: tuple[float, ...] = ()) -> np.ndarray:
-        """Take the first command after a reset to measured struts, starting from where they stand.
+        """Take the first command after a change of tool, or after a reset to measured struts, from where they stand.
 
         What they differ from the command's nominal lengths counts as the correction that they stand at, if it
         could be one; the first command is then the measured struts, and ramps. A trial run finds the nominal
         lengths.
         """
         last = self._last.state
+        if last.resumes[0] == TOOL_CHANGED:
+            refuse_motion(outcome := run(), self._last, self._next, self.geometry.tool_name)
+            return self._finish(outcome, numbers)
         before = last.correction.copy(), last.changed.copy()
         run()
         standing = last.command - self._next.state.nominal
@@ -445,6 +465,7 @@ class Compensator:
         box = self.model.valid_box
         outside_box = box is not None and bool((platform.position < box[0]).any() or (platform.position > box[1]).any())
         return Correction(
+            tool=self.geometry.tool_name,
             tool_pose=tool_pose,
             platform_pose=platform,
             model_pose=self._last.model,

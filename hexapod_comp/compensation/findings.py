@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import math
 
-from ..errors import NotConvergedError, OutsideFieldError, PoseError
+import numpy as np
+
+from ..errors import LimitError, NotConvergedError, OutsideFieldError, PoseError
 from ..kernels.compensation import NO_POSE, OUTSIDE, UNSOLVED
 from ..kernels.limits import WITHIN
 from ..kernels.pose import POSE_NOT_FINITE, QUATERNION_NORM_TOLERANCE
 from ..machine.field import GridField
+from ..machine.limits import STRUT_NAMES
 from ..machine.model import RealMachine
 from .state import CommandState
+
+SAME_PLACE = 1e-5
+"""Nominal lengths that differ by no more, m, are the same place: what a controller's decimals round."""
 
 
 def refuse(outcome: tuple, command: CommandState, machine: RealMachine, numbers: tuple[float, ...] = ()) -> None:
@@ -41,6 +47,27 @@ def refuse(outcome: tuple, command: CommandState, machine: RealMachine, numbers:
         raise _outside_error(command, machine.model.field)
     if finding != WITHIN:
         raise machine.geometry.limits.error(finding, strut, stage, value)
+
+
+def refuse_motion(outcome: tuple, last: CommandState, command: CommandState, tool: str) -> None:
+    """Raise where the first command after a change of tool would move a nominal strut.
+
+    Raises
+    ------
+    LimitError
+        ``tool_changed``, with the strut that would move furthest.
+    """
+    if outcome[0] == NO_POSE:
+        return  # for :func:`refuse`
+    ways = command.state.nominal - last.state.nominal
+    strut = int(np.abs(ways).argmax())
+    way = float(ways[strut])
+    if not abs(way) <= SAME_PLACE:
+        problem = (
+            f"since the change to tool {tool!r} no command was where the struts are: {STRUT_NAMES[strut]} would move "
+            f"by {way * 1e3:.4f} mm, allowed {SAME_PLACE * 1e3:g} mm; command the pose in which this tool is"
+        )
+        raise LimitError("tool_changed", problem, way, SAME_PLACE, strut, "nominal")
 
 
 def _pose_error(outcome: int, numbers: tuple[float, ...]) -> PoseError:

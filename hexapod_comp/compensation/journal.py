@@ -30,13 +30,18 @@ import numpy as np
 
 from ..errors import HexapodError, InputFileError
 from ..formats.yaml import read_text
+from ..machine.frames import BASE, TOOL, WORK
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry, parse_geometry
 from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL, parse_model
 from .compensator import Compensator
+from .state import BESIDE_NUMBERS
 
-FORMAT = 4
+FORMAT = 5
 """Version of pages."""
+
+READABLE = (4, FORMAT)
+"""Versions that are read. In 4 there was one tool, and two frames."""
 
 OLDER = {
     1: "does not hold what the compensator consumed, in its order",
@@ -49,8 +54,8 @@ SNAPSHOT_PERIOD = 0.4
 """Longest time between two snapshots, s: what a lost message costs a replay. A late subscriber is given the ten
 newest pages; at one every 50 ms a snapshot is among them."""
 
-ROLES = ("base", "work")
-"""Frames of commanded poses; an answer names its frame by its place here."""
+ROLES = (BASE, WORK)
+"""Frames of commanded poses that every machine has; an answer names its frame by its place in the snapshots' frames."""
 
 _TIMES = [("stamp", "<i8"), ("stamped", "u1"), ("received", "<f8"), ("published", "<f8")]
 COMMAND = np.dtype([*_TIMES, ("frame", "u1"), ("pose", "<f8", 7), ("lengths", "<f8", (2, 6))])
@@ -142,11 +147,11 @@ class Entry:
     after : int
         Commands answered before it since the session began.
     what : str
-        ``temperature``, ``humidity``, ``model``, ``enable``, ``ramp_rate``, ``reset`` or ``refused``.
+        ``temperature``, ``humidity``, ``model``, ``enable``, ``tool``, ``ramp_rate``, ``reset`` or ``refused``.
     values : dict of str to object
-        ``name``, ``value`` (°C) and ``time`` (s; NaN: not known, as in older recordings) of a temperature; ``value`` (a
-        fraction) and ``time`` of a humidity; ``name`` and ``sha256`` of a model; ``on``; ``value`` (m/s) of a ramp
-        rate; ``measured`` (m, or None) of a reset; ``stamp`` (ns), ``reason`` and ``text`` of a refused command.
+        ``name``, ``value`` (°C) and ``time`` (s; NaN: not known) of a temperature; ``value`` (a fraction) and ``time``
+        of a humidity; ``name`` and ``sha256`` of a model; ``on``; ``name`` of a tool; ``value`` (m/s) of a ramp rate;
+        ``measured`` (m, or None) of a reset; ``stamp`` (ns), ``reason`` and ``text`` of a refused command.
     """
 
     after: int
@@ -165,7 +170,7 @@ class Snapshot:
     model, geometry : dict of str to str
         ``name`` and ``sha256`` of what was in use.
     frames : dict of str to str
-        frame_id of poses in the machine's ``base`` and in its ``work`` frame.
+        frame_id of poses in the machine's ``base``, its ``work`` frame, and its other work frames by their names.
     made_with : dict of str to str
         Versions that the last bit may depend on.
     joints : tuple of str
@@ -246,7 +251,7 @@ class Journal:
     ) -> None:
         self._compensator, self._sources = compensator, sources
         self._always = {"frames": frames, "made_with": made_with(), "joints": list(joints)}
-        self._places = {frames[role]: place for place, role in enumerate(ROLES)}
+        self._places = {frames[role]: place for place, role in enumerate(frames)}
         self._session, self._number, self._count = secrets.token_hex(4), 0, 0
         self._commands, self._begins = bytearray(), 0
         self._entries: list[dict[str, Any]] = []
@@ -321,10 +326,8 @@ def _values(what: str, value: Any, sources: Mapping[str, Source]) -> dict[str, A
         return {"value": value[0], "time": None if math.isnan(value[1]) else value[1]}
     if what == "model":
         return _identity(value, sources["model"])
-    if what == "enable":
-        return {"on": bool(value)}
-    if what == "ramp_rate":
-        return {"value": float(value)}
+    if what in ("enable", "ramp_rate", "tool"):
+        return {key: read(value) for key, read in ENTRIES[what].items()}
     if what == "reset":
         return {"measured": None if value is None else value.tolist()}
     raise JournalError(f"the journal knows no change called {what!r}")
@@ -423,7 +426,7 @@ def read_page(text: str) -> Page:
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, binascii.Error) as error:
         raise JournalError(f"not a page of the journal: {error!r}") from error
     places = [page.begins, *(entry.after for entry in page.entries), page.begins + len(page.commands)]
-    if places != sorted(places) or (page.commands["frame"] >= len(ROLES)).any():
+    if places != sorted(places):
         raise JournalError("its entries and answers are not in an order that a journal can have")
     return page
 
@@ -435,9 +438,9 @@ def _content(text: str) -> dict[str, Any]:
         raise JournalError(f"not JSON: {error}") from error
     version = content.get("journal") if isinstance(content, dict) else content
     if isinstance(version, int) and version in OLDER:
-        advice = f"this release reads version {FORMAT}. Replay the recording with the release that made it"
+        advice = f"this release reads versions 4 to {FORMAT}. Replay the recording with the release that made it"
         raise JournalError(f"is of version {int(version)}, which {OLDER[version]}; {advice}")
-    if not isinstance(content, dict) or version != FORMAT:
+    if not isinstance(content, dict) or version not in READABLE:
         raise JournalError(f"must be of version {FORMAT}, not {str(version)[:40]}")
     return content
 
@@ -456,6 +459,7 @@ ENTRIES: dict[str, dict[str, Callable[[Any], Any]]] = {
     "model": {"name": str, "sha256": str},
     "enable": {"on": bool},
     "ramp_rate": {"value": float},
+    "tool": {"name": str},
     "reset": {"measured": _measured},
     "refused": {"stamp": int, "reason": str, "text": str},
 }
@@ -476,11 +480,11 @@ def _read_snapshot(content: Any) -> Snapshot:
     arrays = {
         str(name): np.array([math.nan if v is None else float(v) for v in numbers])
         for name, numbers in content["state"].items()
-        if name not in ("temperatures", "lags")
+        if name not in BESIDE_NUMBERS
     }
     lags = {str(name): [float(v) for v in numbers] for name, numbers in content["state"].get("lags", {}).items()}
     return Snapshot(
-        state={**arrays, "temperatures": temperatures, "lags": lags},
+        state={**arrays, "temperatures": temperatures, "lags": lags, "tool": str(content["state"].get("tool", TOOL))},
         model=_words(content["model"], "name", "sha256"),
         geometry=_words(content["geometry"], "name", "sha256"),
         frames=_words(content["frames"], *ROLES),
@@ -491,7 +495,6 @@ def _read_snapshot(content: Any) -> Snapshot:
 
 def _words(content: Any, *required: str) -> dict[str, str]:
     words = {str(key): str(value) for key, value in content.items()}
-    missing = [key for key in required if key not in words]
-    if missing:
+    if missing := [key for key in required if key not in words]:
         raise KeyError(missing[0])
     return words

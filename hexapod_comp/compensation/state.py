@@ -16,6 +16,12 @@ from ..machine.model import RealMachine
 from ..machine.motion import MotionState
 from ..pose import Pose
 
+TOOL_CHANGED = 2.0
+"""Value of ``resumes`` in a state: the tool has changed since the last command."""
+
+BESIDE_NUMBERS = ("temperatures", "lags", "tool")
+"""What a compensator's snapshot holds beside the numbers of its state."""
+
 
 @dataclass(frozen=True)
 class Correction:
@@ -23,6 +29,8 @@ class Correction:
 
     Attributes
     ----------
+    tool : str
+        Name of the tool in use.
     tool_pose : Pose
         Commanded ``pose_tool_in_work``.
     platform_pose : Pose
@@ -54,6 +62,7 @@ class Correction:
         The platform is outside the box for which the model was measured.
     """
 
+    tool: str
     tool_pose: Pose
     platform_pose: Pose
     model_pose: Pose
@@ -68,6 +77,12 @@ class Correction:
     ramping: bool
     outside_field: bool
     outside_box: bool
+
+
+def pack_fixed(machine: RealMachine) -> tuple:
+    """Return what the kernels take of a machine: its numbers, the nominal ones, and the arrays whose size varies."""
+    varied = (*machine.strut_arrays[1:], *machine.field_arrays[1:])
+    return pack_machine(machine), pack_nominal(machine.geometry), varied
 
 
 def pack_machine(machine: RealMachine) -> np.ndarray:
@@ -150,14 +165,14 @@ class CommandState:
 
 
 def read_state(snapshot: Mapping[str, Any]) -> np.ndarray:
-    """Return the vector that holds the numbers of a :meth:`CommandState.snapshot`.
+    """Return the vector that holds the numbers of a compensator's snapshot.
 
     Raises
     ------
     ModelError
         A name is missing or unknown, or has not as many numbers as it should.
     """
-    for name in sorted({*State._fields} ^ {*snapshot}):
+    for name in sorted({*State._fields} ^ ({*snapshot} - {*BESIDE_NUMBERS})):
         raise ModelError(f"snapshot.{name}", "is missing" if name in State._fields else "is unknown to this release")
     parts = [np.asarray(snapshot[name], dtype=float) for name in State._fields]
     for name, part, size in zip(State._fields, parts, SIZES, strict=True):

@@ -208,6 +208,11 @@ class CCompensator:
         """Refuse: the model is compiled in."""
         raise ModelError("model", f"is compiled into {self._path}; the recording goes on with {model.name!r}")
 
+    def set_tool(self, name: str) -> None:
+        """Refuse another tool: that of the geometry file is compiled in."""
+        if name != self.geometry.tool_name:
+            raise ModelError("tool", f"{self.geometry.tool_name!r} is compiled into {self._path}; not {name!r}")
+
     def reset(self, measured: np.ndarray | None = None) -> None:
         """Forget the last command; with measured struts, m, start from them."""
         self._check(self._library.hc_reset(byref(self.state), None if measured is None else (c_double * 6)(*measured)))
@@ -224,7 +229,7 @@ class CCompensator:
             pose = getattr(last, name)
             parts |= {f"{name}_position": list(pose.position), f"{name}_rotation": list(pose.rotation)}
         warmth = {"temperatures": dict(self._temperatures), "lags": self._lags()}
-        return {**parts, "ramp_rate": [self.state.ramp_rate], **warmth}
+        return {**parts, "ramp_rate": [self.state.ramp_rate], **warmth, "tool": self.geometry.tool_name}
 
     def _lags(self) -> dict[str, list[float]]:
         state, count = self.state, len(self.model.late_growth.time_constants)
@@ -233,6 +238,7 @@ class CCompensator:
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Take over a snapshot of either compensator."""
+        self.set_tool(snapshot.get("tool", self.geometry.tool_name))
         values, lags = snapshot["temperatures"], snapshot.get("lags", {})
         for name in PARTS:
             self.set_temperature(name, values.get(name, REFERENCE_TEMPERATURE), 0.0)

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..kernels.pose import quaternion_of
+from ..machine.frames import BASE
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import strut_lengths
 from ..pose import Pose
@@ -69,7 +70,7 @@ def joint_positions(
 
 
 def urdf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) -> str:
-    """Return the machine as URDF: links ``base``, ``work``, ``platform``, ``tool`` and the struts'.
+    """Return the machine as URDF: links ``base``, ``work``, ``platform``, ``tool``, the struts', the named frames'.
 
     Its ``ros2_control`` block says what stands below a controller of struts: the compensator's topics.
 
@@ -82,9 +83,12 @@ def urdf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
     """
     robot = ET.Element("robot", name=geometry.name)
     _link(robot, "base", [_ball(joint) for joint in geometry.base_joints])
-    _fixed(robot, "work", geometry.work)
+    for name, pose in geometry.work_frames.items():
+        if name != BASE:
+            _fixed(robot, name, pose)
     _platform(robot, geometry)
-    _fixed(robot, "tool", geometry.tool, "platform")
+    for name, pose in geometry.tools.items():
+        _fixed(robot, name, pose, "platform")
     for n, name in enumerate(joint_names):
         _strut(robot, geometry, n, name)
     _control(robot, joint_names)
@@ -94,8 +98,8 @@ def urdf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
 def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) -> str:
     """Return the machine as MJCF, loops closed: a free platform, each strut's end tied to it, motors on the slides.
 
-    Sites ``base_joint_N``, ``strut_end_N`` and ``platform_joint_N`` mark both ends of a strut, ``tool`` the tool. The
-    reference position is home.
+    Sites ``base_joint_N``, ``strut_end_N`` and ``platform_joint_N`` mark both ends of a strut, ``tool`` and other
+    names the tools. The reference position is home.
     """
     root = ET.Element("mujoco", model=geometry.name)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
@@ -106,7 +110,8 @@ def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
     _plate_geom(platform, geometry)
     for n, joint in enumerate(geometry.platform_joints):
         ET.SubElement(platform, "site", name=f"platform_joint_{n + 1}", pos=_numbers(joint))
-    _site(platform, "tool", geometry.tool)
+    for name, pose in geometry.tools.items():
+        _site(platform, name, pose)
     equality, actuator = ET.Element("equality"), ET.Element("actuator")
     for n, (name, length) in enumerate(zip(joint_names, strut_lengths(geometry, home), strict=True)):
         foot = _body(world, f"{name}_body", geometry.base_joints[n], _foot_frames(geometry)[n])

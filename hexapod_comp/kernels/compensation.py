@@ -64,7 +64,7 @@ class State(NamedTuple):
         ``pose_platform_in_base`` commanded, m, and the model pose q with q ∘ E(q) = that pose; matrices by rows.
     enabled, changed, resumes : 1 number each
         1 or 0: corrections are on; model, temperatures or enabling have changed since the last command; the next
-        command starts from measured struts.
+        command starts from measured struts, or with 2 must be where the struts are, as the tool has changed.
     ramp_rate : 1 number
         Largest speed of the ramp, m/s.
     received, published : 1 number each

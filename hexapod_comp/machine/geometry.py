@@ -1,4 +1,4 @@
-"""The nominal machine: where the twelve joints should be, how far everything may go, and its file.
+"""The nominal machine: where the twelve joints should be, how far everything may go, its tools, and its file.
 
 Frames: ``base`` is fixed, ``platform`` moves; joints are given each in the frame of the body that carries
 them. Struts are numbered 1..6 in the file's order and named ``strut_1`` … ``strut_6``.
@@ -6,18 +6,21 @@ them. Struts are numbered 1..6 in the file's order and named ``strut_1`` … ``s
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..errors import GeometryError, InputFileError, KinematicsError, LimitError, PoseError
+from ..errors import FrameError, GeometryError, InputFileError, KinematicsError, LimitError, shorten
 from ..formats.paths import input_file
 from ..formats.yaml import Section, parse_yaml, read_text
 from ..kernels import kinematics as kernels
 from ..kernels.limits import WITHIN, LimitNumbers, check_stage
 from ..pose import Pose
+from .frames import BASE, TOOL, WORK, read_named_poses, read_pose, refuse_names
 from .limits import STRUT_NAMES as STRUT_NAMES
 from .limits import Limits, frozen_array
 
@@ -56,9 +59,13 @@ class HexapodGeometry:
         Advance of each screw per turn, m; positive for a right-hand thread, zero for struts whose screw
         cannot turn with the joints.
     tool : Pose, optional
-        ``pose_tool_in_platform``.
+        ``pose_tool_in_platform`` of the tool in use.
     work : Pose, optional
-        ``pose_work_in_base``.
+        ``pose_work_in_base`` of the work frame in use.
+    tools, work_frames : mapping of str to Pose, optional
+        What else can be used, by name: see :meth:`using`. Afterwards with those in use; ``base`` is a work frame too.
+    tool_name, work_name : str, optional
+        Of those in use.
 
     Raises
     ------
@@ -78,6 +85,10 @@ class HexapodGeometry:
     screw_lead: np.ndarray = field(default_factory=lambda: np.zeros(6))
     tool: Pose = field(default_factory=Pose.identity)
     work: Pose = field(default_factory=Pose.identity)
+    tools: Mapping[str, Pose] = field(default_factory=dict)
+    work_frames: Mapping[str, Pose] = field(default_factory=dict)
+    tool_name: str = TOOL
+    work_name: str = WORK
     home_sign: float = field(init=False)
     """Sign of det J at home: the other sign is another assembly mode."""
     kernel_joints: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False)
@@ -96,6 +107,10 @@ class HexapodGeometry:
         put("kernel_joints", (self.base_joints.copy(), self.platform_joints.copy()))
         put("screw_lead", frozen_array(self.screw_lead, (6,), "screw.lead"))
         _refuse_coincident(self.base_joints)
+        put("tools", {TOOL: self.tool, **self.tools, self.tool_name: self.tool})
+        frames = {BASE: Pose.identity(), WORK: self.work, **self.work_frames, self.work_name: self.work}
+        put("work_frames", frames | {BASE: Pose.identity()})
+        refuse_names(self.tools, self.work_frames)
         spread = self.platform_joints - self.platform_joints.mean(axis=0)
         put("characteristic_length", float(np.sqrt((spread**2).sum(axis=1).mean())))
         if self.characteristic_length < COINCIDENT:
@@ -151,6 +166,25 @@ class HexapodGeometry:
         outcome = check_stage(*self.kernel_joints, position, rotation, lengths, self.limit_numbers)
         finding, strut, value, _, _ = outcome
         return None if finding == WITHIN else self.limits.error(finding, strut, 0, value)
+
+    def using(self, tool: str | None = None, work: str | None = None) -> HexapodGeometry:
+        """Return the same machine with another tool or work frame in use, by name.
+
+        Raises
+        ------
+        FrameError
+            There is none of that name; lists those that there are.
+        """
+        other = copy.copy(self)  # nothing else is made anew, so nothing else differs by a bit
+        for kind, name, named in (("tool", tool, self.tools), ("work", work, self.work_frames)):
+            if name is None:
+                continue
+            if name not in named:
+                what = "tool" if kind == "tool" else "work frame"
+                raise FrameError(f"machine {self.name} has no {what} {shorten(name)}; it has {', '.join(named)}")
+            object.__setattr__(other, kind, named[name])
+            object.__setattr__(other, f"{kind}_name", name)
+        return other
 
     def platform_pose(self, tool_pose: Pose) -> Pose:
         """Return the ``pose_platform_in_base`` that belongs to a ``pose_tool_in_work``."""
@@ -244,25 +278,13 @@ def parse_geometry(text: str, name: str | Path = "geometry") -> HexapodGeometry:
         screw = top.section("screw")
         lead = screw.per_strut("lead", "length")
         screw.finish()
-    tool = read_pose(top, "tool") if "tool" in top else Pose.identity()
-    work = read_pose(top, "work") if "work" in top else Pose.identity()
+    frames: dict[str, Any] = {key: read_pose(top, key) for key in ("tool", "work") if key in top}
+    frames |= {key: read_named_poses(top, key) for key in ("tools", "work_frames")}
     top.finish()
     try:
-        return HexapodGeometry(machine, base, platform, home, limits, screw_lead=lead, tool=tool, work=work, **axes)
+        return HexapodGeometry(machine, base, platform, home, limits, screw_lead=lead, **frames | axes)
     except GeometryError as error:
         raise InputFileError(name, error.key, error.problem, error.value) from error
-
-
-def read_pose(parent: Section, key: str) -> Pose:
-    """Read a pose section: ``position_*`` and the paper's angles ``rotation_*`` (default zero)."""
-    section = parent.section(key)
-    position = section.quantity("position", "length", (3,))
-    angles = section.quantity("rotation", "angle", (3,), np.zeros(3))
-    section.finish()
-    try:
-        return Pose.from_angles(position, angles)
-    except PoseError as error:
-        raise parent.error(key, str(error)) from error
 
 
 def _read_joints(top: Section) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:

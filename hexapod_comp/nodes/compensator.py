@@ -18,7 +18,6 @@ from ..compensation.compensator import Compensator
 from ..compensation.journal import time_of
 from ..compensation.state import pack_pose
 from ..errors import CommandError, HexapodError, TooEarlyError, shorten
-from ..pose import Pose
 from .command_inputs import command_input
 from .command_source import CommandSource, OwnTopic
 from .compensator_outputs import CompensatorOutputs
@@ -34,6 +33,8 @@ from .reloading import ReloadService
 from .running import keep_discovery_local, run
 from .runtime import ACKNOWLEDGED_WITHIN, MachineNode
 from .stamps import StampCheck, stamp_of
+from .tools import ToolChoice, frame_ids
+from .travel import TravelReports
 from .warming import warm_compensator, warm_up
 
 CHECK_PERIOD = 0.05
@@ -49,9 +50,7 @@ class CompensatorNode(MachineNode):
     def __init__(self, **options: Any) -> None:
         super().__init__("compensator", PARAMETERS, **options)
         self._files = MachineFiles(self._options)
-        simulated = bool(self.get_parameter("use_sim_time").value)
-        clock = (lambda: self.get_clock().now().nanoseconds) if simulated else None
-        self._stamps = StampCheck(self._options["max_command_age"], clock)
+        self._stamps = StampCheck(self._options["max_command_age"], self.simulated_time())
         self._status = status = CompensatorStatus(self._options, self._stamps)
         self._commands, self._following, self._last_known = status.commands, status.following, status.last_known
         self._fresh_start = self._looks_closer = True
@@ -76,17 +75,16 @@ class CompensatorNode(MachineNode):
             self._compensator = Compensator(geometry, self._files.model(geometry), self._options["ramp_rate"])
             warm_up(self._compensator)
             self._compensator.enable(self._options["enable_compensation"])
+            self._compensator.set_tool(self._options["tool"])
+            ids = frame_ids(geometry, self._options)
             self._status.take_parameters()
         except HexapodError as error:
             self._compensator = None
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
-        self._frames = {
-            self._options["base_frame"]: pack_pose(Pose.identity()),
-            self._options["work_frame"]: pack_pose(geometry.work),
-        }
-        self._open_topics()
-        self._journal = JournalTopics(self, self.compensator, self._files.sources, self._options)
+        self._frames = {ids[name]: pack_pose(pose) for name, pose in geometry.work_frames.items()}
+        self._open_topics(ids)
+        self._journal = JournalTopics(self, self.compensator, self._files.sources, self._options, ids)
         what = f"{geometry.name!r} with {self._files.described(self.compensator.model)}"
         self.get_logger().info(f"configured machine {what} in {time.perf_counter() - began:.2f} s")
         return super().on_configure(state)
@@ -102,8 +100,6 @@ class CompensatorNode(MachineNode):
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close topics and forget the machine."""
         self._active = False
-        self._reload.close()
-        self._operator.close()
         self._journal.close(time.monotonic())
         self._forget()
         self._close_topics()
@@ -128,14 +124,13 @@ class CompensatorNode(MachineNode):
         self._diagnostics_pub.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
         self._outputs.wait()
 
-    def _open_topics(self) -> None:
+    def _open_topics(self, ids: dict[str, str]) -> None:
         self.speak_for(self.compensator.geometry.name)
         self._outputs = outputs = CompensatorOutputs(self, self.compensator, self._options, self._files)
         inputs = (self.compensator, self._status, self._options)
         self._feedback = Feedback(self, *inputs, outputs.measured, self._look_at_publishers)
         self._input = asked = command_input(self.compensator, self._options)
-        commands = self.obey(asked.kind, asked.topic, self._on_command, self._look_at_publishers)
-        self._subscription = commands
+        self._subscription = commands = self.obey(asked.kind, asked.topic, self._on_command, self._look_at_publishers)
         allowed = self._options["allow_several_publishers"]
         self._pacing = Pacing(self, self._options, self._take, self._refuse_waiting)
         self._status.watch(
@@ -146,6 +141,8 @@ class CompensatorNode(MachineNode):
         self._hear = self._status.source.hear
         self._reload = ReloadService(self, self._files, self.compensator, self._status.failed_reloads)
         self._operator = OperatorServices(self, self.compensator, self._status, self._forget)
+        self._tools = ToolChoice(self, self.compensator, self._status)
+        self._travel = TravelReports(self, self.compensator, self._status, ids)
         self._timers_open = [
             self.every(CHECK_PERIOD, self._check_state),
             self.every(ESTIMATE_PERIOD, self._estimate_from_commands),
@@ -155,11 +152,10 @@ class CompensatorNode(MachineNode):
     def _close_topics(self) -> None:
         for timer in self._timers_open:
             self.destroy_timer(timer)
-        self.destroy_service(self._reload.service)
-        self._pacing.close()
         self.destroy_subscription(self._subscription)
-        self._feedback.close()
-        self._outputs.close()
+        services = self._reload, self._operator, self._tools, self._travel
+        for part in (*services, self._pacing, self._feedback, self._outputs):
+            part.close()
         for publisher in self._journal.publishers:
             self.destroy_publisher(publisher)
 
@@ -200,8 +196,7 @@ class CompensatorNode(MachineNode):
             self._look_closer()
         if stamp:
             self._stamps.accept(stamp, now)
-        self._following.note(self.compensator.command, now)
-        self._commands.tick(now)
+        self._status.answered(self.compensator.command, frame_id, now)
         self._unestimated = when
         return 0.0
 
@@ -279,6 +274,7 @@ class CompensatorNode(MachineNode):
         self._look_closer()
         self._tell_problem()
         self._reload.look()
+        self._travel.look(now)
         self._journal.tick(now)
         self._outputs.signs.stop(not self._active or self._status.stops(now))
         level, text = self._status.judged(self.compensator, now) if self._active else (WARN, "not active")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ..compensation.compensator import DEFAULT_RAMP_RATE
 from ..compensation.thermal import DEFAULT_TIME_CONSTANT, HUMIDITY_RATE
+from ..machine.frames import TOOL
 from .arguments import Program
 from .parameters import read_table
 
@@ -17,6 +18,8 @@ model_folder | '' |  | start | folder from which geometry and model may be read,
     regular file or larger than 8 MB
 base_frame | base |  | configure | frame_id of poses in the machine base
 work_frame | work | not base_frame | configure | frame_id of poses in the geometry file's work frame
+frame_prefix | '' |  | configure | in front of the names of its other work frames
+tool | {TOOL} |  | always | the tool in use, by its name in the geometry file; while the machine stands
 command_input | poses | poses, struts | configure | what commands: `poses` on `tool_pose_command`, or `struts`
     (nominal lengths) on `strut_setpoints`; the other topic is not heard
 joint_names | [strut_1, strut_2, strut_3, strut_4, strut_5, strut_6] |  | configure | the struts' names in JointState
@@ -58,9 +61,10 @@ publish_array | false |  | configure | also publish `strut_commands_array` for r
 """)
 
 TOPICS = """
-in   tool_pose_command       PoseStamped: commanded tool pose, frame_id base or work; or, by command_input,
+in   tool_pose_command       PoseStamped: commanded tool pose, frame_id a work frame; or, by command_input,
      strut_setpoints         JointState: nominal strut lengths, m; NaN while the controller is not active
      strut_states            JointState: measured strut lengths, m
+     select_tool             String: tool by its name, for controllers; as parameter tool
      temperatures            Temperature: °C; frame_id names strut_1 to strut_6, base or platform
      humidity                RelativeHumidity: 0 to 1; for struts that swell
 out  strut_commands          JointState: compensated strut lengths, m
@@ -69,12 +73,15 @@ out  strut_commands          JointState: compensated strut lengths, m
      tool_pose_estimate      PoseStamped: from measured struts, in base
      ~/predicted_error       PoseWithCovarianceStamped: the tool's error without compensation, in work;
      ~/predicted_error_aligned  the same with the datum aligned
+     ~/tool                  String, latched: the tool in use
+     ~/travel                DiagnosticStatus: how far the tool may go from here, 1 Hz
      ~/stopped               Bool, latched: commands are refused
      ~/heartbeat, ~/validity UInt64, TimeReference: until when the newest command is valid
      joint_states            JointState: all joints of the machine's URDF
      /diagnostics, ~/markers, ~/journal, ~/files
 ask  ~/enable_compensation   SetBool
      ~/reload_model, ~/reset Trigger
+     ~/get_travel            Trigger: how far the tool may go from here
 """
 
 PROGRAM = Program(

@@ -47,8 +47,10 @@ class CompensatorStatus:
     ----------
     commands, feedback : Flow
         Accepted commands and usable measured struts.
-    refusals, bad_feedback, failed_reloads, refused_resets : Refusals
+    refusals, bad_feedback, failed_reloads, refused_resets, refused_tools : Refusals
         What was refused.
+    frame_id : str
+        Of the last command; empty before the first.
     source : CommandSource
         Who commands.
     own_topic : OwnTopic
@@ -78,7 +80,8 @@ class CompensatorStatus:
         self.reading_stamps = stamps.for_readings()
         self.commands, self.feedback = Flow(), Flow()
         self.refusals, self.bad_feedback = Refusals(), Refusals()
-        self.failed_reloads, self.refused_resets = Refusals(), Refusals()
+        self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
+        self.frame_id = ""
         self.following, self.last_known = Following(), LastKnown()
         self.standing = Standing(self.following.commands)
         self.log_space = LogSpace()
@@ -93,6 +96,12 @@ class CompensatorStatus:
         )
         self.following.limit = options["following_error_limit"]
         self.last_known.anywhere_after = options["start_without_feedback_after"]
+
+    def answered(self, command: np.ndarray, frame_id: str, now: float) -> None:
+        """Take notice of a strut command, m, that answered a pose in a frame at the monotonic time `now`, s."""
+        self.following.note(command, now)
+        self.commands.tick(now)
+        self.frame_id = frame_id
 
     def watch(self, source: CommandSource, own_topic: OwnTopic, pacing: Pacing) -> None:
         """Take the guards of the topics of a configured node, and what lets its commands wait."""
@@ -144,6 +153,8 @@ class CompensatorStatus:
             yield WARN, "the old model stays"
         if self.refused_resets.recent(now):
             yield WARN, "reset refused while the machine moves"
+        if self.refused_tools.recent(now):
+            yield WARN, f"tool refused: {self.refused_tools.last_text}"
         yield from self._lost(now)
         if self.log_space.problem:
             yield WARN, self.log_space.problem
@@ -181,6 +192,8 @@ class CompensatorStatus:
         correction = 0.0 if fresh_start else float(np.abs(compensator.correction).max())
         values = {
             "model": compensator.model.name,
+            "tool": compensator.geometry.tool_name,
+            "frame_id": self.frame_id,
             "datum": str(compensator.model.origin.datum or "not known"),
             "compensation": "on" if compensator.enabled else "off",
             "ramping": str(compensator.ramping).lower(),
@@ -199,6 +212,7 @@ class CompensatorStatus:
             "failed_reloads": str(sum(self.failed_reloads.counts.values())),
             "last_failed_reload": self.failed_reloads.last_text,
             "refused_resets": str(sum(self.refused_resets.counts.values())),
+            "refused_tools": str(sum(self.refused_tools.counts.values())),
         }
         heard = dict(compensator.temperatures.values)
         if (humidity := heard.pop(HUMIDITY, None)) is not None:

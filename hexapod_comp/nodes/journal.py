@@ -17,7 +17,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from std_msgs.msg import String
 
 from ..compensation.compensator import Compensator
-from ..compensation.journal import ROLES, Journal, Source, sources_text
+from ..compensation.journal import Journal, Source, sources_text
 from .runtime import ACKNOWLEDGED_WITHIN
 
 JOURNAL_QOS = QoSProfile(
@@ -30,7 +30,7 @@ JOURNAL_QOS = QoSProfile(
 
 
 class JournalTopics:
-    """The journal of a configured node; arguments are the node, and its compensator, files and parameters.
+    """The journal of a configured node; arguments are the node, its compensator, files and parameters, frames.
 
     Nothing is published while a command is handled: what happens is noted, and goes out with :meth:`tick`.
     """
@@ -41,12 +41,12 @@ class JournalTopics:
         compensator: Compensator,
         sources: dict[str, Source],
         options: dict[str, Any],
+        frame_ids: dict[str, str],
     ) -> None:
         self._sources, self._published = sources, dict[str, Source]()
         self._pages = node.create_publisher(String, "~/journal", JOURNAL_QOS)
         self._files = node.create_publisher(String, "~/files", JOURNAL_QOS)
-        frames = {name: options[f"{name}_frame"] for name in ROLES}
-        self._journal = Journal(compensator, sources, frames, options["joint_names"])
+        self._journal = Journal(compensator, sources, frame_ids, options["joint_names"])
         self.answered, self.refused = self._journal.answered, self._journal.refused
         self.tick(time.monotonic())  # so that no command comes before the first page
 

@@ -173,6 +173,7 @@ class PredictedErrorTopics:
             "position": compensator.platform.position.tolist(),
             "rotation": compensator.platform.rotation.tolist(),
             "sense": compensator.motion.sense.tolist(),
+            "tool": compensator.geometry.tool_name,
             **compensator.temperatures.snapshot(),
         }
         process.ask(request)

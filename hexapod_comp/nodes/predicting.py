@@ -29,7 +29,7 @@ NICENESS = 10
 
 
 class Predicting:
-    """Predictors of one model, made anew when a temperature changes.
+    """Predictors of one model, made anew when tool or temperature change.
 
     Parameters
     ----------
@@ -45,15 +45,15 @@ class Predicting:
         self.fitted: FittedParameters | None
         opener = confined_opener(None if setup["folder"] is None else Path(setup["folder"]))
         self.fitted, self.unknown = load_posterior(self.model, self.geometry, sources[1].name, opener)
-        self._at: tuple[dict[str, float], dict[str, list[float]]] | None = None
+        self._at: tuple[str, dict[str, float], dict[str, list[float]]] | None = None
 
     def result(self, asked: dict[str, Any]) -> dict[str, Any]:
-        """Return the errors at a pose: ``position``, ``rotation``, ``sense``, ``temperatures`` and ``lags``."""
-        warmth = asked["temperatures"], asked["lags"]
-        if warmth != self._at:
-            temperatures = Temperatures.restored(*warmth, len(self.model.late_growth.time_constants))
-            machine = RealMachine(self.geometry, self.model, temperatures)
-            self._predictor, self._at = ErrorPredictor(machine, self.fitted), warmth
+        """Return the errors at a pose: ``position``, ``rotation``, ``sense``, ``tool``, ``temperatures``, ``lags``."""
+        at = asked["tool"], asked["temperatures"], asked["lags"]
+        if at != self._at:
+            temperatures = Temperatures.restored(*at[1:], len(self.model.late_growth.time_constants))
+            machine = RealMachine(self.geometry.using(tool=at[0]), self.model, temperatures)
+            self._predictor, self._at = ErrorPredictor(machine, self.fitted), at
         pose = np.array([asked["position"]]), np.array([asked["rotation"]])
         standing, aligned = self._predictor.predict(pose, np.array([asked["sense"]]))
         result = {"standing": _numbers(standing), "aligned": None if aligned is None else _numbers(aligned)}

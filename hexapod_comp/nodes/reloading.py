@@ -44,7 +44,7 @@ class ReloadService:
 
     @property
     def service(self) -> Service:
-        """The service, to be destroyed with the node's own."""
+        """The service itself."""
         return self._late.service
 
     def _on_request(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response | None:
@@ -75,6 +75,7 @@ class ReloadService:
         """Give up what is being loaded."""
         self._loading = None
         self._late.answer(Trigger.Response(success=False, message="the old model stays: the node was cleaned up"))
+        self._node.destroy_service(self.service)
 
     def _failed(self, error: HexapodError) -> Trigger.Response:
         self._failures.add(error.reason, str(error), time.monotonic())

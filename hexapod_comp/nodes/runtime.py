@@ -164,6 +164,11 @@ class MachineNode(LifecycleNode):
             self.on_cleanup(state)
         return super().on_shutdown(state)
 
+    def simulated_time(self) -> Callable[[], int] | None:
+        """Return what reads the simulated time, ns; None where the time is the system's."""
+        simulated = bool(self.get_parameter("use_sim_time").value)
+        return (lambda: int(self.get_clock().now().nanoseconds)) if simulated else None
+
     def warn_of(self, cause: str, text: str) -> None:
         """Log a warning, once per cause and second."""
         if (line := self._throttle.allow(cause, text)) is not None:

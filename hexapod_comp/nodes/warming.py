@@ -32,6 +32,7 @@ from ..machine.model import RealMachine
 from ..machine.model_file import load_model
 from ..machine.struts import home_twists
 from ..virtual.machine import StrutDrive
+from ..workspace.travel import travel
 from .children import end_with_parent
 from .following import Following
 from .messages import StrutMessage, write_pose
@@ -86,6 +87,7 @@ def warm_up(compensator: Compensator) -> None:
     trial.step(numbers, 0.0)
     trial.estimate(trial.command)
     trial.set_model(trial.model)
+    travel(trial.machine, home)
     StrutBytes().write(trial.command)
 
 

@@ -147,14 +147,15 @@ class Watcher:
         commands = self._read("strut_commands", self._lengths, now)
         commanded = None if commands is None or corrections is None else self._pose_of(commands - corrections)
         tool, true = (self._read(topic, _tool, now) for topic in ("tool_pose_estimate", "tool_pose_true"))
+        in_use = self._tool_in_use()
         return View(
-            platform=None if tool is None else tool @ self._geometry.tool.inverse(),
+            platform=None if tool is None else tool @ in_use.inverse(),
             commanded=commanded,
             corrections=corrections,
             measured=self._read("strut_states", self._lengths, now),
             predicted=self._read("compensator/predicted_error", _predicted, now),
-            left=self._error(tool, commanded),
-            seen=self._error(true, commanded),
+            left=self._error(tool, commanded, in_use),
+            seen=self._error(true, commanded, self._geometry.tool),
             latency=self._latency(now),
             states={name: status for name, (status, at) in self._states.items() if now - at < SILENT_AFTER},
         )
@@ -215,11 +216,17 @@ class Watcher:
             return None
         return self._guess
 
-    def _error(self, tool: Pose | None, commanded: Pose | None) -> WatchedError | None:
+    def _tool_in_use(self) -> Pose:
+        """Return ``pose_tool_in_platform`` of the tool that the compensator names; of the geometry's before it does."""
+        status, _ = self._states.get("compensator", (DiagnosticStatus(), 0.0))
+        names = [entry.value for entry in status.values if entry.key == "tool"]
+        return self._geometry.tools.get(names[0], self._geometry.tool) if names else self._geometry.tool
+
+    def _error(self, tool: Pose | None, commanded: Pose | None, in_platform: Pose) -> WatchedError | None:
         """Return how far a tool, in ``base``, is from where a platform pose would have it."""
         if tool is None or commanded is None:
             return None
-        target = commanded @ self._geometry.tool
+        target = commanded @ in_platform
         displacement = self._geometry.work.rotation.T @ (tool.position - target.position)
         return WatchedError(displacement, rotation_angle(tool.rotation @ target.rotation.T))
 

@@ -13,12 +13,13 @@ from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..compensation.journal import IDEAL_SOURCE, JournalError, Page, Snapshot, Source, read_page, read_sources
+from ..compensation.journal import IDEAL_SOURCE, ROLES, JournalError, Page, Snapshot, Source, read_page, read_sources
 from ..errors import HexapodError, InputFileError, printable
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.model import MachineModel
@@ -50,6 +51,9 @@ CUT_OFF = (
 
 SPARE = 4
 """Bytes that some writers leave behind a message."""
+
+MOST_FRAMES = 256
+"""A command's frame is a number of one byte."""
 
 RECORD = "record at least compensator/journal and compensator/files"
 
@@ -116,6 +120,16 @@ class Recording:
     def first(self) -> Snapshot:
         """The first snapshot."""
         return next(page.snapshot for _, page in self.pages if page.snapshot is not None)
+
+    @cached_property
+    def frames(self) -> np.ndarray:
+        """For each command the machine's name of its frame, shape (n,); empty where its session names none."""
+        sessions = {page.session: tuple(page.snapshot.frames) for _, page in self.pages if page.snapshot is not None}
+        names = [np.zeros(0, dtype=object)]
+        for _, page in self.pages:
+            known = sessions.get(page.session, ROLES)
+            names.append(np.array([*known, *[""] * MOST_FRAMES], dtype=object)[page.commands["frame"]])
+        return np.concatenate(names)
 
 
 def read_recording(
@@ -373,7 +387,10 @@ class _Collected:
             f"{count} messages of {name} left out: not a position for each of {', '.join(self._joints)}"
             for name, count in self._odd.items()
         ]
-        return Recording(str(self._path), self._node, topics, pages, commands, self._sources, heard, notes)
+        recording = Recording(str(self._path), self._node, topics, pages, commands, self._sources, heard, notes)
+        if (recording.frames == "").any():
+            raise InputFileError(self._path, self._node + JOURNAL, "has a command in a frame that no snapshot names")
+        return recording
 
 
 def _in_order(pages: list[tuple[int, Page]]) -> list[tuple[int, Page]]:

@@ -15,7 +15,8 @@ from .replay import BEFORE, DIFFERENT, LOST
 from .report import LONGEST_GAP, Report, following_error, since, tool_positions
 
 EVENT_COLOURS = {
-    "temperature": "#8a6d3b", "humidity": "#1f78b4", "model": "#7b3294", "enable": "#2e8b57", "reset": "#555555",
+    "temperature": "#8a6d3b", "humidity": "#1f78b4", "model": "#7b3294", "enable": "#2e8b57", "tool": "#b8860b",
+    "reset": "#555555",
 }  # fmt: skip
 
 MOST_LABELS = 12
@@ -144,7 +145,7 @@ def following_figure(report: Report) -> Figure:
 def tool_figure(report: Report, geometry: HexapodGeometry) -> Figure:
     """Show the commanded tool path from above and from the side, and where the compensator thought the tool was."""
     figure = _figure(report, "Tool", 5.0)
-    positions = tool_positions(report.recording, geometry.work)
+    positions = tool_positions(report.recording, geometry.work_frames)
     estimates = report.recording.topics["tool_pose_estimate"]
     both = len(estimates) > 1 and len(positions) > 1
     panels = figure.subplots(1, 3 if both else 2)

@@ -14,11 +14,10 @@ import numpy as np
 
 from ..compensation.compensator import Compensator
 from ..compensation.journal import Entry, Page, Snapshot, time_of
-from ..compensation.state import pack_pose
-from ..errors import HexapodError
+from ..compensation.state import BESIDE_NUMBERS, pack_pose
+from ..errors import FrameError, HexapodError
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
-from ..pose import Pose
 from .bag import Files, Recording
 
 IDENTICAL, DIFFERENT, LOST, BEFORE = range(4)
@@ -138,8 +137,8 @@ def what_if(
 
 
 def _begin(compensator: Compensator, snapshot: Snapshot) -> dict[str, Any]:
-    """Return a snapshot with no more than what another machine can take over: directions and switches."""
-    kept = ("temperatures", "motion_sense", "enabled", "resumes", "ramp_rate")
+    """Return a snapshot with no more than what another machine can take over: directions, switches, the tool's name."""
+    kept = ("temperatures", "tool", "motion_sense", "enabled", "resumes", "ramp_rate")
     fresh = compensator.snapshot() | {name: value for name, value in snapshot.state.items() if name in kept}
     return fresh | {"motion_sense": np.nan_to_num(fresh["motion_sense"])}
 
@@ -157,7 +156,7 @@ class _Run:
     def take(self, compensator: Compensator) -> None:
         """Give the commands from now on to a compensator."""
         self.compensator = compensator
-        self._frames = pack_pose(Pose.identity()), pack_pose(compensator.geometry.work)  # as journal.ROLES
+        self._frames = {name: pack_pose(pose) for name, pose in compensator.geometry.work_frames.items()}
 
     def run(self) -> Replay:
         """Return what comes of it."""
@@ -195,6 +194,8 @@ class _Run:
             self.compensator.enable(bool(values["on"]))
         elif entry.what == "ramp_rate":
             self.compensator.set_ramp_rate(values["value"])
+        elif entry.what == "tool":
+            self.compensator.set_tool(values["name"])
         elif entry.what == "reset":
             measured = values["measured"]
             self.compensator.reset(None if measured is None else np.array(measured, dtype=float))
@@ -203,7 +204,9 @@ class _Run:
         """Give the command that was answered, as the node did; return what comes of it."""
         asked, given = self._commands[row], self.result.lengths[row]
         try:
-            frame = self._frames[asked["frame"]]
+            frame = self._frames.get(name := self._recording.frames[row])
+            if frame is None:
+                raise FrameError(f"the machine has no work frame {name!r}")
             time = time_of(int(asked["stamp"]), bool(asked["stamped"]))
             self.compensator.step(tuple(asked["pose"].tolist()), time, frame, float(asked["received"]))
         except HexapodError as error:
@@ -267,7 +270,6 @@ class _AsItWas(_Run):
 
 def _same_state(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Return whether two snapshots are the same, all NaN being one number."""
-    by_part = ("temperatures", "lags")
-    if one.keys() != other.keys() or any(one[name] != other[name] for name in by_part):
+    if one.keys() != other.keys() or any(one[name] != other[name] for name in BESIDE_NUMBERS):
         return False
-    return all(np.array_equal(one[name], other[name], equal_nan=True) for name in one if name not in by_part)
+    return all(np.array_equal(one[name], other[name], equal_nan=True) for name in one if name not in BESIDE_NUMBERS)

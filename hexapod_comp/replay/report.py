@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
 
-from ..compensation.journal import ROLES, made_with
+from ..compensation.journal import made_with
 from ..errors import printable
 from ..formats.texts import aligned
 from ..machine.trajectory import feet_on, motion_onto
@@ -49,8 +49,8 @@ class Report:
         What that was.
     tolerance : float
         Differences up to this, m, are accepted.
-    work : Pose or None
-        The work frame in ``base``, where the geometry is at hand: without it nobody can tell where the tool went.
+    work_frames : mapping of str to Pose or None
+        In ``base``, where the geometry is at hand: without them nobody can tell where the tool went.
     """
 
     recording: Recording
@@ -58,7 +58,7 @@ class Report:
     other: Replay | None = None
     other_name: str = ""
     tolerance: float = 0.0
-    work: Pose | None = None
+    work_frames: Mapping[str, Pose] | None = None
 
     @property
     def seconds(self) -> np.ndarray:
@@ -250,9 +250,9 @@ def tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray
     A late tool is not off. The second is None where the tool moved in a line or not at all.
     """
     when = report.seconds
-    if report.work is None or len(when) < 2:
+    if report.work_frames is None or len(when) < 2:
         return
-    corners = tool_positions(report.recording, report.work)
+    corners = tool_positions(report.recording, report.work_frames)
     for name in ("tool_pose_estimate", "tool_pose_true"):
         poses = report.recording.topics[name]
         stamps = poses.stamps if poses.stamps.all() else poses.times
@@ -303,11 +303,12 @@ def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
     return at[inside], states.values[inside] - wanted
 
 
-def tool_positions(recording: Recording, work: Pose) -> np.ndarray:
-    """Return where the tool was commanded in ``base``, (n, 3), m, with the work frame seen from ``base``."""
+def tool_positions(recording: Recording, work_frames: Mapping[str, Pose]) -> np.ndarray:
+    """Return where the tool was commanded in ``base``, (n, 3), m, with the work frames seen from ``base``."""
     positions = recording.commands["pose"][:, :3].copy()
-    in_work = recording.commands["frame"] == ROLES.index("work")
-    positions[in_work] = work.position + positions[in_work] @ work.rotation.T
+    for name, frame in work_frames.items():
+        inside = recording.frames == name
+        positions[inside] = frame.position + positions[inside] @ frame.rotation.T
     return positions
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from ..formats.texts import aligned, number
 from ..kernels.limits import WITHIN
 from ..machine.doubts import doubts, twist_per_lead
+from ..machine.frames import BASE
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import condition_number, strut_lengths
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
@@ -160,11 +161,11 @@ def _tilt_text(tilts: np.ndarray) -> str:
 
 
 def named_frames(geometry: HexapodGeometry) -> dict[str, tuple[str, Pose]]:
-    """Return platform and tool at home, and the work frame, by name: in which frame each is given, and its pose."""
+    """Return platform and tool at home, all tools and work frames, by name: the frame each is given in, its pose."""
     return {
         "platform, at home": ("base", geometry.home),
-        "tool": ("platform", geometry.tool),
-        "work": ("base", geometry.work),
+        **{name: ("platform", pose) for name, pose in geometry.tools.items()},
+        **{name: ("base", pose) for name, pose in geometry.work_frames.items() if name != BASE},
         "tool, at home": ("work", geometry.tool_pose(geometry.home)),
     }
 

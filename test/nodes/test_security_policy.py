@@ -175,7 +175,7 @@ def test_the_operator_may_all_that_the_ros2_tools_open(ros_context: Context, cap
             for right, names in opened(bench.witness, node.get_name(), "").items():
                 wanted[right] |= {name.replace(f"/{node.get_name()}/", f"/{TOOLS}/") for name in names}
             node.destroy_node()
-    own = {f"/compensator/{name}" for name in ("enable_compensation", "reload_model", "reset")}
+    own = {f"/compensator/{name}" for name in ("enable_compensation", "reload_model", "reset", "get_travel")}
     assert wanted["request"] == operator["request"] - own
     assert wanted["publish"] == operator["publish"]
     assert wanted["reply"] == operator["reply"]

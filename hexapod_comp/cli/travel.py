@@ -1,0 +1,39 @@
+"""``hexapod_comp travel``: how far the tool may go from a pose."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from . import common
+
+if TYPE_CHECKING:
+    from ..workspace.travel import Travel
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the verb."""
+    from ..machine.model import RealMachine
+    from ..pose import Pose
+    from ..workspace.travel import pose_text, travel, travel_text
+
+    geometry, model = common.load_machine(args)
+    if args.pose is None:
+        pose = geometry.tool_pose(geometry.home)
+    else:
+        _, positions, rotations = common.one_row(args.pose)
+        pose = Pose(positions[0], rotations[0])
+    common.mention_compiling("travel.travel_one")
+    ways = travel(RealMachine(geometry, model), pose)
+    if args.json:
+        machine = {"machine": geometry.name, "model": model.name, **common.frames(geometry)}
+        common.show({**machine, "pose": pose, "travel": [_as_json(way) for way in ways]})
+    else:
+        title = f"{common.machine_title(geometry, model)}: how far {common.whose(geometry)} may go"
+        common.show(f"{title} from {pose_text(pose)}\n{travel_text(ways)}")
+    return 0
+
+
+def _as_json(way: Travel) -> dict[str, Any]:
+    limit, problem = (None, None) if way.error is None else (way.error.reason, str(way.error))
+    return {"way": way.way, "unit": way.unit, "travel": way.shown, "limit": limit, "problem": problem}

@@ -1,0 +1,148 @@
+"""How far a tool may go from where it is, one way after the other, until a limit stands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..compensation.findings import refuse
+from ..compensation.state import CommandState, pack_fixed, pack_pose
+from ..errors import HexapodError
+from ..formats.texts import aligned, number
+from ..kernels.travel import travel_one
+from ..machine.model import RealMachine
+from ..pose import Pose
+
+COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")
+
+STEPS = 500
+"""Into so many steps the longest strut is divided; what is narrower than one may be stepped over."""
+
+TURN_STEP, LONGEST_TURN = math.radians(0.5), math.pi
+"""The same for turns, rad, and how far they are followed."""
+
+
+@dataclass(frozen=True)
+class Travel:
+    """How far a tool may go one way.
+
+    Attributes
+    ----------
+    coordinate : str
+        One of :data:`COORDINATES`; the others stay.
+    sign : int
+        1 or −1.
+    distance : float
+        The furthest that all limits allow, m or rad.
+    error : HexapodError or None
+        What stands beyond; None where a turn ends at π.
+    """
+
+    coordinate: str
+    sign: int
+    distance: float
+    error: HexapodError | None
+
+    @property
+    def way(self) -> str:
+        """``+x``, ``-alpha``."""
+        return f"{'+' if self.sign > 0 else '-'}{self.coordinate}"
+
+    @property
+    def unit(self) -> str:
+        """Of what is shown: mm or deg."""
+        return "deg" if self.coordinate in COORDINATES[3:] else "mm"
+
+    @property
+    def key(self) -> str:
+        """What :attr:`shown` is called: way and unit."""
+        return f"{self.way}_{self.unit}"
+
+    @property
+    def shown(self) -> float:
+        """The distance in the unit shown."""
+        return self.distance * (1e3 if self.unit == "mm" else 180.0 / math.pi)
+
+
+def travel(
+    machine: RealMachine, tool_pose: Pose, frame: Pose | None = None, compensates: bool = True
+) -> tuple[Travel, ...]:
+    """Return how far the tool may go from a pose, by each of its six coordinates, forward and backward.
+
+    All limits of single poses count, on nominal and on compensated values: stroke, joint cones, clearance, condition
+    number, assembly mode, correction, and the field's box where the model refuses what lies outside. Those of motions,
+    step, speed and acceleration, do not. Directions of motion are not known, as for
+    :func:`~hexapod_comp.compensation.checks.check` with ``poses``.
+
+    Parameters
+    ----------
+    machine : RealMachine
+        Limits, model, and the tool in use.
+    tool_pose : Pose
+        Of the tool in `frame`; angles are the paper's α, β, γ.
+    frame : Pose, optional
+        Seen from ``base``; the machine's work frame by default.
+    compensates : bool, optional
+        Corrections are on.
+
+    Returns
+    -------
+    tuple of Travel
+        +x, −x, +y, … −γ.
+
+    Raises
+    ------
+    LimitError, KinematicsError, OutsideFieldError
+        The pose itself is not allowed.
+    """
+    start = _Start(machine, tool_pose, machine.geometry.work if frame is None else frame, compensates)
+    return tuple(start.travel(coordinate, sign) for coordinate in COORDINATES for sign in (1, -1))
+
+
+class _Start:
+    """Where a machine's tool starts from, packed for the kernel."""
+
+    def __init__(self, machine: RealMachine, tool_pose: Pose, frame: Pose, compensates: bool) -> None:
+        self._machine, self._tool = machine, tool_pose
+        self._judging = pack_pose(frame), pack_fixed(machine), machine.model.field.outside == "refuse"
+        self._last, self._next = CommandState(0.0), CommandState(0.0)
+        self._last.state.enabled[:] = float(compensates)
+        _, beta, _ = tool_pose.angles()
+        # R = Ry(β)·Rx(α)·Rz(γ): α turns about x as Ry(β) leaves it, β about y, γ about the tool's own z.
+        axes = np.array([[math.cos(beta), 0.0, -math.sin(beta)], [0.0, 1.0, 0.0], tool_pose.rotation[:, 2]])
+        self._axes = np.concatenate([np.eye(3), axes])
+
+    def travel(self, coordinate: str, sign: int) -> Travel:
+        """Return how far the tool may go; raise what is wrong with where it starts."""
+        index = COORDINATES.index(coordinate)
+        turns, axis = index >= 3, sign * self._axes[index]
+        vectors = (np.zeros(3), axis) if turns else (axis, np.zeros(3))
+        stroke = float(self._machine.geometry.limits.stroke.max())
+        steps = (TURN_STEP, LONGEST_TURN) if turns else (stroke / STEPS, 4.0 * stroke)
+        pose, states = (self._tool.position, self._tool.rotation), (self._last.numbers, self._next.numbers)
+        inside, outside, refused = travel_one(*pose, *vectors, *steps, *self._judging, *states)
+        try:
+            refuse(refused, self._next, self._machine)
+        except HexapodError as error:
+            if outside == 0.0:
+                raise
+            return Travel(coordinate, sign, inside, error)
+        return Travel(coordinate, sign, inside, None)
+
+
+def travel_text(ways: Sequence[Travel]) -> str:
+    """Return a table: way, how far, and what stands there; empty without ways."""
+    if not ways:
+        return ""
+    rows = [[one.way, number(one.shown, 3), one.unit, str(one.error or "no limit")] for one in ways]
+    return aligned(["way", "travel", "unit", ""], rows)
+
+
+def pose_text(pose: Pose) -> str:
+    """Return a pose in mm and degrees, for people."""
+    places = ", ".join(number(value * 1e3, 3) for value in pose.position)
+    angles = ", ".join(number(math.degrees(value), 4) for value in pose.angles())
+    return f"x, y, z {places} mm, alpha, beta, gamma {angles} deg"
