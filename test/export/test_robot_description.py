@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from foreign_machines import machines
+from foreign_machines import machines, with_frames
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.cli import main
@@ -105,6 +105,22 @@ def test_mujoco_agrees_and_closes_the_loops(name: str, tmp_path: Path):
         tied = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
         assert tied.sum() == 18
         assert np.abs(data.efc_pos[tied]).max() < SAME
+
+
+@pytest.mark.parametrize("name", ["framed", "hanging", "inches", "mirror"])
+def test_named_tools_and_work_frames_are_there(name: str, tmp_path: Path):
+    """Truth: the zoo's own frames; the tools' poses in the platform are where MJCF's sites stand."""
+    machine = with_frames(name)
+    geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
+    placed = links(ET.fromstring(urdf(geometry).encode()), joint_positions(geometry, geometry.home))
+    for tool, frame in machine.tools.items():
+        in_base = transform(geometry.home.position, np.eye(3)) @ transform(np.array(frame.position), frame.matrix)
+        np.testing.assert_allclose(placed[tool], in_base, rtol=0, atol=SAME)
+        site = ET.fromstring(mjcf(geometry).encode()).find(f".//site[@name='{tool}']")
+        np.testing.assert_allclose(np.array(site.get("pos").split(), dtype=float), frame.position, rtol=0, atol=SAME)
+    fixture = machine.work_frames["fixture"]
+    wanted = transform(np.array(fixture.position), fixture.matrix)
+    np.testing.assert_allclose(placed["fixture"], wanted, rtol=0, atol=SAME)
 
 
 def test_export_writes_both_without_a_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

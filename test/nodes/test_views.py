@@ -139,7 +139,8 @@ def test_arguments_reach_the_nodes(launch_file: LaunchFile) -> None:
     words = ["geometry:=example_6_6.yaml", "model:=m.yaml", "truth:=t.yaml", "autostart:=false", "use_sim_time:=true"]
     nodes = launch_file.start(*words, "frame_prefix:=left/", "namespace:=left", "rviz:=true")
     both = {"autostart": False, "use_sim_time": True, "base_frame": "left/base", "geometry_file": "example_6_6.yaml"}
-    assert parameters(nodes["compensator"]) == {**both, "model_file": "m.yaml", "work_frame": "left/work"}
+    own = {"model_file": "m.yaml", "work_frame": "left/work", "frame_prefix": "left/"}
+    assert parameters(nodes["compensator"]) == {**both, **own}
     assert parameters(nodes["strut_drive"]) == {**both, "truth_file": "t.yaml"}
     assert {node["namespace"] for node in nodes.values()} == {"left"}
     description = parameters(nodes["robot_state_publisher"])
