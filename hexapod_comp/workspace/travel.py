@@ -98,11 +98,11 @@ def travel(
     LimitError, KinematicsError, OutsideFieldError
         The pose itself is not allowed.
     """
-    start = _Start(machine, tool_pose, machine.geometry.work if frame is None else frame, compensates)
+    start = _Outset(machine, tool_pose, machine.geometry.work if frame is None else frame, compensates)
     return tuple(start.travel(coordinate, sign) for coordinate in COORDINATES for sign in (1, -1))
 
 
-class _Start:
+class _Outset:
     """Where a machine's tool starts from, packed for the kernel."""
 
     def __init__(self, machine: RealMachine, tool_pose: Pose, frame: Pose, compensates: bool) -> None:
