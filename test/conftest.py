@@ -74,6 +74,12 @@ def isolated_ros(hexapod_domain: int) -> int:
 
 
 @pytest.fixture
+def unsuspected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out of fits what else their readings might be: where that is not asked, it takes longest."""
+    monkeypatch.setattr("hexapod_comp.calibration.verdict.suspicions", lambda *_: [])
+
+
+@pytest.fixture
 def ros_context(hexapod_context: Context) -> Context:
     """Give a private rclpy context."""
     return hexapod_context

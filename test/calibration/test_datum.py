@@ -109,7 +109,7 @@ def test_a_fit_with_poses_of_a_tracker_is_not_touched() -> None:
     assert "the readings saw it" in str(fit.model.origin.datum)
 
 
-def test_another_datum_can_be_given_and_one_out_of_reach_is_refused() -> None:
+def test_another_datum_can_be_given_and_one_out_of_reach_is_refused(unsuspected: None) -> None:
     pose = Pose(np.array([0.05, -0.04, 0.42]), rotation(3.0, -2.0, 5.0))
     readings = small.measured(small.virtual_machine(4), small.campaign(), 4)
     model = fit_model(readings, replace(small.FEW, blocks=()), datum=pose).model

@@ -321,7 +321,7 @@ def test_blocks_that_the_machine_has_are_kept_and_no_others():
     assert not any(d.kept for d in fit.decisions)
 
 
-def test_a_field_is_found():
+def test_a_field_is_found(unsuspected: None):
     """A field of 30 µm and 60 µrad, with terms up to degree six, is kept and takes a good part of it away."""
     bounds = replace(small.BOUNDS, field_displacement=30e-6, field_rotation=60e-6, field_box=small.BOX,
                      field_reversal=0.0)  # fmt: skip
