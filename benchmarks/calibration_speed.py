@@ -1,9 +1,10 @@
 """How long a fit of scheme joint takes: the shipped 5-D campaign on the paper's machine, read more and more finely.
 
 The campaign's 8,046 readings, and the same lines with readings so many times as dense. The processor's time is the
-whole program's, so that a busy computer changes it little; one thread.
+whole program's, so that a busy computer changes it little; one thread. Answers can be kept and compared with those of
+another version: the largest difference of a parameter, in its standard error.
 
-Usage: python -m benchmarks.calibration_speed [--dense 1 14] [--json]
+Usage: python -m benchmarks.calibration_speed [--dense 1 14] [--save FILE] [--against FILE] [--json]
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.machine.geometry import load_geometry
@@ -29,8 +32,11 @@ from hexapod_comp.virtual.named import find_model
 CONFIG = Path(__file__).resolve().parents[1] / "config"
 
 
-def timed(dense: int) -> dict[str, float]:
-    """Return readings, seconds and what is promised of a fit with readings so many times as dense."""
+def timed(dense: int) -> tuple[dict[str, float], np.ndarray]:
+    """Return readings, seconds and what is promised of a fit with readings so many times as dense; and its answer.
+
+    The answer: parameters and their standard errors, shape (2, size).
+    """
     geometry = load_geometry(CONFIG / "paper.yaml")
     campaign = load_campaign(CONFIG / "campaign_5d.yaml")
     campaign = replace(campaign, step=campaign.step / dense)
@@ -40,7 +46,7 @@ def timed(dense: int) -> dict[str, float]:
     fit = fit_model(readings, FitSettings(lead=0.01))
     processor, clock = time.process_time() - processor, time.perf_counter() - clock
     expected = fit.level.after * 1e6 if fit.level is not None else float("nan")
-    return {
+    row = {
         "readings": len(readings),
         "parameters": fit.space.size,
         "steps": fit.solution.steps,
@@ -48,6 +54,7 @@ def timed(dense: int) -> dict[str, float]:
         "clock_s": clock,
         "expected_um": expected,
     }
+    return row, np.array([fit.solution.x, fit.standard_errors])
 
 
 def main() -> None:
@@ -55,9 +62,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--dense", type=int, nargs="+", default=[1, 14], help="times as many readings (default 1 14)")
     parser.add_argument("--json", action="store_true", help="JSON instead of a table")
+    parser.add_argument("--save", type=Path, metavar="FILE", help="keep the answers (.npz)")
+    parser.add_argument("--against", type=Path, metavar="FILE", help="compare the answers with kept ones")
     args = parser.parse_args()
     timed(1)  # compiled and loaded
-    rows = [timed(dense) for dense in args.dense]
+    rows, answers = zip(*map(timed, args.dense), strict=True)
+    if args.save is not None:
+        np.savez(args.save, **{f"dense_{dense}": answer for dense, answer in zip(args.dense, answers, strict=True)})
+    if args.against is not None:
+        kept = np.load(args.against)
+        for dense, row, (x, error) in zip(args.dense, rows, answers, strict=True):
+            row["difference"] = float((np.abs(x - kept[f"dense_{dense}"][0]) / error).max())
     if args.json:
         print(json.dumps(rows, indent=1))
         return
@@ -66,6 +81,7 @@ def main() -> None:
         print(
             f"{row['readings']:8.0f}  {row['parameters']:10.0f}  {row['steps']:5.0f}  {row['processor_s']:11.1f}"
             f"  {row['clock_s']:7.1f}  {row['expected_um']:11.3f}"
+            + (f"  differs by {row['difference']:.1g} standard errors" if "difference" in row else "")
         )
 
 

@@ -97,7 +97,9 @@ class Estimation:
             problem = f"{len(measurements)} readings at {len(self.cells.station)} distinct places leave {free} "
             raise CalibrationError("measurements", problem + f"numbers for the structure's {needed} parameters")
 
-    def linearise(self, x: np.ndarray, reading_weights: np.ndarray) -> tuple[LinearProblem, np.ndarray]:
+    def linearise(
+        self, x: np.ndarray, reading_weights: np.ndarray, prediction: Prediction | None = None
+    ) -> tuple[LinearProblem, np.ndarray]:
         """Return the linear problem at a parameter vector, and each reading's residual there, m or rad.
 
         Parameters
@@ -106,6 +108,8 @@ class Estimation:
             Parameters, SI.
         reading_weights : ndarray, shape (N,)
             Trust in each reading, 0…1.
+        prediction : Prediction, optional
+            What the machine of these parameters does, if that is known.
 
         Raises
         ------
@@ -117,7 +121,7 @@ class Estimation:
         total = np.bincount(c.of_reading, weights)
         scale = np.sqrt(total)
         values = np.bincount(c.of_reading, weights * m.value) / total
-        prediction, directions = self._predicted(x), c.directions.copy()
+        prediction, directions = prediction or self._predicted(x), c.directions.copy()
         expected, unknowns = self._unknowns(directions, prediction.errors[c.station], values, scale)
         misfit = m.value - expected[c.of_reading]
         mean = np.bincount(c.of_reading, weights * misfit) / total

@@ -1,6 +1,6 @@
 """Another reading of the data: a sign, a unit, an axis, a direction or a machine that would explain readings better.
 
-Each is tried with a plain model, structure, pitch and backlash, to which it either fits or not; a length map or a field
+Each is tried with a plain model, structure and screws, to which it either fits or not; a length map or a field
 could describe nearly any readings.
 """
 
@@ -17,14 +17,15 @@ from ..formats.paths import config_file
 from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.passes import Passes
-from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, MeasurementSet
+from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, MeasurementSet, Stations
 from .estimation import Estimation
-from .linear_problem import solve
+from .linear_problem import LinearProblem, Posterior, solve
 from .misfit import FAMILIES, family_of_run
-from .parameters import FitSettings, ParameterSpace
+from .parameters import WAVES, FitSettings, ParameterSpace
+from .sensitivity import Prediction, predict
 
-PLAIN = ("pitch", "wave", "backlash")
-"""Blocks beside the structure: what every machine has, and enough to tell one reading of the data from another."""
+PLAIN = ("pitch", *WAVES, "backlash")
+"""Blocks beside the structure: of the struts alone, and enough to tell one reading of the data from another."""
 
 BETTER, SURELY = 3.0, 1.2
 """Another reading is named when some kind of channel fits so many times better, and all together so many times."""
@@ -92,16 +93,16 @@ def suspicions(
         chosen = np.zeros(len(measurements), dtype=bool)
         chosen[rng.choice(len(measurements), ENOUGH, replace=False)] = True
         measurements = measurements.select(chosen)
-    plain = replace(settings, blocks=PLAIN)
+    plain = _Plain(replace(settings, blocks=PLAIN))
     whole = Reinterpretation("", measurements, np.ones(len(KINDS)))
-    as_they_are = _noise(whole, plain)
+    as_they_are = plain.noise(whole)
     if as_they_are is None or (left and all(as_they_are[k] < BETTER * value for k, value in left.items())):
         return []
     counts = np.bincount(measurements.kind, minlength=len(KINDS))
     tried = []
     for other in _others(measurements, plain):
         progress(f"trying {other.name}")
-        noise = _noise(other, plain)
+        noise = plain.noise(other)
         if noise is not None:
             gains = np.where(counts > 0, as_they_are / noise, 1.0)
             tried.append((float(np.exp(counts @ np.log(gains) / counts.sum())), float(gains.max()), other.name))
@@ -109,20 +110,44 @@ def suspicions(
     return [f"{name} fits {best:.3g} times better" for total, best, name in clear if total > clear[0][0] / AS_GOOD]
 
 
-def _noise(tried: Reinterpretation, settings: FitSettings) -> np.ndarray | None:
-    """Return what a plain model leaves of each kind, in the values' own scale, (kinds,); None where it cannot be."""
-    try:
-        space = ParameterSpace(tried.measurements, settings)
-        estimation = Estimation(tried.measurements, space, alone=False)
-        problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(tried.measurements)))
-        posterior = solve(space, problem, space.start_tolerances(), np.ones(len(KINDS)))
-    except (HexapodError, np.linalg.LinAlgError):
-        return None
-    stated = np.array([tried.measurements.stated_of(k) for k in range(len(KINDS))])
-    return posterior.noise * stated / tried.scale
+class _Plain:
+    """Plain fits; the nominal machine is sent once where readings of the same stations are read differently."""
+
+    def __init__(self, settings: FitSettings) -> None:
+        self._settings = settings
+        self._sent: dict[int, tuple[Stations, Prediction]] = {}
+
+    def _fitted(self, m: MeasurementSet) -> tuple[Estimation, LinearProblem, Posterior] | None:
+        """Return readings, their problem at the nominal machine and its solution; None where it cannot be."""
+        try:
+            space = ParameterSpace(m, self._settings)
+            estimation, x = Estimation(m, space, alone=False), np.zeros(space.size)
+            if id(m.stations) not in self._sent:
+                self._sent[id(m.stations)] = m.stations, predict(space, x, m.stations)
+            problem, _ = estimation.linearise(x, np.ones(len(m)), self._sent[id(m.stations)][1])
+            return estimation, problem, solve(space, problem, space.start_tolerances(), np.ones(len(KINDS)))
+        except (HexapodError, np.linalg.LinAlgError):
+            return None
+
+    def noise(self, tried: Reinterpretation) -> np.ndarray | None:
+        """Return what a plain model leaves of each kind, (kinds,), in the values' own scale; None if it cannot be."""
+        fitted = self._fitted(tried.measurements)
+        if fitted is None:
+            return None
+        stated = np.array([tried.measurements.stated_of(k) for k in range(len(KINDS))])
+        return fitted[-1].noise * stated / tried.scale
+
+    def unlike(self, m: MeasurementSet) -> np.ndarray:
+        """Return which runs are rather the opposite of what a plain fit to all says, shape (runs,)."""
+        fitted = self._fitted(m)
+        if fitted is None:
+            return np.zeros(len(m.runs), dtype=bool)
+        estimation, problem, posterior = fitted
+        products = problem.target * problem.rows.times(posterior.y)
+        return np.bincount(m.run[estimation.cells.first], products, len(m.runs)) < 0.0
 
 
-def _others(m: MeasurementSet, settings: FitSettings) -> Iterator[Reinterpretation]:
+def _others(m: MeasurementSet, plain: _Plain) -> Iterator[Reinterpretation]:
     """Yield other readings of the same data."""
     for name, members in _parts(m):
         yield _multiplied(m, f"{name}: sign reversed", members, -1.0)
@@ -131,7 +156,7 @@ def _others(m: MeasurementSet, settings: FitSettings) -> Iterator[Reinterpretati
     as_it_is = np.ones(len(KINDS))
     swapped = replace(m, direction=-m.direction, stations=replace(m.stations, sense=-m.stations.sense))
     yield Reinterpretation("forward and backward: swapped", swapped, as_it_is)
-    yield from _reversed_runs(m, settings)
+    yield from _reversed_runs(m, plain)
     if np.allclose(m.stations.commands, _nominal(m.geometry, m), rtol=0.0, atol=1e-9):
         for a, b in combinations(range(3), 2):
             yield Reinterpretation(f"{AXES[a]} and {AXES[b]}: exchanged", _exchanged_axes(m, a, b), as_it_is)
@@ -192,7 +217,7 @@ def _exchanged_channels(m: MeasurementSet) -> Iterator[Reinterpretation]:
             yield Reinterpretation(title, replace(m, channel=channel), np.ones(len(KINDS)))
 
 
-def _reversed_runs(m: MeasurementSet, settings: FitSettings) -> Iterator[Reinterpretation]:
+def _reversed_runs(m: MeasurementSet, plain: _Plain) -> Iterator[Reinterpretation]:
     """Yield sets with the signs of some runs reversed, where the runs of a family differ in sign."""
     family, slopes = family_of_run(m), _slopes(m)
     present = np.unique(family)
@@ -200,7 +225,7 @@ def _reversed_runs(m: MeasurementSet, settings: FitSettings) -> Iterator[Reinter
         way = dict(zip(present.tolist(), ways, strict=True))
         signs = np.where(slopes < 0.0, -1.0, 1.0) * [way[n] for n in family.tolist()]
         for _ in range(ROUNDS):
-            unlike = _unlike(m.with_values(m.value * signs[m.run]), settings)
+            unlike = plain.unlike(m.with_values(m.value * signs[m.run]))
             signs = np.where(unlike, -signs, signs)
             if not unlike.any():
                 break
@@ -210,18 +235,6 @@ def _reversed_runs(m: MeasurementSet, settings: FitSettings) -> Iterator[Reinter
             listed = ", ".join(names[:3]) + (", …" if len(names) > 3 else "")
             title = f"{len(names)} of {len(m.runs)} runs ({listed}): sign reversed"
             yield Reinterpretation(title, m.with_values(m.value * signs[m.run]), np.ones(len(KINDS)))
-
-
-def _unlike(m: MeasurementSet, settings: FitSettings) -> np.ndarray:
-    """Return which runs are rather the opposite of what a plain fit to all says, shape (runs,)."""
-    try:
-        space = ParameterSpace(m, settings)
-        estimation = Estimation(m, space, alone=False)
-        problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(m)))
-        y = solve(space, problem, space.start_tolerances(), np.ones(len(KINDS))).y
-    except (HexapodError, np.linalg.LinAlgError):
-        return np.zeros(len(m.runs), dtype=bool)
-    return np.bincount(m.run[estimation.cells.first], problem.target * problem.rows.times(y), len(m.runs)) < 0.0
 
 
 def _slopes(m: MeasurementSet) -> np.ndarray:
