@@ -180,7 +180,10 @@ def _strut(robot: ET.Element, geometry: HexapodGeometry, n: int, name: str) -> N
 
 
 def _control(robot: ET.Element, joint_names: Sequence[str]) -> None:
-    """Add ros2_control's block: the struts' positions, through topics."""
+    """Add ros2_control's block: the struts' positions, through topics.
+
+    The hardware ends at a reading with velocities, which ours have, unless each joint has a state for them.
+    """
     control = ET.SubElement(robot, "ros2_control", name=robot.get("name", ""), type="system")
     system = ET.SubElement(control, "hardware")
     ET.SubElement(system, "plugin").text = "joint_state_topic_hardware_interface/JointStateTopicSystem"
@@ -189,7 +192,8 @@ def _control(robot: ET.Element, joint_names: Sequence[str]) -> None:
     for name in joint_names:
         joint = ET.SubElement(control, "joint", name=name)
         ET.SubElement(joint, "command_interface", name="position")
-        ET.SubElement(joint, "state_interface", name="position")
+        for state in ("position", "velocity"):
+            ET.SubElement(joint, "state_interface", name=state)
 
 
 Shape = tuple[str, dict[str, str], np.ndarray]

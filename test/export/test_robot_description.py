@@ -132,6 +132,8 @@ def test_export_writes_both_without_a_model(tmp_path: Path, capsys: pytest.Captu
     topics = {param.get("name"): param.text for param in robot.find("ros2_control").iter("param")}
     assert topics["joint_commands_topic"] == "strut_setpoints"
     assert topics["joint_states_topic"] == "nominal_strut_states"  # measured ones would be corrected once more
+    for joint in robot.find("ros2_control").findall("joint"):  # JointStateTopicSystem ends at what has no interface
+        assert [state.get("name") for state in joint.findall("state_interface")] == ["position", "velocity"]
     controllers = yaml.safe_load(config_file("ros2_control.yaml").read_text())
     for name in ("joint_trajectory_controller", "forward_command_controller"):
         assert name in controllers["controller_manager"]["ros__parameters"]
