@@ -20,18 +20,16 @@ import numpy as np
 from benchmarks.calibration import CONFIG, LARGE, LEAD
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings
-from hexapod_comp.compensation.thermal import TemperatureFilter
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.late import PARTS
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.passes import Passes, random_passes
-from hexapod_comp.machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
+from hexapod_comp.machine.temperatures import Temperatures
 from hexapod_comp.measurements.campaign import Campaign, template
-from hexapod_comp.measurements.campaign_runs import CampaignRun
 from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.virtual.imperfections import draw_model
-from hexapod_comp.virtual.instruments import measure
 from hexapod_comp.virtual.trial import Trial
+from hexapod_comp.virtual.warm_up import WarmUp
 
 BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])
 INCH = 0.0254
@@ -47,9 +45,6 @@ STEEL, SPREAD = 11.5e-6, 1e-6
 SENSORS = {"a sensor on each part": ("", 0.95), "one sensor in the base": ("base", 0.85)}
 """Which thermometer stands for all, and the bar: share of the drift removed."""
 
-ROUND, ROUNDS = 600, 18
-"""Lines are measured again every so many seconds, so many times."""
-
 DAY, OFF = 9000, (3600, 6000)
 """Length of the judged day, s, and from when to when the power is off."""
 
@@ -61,86 +56,48 @@ class Truth:
     """A machine and how its parts warm."""
 
     model: MachineModel
-    rise: np.ndarray
-    tau: np.ndarray
+    warm_up: WarmUp
 
     @staticmethod
-    def drawn(geometry: HexapodGeometry, seed: int) -> Truth:
-        """Return the machine of a seed."""
+    def drawn(geometry: HexapodGeometry, thermometer: str, noise: float, seed: int) -> Truth:
+        """Return the machine of a seed, with a thermometer in one part, or in each where that is empty."""
         rng = np.random.default_rng([seed, 16])
         struts, base, platform = STEEL + SPREAD * rng.standard_normal(3)
         model = draw_model(geometry, LARGE, seed)
         expansion = struts + 0.2 * SPREAD * rng.standard_normal(6)
         model = replace(model, struts=replace(model.struts, expansion=expansion))
         apart = 1.0 + APART * np.concatenate([rng.standard_normal((6, 2)), np.zeros((2, 2))])
-        return Truth(
-            replace(model, base_expansion=base, platform_expansion=platform), RISE * apart[:, 0], TAU * apart[:, 1]
-        )
-
-    def temperatures(self, seconds: int, off: tuple[int, int] = (0, 0)) -> np.ndarray:
-        """Return the parts' temperatures, °C, at each second from switching on, shape (seconds + 1, 8)."""
-        now, result = np.zeros(len(PARTS)), np.empty((seconds + 1, len(PARTS)))
-        for second in range(seconds + 1):
-            result[second] = REFERENCE_TEMPERATURE + now
-            power = not off[0] <= second < off[1]
-            now = now + (power * self.rise - now) * -np.expm1(-1.0 / self.tau)
-        return result
+        rise, time_constants = np.append(RISE * apart[:, 0], 0.0), np.append(TAU * apart[:, 1], 1.0)
+        sensors = (thermometer,) if thermometer else PARTS
+        warm_up = WarmUp(rise, time_constants, sensors=sensors, noise=(noise, 0.0), cold_rounds=0)
+        return Truth(replace(model, base_expansion=base, platform_expansion=platform), warm_up)
 
 
-def read(true: np.ndarray, thermometer: str, noise: float, rng: np.random.Generator) -> np.ndarray:
-    """Return what the compensator's filter makes of the sensors, °C; parts without one stay at 20 °C."""
-    result, low_pass = np.full(true.shape, REFERENCE_TEMPERATURE), TemperatureFilter()
-    for part in [thermometer] if thermometer else PARTS:
-        column = PARTS.index(part)
-        readings = true[:, column] + noise * rng.standard_normal(len(true))
-        result[:, column] = [low_pass.take(part, value, float(n)) for n, value in enumerate(readings)]
-    return result
-
-
-def readings_of(truth: Truth, geometry: HexapodGeometry, thermometer: str, noise: float, seed: int) -> MeasurementSet:
+def readings_of(truth: Truth, geometry: HexapodGeometry, seed: int) -> MeasurementSet:
     """Return what the shop measures: cold at 20 °C before switching on, then warming."""
-    cold = Campaign(BOX, 8.0 * INCH, 2.0 * INCH, "5-D", 4)
-    runs = []
-    for number in range(ROUNDS):
-        for axis, name in enumerate("xyz"):
-            positions = np.tile(BOX.mean(axis=0), (9, 1))
-            positions[:, axis] = np.linspace(*BOX[:, axis], 9)
-            runs.append(CampaignRun(f"{name} round {number + 1}", "5-D", positions, np.tile(np.eye(3), (9, 1, 1))))
-    campaign = replace(cold, runs=tuple(runs))
-    planned = template(campaign, geometry)
-    rounds = np.array([int(run.name.split()[-1]) - 1 if "round" in run.name else -1 for run in planned.runs])
-    station_round = np.full(len(planned.stations), -1)
-    station_round[planned.station] = rounds[planned.run]
-    seconds = np.arange(len(planned.stations)) - (station_round < 0).sum()  # one a second, the cold ones before that
-    for number in range(ROUNDS):
-        members = np.flatnonzero(station_round == number)
-        seconds[members] = number * ROUND + 300 + 4 * np.arange(len(members))
-    rng = np.random.default_rng([seed, 17])
-    true = truth.temperatures(ROUNDS * ROUND)
-    sensed, warm = read(true, thermometer, noise, rng), np.maximum(seconds, 0)
-    stations = replace(planned.stations, temperatures=true[warm], times=seconds.astype(float))
-    measured = measure(replace(planned, stations=stations), campaign, RealMachine(geometry, truth.model), seed)
-    seen = np.where((seconds < 0)[:, None], REFERENCE_TEMPERATURE, sensed[warm])
-    return replace(measured, stations=replace(stations, temperatures=seen))
+    campaign = truth.warm_up.campaign(Campaign(BOX, 8.0 * INCH, 2.0 * INCH, "5-D", 4))
+    return truth.warm_up.measured(template(campaign, geometry), campaign, RealMachine(geometry, truth.model), seed)
 
 
-def judge(truth: Truth, fit: ModelFit, thermometer: str, noise: float, points: int, seed: int) -> tuple[float, float]:
+def judge(truth: Truth, fit: ModelFit, points: int, seed: int) -> tuple[float, float]:
     """Return mean squares, m², of the tool's displacement by another day's drift, without and with compensation."""
     geometry, rng = fit.measurements.geometry, np.random.default_rng([seed, 18])
     passes = random_passes(geometry, BOX, points, 0.0, rng)
-    true = truth.temperatures(DAY, OFF)
-    sensed, heard = read(true, thermometer, noise, rng), Temperatures()
+    true = truth.warm_up.course(DAY, OFF)
+    sensed, heard = truth.warm_up.sensed(true, rng), Temperatures()
     cold = _tool(RealMachine(geometry, truth.model), passes, fit.model, None)
     moments = np.linspace(0, DAY, MOMENTS + 1)[1:].astype(int)
     groups = np.array_split(np.arange(points), MOMENTS)
     squares: list[list[np.ndarray]] = [[], []]
     at = 0
     for second, row in enumerate(sensed):
-        for name in [thermometer] if thermometer else PARTS:
+        for name in truth.warm_up.sensors:
             heard.follow(name, row[PARTS.index(name)], float(second), fit.model.late_growth.time_constants)
         if at < MOMENTS and second == moments[at]:
             group = np.concatenate([groups[at], groups[at] + points])
-            warm = RealMachine(geometry, truth.model, Temperatures(dict(zip(PARTS, true[second], strict=True))))
+            warm = RealMachine(
+                geometry, truth.model, Temperatures(dict(zip(PARTS, true[second, : len(PARTS)], strict=True)))
+            )
             for kept, believed in zip(squares, (None, heard), strict=True):
                 moved = _tool(warm, passes.select(group), fit.model, believed) - cold[group]
                 kept.append((moved**2).sum(axis=1))
@@ -161,10 +118,10 @@ def fitted_machine(
 ) -> tuple[float, float, ModelFit]:
     """Measure, fit and judge one machine; return mean squares, m², without and with compensation, and the fit."""
     geometry, (thermometer, _) = load_geometry(CONFIG / "paper.yaml"), SENSORS[sensors]
-    truth = Truth.drawn(geometry, seed)
-    measured = readings_of(truth, geometry, thermometer, noise, seed)
+    truth = Truth.drawn(geometry, thermometer, noise, seed)
+    measured = readings_of(truth, geometry, seed)
     fit = fit_model(measured, FitSettings(lead=LEAD, blocks=("pitch", "wave", "backlash", "expansion", "late")), say)
-    return (*judge(truth, fit, thermometer, noise, points, seed), fit)
+    return (*judge(truth, fit, points, seed), fit)
 
 
 @dataclass(frozen=True)

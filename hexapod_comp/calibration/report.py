@@ -142,7 +142,7 @@ def observability_text(seen: Observability, unseen_errors: tuple[str, ...]) -> s
 
 
 def _sight_row(b: BlockSight) -> tuple[str, ...]:
-    unit = {"m": "um", "rad": "urad", "m/m": "ppm", "1/K": "ppm/K", "m, rad": "um, urad"}[b.unit]
+    unit = {"m": "um", "rad": "urad", "m/m": "ppm", "1/K": "ppm/K", "1": "ppm/100 %", "m, rad": "um, urad"}[b.unit]
     cells = (number(b.determined, 1), number(b.tolerance * 1e6, 2), number(b.error * 1e6, 3))
     return (b.name, str(b.parameters), *cells, unit)
 

@@ -294,6 +294,8 @@ def _simulate(parser: argparse.ArgumentParser) -> None:
     _truth(add)
     text = "campaign file, or the name of a shipped one (default campaign_5d.yaml for the machine paper, else campaign)"
     add("--campaign", metavar="FILE", help=text)
+    text = "file of how the machine warms meanwhile, warm_up for the shipped one: then x, y and z lines again and again"
+    add("--warm-up", metavar="FILE", help=text)
     _seed(add, "all that is random")
     add("--out", type=arguments.csv_file, metavar="FILE", required=True, help="write the readings to a CSV file")
     _json(add)
@@ -372,7 +374,7 @@ def _estimation(parser: argparse.ArgumentParser) -> None:
     add("--field-degree", type=arguments.count, metavar="N", help="degree of the field (default 6)")
     text = "thermal expansion of struts, or of struts, base and platform, ppm/K; a warm-up starts there (default 0)"
     add("--expansion-ppm", type=arguments.expansions, metavar="S[,B,P]", help=text)
-    text = "growth of the struts by humidity, ppm per % (carbon fibre: 1 to 5); readings start there (default: none)"
+    text = "growth of the struts by humidity, ppm per %% (carbon fibre: 1 to 5); readings start there (default: none)"
     add("--moisture-ppm", type=arguments.bound, metavar="PPM", help=text)
     text = "part whose sensor stands for all (default: the one that alone was read)"
     add("--thermometer", metavar="PART", help=text)

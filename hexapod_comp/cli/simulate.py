@@ -23,17 +23,25 @@ def run(args: argparse.Namespace) -> int:
     from ..measurements.writing import write_measurements
     from ..virtual.instruments import compensated, measure
     from ..virtual.named import find_model, truth_name
+    from ..virtual.warm_up import growing, load_warm_up
 
     geometry, model = common.load_machine(args)
     args.truth = truth_name(args.truth, geometry)
     truth = find_model(args.truth, geometry)
     campaign = common.load_campaign(args, geometry)
+    warm_up = None
+    if args.warm_up is not None:
+        warm_up, expansion = load_warm_up(args.warm_up, args.seed)
+        campaign, truth = warm_up.campaign(campaign), growing(truth, expansion)
     common.mention_compiling("model.actual_pose_one")
     plan = template(campaign, geometry, args.seed, args.campaign)
-    if args.model != "ideal":
-        plan = compensated(plan, model)
+    running, machine = None if args.model == "ideal" else model, RealMachine(geometry, truth)
     with common.progress_bar(len(plan.stations), " stations") as bar:
-        read = measure(plan, campaign, RealMachine(geometry, truth), args.seed, bar.update)
+        if warm_up is not None:
+            read = warm_up.measured(plan, campaign, machine, args.seed, running, bar.update)
+        else:
+            plan = plan if running is None else compensated(plan, running)
+            read = measure(plan, campaign, machine, args.seed, bar.update)
     measured = read.with_values(read.value.round(RESOLUTION))
     write_measurements(measured, args.out)
     common.show(_as_json(measured, args) if args.json else _report(measured, args))
@@ -45,6 +53,8 @@ def _report(measured: MeasurementSet, args: argparse.Namespace) -> str:
     lengths = "nominal strut lengths" if args.model == "ideal" else f"the strut lengths of {args.model}"
     errors = f"machine {measured.geometry.name} with the errors of {args.truth}"
     lines = [f"{errors}, moved by {lengths}; seed {args.seed}"]
+    if args.warm_up is not None:
+        lines.append(f"{_warmth(measured)}, as {args.warm_up} has it")
     rows = [
         [kind, str(count), texts.number(rms, 3), texts.number(largest, 3), unit]
         for kind, count, rms, largest, unit in _channels(measured)
@@ -54,15 +64,33 @@ def _report(measured: MeasurementSet, args: argparse.Namespace) -> str:
     return "\n".join([*lines, f"{count}: {args.out}"])
 
 
+def _warmth(measured: MeasurementSet) -> str:
+    """Say how far the sensors went."""
+    listed = ", ".join(f"{name} {texts.number(rise, 2)} K" for name, rise in _rises(measured).items() if rise)
+    humidity = measured.stations.humidity
+    damp = humidity.max() - humidity.min()  # NaN where nobody tells
+    air = f", humidity {texts.number(100.0 * damp, 1)} %" if damp > 0.0 else ""
+    return f"warms while it is measured: {listed}{air}"
+
+
+def _rises(measured: MeasurementSet) -> dict[str, float]:
+    """Return how far each part's sensor went, K."""
+    from ..machine.late import PARTS
+
+    values = measured.stations.temperatures
+    return dict(zip(PARTS, (values.max(axis=0) - values.min(axis=0)).tolist(), strict=True))
+
+
 def _as_json(measured: MeasurementSet, args: argparse.Namespace) -> dict[str, Any]:
     """Return the same for programs."""
+    warm = {"warm_up": args.warm_up, "warmed_K": _rises(measured)} if args.warm_up else {}
     head = {"machine": measured.geometry.name, "truth": args.truth, "model": args.model, "seed": args.seed}
     channels = [
         {"channel": kind, "readings": count, f"rms_{unit}": rms, f"max_{unit}": largest}
         for kind, count, rms, largest, unit in _channels(measured)
     ]
     counts = {"readings": len(measured), "runs": len(measured.runs), "stations": len(measured.stations)}
-    return {**head, **counts, "channels": channels, "written": args.out}
+    return {**head, **warm, **counts, "channels": channels, "written": args.out}
 
 
 def _channels(measured: MeasurementSet) -> Iterator[tuple[str, int, float, float, str]]:

@@ -236,7 +236,8 @@ example:
         """Moves the virtual machine through a campaign (lines, diagonals, scattered poses) and writes what its
 instruments read, noise and unknown zeros included. The CSV file is the one that fit reads: one reading a row, errors
 as measured minus commanded, in um and urad. --model measures the machine with that model's compensation: then the file
-also holds the strut lengths that were commanded. The same seed gives the same file.
+also holds the strut lengths that were commanded. --warm-up warm_up warms the machine after the campaign, reads three
+lines again every ten minutes, and writes times and what its sensors tell. The same seed gives the same file.
 
 example:
   $ hexapod_comp simulate --campaign campaign_1d --seed 1 --out measured.csv

@@ -38,6 +38,7 @@ UNITS: dict[str, dict[str, float]] = {
     "expansion": {"ppm_per_K": 1e-6},
     "moisture": {"ppm_per_percent": 1e-4},
     "temperature": {"degC": 1.0},
+    "difference": {"K": 1.0},
     "speed": {"m_s": 1.0, "mm_s": 1e-3, "m_min": 1.0 / 60.0},
     "acceleration": {"m_s2": 1.0, "mm_s2": 1e-3},
     "time": {"s": 1.0, "ms": 1e-3},
