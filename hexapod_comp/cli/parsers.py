@@ -374,8 +374,7 @@ def _estimation(parser: argparse.ArgumentParser) -> None:
     add("--field-degree", type=arguments.count, metavar="N", help="degree of the field (default 6)")
     text = "thermal expansion of struts, or of struts, base and platform, ppm/K; a warm-up starts there (default 0)"
     add("--expansion-ppm", type=arguments.expansions, metavar="S[,B,P]", help=text)
-    text = "growth of the struts by humidity, ppm per %% (carbon fibre: 1 to 5); readings start there (default: none)"
-    add("--moisture-ppm", type=arguments.bound, metavar="PPM", help=text)
+    add("--moisture-ppm", type=arguments.bound, metavar="PPM", help="growth of struts by humidity, ppm per %% (1 to 5)")
     text = "part whose sensor stands for all (default: the one that alone was read)"
     add("--thermometer", metavar="PART", help=text)
     text = "how late parts follow their sensors (default: sought from the readings)"
