@@ -334,9 +334,7 @@ def unseen_errors(measurements: MeasurementSet, settings: FitSettings) -> tuple[
         Of the fit.
     """
     space = ParameterSpace(measurements, replace(settings, blocks=("field displacement", "field rotation")))
-    estimation = Estimation(measurements, space)
-    problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(measurements)))
-    return without_trace(space, problem)
+    return without_trace(Estimation(measurements, space))
 
 
 def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:

@@ -12,6 +12,7 @@ from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
 from ..measurements.readings import AXES, Stations
 from ..pose import rotation_from_angles
 from ..virtual.trial import without_datum
+from .estimation import Estimation
 from .linear_problem import LinearProblem, Posterior, physical_covariance
 from .parameters import ParameterSpace
 from .sensitivity import Prediction, derivatives, predict
@@ -178,19 +179,19 @@ def _weak(space: ParameterSpace, singular: np.ndarray, vectors: np.ndarray) -> l
     return weak
 
 
-def without_trace(space: ParameterSpace, problem: LinearProblem) -> tuple[str, ...]:
-    """Return the machine errors that leave no trace in the readings; none when the space has no field.
+def without_trace(estimation: Estimation) -> tuple[str, ...]:
+    """Return the machine errors that leave no trace in the readings; none when their space has no field.
 
     Parameters
     ----------
-    space : ParameterSpace
-        With the field's blocks.
-    problem : LinearProblem
-        The data's derivatives.
+    estimation : Estimation
+        The readings, against parameters with the field's blocks.
     """
+    space, cells, measurements = estimation.space, estimation.cells, estimation.measurements
+    points, still = measurements.points(), np.zeros((len(measurements.stations), 3))
     index = {label: n for n, label in enumerate(space.labels)}
     tolerances, half = space.spread(space.start_tolerances()), np.ptp(space.box, axis=0)
-    names = []
+    seen: dict[str, np.ndarray] = {}
     for name, parts in MACHINE_ERRORS.items():
         wanted = [index[label] for label in (f"{c} {term}" for c, term in parts) if label in index]
         if len(wanted) < len(parts):
@@ -199,10 +200,13 @@ def without_trace(space: ParameterSpace, problem: LinearProblem) -> tuple[str, .
         x = np.zeros(space.size)
         x[wanted] = [np.prod([half[AXES.index(letter)] for letter in term if letter in AXES]) for _, term in parts]
         y = space.whitened_parameters(x)
-        y *= (tolerances / np.abs(y).max())[np.abs(y).argmax()]
-        if np.sqrt(np.einsum("i,kij,j->", y, problem.normal, y)) <= SEEN:
-            names.append(name)
-    return tuple(names)
+        x *= (tolerances / np.abs(y).max())[np.abs(y).argmax()]
+        errors = space.field_errors(x, points, still)
+        seen[name] = np.einsum("ci,ci->c", cells.directions, errors[cells.station])
+    if not seen:
+        return ()
+    traces = np.linalg.norm(estimation.free_of_unknowns(np.stack([*seen.values()], axis=1)), axis=0)
+    return tuple(name for name, trace in zip(seen, traces, strict=True) if trace <= SEEN)
 
 
 @dataclass(frozen=True)

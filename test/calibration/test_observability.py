@@ -43,6 +43,12 @@ def linearised(
     return problem_of(template(plan, small.paper()), settings)
 
 
+def read(instrument: str, diagonals: int, settings: FitSettings) -> Estimation:
+    """Return a campaign's readings against parameters."""
+    plan = template(small.campaign(instrument, diagonals), small.paper())
+    return Estimation(plan, ParameterSpace(plan, settings))
+
+
 def problem_of(measurements: MeasurementSet, settings: FitSettings) -> tuple[ParameterSpace, LinearProblem]:
     space = ParameterSpace(measurements, settings)
     estimation = Estimation(measurements, space)
@@ -93,13 +99,13 @@ def test_tilted_poses_see_more():
 def test_machine_errors_that_leave_no_trace(instrument: str, diagonals: int, unseen: set[str]):
     """By hand: a shear or a bilinear twist is constant along its own line and linear across, which zeros and beam
     slopes swallow; on a body diagonal it is not. Roll needs a roll channel."""
-    assert set(without_trace(*linearised(instrument, diagonals, FIELD))) == unseen
+    assert set(without_trace(read(instrument, diagonals, FIELD))) == unseen
 
 
 def test_errors_are_unseen_however_few_terms_the_field_has():
     """A field of degree 2 has no term for a twist that involves the short z axis: it is no less unseen."""
     small_field = replace(FIELD, field_degree=2)
-    assert set(without_trace(*linearised("5-D", 0, small_field))) == {*SQUARENESS, *TWISTS, *ROLLS}
+    assert set(without_trace(read("5-D", 0, small_field))) == {*SQUARENESS, *TWISTS, *ROLLS}
 
 
 def readings_of(instrument: str, diagonals: int, model: MachineModel) -> Estimation:
@@ -127,7 +133,7 @@ def test_an_unseen_error_really_changes_no_reading(name: str):
 
 
 def test_without_field_blocks_nothing_is_called_unseen():
-    assert without_trace(*linearised("5-D", 0, STRUCTURE)) == ()
+    assert without_trace(read("5-D", 0, STRUCTURE)) == ()
 
 
 # ---------------------------------------------------------------- definitions
