@@ -57,10 +57,10 @@ def select(
 
     Where there is only one, nothing is left to fit without it, and no block is kept.
 
-    All blocks start in. The screw waves' harmonics go first, if all together do not help clearly, or else each that
-    does not. Then the general block that helps least goes, until every one that is left helps clearly; then the
-    expected ones that do not help at all. Taking them in one by one instead can let a field explain what a length map
-    does better.
+    All blocks start in. The screw waves' harmonics go first, if all together do not help clearly. Then the general
+    block that helps least goes, until every one that is left helps clearly; then the harmonics that do not help
+    clearly, and the expected ones that do not help at all. Taking them in one by one instead can let a field explain
+    what a length map does better.
 
     Parameters
     ----------
@@ -83,7 +83,10 @@ def select(
     names = [b.name for b in space.blocks[1:]]
     kept = list(names)
     gains: dict[str, tuple[float, float]] = {}
-    kept = _without_harmonics(trials, kept, gains)
+    harmonics = [name for name in names if name in HARMONICS]
+    if harmonics:
+        gains |= dict.fromkeys(harmonics, trials.gain(("structure", *names), *harmonics))
+        kept = [name for name in names if name not in HARMONICS or _clear(gains[name])]
     general = [name for name in names if name not in (*EXPECTED, *HARMONICS)]
     while True:
         # A block that helps clearly beside all others helps no less when some of them have gone.
@@ -93,24 +96,15 @@ def select(
         if not doubtful:
             break
         kept.remove(min(doubtful, key=lambda name: gains[name][0] / max(gains[name][1], 1e-12)))
+    if len(harmonics) > 1:
+        gains |= {name: trials.gain(("structure", *kept), name) for name in harmonics if name in kept}
+        kept = [name for name in kept if name not in HARMONICS or _clear(gains[name])]
     for name in (name for name in names if name in EXPECTED):
         gains[name] = trials.gain(("structure", *kept), name)
     useless = [name for name in EXPECTED if name in kept and gains[name][0] <= LEAST_GAIN]
     kept = [name for name in kept if name not in useless]
     decisions = [Decision(name, name in kept, *gains[name]) for name in names]
     return decisions, trials.everything, trials.fit(("structure", *kept))
-
-
-def _without_harmonics(trials: _Trials, kept: list[str], gains: dict[str, tuple[float, float]]) -> list[str]:
-    """Return the blocks that are left when the harmonics have been decided on; add these blocks' gains."""
-    every, harmonics = ("structure", *kept), [name for name in kept if name in HARMONICS]
-    if not harmonics:
-        return kept
-    together = trials.gain(every, *harmonics)
-    gains |= dict.fromkeys(harmonics, together)
-    if _clear(together) and len(harmonics) > 1:
-        gains |= {name: trials.gain(every, name) for name in harmonics}
-    return [name for name in kept if name not in HARMONICS or (_clear(together) and _clear(gains[name]))]
 
 
 def _clear(gain: tuple[float, float] | None) -> bool:
