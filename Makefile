@@ -36,13 +36,14 @@ help:
 	@echo 'make test    ruff, mypy and the tests, in three processes for two cores'
 	@echo 'make test-all     the same with every Python found here, each in .venv-3.x; VERSIONS="3.10 3.13" for some'
 	@echo 'make docs    the pages of doc/ as a site with a search and the Python reference, in out/doc'
-	@echo 'make constraints  renew constraints.txt: the versions of all that is installed'
+	@echo 'make constraints  renew constraints.txt and locked/: versions and hashes of all that is installed'
 	@echo 'make bench   speed beside NumPy, SciPy, MuJoCo, Pinocchio, LinuxCNC and a relay node'
 	@echo 'make fuzz    a nightly run of the fuzzing tests: 100,000 cases and more'
 	@echo 'make linuxcnc       .venv-linuxcnc, to run beside LinuxCNC'
 	@echo 'make linuxcnc-rt MODEL=mine.yaml  the compensator as a realtime component of LinuxCNC (MACHINE=paper)'
 	@echo 'make test-linuxcnc  the tests with a real LinuxCNC; root installs the package first'
 	@echo 'make clean   remove .venv, .venv-…, build folders and caches (out/ stays)'
+	@echo 'HASHES=no    take the locked versions from an index whose files are not those of PyPI'
 	@echo 'PYTHON=...   the Python (3.10 to 3.13) from which .venv is made; make clean before a change'
 
 demo: $(VENV)/with-ros
@@ -77,6 +78,7 @@ constraints: $(VENV)/made-in
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check 'uv>=0.5'
 	$(BIN)/uv pip compile setup.py --extra ros --extra test --extra docs --universal --python-version 3.10 --upgrade --quiet \
 	    --no-annotate --custom-compile-command 'make constraints' --output-file constraints.txt
+	$(BIN)/python tools/lock_hashes.py
 
 bench: $(VENV)/with-ros,bench
 	@$(BIN)/python -m benchmarks
@@ -120,9 +122,17 @@ $(VENV)/made-in:
 	@'$(PYTHON)' -m venv --clear $(VENV)
 	@pwd -P > $@
 
-$(VENV)/with-%: setup.py constraints.txt $(VENV)/made-in
+# First what locked/ names, each file by its SHA-256, then this package and what is not locked (bench) by version.
+# An index whose files are not PyPI's, as one that builds wheels itself, needs HASHES=no: the same versions unchecked.
+HASHES ?= yes
+comma := ,
+PIP_INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-input
+LOCKED = $(foreach extra,$(subst $(comma), ,$*),$(addprefix --requirement ,$(wildcard locked/$(extra).txt)))
+
+$(VENV)/with-%: setup.py constraints.txt $(wildcard locked/*.txt) $(VENV)/made-in
 	@echo "Installing hexapod_comp[$*] and what it needs into $(VENV), once; this takes a minute or two ..."
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-input --use-pep517 \
+	@[ '$(HASHES)' = no ] || $(PIP_INSTALL) --require-hashes $(LOCKED) || { echo "$$OTHER_INDEX" >&2; exit 1; }
+	@$(PIP_INSTALL) --use-pep517 $(if $(filter no,$(HASHES)),,--no-build-isolation) \
 	    --constraint constraints.txt --editable '.[$*]'
 	@touch $(VENV)/with-ros $@
 
@@ -143,6 +153,12 @@ make: '$(PYTHON)' is not a command here. Python 3.10 to 3.13 is needed: install 
   for example: make demo PYTHON=python3.12
 endef
 export NO_PYTHON
+
+define OTHER_INDEX
+make: could not install what locked/ names. If pip speaks of hashes that do not match, its index has other files than
+  PyPI. Where you trust it: make HASHES=no ... takes the same versions, unchecked.
+endef
+export OTHER_INDEX
 
 define CHECK_PYTHON
 import platform, sys

@@ -137,23 +137,51 @@ def test_the_source_archive_carries_all_that_its_checks_need(wheel: Path):
     assert needed <= held
 
 
-@pytest.mark.parametrize("version", ["3.10", "3.11", "3.12", "3.13"])
+VERSIONS = ("3.10", "3.11", "3.12", "3.13")
+
+
+def _pins(path: Path, version: str) -> dict[str, str]:
+    """Return the versions that a file of requirements pins for a version of Python, by normalised name."""
+    here = {"python_version": version, "python_full_version": f"{version}.0", "sys_platform": "linux"}
+    text = re.sub(r" \\\n +--hash=\S+", "", path.read_text(encoding="utf-8"))
+    pins = [Requirement(line) for line in text.splitlines() if line and not line.startswith("#")]
+    pins = [pin for pin in pins if pin.marker is None or pin.marker.evaluate(here)]
+    assert all([specifier.operator for specifier in pin.specifier] == ["=="] for pin in pins)
+    pinned = {canonicalize_name(pin.name): next(iter(pin.specifier)).version for pin in pins}
+    assert len(pinned) == len(pins)
+    return pinned
+
+
+@pytest.mark.parametrize("version", VERSIONS)
 def test_constraints_pin_all_that_make_installs(version: str, monkeypatch: pytest.MonkeyPatch):
     """One exact version for each requirement, which it satisfies; after a change of setup.py: ``make constraints``."""
     monkeypatch.chdir(ROOT)
-    here = {"python_version": version, "python_full_version": f"{version}.0", "sys_platform": "linux"}
-    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
-    pins = [Requirement(line) for line in lines if line and not line.startswith("#")]
-    pins = [pin for pin in pins if pin.marker is None or pin.marker.evaluate(here)]
-    pinned = {canonicalize_name(pin.name): pin.specifier for pin in pins}
-    assert len(pinned) == len(pins)
-    assert all([specifier.operator for specifier in found] == ["=="] for found in pinned.values())
+    pinned = _pins(ROOT / "constraints.txt", version)
     setup = _setup_arguments()
     wanted = [Requirement(line) for line in (*setup["install_requires"], *setup["extras_require"]["ros"])]
     wanted += [Requirement(line) for extra in ("test", "docs") for line in setup["extras_require"][extra]]
     for requirement in wanted:
-        (exact,) = pinned[canonicalize_name(requirement.name)]
-        assert requirement.specifier.contains(exact.version), requirement
+        assert requirement.specifier.contains(pinned[canonicalize_name(requirement.name)]), requirement
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_locked_files_are_the_constraints_with_hashes(version: str):
+    """Nothing is left out or has two versions; setuptools, which then builds this package, is there."""
+    locked = {path.stem: _pins(path, version) for path in sorted((ROOT / "locked").glob("*.txt"))}
+    assert set(locked) == {"docs", "ros", "test"}
+    assert "setuptools" in locked["ros"]
+    assert {pin for pins in locked.values() for pin in pins.items()} == set(
+        _pins(ROOT / "constraints.txt", version).items()
+    )
+
+
+def test_locked_files_have_a_hash_for_each_package():
+    for path in (ROOT / "locked").glob("*.txt"):
+        _, *entries = re.split(r"^(?=\S)", path.read_text(encoding="utf-8").partition("\n")[2], flags=re.MULTILINE)
+        for entry in entries:
+            head, *hashes = [line.removesuffix(" \\").strip() for line in entry.splitlines()]
+            assert hashes, head
+            assert all(re.fullmatch(r"--hash=sha256:[0-9a-f]{64}", line) for line in hashes), head
 
 
 def test_citation_and_changelog_name_the_version():
@@ -252,7 +280,8 @@ def test_package_xml_lists_what_the_source_imports():
 
 @pytest.mark.filterwarnings("ignore:.*parse_:DeprecationWarning")  # catkin_pkg under a newer pyparsing
 @pytest.mark.parametrize(
-    ("distribution", "packaged"), [("humble", True), ("jazzy", False), ("kilted", False), ("", True)]
+    ("distribution", "packaged"),
+    [("humble", True), ("jazzy", False), ("kilted", False), ("lyrical", True), ("", True)],
 )
 def test_rosdep_is_asked_for_numba_only_where_ubuntu_packages_it(distribution: str, packaged: bool):
     """Ubuntu 24.04, the system of Jazzy and Kilted, has no python3-numba: rosdep install would end there."""

@@ -35,10 +35,12 @@ class Sequence:
     ----------
     missed : int
         Messages that were sent and never handled: a newer one had replaced them, or the network lost them.
+    counted : bool
+        Whether the middleware counts messages at all.
     """
 
     def __init__(self) -> None:
-        self.missed = 0
+        self.missed, self.counted = 0, True
         self._missed_at = self._turned_at = self._changed_at = -float("inf")
         self._last = self._other = 0
 
@@ -47,6 +49,7 @@ class Sequence:
 
         Middleware that does not count gives None.
         """
+        self.counted = number is not None
         if number is None or number == self._last + 1:
             self._last = number or 0
             return False
@@ -171,9 +174,10 @@ class CommandSource:
 
     def hear(self, number: int | None, now: float) -> bool:
         """Take a message's sequence number; return whether it has shown a second speaker."""
-        if self.sequence.hear(number, now):
+        counted = self.sequence.counted
+        if self.sequence.hear(number, now) or counted and not self.sequence.counted:
             self._judge(now)
-            return True
+            return bool(self.problem)
         return False
 
     def _judge(self, now: float) -> None:
@@ -187,6 +191,11 @@ class CommandSource:
             self.problem = f"several publishers of {topic}: {', '.join(names)}"
         elif self._publishers.count > 1 and self.sequence.two_speak(now):
             self.problem = f"two publishers of {topic} speak in turn, both called {', '.join(names) or UNKNOWN_NAME}"
+        elif self._publishers.count > 1 and not self.sequence.counted:
+            self.problem = (
+                f"two publishers of {topic} are called {', '.join(names) or UNKNOWN_NAME}, and this middleware (RMW) does "
+                "not count messages: whether both speak cannot be told"
+            )
 
 
 class OwnTopic:

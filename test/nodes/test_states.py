@@ -417,6 +417,21 @@ def test_sequence_numbers_tell(case):
     assert (sequence.missed, any(found), sequence.two_speak(0.1)) == (missed, two, two)
 
 
+def test_two_of_one_name_are_refused_where_the_middleware_does_not_count():
+    """As rmw_cyclonedds: whether one is the other's ghost cannot be told; one alone is obeyed."""
+    end = SimpleNamespace(node_name="controller", node_namespace="/")
+    for publishers, number, refused in ((1, None, False), (2, None, True), (2, 1, False)):
+        node = SimpleNamespace(get_publishers_info_by_topic=lambda topic, n=publishers: [end] * n)
+        source = CommandSource(node, "/tool_pose_command", lambda n=publishers: n, False)
+        source.look(0.0)
+        assert not source.problem
+        assert source.hear(number, 0.01) is refused
+        assert ("does not count" in source.problem) is refused
+        source.look(10.0)
+        assert bool(source.problem) is refused
+        assert not source.hear(number, 10.1)
+
+
 def test_middleware_without_sequence_numbers_tells_nothing():
     sequence = Sequence()
     assert not any(sequence.hear(None, 0.01 * n) for n in range(5))
