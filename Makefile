@@ -131,7 +131,7 @@ LOCKED = $(foreach extra,$(subst $(comma), ,$*),$(addprefix --requirement ,$(wil
 
 $(VENV)/with-%: setup.py constraints.txt $(wildcard locked/*.txt) $(VENV)/made-in
 	@echo "Installing hexapod_comp[$*] and what it needs into $(VENV), once; this takes a minute or two ..."
-	@[ '$(HASHES)' = no ] || $(PIP_INSTALL) --require-hashes $(LOCKED) || { echo "$$OTHER_INDEX" >&2; exit 1; }
+	@[ '$(HASHES)' = no ] || $(PIP_INSTALL) --use-pep517 --require-hashes $(LOCKED) || { echo "$$OTHER_INDEX" >&2; exit 1; }
 	@$(PIP_INSTALL) --use-pep517 $(if $(filter no,$(HASHES)),,--no-build-isolation) \
 	    --constraint constraints.txt --editable '.[$*]'
 	@touch $(VENV)/with-ros $@
