@@ -13,9 +13,10 @@ if TYPE_CHECKING:
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
+    from ..machine.frames import pose_text
     from ..machine.model import RealMachine
     from ..pose import Pose
-    from ..workspace.travel import pose_text, travel, travel_text
+    from ..workspace.travel import travel, travel_text
 
     geometry, model = common.load_machine(args)
     if args.pose is None:

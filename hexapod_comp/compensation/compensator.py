@@ -374,7 +374,7 @@ class Compensator:
         """
         last = self._last.state
         if last.resumes[0] == TOOL_CHANGED:
-            refuse_motion(outcome := run(), self._last, self._next, self.geometry.tool_name)
+            refuse_motion(outcome := run(), self._last, self._next, self.geometry)
             return self._finish(outcome, numbers)
         before = last.correction.copy(), last.changed.copy()
         run()

@@ -11,6 +11,8 @@ from ..kernels.compensation import NO_POSE, OUTSIDE, UNSOLVED
 from ..kernels.limits import WITHIN
 from ..kernels.pose import POSE_NOT_FINITE, QUATERNION_NORM_TOLERANCE
 from ..machine.field import GridField
+from ..machine.frames import pose_text
+from ..machine.geometry import HexapodGeometry
 from ..machine.limits import STRUT_NAMES
 from ..machine.model import RealMachine
 from .state import CommandState
@@ -49,13 +51,13 @@ def refuse(outcome: tuple, command: CommandState, machine: RealMachine, numbers:
         raise machine.geometry.limits.error(finding, strut, stage, value)
 
 
-def refuse_motion(outcome: tuple, last: CommandState, command: CommandState, tool: str) -> None:
+def refuse_motion(outcome: tuple, last: CommandState, command: CommandState, geometry: HexapodGeometry) -> None:
     """Raise where the first command after a change of tool would move a nominal strut.
 
     Raises
     ------
     LimitError
-        ``tool_changed``, with the strut that would move furthest.
+        ``tool_changed``, with the strut that would move furthest, and where the tool is.
     """
     if outcome[0] == NO_POSE:
         return  # for :func:`refuse`
@@ -64,8 +66,9 @@ def refuse_motion(outcome: tuple, last: CommandState, command: CommandState, too
     way = float(ways[strut])
     if not abs(way) <= SAME_PLACE:
         problem = (
-            f"since the change to tool {tool!r} no command was where the struts are: {STRUT_NAMES[strut]} would move "
-            f"by {way * 1e3:.4f} mm, allowed {SAME_PLACE * 1e3:g} mm; command the pose in which this tool is"
+            f"since the change to tool {geometry.tool_name!r} no command was where the struts are: "
+            f"{STRUT_NAMES[strut]} would move by {way * 1e3:.4f} mm, allowed {SAME_PLACE * 1e3:g} mm; in "
+            f"{geometry.work_name} the tool is at {pose_text(geometry.tool_pose(last.platform))}"
         )
         raise LimitError("tool_changed", problem, way, SAME_PLACE, strut, "nominal")
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 
 import numpy as np
 
 from ..errors import GeometryError, PoseError
+from ..formats.texts import number
 from ..formats.yaml import Section
 from ..pose import Pose
 
@@ -45,6 +47,13 @@ def read_named_poses(top: Section, key: str) -> dict[str, Pose]:
         if name in section:
             raise section.error(name, f"is what the machine's own {name} frame is called")
     return {name: read_pose(section, name) for name in section.left()}
+
+
+def pose_text(pose: Pose) -> str:
+    """Return a pose in mm and degrees, for people."""
+    places = ", ".join(number(value * 1e3, 3) for value in pose.position)
+    angles = ", ".join(number(math.degrees(value), 4) for value in pose.angles())
+    return f"x, y, z {places} mm, alpha, beta, gamma {angles} deg"
 
 
 def refuse_names(tools: Mapping[str, Pose], work_frames: Mapping[str, Pose]) -> None:

@@ -71,7 +71,7 @@ class ToolChoice:
             for name in _tools(parameters):
                 self._refuse(name)
         except HexapodError as error:
-            return SetParametersResult(successful=False, reason=f"parameter {'tool'}: {error}")
+            return SetParametersResult(successful=False, reason=f"parameter tool: {error}")
         return SetParametersResult(successful=True)
 
     def _refuse(self, name: object) -> None:

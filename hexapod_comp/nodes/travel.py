@@ -10,9 +10,9 @@ from std_srvs.srv import Trigger
 
 from ..compensation.compensator import Compensator
 from ..errors import CommandError, HexapodError, printable
-from ..machine.frames import WORK
+from ..machine.frames import WORK, pose_text
 from ..pose import Pose
-from ..workspace.travel import Travel, pose_text, travel, travel_text
+from ..workspace.travel import Travel, travel, travel_text
 from .compensator_status import CompensatorStatus
 from .health import ERROR, OK
 from .runtime import EVENT_QOS, LateAnswer, MachineNode
@@ -73,7 +73,7 @@ class TravelReports:
                 self._tell(ERROR, str(error), ())
 
     def _on_request(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response | None:
-        if self._asked:
+        if self._asked and self._work is not None:
             raise CommandError("busy", "it is being worked out already")
         if self._work is None:
             self._begin()

@@ -139,10 +139,3 @@ def travel_text(ways: Sequence[Travel]) -> str:
         return ""
     rows = [[one.way, number(one.shown, 3), one.unit, str(one.error or "no limit")] for one in ways]
     return aligned(["way", "travel", "unit", ""], rows)
-
-
-def pose_text(pose: Pose) -> str:
-    """Return a pose in mm and degrees, for people."""
-    places = ", ".join(number(value * 1e3, 3) for value in pose.position)
-    angles = ", ".join(number(math.degrees(value), 4) for value in pose.angles())
-    return f"x, y, z {places} mm, alpha, beta, gamma {angles} deg"

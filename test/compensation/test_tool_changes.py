@@ -5,6 +5,7 @@ Truth: the zoo's own frames say which pose of the new tool is where the struts s
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -64,6 +65,10 @@ def test_a_command_for_another_place_is_refused(way: float, machine: Machine, co
         ) as caught:
             compensator.step(numbers(machine, "probe", way), 1.01)
         assert caught.value.reason == "tool_changed"
+    named = re.search(r"in work the tool is at x, y, z (.*), (.*), (.*) mm, alpha", str(caught.value))
+    assert named is not None
+    at = 1e3 * np.array(numbers(machine, "probe")[:3])
+    np.testing.assert_allclose([float(part) for part in named.groups()], at, rtol=0.0, atol=5.1e-4)  # as many digits
     with pytest.raises(LimitError, match="since the change"):
         compensator.step(numbers(machine, None), 1.01)
     with pytest.raises(PoseError):
