@@ -47,6 +47,8 @@ SENSOR_QOS = QoSProfile(depth=10, history=HistoryPolicy.KEEP_LAST, reliability=R
 EVENT_QOS = QoSProfile(depth=10, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 """Rare messages, each of which counts: diagnostics, markers."""
 
+TRANSITIONS = ("on_configure", "on_activate", "on_deactivate", "on_cleanup", "on_shutdown")
+
 OVERRIDES = QoSOverridingOptions(
     (
         QoSPolicyKind.HISTORY,
@@ -88,6 +90,9 @@ class MachineNode(LifecycleNode):
         self._active = False
         self._throttle = Throttle()
         self.guard = CallbackGuard(self.warn_of, self.complain_of)
+        for change in TRANSITIONS:  # rclpy would swallow what they raise, and say nothing
+            guarded = self.guard.around(change, getattr(self, change), TransitionCallbackReturn.ERROR)
+            setattr(self, change, guarded)
         super().__init__(name, **options)
         self._logger = PlainLogger(self.get_logger().name, self.guard)
         for service in self.services:  # the lifecycle's are not made by create_service

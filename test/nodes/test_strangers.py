@@ -32,6 +32,7 @@ from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.nodes.guarding import CallbackGuard
 from hexapod_comp.nodes.health import ERROR
+from hexapod_comp.nodes.machine_files import MachineFiles
 from hexapod_comp.nodes.messages import pose_message
 
 NAMELESS = Path(__file__).parents[1] / "nameless.py"
@@ -138,6 +139,14 @@ def test_several_publishers_allowed_means_also_those_without_a_readable_name(ben
 
 
 # ---- no callback ends a node ----
+
+
+def test_a_transition_that_raises_is_said(bench, monkeypatch):
+    """rclpy swallows it: the node went out of reach without a line."""
+    bench.compensator(start=False)
+    monkeypatch.setattr(MachineFiles, "geometry", lambda files: 1 / 0)
+    assert not bench.change("configure")
+    assert bench.logged("error in a callback, the node goes on: on_configure: ZeroDivisionError")
 
 
 @pytest.mark.parametrize("name", NODES)
