@@ -5,17 +5,20 @@ Usage: python -m benchmarks.memory [--messages 30]; exits 1 when a bar is missed
 Resident is what the system counts for a process, and counts again for each other that uses the same libraries; its
 share divides those pages among them; private is what would come free if it ended. A bare lifecycle node stands beside
 them for what rclpy and DDS take by themselves. Messages come by commands, readings and temperatures in turn. 1 MB is
-2²⁰ bytes.
+2²⁰ bytes. The nodes run without coverage.py, as where no developer has installed it: Numba would load it.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
+import os
 import re
 import subprocess
 import sys
 import time
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import QoSProfile
@@ -23,6 +26,8 @@ from sensor_msgs.msg import JointState, Temperature
 
 from hexapod_comp.loop.processes import NodeProcess, PrivateDomain
 from hexapod_comp.nodes.middleware import RosSession
+
+ROOT = Path(__file__).resolve().parents[1]
 
 BAR, LARGEST_BAR = 150.0, 250.0
 """At rest and at most, MB."""
@@ -56,11 +61,13 @@ def kept(pid: int) -> tuple[float, float, float]:
 
 def settled(pid: int) -> tuple[float, float, float]:
     """Return what a process has in memory when that does not change any more, MB."""
-    before, now = (0.0, 0.0, 0.0), kept(pid)
-    while abs(now[0] - before[0]) > 1.0:
+    before = math.inf
+    while True:
         time.sleep(SETTLED)
-        before, now = now, kept(pid)
-    return now
+        now = kept(pid)
+        if abs(now[0] - before) < 1.0:
+            return now
+        before = now[0]
 
 
 def largest(pid: int, topics: dict[str, type], messages: int) -> float:
@@ -104,7 +111,9 @@ def main() -> int:
     parser.add_argument("--messages", type=int, default=30)
     messages = parser.parse_args().messages
     print("resident / share / private:")
-    with PrivateDomain():
+    with TemporaryDirectory() as folder, PrivateDomain():
+        Path(folder, "coverage.py").write_text('raise ImportError("not here")\n', encoding="ascii")
+        os.environ["PYTHONPATH"] = os.pathsep.join([folder, str(ROOT)])
         bare = subprocess.Popen([sys.executable, "-c", BARE])
         try:
             print("a bare lifecycle node: {:.0f} / {:.0f} / {:.0f} MB".format(*settled(bare.pid)))

@@ -17,8 +17,8 @@ MAPS = Path("/proc/self/smaps")
 
 HEAD = re.compile(r"^([0-9a-f]+)-([0-9a-f]+) (\S{4}) \S+ \S+ \S+ +(/\S.*)$", re.MULTILINE)
 
-COMPILING = ("libllvmlite", "/scipy")
-"""Words in the names of libraries that only compiling needs: LLVM, and what Numba loads of SciPy beside it."""
+COMPILING = ("llvmlite", "scipy")
+"""Words in the names of libraries that only compiling needs: LLVM, and what Numba loads of linear algebra beside it."""
 
 
 def give_blocks_back() -> None:
