@@ -99,8 +99,6 @@ class NodeProcess:
         Topics under other names.
     wrapper : sequence of str, optional
         Command that runs the node and becomes it, such as ``nsenter``.
-    program : sequence of str, optional
-        Another program, started in place of one of this package's nodes.
     """
 
     def __init__(
@@ -109,14 +107,12 @@ class NodeProcess:
         parameters: dict[str, object],
         remaps: Mapping[str, str] | None = None,
         wrapper: Sequence[str] = (),
-        program: Sequence[str] = (),
     ) -> None:
         self.name = module
         handle, path = tempfile.mkstemp(prefix=f"hexapod_comp_{module}_", suffix=".log")
         self.log = Path(path)
         arguments = ros_arguments(parameters, remaps)
-        own = sys.executable, "-m", f"hexapod_comp.nodes.{module}"
-        command = [*wrapper, *(program or own), *arguments]
+        command = [*wrapper, sys.executable, "-m", f"hexapod_comp.nodes.{module}", *arguments]
         with os.fdopen(handle, "wb") as log:
             self._process = subprocess.Popen(
                 command,
