@@ -175,7 +175,7 @@ class CommandSource:
     def hear(self, number: int | None, now: float) -> bool:
         """Take a message's sequence number; return whether it has shown a second speaker."""
         counted = self.sequence.counted
-        if self.sequence.hear(number, now) or counted and not self.sequence.counted:
+        if self.sequence.hear(number, now) or (counted and not self.sequence.counted):
             self._judge(now)
             return bool(self.problem)
         return False
@@ -193,8 +193,8 @@ class CommandSource:
             self.problem = f"two publishers of {topic} speak in turn, both called {', '.join(names) or UNKNOWN_NAME}"
         elif self._publishers.count > 1 and not self.sequence.counted:
             self.problem = (
-                f"two publishers of {topic} are called {', '.join(names) or UNKNOWN_NAME}, and this middleware (RMW) does "
-                "not count messages: whether both speak cannot be told"
+                f"two publishers of {topic} are called {', '.join(names) or UNKNOWN_NAME}; whether both speak cannot "
+                "be told, as this middleware (RMW) does not count messages"
             )
 
 
