@@ -19,6 +19,7 @@ from .datum import HeldDatum, hold, unseen_part
 from .estimation import HUBER, OUTLIER, Estimation, Solution, iterate
 from .lead import ScrewLead, look_for_lead
 from .linear_problem import LinearProblem, Posterior, held_out, physical_covariance
+from .misfit import Residuals
 from .observability import Allowed, Observability, ToolError, observe, without_trace
 from .parameters import WAVES, FitSettings, ParameterSpace
 from .selection import Decision, select
@@ -198,7 +199,8 @@ def fit_model(
     """
     everything, problem, lead, constants = _begin(measurements, settings or FitSettings(), progress)
     settings = everything.space.settings
-    decisions, possible, (space, estimation, solution) = _choose(everything, problem, settings, progress)
+    decisions, (problem, possible), answer = _choose(everything, problem, settings, progress)
+    space, estimation, solution = answer
     channels = tuple(_channels(estimation, solution))
     notes = [
         *_about_lead(lead),
@@ -207,9 +209,16 @@ def fit_model(
         *_check_noise(channels),
     ]
     progress("what is it worth?")
-    allowed = _allowed(everything.space, possible, (space, solution))
+    way = _way(space, solution, everything.space, possible)
+    allowed = everything.space, everything.space.physical(way), physical_covariance(everything.space, possible)
+
+    def with_all() -> tuple[Residuals, np.ndarray]:
+        x = everything.space.physical(possible.y - way)
+        known = Solution(problem, possible, x, solution.residuals, solution.weights, solution.steps, solution.change)
+        return Residuals.of(everything, known), way
+
     noise = {KINDS.index(c.kind): c.estimated for c in channels}
-    verdict = judge(estimation, solution, allowed, settings, noise, progress)
+    verdict = judge(estimation, solution, allowed, with_all, settings, noise, progress)
     as_solved = _named(space, solution, measurements, channels, len(decisions), verdict.level)
     model, held = _held(as_solved, estimation, solution.posterior, datum)
     return ModelFit(
@@ -258,8 +267,8 @@ def _begin(
 
 def _choose(
     everything: Estimation, problem: LinearProblem, settings: FitSettings, progress: Callable[[str], object]
-) -> tuple[list[Decision], Posterior, tuple[ParameterSpace, Estimation, Solution]]:
-    """Return what is fitted, what the data allow with all blocks in, and the fit."""
+) -> tuple[list[Decision], tuple[LinearProblem, Posterior], tuple[ParameterSpace, Estimation, Solution]]:
+    """Return what is fitted, what the data allow with all blocks in and by which problem, and the fit."""
     space, measurements = everything.space, everything.measurements
     decisions, possible, kept = select(space, problem, np.ones(len(KINDS)), progress)
     y = np.zeros(space.size)
@@ -276,7 +285,7 @@ def _choose(
         if [d.kept for d in again] != [d.kept for d in decisions]:
             answer = _solve(measurements, again, settings, start, progress)
         decisions = again
-    return decisions, possible, answer
+    return decisions, (problem, possible), answer
 
 
 class _Start(NamedTuple):
@@ -317,10 +326,14 @@ def _carried_over(start: _Start, space: ParameterSpace) -> tuple[np.ndarray, np.
     return x, tolerances, start.noise
 
 
-def _allowed(everything: ParameterSpace, possible: Posterior, answer: tuple[ParameterSpace, Solution]) -> Allowed:
-    """Return what the readings allow, as :func:`expected_error` wants it, seen from an answer."""
-    x, _, _ = _carried_over(_Start.of(*answer), everything)
-    return everything, everything.physical(possible.y) - x, physical_covariance(everything, possible)
+def _way(space: ParameterSpace, solution: Solution, everything: ParameterSpace, possible: Posterior) -> np.ndarray:
+    """Return the way from an answer's parameters y to the most probable ones with all blocks in, shape (size,)."""
+    way = possible.y.copy()
+    for block in everything.blocks:
+        own = space.block(block.name)
+        if own is not None:
+            way[block.part] -= solution.posterior.y[own.part]
+    return way
 
 
 def unseen_errors(measurements: MeasurementSet, settings: FitSettings) -> tuple[str, ...]:

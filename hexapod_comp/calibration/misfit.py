@@ -9,19 +9,21 @@ is fitted to what is left. The scale of an instrument, which no reading shows, i
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Container, Iterator
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg.lapack import dtrtrs
 
-from ..measurements.readings import ANGULAR_KINDS, BACKWARD, FORWARD, KINDS, MeasurementSet
+from ..measurements.readings import ANGULAR_KINDS, AXES, BACKWARD, FORWARD, KINDS, MeasurementSet
 from ..virtual.trial import without_datum
 from .cell_rows import CellRows
 from .estimation import Estimation, Solution
 from .linear_problem import LARGE_FOLD, whitened_precision
-from .observability import ToolError, box_stations
-from .parameters import FitSettings, ParameterSpace
+from .observability import box_stations
+from .parameters import FitSettings
+from .promise import Unexplained
 from .sensitivity import derivatives, predict
 
 CHANCE = 2.88
@@ -50,11 +52,23 @@ ALIGNMENT = 0.5e-3
 HELD = 0.5
 """A promise of which more than this share comes from the priors is none."""
 
+LINE = "line"
+ALL = (
+    LINE,
+    "family of lines",
+    *(f"plane across {axis}" for axis in AXES),
+    "direction",
+    "quarter of the time",
+    "channel",
+)
+"""What is left out in turn."""
+
+GENERAL, FINE_TERMS = ("map", "field displacement", "field rotation", "field reversal"), 0.3
+"""Blocks of coarse and fine terms; and how well the size of the fine ones is known by that of the coarse, as the
+standard deviation of its logarithm."""
+
 FAMILIES = ("x lines", "y lines", "z lines", "other lines", "other runs")
 """Families of runs, by direction in the work frame."""
-
-TWICE, LACK_MARGIN = 2.0, 1.5
-"""The upper end of an interval stands so far out: in standard deviations of a scale, and in sizes of a lack."""
 
 CLEAR_LACK = 3.0
 """What readings share is no chance from so many standard deviations on."""
@@ -62,14 +76,15 @@ CLEAR_LACK = 3.0
 CUT = 4.0
 """Residuals count for no more standard deviations than that: a gross error is a single reading's."""
 
+CUT_OF_PAIRS, LEFT_BY_CUT = 2.0, 0.911
+"""The same where pairs are compared, for an instrument that slips puts many readings off; and what is left by that of
+the covariance of normal ones that are nearly independent, (P(|x| < 2))²."""
+
+LEAST_LEFT = 0.25
+"""No more than the rest is taken for swallowed by the parameters."""
+
 LEAST_FREE = 3.0
 """A χ² is given for more degrees of freedom only."""
-
-DOUBTFUL_FACTOR = 3.0
-"""Parts of the readings that differ so many times as much as their noise explains put the whole fit in doubt."""
-
-STEEL = 11.5e-6
-"""Expansion of steel, 1/K."""
 
 LEAST_RUNS = 6
 """A drift is looked for in so many runs of a linear laser, or more."""
@@ -79,76 +94,6 @@ NEGLIGIBLE = 1e-4
 
 LEAST_PAIRS = 30
 """Pairs of readings there and back from which on their likeness tells the machine's errors from noise."""
-
-
-@dataclass(frozen=True)
-class Unexplained:
-    """What widens a promise.
-
-    Attributes
-    ----------
-    factor : float
-        On the standard deviations of all parameters, from 1: what leaving out `without` shows.
-    without : str
-        What was left out in turn where that showed most; empty where the factor is 1.
-    lack : float
-        RMS displacement of the tool that readings show and no parameter describes, m.
-    drift : float
-        Change of the scale from the first to the last reading, m/m; 0 where there is none.
-    scale : float
-        Stated standard deviation of the scale of all readings, m/m.
-    """
-
-    factor: float = 1.0
-    without: str = ""
-    lack: float = 0.0
-    drift: float = 0.0
-    scale: float = 0.0
-
-    def widened(self, error: ToolError | None) -> ToolError | None:
-        """Return a tool error whose expectation and interval allow for all this; its lower end stays."""
-        if error is None:
-            return None
-        stretch = error.radius * np.array([self.scale, 0.5 * self.drift])
-        after = np.sqrt((self.factor * error.after) ** 2 + self.lack**2 + stretch @ stretch)
-        high = np.sqrt((self.factor * error.high) ** 2 + (LACK_MARGIN * self.lack) ** 2 + TWICE**2 * stretch @ stretch)
-        rotation = self.factor * error.rotation_after
-        return replace(error, after=float(after), high=float(high), rotation_after=float(rotation))
-
-    def doubts(self) -> list[str]:
-        """Return what puts a fit in doubt."""
-        listed = []
-        if self.factor > DOUBTFUL_FACTOR:
-            listed.append(f"{self._outcome()}: lines, or what they were read with, disagree with each other")
-        if self.drift:
-            size = f"{self.drift * 1e6:.2g} ppm, as steel's does in {self.drift / STEEL:.2g} K"
-            listed.append(f"the scale of the linear readings changes by {size}, from the first to the last")
-        return listed
-
-    def remarks(self) -> list[str]:
-        """Return what a reader must know of how the promise came about."""
-        listed = []
-        if 1.0 < self.factor <= DOUBTFUL_FACTOR:
-            listed.append(f"{self._outcome()}; the expected tool error allows for it")
-        if self.lack:
-            problem = f"{self.lack * 1e6:.2f} µm RMS of the tool's error, there and back alike, are in no parameter"
-            listed.append(f"{problem}; the expected tool error allows for them")
-        return listed
-
-    def as_json(self) -> dict[str, float | str]:
-        """Return this as plain numbers; units are in the keys."""
-        return {
-            "factor": self.factor,
-            "without": self.without,
-            "lack_m": self.lack,
-            "drift_m_per_m": self.drift,
-            "scale_m_per_m": self.scale,
-        }
-
-    def _outcome(self) -> str:
-        return (
-            f"left out in turn, each {self.without} changes the tool {self.factor:.1f} times as much as noise explains"
-        )
 
 
 @dataclass(frozen=True)
@@ -163,8 +108,6 @@ class Residuals:
         Derivatives by the parameters in use.
     residual : ndarray, shape (C,)
         What is left.
-    leverage : ndarray, shape (C,)
-        Share of each cell that the parameters take up.
     run, direction : ndarray of int, shape (C,)
         Of each cell.
     rank : ndarray, shape (C,)
@@ -175,7 +118,6 @@ class Residuals:
     solution: Solution
     rows: CellRows
     residual: np.ndarray
-    leverage: np.ndarray
     run: np.ndarray
     direction: np.ndarray
     rank: np.ndarray
@@ -185,7 +127,7 @@ class Residuals:
         """Return those of a fit."""
         problem, posterior, cells = solution.problem, solution.posterior, estimation.cells
         scale = 1.0 / posterior.noise[problem.kind]
-        rows, every = problem.rows.using(posterior.used, scale), np.arange(len(scale))
+        rows = problem.rows.using(posterior.used, scale)
         m = estimation.measurements
         order = np.argsort(np.argsort(cells.first))
         return Residuals(
@@ -193,14 +135,43 @@ class Residuals:
             solution=solution,
             rows=rows,
             residual=scale * problem.target - rows.times(posterior.y),
-            leverage=rows.between(posterior.covariance, every, every),
             run=m.run[cells.first],
             direction=m.direction[cells.first],
             rank=order / max(len(order) - 1, 1) - 0.5,
         )
 
+    @cached_property
+    def taken(self) -> np.ndarray:
+        """Share of each cell that parameters and unknowns of the instruments take up, shape (C,)."""
+        every = np.arange(len(self.residual))
+        return self.shared(every, every) + self.estimation.shares_of_unknowns()
 
-def unexplained(residuals: Residuals, scale: float) -> Unexplained:
+    @cached_property
+    def metric(self) -> np.ndarray:
+        """M: yᵀ·M·y is the tool's mean squared error in the box, the datum aligned, of parameters y in use; or zero."""
+        space = self.estimation.space
+        stations = box_stations(space)
+        if stations is None:
+            return np.zeros((len(self.solution.posterior.used),) * 2)
+        slopes = derivatives(space, predict(space, self.solution.x, stations), stations)[:, :3]
+        slopes = space.whitened(slopes.reshape(-1, space.size))[:, self.solution.posterior.used]
+        points = stations.positions + stations.rotations @ space.probe
+        effects = without_datum(points, slopes.reshape(len(points), 3, -1)).reshape(3 * len(points), -1)
+        return np.asarray(effects.T @ effects / len(points))
+
+    @property
+    def expected(self) -> float:
+        """Mean squared error of the tool to expect by the covariance, m²."""
+        return float(np.vdot(self.metric, self.solution.posterior.covariance))
+
+    def shared(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Return by how much fitting makes cells unlike each other, pair by pair: what both give to the parameters."""
+        return self.rows.between(self.solution.posterior.covariance, first, second)
+
+
+def unexplained(
+    residuals: Residuals, scale: float, everything: Callable[[], tuple[Residuals, np.ndarray]]
+) -> Unexplained:
     """Return what a settled fit leaves unexplained.
 
     Parameters
@@ -209,9 +180,32 @@ def unexplained(residuals: Residuals, scale: float) -> Unexplained:
         Of the fit.
     scale : float
         Stated standard deviation of the scale of all readings, m/m.
+    everything : callable
+        Returns the residuals with all blocks in, and by how much the parameters y in use differ from the fit's.
     """
-    factor, without = _left_out(residuals)
-    return Unexplained(factor, without, _lack(residuals), _drift(residuals), scale)
+    factor, without, allowed = _left_out(residuals, everything)
+    prior = _of_priors(residuals)
+    return Unexplained(factor, without, allowed, prior, _lack(residuals), _drift(residuals), scale)
+
+
+def _of_priors(r: Residuals) -> float:
+    """Return how well the logarithm of the tool error to expect is known, as the sizes of priors are estimates.
+
+    A size that n parameters determine is known to 1/√(2n) of itself, and moves the squared error by its prior's share
+    of it: with C = (N + T⁻²)⁻¹, tr(M·C·T⁻²·C)/tr(M·C). Of a length map or a field, coarse terms determine the size and
+    fine ones are taken to be in proportion.
+    """
+    posterior, metric, expected = r.solution.posterior, r.metric, r.expected
+    if not expected > 0.0:
+        return 0.0
+    held = np.einsum("ij,ji->i", posterior.covariance @ metric, posterior.covariance) / posterior.spread**2
+    variance = 0.0
+    for block in r.estimation.space.blocks:
+        members = (posterior.used >= block.part.start) & (posterior.used < block.part.stop)
+        share = held[members].sum() / expected
+        variance += 0.5 * share**2 / max(posterior.determined[members].sum(), 1.0)
+        variance += (share * FINE_TERMS) ** 2 if block.name in GENERAL else 0.0
+    return float(np.sqrt(variance))
 
 
 def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
@@ -228,9 +222,8 @@ def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
 
 def held_by_priors(residuals: Residuals) -> bool:
     """Return whether what a fit expects of the tool comes from the priors rather than from the readings."""
-    r = residuals
-    metric = _tool_metric(r.estimation.space, r.solution)
-    if metric is None:
+    r, metric = residuals, residuals.metric
+    if not metric.any():
         return False
     posterior = r.solution.posterior
     spread = r.estimation.space.spread(posterior.tolerances)[posterior.used]
@@ -248,21 +241,38 @@ def family_of_run(measurements: MeasurementSet) -> np.ndarray:
     return np.where(axes.any(axis=1), family, 4)
 
 
-def _left_out(r: Residuals) -> tuple[float, str]:
-    """Return the largest factor on standard deviations that leaving something out shows, and what that was."""
-    metric = _tool_metric(r.estimation.space, r.solution)
-    if metric is None:
-        return 1.0, ""
-    leaving = _Leaving(metric, r)
+def _left_out(r: Residuals, everything: Callable[[], tuple[Residuals, np.ndarray]]) -> tuple[float, str, float]:
+    """Return the largest factor on standard deviations that leaving something out shows, what that was, and `allowed`.
+
+    Without one line the others still stand about it. Without a family, a plane or a channel the model is left to
+    itself, and with fewer blocks than the machine has it is too sure: then no more is unexplained than all blocks
+    together leave possible.
+    """
+    factors = _factors(r, ALL)
+    allowed, far = factors.get(LINE, 1.0), factors.keys() - {LINE}
+    if far:
+        wide, shift = everything()
+        beyond = _factors(wide, far)
+        possible = np.sqrt((wide.expected + shift @ wide.metric @ shift) / r.expected)
+        for what in far:
+            factors[what] = min(factors[what], float(possible) * beyond.get(what, 1.0))
+        allowed = max(allowed, *beyond.values(), 1.0)
+    without = max(factors, key=lambda what: factors[what], default="")
+    return (factors[without], without, allowed) if factors.get(without, 0.0) > 1.0 else (1.0, "", allowed)
+
+
+def _factors(r: Residuals, wanted: Container[str]) -> dict[str, float]:
+    """Return what changes the tool too much when it is left out, with the factor on standard deviations."""
+    leaving = _Leaving(r)
     changes: dict[str, list[tuple[float, float, float]]] = {}
-    for what, cells in _groups(r):
+    for what, cells in _groups(r, wanted):
         changes.setdefault(what, []).append(leaving.change(cells))
-    worst, name = 1.0, ""
+    factors = {}
     for what, listed in changes.items():
         ratio, limit = _excess(*np.transpose(listed))
-        if ratio > max(limit, worst**2):
-            worst, name = float(np.sqrt(ratio)), what
-    return worst, name
+        if ratio > max(limit, 1.0):
+            factors[what] = float(np.sqrt(ratio))
+    return factors
 
 
 class _Leaving:
@@ -272,12 +282,12 @@ class _Leaving:
     into the tool's mean squared error in the measured box; M = F·Fᵀ, F without what no prior lets happen.
     """
 
-    def __init__(self, metric: np.ndarray, residuals: Residuals) -> None:
+    def __init__(self, residuals: Residuals) -> None:
         self._residuals, self._posterior = residuals, residuals.solution.posterior
         self._spread = self._posterior.spread
         self._precision = whitened_precision(residuals.solution.problem, self._posterior)
-        values, vectors = np.linalg.eigh(self._spread[:, None] * metric * self._spread)
-        unheeded = NEGLIGIBLE * np.vdot(metric, self._posterior.covariance)
+        values, vectors = np.linalg.eigh(self._spread[:, None] * residuals.metric * self._spread)
+        unheeded = NEGLIGIBLE * residuals.expected
         kept = np.cumsum(values) > unheeded  # ascending
         self._effects = vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0))
         self._reached = self._posterior.covariance @ (self._effects / self._spread[:, None])  # C·F
@@ -303,15 +313,15 @@ class _Leaving:
         return float(moved @ moved), expected, expected**2 / float(np.vdot(spread, spread))
 
 
-def _groups(r: Residuals) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the cells that are left out in turn, by name; nothing where it would be all."""
-    groupings = {"line": r.run} | {what: groups[r.run] for what, groups in _groupings_of_runs(r).items()}
+def _groups(r: Residuals, wanted: Container[str]) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the cells that are left out in turn of what is wanted, by name; nothing where it would be all."""
+    groupings = {LINE: r.run} | {what: groups[r.run] for what, groups in _groupings_of_runs(r).items()}
     groupings["direction"] = r.direction
     groupings["quarter of the time"] = np.floor((r.rank + 0.5) * (QUARTERS - 1e-9))
     groupings["channel"] = r.estimation.cells.kind
     for what, groups in groupings.items():
         different = np.unique(groups)
-        for group in different if len(different) > 1 else ():
+        for group in different if len(different) > 1 and what in wanted else ():
             yield what, np.flatnonzero(groups == group)
 
 
@@ -328,18 +338,6 @@ def _excess(shown: np.ndarray, expected: np.ndarray, freedom: np.ndarray) -> tup
     return float(shown.sum() / expected.sum()), float((1.0 - width + CHANCE * np.sqrt(width)) ** 3)
 
 
-def _tool_metric(space: ParameterSpace, solution: Solution) -> np.ndarray | None:
-    """Return M: yᵀ·M·y is the mean squared error of the tool in the box, the datum aligned, of parameters y in use."""
-    stations = box_stations(space)
-    if stations is None:
-        return None
-    slopes = derivatives(space, predict(space, solution.x, stations), stations)[:, :3]
-    slopes = space.whitened(slopes.reshape(-1, space.size))[:, solution.posterior.used]
-    points = stations.positions + stations.rotations @ space.probe
-    effects = without_datum(points, slopes.reshape(len(points), 3, -1)).reshape(3 * len(points), -1)
-    return effects.T @ effects / len(points)
-
-
 def _groupings_of_runs(r: Residuals) -> dict[str, np.ndarray]:
     """Return which runs are left out together, by name: a number for each run."""
     m = r.estimation.measurements
@@ -347,7 +345,7 @@ def _groupings_of_runs(r: Residuals) -> dict[str, np.ndarray]:
     places = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)[0][r.estimation.cells.station]
     count = np.maximum(np.bincount(r.run, minlength=len(m.runs)), 1)
     groups = {"family of lines": family}
-    for axis, name in enumerate("xyz"):
+    for axis, name in enumerate(AXES):
         middle = np.bincount(r.run, places[:, axis], len(m.runs)) / count
         across = (family < 3) & (family != axis)
         groups[f"plane across {name}"] = np.where(across, np.round(middle / PLACE), np.inf)
@@ -394,14 +392,19 @@ def _pairs(r: Residuals, kind: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _likeness(r: Residuals, there: np.ndarray, back: np.ndarray) -> float:
-    """Return the variance that pairs of cells share, in their estimated noise's; 0 where it may be chance."""
-    cut = np.clip(r.residual, -CUT, CUT)
-    # Fitting alone makes them unlike each other: by what both give to the parameters and to the run's unknowns.
-    fitted = r.rows.between(r.solution.posterior.covariance, there, back)
+    """Return the variance that pairs of cells share, in their estimated noise's; 0 where it may be chance.
+
+    Fitting makes the noise of a pair unlike each other, by what both give to the parameters and to the run's unknowns;
+    and it takes up that part of what they share.
+    """
+    cut = np.clip(r.residual, -CUT_OF_PAIRS, CUT_OF_PAIRS)
     groups = r.estimation.cells.group
     sizes = np.bincount(groups + 1)[groups[there] + 1]
-    shared = cut[there] * cut[back] + fitted + np.where(groups[there] < 0, 0.0, 1.0 / sizes)
-    return max(0.0, float(shared.mean())) if shared.mean() > CLEAR_LACK / np.sqrt(len(there)) else 0.0
+    unlike = r.shared(there, back) + np.where(groups[there] < 0, 0.0, 1.0 / sizes)
+    shared = (cut[there] * cut[back] / LEFT_BY_CUT + unlike).mean()
+    if shared < CLEAR_LACK / np.sqrt(len(there)):
+        return 0.0
+    return float(shared / max(1.0 - (r.taken[there] + unlike).mean(), LEAST_LEFT))
 
 
 def _drift(r: Residuals) -> float:
@@ -445,8 +448,7 @@ class ChiSquare:
 def chi_squares(r: Residuals) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare, ...]]:
     """Return χ² by kind of channel for families of lines and for directions, and run by run, the worst first."""
     m, solution, of_reading = r.estimation.measurements, r.solution, r.estimation.cells.of_reading
-    taken = r.leverage + r.estimation.shares_of_unknowns()
-    freedom = 1.0 - (taken / np.bincount(of_reading))[of_reading]
+    freedom = 1.0 - (r.taken / np.bincount(of_reading))[of_reading]
     squares = (solution.weights * solution.residuals / r.estimation.uncertainty) ** 2
     family, runs = family_of_run(m), [run.name for run in m.runs]
     ways = {FORWARD: "forward", BACKWARD: "backward"}

@@ -15,6 +15,7 @@ from ..virtual.trial import without_datum
 from .estimation import Estimation
 from .linear_problem import LinearProblem, Posterior, physical_covariance
 from .parameters import ParameterSpace
+from .promise import Unexplained
 from .sensitivity import Prediction, derivatives, predict
 
 SEEN = 1.0
@@ -224,8 +225,6 @@ class ToolError:
         readings do not tell whether the machine has them.
     rotation_before, rotation_after : float
         The same of the rotation, rad.
-    radius : float
-        RMS distance of the points from their middle, m: what a scale that is off acts on.
     """
 
     before: float
@@ -234,7 +233,6 @@ class ToolError:
     high: float
     rotation_before: float
     rotation_after: float
-    radius: float
 
 
 Allowed = tuple[ParameterSpace, np.ndarray, np.ndarray]
@@ -248,6 +246,7 @@ def expected_error(
     tilt: float = 0.0,
     prior: np.ndarray | None = None,
     allowed: Allowed | None = None,
+    beyond: Unexplained | None = None,
 ) -> ToolError | None:
     """Return the tool error that the parameters' covariance leaves, at random points, both directions.
 
@@ -265,6 +264,8 @@ def expected_error(
     allowed : (ParameterSpace, ndarray, ndarray), optional
         A larger space with nothing ruled out, the way from x to its most probable parameters, and their covariance:
         what may hide there widens the interval upwards.
+    beyond : Unexplained, optional
+        What else does.
     """
     stations = box_stations(space, tilt)
     if stations is None:
@@ -276,10 +277,10 @@ def expected_error(
         errors = derivatives(space, prediction, stations) @ _drawn(prior)
     before, rotation_before = _aligned_rms(points, errors)
     left, possible = left_errors(space, prediction, stations, covariance, allowed)
-    after, rotation_after = _aligned_rms(points, left)
-    low, high = interval(after, _aligned_rms(points, possible)[0])
-    radius = rms(np.linalg.norm(points - points.mean(axis=0), axis=1))
-    return ToolError(rms(before), rms(after), low, high, rms(rotation_before), rms(rotation_after), radius)
+    beyond, (sizes, rotation_sizes) = beyond or Unexplained(), _aligned_rms(points, left)
+    after, low, high = beyond.promised(sizes, _aligned_rms(points, possible)[0], points)
+    rotation_after = beyond.factor * rms(rotation_sizes)
+    return ToolError(rms(before), after, low, high, rms(rotation_before), rotation_after)
 
 
 def left_errors(
@@ -308,12 +309,6 @@ def left_errors(
         return left, left
     wide_space, shift, wide_covariance = allowed
     return left, derivatives(wide_space, prediction, stations) @ (shift[:, None] + _drawn(wide_covariance))
-
-
-def interval(left: np.ndarray, possible: np.ndarray) -> tuple[float, float]:
-    """Return between what an error lies with 95 %, given draws of it and of what is possible, shape (D,) each."""
-    low, high = np.percentile(left, [2.5, 97.5])
-    return float(low), float(max(high, np.percentile(possible, 97.5)))
 
 
 def _aligned_rms(points: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,6 @@ from .linear_problem import physical_covariance
 from .misfit import (
     ChiSquare,
     Residuals,
-    Unexplained,
     chi_squares,
     held_by_priors,
     stated_scale,
@@ -21,6 +20,7 @@ from .misfit import (
 )
 from .observability import Allowed, ToolError, expected_error
 from .parameters import FitSettings, ParameterSpace
+from .promise import Unexplained
 from .selection import EXPECTED
 from .suspicions import suspicions
 
@@ -70,6 +70,7 @@ def judge(
     estimation: Estimation,
     solution: Solution,
     allowed: Allowed,
+    everything: Callable[[], tuple[Residuals, np.ndarray]],
     settings: FitSettings,
     noise: Mapping[int, float],
     progress: Callable[[str], object] = lambda text: None,
@@ -82,6 +83,8 @@ def judge(
         The fit.
     allowed : Allowed
         What the readings do not rule out.
+    everything : callable
+        As for :func:`~.misfit.unexplained`.
     settings : FitSettings
         Of the fit, with all blocks that it might have used.
     noise : mapping of int to float
@@ -91,13 +94,11 @@ def judge(
     """
     measurements, space = estimation.measurements, estimation.space
     residuals = Residuals.of(estimation, solution)
-    beyond = unexplained(residuals, stated_scale(measurements, settings))
+    beyond = unexplained(residuals, stated_scale(measurements, settings), everything)
     covariance = physical_covariance(space, solution.posterior)
     level_only = _is_level_only(measurements, space)
     level, tilted = (
-        None
-        if level_only and tilt
-        else beyond.widened(expected_error(space, solution.x, covariance, tilt, None, allowed))
+        None if level_only and tilt else expected_error(space, solution.x, covariance, tilt, None, allowed, beyond)
         for tilt in (0.0, TILT)
     )
     families, runs = chi_squares(residuals)

@@ -10,8 +10,9 @@ import numpy as np
 
 from ..calibration.evaluation import PaperMetric, paper_metric
 from ..calibration.fit import ModelFit, fit_model
+from ..calibration.linear_problem import physical_covariance
 from ..calibration.lines import fit_lines
-from ..calibration.observability import interval, left_errors, stations_of
+from ..calibration.observability import left_errors, stations_of
 from ..calibration.parameters import FitSettings
 from ..calibration.report import tool_error_text
 from ..calibration.sensitivity import predict
@@ -251,18 +252,15 @@ def promises(fit: ModelFit, poses: Sequence[Pose], path: Path) -> tuple[tuple[fl
     lengths = np.linalg.norm(ways, axis=1, keepdims=True)
     along = ways / np.where(lengths > 0.0, lengths, 1.0)
     sizes = []
-    for errors in left_errors(space, prediction, stations, fit.covariance, fit.allowed):
+    covariance = physical_covariance(space, fit.solution.posterior)
+    for errors in left_errors(space, prediction, stations, covariance, fit.allowed):
         aligned = without_datum(tool[0], errors[:, :3], rest)
         across = aligned - along[:, :, None] * np.einsum("ni,nid->nd", along, aligned)[:, None]
         sizes.append([np.sqrt((e**2).sum(axis=1).mean(axis=0)) for e in (aligned[rest], across[len(poses) :])])
     (rest_left, path_left), (rest_possible, path_possible) = sizes
-    # What widens a promise leaves its lower end where it is, here as in the fit's report.
-    widened = fit.verdict.unexplained.factor
-    (rest_low, rest_high), (path_low, path_high) = (
-        interval(rest_left, rest_possible),
-        interval(path_left, path_possible),
-    )
-    return (rest_low / widened, rest_high), (path_low / widened, path_high)
+    beyond = fit.verdict.unexplained
+    at_rest = beyond.promised(rest_left, rest_possible, tool[0][rest])
+    return at_rest[1:], beyond.promised(path_left, path_possible, tool[0][len(poses) :])[1:]
 
 
 def left_by_drives(
