@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,11 +77,22 @@ class CheckReadings:
             problem = "tell nothing: the unknown zeros of their runs take all of them; read more places of each run"
             raise CalibrationError("measurements", problem)
         sigma = fitted.noise[kinds]
+        self._seen = seen
         self.rows = seen.T @ rows
         self.residuals = seen.T @ linear.target - self.rows @ fitted.x
         self.noise = (seen.T * sigma**2) @ seen
         self.single = seen.T * sigma
         self.readings = [int((of_reading == cell).argmax()) for cell in range(len(kinds))]
+
+    def part(self, contrasts: np.ndarray) -> CheckReadings:
+        """Return what some differences of the places tell, shape (k, places), orthonormal and free of all zeros."""
+        reduced, result = contrasts @ self._seen, copy(self)
+        result.rows, result.residuals, result.single = (reduced @ a for a in (self.rows, self.residuals, self.single))
+        result.noise = reduced @ self.noise @ reduced.T
+        used = np.flatnonzero(contrasts.any(axis=0))
+        result.single, result.readings = result.single[:, used], [self.readings[n] for n in used]
+        result._seen = reduced
+        return result
 
     def covariance(self, of_parameters: np.ndarray) -> np.ndarray:
         """Return the readings' covariance when the parameters have one, shape (n, n)."""

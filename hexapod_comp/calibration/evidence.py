@@ -103,7 +103,11 @@ class Evidence:
         Kinds of change have their :data:`~.changes.PRIOR`; the groups of a kind are equally likely, as are the
         hypotheses of a group, and the scales of each.
         """
-        return [logs[0] for logs in self._logs(self.whitened(readings)[None])]
+        return [logs[0] for logs in self.weights_of_each(readings[None])]
+
+    def weights_of_each(self, readings: np.ndarray) -> list[np.ndarray]:
+        """Return the same, (N, m), of N sets of readings, shape (N, n)."""
+        return self._logs(self.whitened(readings.T).T)
 
     def probability_unchanged(self, readings: np.ndarray) -> float:
         """Return in which share of checks a machine that has not changed reads as strangely as this, or more so.

@@ -70,7 +70,7 @@ def settle(
         for group in np.unique(groups):
             chosen = np.flatnonzero(groups == group)
             odds = _separation(rows[chosen], fitted.noise[cells.kind[chosen]], explanations)
-            proposals.append(Settling(*_described(readings, first[chosen]), len(chosen), odds))
+            proposals.append(Settling(*described(readings, first[chosen]), len(chosen), odds))
     return sorted(proposals, key=lambda p: -p.odds)[:MOST]
 
 
@@ -115,7 +115,7 @@ def _of_kinds(readings: MeasurementSet, kinds: np.ndarray) -> MeasurementSet:
     return readings.select(np.isin(readings.kind, kinds))
 
 
-def _described(readings: MeasurementSet, members: np.ndarray) -> tuple[str, tuple[str, ...]]:
+def described(readings: MeasurementSet, members: np.ndarray) -> tuple[str, tuple[str, ...]]:
     """Return where some readings of one run or one pose are taken, and what is read."""
     run = readings.runs[readings.run[members[0]]]
     channels = tuple(dict.fromkeys(CHANNELS[c] for c in readings.channel[members]))

@@ -337,8 +337,10 @@ def _fit(parser: argparse.ArgumentParser) -> None:
 def _verify(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("model", metavar="MODEL", help="model file that fit has written, MODEL.posterior.npz beside it")
-    _readings(add)
+    _readings(add, "*")
     _compensated(add)
+    add("--propose", metavar="FILE", help="instead: write which readings to take, a tidy CSV file without values")
+    add("--readings", type=int, metavar="N", help="how many of them (default 12)")
     _json(add)
 
 
@@ -347,9 +349,9 @@ def _compensated(add: Add) -> None:
     add("--compensated", action="store_true", help=text)
 
 
-def _readings(add: Add) -> None:
+def _readings(add: Add, count: str = "+") -> None:
     """Add the measured files, the machine, and how the files are read."""
-    add("files", nargs="+", metavar="FILE", help="measured files")
+    add("files", nargs=count, metavar="FILE", help="measured files")
     _machine(add)
     add("--columns", metavar="FILE", help="columns file that explains wide CSV files")
     text = "measured point in platform (default: the tool's tip)"

@@ -21,9 +21,46 @@ def run(args: argparse.Namespace) -> int:
     from ..calibration.verification import VALID
     from ..calibration.verification_report import verification_json, verification_report
 
+    _refuse_what_does_not_fit(args)
+    if args.propose is not None:
+        return _propose(args)
     result = checked(args, args.model).verification
     common.show(verification_json(result) if args.json else verification_report(result))
     return 0 if result.verdict == VALID else 1
+
+
+def _refuse_what_does_not_fit(args: argparse.Namespace) -> None:
+    """Raise on readings that are missing, or that nobody would look at, and on options without a meaning."""
+    from ..errors import CommandError
+
+    if args.propose is None and not args.files:
+        raise CommandError("FILE", "check readings are missing; --propose FILE says which to take")
+    if args.propose is not None and (args.files or args.compensated):
+        raise CommandError("--propose", "says which readings to take: measured files and --compensated come after that")
+    if args.readings is not None and args.propose is None:
+        raise CommandError("--readings", "needs --propose")
+
+
+def _propose(args: argparse.Namespace) -> int:
+    """Write the check readings to take."""
+    from ..calibration.check_plan import USUAL, propose_check
+    from ..calibration.settling import described
+    from ..measurements.writing import write_measurements
+
+    _, fitted = _known(args, args.model)
+    common.mention_compiling("model.actual_pose_one")
+    with common.stage("choosing readings"):
+        readings = propose_check(fitted, USUAL if args.readings is None else args.readings)
+    write_measurements(readings, args.propose)
+    runs = [described(readings, (readings.run == run).nonzero()[0]) for run in dict.fromkeys(readings.run.tolist())]
+    if args.json:
+        common.show(
+            {"runs": [{"where": where, "channels": channels} for where, channels in runs], "written": args.propose}
+        )
+    else:
+        print(f"{len(readings)} check readings:", *(f"  {where}: {', '.join(read)}" for where, read in runs), sep="\n")
+        print(f"to be filled in: {args.propose}")
+    return 0
 
 
 @dataclass(frozen=True)
@@ -44,26 +81,14 @@ def checked(args: argparse.Namespace, path: str) -> Checked:
     CommandError
         It is not known how well the model's parameters are known.
     """
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as for fit
     import numpy as np
 
-    from ..calibration.posterior import load_posterior
     from ..calibration.verification import verify_model
-    from ..errors import CommandError
-    from ..machine.geometry import load_geometry
-    from ..machine.model_file import load_model
     from ..measurements.files import read_measurements
     from ..virtual.instruments import compensated
 
-    geometry = load_geometry(args.machine)
-    model = load_model(path, geometry)
-    fitted, unknown = load_posterior(model, geometry, path)
-    if fitted is None:
-        problem = (
-            f"{path} cannot be checked: {unknown}. A fit of scheme joint writes MODEL.posterior.npz beside its model"
-        )
-        raise CommandError("model", problem)
-    probe = args.probe_mm
+    model, fitted = _known(args, path)
+    geometry, probe = fitted.space.geometry, args.probe_mm
     if probe is None and not np.allclose(fitted.space.probe, geometry.tool.position, rtol=0.0, atol=1e-12):
         probe = fitted.space.probe  # as the fit was told
     with common.stage("reading measurements"):
@@ -74,3 +99,22 @@ def checked(args: argparse.Namespace, path: str) -> Checked:
     with common.stage("weighing what may have happened"):
         verification = verify_model(model, fitted, measured)
     return Checked(model, fitted, measured, verification)
+
+
+def _known(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedParameters]:
+    """Return a model and what its fit knows."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as for fit
+    from ..calibration.posterior import load_posterior
+    from ..errors import CommandError
+    from ..machine.geometry import load_geometry
+    from ..machine.model_file import load_model
+
+    geometry = load_geometry(args.machine)
+    model = load_model(path, geometry)
+    fitted, unknown = load_posterior(model, geometry, path)
+    if fitted is None:
+        problem = (
+            f"{path} cannot be checked: {unknown}. A fit of scheme joint writes MODEL.posterior.npz beside its model"
+        )
+        raise CommandError("model", problem)
+    return model, fitted

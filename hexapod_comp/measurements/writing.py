@@ -22,8 +22,9 @@ from .tidy_rows import DIRECTIONS
 def write_measurements(measurements: MeasurementSet, path: str | Path) -> None:
     """Write a set as the file that :func:`~.tidy_csv.read_tidy` reads back, to the last bit.
 
-    Commanded poses are written to 10⁻¹³ m and 10⁻¹² degrees. The measured point is not a column: where it is not
-    the tool's tip, a comment in the file says where it is, and it has to be given again for reading.
+    Commanded poses are written to 10⁻¹³ m and 10⁻¹² degrees; values that are not a number are left empty, to be filled
+    in. The measured point is not a column: where it is not the tool's tip, a comment in the file says where it is, and
+    it has to be given again for reading.
 
     Raises
     ------
@@ -86,7 +87,11 @@ def _value_cells(channel: str, value: float, uncertainty: float, commanded: floa
     kind = channel.partition("_")[0]
     unit, digits = ("urad", 6) if kind in ANGULAR_KINDS else ("mm", 3) if kind in ("position", "length") else ("um", 6)
     number = Decimal(repr(value)) + Decimal(repr(commanded))
-    return [_moved(number, digits), unit, "" if math.isnan(uncertainty) else _scaled(uncertainty, digits)]
+    return [
+        "" if math.isnan(value) else _moved(number, digits),
+        unit,
+        "" if math.isnan(uncertainty) else _scaled(uncertainty, digits),
+    ]
 
 
 def _scaled(value: float, digits: int) -> str:

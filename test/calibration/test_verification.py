@@ -15,6 +15,7 @@ from calibration_helpers import BOX, FEW, campaign, measured, paper, virtual_mac
 from scipy.stats import multivariate_normal
 
 from hexapod_comp.calibration.changes import DATUM, FAMILIES, OTHER, STRUT, TEMPERATURE, possible_changes, widened
+from hexapod_comp.calibration.check_plan import propose_check
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.evidence import Evidence, Hypothesis
 from hexapod_comp.calibration.fit import fit_model
@@ -26,6 +27,7 @@ from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.datum import tool_move
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.measurements.readings import CHANNELS, FORWARD, MeasurementSet
+from hexapod_comp.virtual.instruments import measure
 
 RUNS = ("diagonal 1", "diagonal 2", "diagonal 4", "x line at y 0.0, z 350.0", "y line at x 0.0, z 350.0")
 
@@ -70,6 +72,20 @@ def crashed(strut: int, size: float) -> MachineModel:
 def left(truth: MachineModel, model: MachineModel) -> float:
     """Return what a model leaves of the tool's error at points nobody measured, the datum aligned, m."""
     return held_out(RealMachine(paper(), truth), model, BOX, 100).aligned.rms
+
+
+def test_twelve_proposed_readings_name_the_strut() -> None:
+    """Strut 3 by 20 µm, read by the virtual instruments where the package proposes; two or more share a zero."""
+    proposed = propose_check(fitted().known)
+    assert len(proposed) == 12
+    assert np.isnan(proposed.value).all()
+    shared = np.unique(np.stack([proposed.run, proposed.channel], axis=1), axis=0, return_counts=True)[1]
+    assert shared.min() >= 2
+    readings = measure(proposed, campaign(), RealMachine(paper(), crashed(2, 20e-6)), 9)
+    result = verify_model(fitted().model, fitted().known, readings)
+    assert (result.verdict, result.candidates[0].family, result.candidates[0].name) == (NAMED, STRUT, "strut_3")
+    with pytest.raises(CalibrationError, match=r"readings: must be 6…60, not 5"):
+        propose_check(fitted().known, 5)
 
 
 def test_evidence_is_the_ratio_of_two_normal_densities() -> None:
