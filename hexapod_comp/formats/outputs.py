@@ -27,6 +27,7 @@ READ = (
     "model",
     "poses",
     "truth",
+    "warm_up",
     "update",
 )
 """Arguments of all verbs that name what is read: files, shipped files, or a bag's folder."""

@@ -17,7 +17,7 @@ from ..errors import NoAnswerError
 from ..machine.trajectory import Path
 from ..pose import Pose
 from .messages import StrutReader, message_pose, pose_message
-from .middleware import RosSession
+from .ros_session import RosSession
 from .runtime import COMMAND_QOS, EVENT_QOS, STATE_QOS
 from .stamps import nanoseconds_of
 

@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
 from std_msgs.msg import String
 
 from ..errors import HexapodError, InputFileError
-from .middleware import RosSession
+from .ros_session import RosSession
 from .running import SPIN_PERIOD
 
 COMPENSATOR = "compensator"

@@ -21,7 +21,7 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import solve_pose
 from ..pose import Pose, rotation_angle
 from .messages import StrutReader, message_pose, read_message
-from .middleware import RosSession
+from .ros_session import RosSession
 from .running import SPIN_PERIOD, keep_discovery_local
 from .runtime import EVENT_QOS, STATE_QOS
 from .stamps import nanoseconds_of
