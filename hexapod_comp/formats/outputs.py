@@ -32,7 +32,7 @@ READ = (
 )
 """Arguments of all verbs that name what is read: files, shipped files, or a bag's folder."""
 
-WRITTEN = ("certificate", "mjcf", "out", "report", "table", "urdf")
+WRITTEN = ("certificate", "mjcf", "out", "propose", "report", "table", "urdf")
 """Arguments that name files to write."""
 
 FOLDERS = ("c_folder", "folder", "linuxcnc", "pictures")
