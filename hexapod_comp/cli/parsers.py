@@ -144,8 +144,7 @@ def _check(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("poses", metavar="POSES.csv", help="CSV file of poses (mm, degrees); - for standard input")
     add("--stream", action="store_true", help="rows are consecutive commands")
-    text = "commands per second (default 250)"
-    add("--rate-hz", type=arguments.finite, default=250.0, metavar="HZ", help=text)
+    add("--rate-hz", type=arguments.finite, default=250.0, metavar="HZ", help="commands per second (default 250)")
     _machine_model_frames(add)
     _table_out(add, "all margins")
     _json(add)
@@ -326,18 +325,16 @@ def _fit(parser: argparse.ArgumentParser) -> None:
     add("--scale-ppm", type=arguments.bound, metavar="PPM", help=text)
     text = "angle between a laser's beam and its line, 1 σ, mrad (scheme joint; default 0.5)"
     add("--alignment-mrad", type=arguments.bound, metavar="MRAD", help=text)
-    text = "trust readings that disagree with the rest (scheme joint)"
-    add("--not-robust", action="store_true", help=text)
+    add("--not-robust", action="store_true", help="trust readings that disagree with the rest (scheme joint)")
     text = "what picks the polynomials' order (scheme lines; default adjusted-r2)"
     add("--order", choices=("adjusted-r2", "aicc"), help=text)
-    text = "report order, R² and residual of each line (scheme lines)"
-    add("--every-line", action="store_true", help=text)
+    add("--every-line", action="store_true", help="report order, R² and residual of each line (scheme lines)")
 
 
 def _verify(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("model", metavar="MODEL", help="model file that fit has written, MODEL.posterior.npz beside it")
-    _readings(add, "*")
+    _readings(add, required=False)
     _compensated(add)
     add("--propose", metavar="FILE", help="instead: write which readings to take, a tidy CSV file without values")
     add("--readings", type=int, metavar="N", help="how many of them (default 12)")
@@ -349,9 +346,10 @@ def _compensated(add: Add) -> None:
     add("--compensated", action="store_true", help=text)
 
 
-def _readings(add: Add, count: str = "+") -> None:
+def _readings(add: Add, required: bool = True) -> None:
     """Add the measured files, the machine, and how the files are read."""
-    add("files", nargs=count, metavar="FILE", help="measured files")
+    files = add("files", nargs="+", metavar="FILE", help="measured files")
+    files.required = required  # nargs="*" would take none where an option stands before them
     _machine(add)
     add("--columns", metavar="FILE", help="columns file that explains wide CSV files")
     text = "measured point in platform (default: the tool's tip)"
@@ -359,8 +357,7 @@ def _readings(add: Add, count: str = "+") -> None:
 
 
 def _separate_joints(add: Add) -> None:
-    text = "platform joints at the same place are two joints, not one"
-    add("--separate-joints", action="store_true", help=text)
+    add("--separate-joints", action="store_true", help="platform joints at the same place are two joints, not one")
 
 
 def _estimation(parser: argparse.ArgumentParser) -> None:
@@ -377,8 +374,7 @@ def _estimation(parser: argparse.ArgumentParser) -> None:
     text = "thermal expansion of struts, or of struts, base and platform, ppm/K; a warm-up starts there (default 0)"
     add("--expansion-ppm", type=arguments.expansions, metavar="S[,B,P]", help=text)
     add("--moisture-ppm", type=arguments.bound, metavar="PPM", help="growth of struts by humidity, ppm per %% (1 to 5)")
-    text = "part whose sensor stands for all (default: the one that alone was read)"
-    add("--thermometer", metavar="PART", help=text)
+    add("--thermometer", metavar="PART", help="part whose sensor stands for all (default: the one that alone was read)")
     text = "how late parts follow their sensors (default: sought from the readings)"
     add("--time-constants-s", type=arguments.time_constants, metavar="S[,S]", help=text)
 
@@ -424,8 +420,7 @@ def _assess(parser: argparse.ArgumentParser) -> None:
     ):
         text = f"bound of {what} (default {default:g})"
         add(f"--{name}", type=arguments.bound, default=default, metavar="BOUND", help=text)
-    text = "period of that error (default 10)"
-    add("--wave-period-mm", type=arguments.bound, default=10.0, metavar="MM", help=text)
+    add("--wave-period-mm", type=arguments.bound, default=10.0, metavar="MM", help="period of that error (default 10)")
     text = "struts that share a platform joint nominally each get one of their own"
     add("--separate-platform-joints", action="store_true", help=text)
     add("--machines", type=arguments.count, default=1, metavar="N", help="how many to draw (default 1)")
@@ -468,13 +463,11 @@ def _classify(parser: argparse.ArgumentParser) -> None:
     add("--compare", type=arguments.count, metavar="N", help=text)
     text = "allowed error of the tool: says what the errors may be"
     add("--allow-um", type=arguments.above_zero, metavar="UM", help=text)
-    text = "processes (default 1, with all threads)"
-    add("--workers", type=arguments.workers, default=1, metavar="N", help=text)
+    add("--workers", type=arguments.workers, default=1, metavar="N", help="processes (default 1, with all threads)")
     add("--scheduler", metavar="tcp://…", help="Dask scheduler that does the work instead")
     _seed(add, "random poses and draws")
     add("--no-page", action="store_true", help="leave the interactive page out of --pictures")
-    text = "then keep the worst type's shells on workspace/shells until Ctrl-C"
-    add("--publish", action="store_true", help=text)
+    add("--publish", action="store_true", help="then keep the worst type's shells on workspace/shells until Ctrl-C")
 
 
 OPTIONS: dict[str, Callable[[argparse.ArgumentParser], None]] = {

@@ -62,6 +62,29 @@ def test_a_valid_model_exits_0(folder: Path, capsys: pytest.CaptureFixture[str])
     assert "\nVALID: " in capsys.readouterr().out
 
 
+def test_files_may_follow_an_option(folder: Path) -> None:
+    assert run("verify", model_in(folder), "--machine", "paper", folder / "same.csv") == 0
+
+
+def test_proposed_readings_are_written_to_be_filled_in(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """They are of the model that is named; what is measured has its own files; and one of both is needed."""
+    proposed = folder / "check.csv"
+    assert run("verify", model_in(folder), "--propose", proposed, "--readings", "8") == 0
+    rows = proposed.read_text().splitlines()[1:]
+    assert len(rows) == 8
+    assert all(row.split(",")[-2] == "" for row in rows), "no values yet"
+    assert f"to be filled in: {proposed}" in capsys.readouterr().out
+    for wrong, problem in (
+        ((), "check readings are missing"),
+        ((folder / "same.csv", "--propose", proposed), "says which readings to take"),
+        (("--propose", proposed, "--readings", "2"), "must be 6…60, not 2"),
+        (("--readings", "8"), "check readings are missing"),
+        ((proposed,), "value"),
+    ):
+        assert run("verify", model_in(folder), *wrong) == 2
+        assert problem in capsys.readouterr().err
+
+
 def test_readings_under_compensation_need_its_option(folder: Path) -> None:
     """All struts are 30 µm too long: taken for readings without compensation, those of a compensated one differ."""
     assert run("verify", model_in(folder), folder / "running.csv", "--compensated") == 0
