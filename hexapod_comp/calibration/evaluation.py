@@ -194,11 +194,19 @@ class Worth:
         The tool's error in space without and with the model.
     paper : PaperMetric
         Mou & King's own measure.
+    promised : (float, float) or None
+        Where a fit expects the RMS error in space with the model, the datum aligned, m.
     """
 
     before: HeldOut
     after: HeldOut
     paper: PaperMetric
+    promised: tuple[float, float] | None = None
+
+    @property
+    def kept(self) -> bool | None:
+        """Whether what a fit promised is so; None where it promised nothing."""
+        return None if self.promised is None else self.promised[0] <= self.after.aligned.rms <= self.promised[1]
 
 
 def worth(

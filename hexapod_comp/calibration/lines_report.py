@@ -141,7 +141,8 @@ def worth_json(worth: Worth) -> dict[str, Any]:
         for name, one in (("error_without", worth.before), ("error_with", worth.after))
     }
     along = {"without_m": worth.paper.before, "with_m": worth.paper.after, "lines": worth.paper.lines}
-    return {**error, "mean_displacement_error_along_lines": along}
+    promised = {"promised_m": worth.promised, "kept": worth.kept}
+    return {**error, **promised, "mean_displacement_error_along_lines": along}
 
 
 def _worth_lines(worth: Worth) -> Iterator[str]:
@@ -150,6 +151,9 @@ def _worth_lines(worth: Worth) -> Iterator[str]:
     yield f"On the virtual machine, without → with the model (held out: {after.points} points, both ways):"
     yield f"  metric of Mou & King, mean |displacement error| along {paper.lines} lines: {along}"
     yield f"  error vector in space, RMS, datum aligned: {_fall(before.aligned.rms, after.aligned.rms, 'µm')}"
+    if worth.promised is not None:
+        low, high = (f"{end * 1e6:.2f}" for end in worth.promised)
+        yield f"  promised by the fit: {low} to {high} µm, {'kept' if worth.kept else 'NOT KEPT'}"
     yield f"  its largest: {_fall(before.aligned.largest, after.aligned.largest, 'µm')}"
     yield f"  error vector in space, RMS, as it is: {_fall(before.raw.rms, after.raw.rms, 'µm')}"
     yield f"  rotation, RMS, datum aligned: {_fall(before.rotation.rms, after.rotation.rms, 'µrad')}"

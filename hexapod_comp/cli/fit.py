@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
         _refuse(args, result)
         return 1
     with common.stage("trying the model on the virtual machine"):
-        worth = _worth(truth, result.model, measured)
+        worth = _worth(truth, result, measured)
     _write(args, result, measured, worth)
     return 0
 
@@ -271,7 +271,7 @@ def _lines(args: argparse.Namespace, measured: MeasurementSet) -> _Result:
     return _Result(fit.model, text, lambda: as_json(fit), pictures, fit.misfit)
 
 
-def _worth(truth: RealMachine | None, model: MachineModel, measured: MeasurementSet) -> Worth | None:
+def _worth(truth: RealMachine | None, result: _Result, measured: MeasurementSet) -> Worth | None:
     """Return what the model is worth on the virtual machine that was measured, if that is known."""
     from ..calibration.evaluation import worth
     from ..errors import CalibrationError
@@ -283,4 +283,6 @@ def _worth(truth: RealMachine | None, model: MachineModel, measured: Measurement
     if not spans(box):
         raise CalibrationError("--truth", "the readings span no box in which the model could be judged")
     level = geometry.work.rotation.T @ measured.level() @ geometry.tool.rotation
-    return worth(truth, model, box, level=level)
+    tool = None if result.fit is None else result.fit.level
+    promised = None if tool is None else (tool.low, tool.high)
+    return replace(worth(truth, result.model, box, level=level), promised=promised)

@@ -212,6 +212,8 @@ def test_json_holds_every_parameter_with_its_error(done: Calibration) -> None:
     assert 0.0 < content["channels"][0]["found_m"] < 1e-5
     assert content["misfit"] == ""
     assert content["worth"]["error_with"]["aligned_rms_m"] < 0.1 * content["worth"]["error_without"]["aligned_rms_m"]
+    low, high = content["worth"]["promised_m"]
+    assert content["worth"]["kept"] is (low <= content["worth"]["error_with"]["aligned_rms_m"] <= high)
     assert content["standards"]["iso230_2"]["x line at y 0.0, z 350.0"]["A_m"] > 0.0
     assert content["written"] == str(done.file("model.yaml"))
     error = content["expected_tool_error"]
