@@ -42,7 +42,7 @@ GROWTH = 20
 PEAK, COPIES = 250, 60
 """No node may ever have more than this, MB, or than it began with and six copies of the longest message: the
 middleware's, rclpy's, the one that is looked at, and others that wait; 55 is the most in 200,000 messages. A node
-begins with 210 to 240, half of it pages of libraries that all processes share."""
+begins with 140 to 180, and with more where it has compiled."""
 
 TOPICS = {
     "compensator": ("tool_pose_command", "strut_states", "temperatures", "humidity"),
