@@ -372,7 +372,7 @@ class Rig:
 def dated(callback: Callable[[Any, float], None]) -> Callable[..., None]:
     """Return a callback for rclpy that hands on a message and when its publisher sent it, s on the system's clock.
 
-    As :func:`hexapod_comp.nodes.runtime.numbered`: rclpy asks the signature, and its executors differ.
+    As :func:`hexapod_comp.nodes.callbacks.numbered`: rclpy asks the signature, and its executors differ.
     """
 
     def called(*arguments: Any) -> None:

@@ -9,11 +9,12 @@ from std_srvs.srv import Trigger
 
 from ..compensation.compensator import Compensator
 from ..errors import HexapodError
+from .callbacks import LateAnswer
 from .callers import callers
 from .health import Refusals
 from .machine_files import MachineFiles
 from .model_loading import Loading
-from .runtime import LateAnswer, MachineNode
+from .runtime import MachineNode
 
 
 class ReloadService:

@@ -6,8 +6,9 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 
 from ..errors import HexapodError
+from .callbacks import LateAnswer
 from .health import OK, WARN
-from .runtime import LateAnswer, MachineNode
+from .runtime import MachineNode
 from .warming import Warming
 
 CONFIGURE = "configure"

@@ -13,9 +13,10 @@ from ..errors import CommandError, HexapodError, printable
 from ..machine.frames import WORK, pose_text
 from ..pose import Pose
 from ..workspace.travel import Travel, travel, travel_text
+from .callbacks import LateAnswer
 from .compensator_status import CompensatorStatus
 from .health import ERROR, OK
-from .runtime import EVENT_QOS, LateAnswer, MachineNode
+from .runtime import EVENT_QOS, MachineNode
 
 PERIOD = 1.0
 """Between two messages, s."""
