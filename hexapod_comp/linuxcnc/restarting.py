@@ -10,7 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from ..nodes.health import ERROR
+from ..nodes.health import ERROR, status_prefix
 from ..nodes.runtime import EVENT_QOS, MachineNode
 from .bridge_status import BridgeStatus
 
@@ -42,7 +42,7 @@ class CompensatorReset:
 
     def __init__(self, node: MachineNode, status: BridgeStatus, options: dict[str, Any]) -> None:
         self._node, self._status, self._options = node, status, options
-        self._name = f"{node.get_namespace()}/compensator:".lstrip("/")
+        self._name = status_prefix(node.get_namespace(), "compensator")
         self._asked_at = self._complained_at = -math.inf
         self._in_vain = 0
         self._question: Future | None = None

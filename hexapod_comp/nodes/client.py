@@ -16,6 +16,7 @@ from std_srvs.srv import SetBool
 from ..errors import NoAnswerError
 from ..machine.trajectory import Path
 from ..pose import Pose
+from .health import status_prefix
 from .messages import StrutReader, message_pose, pose_message
 from .ros_session import RosSession
 from .runtime import COMMAND_QOS, EVENT_QOS, STATE_QOS
@@ -68,7 +69,7 @@ class LoopClient:
         self.track: list[tuple[np.ndarray, int]] = []
         self._streamed: int | None = None
         self.diagnostics: dict[str, str] = {}
-        self._status_name = f"{self.node.get_namespace()}/compensator:".lstrip("/")
+        self._status_name = status_prefix(self.node.get_namespace(), "compensator")
         self._counted_before: tuple[int, int] | None = None
         self._true: PoseStamped | None = None
         self._estimate: PoseStamped | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -15,6 +15,21 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 
 REFUSAL_SHOWN_FOR = 1.0
 """A refusal colours the status for this long, s."""
+
+
+def status_prefix(namespace: str, node: str) -> str:
+    """Return what the names of all statuses begin with that a node of a namespace publishes."""
+    return f"{namespace.strip('/')}/{node}:".lstrip("/")
+
+
+def status_of(
+    name: str, hardware_id: str, level: bytes, text: str, values: Mapping[str, str], longest: int = LONGEST_TEXT
+) -> DiagnosticStatus:
+    """Return a status; of text and values no more is shown than `longest` characters each."""
+    status = DiagnosticStatus(level=level, name=printable(name), hardware_id=printable(hardware_id))
+    status.message = printable(text, longest)
+    status.values = [KeyValue(key=key, value=printable(value, longest)) for key, value in values.items()]
+    return status
 
 
 class Flow:
@@ -104,10 +119,7 @@ class HealthReport:
 
     def message(self, level: bytes, text: str, values: dict[str, str], stamp: Time) -> DiagnosticArray:
         """Return the diagnostics message."""
-        name, hardware_id, text = printable(self._name), printable(self._hardware_id), printable(text, LONGEST_TEXT)
-        status = DiagnosticStatus(level=level, name=name, message=text, hardware_id=hardware_id)
-        status.values = [KeyValue(key=key, value=printable(value, LONGEST_TEXT)) for key, value in values.items()]
-        array = DiagnosticArray(status=[status])
+        array = DiagnosticArray(status=[status_of(self._name, self._hardware_id, level, text, values)])
         array.header.stamp = stamp
         return array
 

@@ -192,8 +192,8 @@ class MachineNode(LifecycleNode):
     def speak_for(self, what: str) -> None:
         """Name the machine or component that this node serves from now on in its status: within its namespace, so that
         two of a kind are told apart. The status's name stays: an aggregator would wait for the old one for ever."""
-        hardware_id = f"{self.get_namespace()}/{what}".strip("/")
-        self._report = HealthReport(f"{self.get_fully_qualified_name()[1:]}: state", hardware_id)
+        self.hardware_id = f"{self.get_namespace()}/{what}".strip("/")
+        self._report = HealthReport(f"{self.get_fully_qualified_name()[1:]}: state", self.hardware_id)
 
     def tell(self, level: bytes, text: str, values: Callable[[], dict[str, str]]) -> None:
         """Publish level, text and values when they are due, with what the guard has caught."""

@@ -5,21 +5,24 @@ from __future__ import annotations
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 from std_srvs.srv import Trigger
 
 from ..compensation.compensator import Compensator
-from ..errors import CommandError, HexapodError, printable
+from ..errors import CommandError, HexapodError
 from ..machine.frames import WORK, pose_text
 from ..pose import Pose
 from ..workspace.travel import Travel, travel, travel_text
 from .callbacks import LateAnswer
 from .compensator_status import CompensatorStatus
-from .health import ERROR, OK
+from .health import ERROR, OK, status_of
 from .runtime import EVENT_QOS, MachineNode
 
 PERIOD = 1.0
 """Between two messages, s."""
+
+LONGEST = 200
+"""Characters of what stands in the way."""
 
 
 class TravelReports:
@@ -100,14 +103,10 @@ class TravelReports:
     def _tell(self, level: bytes, text: str, ways: tuple[Travel, ...]) -> None:
         self._answer(level == OK, "\n".join(filter(None, (text, travel_text(ways)))))
         if self._publisher.get_subscription_count():
-            values = [(one.key, f"{one.shown:.6f}") for one in ways]
-            values += [(f"{one.way} stops at", str(one.error or "")) for one in ways]
-            message = DiagnosticStatus(level=level, name=f"{self._node.get_fully_qualified_name()[1:]}: travel")
-            machine = self._compensator.geometry.name
-            message.hardware_id = printable(f"{self._node.get_namespace()}/{machine}".lstrip("/"))
-            message.message = printable(text)
-            message.values = [KeyValue(key=key, value=printable(value)) for key, value in values]
-            self._publisher.publish(message)
+            values = {one.key: f"{one.shown:.6f}" for one in ways}
+            values |= {f"{one.way} stops at": str(one.error or "") for one in ways}
+            name = f"{self._node.get_fully_qualified_name()[1:]}: travel"
+            self._publisher.publish(status_of(name, self._node.hardware_id, level, text, values, LONGEST))
 
     def _answer(self, success: bool, text: str) -> None:
         if self._asked:

@@ -20,6 +20,7 @@ from ..errors import HexapodError
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import solve_pose
 from ..pose import Pose, rotation_angle
+from .health import status_prefix
 from .messages import StrutReader, message_pose, read_message
 from .ros_session import RosSession
 from .running import SPIN_PERIOD, keep_discovery_local
@@ -128,7 +129,7 @@ class Watcher:
         self._states: dict[str, tuple[DiagnosticStatus, float]] = {}
         self._delays: deque[tuple[float, float]] = deque()
         self.node = node
-        self._prefix = f"{node.get_namespace()}/".lstrip("/")
+        self._prefixes = {name: status_prefix(node.get_namespace(), name) for name in NODES}
         node.create_subscription(JointState, "strut_commands", self._on_command, STREAM_QOS, raw=True)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
         for topic, kind in (
@@ -180,8 +181,8 @@ class Watcher:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            for name in NODES:
-                if status.name.startswith(f"{self._prefix}{name}:"):
+            for name, prefix in self._prefixes.items():
+                if status.name.startswith(prefix):
                     self._states[name] = (status, time.monotonic())
 
     def _forget(self, now: float) -> None:

@@ -37,6 +37,7 @@ from ..formats.paths import config_file
 from ..machine.geometry import STRUT_NAMES, load_geometry
 from ..machine.model_file import save_model
 from ..nodes.compensator import CompensatorNode
+from ..nodes.health import status_prefix
 from ..nodes.messages import message_pose, pose_message
 from ..nodes.running import autostart
 from ..nodes.strut_drive import StrutDriveNode
@@ -377,7 +378,7 @@ class Bench:
 
     def statuses(self, node: str = "compensator") -> list[DiagnosticStatus]:
         """Return all statuses of a node, oldest first."""
-        prefix = f"{self.namespace.strip('/')}/{node}:".lstrip("/")
+        prefix = status_prefix(self.namespace, node)
         return [s for array in self.seen["/diagnostics"] for s in array.status if s.name.startswith(prefix)]
 
     def status(self, node: str = "compensator") -> DiagnosticStatus | None:
