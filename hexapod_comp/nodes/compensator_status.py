@@ -90,10 +90,8 @@ class CompensatorStatus:
     def take_parameters(self) -> None:
         """Take the parameters as they are now; others are looked up where they are needed."""
         options = self._options
-        self._stamps.largest_age, self.reading_stamps.largest_age = (
-            options["max_command_age"],
-            options["max_reading_age"],
-        )
+        self._stamps.largest_age = options["max_command_age"]
+        self.reading_stamps.largest_age = options["max_reading_age"]
         self.following.limit = options["following_error_limit"]
         self.last_known.anywhere_after = options["start_without_feedback_after"]
 

@@ -176,9 +176,8 @@ class WarmUp:
             seconds[members] = number * self.every + self.every // 2 + self.pace * np.arange(len(members))
         true = self.course(self.rounds * self.every)
         sensed, warm = self.sensed(true, np.random.default_rng([seed, NOISE])), np.maximum(seconds, 0)
-        before = np.append(
-            np.full(len(PARTS), REFERENCE_TEMPERATURE), self.humidity if HUMIDITY in self.sensors else np.nan
-        )
+        before = self.start
+        before[-1] = self.humidity if HUMIDITY in self.sensors else np.nan
         seen = np.where((seconds < 0)[:, None], before, sensed[warm])
         times = seconds.astype(float)
         is_so, is_read = (
