@@ -397,14 +397,19 @@ class Bench:
         return {} if status is None else {entry.key: entry.value for entry in status.values}
 
     def until_status(self, level: bytes, message: str, node: str = "compensator") -> dict[str, str]:
-        """Wait until a node's newest status has a level and its message starts so; return the values."""
+        """Wait for a node's status, the newest or a later one, of a level and a message that starts so; return its values."""
+        statuses = self.statuses(node)
+        looked_at, hits = max(len(statuses) - 1, 0), []
 
         def there() -> bool:
-            status = self.status(node)
-            return status is not None and status.level == level and status.message.startswith(message)
+            nonlocal looked_at
+            later = self.statuses(node)[looked_at:]
+            looked_at += len(later)
+            hits.extend(s for s in later if s.level == level and s.message.startswith(message))
+            return bool(hits)
 
         self.until(there, f"status {message!r}")
-        return self.values(node)
+        return {entry.key: entry.value for entry in hits[0].values}
 
     def logged(self, part: str) -> list[str]:
         """Return what nodes have logged up to now and contains a part, oldest first, without time and name."""

@@ -94,12 +94,12 @@ def test_the_velocity_of_a_command_is_none_above_the_limit(bench):
     assert 0.99 * SPEED < np.abs(velocity).max() <= SPEED * (1.0 + 1e-9)
 
 
-def burst(bench: Bench, count: int, stamped: bool = True) -> float:
-    """Send commands 0.5 mm apart, all at once, their stamps 4 ms apart; return the way that the struts are told, m."""
+def burst(bench: Bench, count: int, stamped: bool = True, stride: float = 0.5) -> float:
+    """Send commands a stride apart, mm, all at once, their stamps 4 ms apart; return the way of the struts, m."""
     bench.ask(risen(bench, 0.0, -0.4))
     for n in range(1, count + 1):
-        bench.send(risen(bench, 0.5 * n, -0.4 + 4e-3 * n if stamped else None))
-    return way(0.0, 0.5 * count)
+        bench.send(risen(bench, stride * n, -0.4 + 4e-3 * n if stamped else None))
+    return way(0.0, stride * count)
 
 
 @pytest.mark.parametrize("stamped", [True, False])
@@ -119,16 +119,19 @@ def test_a_burst_is_followed_in_order_no_faster_than_the_struts_may_move(bench, 
 
 
 def test_a_burst_that_would_be_followed_too_late_ends(bench):
-    """Ninety commands, 180 ms at the largest speed; 0.1 s are allowed. What waits is refused, and the struts stand."""
-    bench.compensator()
-    burst(bench, 90)
-    values = bench.until_status(ERROR, "refusing commands: speed")
-    assert "commands come faster than the struts may move" in values["last_refusal"]
+    """Ninety commands, 0.29 s at the largest speed; 0.02 s are allowed. What waits is refused, and the struts
+    stand. A busy computer may take a quarter of a second for the ninety, and no less may be refused for that.
+    """
+    bench.compensator(catch_up_within=0.02)
+    way_told = burst(bench, 90, stride=1.0)
+    assert way_told / SPEED > 0.28
+    bench.until(lambda: "refused.speed" in bench.values(), "a refusal")
+    assert "commands come faster than the struts may move" in bench.values()["last_refusal"]
     bench.until(lambda: int(bench.values()["commands"]) + int(bench.values()["refused"]) == 91, "an end")
     answered = len(lengths(bench))
     assert 5 < answered < 80
-    last = 0.5 * (answered - 1)
-    bench.send(risen(bench, 45.5, 0.0))
+    last = 1.0 * (answered - 1)
+    bench.send(risen(bench, 95.0, 0.0))
     bench.until(lambda: "refused.step" in bench.values(), "that it is far away")
     bench.ask(risen(bench, last + 0.5, 0.0))
 
