@@ -29,6 +29,7 @@ from benchmarks.smooth_imperfections import with_wavy_field
 from hexapod_comp.calibration.evaluation import Worth, worth
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.lines import fit_lines
+from hexapod_comp.calibration.observability import ToolError
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -94,11 +95,11 @@ def truth_of(geometry: HexapodGeometry, kind: str, seed: int, box: np.ndarray) -
 
 @dataclass(frozen=True)
 class Machine:
-    """One machine measured, fitted and judged; `expected`: RMS after, and its 95 % interval, as the fit says."""
+    """One machine measured, fitted and judged; `expected`: what the fit promises."""
 
     worth: Worth
     seconds: float
-    expected: tuple[float, float, float] | None
+    expected: ToolError | None
 
 
 def one_machine(number: int, seed: int) -> Machine:
@@ -112,9 +113,7 @@ def one_machine(number: int, seed: int) -> Machine:
         model = fit_lines(measured).model
     else:
         fit = fit_model(measured, FitSettings(lead=LEAD))
-        model = fit.model
-        if fit.level is not None:
-            expected = (fit.level.after, fit.level.low, fit.level.high)
+        model, expected = fit.model, fit.level
     seconds = time.perf_counter() - began
     judged = worth(truth, model, campaign.box, seed=seed, repeatability=campaign.repeatability)
     return Machine(judged, seconds, expected)
@@ -122,7 +121,7 @@ def one_machine(number: int, seed: int) -> Machine:
 
 @dataclass(frozen=True)
 class Row:
-    """What came out of a case; lengths in µm, rotations in µrad."""
+    """What came out of a case; lengths in µm, rotations in µrad; `inside`: of position and of rotation."""
 
     case: str
     machine: str
@@ -137,7 +136,7 @@ class Row:
     bar: float
     met: bool
     expected: float | None
-    inside: int | None
+    inside: tuple[int, int] | None
     seconds: float
 
 
@@ -147,7 +146,9 @@ def summed_up(case: Case, machines: list[Machine]) -> Row:
     together = np.mean if case.figure == "paper" else lambda v: np.sqrt(np.mean(v**2))
     removed = 1.0 - together(after) / together(before)
     largest = max(m.worth.after.aligned.largest for m in machines)
-    expected = [m.expected for m in machines if m.expected is not None]
+    promised = [m for m in machines if m.expected is not None]
+    name = "rotation_after" if case.figure == "rotation" else "after"
+    expected = [getattr(m.expected, name) for m in promised]
     return Row(
         case=case.name,
         machine=case.machine,
@@ -161,12 +162,20 @@ def summed_up(case: Case, machines: list[Machine]) -> Row:
         least_removed=float((1.0 - after / before).min()),
         bar=case.bar,
         met=bool(removed >= case.bar and together(after) <= case.largest_rms and largest <= case.largest),
-        expected=1e6 * float(np.sqrt(np.mean([e[0] ** 2 for e in expected]))) if expected else None,
-        inside=sum(e[1] <= m.worth.after.aligned.rms <= e[2] for e, m in zip(expected, machines, strict=False))
-        if expected
-        else None,
+        expected=1e6 * float(np.sqrt(np.mean(np.square(expected)))) if expected else None,
+        inside=(sum(map(_position_kept, promised)), sum(map(_rotation_kept, promised))) if expected else None,
         seconds=float(np.median([m.seconds for m in machines])),
     )
+
+
+def _position_kept(machine: Machine) -> bool:
+    promised = machine.expected
+    return promised is not None and promised.low <= machine.worth.after.aligned.rms <= promised.high
+
+
+def _rotation_kept(machine: Machine) -> bool:
+    promised, left = machine.expected, machine.worth.after.rotation.rms
+    return promised is not None and promised.rotation_low <= left <= promised.rotation_high
 
 
 def _figure(case: Case, machine: Machine, which: str) -> float:
@@ -184,7 +193,8 @@ def shown(row: Row) -> str:
     """Return a row of the table."""
     unit = "µrad" if row.figure == "rotation" else "µm"
     shares = " | ".join(f"{100.0 * share:.1f} %" for share in (row.removed, row.mean_removed, row.least_removed))
-    expected = "" if row.expected is None else f"{row.expected:.3f} ({row.inside}/{row.machines})"
+    inside = "" if row.inside is None else ", ".join(f"{count}/{row.machines}" for count in row.inside)
+    expected = "" if row.expected is None else f"{row.expected:.3f} ({inside})"
     verdict = f"{100.0 * row.bar:.0f} % {'met' if row.met else 'MISSED'}"
     return (
         f"| {row.case} | {row.machine} | {row.figure} | {row.before:.2f} {unit} | {row.after:.3f} {unit} "

@@ -19,9 +19,9 @@ from .datum import HeldDatum, hold, unseen_part
 from .estimation import HUBER, OUTLIER, Estimation, Solution, iterate
 from .lead import ScrewLead, look_for_lead
 from .linear_problem import LinearProblem, Posterior, held_out, physical_covariance
-from .misfit import Residuals
 from .observability import Allowed, Observability, ToolError, observe, without_trace
 from .parameters import WAVES, FitSettings, ParameterSpace
+from .residuals import Residuals
 from .selection import Decision, select
 from .smooth_field import DIGITS
 from .verdict import Verdict, judge

@@ -11,20 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.linalg.lapack import dtrtrs
 
 from ..measurements.readings import ANGULAR_KINDS, AXES, BACKWARD, FORWARD, KINDS, MeasurementSet
-from ..virtual.trial import without_datum
-from .cell_rows import CellRows
-from .estimation import Estimation, Solution
 from .linear_problem import LARGE_FOLD, whitened_precision
-from .observability import box_stations
 from .parameters import FitSettings
 from .promise import Unexplained
-from .sensitivity import derivatives, predict
+from .residuals import Residuals
+from .scatter import scatter
 
 CHANCE = 2.88
 """Standard deviations of a normal distribution beyond which two of a thousand lie: so rarely readings that the model
@@ -70,18 +66,8 @@ standard deviation of its logarithm."""
 FAMILIES = ("x lines", "y lines", "z lines", "other lines", "other runs")
 """Families of runs, by direction in the work frame."""
 
-CLEAR_LACK = 3.0
-"""What readings share is no chance from so many standard deviations on."""
-
 CUT = 4.0
 """Residuals count for no more standard deviations than that: a gross error is a single reading's."""
-
-CUT_OF_PAIRS, LEFT_BY_CUT = 2.0, 0.911
-"""The same where pairs are compared, for an instrument that slips puts many readings off; and what is left by that of
-the covariance of normal ones that are nearly independent, (P(|x| < 2))²."""
-
-LEAST_LEFT = 0.25
-"""No more than the rest is taken for swallowed by the parameters."""
 
 LEAST_FREE = 3.0
 """A χ² is given for more degrees of freedom only."""
@@ -91,82 +77,6 @@ LEAST_RUNS = 6
 
 NEGLIGIBLE = 1e-4
 """Effects on the tool that together are below this share of its squared error cannot matter, whatever is left out."""
-
-LEAST_PAIRS = 30
-"""Pairs of readings there and back from which on their likeness tells the machine's errors from noise."""
-
-
-@dataclass(frozen=True)
-class Residuals:
-    """A settled fit's residuals, cell by cell, in standard deviations at the noise that was estimated.
-
-    Attributes
-    ----------
-    estimation, solution : Estimation, Solution
-        The fit.
-    rows : CellRows, shape (C, n)
-        Derivatives by the parameters in use.
-    residual : ndarray, shape (C,)
-        What is left.
-    run, direction : ndarray of int, shape (C,)
-        Of each cell.
-    rank : ndarray, shape (C,)
-        Place in the order of the readings, −½…½.
-    """
-
-    estimation: Estimation
-    solution: Solution
-    rows: CellRows
-    residual: np.ndarray
-    run: np.ndarray
-    direction: np.ndarray
-    rank: np.ndarray
-
-    @staticmethod
-    def of(estimation: Estimation, solution: Solution) -> Residuals:
-        """Return those of a fit."""
-        problem, posterior, cells = solution.problem, solution.posterior, estimation.cells
-        scale = 1.0 / posterior.noise[problem.kind]
-        rows = problem.rows.using(posterior.used, scale)
-        m = estimation.measurements
-        order = np.argsort(np.argsort(cells.first))
-        return Residuals(
-            estimation=estimation,
-            solution=solution,
-            rows=rows,
-            residual=scale * problem.target - rows.times(posterior.y),
-            run=m.run[cells.first],
-            direction=m.direction[cells.first],
-            rank=order / max(len(order) - 1, 1) - 0.5,
-        )
-
-    @cached_property
-    def taken(self) -> np.ndarray:
-        """Share of each cell that parameters and unknowns of the instruments take up, shape (C,)."""
-        every = np.arange(len(self.residual))
-        return self.shared(every, every) + self.estimation.shares_of_unknowns()
-
-    @cached_property
-    def metric(self) -> np.ndarray:
-        """M: yᵀ·M·y is the tool's mean squared error in the box, the datum aligned, of parameters y in use; or zero."""
-        space = self.estimation.space
-        stations = box_stations(space)
-        if stations is None:
-            return np.zeros((len(self.solution.posterior.used),) * 2)
-        slopes = derivatives(space, predict(space, self.solution.x, stations), stations)[:, :3]
-        slopes = space.whitened(slopes.reshape(-1, space.size))[:, self.solution.posterior.used]
-        points = stations.positions + stations.rotations @ space.probe
-        effects = without_datum(points, slopes.reshape(len(points), 3, -1)).reshape(3 * len(points), -1)
-        return np.asarray(effects.T @ effects / len(points))
-
-    @property
-    def expected(self) -> float:
-        """Mean squared error of the tool to expect by the covariance, m²."""
-        return float(np.vdot(self.metric, self.solution.posterior.covariance))
-
-    def shared(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return by how much fitting makes cells unlike each other, pair by pair: what both give to the parameters."""
-        return self.rows.between(self.solution.posterior.covariance, first, second)
 
 
 def unexplained(
@@ -184,18 +94,30 @@ def unexplained(
         Returns the residuals with all blocks in, and by how much the parameters y in use differ from the fit's.
     """
     factor, without, allowed = _left_out(residuals, everything)
-    prior = _of_priors(residuals)
-    return Unexplained(factor, without, allowed, prior, _lack(residuals), _drift(residuals), scale)
+    prior, prior_of_rotation = (_of_priors(residuals, m) for m in (residuals.metric, residuals.metric_of_rotation))
+    displacement, rotation = scatter(residuals)
+    return Unexplained(
+        factor=factor,
+        without=without,
+        allowed=allowed,
+        prior=prior,
+        prior_rotation=prior_of_rotation,
+        displacement=displacement,
+        rotation=rotation,
+        drift=_drift(residuals),
+        scale=scale,
+    )
 
 
-def _of_priors(r: Residuals) -> float:
-    """Return how well the logarithm of the tool error to expect is known, as the sizes of priors are estimates.
+def _of_priors(r: Residuals, metric: np.ndarray) -> float:
+    """Return how well the logarithm of a tool error to expect is known, as the sizes of priors are estimates.
 
     A size that n parameters determine is known to 1/√(2n) of itself, and moves the squared error by its prior's share
     of it: with C = (N + T⁻²)⁻¹, tr(M·C·T⁻²·C)/tr(M·C). Of a length map or a field, coarse terms determine the size and
     fine ones are taken to be in proportion.
     """
-    posterior, metric, expected = r.solution.posterior, r.metric, r.expected
+    posterior = r.solution.posterior
+    expected = float(np.vdot(metric, posterior.covariance))
     if not expected > 0.0:
         return 0.0
     held = np.einsum("ij,ji->i", posterior.covariance @ metric, posterior.covariance) / posterior.spread**2
@@ -350,61 +272,6 @@ def _groupings_of_runs(r: Residuals) -> dict[str, np.ndarray]:
         across = (family < 3) & (family != axis)
         groups[f"plane across {name}"] = np.where(across, np.round(middle / PLACE), np.inf)
     return groups
-
-
-def _lack(r: Residuals) -> float:
-    """Return the RMS displacement of the tool that is left and is no noise, m.
-
-    Readings there and back at one place share what the machine does there, and no noise. Where there are no such
-    pairs, what is beyond the stated noise counts.
-    """
-    m, cells, posterior = r.estimation.measurements, r.estimation.cells, r.solution.posterior
-    squares, weights = [0.0], [1e-300]
-    for k in np.unique(cells.kind):
-        if KINDS[k] in ANGULAR_KINDS:
-            continue
-        there, back = _pairs(r, k)
-        if len(there) >= LEAST_PAIRS:
-            share = _likeness(r, there, back) * posterior.noise[k] ** 2
-        else:
-            readings = int((m.kind == k).sum())
-            beyond = posterior.noise[k] ** 2 - 1.0
-            share = beyond if beyond > CLEAR_LACK * np.sqrt(2.0 / readings) else 0.0
-        squares.append(share * m.stated_of(k) ** 2 * (cells.kind == k).sum())
-        weights.append(float((cells.kind == k).sum()))
-    return float(np.sqrt(3.0 * sum(squares) / sum(weights)))
-
-
-def _pairs(r: Residuals, kind: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cells of a kind that were read forward, and those read backward at the same places."""
-    cells, stations = r.estimation.cells, r.estimation.measurements.stations
-    poses = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(9)
-    pose = np.unique(poses, axis=0, return_inverse=True)[1].ravel()[cells.station]
-    keys = np.stack([r.run, cells.channel, pose], axis=1)
-    key = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
-    ways = []
-    for direction in (FORWARD, BACKWARD):
-        members = np.flatnonzero((cells.kind == kind) & (r.direction == direction))
-        ways.append((members, key[members]))
-    (there, a), (back, b) = ways
-    _, first, second = np.intersect1d(a, b, return_indices=True)
-    return there[first], back[second]
-
-
-def _likeness(r: Residuals, there: np.ndarray, back: np.ndarray) -> float:
-    """Return the variance that pairs of cells share, in their estimated noise's; 0 where it may be chance.
-
-    Fitting makes the noise of a pair unlike each other, by what both give to the parameters and to the run's unknowns;
-    and it takes up that part of what they share.
-    """
-    cut = np.clip(r.residual, -CUT_OF_PAIRS, CUT_OF_PAIRS)
-    groups = r.estimation.cells.group
-    sizes = np.bincount(groups + 1)[groups[there] + 1]
-    unlike = r.shared(there, back) + np.where(groups[there] < 0, 0.0, 1.0 / sizes)
-    shared = (cut[there] * cut[back] / LEFT_BY_CUT + unlike).mean()
-    if shared < CLEAR_LACK / np.sqrt(len(there)):
-        return 0.0
-    return float(shared / max(1.0 - (r.taken[there] + unlike).mean(), LEAST_LEFT))
 
 
 def _drift(r: Residuals) -> float:

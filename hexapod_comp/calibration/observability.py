@@ -223,7 +223,7 @@ class ToolError:
     low, high : float
         Between these it lies with a probability of 95 %, m; the upper end also allows for errors of which the
         readings do not tell whether the machine has them.
-    rotation_before, rotation_after : float
+    rotation_before, rotation_after, rotation_low, rotation_high : float
         The same of the rotation, rad.
     """
 
@@ -233,6 +233,8 @@ class ToolError:
     high: float
     rotation_before: float
     rotation_after: float
+    rotation_low: float
+    rotation_high: float
 
 
 Allowed = tuple[ParameterSpace, np.ndarray, np.ndarray]
@@ -277,10 +279,14 @@ def expected_error(
         errors = derivatives(space, prediction, stations) @ _drawn(prior)
     before, rotation_before = _aligned_rms(points, errors)
     left, possible = left_errors(space, prediction, stations, covariance, allowed)
-    beyond, (sizes, rotation_sizes) = beyond or Unexplained(), _aligned_rms(points, left)
-    after, low, high = beyond.promised(sizes, _aligned_rms(points, possible)[0], points)
-    rotation_after = beyond.factor * rms(rotation_sizes)
-    return ToolError(rms(before), after, low, high, rms(rotation_before), rotation_after)
+    beyond = beyond or Unexplained()
+    (sizes, rotation_sizes), (widest, rotation_widest) = (_aligned_rms(points, part) for part in (left, possible))
+    return ToolError(
+        float(np.hypot(rms(before), beyond.displacement.stops)),
+        *beyond.promised(sizes, widest, points),
+        float(np.hypot(rms(rotation_before), beyond.rotation.stops)),
+        *beyond.promised_rotation(rotation_sizes, rotation_widest),
+    )
 
 
 def left_errors(

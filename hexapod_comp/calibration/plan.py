@@ -13,6 +13,7 @@ from .fit import unseen_errors
 from .linear_problem import physical_covariance, solve
 from .observability import Observability, ToolError, expected_error, observe
 from .parameters import FitSettings, ParameterSpace
+from .promise import Scatter, Unexplained
 from .verdict import TILT
 
 
@@ -31,7 +32,8 @@ class Plan:
     unseen_errors : tuple of str
         Machine errors that they cannot show.
     level, tilted : ToolError or None
-        The tool error to expect after a fit; `before` is that of machines within the tolerances.
+        The tool error to expect after a fit, the machine's repeatability included; `before` is that of machines within
+        the tolerances.
     """
 
     measurements: MeasurementSet
@@ -61,7 +63,9 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
     posterior = solve(space, problem, space.start_tolerances(), noise, rounds=0)
     covariance, x = physical_covariance(space, posterior), np.zeros(space.size)
     prior = space.prior_covariance(space.start_tolerances())
-    level, tilted = (expected_error(space, x, covariance, tilt, prior) for tilt in (0.0, TILT))
+    stops = float(np.sqrt(3.0)) * campaign.repeatability
+    beyond = Unexplained(displacement=Scatter(stops=stops, most_stops=stops))
+    level, tilted = (expected_error(space, x, covariance, tilt, prior, None, beyond) for tilt in (0.0, TILT))
     return Plan(
         measurements=measurements,
         space=space,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +19,33 @@ STEEL = 11.5e-6
 """Expansion of steel, 1/K."""
 
 
+class Scatter(NamedTuple):
+    """What the tool does that no parameter describes, RMS over all three axes: displacement, m, or rotation, rad.
+
+    Attributes
+    ----------
+    lack : float
+        Of an error that repeats there and back.
+    stops, most_stops : float
+        Of where the machine stops from visit to visit, if the instruments scatter as stated; and what it is at most.
+    """
+
+    lack: float = 0.0
+    stops: float = 0.0
+    most_stops: float = 0.0
+
+
+NO_SCATTER = Scatter()
+
+
+class Promise(NamedTuple):
+    """RMS error of the tool to expect, and between what it lies with 95 %: m, or rad."""
+
+    after: float
+    low: float
+    high: float
+
+
 @dataclass(frozen=True)
 class Unexplained:
     """What widens a promise.
@@ -30,11 +58,11 @@ class Unexplained:
         What was left out in turn where that showed most; empty where the factor is 1.
     allowed : float
         The same on what the readings allow with all blocks in, of which the fit has chosen some.
-    prior : float
-        Standard deviation of the logarithm of the tool error to expect: the sizes of the priors are estimated from the
-        same readings.
-    lack : float
-        RMS displacement of the tool that readings show and no parameter describes, m.
+    prior, prior_rotation : float
+        Standard deviation of the logarithm of the tool error to expect, and of the tool's rotation: the sizes of the
+        priors are estimated from the same readings.
+    displacement, rotation : Scatter
+        What the tool does that no parameter describes.
     drift : float
         Change of the scale from the first to the last reading, m/m; 0 where there is none.
     scale : float
@@ -45,12 +73,14 @@ class Unexplained:
     without: str = ""
     allowed: float = 1.0
     prior: float = 0.0
-    lack: float = 0.0
+    prior_rotation: float = 0.0
+    displacement: Scatter = NO_SCATTER
+    rotation: Scatter = NO_SCATTER
     drift: float = 0.0
     scale: float = 0.0
 
-    def promised(self, left: np.ndarray, possible: np.ndarray, points: np.ndarray) -> tuple[float, float, float]:
-        """Return the error to expect, and between what it lies with 95 %, m; what is unexplained raises the upper end.
+    def promised(self, left: np.ndarray, possible: np.ndarray, points: np.ndarray) -> Promise:
+        """Return what is promised of the tool's displacement; what is unexplained raises the upper end.
 
         Parameters
         ----------
@@ -59,16 +89,29 @@ class Unexplained:
         points : ndarray, shape (n, 3)
             The places, m: a scale that is off acts on their distances.
         """
-        size, (low, high) = rms(left), np.percentile(left, [2.5, 97.5])
-        if low > 0.0:
-            down, up = (np.exp(np.hypot(np.log(end / size), TWICE * self.prior)) for end in (low, high))
-            low, high = size / down, size * up
-        high = max(self.factor * high, self.allowed * float(np.percentile(possible, 97.5)))
+        after, low, high = self._interval(left, possible, self.prior, self.displacement)
         radius = rms(np.linalg.norm(points - points.mean(axis=0), axis=1))
         stretch = radius * np.array([self.scale, 0.5 * self.drift])
-        after = np.sqrt((self.factor * size) ** 2 + self.lack**2 + stretch @ stretch)
-        high = np.sqrt(high**2 + (LACK_MARGIN * self.lack) ** 2 + TWICE**2 * stretch @ stretch)
-        return float(after), float(low), float(high)
+        off = float(stretch @ stretch)
+        return Promise(float(np.sqrt(after**2 + off)), low, float(np.sqrt(high**2 + TWICE**2 * off)))
+
+    def promised_rotation(self, left: np.ndarray, possible: np.ndarray) -> Promise:
+        """Return what is promised of the tool's rotation, from draws as for :meth:`promised`, rad."""
+        return self._interval(left, possible, self.prior_rotation, self.rotation)
+
+    def _interval(self, left: np.ndarray, possible: np.ndarray, prior: float, scatter: Scatter) -> Promise:
+        """Return what is promised without any error of scale.
+
+        Whether the machine or its instrument scatters more than stated nobody can say: the lower end is without it.
+        """
+        size, (low, high) = rms(left), np.percentile(left, [2.5, 97.5])
+        if low > 0.0:
+            down, up = (np.exp(np.hypot(np.log(end / size), TWICE * prior)) for end in (low, high))
+            low, high = size / down, size * up
+        high = max(self.factor * high, self.allowed * float(np.percentile(possible, 97.5)))
+        after = np.linalg.norm([self.factor * size, scatter.lack, scatter.stops])
+        high = np.linalg.norm([high, LACK_MARGIN * scatter.lack, scatter.most_stops])
+        return Promise(float(after), float(low), float(high))
 
     def doubts(self) -> list[str]:
         """Return what puts a fit in doubt."""
@@ -85,9 +128,14 @@ class Unexplained:
         listed = []
         if 1.0 < self.factor <= DOUBTFUL_FACTOR:
             listed.append(f"{self._outcome()}; the expected tool error allows for it")
-        if self.lack:
-            problem = f"{self.lack * 1e6:.2f} µm RMS of the tool's error, there and back alike, are in no parameter"
-            listed.append(f"{problem}; the expected tool error allows for them")
+        lack, stops = (
+            _sizes(getattr(self.displacement, name), getattr(self.rotation, name)) for name in ("lack", "stops")
+        )
+        if lack:
+            listed.append(f"{lack}, there and back alike, is in no parameter; the expected tool error allows for it")
+        if stops:
+            problem = "readings scatter more than stated, and not alike there and back: taken for the machine's own"
+            listed.append(f"{problem} repeatability, {stops}; the expected tool error has it, the lower end has not")
         return listed
 
     def as_json(self) -> dict[str, float | str]:
@@ -97,7 +145,9 @@ class Unexplained:
             "without": self.without,
             "factor_allowed": self.allowed,
             "prior_log_deviation": self.prior,
-            "lack_m": self.lack,
+            "prior_rotation_log_deviation": self.prior_rotation,
+            **{f"{name}_m": value for name, value in self.displacement._asdict().items()},
+            **{f"{name}_rad": value for name, value in self.rotation._asdict().items()},
             "drift_m_per_m": self.drift,
             "scale_m_per_m": self.scale,
         }
@@ -105,3 +155,10 @@ class Unexplained:
     def _outcome(self) -> str:
         problem = f"left out in turn, each {self.without} changes the tool more than noise explains"
         return f"{problem}: standard errors are {self.factor:.1f} times as large"
+
+
+def _sizes(displacement: float, rotation: float) -> str:
+    """Return sizes of what the tool does in words; empty where it does nothing."""
+    shown = [f"{displacement * 1e6:.2f} µm RMS of the tool's displacement"] if displacement else []
+    shown += [f"{rotation * 1e6:.2f} µrad RMS of its rotation"] if rotation else []
+    return " and ".join(shown)

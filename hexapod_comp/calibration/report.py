@@ -88,7 +88,8 @@ def tool_error_text(error: ToolError) -> str:
     return (
         f"{error.before * 1e6:.2f} → {error.after * 1e6:.3f} µm RMS "
         f"({error.low * 1e6:.3f}…{error.high * 1e6:.3f} with 95 %), {removed:.1f} % less; "
-        f"rotation {error.rotation_before * 1e6:.1f} → {error.rotation_after * 1e6:.2f} µrad RMS"
+        f"rotation {error.rotation_before * 1e6:.1f} → {error.rotation_after * 1e6:.2f} µrad RMS "
+        f"({error.rotation_low * 1e6:.2f}…{error.rotation_high * 1e6:.2f})"
     )
 
 

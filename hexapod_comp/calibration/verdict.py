@@ -7,20 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..measurements.readings import MeasurementSet, attitude_error
+from ..measurements.readings import ANGULAR_KINDS, DEFAULT_UNCERTAINTY, KINDS, MeasurementSet, attitude_error
 from .estimation import SETTLED, Estimation, Solution
 from .linear_problem import physical_covariance
-from .misfit import (
-    ChiSquare,
-    Residuals,
-    chi_squares,
-    held_by_priors,
-    stated_scale,
-    unexplained,
-)
+from .misfit import ChiSquare, chi_squares, held_by_priors, stated_scale, unexplained
 from .observability import Allowed, ToolError, expected_error
 from .parameters import FitSettings, ParameterSpace
 from .promise import Unexplained
+from .residuals import Residuals
 from .selection import EXPECTED
 from .suspicions import suspicions
 
@@ -109,7 +103,7 @@ def judge(
     suspects = suspicions(measurements, settings, progress, least) if doubtful or general else []
     doubts = [*([] if far_off else [doubtful]), *suspects, *beyond.doubts(), _unsettled(solution)]
     refusals = [far_off, _useless(level), _held(residuals)]
-    remarks = [*beyond.remarks(), NOT_TILTED if level_only else ""]
+    remarks = [*beyond.remarks(), _unstated(measurements), NOT_TILTED if level_only else ""]
     listed = (tuple(filter(None, part)) for part in (refusals, doubts, remarks))
     return Verdict(level, tilted, beyond, families, runs, *listed)
 
@@ -121,6 +115,18 @@ def _is_level_only(measurements: MeasurementSet, space: ParameterSpace) -> bool:
     """Return whether a field is needed that was measured with a level tool alone: it says nothing of a tilted one."""
     turned = np.linalg.norm(attitude_error(measurements.stations.rotations, space.level), axis=1)
     return space.block("field displacement") is not None and turned.max() < 0.5 * TILT
+
+
+def _unstated(m: MeasurementSet) -> str:
+    """Return a remark on lengths whose noise is assumed, for the machine's own may hide in it; empty if none is."""
+    unstated = np.unique(m.kind[~np.isfinite(m.uncertainty)])
+    listed = [
+        f"{KINDS[k]} {DEFAULT_UNCERTAINTY[KINDS[k]] * 1e6:g} µm" for k in unstated if KINDS[k] not in ANGULAR_KINDS
+    ]
+    if not listed:
+        return ""
+    problem = f"no uncertainty is stated ({', '.join(listed)} assumed)"
+    return f"{problem}: what the machine's own repeatability has of that is not in the expected tool error"
 
 
 def _useless(level: ToolError | None) -> str:

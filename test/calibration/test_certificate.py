@@ -81,6 +81,10 @@ def test_it_promises_what_the_report_promises(fit: ModelFit, filed: Filed) -> No
     wanted = [1e6 * v for v in (level.before, level.after, level.low, level.high, 2.0 * level.high)]
     assert shown == pytest.approx(wanted, abs=0.0051)
     assert unit == "µm"
+    rotation = rows["level tool: rotation"]
+    ends = [float(end) for end in rotation[2].split(" … ")]
+    assert ends == pytest.approx([1e6 * level.rotation_low, 1e6 * level.rotation_high], abs=0.0051)
+    assert float(rotation[3]) == pytest.approx(2e6 * level.rotation_high, abs=0.051)
     assert "do not trust this model with a tilted tool" in certificate_text(fit, filed), "as the report says it"
 
 

@@ -11,13 +11,14 @@ from functools import partial
 
 import numpy as np
 import pytest
-from calibration_helpers import FEW, SETTINGS, campaign, measured, virtual_machine
+from calibration_helpers import BOX, FEW, SETTINGS, campaign, measured, virtual_machine
 
+from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.misfit import FAMILIES, family_of_run, stated_scale
 from hexapod_comp.calibration.observability import expected_error
 from hexapod_comp.calibration.parameters import FitSettings
-from hexapod_comp.calibration.promise import Unexplained
+from hexapod_comp.calibration.promise import Scatter, Unexplained
 from hexapod_comp.calibration.report import as_json, fit_report
 from hexapod_comp.calibration.suspicions import suspicions
 from hexapod_comp.errors import CalibrationError, ModelError
@@ -41,7 +42,8 @@ def test_what_is_described_is_promised_as_before(readings):
     """The promise grows by the laser's stated scale alone, 0.5 ppm over some 0.2 m: priors hold next to nothing."""
     fit = fit_model(readings, FEW)
     beyond = fit.verdict.unexplained
-    assert (beyond.factor, beyond.lack, beyond.drift) == (1.0, 0.0, 0.0)
+    assert (beyond.factor, beyond.drift) == (1.0, 0.0)
+    assert beyond.displacement == beyond.rotation == Scatter()
     assert (fit.misfit, fit.verdict.doubts) == ("", ())
     before = expected_error(fit.space, fit.solution.x, fit.covariance, allowed=fit.allowed)
     assert beyond.prior < 1e-3
@@ -62,6 +64,11 @@ def test_an_interval_is_widened_by_each_cause_in_its_way():
     assert priors == pytest.approx((1e-6, 0.5e-6, 2e-6))
     scaled = Unexplained(scale=1e-6).promised(one, one, places)
     assert scaled == pytest.approx((np.sqrt(2.0) * 1e-6, 1e-6, np.sqrt(5.0) * 1e-6))
+    stops = Unexplained(displacement=Scatter(stops=np.sqrt(3.0) * 1e-6, most_stops=np.sqrt(8.0) * 1e-6))
+    assert stops.promised(one, one, places) == pytest.approx((2e-6, 1e-6, 3e-6))
+    assert stops.promised_rotation(one, one) == pytest.approx((1e-6, 1e-6, 1e-6))
+    turned = Unexplained(rotation=Scatter(lack=np.sqrt(3.0) * 1e-6))
+    assert turned.promised_rotation(one, one) == pytest.approx((2e-6, 1e-6, np.sqrt(1.0 + 2.25 * 3.0) * 1e-6))
 
 
 def test_a_run_that_slips_hides_no_error_that_repeats(readings):
@@ -70,7 +77,7 @@ def test_a_run_that_slips_hides_no_error_that_repeats(readings):
     spoilt = with_own_errors(readings).value.copy()
     spoilt[members[len(members) // 3 :]] += 15e-6
     fit = fit_model(readings.with_values(spoilt), FEW)
-    assert fit.verdict.unexplained.lack == pytest.approx(3e-6 * np.sqrt(3.0), rel=0.2)
+    assert fit.verdict.unexplained.displacement.lack == pytest.approx(3e-6 * np.sqrt(3.0), rel=0.2)
 
 
 def with_own_errors(readings: MeasurementSet) -> MeasurementSet:
@@ -84,21 +91,74 @@ def with_own_errors(readings: MeasurementSet) -> MeasurementSet:
 def test_an_error_that_repeats_there_and_back_is_the_machine_s(readings):
     """Each place has an error of its own, 3 µm along each axis; some of it the parameters take up."""
     fit = fit_model(with_own_errors(readings), FEW)
-    assert fit.verdict.unexplained.lack == pytest.approx(3e-6 * np.sqrt(3.0), rel=0.2)
+    assert fit.verdict.unexplained.displacement.lack == pytest.approx(3e-6 * np.sqrt(3.0), rel=0.2)
     assert fit.level.high > 3e-6 * np.sqrt(3.0)
     assert any("there and back alike" in note for note in fit.notes)
 
 
-def test_noise_that_does_not_repeat_is_the_instrument_s(readings):
-    """Four times the stated noise: in doubt, above three times, but written, below ten."""
+def test_noise_that_does_not_repeat_is_no_error_that_stays(readings):
+    """Four times the stated noise: in doubt, above three times, but written, below ten.
+
+    Whether instrument or machine scatters so nobody can tell: the upper end has it, the lower end has not.
+    """
     noise = 4e-6 * np.random.default_rng(2).standard_normal(len(readings))
     fit = fit_model(readings.with_values(readings.value + noise), FEW)
-    assert fit.verdict.unexplained.lack == 0.0
+    beyond = fit.verdict.unexplained
+    assert beyond.displacement.lack == beyond.rotation.lack == 0.0
+    for part in (beyond.displacement, beyond.rotation):
+        assert part.stops == pytest.approx(4e-6 * np.sqrt(3.0), rel=0.1)
+    assert fit.level.low < 1e-6
+    assert fit.level.high > 4e-6 * np.sqrt(3.0)
     assert fit.misfit == ""
     doubts = fit.verdict.doubts
     assert len(doubts) == 1
     assert all(f"{kind} by " in doubts[0] for kind in ("linear", "straightness", "rotation"))
     assert fit_report(fit).startswith("IN DOUBT:\n  readings are off by more than 3 times their noise")
+
+
+def with_stops(cycles: int, seed: int) -> MeasurementSet:
+    """Return the readings of a machine that stops within ±1 µm of where it should, along each axis."""
+    return measured(virtual_machine(seed), campaign(cycles=cycles, repeatability=1e-6), seed)
+
+
+def test_the_machine_s_repeatability_stays_in_use():
+    """The tool stops √3 µm off, RMS, whatever the model says; some 600 readings tell that to 10 %."""
+    fit = fit_model(with_stops(1, 3), FEW)
+    scatter = fit.verdict.unexplained.displacement
+    assert scatter.stops == pytest.approx(1e-6 * np.sqrt(3.0), rel=0.1)
+    assert scatter.lack == 0.0
+    left = held_out(virtual_machine(3), fit.model, BOX, repeatability=1e-6).aligned.rms
+    assert fit.level.low < left < fit.level.high < 1.3 * left
+    assert fit.level.after == pytest.approx(left, rel=0.1)
+    assert any("the machine's own repeatability, 1." in note for note in fit.notes)
+
+
+def test_repeated_readings_tell_repeatability_from_errors_that_stay():
+    """Each place has an error of its own besides, 3 µm; three passes differ by noise and stops alone."""
+    scatter = fit_model(with_own_errors(with_stops(3, 3)), FEW).verdict.unexplained.displacement
+    assert scatter.stops == pytest.approx(1e-6 * np.sqrt(3.0), rel=0.1)
+    assert scatter.lack == pytest.approx(3e-6 * np.sqrt(3.0), rel=0.2)
+
+
+def test_scatter_that_is_stated_is_the_instrument_s():
+    """The same readings, said to be good to √2 µm; then no remark says that the noise is assumed either."""
+    readings = with_stops(1, 3)
+    assumed = [note for note in fit_model(readings, FEW).notes if "(linear 1 µm, straightness 1 µm assumed)" in note]
+    assert len(assumed) == 1
+    stated = np.where(readings.kind == ROTATION, 1e-6, np.sqrt(2.0) * 1e-6)
+    fit = fit_model(replace(readings, uncertainty=stated), FEW)
+    assert fit.verdict.unexplained.displacement == Scatter()
+    assert not [note for note in fit.notes if "assumed" in note]
+
+
+def test_rotation_that_is_in_no_parameter_is_promised(readings):
+    """Each place has a rotation of its own, 2 µrad about each axis, which lines read, and which the tool keeps."""
+    place = np.unique(readings.points()[readings.station].round(6), axis=0, return_inverse=True)[1].ravel()
+    own = 2e-6 * np.random.default_rng(6).standard_normal((place.max() + 1, 3))
+    turned = (readings.directions()[:, 3:] * own[place]).sum(axis=1)
+    level = fit_model(readings.with_values(readings.value + turned), FEW).level
+    assert level.rotation_high > 2e-6 * np.sqrt(3.0)
+    assert level.after < 1e-6
 
 
 def test_a_scale_that_drifts_is_measured(readings):
