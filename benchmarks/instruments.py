@@ -50,6 +50,11 @@ def circles(box: np.ndarray, points: int = 37) -> list[CampaignRun]:
     return runs
 
 
+def calibrated_circles(box: np.ndarray) -> list[CampaignRun]:
+    """Return the same circles by a bar of known length, as a calibrator of little expansion gives it."""
+    return [replace(run, known_zero=True) for run in circles(box)]
+
+
 def r_tests(box: np.ndarray, points: int = 41) -> list[CampaignRun]:
     """Return R-tests at four places, tilted up to 10°."""
     places = (box.mean(axis=0) + 0.3 * CORNERS * np.ptp(box, axis=0)).round(6)
@@ -85,12 +90,13 @@ class InstrumentCase:
     bar: Bar
 
 
-PARTS = {"circles": circles, "r_tests": r_tests, "stations": stations}
+PARTS = {"circles": circles, "calibrated circles": calibrated_circles, "r_tests": r_tests, "stations": stations}
 
 CASES = (
     InstrumentCase("ball bar", "A", ("circles",), Bar(0.75)),
     InstrumentCase("ball bar", "B", ("circles",), Bar(0.85)),
     InstrumentCase("ball bar and R-test", "B", ("circles", "r_tests"), Bar(0.92, 0.90)),
+    InstrumentCase("calibrated ball bar and R-test", "B", ("calibrated circles", "r_tests"), Bar(0.92, 0.90)),
     InstrumentCase("stations", "A", ("stations",), Bar(0.92)),
     InstrumentCase("stations", "B", ("stations",), Bar(0.98)),
 )

@@ -20,6 +20,7 @@ from hexapod_comp.calibration.observability import (
     without_trace,
 )
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
+from hexapod_comp.calibration.plan import plan
 from hexapod_comp.calibration.sensitivity import predict
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -223,6 +224,15 @@ def test_level_campaigns_are_not_trusted_with_a_tilted_tool():
     answer = solve(space, problem, space.start_tolerances(), ONES, 0)
     level, tilted = (expected_error(space, np.zeros(space.size), answer.covariance, t) for t in (0.0, np.radians(10.0)))
     assert tilted.after > 10.0 * level.after
+
+
+def test_a_plan_counts_the_machine_s_repeatability():
+    """Each stop is 5 µm off along each axis, √3 times that in space; what the parameters leave is small beside it."""
+    loose = small.campaign(repeatability=5e-6)
+    expected = plan(template(loose, small.paper()), loose, small.FEW).level
+    assert expected is not None
+    assert 1.0 < expected.after / (5e-6 * np.sqrt(3.0)) < 1.1
+    assert expected.high > expected.after
 
 
 def test_a_box_out_of_reach_promises_nothing():
