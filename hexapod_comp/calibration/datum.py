@@ -98,6 +98,19 @@ class HeldDatum:
         }
 
 
+def refuse_unreachable(geometry: HexapodGeometry, pose: Pose) -> None:
+    """Refuse a datum, ``pose_platform_in_base``, where the machine cannot be.
+
+    Raises
+    ------
+    CalibrationError
+        A limit of the machine forbids the pose.
+    """
+    refusal = geometry.refusal(pose.position, pose.rotation, strut_lengths(Structure.of(geometry), pose))
+    if refusal is not None:
+        raise CalibrationError("datum", f"is a pose that the machine cannot take: {refusal}")
+
+
 def hold(
     geometry: HexapodGeometry, model: MachineModel, pose: Pose, part: np.ndarray
 ) -> tuple[MachineModel, HeldDatum]:
@@ -117,9 +130,7 @@ def hold(
     CalibrationError
         A limit of the machine forbids the pose.
     """
-    refusal = geometry.refusal(pose.position, pose.rotation, strut_lengths(Structure.of(geometry), pose))
-    if refusal is not None:
-        raise CalibrationError("datum", f"is a pose that the machine cannot take: {refusal}")
+    refuse_unreachable(geometry, pose)
     given_up = tool_move(geometry, model, pose)
     model = with_datum_held(geometry, model, pose, part)
     rounded = {name: getattr(model, name).round(DIGITS) for name in ("base_deviation", "base_axes_turn")}

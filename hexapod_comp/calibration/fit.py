@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import CalibrationError
+from ..errors import CalibrationError, HexapodError
 from ..machine.model import MachineModel, ModelOrigin
 from ..machine.size import rms
 from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementSet, refuse_unmoved
 from ..pose import Pose
-from .datum import HeldDatum, hold, unseen_part
+from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
 from .estimation import HUBER, OUTLIER, Estimation, Solution, iterate
 from .lead import ScrewLead, look_for_lead
 from .linear_problem import LinearProblem, Posterior, held_out, physical_covariance
@@ -24,17 +24,12 @@ from .parameters import WAVES, FitSettings, ParameterSpace
 from .residuals import Residuals
 from .selection import Decision, select
 from .smooth_field import DIGITS
+from .suspicions import SCATTERED, SURE, SWAPPED, causes
 from .verdict import Verdict, judge
 from .warming import HeatSeen, TimeConstants, seek_time_constants
 
-SURE = 4.0
-"""Backlash so many standard deviations below zero is no noise."""
-
 LARGEST_NOISE = 0.02
 """A machine that leaves more than this of its readings, m or rad, is not the one that was measured."""
-
-SCATTERED = 1.5
-"""Readings whose noise is found so many times as large as stated are remarked on."""
 
 WARM = 0.2
 """Readings taken further than this from the reference temperature, K, need an expansion: 1 µm on half a metre."""
@@ -195,10 +190,32 @@ def fit_model(
     ------
     CalibrationError
         A datum that the machine does not reach, too few readings, or such that show nothing, a fit that does not
-        settle, forward and backward swapped.
+        settle, forward and backward swapped; with what would explain the readings better, where something does.
     """
-    everything, problem, lead, constants = _begin(measurements, settings or FitSettings(), progress)
-    settings = everything.space.settings
+    datum = measurements.geometry.home if datum is None else datum
+    refuse_unreachable(measurements.geometry, datum)
+    begun = _begin(measurements, settings or FitSettings(), progress)
+    try:
+        return _fit(begun, progress, datum)
+    except HexapodError as error:
+        if named := causes(measurements, begun.everything.space.settings, progress):
+            error.with_lines("\n".join(f"  {cause}" for cause in named))
+        raise
+
+
+class _Begun(NamedTuple):
+    """All parameters that may be used, the problem at the nominal machine, the screws' lead, and time constants."""
+
+    everything: Estimation
+    problem: LinearProblem
+    lead: ScrewLead | None
+    constants: TimeConstants
+
+
+def _fit(begun: _Begun, progress: Callable[[str], object], datum: Pose) -> ModelFit:
+    """Choose blocks, fit them, and judge what comes of it."""
+    everything, problem, lead, constants = begun
+    measurements, settings = everything.measurements, everything.space.settings
     decisions, (problem, possible), answer = _choose(everything, problem, settings, progress)
     space, estimation, solution = answer
     channels = tuple(_channels(estimation, solution))
@@ -220,7 +237,8 @@ def fit_model(
     noise = {KINDS.index(c.kind): c.estimated for c in channels}
     verdict = judge(estimation, solution, allowed, with_all, settings, noise, progress)
     as_solved = _named(space, solution, measurements, channels, len(decisions), verdict.level)
-    model, held = _held(as_solved, estimation, solution.posterior, datum)
+    unseen = unseen_part(estimation, solution.posterior.tolerances[0], solution.posterior.noise, datum)
+    model, held = hold(measurements.geometry, as_solved, datum, unseen)
     return ModelFit(
         model=model,
         measurements=measurements,
@@ -240,10 +258,8 @@ def fit_model(
     )
 
 
-def _begin(
-    measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object]
-) -> tuple[Estimation, LinearProblem, ScrewLead | None, TimeConstants]:
-    """Return all parameters that may be used, the problem at the nominal machine, the screws' lead, time constants.
+def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object]) -> _Begun:
+    """Return what a fit starts from.
 
     The lead is not looked for where no screw wave may be fitted, or where the geometry says that screws differ.
     """
@@ -256,13 +272,13 @@ def _begin(
     refuse_unmoved(measurements, residuals)
     known = everything.space.periods[np.isfinite(everything.space.periods)]
     if not set(settings.blocks) & set(WAVES) or len(np.unique(known)) > 1:
-        return everything, problem, None, constants
+        return _Begun(everything, problem, None, constants)
     progress("looking for the screws' lead")
     lead = look_for_lead(everything, problem)
     if lead.given is None and lead.used is not None:
         everything = Estimation(measurements, ParameterSpace(measurements, replace(settings, lead=lead.used)))
         problem, _ = everything.linearise(np.zeros(everything.space.size), trust)
-    return everything, problem, lead, constants
+    return _Begun(everything, problem, lead, constants)
 
 
 def _choose(
@@ -366,7 +382,7 @@ def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
     negative = np.flatnonzero(sigmas < -SURE)
     if len(negative) > 3:
         listed = ", ".join(f"{v * 1e6:.2f}" for v in values)
-        problem = f"forward and backward look swapped: the struts would have a backlash of {listed} µm"
+        problem = f"{SWAPPED}: the struts would have a backlash of {listed} µm"
         raise CalibrationError("direction", problem)
     return [f"strut_{i + 1}: backlash of {values[i] * 1e6:.2f} µm found, taken as none" for i in negative]
 
@@ -451,15 +467,6 @@ def _outliers(estimation: Estimation, solution: Solution) -> list[Outlier]:
         Outlier(m.sources[i], int(m.channel[i]), float(solution.residuals[i]), float(sigmas[i]), m.runs[m.run[i]].name)
         for i in far
     ]
-
-
-def _held(
-    model: MachineModel, estimation: Estimation, posterior: Posterior, datum: Pose | None
-) -> tuple[MachineModel, HeldDatum]:
-    """Return a model that leaves the tool where it is at a datum, as far as the readings do not show more."""
-    geometry = estimation.measurements.geometry
-    pose = geometry.home if datum is None else datum
-    return hold(geometry, model, pose, unseen_part(estimation, posterior.tolerances[0], posterior.noise, pose))
 
 
 def _named(

@@ -19,7 +19,7 @@ from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.passes import Passes
 from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, MeasurementSet, Stations
 from .estimation import Estimation
-from .linear_problem import LinearProblem, Posterior, solve
+from .linear_problem import LinearProblem, Posterior, physical_covariance, solve
 from .misfit import FAMILIES, family_of_run
 from .parameters import WAVES, FitSettings, ParameterSpace
 from .sensitivity import Prediction, predict
@@ -29,6 +29,10 @@ PLAIN = ("pitch", *WAVES, "backlash")
 
 BETTER, SURELY = 3.0, 1.2
 """Another reading is named when some kind of channel fits so many times better, and all together so many times."""
+
+SCATTERED, AS_STATED = 1.5, 1.15
+"""Readings that scatter so many times as much as stated are looked into. What brings all of them down to so many times
+their stated noise is named too, however little better it is: nothing but the truth does that."""
 
 AS_GOOD = 1.05
 """Others that fit all together as well, to this factor, are named too."""
@@ -44,6 +48,11 @@ UNITS = {
 
 GEOMETRIES = ("paper.yaml", "example_6_6.yaml", "jugglebot.yaml", "positioning_unit.yaml")
 """Machines whose readings may have been mixed up: the shipped ones."""
+
+SURE = 4.0
+"""Backlash so many standard deviations below zero is no noise."""
+
+SWAPPED = "forward and backward look swapped, or the sign of all readings reversed"
 
 ROUNDS = 3
 """Rounds in which each run's sign is looked at with the others' as they are."""
@@ -85,36 +94,60 @@ def suspicions(
     progress : callable
         Called with what is tried.
     left : mapping of int to float, optional
-        Standard deviation that their fit leaves of each kind, m or rad. Where a plain model leaves little more, nothing
-        could be far better, and nothing is tried.
+        Standard deviation that their fit leaves of each kind, m or rad. Where that is as stated, and a plain model
+        leaves little more, nothing could be far better, and nothing is tried.
     """
-    rng = np.random.default_rng(0)
-    if len(measurements) > ENOUGH:
-        chosen = np.zeros(len(measurements), dtype=bool)
-        chosen[rng.choice(len(measurements), ENOUGH, replace=False)] = True
-        measurements = measurements.select(chosen)
-    plain = _Plain(replace(settings, blocks=PLAIN))
-    whole = Reinterpretation("", measurements, np.ones(len(KINDS)))
-    as_they_are = plain.noise(whole)
-    if as_they_are is None or (left and all(as_they_are[k] < BETTER * value for k, value in left.items())):
+    measurements, plain = _thinned(measurements), _Plain(settings)
+    present = np.unique(measurements.kind)
+    stated = np.array([measurements.stated_of(k) for k in present])
+    as_they_are = plain.noise(Reinterpretation("", measurements, np.ones(len(KINDS))))
+    if as_they_are is None:
         return []
-    counts = np.bincount(measurements.kind, minlength=len(KINDS))
-    tried = []
+    if left is not None:
+        by_fit = np.array([left[k] for k in present])
+        if (by_fit < SCATTERED * stated).all() and (as_they_are[present] < BETTER * by_fit).all():
+            return []
+    shares = np.bincount(measurements.kind)[present] / len(measurements)
+    clear = []
     for other in _others(measurements, plain):
         progress(f"trying {other.name}")
         noise = plain.noise(other)
-        if noise is not None:
-            gains = np.where(counts > 0, as_they_are / noise, 1.0)
-            tried.append((float(np.exp(counts @ np.log(gains) / counts.sum())), float(gains.max()), other.name))
-    clear = sorted((t for t in tried if t[0] > SURELY and t[1] > BETTER), reverse=True)
+        if noise is None:
+            continue
+        gains = as_they_are[present] / noise[present]
+        total, best = float(np.exp(shares @ np.log(gains))), float(gains.max())
+        if total > SURELY and (best > BETTER or (noise[present] < AS_STATED * stated).all()):
+            clear.append((total, best, other.name))
+    clear.sort(reverse=True)
     return [f"{name} fits {best:.3g} times better" for total, best, name in clear if total > clear[0][0] / AS_GOOD]
+
+
+def causes(
+    measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object] = lambda text: None
+) -> list[str]:
+    """Return by name what may be why no machine could be fitted: as :func:`suspicions`, and a backlash below zero.
+
+    Which way is forward, and the sign of everything, only backlash tells: no nut leads its screw.
+    """
+    backlash, deviation = _Plain(settings).backlash(_thinned(measurements))
+    swapped = (backlash < -SURE * deviation).sum() > len(backlash) // 2
+    return [*suspicions(measurements, settings, progress), *([SWAPPED] if swapped else [])]
+
+
+def _thinned(m: MeasurementSet) -> MeasurementSet:
+    """Return so many readings, drawn at random, that they tell."""
+    if len(m) <= ENOUGH:
+        return m
+    chosen = np.zeros(len(m), dtype=bool)
+    chosen[np.random.default_rng(0).choice(len(m), ENOUGH, replace=False)] = True
+    return m.select(chosen)
 
 
 class _Plain:
     """Plain fits; the nominal machine is sent once where readings of the same stations are read differently."""
 
     def __init__(self, settings: FitSettings) -> None:
-        self._settings = settings
+        self._settings = replace(settings, blocks=PLAIN)
         self._sent: dict[int, tuple[Stations, Prediction]] = {}
 
     def _fitted(self, m: MeasurementSet) -> tuple[Estimation, LinearProblem, Posterior] | None:
@@ -136,6 +169,15 @@ class _Plain:
             return None
         stated = np.array([tried.measurements.stated_of(k) for k in range(len(KINDS))])
         return fitted[-1].noise * stated / tried.scale
+
+    def backlash(self, m: MeasurementSet) -> tuple[np.ndarray, np.ndarray]:
+        """Return the struts' backlash and its standard deviation, (6,) each, m; (0,) where it cannot be."""
+        fitted = self._fitted(m)
+        if fitted is None or (block := fitted[0].space.block("backlash")) is None:
+            return np.zeros(0), np.zeros(0)
+        space, posterior = fitted[0].space, fitted[-1]
+        deviation = np.sqrt(np.diag(physical_covariance(space, posterior))[block.part])
+        return space.physical(posterior.y)[block.part], deviation
 
     def unlike(self, m: MeasurementSet) -> np.ndarray:
         """Return which runs are rather the opposite of what a plain fit to all says, shape (runs,)."""
@@ -194,11 +236,13 @@ def _multiplied(m: MeasurementSet, name: str, members: np.ndarray, factor: float
 
 
 def _in_other_units(m: MeasurementSet) -> Iterator[Reinterpretation]:
-    """Yield each kind of channel in each other unit."""
-    for k in np.unique(m.kind):
-        which, meant = ("angle", "µrad") if KINDS[k] in ANGULAR_KINDS else ("length", "µm")
-        for unit, factor in UNITS[which]:
-            yield _multiplied(m, f"{KINDS[k]}: {unit} in place of {meant}", m.kind == k, factor)
+    """Yield each kind of channel in each other unit, and all lengths or angles together."""
+    present = np.unique(m.kind)
+    angular = np.array([KINDS[k] in ANGULAR_KINDS for k in present])
+    for which, meant, kinds in (("length", "µm", present[~angular]), ("angle", "µrad", present[angular])):
+        together = [(f"all {which}s", kinds)] if len(kinds) > 1 else []
+        for (name, members), (unit, factor) in product([*together, *((KINDS[k], k) for k in kinds)], UNITS[which]):
+            yield _multiplied(m, f"{name}: {unit} in place of {meant}", np.isin(m.kind, members), factor)
 
 
 def _exchanged_channels(m: MeasurementSet) -> Iterator[Reinterpretation]:

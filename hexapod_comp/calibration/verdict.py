@@ -15,7 +15,6 @@ from .observability import Allowed, ToolError, expected_error
 from .parameters import FitSettings, ParameterSpace
 from .promise import Unexplained
 from .residuals import Residuals
-from .selection import EXPECTED
 from .suspicions import suspicions
 
 DOUBTFUL = 3.0
@@ -97,12 +96,8 @@ def judge(
     )
     families, runs = chi_squares(residuals)
     far_off, doubtful = measurements.misfit(noise, MISFIT), measurements.misfit(noise, DOUBTFUL)
-    # A length map or a field can describe nearly anything, also readings that are none of this machine's.
-    general = any(block.name not in ("structure", *EXPECTED) for block in space.blocks)
-    least = {} if doubtful else noise
-    suspects = suspicions(measurements, settings, progress, least) if doubtful or general else []
-    doubts = [*([] if far_off else [doubtful]), *suspects, *beyond.doubts(), _unsettled(solution)]
-    refusals = [far_off, _useless(level), _held(residuals)]
+    doubts = [*([] if far_off else [doubtful]), *beyond.doubts(), _unsettled(solution)]
+    refusals = [far_off, _useless(level), _held(residuals), *suspicions(measurements, settings, progress, noise)]
     remarks = [*beyond.remarks(), _unstated(measurements), NOT_TILTED if level_only else ""]
     listed = (tuple(filter(None, part)) for part in (refusals, doubts, remarks))
     return Verdict(level, tilted, beyond, families, runs, *listed)

@@ -397,9 +397,9 @@ class Bench:
         return {} if status is None else {entry.key: entry.value for entry in status.values}
 
     def until_status(self, level: bytes, message: str, node: str = "compensator") -> dict[str, str]:
-        """Wait for a node's status, the newest or a later one, of a level and a message that starts so; return its values."""
+        """Wait for a status, the newest or a later one, of a level whose message starts so; return its values."""
         statuses = self.statuses(node)
-        looked_at, hits = max(len(statuses) - 1, 0), []
+        looked_at, hits = max(len(statuses) - 1, 0), list[DiagnosticStatus]()
 
         def there() -> bool:
             nonlocal looked_at

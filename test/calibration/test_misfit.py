@@ -20,9 +20,9 @@ from hexapod_comp.calibration.observability import expected_error
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.promise import Scatter, Unexplained
 from hexapod_comp.calibration.report import as_json, fit_report
-from hexapod_comp.calibration.suspicions import suspicions
+from hexapod_comp.calibration.suspicions import SWAPPED, causes, suspicions
 from hexapod_comp.errors import CalibrationError, ModelError
-from hexapod_comp.measurements.readings import BACKWARD, FORWARD, KINDS, MeasurementSet
+from hexapod_comp.measurements.readings import BACKWARD, CHANNELS, FORWARD, KINDS, MeasurementSet
 
 LINEAR, STRAIGHTNESS, ROTATION = (KINDS.index(kind) for kind in ("linear", "straightness", "rotation"))
 
@@ -202,6 +202,13 @@ def test_one_run_is_held_by_the_priors(readings):
     assert fit.misfit in "; ".join(fit.verdict.refusals)
 
 
+@pytest.fixture
+def some(readings, monkeypatch) -> MeasurementSet:
+    """Return the readings, of which 500 are looked at when causes are sought."""
+    monkeypatch.setattr("hexapod_comp.calibration.suspicions.ENOUGH", 500)
+    return readings
+
+
 def reversed_where(readings: MeasurementSet, members: np.ndarray) -> MeasurementSet:
     return readings.with_values(np.where(members, -readings.value, readings.value))
 
@@ -216,15 +223,51 @@ CAUSES = {
 
 
 @pytest.mark.parametrize("cause", CAUSES)
-def test_the_cause_is_named(readings, cause):
+def test_the_cause_is_named(some, cause):
     """The first that is named is what was done; of half the runs, which half is reversed is anybody's guess."""
-    named = suspicions(CAUSES[cause](readings), FEW)
+    named = suspicions(CAUSES[cause](some), FEW)
     assert named
     assert named[0].startswith(cause) or ("of 25 runs" in cause and "12 of 25 runs" in named[0])
 
 
-def test_nothing_is_suspected_without_a_cause(readings):
-    assert suspicions(readings, FEW) == []
+def test_nothing_is_suspected_without_a_cause(some):
+    assert suspicions(some, FEW) == []
+    assert causes(some, FEW) == []
+
+
+def test_a_fit_that_fails_names_the_cause(some, monkeypatch):
+    """Large errors and a reversed sign end in no machine at all: whoever reads that must learn why."""
+
+    def fail(*_):
+        raise CalibrationError("fit", "did not settle")
+
+    monkeypatch.setattr("hexapod_comp.calibration.fit._fit", fail)
+    with pytest.raises(CalibrationError, match=r"did not settle\n  x lines: sign reversed fits \d+\.\d times better$"):
+        fit_model(CAUSES["x lines: sign reversed"](some), FEW)
+    with pytest.raises(CalibrationError, match=r"did not settle$"):
+        fit_model(some, FEW)
+
+
+def test_the_sign_of_everything_shows_in_the_backlash_alone(some):
+    """To first order the machine with all errors reversed reads so, but its screws would lead their nuts."""
+    assert causes(some.with_values(-some.value), FEW) == [SWAPPED]
+
+
+def test_what_fits_better_otherwise_is_not_written(some):
+    """Straightness of the x lines is small here: exchanged, it scatters by 2.5 µm, and nothing else makes that 1 µm."""
+    exchanged = np.arange(len(CHANNELS))
+    y, z = (CHANNELS.index(f"straightness_{axis}") for axis in "yz")
+    exchanged[[y, z]] = z, y
+    of_x_lines = family(some) == 0
+    fit = fit_model(replace(some, channel=np.where(of_x_lines, exchanged[some.channel], some.channel)), FEW)
+    assert fit.misfit.startswith("x lines, straightness_y and straightness_z: exchanged fits")
+
+
+def test_a_unit_that_all_lengths_share_is_named_once(some):
+    """Straightness and distances in µinch; the angles are as they should be."""
+    lengths = some.kind != ROTATION
+    named = suspicions(some.with_values(np.where(lengths, some.value / 0.0254, some.value)), FEW)
+    assert named[0].startswith("all lengths: µinch in place of µm fits")
 
 
 @pytest.mark.parametrize("value", [1e308, -1e150, 2.0, np.nan])
