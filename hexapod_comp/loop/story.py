@@ -141,6 +141,7 @@ def calibrate(
     real, campaign = RealMachine(geometry, truth), demo_campaign(place)
     say("measuring with 5-D lasers")
     measured = measure(template(campaign, geometry, seed), campaign, real, seed)
+    measured = replace(measured, uncertainty=np.array(campaign.noise)[measured.kind])
     fit = fit_model(measured, FitSettings(lead=_lead(geometry, truth)), say)
     say("the 1-D scheme of Mou & King")
     # Their lines run along the base's axes, and the platform is as level as above, whatever the work frame is.
