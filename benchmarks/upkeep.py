@@ -6,10 +6,13 @@ the check readings, each of 1 µm or 1 µrad: at both ends of three body diagona
 pitch and yaw), 12 readings, or of a line along x, y and z, 24; or the twelve that ``verify --propose`` chooses. What is
 left of the tool's error is judged at points that nothing was fitted to, the datum aligned.
 
-Usage: python -m benchmarks.upkeep [--machines 100] [--foreign 5] [--drifting 20] [--workers 2] [--json]
+Usage: python -m benchmarks.upkeep [--machines 100] [--foreign 5] [--drifting 20] [--workers 2] [--save FILE] [--json]
 
-Exits 1 when a bar is missed: no more than 5 % false alarms, a strut moved by 20 µm named in 95 %, repaired to 1.5 times
-what the calibration had left, and a bend in space or a moved joint never taken for what it is not in more than 10 %.
+``--save`` keeps each machine's results as they come, and goes on from those that are there; a run that is broken off
+prints what it has, and ``--machines 0 --foreign 0 --save FILE`` prints what a file has. Exits 1 when a bar is missed:
+no more than 5 % false alarms, a strut moved by 20 µm named in 95 %, repaired to 1.5 times what the calibration had
+left, a bend in space or a moved joint taken for what it is not in no more than 10 %, and of all that is named 90 %
+rightly.
 """
 
 from __future__ import annotations
@@ -20,8 +23,9 @@ import multiprocessing
 import os
 import sys
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -30,14 +34,14 @@ from tqdm import tqdm
 
 from benchmarks.calibration import LARGE, LEAD
 from benchmarks.smooth_imperfections import with_wavy_field
-from hexapod_comp.calibration.changes import STRUT
+from hexapod_comp.calibration.changes import AGEING, DATUM, OTHER, STRUT, TEMPERATURE
 from hexapod_comp.calibration.check_plan import propose_check
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.posterior import FittedParameters
 from hexapod_comp.calibration.update import refusal, update_model
-from hexapod_comp.calibration.verification import NAMED, VALID, Verification, verify_model
+from hexapod_comp.calibration.verification import NAMED, UNDECIDED, UNEXPLAINED, VALID, Verification, verify_model
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.measurements.campaign import Campaign, template
@@ -57,11 +61,16 @@ SETS = (CHOSEN, "12", "24")
 """Check readings: twelve that the package chooses, twelve and twenty-four by the rule of thumb above."""
 BOX = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]])
 
-CHANGES = ("nothing", "strut", "datum", "temperature", "ageing", "two struts")
-UNKNOWN = ("platform joint", "base joint", "bend", "backlash")
-"""Changes that parameters can follow, and such that are in no hypothesis that is named. Lines cannot see the datum."""
+CHANGES = {"nothing": None, "strut": STRUT, "datum": DATUM, "temperature": TEMPERATURE, "ageing": AGEING,
+           "two struts": STRUT}  # fmt: skip
+UNKNOWN = dict.fromkeys(("platform joint", "base joint", "bend", "backlash"), OTHER)
+"""What parameters can follow, and what is in no hypothesis that is named; with their kinds. Lines cannot see the datum.
+"""
 
-FALSE_ALARMS, NAMED_RIGHTLY, REPAIRED, CONFIDENTLY_WRONG = 0.05, 0.95, 1.5, 0.10
+SHARES = (0.0, 0.5, 0.7, 0.9, 0.99, 1.0)
+"""The probability of the likeliest kind falls between two of these; how often it is the right one?"""
+
+FALSE_ALARMS, NAMED_RIGHTLY, REPAIRED, CONFIDENTLY_WRONG, RIGHT_OF_NAMED = 0.05, 0.95, 1.5, 0.10, 0.90
 
 DRIFT, CHECK_EVERY, CHECKS = 20e-6, 0.5, 6
 """Struts that grow by so much an hour, m, checked so often, h."""
@@ -166,27 +175,34 @@ class Machine:
         return 1e6 * held_out(machine, model, self.box, POINTS, self.seed, level=level).aligned.rms
 
 
-def answer(verification: Verification, truth: MachineModel, before: MachineModel) -> str:
-    """Return what a check says, in a word: a kind of change, ``undecided``, ``other`` or ``valid``."""
-    if verification.verdict != NAMED:
-        return {"unexplained": "other"}.get(verification.verdict, verification.verdict)
+def answer(verification: Verification, what: str, truth: MachineModel, before: MachineModel) -> dict:
+    """Return what a check says: in a word, the likeliest kind's probability, and whether it is the right one.
+
+    The word is a kind of change, ``undecided``, ``other`` or ``valid``.
+    """
     best = verification.candidates[0]
+    right = best.family == (CHANGES | UNKNOWN)[what]
+    word = {NAMED: best.family, UNEXPLAINED: OTHER}.get(verification.verdict, verification.verdict)
     moved = np.abs(truth.struts.offset - before.struts.offset)
-    if best.family == STRUT and (moved > 0.0).sum() == 1 and best.name != f"strut_{moved.argmax() + 1}":
-        return "the wrong strut"
-    return best.family
+    another = best.family == STRUT and (moved > 0.0).sum() == 1 and best.name != f"strut_{moved.argmax() + 1}"
+    return {
+        "what": what,
+        "answer": "the wrong strut" if another and verification.verdict == NAMED else word,
+        "probability": verification.families[best.family],
+        "right": right and not another,
+    }
 
 
 def one_machine(name: str, seed: int, drifting: bool) -> dict:
     """Return everything about one machine."""
     machine = Machine(name, seed)
-    result: dict = {"machine": name, "fresh": machine.left(machine.truth, machine.model), "answers": {}}
-    for what in CHANGES + UNKNOWN:
+    result: dict = {"machine": name, "seed": seed, "fresh": machine.left(machine.truth, machine.model), "checks": []}
+    for what in CHANGES | UNKNOWN:
         truth = changed(machine.truth, what, machine.geometry, machine.in_base, seed)
         for count in SETS:
             readings = machine.read(truth, count)
             verification = verify_model(machine.model, machine.fitted, readings)
-            result["answers"][f"{what}, {count}"] = answer(verification, truth, machine.truth)
+            result["checks"].append({"readings": count} | answer(verification, what, truth, machine.truth))
             if what == "strut":
                 result[f"crashed, {count}"] = machine.left(truth, machine.model)
                 if not refusal(verification):
@@ -214,21 +230,38 @@ def drift(machine: Machine) -> list[tuple[float, float, float]]:
 
 def summed_up(results: list[dict]) -> dict:
     """Return the figures of some machines."""
-    count = len(results)
-    figures: dict = {"machines": count, "answers": {}}
-    for key in results[0]["answers"]:
-        figures["answers"][key] = dict(Counter(r["answers"][key] for r in results).most_common())
+    checks = [check for result in results for check in result["checks"]]
+    answers = {
+        f"{what}, {size}": dict(Counter(c["answer"] for c in checks if (c["what"], c["readings"]) == (what, size)))
+        for what in CHANGES | UNKNOWN
+        for size in SETS
+    }
+    figures: dict = {"machines": len(results), "answers": answers}
     fresh = np.array([r["fresh"] for r in results])
     figures["fresh_um"] = float(np.sqrt((fresh**2).mean()))
     for size in SETS:
+        figures[f"reliability, {size}"] = reliability([c for c in checks if c["readings"] == size])
         pairs = [(r[f"repaired, {size}"], r["fresh"]) for r in results if f"repaired, {size}" in r]
-        after, before = (np.sqrt((np.array(column) ** 2).mean()) for column in zip(*pairs, strict=True))
+        after, before = np.sqrt((np.array(pairs or [(np.nan, np.nan)]) ** 2).mean(axis=0))
         crashed = np.sqrt(np.mean([r[f"crashed, {size}"] ** 2 for r in results]))
         figures[f"repair_{size}"] = {"crashed_um": float(crashed), "repaired_um": float(after), "machines": len(pairs),
                                      "times_fresh": float(after / before)}  # fmt: skip
     drifts = np.array([r["drift"] for r in results if "drift" in r])
     figures["drift"] = [] if not len(drifts) else np.sqrt((drifts**2).mean(axis=0)).tolist()
     return figures
+
+
+def reliability(checks: list[dict]) -> dict:
+    """Return how many of the checks that say "changed" are right, beside what they state; and of those that name it."""
+    alarms = [c for c in checks if c["answer"] != VALID]
+    stated, right = (np.array([c[key] for c in alarms], dtype=float) for key in ("probability", "right"))
+    place, rows = np.digitize(stated, SHARES[1:-1]), []
+    for n, (low, high) in enumerate(pairwise(SHARES)):
+        there = place == n
+        if there.any():
+            rows.append([low, high, int(there.sum()), float(stated[there].mean()), float(right[there].mean())])
+    named = [c["right"] for c in alarms if c["answer"] not in (UNDECIDED, OTHER)]
+    return {"rows": rows, "named": len(named), "named_rightly": float(np.mean(named or [1.0]))}
 
 
 def share(figures: dict, key: str, answers: tuple[str, ...]) -> float:
@@ -241,13 +274,16 @@ def bars(figures: dict) -> list[tuple[str, float, float, bool]]:
     alarms = max(1.0 - share(figures, f"nothing, {n}", (VALID,)) for n in SETS)
     named = share(figures, f"strut, {CHOSEN}", (STRUT,))
     repaired = figures[f"repair_{CHOSEN}"]["times_fresh"]
-    wrong = {f"{what}, 24": 1.0 - share(figures, f"{what}, 24", ("other", "undecided", VALID)) for what in UNKNOWN}
+    wrong = {f"{what}, 24": 1.0 - share(figures, f"{what}, 24", (OTHER, UNDECIDED, VALID)) for what in UNKNOWN}
     worst = max(wrong, key=lambda key: wrong[key])
+    least = min(SETS, key=lambda size: figures[f"reliability, {size}"]["named_rightly"])
+    right = figures[f"reliability, {least}"]["named_rightly"]
     return [
         ("false alarms", alarms, FALSE_ALARMS, alarms <= FALSE_ALARMS),
         ("a strut, 12 chosen readings, named", named, NAMED_RIGHTLY, named >= NAMED_RIGHTLY),
         ("repaired, times what the calibration left", repaired, REPAIRED, repaired <= REPAIRED),
         (f"{worst}: named wrongly", wrong[worst], CONFIDENTLY_WRONG, wrong[worst] <= CONFIDENTLY_WRONG),
+        (f"of all that is named, with {least} readings, rightly", right, RIGHT_OF_NAMED, right >= RIGHT_OF_NAMED),
     ]
 
 
@@ -260,9 +296,30 @@ def report(title: str, figures: dict) -> str:
         r = figures[f"repair_{size}"]
         text = f"{r['crashed_um']:.3f} → {r['repaired_um']:.3f} µm, {r['times_fresh']:.2f} × fresh, {r['machines']}"
         lines.append(f"  repair with {size} readings: {text} machines")
+    for size in SETS:
+        said = figures[f"reliability, {size}"]
+        lines.append(f"  {size} readings: {said['named']} named, {100 * said['named_rightly']:.1f} % of them rightly")
+        for low, high, number, stated, right in said["rows"]:
+            text = f"{number} checks, stated {100 * stated:.1f} %, right {100 * right:.1f} %"
+            lines.append(f"    likeliest kind {low:g}…{high:g}: {text}")
     for hours, without, with_checks in figures["drift"]:
         lines.append(f"  drift, {hours:.1f} h: {without:.3f} µm without checks, {with_checks:.3f} µm with")
     return "\n".join(lines)
+
+
+def run(tasks: list[tuple[str, int, bool]], workers: int, results: list[dict], save: Path | None) -> None:
+    """Add each machine's results to those that there are, and to the file, as they come; until broken off."""
+    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        waiting = [pool.submit(one_machine, *task) for task in tasks]
+        try:
+            for done in tqdm(as_completed(waiting), total=len(tasks), disable=None):
+                results.append(done.result())
+                if save is not None:
+                    with save.open("a", encoding="utf-8") as file:
+                        file.write(json.dumps(results[-1]) + "\n")
+        except KeyboardInterrupt:
+            pool.shutdown(cancel_futures=True)
 
 
 def main() -> int:
@@ -271,16 +328,18 @@ def main() -> int:
     parser.add_argument("--machines", type=int, default=100, help="of the paper's kind (default 100)")
     parser.add_argument("--foreign", type=int, default=5, help="of each other kind (default 5)")
     parser.add_argument("--drifting", type=int, default=20, help="of the first, that drift as well (default 20)")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: all cores)")
+    parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
+    parser.add_argument("--save", type=Path, metavar="FILE", help="keep results as they come; go on from those there")
     parser.add_argument("--json", action="store_true", help="JSON instead of text")
     args = parser.parse_args()
     tasks = [("paper", seed, seed <= args.drifting) for seed in range(1, args.machines + 1)]
     tasks += [(name, seed, False) for name in FOREIGN for seed in range(1, args.foreign + 1)]
-    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-    pool = ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn"))
-    with pool:
-        results = list(tqdm(pool.map(one_machine, *zip(*tasks, strict=True)), total=len(tasks), disable=None))
-    names = dict.fromkeys(task[0] for task in tasks)
+    results = []
+    if args.save is not None and args.save.exists():
+        results = [json.loads(line) for line in args.save.read_text(encoding="utf-8").splitlines()]
+    there = {(result["machine"], result["seed"]) for result in results}
+    run([task for task in tasks if task[:2] not in there], args.workers, results, args.save)
+    names = [name for name in ("paper", *FOREIGN) if any(r["machine"] == name for r in results)]
     figures = {name: summed_up([r for r in results if r["machine"] == name]) for name in names}
     print(json.dumps(figures, indent=1) if args.json else "\n".join(report(*pair) for pair in figures.items()))
     met = bars(figures["paper"]) if "paper" in figures else []

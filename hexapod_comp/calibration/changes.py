@@ -28,9 +28,10 @@ FAMILIES = {
 }
 """Kinds of change, and what each is called."""
 
-PRIOR = {DATUM: 1.0, STRUT: 1.0, TEMPERATURE: 1.0, AGEING: 0.25, READING: 0.25, OTHER: 0.25}
+PRIOR = {DATUM: 1.0, STRUT: 1.0, TEMPERATURE: 1.0, AGEING: 0.25, READING: 0.25, OTHER: 0.5}
 """How likely they are beforehand, beside each other. So are the groups of a kind, equally, and the changes of a group:
-else a bend would count for little beside all joints and screws, and what is one would be called ageing."""
+else a bend would count for little beside all joints and screws, and what is one would be called ageing. For the same
+reason the last kind, which has four groups, counts twice."""
 
 REPAIRABLE = (DATUM, STRUT, TEMPERATURE, AGEING)
 """Kinds that few readings can repair: they are parameters of the model."""
@@ -44,8 +45,9 @@ GROWTHS = (4e-6, 12e-6, 36e-6, 120e-6)
 SHARES = (0.02, 0.05, 0.1, 0.2)
 """By which share of its tolerance everything may have aged: the joints by 2 to 20 µm of 100."""
 
-BENDS = (0.5, 2.0, 8.0, 32.0)
-"""How large a smooth field may have grown, in its first tolerances (5 µm, 20 µrad)."""
+BENDS = (0.5, 1.0, 2.0, 4.0, 8.0)
+"""How large a smooth field may have grown, in its first tolerances (5 µm, 20 µrad). As fine as :data:`SHARES`: of two
+explanations by many directions the one whose scales fit better would win, whichever is true."""
 
 FIELD = ("field displacement", "field rotation")
 """Blocks of which it is made."""

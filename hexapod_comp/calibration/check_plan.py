@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import logsumexp
 
 from ..errors import CalibrationError
 from ..machine.geometry import STRUT_NAMES
@@ -31,6 +30,10 @@ CHANNELS_READ = ("linear", "rotation_x", "rotation_y", "rotation_z")
 
 CRASH, WARMTH = 20e-6, 12e-6
 """Changes that are to be named: of each strut by itself, m, and growth of all struts, m/m: steel by a kelvin."""
+
+
+_log_sum = np.logaddexp.reduce
+"""Of arrays so small that checks of arguments took scipy's most of the time."""
 
 
 @dataclass(frozen=True)
@@ -134,12 +137,12 @@ class _Weighing:
         """Return the log odds of the right kind of change over all others; those that are told worst count most."""
         check = self._every.part(choice.contrasts(len(self._laid_out)))
         evidence = weigh(check, self._fitted, self._changes, self._laid_out)
-        weights = np.array([logsumexp(w, axis=1) for w in evidence.weights_of_each(self._named @ check.rows.T)])
+        weights = np.array([_log_sum(w, 1) for w in evidence.weights_of_each(self._named @ check.rows.T)])
         own, other = (
             np.array([of(h, c) for h in evidence.hypotheses for c in self._changes_named]) for of in (_same, _other)
         )
-        right, wrong = (logsumexp(np.where(of.reshape(weights.shape), weights, -np.inf), axis=0) for of in (own, other))
-        return -float(logsumexp(wrong - right))
+        right, wrong = (_log_sum(np.where(of.reshape(weights.shape), weights, -np.inf), 0) for of in (own, other))
+        return -float(_log_sum(wrong - right, 0))
 
 
 def _same(hypothesis: Hypothesis, change: Change) -> bool:

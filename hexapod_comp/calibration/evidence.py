@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.special import logsumexp
 
 from .changes import PRIOR
 
@@ -60,7 +59,11 @@ class Hypothesis:
     @staticmethod
     def of(family: str, name: str, effect: np.ndarray, scales: tuple[float, ...], group: str = "") -> Hypothesis:
         """Return a hypothesis from its effect (n, k) on whitened readings."""
-        directions, gains, _ = np.linalg.svd(effect, full_matrices=False)
+        if effect.shape[1] == 1:  # most of them: no need to decompose
+            gains = np.linalg.norm(effect, axis=0)
+            directions = effect / (gains or 1.0)
+        else:
+            directions, gains, _ = np.linalg.svd(effect, full_matrices=False)
         felt = gains > LEAST_GAIN * max(gains.max(initial=0.0), 1.0)
         return Hypothesis(family, name, directions[:, felt], gains[felt], np.array(scales), effect.shape[1], group)
 
@@ -86,12 +89,12 @@ class Evidence:
     """
 
     def __init__(self, covariance: np.ndarray) -> None:
-        self._root = np.linalg.cholesky(covariance)
+        self._whitening = solve_triangular(np.linalg.cholesky(covariance), np.eye(len(covariance)), lower=True)
         self.hypotheses: list[Hypothesis] = []
 
     def whitened(self, effect: np.ndarray) -> np.ndarray:
         """Return readings or effects (n, …) in coordinates in which those of an unchanged machine are N(0, 1)."""
-        return solve_triangular(self._root, effect, lower=True)
+        return np.asarray(self._whitening @ effect)
 
     def add(self, family: str, name: str, effect: np.ndarray, scales: tuple[float, ...], group: str = "") -> None:
         """Add what has an effect (n, k) on readings, for a coefficient of one."""
@@ -120,7 +123,7 @@ class Evidence:
 
     def _changed(self, z: np.ndarray) -> np.ndarray:
         """Return the log evidence of all changes together over that of none, shape (N,)."""
-        return logsumexp(np.concatenate(self._logs(z), axis=1), axis=1)
+        return np.logaddexp.reduce(np.concatenate(self._logs(z), axis=1), axis=1)
 
     def _logs(self, z: np.ndarray) -> list[np.ndarray]:
         groups = [(h.family, h.group) for h in self.hypotheses]

@@ -10,12 +10,11 @@ from dataclasses import dataclass, replace
 from datetime import date
 
 import numpy as np
-from scipy.special import logsumexp
 
 from ..errors import CalibrationError
 from ..machine.model import MachineModel
 from ..measurements.readings import MeasurementSet
-from .changes import FAMILIES, READING, REPAIRABLE, TEMPERATURE, Change, possible_changes, widened
+from .changes import FAMILIES, OTHER, READING, REPAIRABLE, TEMPERATURE, Change, possible_changes, widened
 from .check_readings import CheckReadings, Explanation, explained, weigh
 from .datum import hold, unseen_part
 from .estimation import Estimation
@@ -93,7 +92,7 @@ def _mixture(
     if not changes:
         return explained(check, prior, None, 0.0)
     weights = weigh(check, prior, changes, measurements).weights(check.residuals)[: len(changes)]
-    whole = logsumexp(np.concatenate(weights))
+    whole = np.logaddexp.reduce(np.concatenate(weights))
     parts, shares = [], []
     for change, logs in zip(changes, weights, strict=True):
         for scale, share in zip(change.scales, np.exp(logs - whole), strict=True):
@@ -141,6 +140,9 @@ def refusal(verification: Verification) -> str:
     """Return why few readings cannot renew a model; empty where they can."""
     if verification.verdict == UNEXPLAINED:
         return "the machine has changed in a way that few readings cannot repair: measure a campaign and fit anew"
-    if verification.verdict != VALID and verification.candidates[0].family == READING:
-        return f"a single reading is probably wrong: {verification.candidates[0].name}; take it again"
+    best = verification.candidates[0]
+    if verification.verdict != VALID and best.family == READING:
+        return f"a single reading is probably wrong: {best.name}; take it again"
+    if verification.verdict != VALID and best.family == OTHER:
+        return "it is open whether few readings can repair what has changed: take those that verify proposes as well"
     return ""

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import logsumexp
 
 from ..errors import CalibrationError, ModelError
 from ..machine.model import MachineModel, RealMachine
@@ -26,7 +25,7 @@ FALSE_ALARMS = 0.01
 """Share of unchanged machines that may be called changed."""
 
 SURE = 0.9
-"""A kind of change is named when it has this share of the probability of all changes."""
+"""A kind of change, also the one that nothing explains, is stated when it has this share of the probability of all."""
 
 CLEAR = 4.0
 """A change of so many standard deviations is surely seen."""
@@ -120,9 +119,9 @@ def _verdict(valid: bool, families: dict[str, float]) -> str:
     best = max(families, key=lambda family: families[family])
     if valid:
         return VALID
-    if best == OTHER:
-        return UNEXPLAINED
-    return NAMED if families[best] >= SURE else UNDECIDED
+    if families[best] < SURE:
+        return UNDECIDED
+    return UNEXPLAINED if best == OTHER else NAMED
 
 
 def verify_model(
@@ -179,7 +178,7 @@ def _candidates(
     """Return the probability of each kind, and its best explanation, the most probable kind first."""
     weights = evidence.weights(check.residuals)
     kinds = np.array([hypothesis.family for hypothesis in evidence.hypotheses])
-    shares = np.exp(np.array([logsumexp(w) for w in weights]) - logsumexp(np.concatenate(weights)))
+    shares = np.exp(np.array([np.logaddexp.reduce(w) for w in weights]) - np.logaddexp.reduce(np.concatenate(weights)))
     families = {family: float(shares[kinds == family].sum()) for family in FAMILIES}
     candidates = []
     for family in sorted(families, key=lambda name: -families[name]):

@@ -50,8 +50,8 @@ def _verdict(result: Verification) -> Iterator[str]:
         yield f"CHANGED: {head}"
         share = f"in fewer than {_percent(result.usual)}" if result.usual < 1e-3 else f"in {_percent(result.usual)}"
         yield f"a machine that has not changed reads as strangely as this {share} of checks"
-        if result.verdict == NAMED and best.family == READING:
-            yield "take that reading again: the machine itself need not have changed"
+        doubted = [c.name for c in result.candidates[: 1 + (result.verdict == UNDECIDED)] if c.family == READING]
+        yield from (f"take {name} again: the machine itself need not have changed" for name in doubted)
     yield f"χ² {result.chi_square:.3g} per number against the model and what its fit knows"
     if result.tool is not None:
         standing, aligned_ = (1e6 * size for size in result.tool)
@@ -93,7 +93,7 @@ def _settling(result: Verification) -> Iterator[str]:
     first, second = (FAMILIES[c.family] for c in result.candidates[:2])
     rows = [(s.name, str(s.readings), ", ".join(s.channels), _odds(s.odds)) for s in result.settling]
     table = aligned(("read", "readings", "channels", "odds to expect"), rows)
-    yield f"to tell {first!r} from {second!r}, with the instruments used so far\n{table}"
+    yield f'to tell "{first}" from "{second}", with the instruments used so far\n{table}'
 
 
 def _odds(logarithm: float) -> str:

@@ -14,14 +14,23 @@ import pytest
 from calibration_helpers import BOX, FEW, campaign, measured, paper, virtual_machine
 from scipy.stats import multivariate_normal
 
-from hexapod_comp.calibration.changes import DATUM, FAMILIES, OTHER, STRUT, TEMPERATURE, possible_changes, widened
+from hexapod_comp.calibration.changes import (
+    DATUM,
+    FAMILIES,
+    OTHER,
+    READING,
+    STRUT,
+    TEMPERATURE,
+    possible_changes,
+    widened,
+)
 from hexapod_comp.calibration.check_plan import propose_check
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.evidence import Evidence, Hypothesis
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.posterior import FittedParameters
 from hexapod_comp.calibration.update import refusal, update_model
-from hexapod_comp.calibration.verification import NAMED, UNEXPLAINED, VALID, verify_model
+from hexapod_comp.calibration.verification import NAMED, UNDECIDED, UNEXPLAINED, VALID, Verification, verify_model
 from hexapod_comp.calibration.verification_report import verification_json, verification_report
 from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.datum import tool_move
@@ -180,14 +189,30 @@ def test_growth_of_all_struts_is_a_temperature() -> None:
         assert abs(best.coefficients[0] - 40e-6) < 4.0 * best.deviations[0]
 
 
-def test_one_wrong_reading_is_no_change_of_the_machine() -> None:
-    """A reading moved by 50 µm is told from the machine; the model is not renewed from it."""
+def with_one_wrong(number: int) -> Verification:
+    """Return a check of the machine as it was, one reading 50 µm or µrad off."""
     readings = check(fitted().truth)
     value = readings.value.copy()
-    value[1] += 50e-6
-    result = verify_model(fitted().model, fitted().known, readings.with_values(value))
-    assert result.candidates[0].family == "reading"
+    value[number] += 50e-6
+    return verify_model(fitted().model, fitted().known, readings.with_values(value))
+
+
+def test_one_wrong_reading_is_no_change_of_the_machine() -> None:
+    """It is told from the machine; the model is not renewed from it."""
+    result = with_one_wrong(8)
+    assert (result.verdict, result.candidates[0].family) == (NAMED, READING)
     assert "take it again" in refusal(result)
+
+
+def test_what_readings_cannot_tell_stays_open_and_says_what_would_settle_it() -> None:
+    """A wrong pitch at one end of the only line with one: a joint that has moved explains it as well."""
+    result = with_one_wrong(1)
+    assert result.verdict == UNDECIDED
+    assert {c.family for c in result.candidates[:2]} == {READING, OTHER}
+    assert refusal(result)
+    report = verification_report(result)
+    assert "again: the machine itself need not have changed" in report
+    assert "odds to expect" in report
 
 
 def test_what_is_in_no_hypothesis_is_not_named() -> None:
