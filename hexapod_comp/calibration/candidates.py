@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,11 +24,14 @@ from ..measurements.readings import AXES
 from ..pose import rotation_from_angles
 from ..workspace.reach import Examiner
 
-POINTS = {"linear": (5, 8, 21), "5-D": (5, 13), "6-D": (5, 13)}
+POINTS = {"linear": (8, 21), "5-D": (5, 13), "6-D": (5, 13)}
 """Points of a line, by instrument: few at little cost, or enough to see the screws' waves."""
 
+ALTERNATE_POINTS = {"linear": (4, 6, 10), "5-D": (4, 8), "6-D": (4, 8)}
+"""The same where each is read once, on the way there or back: more places for as many readings."""
+
 USUAL_POINTS = (13,)
-"""The same of all others."""
+"""Points of lines of all other instruments, there and back."""
 
 SAMPLES = 41
 """Points of a line that are examined."""
@@ -113,9 +116,12 @@ def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[Campaign
 def _read_by(instrument: str, lines: list[tuple[str, np.ndarray, np.ndarray]]) -> Iterator[CampaignRun]:
     """Yield the lines that an instrument can read, with each number of points."""
     for name, ends, rotation in lines:
+        if instrument in ("straightness", "rotation") and name.startswith("diagonal"):
+            continue
         for points in POINTS.get(instrument, USUAL_POINTS):
-            if instrument not in ("straightness", "rotation") or not name.startswith("diagonal"):
-                yield line_run(f"{instrument}, {name}", instrument, ends, points, rotation)
+            yield line_run(f"{instrument}, {name}", instrument, ends, points, rotation)
+        for points in ALTERNATE_POINTS.get(instrument, ()):
+            yield replace(line_run(f"{instrument}, {name}", instrument, ends, points, rotation), alternate=True)
 
 
 def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:

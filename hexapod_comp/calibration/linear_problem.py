@@ -253,6 +253,19 @@ def _tolerances(space: ParameterSpace, posterior: Posterior, z: np.ndarray) -> n
     return result
 
 
+def log_evidence(problem: LinearProblem, posterior: Posterior) -> float:
+    """Return the logarithm of the readings' probability under a posterior's tolerances and noise, but for a constant.
+
+    MacKay (1992), Neural Computation 4, 415: how well the readings are met, less what it takes to single the parameters
+    out of their priors.
+    """
+    kinds = np.unique(problem.kind)
+    weights, moment = posterior.noise[kinds] ** -2, problem.moment[np.ix_(kinds, posterior.used)]
+    _, determinant = np.linalg.slogdet(whitened_precision(problem, posterior))
+    unmet = weights @ (problem.square[kinds] - moment @ posterior.y)
+    return float(-0.5 * (unmet + determinant - problem.freedom[kinds] @ np.log(weights)))
+
+
 def held_out(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
     """Return the errors, in standard deviations, at cells whose fold the fit did not see, shape (C,).
 

@@ -116,12 +116,19 @@ def _chi_square_tables(fit: ModelFit) -> Iterator[str]:
 
 
 def _decision_table(fit: ModelFit) -> str:
-    header = ("block", "kept", "gain", "±", "")
+    header = ("block", "kept", "gain", "±", "", "evidence")
     rows = [
-        (d.block, "yes" if d.kept else "no", number(100.0 * d.gain, 2), number(100.0 * d.uncertainty, 2), "%")
+        (
+            d.block,
+            "yes" if d.kept else "no",
+            *(number(100.0 * v, 2) for v in (d.gain, d.uncertainty)),
+            "%",
+            number(d.evidence, 1),
+        )
         for d in fit.decisions
     ]
-    return "blocks; gain: how much less squared error at held-out readings\n" + aligned(header, rows)
+    head = "blocks; gain: how much less squared error at held-out readings; evidence: log of how much likelier all are"
+    return head + "\n" + aligned(header, rows)
 
 
 def observability_text(seen: Observability, unseen_errors: tuple[str, ...]) -> str:

@@ -1,20 +1,25 @@
-"""Which blocks of parameters a fit keeps: those that help on readings that it has not seen."""
+"""Which blocks of parameters a fit keeps: those that help on readings that it has not seen.
+
+Where these are too few to tell, the readings' probability with and without a block decides.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from .linear_problem import LinearProblem, Posterior, held_out, solve
+from .linear_problem import LinearProblem, Posterior, held_out, log_evidence, solve
 from .parameters import ParameterSpace
 
 FIRST_ROUNDS, ROUNDS = 10, 4
 """Rounds of estimating tolerances and noise: for all blocks, and for each set with fewer, which starts there."""
 
 CLEAR = 2.0
-"""A general block stays when its gain is so many times its standard error over the folds."""
+"""The folds tell whether a block helps if its gain is so many times its standard error from zero. Otherwise it helps if
+the readings are as much more probable with it as with a number that is found so many standard errors from zero."""
 
 LEAST_GAIN = 1e-4
 """A block does not help when its gain is below this: it is rounding, which depends on the libraries, or of no use."""
@@ -42,12 +47,30 @@ class Decision:
         that were in when it was decided on.
     uncertainty : float
         Standard error of the gain over the folds.
+    evidence : float
+        By how much the logarithm of the readings' probability is larger with it.
     """
 
     block: str
     kept: bool
     gain: float
     uncertainty: float
+    evidence: float
+
+
+class Gain(NamedTuple):
+    """What blocks bring: the attributes of a :class:`Decision`."""
+
+    share: float
+    uncertainty: float
+    evidence: float
+
+    @property
+    def clear(self) -> bool:
+        """Whether they help clearly."""
+        if abs(self.share) > CLEAR * self.uncertainty:
+            return self.share > LEAST_GAIN
+        return 2.0 * self.evidence > CLEAR**2
 
 
 def select(
@@ -59,8 +82,8 @@ def select(
 
     All blocks start in. The screw waves' harmonics go first, if all together do not help clearly. Then the general
     block that helps least goes, until every one that is left helps clearly; then the harmonics that do not help
-    clearly, and the expected ones that do not help at all. Taking them in one by one instead can let a field explain
-    what a length map does better.
+    clearly, and the expected ones that do not even seem to help. Taking them in one by one instead can let a field
+    explain what a length map does better.
 
     Parameters
     ----------
@@ -82,33 +105,29 @@ def select(
     trials = _Trials(space, problem, noise, progress)
     names = [b.name for b in space.blocks[1:]]
     kept = list(names)
-    gains: dict[str, tuple[float, float]] = {}
+    gains: dict[str, Gain] = {}
     harmonics = [name for name in names if name in HARMONICS]
     if harmonics:
         gains |= dict.fromkeys(harmonics, trials.gain(("structure", *names), *harmonics))
-        kept = [name for name in names if name not in HARMONICS or _clear(gains[name])]
+        kept = [name for name in names if name not in HARMONICS or gains[name].clear]
     general = [name for name in names if name not in (*EXPECTED, *HARMONICS)]
     while True:
         # A block that helps clearly beside all others helps no less when some of them have gone.
-        doubtful = [name for name in general if name in kept and not _clear(gains.get(name))]
+        doubtful = [name for name in general if name in kept and not (name in gains and gains[name].clear)]
         gains |= {name: trials.gain(("structure", *kept), name) for name in doubtful}
-        doubtful = [name for name in doubtful if not _clear(gains[name])]
+        doubtful = [name for name in doubtful if not gains[name].clear]
         if not doubtful:
             break
-        kept.remove(min(doubtful, key=lambda name: gains[name][0] / max(gains[name][1], 1e-12)))
+        kept.remove(min(doubtful, key=lambda name: gains[name].share / max(gains[name].uncertainty, 1e-12)))
     if len(harmonics) > 1:
         gains |= {name: trials.gain(("structure", *kept), name) for name in harmonics if name in kept}
-        kept = [name for name in kept if name not in HARMONICS or _clear(gains[name])]
+        kept = [name for name in kept if name not in HARMONICS or gains[name].clear]
     for name in (name for name in names if name in EXPECTED):
         gains[name] = trials.gain(("structure", *kept), name)
-    useless = [name for name in EXPECTED if name in kept and gains[name][0] <= LEAST_GAIN]
-    kept = [name for name in kept if name not in useless]
+    useful = [name for name in EXPECTED if name in kept and (gains[name].share > LEAST_GAIN or gains[name].clear)]
+    kept = [name for name in kept if name not in EXPECTED or name in useful]
     decisions = [Decision(name, name in kept, *gains[name]) for name in names]
     return decisions, trials.everything, trials.fit(("structure", *kept))
-
-
-def _clear(gain: tuple[float, float] | None) -> bool:
-    return gain is not None and gain[0] > max(LEAST_GAIN, CLEAR * gain[1])
 
 
 class _Trials:
@@ -119,17 +138,17 @@ class _Trials:
     ) -> None:
         self._space, self._problem, self._noise, self._progress = space, problem, noise, progress
         self._fits: dict[frozenset[str], Posterior] = {}
-        self._known: dict[frozenset[str], np.ndarray] = {}
+        self._known: dict[frozenset[str], tuple[np.ndarray, float]] = {}
         self.everything = self._solve(space.start_tolerances(), FIRST_ROUNDS)
 
-    def gain(self, names: tuple[str, ...], *blocks: str) -> tuple[float, float]:
-        """Return by which share blocks among `names` lower the squared error, and its standard error."""
-        with_it = self._errors(names)
-        without = self._errors(tuple(name for name in names if name not in blocks))
+    def gain(self, names: tuple[str, ...], *blocks: str) -> Gain:
+        """Return what blocks among `names` bring."""
+        with_it, evidence = self._outcome(names)
+        without, less_evidence = self._outcome(tuple(name for name in names if name not in blocks))
         if len(without) < 2:
-            return 0.0, 0.0
+            return Gain(0.0, 0.0, 0.0)
         less = (without - with_it) / max(without.sum(), np.finfo(float).tiny)
-        return float(less.sum()), float(np.sqrt(len(less) * less.var()))
+        return Gain(float(less.sum()), float(np.sqrt(len(less) * less.var())), evidence - less_evidence)
 
     def _solve(self, tolerances: np.ndarray, rounds: int) -> Posterior:
         return solve(self._space, self._problem, tolerances, self._noise, rounds)
@@ -142,12 +161,13 @@ class _Trials:
             self._fits[key] = self._solve(tolerances, ROUNDS)
         return self._fits[key]
 
-    def _errors(self, names: tuple[str, ...]) -> np.ndarray:
-        """Return the summed squared errors of each fold, in fixed units, under a set of blocks."""
+    def _outcome(self, names: tuple[str, ...]) -> tuple[np.ndarray, float]:
+        """Return the summed squared errors of each fold, in fixed units, and the log evidence, of a set of blocks."""
         key = frozenset(names)
         if key not in self._known:
             self._progress(f"trying {', '.join(names)}")
             posterior = self.fit(names)
             errors = held_out(self._problem, posterior) * (posterior.noise / self._noise)[self._problem.kind]
-            self._known[key] = np.bincount(self._problem.fold, errors**2)
+            of_folds = np.bincount(self._problem.fold, errors**2)
+            self._known[key] = of_folds, log_evidence(self._problem, posterior)
         return self._known[key]

@@ -55,6 +55,8 @@ class CampaignRun:
         From where lengths are read, in the work frame, m.
     known_zero : bool
         The lengths are known as a whole.
+    alternate : bool
+        A line's places are read once: every second one on the way there, the others on the way back.
 
     Raises
     ------
@@ -68,6 +70,7 @@ class CampaignRun:
     rotations: np.ndarray
     centres: np.ndarray | None = None
     known_zero: bool = False
+    alternate: bool = False
 
     def __post_init__(self) -> None:
         if self.instrument not in LISTED_INSTRUMENTS:
@@ -130,7 +133,7 @@ class CampaignRun:
 
     def count(self, cycles: int) -> int:
         """Return how many readings :meth:`readings` yields."""
-        return len(self.positions) * len(self.channels) * self._passes(cycles)
+        return len(self.positions) * len(self.channels) * self._passes(cycles) // (1 + self.alternate)
 
     def _passes(self, cycles: int) -> int:
         """Return how often the poses are passed: a tracker's once, a line and a circle there and back."""
@@ -142,7 +145,7 @@ class CampaignRun:
         """Yield the readings, values of zero; a line's in so many passes forward and backward, each pose's once."""
         poses = [Pose(*pose) for pose in zip(self.positions, self.rotations, strict=True)]
         if self.is_line:
-            yield from line_readings(self.name, poses, self.channels, cycles)
+            yield from line_readings(self.name, poses, self.channels, cycles, self.alternate)
             return
         if self.instrument in POSE_INSTRUMENTS:
             for pose in poses:
@@ -174,6 +177,7 @@ class CampaignRun:
             "line_mm": [positions[0], positions[-1]],
             "points": len(positions),
             "angles_deg": angles[0],
+            **({"stops": "alternate"} if self.alternate else {}),
         }
 
 
@@ -217,18 +221,22 @@ def tilts(points: int, largest: float) -> np.ndarray:
     return rotation_from_angles((largest * angles).round(9))
 
 
-def line_readings(name: str, poses: Sequence[Pose], channels: Iterable[str], cycles: int) -> Iterator[Reading]:
-    """Yield the readings of passes forward and backward over a line, values of zero.
+def line_readings(
+    name: str, poses: Sequence[Pose], channels: Iterable[str], cycles: int, alternate: bool = False
+) -> Iterator[Reading]:
+    """Yield the readings of passes forward and backward over a line, values of zero; all each way, or alternate ones.
 
     Forward is along the first of x, y, z of the work frame that moves, whichever way the poses are listed.
     """
     way = poses[-1].position - poses[0].position
     if way[np.flatnonzero(np.abs(way) > LEAST_TRAVEL)[0]] < 0.0:
         poses = poses[::-1]
-    channels = tuple(channels)
+    channels, stops = tuple(channels), (poses, poses)
+    if alternate:
+        stops = poses[::2], poses[1::2]
     for cycle in range(1, cycles + 1):
-        for direction in (FORWARD, BACKWARD):
-            for pose in poses[::direction]:
+        for direction, there in zip((FORWARD, BACKWARD), stops, strict=True):
+            for pose in there[::direction]:
                 for channel in channels:
                     yield Reading(name, cycle, direction, pose, channel, 0.0)
 
@@ -309,7 +317,8 @@ def _read_line(entry: Section, name: str, instrument: str) -> CampaignRun:
     points = entry.integer("points", 2)
     if not 2 <= points <= MOST_POINTS:
         raise entry.error("points", f"must be 2 to {MOST_POINTS}", points)
-    return line_run(name, instrument, ends, points, rotation_from_angles(angles))
+    run = line_run(name, instrument, ends, points, rotation_from_angles(angles))
+    return replace(run, alternate=entry.choice("stops", ("all", "alternate"), "all") == "alternate")
 
 
 def _read_poses(entry: Section, name: str, instrument: str) -> CampaignRun:

@@ -1,5 +1,6 @@
 """Campaigns that list their runs: files there and back, their readings in order, and what is refused."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import calibration_helpers as small
@@ -50,9 +51,22 @@ def test_readings_come_in_measuring_order() -> None:
     assert m.direction[0] == 1
 
 
+def test_alternate_stops_are_read_once(tmp_path: Path) -> None:
+    """Of five places the first, third and fifth on the way there, the others on the way back; from a file too."""
+    run = replace(RUNS[1], positions=np.linspace(*BOX, 5), rotations=np.tile(np.eye(3), (5, 1, 1)), alternate=True)
+    path = tmp_path / "planned.yaml"
+    path.write_text(campaign_text(replace(listed(), cycles=1, runs=(run,))))
+    (read,) = load_campaign(path).runs
+    readings = list(read.readings(1))
+    assert [round(r.pose.position[0], 9) for r in readings] == [-0.1, 0.0, 0.1, 0.05, -0.05]
+    assert [r.direction for r in readings] == [1, 1, 1, -1, -1]
+    assert (read.count(1), read.count(2)) == (5, 10)
+
+
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
+        (("points: 3", "points: 3\n  stops: some"), "runs[1].stops: must be one of all, alternate"),
         (("instrument: linear", "instrument: laser"), "runs[1].instrument: must be one of linear"),
         (("instrument: linear", "instrument: rotation"), "run diagonal: is not parallel to an axis of the work frame"),
         (("points: 3", "points: 1"), "runs[1].points: must be 2 to 10000"),
