@@ -84,8 +84,8 @@ def test_what_limits_a_goal() -> None:
 
 
 def test_no_time_at_all() -> None:
-    """The laser takes 20 min to put up, 8 min for a run; five points there and back at 4 s are 0.7 min: 0.48 h."""
-    with pytest.raises(CalibrationError, match=r"hours: are too few: the shortest run takes 0\.48 h"):
+    """The laser takes 20 min to put up, 8 min for a run; four points, each read once, at 4 s are 0.3 min: 0.47 h."""
+    with pytest.raises(CalibrationError, match=r"hours: are too few: the shortest run takes 0\.47 h"):
         proposed(1.0 * UM, 0.0, ("linear",), 0.2)
 
 
