@@ -143,16 +143,20 @@ def readings_of(plan: Campaign, truth: RealMachine, hidden: Hidden, kind: str, s
             stations, commands=stations.commands + hidden.lengths((stations.positions, stations.rotations))
         ),
     )
-    values = measure(real, plan, truth, seed).value
-    rng = np.random.default_rng([seed, 3])
+    return empty.with_values(measure(real, plan, truth, seed).value + carelessness(empty, real, truth, kind, seed))
+
+
+def carelessness(empty: MeasurementSet, real: MeasurementSet, truth: RealMachine, kind: str, seed: int) -> np.ndarray:
+    """Return what instruments read in addition that were used carelessly, on the machine as it really stands."""
+    values, rng = np.zeros(len(empty)), np.random.default_rng([seed, 3])
     errors = station_errors(real, truth)
     if kind in ("beams", "all"):
-        values = values + beams_off(empty, errors, rng)
+        values += beams_off(empty, errors, rng)
     if kind in ("drift", "all"):
-        values = values + drifted(real, truth, errors, rng)
+        values += drifted(real, truth, errors, rng)
     if kind in ("outliers", "all"):
-        values = values + gross(empty, rng)
-    return empty.with_values(values)
+        values += gross(empty, rng)
+    return values
 
 
 def beams_off(m: MeasurementSet, errors: np.ndarray, rng: np.random.Generator) -> np.ndarray:

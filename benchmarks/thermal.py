@@ -6,9 +6,9 @@ exact, gets what the filter makes of it, from the first reading on. At 1,000 hel
 of the two half hours and passed there and back, the figure is how far the drift has brought the tool from where it
 is at 20 °C: the error in space as it is, since a drift moves the datum and no alignment may take that out.
 
-Then expansions and time constants are fitted: see :mod:`benchmarks.warm_up`.
+Then expansions and time constants are fitted, and their stated deviations judged: see :mod:`benchmarks.warm_up`.
 
-Usage: python -m benchmarks.thermal [--only stated|fitted] [--machines 20] [--points 1000] [--noise 0.05]
+Usage: python -m benchmarks.thermal [--only stated|fitted|pulls] [--machines 20] [--points 1000] [--noise 0.05]
 [--time-constant 30] [--json]
 
 Exits 1 when a bar is missed.
@@ -26,7 +26,21 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.calibration import CONFIG, LARGE
-from benchmarks.warm_up import FITTED_HEADER, SENSORS, FittedRow, fitted_machine, fitted_row, fitted_shown
+from benchmarks.warm_up import (
+    FITTED_HEADER,
+    PULL_HEADER,
+    PULLED,
+    SENSORS,
+    FittedRow,
+    Pull,
+    PullRow,
+    fitted_machine,
+    fitted_row,
+    fitted_shown,
+    pull_row,
+    pull_shown,
+    pulls_of,
+)
 from hexapod_comp.compensation.thermal import DEFAULT_TIME_CONSTANT, TemperatureFilter
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -223,6 +237,24 @@ def fitted(args: argparse.Namespace) -> list[FittedRow]:
     return rows
 
 
+def pulled(args: argparse.Namespace) -> list[PullRow]:
+    """Return the rows of what was estimated beside its stated deviations, printed as it comes."""
+    pulls: list[Pull] = []
+    thermometers = ("", "base")
+    with tqdm(total=args.draws, disable=None) as bar:
+        for draw in range(args.draws):
+            kind = PULLED[draw % len(PULLED)]
+            seed = 100 + draw
+            # Kinds, machines and thermometers in turn, each with each.
+            pulls += pulls_of(kind, thermometers[seed // len(PULLED) % 2], seed + seed // len(PULLED))
+            bar.update()
+    names = list(dict.fromkeys(p.parameter for p in pulls))
+    rows = [pull_row(name, pulls) for name in (*names, "")]
+    if not args.json:
+        print("\n".join(["", PULL_HEADER, *map(pull_shown, rows)]), flush=True)
+    return rows
+
+
 def main() -> int:
     """Run the drifts and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -230,15 +262,18 @@ def main() -> int:
     parser.add_argument("--points", type=int, default=1000, help="held-out points (default 1000)")
     parser.add_argument("--noise", type=float, default=0.05, help="standard deviation of a reading, K (default 0.05)")
     parser.add_argument("--time-constant", type=float, default=DEFAULT_TIME_CONSTANT, help="of the filter, s")
-    parser.add_argument("--only", choices=("stated", "fitted"), help="expansion as stated, or fitted (default: both)")
+    parser.add_argument("--draws", type=int, default=48, help="machines of the zoo whose pulls are taken (default 48)")
+    parser.add_argument("--only", choices=("stated", "fitted", "pulls"), help="one part alone (default: all)")
     parser.add_argument("--json", action="store_true", help="JSON instead of a table")
     args = parser.parse_args()
     settings = FitSettings(args.points, args.noise, args.time_constant)
-    rows: list[Row | FittedRow] = []
-    if args.only != "fitted":
+    rows: list[Row | FittedRow | PullRow] = []
+    if args.only in (None, "stated"):
         rows += stated(args, settings)
-    if args.only != "stated":
+    if args.only in (None, "fitted"):
         rows += fitted(args)
+    if args.only in (None, "pulls"):
+        rows += pulled(args)
     if args.json:
         print(json.dumps([asdict(row) for row in rows], indent=1))
     return 0 if all(row.met for row in rows) else 1

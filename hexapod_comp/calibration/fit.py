@@ -15,6 +15,7 @@ from ..machine.size import rms
 from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementSet, refuse_unmoved
 from ..pose import Pose
+from .courses import with_courses
 from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
 from .estimation import HUBER, OUTLIER, Estimation, Solution, iterate
 from .lead import ScrewLead, look_for_lead
@@ -196,7 +197,7 @@ def fit_model(
     refuse_unreachable(measurements.geometry, datum)
     begun = _begin(measurements, settings or FitSettings(), progress)
     try:
-        return _fit(begun, progress, datum)
+        return _fit(measurements, begun, progress, datum)
     except HexapodError as error:
         if named := causes(measurements, begun.everything.space.settings, progress):
             error.with_lines("\n".join(f"  {cause}" for cause in named))
@@ -212,10 +213,10 @@ class _Begun(NamedTuple):
     constants: TimeConstants
 
 
-def _fit(begun: _Begun, progress: Callable[[str], object], datum: Pose) -> ModelFit:
+def _fit(measurements: MeasurementSet, begun: _Begun, progress: Callable[[str], object], datum: Pose) -> ModelFit:
     """Choose blocks, fit them, and judge what comes of it."""
     everything, problem, lead, constants = begun
-    measurements, settings = everything.measurements, everything.space.settings
+    settings = everything.space.settings
     decisions, (problem, possible), answer = _choose(everything, problem, settings, progress)
     space, estimation, solution = answer
     channels = tuple(_channels(estimation, solution))
@@ -253,7 +254,7 @@ def _fit(begun: _Begun, progress: Callable[[str], object], datum: Pose) -> Model
         notes=(*measurements.notes, *notes, *verdict.remarks),
         allowed=allowed,
         held=held,
-        warming=HeatSeen.of(measurements, space, solution, constants),
+        warming=HeatSeen.of(measurements, estimation, solution, constants, verdict.unexplained.factor),
         lead=lead,
     )
 
@@ -263,6 +264,7 @@ def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callab
 
     The lead is not looked for where no screw wave may be fitted, or where the geometry says that screws differ.
     """
+    measurements = with_courses(measurements)
     constants = seek_time_constants(measurements, ParameterSpace(measurements, settings), progress)
     if constants.values:
         settings = replace(settings, time_constants=constants.values)

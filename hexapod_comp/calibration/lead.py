@@ -248,8 +248,9 @@ class _Rest:
         c, s = self.gains[:, None] * turns.real, self.gains[:, None] * turns.imag
         waves = self._free(np.concatenate([c, s], axis=1).reshape(len(c), -1))
         shared = self._rows.transposed_times(waves)
-        amplitudes, less, _ = self._solved(waves, shared)
-        a, b = amplitudes.reshape(2, len(orders), 6)
+        amplitudes, less, covariance = self._solved(waves, shared)
+        noise = max(self.square - less, 1e-6 * self.square) / (self.freedom - amplitudes.size)
+        a, b = _shrunk(amplitudes.reshape(2, -1, 6), noise * covariance)
         turning = 2.0 * np.pi * self.commands[:, None] * orders[:, None]
         slope = self._free(((b * c - a * s) * turning).sum(axis=(1, 2))[:, None])
         every = np.hstack([waves, slope]), np.hstack([shared, self._rows.transposed_times(slope)])
@@ -277,6 +278,20 @@ class _Rest:
         moment = columns.T @ self.left
         factors = covariance @ moment
         return factors, float(moment @ factors), covariance
+
+
+def _shrunk(amplitudes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return amplitudes (2, harmonics, 6) without what noise makes of them, harmonic by harmonic (James & Stein).
+
+    A harmonic that is none turns fastest: what noise makes of it would pass for knowledge of the frequency.
+    """
+    result, numbers = amplitudes.copy(), np.arange(amplitudes.size).reshape(amplitudes.shape)
+    for n in range(amplitudes.shape[1]):
+        own = numbers[:, n].ravel()
+        values = amplitudes[:, n].ravel()
+        size = float(values @ np.linalg.solve(covariance[np.ix_(own, own)], values))
+        result[:, n] *= max(0.0, 1.0 - len(own) / size) if size > 0.0 else 0.0
+    return result
 
 
 def _fundamental(rest: _Rest, spectrum: np.ndarray) -> Line:

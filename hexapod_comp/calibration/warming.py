@@ -36,6 +36,13 @@ SEEN_SHARE = 0.5
 """A parameter is determined when more than this share of it comes from the readings."""
 
 
+LEAST_KNOWN = {"expansion": 20e-6, "late": 30e-6, "moisture": 5e-4}
+"""Growth that surprises in no material: by heat and what of it comes late, 1/K, and by humidity, m/m."""
+
+STEP = 0.02
+"""Of a time constant's logarithm, for derivatives."""
+
+
 @dataclass(frozen=True)
 class TimeConstants:
     """Time constants, and how well they are known.
@@ -94,6 +101,13 @@ def _tried(estimation: Estimation) -> Posterior:
     return solve(space, problem, space.start_tolerances(), np.ones(len(KINDS)))
 
 
+def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
+    """Return what the relative growth of each part moves each cell by, shape (C, 8), m or rad."""
+    space, cells = estimation.space, estimation.cells
+    columns = growth_columns(space, predict(space, x, estimation.measurements.stations))[cells.station]
+    return np.einsum("ci,cip->cp", cells.directions, columns)
+
+
 class _Scan:
     """What each time constant of a grid would explain of what a fit without late parts leaves."""
 
@@ -107,8 +121,7 @@ class _Scan:
         nominal = np.zeros(space.size)
         problem, _ = estimation.linearise(nominal, np.ones(len(estimation.measurements)))
         posterior = solve(space, problem, known.tolerances, known.noise, rounds=0)
-        per_growth = growth_columns(space, predict(space, nominal, stations))[cells.station]
-        per_growth = np.einsum("ci,cip->cp", cells.directions, per_growth)
+        per_growth = _per_growth(estimation, nominal)
         behind = growth_causes(space, stations, grid)[cells.station, :, 1:]
         columns = (per_growth[:, :, None] * behind).transpose(0, 2, 1) @ (TOLERANCES["late"] * growth_root(1))
         columns = estimation.free_of_unknowns(columns.reshape(len(columns), -1))
@@ -133,20 +146,28 @@ class _Scan:
         return best, gains[best]
 
     def refined(self, chosen: tuple[int, ...]) -> TimeConstants:
-        """Return the summits of parabolas through each constant's gain and its neighbours', the others kept."""
+        """Return the summits of parabolas through each constant's gain and its neighbours', the others kept.
+
+        Deviations are by all bends together: two constants that act alike are known the less.
+        """
         step = np.log(self._grid[1] / self._grid[0])
-        values, deviations = [], []
-        for place, n in enumerate(chosen):
-            others = chosen[:place] + chosen[place + 1 :]
-            if not 0 < n < len(self._grid) - 1 or {n - 1, n + 1} & {*others}:
-                values.append(float(self._grid[n]))
-                deviations.append(math.inf)
-                continue
-            before, here, after = (self.gain((*others, n + way)) for way in (-1, 0, 1))
-            bend = 2.0 * here - before - after
-            values.append(float(self._grid[n] * np.exp(step * 0.5 * (after - before) / bend)))
-            deviations.append(float(step / np.sqrt(bend)))
-        return TimeConstants(tuple(values), tuple(deviations))
+        values, deviations = self._grid[list(chosen)], np.full(len(chosen), math.inf)
+        inside = [i for i, n in enumerate(chosen) if 0 < n < len(self._grid) - 1 and not {n - 1, n + 1} & {*chosen}]
+        here, bends = self.gain(chosen), np.zeros((len(inside), len(inside)))
+        for a, i in enumerate(inside):
+            before, after = (self._moved(chosen, {i: way}) for way in (-1, 1))
+            bends[a, a] = 2.0 * here - before - after
+            values[i] *= np.exp(step * 0.5 * (after - before) / bends[a, a])
+            for b, j in enumerate(inside[:a]):
+                ways = [(u, v, u * v) for u in (-1, 1) for v in (-1, 1)]
+                bends[a, b] = bends[b, a] = -0.25 * sum(w * self._moved(chosen, {i: u, j: v}) for u, v, w in ways)
+        if (np.linalg.eigvalsh(bends) > 0.0).all():
+            deviations[inside] = step * np.sqrt(np.diag(np.linalg.inv(bends)))
+        return TimeConstants(tuple(values.tolist()), tuple(deviations.tolist()))
+
+    def _moved(self, chosen: tuple[int, ...], ways: dict[int, int]) -> float:
+        """Return the gain of constants some of which are moved on the grid."""
+        return self.gain([n + ways.get(i, 0) for i, n in enumerate(chosen)])
 
 
 @dataclass(frozen=True)
@@ -224,37 +245,81 @@ class HeatSeen:
 
     @staticmethod
     def of(
-        measurements: MeasurementSet, space: ParameterSpace, solution: Solution, time_constants: TimeConstants
+        measurements: MeasurementSet,
+        estimation: Estimation,
+        solution: Solution,
+        time_constants: TimeConstants,
+        factor: float,
     ) -> HeatSeen:
-        """Return what a fit tells."""
+        """Return what a fit to readings tells; deviations are wider by a `factor` (:class:`~.promise.Unexplained`)."""
+        space = estimation.space
         stations, block = measurements.stations, space.block("expansion")
         read = (stations.temperatures != REFERENCE_TEMPERATURE).any(axis=0)
         changes = zip(PARTS, np.ptp(stations.temperatures, axis=0).tolist(), read, strict=True)
         growth = space.model(solution.x, with_field=False).late_growth
         if growth.time_constants and not time_constants.values:  # given
             time_constants = TimeConstants(growth.time_constants, (0.0,) * len(growth.time_constants))
-        covariance = physical_covariance(space, solution.posterior)
+        known = _Known.of(estimation, solution, time_constants, factor)
         return HeatSeen(
             changes=tuple((name, change) for name, change, is_read in changes if is_read),
             thermometer=space.settings.thermometer,
-            parts=() if block is None else tuple(_parts(space, solution, covariance, block.part.start, growth)),
+            parts=() if block is None else tuple(_parts(space, solution, known, block.part.start, growth)),
             time_constants=time_constants if growth.time_constants else TimeConstants(),
             timed=bool(np.isfinite(stations.times).all()),
-            swelling=_swelling(measurements, space, solution, covariance) if space.swells else None,
+            swelling=_swelling(measurements, space, solution, known) if space.swells else None,
         )
 
 
-def _swelling(
-    measurements: MeasurementSet, space: ParameterSpace, solution: Solution, covariance: np.ndarray
-) -> Swelling:
+@dataclass(frozen=True)
+class _Known:
+    """How well growth is known: covariance of all parameters, SI, and what it would be without readings."""
+
+    covariance: np.ndarray
+    prior: np.ndarray
+
+    @staticmethod
+    def of(estimation: Estimation, solution: Solution, constants: TimeConstants, factor: float) -> _Known:
+        """Return the covariance of a fit, whose priors and time constants are themselves no more than estimates.
+
+        The size of a prior is estimated from hardly three numbers, which are themselves drawn to it: how far they may
+        be off is worked out with a prior that no material surprises. Time constants that differ by δ, in the logarithm,
+        move the readings by h·δ, and with them the parameters by −C·Rᵀ·h·δ.
+        """
+        space, noise, problem = estimation.space, solution.posterior.noise, solution.problem
+        least = [LEAST_KNOWN.get(block.name, 0.0) for block in space.blocks]
+        posterior = solve(space, problem, np.maximum(solution.posterior.tolerances, least), noise, rounds=0)
+        covariance, over = physical_covariance(space, posterior), 1.0 / noise[problem.kind]
+        rows = problem.rows.using(posterior.used, over)
+        for deviation, effect in zip(constants.deviations, _effects(estimation, solution.x, constants), strict=False):
+            moved = space.physical(posterior.covariance @ rows.transposed_times(over * effect))
+            covariance += min(deviation, 1.0) ** 2 * np.outer(moved, moved)
+        return _Known(factor**2 * covariance, space.prior_covariance(posterior.tolerances))
+
+    def of_mean(self, members: slice) -> tuple[float, float]:
+        """Return the standard deviation of the mean of some parameters, and its share that comes from readings."""
+        variance, prior = (float(matrix[members, members].mean()) for matrix in (self.covariance, self.prior))
+        return math.sqrt(variance), max(0.0, 1.0 - variance / prior)
+
+
+def _effects(estimation: Estimation, x: np.ndarray, constants: TimeConstants) -> Iterator[np.ndarray]:
+    """Yield how the logarithm of each time constant moves the cells, (C,), over their stated noise, free of zeros."""
+    space, stations = estimation.space, estimation.measurements.stations
+    block = space.block("late")
+    if block is None:
+        return
+    growth, per_growth = x[block.part].reshape(len(PARTS), -1), _per_growth(estimation, x)
+    for k, value in enumerate(constants.values):
+        shorter, longer = (growth_causes(space, stations, [value * math.exp(way)])[:, :, 1] for way in (-STEP, STEP))
+        later = ((longer - shorter) / (2.0 * STEP))[estimation.cells.station]
+        yield estimation.free_of_unknowns((per_growth * later) @ growth[:, k : k + 1])[:, 0]
+
+
+def _swelling(measurements: MeasurementSet, space: ParameterSpace, solution: Solution, known: _Known) -> Swelling:
     humidity = np.nan_to_num(measurements.stations.humidity, nan=REFERENCE_HUMIDITY)
     change, stated, block = float(np.ptp(humidity)), space.settings.strut_moisture or 0.0, space.block("moisture")
     if block is None:
         return Swelling(change, stated, stated, math.nan, 0.0)
-    at = block.part.start
-    variance = float(covariance[at, at])
-    determined = 1.0 - variance / float(space.prior_covariance(solution.posterior.tolerances)[at, at])
-    return Swelling(change, stated, stated + float(solution.x[at]), math.sqrt(variance), determined)
+    return Swelling(change, stated, stated + float(solution.x[block.part][0]), *known.of_mean(block.part))
 
 
 MEMBERS = {"struts": slice(0, 6), "base": slice(6, 7), "platform": slice(7, 8)}
@@ -262,19 +327,19 @@ MEMBERS = {"struts": slice(0, 6), "base": slice(6, 7), "platform": slice(7, 8)}
 
 
 def _parts(
-    space: ParameterSpace, solution: Solution, covariance: np.ndarray, start: int, growth: LateGrowth
+    space: ParameterSpace, solution: Solution, known: _Known, start: int, growth: LateGrowth
 ) -> Iterator[PartGrowth]:
     """Yield how each kind of part grows; the expansions stand in the parameters from `start` on."""
-    prior = space.prior_covariance(solution.posterior.tolerances)
     for name, members in MEMBERS.items():
         where = slice(start + members.start, start + members.stop)
-        stated, variance = float(space.stated_expansion[members].mean()), float(covariance[where, where].mean())
+        stated = float(space.stated_expansion[members].mean())
+        deviation, determined = known.of_mean(where)
         yield PartGrowth(
             part=name,
             stated=stated,
             expansion=stated + float(solution.x[where].mean()),
-            deviation=math.sqrt(variance),
-            determined=1.0 - variance / float(prior[where, where].mean()),
+            deviation=deviation,
+            determined=determined,
             late=tuple(growth.expansion[members].mean(axis=0).tolist()),
         )
 

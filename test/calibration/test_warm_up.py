@@ -71,6 +71,32 @@ def test_expansions_and_time_constant_come_back():
     assert abs(np.log(constant / TAU)) < 3.0 * deviation < 0.6
 
 
+def test_the_noise_of_sensors_is_not_taken_for_growth():
+    """Struts with sensors of their own that read 0.02 K beside, one kelvin in 150: within three of the deviations that
+    the same readings have without that noise. Fitted to what is read, 19.7 ± 0.3 ppm/K would be 1.4 ± 0.2."""
+    quiet = measured(parts=tuple(range(8)))
+    noise = 0.02 * np.random.default_rng(5).standard_normal(quiet.stations.temperatures.shape)
+    stations = replace(quiet.stations, temperatures=quiet.stations.temperatures + noise)
+    settings = replace(SETTINGS, blocks=("expansion",))
+    noisy, known = (fit_model(replace(quiet, stations=s), settings).warming.parts for s in (stations, quiet.stations))
+    for part, undisturbed in zip(noisy, known, strict=True):
+        assert abs(part.expansion - undisturbed.expansion) < 3.0 * undisturbed.deviation, part
+        assert part.deviation > 0.9 * undisturbed.deviation, part
+
+
+def test_expansions_are_known_no_better_than_the_time_constant():
+    """Truth: fits with the time constant a tenth up and down; sizes of priors follow it too, by a little."""
+    (constant,), (deviation,) = fit().warming.time_constants.values, fit().warming.time_constants.deviations
+    ends = [
+        fit_model(measured(), replace(SETTINGS, time_constants=(constant * np.exp(way),))).warming.parts
+        for way in (-0.1, 0.1)
+    ]
+    for part, shorter, longer in zip(fit().warming.parts, *ends, strict=True):
+        moved = deviation * abs(longer.expansion - shorter.expansion) / 0.2
+        alone = 0.5 * (shorter.deviation + longer.deviation)
+        assert part.deviation == pytest.approx(np.hypot(alone, moved), rel=0.1), part
+
+
 def test_the_model_follows_the_one_thermometer():
     model = fit().model.late_growth
     assert (model.thermometer, model.time_constants) == ("base", fit().warming.time_constants.values)
