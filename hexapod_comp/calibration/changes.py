@@ -24,14 +24,14 @@ FAMILIES = {
     TEMPERATURE: "a temperature acts",
     AGEING: "the whole machine has aged",
     READING: "a single reading is wrong",
-    OTHER: "changed in a way that none of these explains",
+    OTHER: "it has changed in a way that none of these explains",
 }
 """Kinds of change, and what each is called."""
 
-PRIOR = {DATUM: 1.0, STRUT: 1.0, TEMPERATURE: 1.0, AGEING: 0.25, READING: 0.25, OTHER: 0.5}
+PRIOR = {DATUM: 1.0, STRUT: 1.0, TEMPERATURE: 1.0, AGEING: 0.125, READING: 0.25, OTHER: 0.5}
 """How likely they are beforehand, beside each other. So are the groups of a kind, equally, and the changes of a group:
 else a bend would count for little beside all joints and screws, and what is one would be called ageing. For the same
-reason the last kind, which has four groups, counts twice."""
+reason ageing is as likely as one of the last kind's four groups: each can stand for the other, and for much else."""
 
 REPAIRABLE = (DATUM, STRUT, TEMPERATURE, AGEING)
 """Kinds that few readings can repair: they are parameters of the model."""

@@ -1,13 +1,14 @@
 """Another reading of the data: a sign, a unit, an axis, a direction or a machine that would explain readings better.
 
 Each is tried with a plain model, structure and screws, to which it either fits or not; a length map or a field
-could describe nearly any readings.
+could describe nearly any readings. Check readings are tried with the model that they check.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations, product
 
 import numpy as np
@@ -16,8 +17,10 @@ from ..errors import HexapodError
 from ..formats.paths import config_file
 from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.kinematics import Structure, strut_lengths_batch
+from ..machine.model import MachineModel
 from ..machine.passes import Passes
 from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, MeasurementSet, Stations
+from ..virtual.instruments import compensated
 from .estimation import Estimation
 from .linear_problem import LinearProblem, Posterior, physical_covariance, solve
 from .misfit import FAMILIES, family_of_run
@@ -53,6 +56,10 @@ SURE = 4.0
 """Backlash so many standard deviations below zero is no noise."""
 
 SWAPPED = "forward and backward look swapped, or the sign of all readings reversed"
+
+STRANGE, PLAUSIBLE = 100.0, 10.0
+"""χ² per number above which check readings may have been taken for something else, and that of what they then are: of
+ten and of three times the noise to expect."""
 
 ROUNDS = 3
 """Rounds in which each run's sign is looked at with the others' as they are."""
@@ -120,6 +127,56 @@ def suspicions(
             clear.append((total, best, other.name))
     clear.sort(reverse=True)
     return [f"{name} fits {best:.3g} times better" for total, best, name in clear if total > clear[0][0] / AS_GOOD]
+
+
+def misread(
+    m: MeasurementSet, model: MachineModel, as_they_are: float, chi_square: Callable[[MeasurementSet], float]
+) -> list[str]:
+    """Return by name how check readings must be taken to be those of a machine that has not changed; the best, or none.
+
+    Parameters
+    ----------
+    m : MeasurementSet
+        The readings as they are.
+    model : MachineModel
+        The model that they check.
+    as_they_are : float
+        Their χ² per number.
+    chi_square : callable
+        Returns χ² per number of readings against the model and what its fit knows.
+    """
+    if as_they_are < STRANGE:
+        return []
+    clear = []
+    for name, tried in _check_otherwise(m, model):
+        try:
+            value = chi_square(tried())
+        except HexapodError:  # out of reach that way
+            continue
+        if value < PLAUSIBLE:
+            clear.append((value, name))
+    best = min(clear, default=(0.0, ""))[0]
+    times = [(value, f"{name} fits {np.sqrt(as_they_are / value):.3g} times better") for value, name in sorted(clear)]
+    return [text for value, text in times if value <= BETTER * best]
+
+
+def _check_otherwise(m: MeasurementSet, model: MachineModel) -> Iterator[tuple[str, Callable[[], MeasurementSet]]]:
+    """Yield other ways to take check readings."""
+    if np.allclose(m.stations.commands, _nominal(m.geometry, m), rtol=0.0, atol=1e-9):
+        yield "taken with this model running (--compensated)", lambda: compensated(m, model)
+        for a, b in combinations(range(3), 2):
+            yield f"{AXES[a]} and {AXES[b]}: exchanged", partial(_exchanged_axes, m, a, b)
+    else:
+        off = replace(m, stations=replace(m.stations, commands=_nominal(m.geometry, m)))
+        yield "taken with the compensation off", lambda: off
+    yield "all readings: sign reversed", lambda: m.with_values(-m.value)
+    parts = (_multiplied(m, f"{name}: sign reversed", members, -1.0) for name, members in _parts(m))
+    for other in (*parts, *_in_other_units(m), *_exchanged_channels(m)):
+        yield other.name, partial(_measured, other)
+
+
+def _measured(other: Reinterpretation) -> MeasurementSet:
+    return other.measurements
 
 
 def causes(

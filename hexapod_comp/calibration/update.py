@@ -138,6 +138,8 @@ def _reason(verification: Verification) -> str:
 
 def refusal(verification: Verification) -> str:
     """Return why few readings cannot renew a model; empty where they can."""
+    if verification.doubts:
+        return f"the readings may be others than they are taken for: {verification.doubts[0]}"
     if verification.verdict == UNEXPLAINED:
         return "the machine has changed in a way that few readings cannot repair: measure a campaign and fit anew"
     best = verification.candidates[0]

@@ -20,6 +20,7 @@ from .evidence import Evidence
 from .posterior import FittedParameters
 from .prediction import ErrorPredictor
 from .settling import Settling, settle
+from .suspicions import misread
 
 FALSE_ALARMS = 0.01
 """Share of unchanged machines that may be called changed."""
@@ -95,6 +96,8 @@ class Verification:
         aligned, m; None where it is no change of the machine, or the model has no box.
     settling : tuple of Settling
         Where it is undecided: readings that would tell the two most probable kinds apart.
+    doubts : tuple of str
+        What the readings may be instead, by name: of an unchanged machine, in another unit, with another sign, ….
     """
 
     model: MachineModel
@@ -108,6 +111,7 @@ class Verification:
     visible: dict[str, float]
     tool: tuple[float, float] | None
     settling: tuple[Settling, ...]
+    doubts: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -155,13 +159,14 @@ def verify_model(
     changes = possible_changes(wide.space, tuple(block.name for block in fitted.space.blocks))
     evidence = weigh(check, wide, changes, measurements)
     families, candidates = _candidates(check, wide, changes, evidence)
-    usual, z = evidence.probability_unchanged(check.residuals), evidence.whitened(check.residuals)
+    usual, chi_square = evidence.probability_unchanged(check.residuals), _chi_square(wide, check)
     verdict = _verdict(usual > false_alarms, families)
+    doubts = misread(measurements, model, chi_square, lambda tried: _chi_square(wide, CheckReadings(wide, tried)))
     return Verification(
         model=model,
         measurements=measurements,
-        independent=len(z),
-        chi_square=float(z @ z) / len(z),
+        independent=len(check.residuals),
+        chi_square=chi_square,
         usual=usual,
         false_alarms=false_alarms,
         families=families,
@@ -169,7 +174,14 @@ def verify_model(
         visible=_visible(evidence),
         tool=None if verdict == VALID else _tool(model, wide, check, candidates[0]),
         settling=_settling(wide, check, measurements, candidates) if verdict == UNDECIDED else (),
+        doubts=tuple(doubts),
     )
+
+
+def _chi_square(fitted: FittedParameters, check: CheckReadings) -> float:
+    """Return the squared differences of readings from what is expected of an unchanged machine, per number."""
+    solved = np.linalg.solve(check.covariance(fitted.covariance), check.residuals)
+    return float(check.residuals @ solved) / len(solved)
 
 
 def _candidates(

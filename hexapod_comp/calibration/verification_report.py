@@ -15,6 +15,9 @@ from .verification import NAMED, UNDECIDED, VALID, Candidate, Verification
 SHOWN = 0.001
 """Kinds of change less probable than this are not listed."""
 
+SLACK = 1e-3
+"""So far outside a box, m, is still in it."""
+
 MOST_ODDS = 1e6
 """Odds above this are all the same to a reader."""
 
@@ -27,12 +30,27 @@ def verification_report(result: Verification) -> str:
         f"runs, {result.independent} numbers without what the instruments leave open",
         "\n".join(_verdict(result)),
     ]
+    if result.doubts:
+        parts.insert(0, "IN DOUBT:\n" + "\n".join(f"  {doubt}" for doubt in result.doubts))
+    if outside := _outside(result):
+        parts.append(outside)
     if m.notes:
         parts.append("\n".join(f"note: {note}" for note in m.notes))
     if result.verdict != VALID:
         parts.append(_table(result))
     parts += [*_settling(result), "\n".join(_visible(result))]
     return "\n\n".join(parts) + "\n"
+
+
+def _outside(result: Verification) -> str:
+    """Return how many places lie outside the box that the model was fitted in; empty if none does."""
+    box, positions = result.model.valid_box, result.measurements.stations.positions
+    if box is None:
+        return ""
+    beyond = ((positions < box[0] - SLACK) | (positions > box[1] + SLACK)).any(axis=1)
+    if not beyond.any():
+        return ""
+    return f"{beyond.sum()} of {len(beyond)} places lie outside the box in which the model was fitted"
 
 
 def _verdict(result: Verification) -> Iterator[str]:
@@ -43,7 +61,7 @@ def _verdict(result: Verification) -> Iterator[str]:
     else:
         head = {
             NAMED: f"{FAMILIES[best.family]}: {_described(best)}",
-            UNDECIDED: f"{' or '.join(FAMILIES[c.family] for c in result.candidates[:2])}",
+            UNDECIDED: f"either {', or '.join(FAMILIES[c.family] for c in result.candidates[:2])}",
         }.get(
             result.verdict, f"in a way that no motion of the datum, strut, temperature or ageing explains{_near(best)}"
         )
@@ -144,6 +162,7 @@ def verification_json(result: Verification) -> dict:
             {"read": s.name, "channels": s.channels, "readings": s.readings, "log_odds": s.odds}
             for s in result.settling
         ],
+        "doubts": result.doubts,
         "notes": result.measurements.notes,
     }
 

@@ -36,7 +36,7 @@ from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.datum import tool_move
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.measurements.readings import CHANNELS, FORWARD, MeasurementSet
-from hexapod_comp.virtual.instruments import measure
+from hexapod_comp.virtual.instruments import compensated, measure
 
 RUNS = ("diagonal 1", "diagonal 2", "diagonal 4", "x line at y 0.0, z 350.0", "y line at x 0.0, z 350.0")
 
@@ -213,6 +213,32 @@ def test_what_readings_cannot_tell_stays_open_and_says_what_would_settle_it() ->
     report = verification_report(result)
     assert "again: the machine itself need not have changed" in report
     assert "odds to expect" in report
+
+
+def test_readings_of_an_unchanged_machine_taken_for_something_else_are_recognised() -> None:
+    """Each mistake by the name of what the test has done; arcseconds are 4.848 µrad. Nothing is renewed from them."""
+    readings, known = check(fitted().truth), fitted().known
+    angular = np.isin(readings.channel, [CHANNELS.index(name) for name in ("rotation_x", "rotation_y", "rotation_z")])
+    arcseconds = readings.with_values(np.where(angular, readings.value / 4.848137, readings.value))
+    mistaken = {
+        "rotation: arcsec in place of µrad": arcseconds,
+        "all readings: sign reversed": readings.with_values(-readings.value),
+        "taken with the compensation off": compensated(readings, fitted().model),
+    }
+    for name, taken in mistaken.items():
+        result = verify_model(fitted().model, known, taken)
+        assert result.doubts[0].startswith(name)
+        assert name in refusal(result)
+        assert verification_report(result).startswith(f"IN DOUBT:\n  {name}")
+
+
+def test_places_outside_the_fitted_box_are_counted() -> None:
+    readings = check(fitted().truth)
+    model = replace(fitted().model, valid_box=np.array([[-1.0, -1.0, 2.0], [1.0, 1.0, 3.0]]))
+    stations = len(readings.stations.positions)
+    report = verification_report(verify_model(model, fitted().known, readings))
+    assert f"{stations} of {stations} places lie outside the box" in report
+    assert "outside" not in verification_report(verify_model(fitted().model, fitted().known, readings))
 
 
 def test_what_is_in_no_hypothesis_is_not_named() -> None:
