@@ -133,7 +133,9 @@ def look_for_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
         return ScrewLead(given, None, np.inf, odds)
     # So far the waves counted as noise, which let the priors weigh too much.
     quiet = solve(space, problem, posterior.tolerances, posterior.noise * best.noise, rounds=0)
-    best = _Rest(estimation, problem, quiet).line(best.frequency)
+    rest = _Rest(estimation, problem, quiet)
+    if rest.freedom >= LEAST_FREEDOM:  # few readings leave a quiet fit nothing to tell its noise by
+        best = rest.line(best.frequency)
     if not np.isfinite(best.error):
         return ScrewLead(given, None, np.inf, odds)
     return ScrewLead(given, float(1.0 / best.frequency), float(best.error / best.frequency**2), odds)
