@@ -1,11 +1,14 @@
-"""Callbacks that know a message's sequence number, and services that answer later: rclpy offers neither openly."""
+"""Callbacks that know a message's sequence number, alarms, and services that answer later: rclpy lacks them."""
 
 from __future__ import annotations
 
 import inspect
+import time
 from collections.abc import Callable
+from threading import Condition, Thread
 from typing import Any, cast
 
+from rclpy.node import Node
 from rclpy.service import Service
 
 
@@ -22,6 +25,51 @@ def numbered(callback: Callable[[Any, int | None], None]) -> Callable[..., None]
 
     called.__signature__ = inspect.signature(lambda message, info: None)  # type: ignore[attr-defined]
     return called
+
+
+class Alarm:
+    """Calls back once, in the executor, a while after it was set; it may be set as often as one likes.
+
+    A timer may not be reset so often: at each reset the EventsExecutor of Jazzy (rclpy 7.1) calls every timer that is
+    due once more, and puts its next call off by a period. On a busy processor a check every 50 ms rested for seconds.
+
+    Parameters
+    ----------
+    node : Node
+        In whose executor.
+    callback : callable
+        What is called.
+    """
+
+    def __init__(self, node: Node, callback: Callable[[], None]) -> None:
+        self._node, self._callback = node, callback
+        self._change, self._open, self._due = Condition(), True, float("inf")
+        self._thread = Thread(target=self._wait, name="alarm", daemon=True)
+        self._thread.start()
+
+    def set(self, seconds: float) -> None:
+        """Call back in so many seconds, and not when it was set to before; never, if infinite."""
+        with self._change:
+            self._due = time.monotonic() + seconds
+            self._change.notify()
+
+    def close(self) -> None:
+        """Call back no more."""
+        with self._change:
+            self._open = False
+            self._change.notify()
+        self._thread.join()
+
+    def _wait(self) -> None:
+        with self._change:
+            while self._open:
+                left = self._due - time.monotonic()
+                if left > 0.0:
+                    self._change.wait(None if left == float("inf") else left)
+                else:
+                    self._due = float("inf")
+                    if self._node.executor is not None:  # that of Jazzy knows no guard conditions
+                        self._node.executor.create_task(self._callback)
 
 
 class LateAnswer:

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from typing import Any
 
 from ..errors import HexapodError, LimitError
-from .runtime import COMMAND_QOS, NEVER, MachineNode
+from .callbacks import Alarm
+from .runtime import COMMAND_QOS, MachineNode
 
 SHOWN_FOR = 1.0
 """That commands are taken late is spoken of for this long, s."""
@@ -23,7 +24,7 @@ class Pacing:
     Parameters
     ----------
     node : MachineNode
-        Whose timer it is.
+        In whose executor what waits is taken.
     options : dict
         The node's parameter ``catch_up_within``: how long a command may wait, s; all that wait are refused when one
         has waited longer. 0: only the newest waits, and those that it replaces are dropped.
@@ -49,8 +50,7 @@ class Pacing:
         self._waiting: deque[tuple[float, bytes]] = deque()
         self._behind_at = -float("inf")
         self.waited = self.dropped = 0
-        self._timer = node.every(NEVER, self._go_on)
-        self._timer.cancel()
+        self._alarm = Alarm(node, node.guard.around("go_on", self._go_on))
 
     @property
     def _longest(self) -> float:
@@ -62,7 +62,7 @@ class Pacing:
             if (wait := self._take(message, now)) > 0.0:
                 self._waiting.append((now, message))
                 self.waited += 1
-                self._wait(wait)
+                self._alarm.set(wait)
             return
         if not self._longest:
             self.dropped += len(self._waiting)
@@ -80,20 +80,14 @@ class Pacing:
     def clear(self) -> None:
         """Forget what waits."""
         self._waiting.clear()
-        self._timer.cancel()
 
     def close(self) -> None:
-        """Destroy the timer."""
+        """Forget what waits, and take nothing any more."""
         self.clear()
-        self._node.destroy_timer(self._timer)
-
-    def _wait(self, seconds: float) -> None:
-        self._timer.timer_period_ns = int(seconds * 1e9) + 1
-        self._timer.reset()
+        self._alarm.close()
 
     def _go_on(self) -> None:
         """Take what waits, as far as the struts may go by now."""
-        self._timer.cancel()
         if not self._node.active:
             self._waiting.clear()
         while self._waiting:
@@ -103,7 +97,7 @@ class Pacing:
                 self._refuse_all(now)
                 return
             if (wait := self._take(message, now)) > 0.0:
-                self._wait(wait)
+                self._alarm.set(wait)
                 return
             if now - came > JITTER:
                 self._behind_at = now
