@@ -178,8 +178,9 @@ GEOMETRIES = ("paper", "framed", "hanging", "inches", "mirror", "offset")
 PULLED = ("B", "D", "G", "joints", "beams", "outliers")
 """Kinds of machines and readings; the last three carry what no parameter describes."""
 
-ROUNDS, EVERY, STEPS = 9, 1200, 6
-"""Rounds while the machine warms, s from one to the next, and steps along the longest line of the campaign."""
+ROUNDS, EVERY, STEPS, DEGREE = 9, 1200, 6, 3
+"""Rounds while the machine warms, s from one to the next, steps along the longest line of the campaign, and a field's
+degree: enough for a fit of some seconds."""
 
 DAMP, DRY_TO_DAMP, DAMP_TAU = (1e-4, 4e-4), (0.45, 0.65), 2400.0
 """Growth of the struts by humidity, m/m; the humidity before and in the end; and its time constant, s."""
@@ -247,7 +248,8 @@ def pulls_of(kind: str, thermometer: str, seed: int) -> list[Pull]:
     """Measure and fit a machine of the zoo, as ``hexapod_comp fit`` does it, and compare."""
     model, warm, measured = zoo_readings(kind, thermometer, seed)
     damp = bool(model.struts.moisture.any())
-    seen = fit_model(measured, FitSettings(blocks=KNOWN, lead=LEAD, strut_moisture=0.0 if damp else None)).warming
+    settings = FitSettings(blocks=KNOWN, lead=LEAD, field_degree=DEGREE, strut_moisture=0.0 if damp else None)
+    seen = fit_model(measured, settings).warming
     expansion = np.array([*model.struts.expansion, model.base_expansion, model.platform_expansion])
     if thermometer:  # what a part grows by, in the end, for each kelvin of the one that is read
         expansion *= warm.rise[:-1] / warm.rise[PARTS.index(thermometer)]
