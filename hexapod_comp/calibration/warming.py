@@ -36,8 +36,12 @@ SEEN_SHARE = 0.5
 """A parameter is determined when more than this share of it comes from the readings."""
 
 
-LEAST_KNOWN = {"expansion": 20e-6, "late": 30e-6, "moisture": 5e-4}
-"""Growth that surprises in no material: by heat and what of it comes late, 1/K, and by humidity, m/m."""
+LEAST_KNOWN = {"expansion": 20e-6, "late": 60e-6, "moisture": 5e-4}
+"""Growth that surprises in no material: by heat, 1/K; what of it comes late, which is several times that of a part much
+faster than its thermometer; and by humidity, m/m."""
+
+UNSEEN = (0.1, 0.5)
+"""Time constants that nothing has shown may be such shares of what the readings span."""
 
 STEP = 0.02
 """Of a time constant's logarithm, for derivatives."""
@@ -108,6 +112,14 @@ def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
     return np.einsum("ci,cip->cp", cells.directions, columns)
 
 
+def _late_columns(estimation: Estimation, x: np.ndarray, constants: np.ndarray, size: float) -> np.ndarray:
+    """Return what late parts of a size, 1/K, move the cells by, (C, K·8), over the stated noise, free of zeros."""
+    behind = growth_causes(estimation.space, estimation.measurements.stations, constants)
+    behind = behind[estimation.cells.station, :, 1:]
+    columns = (_per_growth(estimation, x)[:, :, None] * behind).transpose(0, 2, 1) @ (size * growth_root(1))
+    return estimation.free_of_unknowns(columns.reshape(len(columns), -1))
+
+
 class _Scan:
     """What each time constant of a grid would explain of what a fit without late parts leaves."""
 
@@ -117,14 +129,11 @@ class _Scan:
     @staticmethod
     def of(estimation: Estimation, grid: np.ndarray, known: Posterior) -> _Scan:
         """Return the scan at the nominal machine with known tolerances and noise."""
-        space, cells, stations = estimation.space, estimation.cells, estimation.measurements.stations
+        space = estimation.space
         nominal = np.zeros(space.size)
         problem, _ = estimation.linearise(nominal, np.ones(len(estimation.measurements)))
         posterior = solve(space, problem, known.tolerances, known.noise, rounds=0)
-        per_growth = _per_growth(estimation, nominal)
-        behind = growth_causes(space, stations, grid)[cells.station, :, 1:]
-        columns = (per_growth[:, :, None] * behind).transpose(0, 2, 1) @ (TOLERANCES["late"] * growth_root(1))
-        columns = estimation.free_of_unknowns(columns.reshape(len(columns), -1))
+        columns = _late_columns(estimation, nominal, grid, TOLERANCES["late"])
         over = 1.0 / posterior.noise[problem.kind]
         rows, columns = problem.rows.using(posterior.used, over), over[:, None] * columns
         left = over * problem.target - rows.times(posterior.y)
@@ -283,7 +292,8 @@ class _Known:
 
         The size of a prior is estimated from hardly three numbers, which are themselves drawn to it: how far they may
         be off is worked out with a prior that no material surprises. Time constants that differ by δ, in the logarithm,
-        move the readings by h·δ, and with them the parameters by −C·Rᵀ·h·δ.
+        move the readings by h·δ, and with them the parameters by −C·Rᵀ·h·δ. One thermometer for all whose late parts
+        nothing has shown may have some all the same, as far as the readings allow.
         """
         space, noise, problem = estimation.space, solution.posterior.noise, solution.problem
         least = [LEAST_KNOWN.get(block.name, 0.0) for block in space.blocks]
@@ -293,6 +303,14 @@ class _Known:
         for deviation, effect in zip(constants.deviations, _effects(estimation, solution.x, constants), strict=False):
             moved = space.physical(posterior.covariance @ rows.transposed_times(over * effect))
             covariance += min(deviation, 1.0) ** 2 * np.outer(moved, moved)
+        times = estimation.measurements.stations.times
+        if space.settings.thermometer and space.block("late") is None and np.ptp(times) > 0.0:
+            columns = _late_columns(estimation, solution.x, np.ptp(times) * np.array(UNSEEN), LEAST_KNOWN["late"])
+            columns *= over[:, None]
+            shared = rows.transposed_times(columns)
+            moved = posterior.covariance @ shared
+            left = np.eye(len(shared[0])) + columns.T @ columns - shared.T @ moved
+            covariance += space.physical(space.physical(moved @ np.linalg.solve(left, moved.T)).T)
         return _Known(factor**2 * covariance, space.prior_covariance(posterior.tolerances))
 
     def of_mean(self, members: slice) -> tuple[float, float]:
