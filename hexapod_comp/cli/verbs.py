@@ -273,7 +273,8 @@ example:
 parameters. If the machine has changed it says what has probably happened: the datum has moved, a strut's offset has
 changed (which, by how much), a temperature acts, the whole has aged, a single reading is wrong, or none of these. One
 machine in a hundred that has not changed is called changed. Where two explanations stay close it says which further
-readings would tell them apart.
+readings would tell them apart. Readings that are far off are tried in other units, with other signs, axes
+exchanged, and with the compensation on or off: the report opens with what fits.
 
 The readings are taken as for fit: compensation off, or with the struts' commands in the file, or with this model
 running and --compensated. fit --update renews the model from them. Errors are in µm and µrad. Exit code: 0 valid,
