@@ -136,7 +136,7 @@ class Row:
     bar: float
     met: bool
     expected: float | None
-    inside: tuple[int, int] | None
+    inside: tuple[int, int | None] | None
     seconds: float
 
 
@@ -163,7 +163,7 @@ def summed_up(case: Case, machines: list[Machine]) -> Row:
         bar=case.bar,
         met=bool(removed >= case.bar and together(after) <= case.largest_rms and largest <= case.largest),
         expected=1e6 * float(np.sqrt(np.mean(np.square(expected)))) if expected else None,
-        inside=(sum(map(_position_kept, promised)), sum(map(_rotation_kept, promised))) if expected else None,
+        inside=(sum(map(_position_kept, promised)), _rotations_kept(promised)) if expected else None,
         seconds=float(np.median([m.seconds for m in machines])),
     )
 
@@ -173,9 +173,15 @@ def _position_kept(machine: Machine) -> bool:
     return promised is not None and promised.low <= machine.worth.after.aligned.rms <= promised.high
 
 
-def _rotation_kept(machine: Machine) -> bool:
-    promised, left = machine.expected, machine.worth.after.rotation.rms
-    return promised is not None and promised.rotation_low <= left <= promised.rotation_high
+def _rotations_kept(machines: list[Machine]) -> int | None:
+    """Return for how many machines the rotation lies in its interval; None where one has none."""
+    count = 0
+    for machine in machines:
+        promised, left = machine.expected, machine.worth.after.rotation.rms
+        if promised is None or promised.rotation_low is None or promised.rotation_high is None:
+            return None
+        count += promised.rotation_low <= left <= promised.rotation_high
+    return count
 
 
 def _figure(case: Case, machine: Machine, which: str) -> float:
@@ -193,7 +199,7 @@ def shown(row: Row) -> str:
     """Return a row of the table."""
     unit = "µrad" if row.figure == "rotation" else "µm"
     shares = " | ".join(f"{100.0 * share:.1f} %" for share in (row.removed, row.mean_removed, row.least_removed))
-    inside = "" if row.inside is None else ", ".join(f"{count}/{row.machines}" for count in row.inside)
+    inside = ", ".join(f"{count}/{row.machines}" for count in row.inside or () if count is not None)
     expected = "" if row.expected is None else f"{row.expected:.3f} ({inside})"
     verdict = f"{100.0 * row.bar:.0f} % {'met' if row.met else 'MISSED'}"
     return (

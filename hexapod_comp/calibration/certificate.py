@@ -217,9 +217,12 @@ def _before_after(name: str, error: ToolError) -> Iterator[tuple[str, ...]]:
     between = f"{number(error.low * 1e6, 3)} … {number(error.high * 1e6, 3)}"
     expanded = number(COVERAGE * error.high * 1e6, 2)
     yield f"{name}: displacement", number(error.before * 1e6, 2), number(error.after * 1e6, 3), between, expanded, "µm"
-    between = f"{number(error.rotation_low * 1e6, 2)} … {number(error.rotation_high * 1e6, 2)}"
     sizes = (number(error.rotation_before * 1e6, 1), number(error.rotation_after * 1e6, 2))
-    yield f"{name}: rotation", *sizes, between, number(COVERAGE * error.rotation_high * 1e6, 1), "µrad"
+    between, expanded = "roll was not read", ""
+    if error.rotation_low is not None and error.rotation_high is not None:
+        between = f"{number(error.rotation_low * 1e6, 2)} … {number(error.rotation_high * 1e6, 2)}"
+        expanded = number(COVERAGE * error.rotation_high * 1e6, 1)
+    yield f"{name}: rotation", *sizes, between, expanded, "µrad"
 
 
 def _instruments(fit: ModelFit, details: Details) -> Iterator[str]:

@@ -237,6 +237,9 @@ def _fit(measurements: MeasurementSet, begun: _Begun, progress: Callable[[str], 
 
     noise = {KINDS.index(c.kind): c.estimated for c in channels}
     verdict = judge(estimation, solution, allowed, with_all, settings, noise, progress)
+    no_trace = unseen_errors(measurements, settings)
+    if any(name.startswith("roll") for name in no_trace):
+        verdict = verdict.without_rotation()
     as_solved = _named(space, solution, measurements, channels, len(decisions), verdict.level)
     unseen = unseen_part(estimation, solution.posterior.tolerances[0], solution.posterior.noise, datum)
     model, held = hold(measurements.geometry, as_solved, datum, unseen)
@@ -248,7 +251,7 @@ def _fit(measurements: MeasurementSet, begun: _Begun, progress: Callable[[str], 
         decisions=tuple(decisions),
         channels=channels,
         observability=observe(space, solution.problem, solution.posterior),
-        unseen_errors=unseen_errors(measurements, settings),
+        unseen_errors=no_trace,
         verdict=verdict,
         outliers=tuple(_outliers(estimation, solution)),
         notes=(*measurements.notes, *notes, *verdict.remarks),

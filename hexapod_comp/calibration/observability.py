@@ -223,8 +223,10 @@ class ToolError:
     low, high : float
         Between these it lies with a probability of 95 %, m; the upper end also allows for errors of which the
         readings do not tell whether the machine has them.
-    rotation_before, rotation_after, rotation_low, rotation_high : float
+    rotation_before, rotation_after : float
         The same of the rotation, rad.
+    rotation_low, rotation_high : float or None
+        None where nothing read how the tool rolls: the priors alone would say it.
     """
 
     before: float
@@ -233,8 +235,8 @@ class ToolError:
     high: float
     rotation_before: float
     rotation_after: float
-    rotation_low: float
-    rotation_high: float
+    rotation_low: float | None
+    rotation_high: float | None
 
 
 Allowed = tuple[ParameterSpace, np.ndarray, np.ndarray]

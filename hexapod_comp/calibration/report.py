@@ -88,9 +88,16 @@ def tool_error_text(error: ToolError) -> str:
     return (
         f"{error.before * 1e6:.2f} → {error.after * 1e6:.3f} µm RMS "
         f"({error.low * 1e6:.3f}…{error.high * 1e6:.3f} with 95 %), {removed:.1f} % less; "
-        f"rotation {error.rotation_before * 1e6:.1f} → {error.rotation_after * 1e6:.2f} µrad RMS "
-        f"({error.rotation_low * 1e6:.2f}…{error.rotation_high * 1e6:.2f})"
+        f"rotation {error.rotation_before * 1e6:.1f} → {error.rotation_after * 1e6:.2f} µrad RMS"
+        + rotation_interval(error)
     )
+
+
+def rotation_interval(error: ToolError) -> str:
+    """Return the interval of a tool's rotation in µrad, or that there is none."""
+    if error.rotation_low is None or error.rotation_high is None:
+        return " by the priors, for nothing read its roll"
+    return f" ({error.rotation_low * 1e6:.2f}…{error.rotation_high * 1e6:.2f})"
 
 
 def _channel_table(fit: ModelFit) -> str:

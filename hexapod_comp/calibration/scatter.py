@@ -43,8 +43,8 @@ class _OfKind(NamedTuple):
 
     Attributes
     ----------
-    alike : float
-        Shared by readings there and back, with the part that the parameters have swallowed.
+    alike, most_alike : float
+        Shared by readings there and back, with the part that the parameters have swallowed; and what would have shown.
     stops, most_stops : float
         Of what never repeats, and what it is at most.
     cells : int
@@ -52,6 +52,7 @@ class _OfKind(NamedTuple):
     """
 
     alike: float
+    most_alike: float
     stops: float
     most_stops: float
     cells: int
@@ -61,28 +62,32 @@ def scatter(r: Residuals) -> tuple[Scatter, Scatter]:
     """Return what residuals show of the tool's displacement, and of its rotation, that no parameter describes.
 
     A field that is not as smooth as its terms shows that first where it is large beside the readings' noise, in its
-    rotations as a rule; in displacements there is as much, in proportion to the sizes that were fitted.
+    rotations as a rule; in displacements there is as much, in proportion to the sizes that were fitted, unless so much
+    would have shown there as well.
     """
     kinds = np.unique(r.estimation.cells.kind)
     parts = [_of_kind(r, k) for k in kinds]
     angular = np.array([KINDS[k] in ANGULAR_KINDS for k in kinds])
-    displacement, rotation = (_together([parts[n] for n in np.flatnonzero(which)]) for which in (~angular, angular))
+    (displacement, hidden), (rotation, hidden_rotation) = (
+        _together([parts[n] for n in np.flatnonzero(which)]) for which in (~angular, angular)
+    )
     space, sizes = r.estimation.space, r.solution.posterior.tolerances
     fields = {b.name: size for b, size in zip(space.blocks, sizes, strict=True) if b.name in FIELDS and size > 0.0}
     if len(fields) == len(FIELDS):
         ratio = float(fields[FIELDS[0]] / fields[FIELDS[1]])
-        lacks = max(displacement.lack, rotation.lack * ratio), max(rotation.lack, displacement.lack / ratio)
-        displacement, rotation = (
-            part._replace(lack=lack) for part, lack in zip((displacement, rotation), lacks, strict=True)
-        )
+        shifted = max(displacement.lack, min(rotation.lack * ratio, hidden))
+        turned = max(rotation.lack, min(displacement.lack / ratio, hidden_rotation))
+        displacement, rotation = displacement._replace(lack=shifted), rotation._replace(lack=turned)
     return displacement, rotation
 
 
-def _together(parts: list[_OfKind]) -> Scatter:
-    """Return what kinds of readings show together: the mean variance of an axis, three times."""
+def _together(parts: list[_OfKind]) -> tuple[Scatter, float]:
+    """Return what kinds of readings show together, the mean variance of an axis, three times; and the most alike."""
     if not parts:
-        return Scatter()
-    return Scatter(*np.sqrt(3.0 * np.average([part[:3] for part in parts], 0, [part.cells for part in parts])).tolist())
+        return Scatter(), 0.0
+    mean = np.average([part[:-1] for part in parts], 0, [part.cells for part in parts])
+    alike, most_alike, stops, most_stops = np.sqrt(3.0 * mean).tolist()
+    return Scatter(alike, stops, most_stops), most_alike
 
 
 def _of_kind(r: Residuals, kind: int) -> _OfKind:
@@ -91,21 +96,25 @@ def _of_kind(r: Residuals, kind: int) -> _OfKind:
     readings, cells = int((m.kind == kind).sum()), int((r.estimation.cells.kind == kind).sum())
     there, back = _pairs(r, kind)
     repeated, freedom = _repeated(r, kind)
-    alike = own = error = 0.0
+    own = error = 0.0
     if len(there) >= LEAST_PAIRS:
         shared, kept = _likeness(r, there, back)
         # Residuals of cells count in their means' noise, which is smaller than a reading's.
-        alike = shared / kept * cells / readings if shared > CLEAR / np.sqrt(len(there)) else 0.0
+        alike, clear = (v * estimated / kept * cells / readings for v in (shared, CLEAR / np.sqrt(len(there))))
         own, error = (1.0 - shared) * estimated - 1.0, estimated * np.sqrt(2.0 / readings + 1.0 / len(there))
     if freedom >= LEAST_REPEATED:
         own, error = repeated - 1.0, repeated * np.sqrt(2.0 / freedom)
     own = own if own > CLEAR * error else 0.0
     if len(there) < LEAST_PAIRS:  # what is beyond noise, and may repeat, is taken for the machine's
-        beyond = estimated - 1.0 - own
-        alike = beyond / estimated if beyond > CLEAR * estimated * np.sqrt(2.0 / readings) else 0.0
-    most = own + MOST * error if own else 0.0
-    alike, own, most = (float(v) * m.stated_of(kind) ** 2 for v in (alike * estimated, own, most))
-    return _OfKind(alike, own, most, cells)
+        alike, clear = estimated - 1.0 - own, CLEAR * estimated * np.sqrt(2.0 / readings)
+    variance = m.stated_of(kind) ** 2
+    return _OfKind(
+        alike=variance * alike if alike > clear else 0.0,
+        most_alike=variance * max(alike, clear),
+        stops=variance * own,
+        most_stops=variance * (own + MOST * error) if own else 0.0,
+        cells=cells,
+    )
 
 
 def _repeated(r: Residuals, kind: int) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -57,6 +57,14 @@ class Verdict:
     refusals: tuple[str, ...]
     doubts: tuple[str, ...]
     remarks: tuple[str, ...]
+
+    def without_rotation(self) -> Verdict:
+        """Return the same with no interval for the tool's rotation, of which the priors alone would speak."""
+        level, tilted = (
+            None if error is None else replace(error, rotation_low=None, rotation_high=None)
+            for error in (self.level, self.tilted)
+        )
+        return replace(self, level=level, tilted=tilted)
 
 
 def judge(

@@ -50,6 +50,8 @@ def test_what_is_described_is_promised_as_before(readings):
     assert fit.level.low == pytest.approx(before.low, rel=1e-4)
     assert before.high < fit.level.high < 1.3 * before.high
     assert "IN DOUBT" not in fit_report(fit)
+    assert fit.level.rotation_high is None, "nothing reads the roll"
+    assert "µrad RMS by the priors" in fit_report(fit)
 
 
 def test_an_interval_is_widened_by_each_cause_in_its_way():
@@ -151,14 +153,31 @@ def test_scatter_that_is_stated_is_the_instrument_s():
     assert not [note for note in fit.notes if "assumed" in note]
 
 
-def test_rotation_that_is_in_no_parameter_is_promised(readings):
+def test_rotation_that_is_in_no_parameter_is_promised():
     """Each place has a rotation of its own, 2 µrad about each axis, which lines read, and which the tool keeps."""
+    readings = measured(virtual_machine(3), campaign("6-D"), 3)
     place = np.unique(readings.points()[readings.station].round(6), axis=0, return_inverse=True)[1].ravel()
     own = 2e-6 * np.random.default_rng(6).standard_normal((place.max() + 1, 3))
     turned = (readings.directions()[:, 3:] * own[place]).sum(axis=1)
     level = fit_model(readings.with_values(readings.value + turned), FEW).level
     assert level.rotation_high > 2e-6 * np.sqrt(3.0)
     assert level.after < 1e-6
+
+
+def test_what_a_field_lacks_in_rotation_it_lacks_in_displacement(readings):
+    """Waves of 0.4 m in space, 1 µm and 20 µrad about each axis; the field's degree of 3 is too low for them.
+
+    Rotations are read to 1 µrad, so it shows there. What displacements lack is 1/20 of it, and would not show.
+    """
+    waves = np.sin(2.0 * np.pi / 0.4 * readings.points()[readings.station] + np.arange(3.0))
+    errors = np.hstack([1e-6 * waves[:, [1, 2, 0]], 20e-6 * waves[:, [2, 0, 1]]])
+    spoilt = readings.with_values(readings.value + (readings.directions() * errors).sum(axis=1))
+    fields = ("field displacement", "field rotation")
+    fit = fit_model(spoilt, replace(SETTINGS, blocks=(*FEW.blocks, *fields)))
+    beyond = fit.verdict.unexplained
+    assert {fit.space.block(name) is None for name in fields} == {False}
+    assert beyond.rotation.lack > 2e-6
+    assert 0.0 < beyond.displacement.lack < beyond.rotation.lack * 0.2
 
 
 def test_a_scale_that_drifts_is_measured(readings):
