@@ -10,8 +10,15 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg.lapack import dpstrf
 
 from .unknowns import Unknown
+
+FEW = 8
+"""Fewer cells of a group are kept as they are."""
+
+FAINT = 1e-11
+"""What moves cells by less than this variance, of their noise's, does not count."""
 
 
 class Alike(NamedTuple):
@@ -111,10 +118,57 @@ class CellRows:
             parts.append(Alike(part.cells, place[part.columns[kept]], values))
         return CellRows((self.shape[0], len(used)), parts)
 
+    def condensed(
+        self, target: np.ndarray, group: np.ndarray, draws: np.ndarray
+    ) -> tuple[CellRows, np.ndarray, np.ndarray]:
+        """Return fewer rows that say the same, with their targets and groups.
+
+        Cells of a group that the same parameters move are turned, orthogonally, so that a few of them have all that
+        parameters do: some twenty along a line, however densely it was read. The others are left out.
+
+        Parameters
+        ----------
+        target : ndarray, shape (C,)
+            What the rows explain.
+        group : ndarray of int, shape (C,)
+            Of each cell.
+        draws : ndarray, shape (size, D)
+            Parameters as they may be, over √D.
+        """
+        parts, of_rows, count = [], [], 0
+        for part in self.parts:
+            order = np.argsort(group[part.cells], kind="stable")
+            pieces = np.split(order, np.flatnonzero(np.diff(group[part.cells[order]])) + 1)
+            few = np.concatenate([np.zeros(0, dtype=int), *(piece for piece in pieces if len(piece) < FEW)])
+            listed = [(part.values[few], target[part.cells[few]], group[part.cells[few]])]
+            for piece in (piece for piece in pieces if len(piece) >= FEW):
+                cells = part.cells[piece]
+                rows, along = _moved(part.values[in_a_row(piece)], target[cells], draws[part.columns])
+                listed.append((rows, along, np.full(len(along), group[cells[0]])))
+            values, *own = (np.concatenate(arrays) for arrays in zip(*listed, strict=True))
+            parts.append(Alike(np.arange(count, count + len(values)), part.columns, values))
+            of_rows.append(own)
+            count += len(values)
+        targets, groups = (np.concatenate(arrays) for arrays in zip(*of_rows, strict=True))
+        return CellRows((count, self.shape[1]), parts), targets, groups
+
     def project_out(self, unknown: Unknown) -> None:
         """Take off, in place, what an unknown of an instrument may explain; its cells stand in one part."""
         values = self.parts[self._part[unknown.members[0]]].values
         unknown.project_out(values, in_a_row(self._place[unknown.members]))
+
+
+def _moved(values: np.ndarray, target: np.ndarray, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return Qᵀ·values and Qᵀ·target, with the columns of Q an orthonormal basis of what draws of parameters do.
+
+    A pivoted Cholesky factor tells which draws are enough; all cells are kept where none are.
+    """
+    shown = values @ draws
+    _, pivots, rank, _ = dpstrf((shown.T @ shown).T, tol=FAINT, overwrite_a=1)
+    if rank >= min(shown.shape):
+        return values, target
+    basis = np.linalg.qr(shown[:, pivots[:rank] - 1])[0].T
+    return basis @ values, basis @ target
 
 
 def in_a_row(indices: np.ndarray) -> np.ndarray | slice:
@@ -126,6 +180,7 @@ def in_a_row(indices: np.ndarray) -> np.ndarray | slice:
 
 def _alike(first: np.ndarray, second: np.ndarray) -> Iterator[tuple[tuple[int, int], np.ndarray]]:
     """Yield each pair of numbers that occurs, and where."""
-    pairs, group = np.unique(np.stack([first, second], axis=1), axis=0, return_inverse=True)
-    for n, (p, q) in enumerate(pairs.tolist()):
-        yield (p, q), np.flatnonzero(group.ravel() == n)
+    many = int(second.max(initial=0)) + 1
+    pairs, group = np.unique(first * many + second, return_inverse=True)
+    for n, pair in enumerate(pairs.tolist()):
+        yield divmod(pair, many), np.flatnonzero(group == n)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..measurements.readings import ABSOLUTE_KINDS, KINDS, LEAST_TRAVEL, LENGTH, MeasurementSet
+from ..measurements.readings import ABSOLUTE_KINDS, KINDS, LEAST_TRAVEL, LENGTH, MeasurementSet, different_rows
 from .unknowns import Lengths
 
 
@@ -44,17 +44,16 @@ class Cells:
     def of(measurements: MeasurementSet) -> Cells:
         """Return the cells of a set."""
         m = measurements
-        centre = np.unique(np.nan_to_num(m.centre), axis=0, return_inverse=True)[1].ravel()
-        keys = np.stack([m.station, m.channel, centre], axis=1)
-        _, first, of_reading = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        groups = np.unique(np.stack([m.run, m.channel], axis=1), axis=0, return_inverse=True)[1].ravel()
+        centre = different_rows(np.nan_to_num(m.centre))[1]
+        first, of_reading = different_rows(np.stack([m.station, m.channel, centre], axis=1))
+        groups = different_rows(np.stack([m.run, m.channel], axis=1))[1]
         absolute = np.isin(np.array(KINDS)[m.kind[first]], ABSOLUTE_KINDS)
         whole = _left_out_whole(m)[m.run[first]]
         poses = np.hstack([m.stations.positions, m.stations.rotations.reshape(-1, 9)]).round(9)
-        pose = np.unique(poses, axis=0, return_inverse=True)[1].ravel()[m.station[first]]
+        pose = different_rows(poses)[1][m.station[first]]
         fold_key = np.where(whole, -1 - m.run[first], pose)
         return Cells(
-            of_reading=of_reading.ravel(),
+            of_reading=of_reading,
             first=first,
             station=m.station[first],
             channel=m.channel[first],

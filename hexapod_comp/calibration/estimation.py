@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,7 @@ from ..errors import CalibrationError, KinematicsError, ModelError
 from ..measurements.readings import KINDS, LEAST_NOISE, MeasurementSet, refuse_absurd
 from .cell_rows import Alike, CellRows
 from .cells import Cells
-from .linear_problem import LARGE_FOLD, SMALL, FoldSum, LinearProblem, Posterior, physical_covariance, solve
+from .linear_problem import LinearProblem, Posterior, physical_covariance, solve
 from .parameters import ParameterSpace
 from .sensitivity import Prediction, Slopes, predict
 from .unknowns import Unknown, of_zero
@@ -51,15 +50,11 @@ OUTLIER = 5.0
 
 
 class _Group(NamedTuple):
-    """Cells of one kind whose errors have the same components.
-
-    Large folds stand together, and in them what shares an unknown; small folds stand together, marked as such.
-    """
+    """Cells of one kind whose errors have the same components; those of a run, and of an unknown, stand together."""
 
     kind: int
     components: np.ndarray
     cells: np.ndarray
-    folds: list[tuple[int, slice]]
 
 
 class Estimation:
@@ -217,32 +212,24 @@ class Estimation:
         freedom = np.bincount(self.measurements.kind, minlength=kinds).astype(float)
         for part in unknowns:
             freedom[kind[part.members[0]]] -= part.share.sum()
-        sums: list[FoldSum] = []
-        for n, (group, (_, columns, values)) in enumerate(zip(self._groups, rows.parts, strict=True)):
-            own = [FoldSum(fold, n, where, values[where].T @ values[where]) for fold, where in group.folds]
-            normal[group.kind][np.ix_(columns, columns)] += sum(one.normal for one in own)
+        for group, (_, columns, values) in zip(self._groups, rows.parts, strict=True):
+            normal[group.kind][np.ix_(columns, columns)] += values.T @ values
             moment[group.kind][columns] += target[group.cells] @ values
-            sums += [one for one in own if one.fold != SMALL]
             square[group.kind] += target[group.cells] @ target[group.cells]
         least_noise = LEAST_NOISE / np.array([self.measurements.stated_of(k) for k in range(kinds)])
-        fold = self.cells.fold
-        return LinearProblem(target, rows, kind, fold, normal, moment, square, freedom, least_noise, sums=tuple(sums))
+        return LinearProblem(target, rows, kind, self.cells.fold, normal, moment, square, freedom, least_noise)
 
     def _group_alike(self) -> list[_Group]:
         """Return the cells in groups of one kind whose errors have the same components."""
         c = self.cells
         for members in [members for members, _ in self._zeros] + [lengths.members for lengths in self._lengths]:
             self._components[members] |= self._components[members].any(axis=0)
-        fold = np.where(np.bincount(c.fold)[c.fold] >= LARGE_FOLD, c.fold, SMALL)
         key = c.kind * 64 + self._components @ (1 << np.arange(6))
-        order = np.lexsort((c.group, fold, key))
-        result = []
-        for cells in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
-            ends = [0, *(np.flatnonzero(np.diff(fold[cells])) + 1).tolist(), len(cells)]
-            folds = [(int(fold[cells[a]]), slice(a, b)) for a, b in pairwise(ends)]
-            components = np.flatnonzero(self._components[cells[0]])
-            result.append(_Group(int(c.kind[cells[0]]), components, cells, folds))
-        return result
+        order = np.lexsort((c.group, self.measurements.run[c.first], key))
+        return [
+            _Group(int(c.kind[cells[0]]), np.flatnonzero(self._components[cells[0]]), cells)
+            for cells in np.split(order, np.flatnonzero(np.diff(key[order])) + 1)
+        ]
 
     def robust_weights(self, residuals: np.ndarray) -> np.ndarray:
         """Return Huber's weights of residuals (N,), 1 for all that are no surprise.

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..kernels.struts import MOST_HARMONICS
 from .estimation import HUBER, MEDIAN_TO_SIGMA, Estimation
-from .linear_problem import LinearProblem, Posterior, solve
+from .linear_problem import LinearProblem, Posterior, at_once, solve
 from .parameters import WAVES
 
 SHORTEST, LONGEST = 1e-3, 30e-3
@@ -121,14 +121,14 @@ def look_for_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
     """
     space, measurements = estimation.space, estimation.measurements
     given = float(space.periods[0]) if np.isfinite(space.periods).all() else None
-    nominal, odds, near = np.zeros(space.size), 0.0, None
+    odds = 0.0
     if len(measurements) > PLENTY:
         some = np.zeros(len(measurements), dtype=bool)
         some[np.random.default_rng(0).choice(len(measurements), PLENTY, replace=False)] = True
         few = Estimation(measurements.select(some), space, alone=False)
-        odds, near, _ = _strongest(few, few.linearise(nominal, np.ones(PLENTY))[0])
-    shown, best, posterior = _strongest(estimation, problem, near if odds >= SURE else None)
-    odds = odds if odds >= SURE else shown
+        odds, best, posterior = _strongest(few, few.linearise(np.zeros(space.size), np.ones(PLENTY))[0])
+    if odds < SURE:
+        odds, best, posterior = _strongest(estimation, problem)
     if best is None or odds < SURE:
         return ScrewLead(given, None, np.inf, odds)
     # So far the waves counted as noise, which let the priors weigh too much.
@@ -141,26 +141,18 @@ def look_for_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
     return ScrewLead(given, float(1.0 / best.frequency), float(best.error / best.frequency**2), odds)
 
 
-def _strongest(
-    estimation: Estimation, problem: LinearProblem, near: Line | None = None
-) -> tuple[float, Line | None, Posterior]:
-    """Return the odds of the period that readings speak for most, that period, and the fit without waves.
-
-    Where others have shown one already, only that is looked at, and against none.
-    """
+def _strongest(estimation: Estimation, problem: LinearProblem) -> tuple[float, Line | None, Posterior]:
+    """Return the odds of the period that readings speak for most, that period, and the fit without waves."""
     space = estimation.space
     tolerances = np.where([b.name in WAVES for b in space.blocks], 0.0, space.start_tolerances())
     posterior = solve(space, problem, tolerances, np.ones(problem.normal.shape[0]), SCALE_ROUNDS)
     rest = _Rest(estimation, problem, posterior)
     if rest.freedom < LEAST_FREEDOM:
         return 0.0, None, posterior
-    if near is not None:
-        best = rest.line(near.frequency)
-        return best.odds, best, posterior
     spectrum = rest.spectrum()
     best = _fundamental(rest, spectrum)
-    others = _rivals(rest.frequencies, spectrum, best.frequency, rest.span)
-    return min([best.odds, *(best.odds - rest.line(f, 1).odds for f in others)]), best, posterior
+    others = at_once(lambda f: rest.line(f, 1), _rivals(rest.frequencies, spectrum, best.frequency, rest.span))
+    return min([best.odds, *(best.odds - other.odds for other in others)]), best, posterior
 
 
 @dataclass(frozen=True)
@@ -195,8 +187,9 @@ class _Rest:
     def __init__(self, estimation: Estimation, problem: LinearProblem, posterior: Posterior) -> None:
         over_noise = 1.0 / posterior.noise[problem.kind]
         self._problem, self._posterior, self._over_noise = problem, posterior, over_noise
-        self._rows = problem.rows.using(posterior.used, over_noise)
-        left = over_noise * problem.target - self._rows.times(posterior.y)
+        y = np.zeros(problem.rows.shape[1])
+        y[posterior.used] = posterior.y
+        left = over_noise * (problem.target - problem.rows.times(y))
         cut = HUBER * MEDIAN_TO_SIGMA * np.median(np.abs(left))
         self.left = np.clip(left, -cut, cut)
         self.gains = over_noise[:, None] * problem.per_length
@@ -229,9 +222,11 @@ class _Rest:
             noise = np.sqrt(max(self.square - less, 1e-6 * self.square) / (self.freedom - parameters))
             error = noise * deviation
             step = float(np.clip(step, -half_width, half_width))
-            if abs(frequency + step - start) > half_width or abs(step) < 0.01 * error:
+            if abs(frequency + step - start) > half_width:
                 break
             frequency += step
+            if abs(step) < 0.1 * error:  # a Newton step squares that
+                break
         return Line(frequency, error, self._odds(less, parameters), noise)
 
     def _odds(self, less: float, parameters: int) -> float:
@@ -249,13 +244,13 @@ class _Rest:
         turns = np.cumprod(np.repeat(first, harmonics, axis=1), axis=1)
         c, s = self.gains[:, None] * turns.real, self.gains[:, None] * turns.imag
         waves = self._free(np.concatenate([c, s], axis=1).reshape(len(c), -1))
-        shared = self._rows.transposed_times(waves)
+        shared = self._shared(waves)
         amplitudes, less, covariance = self._solved(waves, shared)
         noise = max(self.square - less, 1e-6 * self.square) / (self.freedom - amplitudes.size)
         a, b = _shrunk(amplitudes.reshape(2, -1, 6), noise * covariance)
         turning = 2.0 * np.pi * self.commands[:, None] * orders[:, None]
         slope = self._free(((b * c - a * s) * turning).sum(axis=(1, 2))[:, None])
-        every = np.hstack([waves, slope]), np.hstack([shared, self._rows.transposed_times(slope)])
+        every = np.hstack([waves, slope]), np.hstack([shared, self._shared(slope)])
         together, _, covariance = self._solved(*every, loose=1)
         if not covariance[-1, -1] > 0.0:
             return less, 0.0, np.inf
@@ -267,11 +262,15 @@ class _Rest:
             part.project_out(columns)
         return columns
 
+    def _shared(self, columns: np.ndarray) -> np.ndarray:
+        """Return the products of columns with the derivatives by all other parameters."""
+        return self._problem.rows.transposed_times(self._over_noise[:, None] * columns)[self._posterior.used]
+
     def _solved(self, columns: np.ndarray, shared: np.ndarray, loose: int = 0) -> tuple[np.ndarray, float, np.ndarray]:
         """Return factors of columns (C, n), by how much they lower the squares, and their covariance.
 
-        `shared` are their products with the derivatives by all other parameters, which are free within their priors;
-        the last `loose` columns have none.
+        `shared` are theirs of :meth:`_shared`; the other parameters are free within their priors, and the last `loose`
+        columns have none.
         """
         precision = columns.T @ columns - shared.T @ self._posterior.covariance @ shared
         tight = len(precision) - loose

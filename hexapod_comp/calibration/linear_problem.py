@@ -6,13 +6,15 @@ often tolerances and noise are estimated anew.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
 
 from ..errors import CalibrationError
 from .cell_rows import CellRows
@@ -40,32 +42,43 @@ LARGEST_TOLERANCE = {"structure": 5e-3}
 LEAST_FREEDOM = 10.0
 """Noise is estimated from at least so many readings beyond those that the parameters use up."""
 
+DRAWS, SEED = 160, 5
+"""Draws of the parameters that show what they do along a line."""
+
 TOGETHER = 1000
-"""Cells of small folds that are looked at together."""
-
-LARGE_FOLD, SMALL = 300, -1
-"""Cells from which a fold is left out by its sums, not cell by cell; and the mark of all smaller folds together."""
+"""Rows of small folds that are looked at together."""
 
 
-class FoldSum(NamedTuple):
-    """Sum of products of the derivatives of one fold's cells that the same parameters move.
+Given = TypeVar("Given")
+Result = TypeVar("Result")
+
+
+def at_once(work: Callable[[Given], Result], items: Iterable[Given]) -> list[Result]:
+    """Return the results of independent work with matrices: NumPy lets as many threads work as there are processors."""
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        return list(pool.map(work, items))
+
+
+class Condensed(NamedTuple):
+    """The cells of a linear problem, each fold's and kind's in as few rows as its parameters can be told by.
 
     Attributes
     ----------
-    fold : int
-        As in :class:`Cells`; :data:`SMALL` for all small folds together.
-    part : int
-        Which part of the rows.
-    where : slice
-        Where they stand in it.
-    normal : ndarray, shape (m, m)
-        rowsᵀ·rows.
+    target : ndarray, shape (K,)
+        In place of the cells' targets.
+    rows : CellRows, shape (K, size)
+        In place of theirs.
+    cell, first : ndarray of int, shape (K,) and (C,)
+        The first cell of the fold and kind that a row, or a cell, belongs to.
+    rest : ndarray, shape (folds, kinds)
+        Squares of what of the cells' targets no parameter moves.
     """
 
-    fold: int
-    part: int
-    where: slice
-    normal: np.ndarray
+    target: np.ndarray
+    rows: CellRows
+    cell: np.ndarray
+    first: np.ndarray
+    rest: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -94,8 +107,6 @@ class LinearProblem:
         Derivatives by the struts' lengths, scaled as the rows, with what instruments do not know still in them.
     unknowns : tuple of Unknown
         What that is.
-    sums : tuple of FoldSum
-        The parts of `normal` that large folds make up.
     """
 
     target: np.ndarray
@@ -109,7 +120,6 @@ class LinearProblem:
     least_noise: np.ndarray
     per_length: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
     unknowns: tuple[Unknown, ...] = ()
-    sums: tuple[FoldSum, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -266,69 +276,78 @@ def log_evidence(problem: LinearProblem, posterior: Posterior) -> float:
     return float(-0.5 * (unmet + determinant - problem.freedom[kinds] @ np.log(weights)))
 
 
-def held_out(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
-    """Return the errors, in standard deviations, at cells whose fold the fit did not see, shape (C,).
+def condense(problem: LinearProblem, posterior: Posterior) -> Condensed:
+    """Return what leaving out folds looks at, for fits with the parameters of a posterior, or some of them."""
+    group = problem.fold * len(problem.freedom) + problem.kind
+    _, cells, member = np.unique(group, return_index=True, return_inverse=True)
+    first = cells[member.ravel()]
+    draws = np.zeros((problem.rows.shape[1], DRAWS))
+    z = np.random.default_rng(SEED).standard_normal((len(posterior.used), DRAWS)) / np.sqrt(DRAWS)
+    root = np.linalg.cholesky(whitened_precision(problem, posterior))
+    draws[posterior.used] = posterior.spread[:, None] * dtrtrs(root, z, lower=1, trans=1)[0]
+    rows, target, cell = problem.rows.condensed(problem.target, first, draws / posterior.noise[problem.kind].min())
+    shape = int(problem.fold.max()) + 1, len(problem.freedom)
+    rest = np.bincount(group, problem.target**2, shape[0] * shape[1])
+    rest -= np.bincount(group[cell], target**2, len(rest))
+    return Condensed(target, rows, cell, first, np.maximum(rest, 0.0).reshape(shape))
 
-    Leaving fold g out of a linear least-squares fit changes its residuals r to (I − H_gg)⁻¹·r, with H the
-    hat matrix: exact, and no fit is repeated. In a fold of many cells the same is r + R_g·(P − R_gᵀ·R_g)⁻¹·R_gᵀ·r, with
-    R_g its rows and P the precision of all: a matrix of the parameters' size.
-    """
-    full = np.zeros(problem.rows.shape[1])
-    full[posterior.used] = posterior.y
-    residual = (problem.target - problem.rows.times(full)) / posterior.noise[problem.kind]
-    sums: dict[int, list[FoldSum]] = {}
-    for one in problem.sums:
-        sums.setdefault(one.fold, []).append(one)
-    precision = whitened_precision(problem, posterior) if sums else np.zeros((0, 0))
-    folds = _Folds(problem, posterior, residual, precision)
-    result = residual.copy()
-    for cells, change in map(folds.large, sums.values()):
-        result[cells] += change
-    for cells, change in map(folds.small, _small_folds(problem.fold, [*sums])):
-        result[cells] += change
+
+def held_out(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
+    """Return the errors, in standard deviations, at cells whose fold the fit did not see, shape (C,)."""
+    answers = _answers_without(problem, condense(problem, posterior), posterior)
+    return _errors(problem.rows, problem.target, problem.fold, answers) / posterior.noise[problem.kind]
+
+
+def held_out_squares(problem: LinearProblem, condensed: Condensed, posterior: Posterior) -> np.ndarray:
+    """Return the sums of squares of :func:`held_out` by fold and kind, over the stated noise, shape (folds, kinds)."""
+    squares, (fold, kind) = condensed.rest.copy(), (each[condensed.cell] for each in (problem.fold, problem.kind))
+    errors = _errors(condensed.rows, condensed.target, fold, _answers_without(problem, condensed, posterior))
+    np.add.at(squares, (fold, kind), errors**2)
+    return squares
+
+
+def _errors(rows: CellRows, target: np.ndarray, fold: np.ndarray, answers: np.ndarray) -> np.ndarray:
+    """Return what is left of targets at each fold's own answer (folds, size)."""
+    result = target.copy()
+    for part in rows.parts:
+        for first in range(0, len(part.cells), TOGETHER):
+            cells, values = part.cells[first : first + TOGETHER], part.values[first : first + TOGETHER]
+            result[cells] -= np.einsum("ci,ci->c", values, answers[np.ix_(fold[cells], part.columns)])
     return result
 
 
-class _Folds(NamedTuple):
-    """What leaving out folds needs; either way returns cells, and by how much their residuals change without them."""
+def _answers_without(problem: LinearProblem, condensed: Condensed, posterior: Posterior) -> np.ndarray:
+    """Return the most probable y of fits that did not see one fold, shape (folds, size): exact, and no fit is repeated.
 
-    problem: LinearProblem
-    posterior: Posterior
-    residual: np.ndarray
-    precision: np.ndarray
-
-    def large(self, sums: list[FoldSum]) -> tuple[np.ndarray, np.ndarray]:
-        """Leave out a fold of many cells, given its sums."""
-        cells = np.concatenate([self.problem.rows.parts[one.part].cells[one.where] for one in sums])
-        posterior, rows = self.posterior, self.problem.rows.select(cells)
-        scale, change = 1.0 / posterior.noise[self.problem.kind[cells]], np.zeros(rows.shape[1])
-        missing = rows.transposed_times(scale * self.residual[cells])[posterior.used]
-        factor = np.linalg.cholesky(_without(self.precision, self.problem, sums, posterior))
-        change[posterior.used] = posterior.spread * dpotrs(factor, posterior.spread * missing, lower=1)[0]
-        return cells, scale * rows.times(change)
-
-    def small(self, folds: tuple[np.ndarray, list[int]]) -> tuple[np.ndarray, np.ndarray]:
-        """Leave out folds of few cells in turn, given all their cells and where each ends."""
-        cells, ends = folds
-        rows = self.problem.rows.select(cells)
-        rows = rows.using(self.posterior.used, 1.0 / self.posterior.noise[self.problem.kind[cells]])
-        shared, whole, left = rows.times(self.posterior.covariance), rows.dense(), self.residual[cells]
-        result = np.empty(len(cells))
-        for a, b in pairwise(ends):
-            result[a:b] = np.linalg.solve(np.eye(b - a) - shared[a:b] @ whole[a:b].T, left[a:b])
-        return cells, result - left
+    Without a fold with rows R and residuals r, y changes by −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r, with C the parameters' covariance,
+    or by −(C⁻¹ − Rᵀ·R)⁻¹·Rᵀ·r: a matrix of the rows' size, where they are few, or of the parameters'.
+    """
+    used, spread, fold = posterior.used, posterior.spread, problem.fold[condensed.cell]
+    precision, answers = whitened_precision(problem, posterior), np.zeros((len(condensed.rest), problem.rows.shape[1]))
+    for chosen, ends in _whole_folds(fold, len(used) // 2):
+        scale = 1.0 / posterior.noise[problem.kind[condensed.cell[chosen]]]
+        rows = condensed.rows.select(chosen).using(used, scale)
+        left = scale * condensed.target[chosen] - rows.times(posterior.y)
+        if 2 * ends[1] > len(used):
+            factor = np.linalg.cholesky(precision - spread[:, None] * rows.normal() * spread)
+            changes = spread * dpotrs(factor, spread * rows.transposed_times(left), lower=1)[0]
+        else:
+            shared, whole = rows.times(posterior.covariance), rows.dense()
+            changes = np.empty((len(ends) - 1, len(used)))
+            for n, (a, b) in enumerate(pairwise(ends)):
+                changes[n] = np.linalg.solve(np.eye(b - a) - shared[a:b] @ whole[a:b].T, left[a:b]) @ shared[a:b]
+        answers[np.ix_(fold[chosen[ends[:-1]]], used)] = posterior.y - changes
+    return answers
 
 
-def _small_folds(fold: np.ndarray, large: list[int]) -> Iterator[tuple[np.ndarray, list[int]]]:
-    """Yield the cells of small folds, a thousand or so at a time, in the order of their folds, and where these end."""
+def _whole_folds(fold: np.ndarray, small: int) -> Iterator[tuple[np.ndarray, list[int]]]:
+    """Yield rows in the order of their folds, and where each ends: some thousand of small folds, or a large one."""
     order = np.argsort(fold, kind="stable")
-    order = order[~np.isin(fold[order], large)]
-    if not len(order):
-        return
     ends = [0, *(np.flatnonzero(np.diff(fold[order])) + 1).tolist(), len(order)]
     first = 0
-    for n, end in enumerate(ends):
-        if end - ends[first] >= TOGETHER or n == len(ends) - 1:
+    for n, (start, end) in enumerate(pairwise(ends), 1):
+        last = n == len(ends) - 1
+        if last or end - ends[first] >= TOGETHER or max(end - start, ends[n + 1] - end) > small:
             yield order[ends[first] : end], [e - ends[first] for e in ends[first : n + 1]]
             first = n
 
@@ -341,21 +360,6 @@ def whitened_precision(problem: LinearProblem, posterior: Posterior) -> np.ndarr
     precision *= posterior.spread[:, None] * posterior.spread
     precision[np.diag_indices_from(precision)] += 1.0
     return precision
-
-
-def _without(precision: np.ndarray, problem: LinearProblem, parts: list[FoldSum], posterior: Posterior) -> np.ndarray:
-    """Return a whitened precision without what the cells of one fold tell."""
-    place = np.full(problem.rows.shape[1], -1)
-    place[posterior.used] = np.arange(len(posterior.used))
-    left = precision.copy()
-    for one in parts:
-        cells, columns, _ = problem.rows.parts[one.part]
-        known = np.flatnonzero(place[columns] >= 0)
-        at = place[columns[known]]
-        size = posterior.spread[at] / posterior.noise[problem.kind[cells[0]]]
-        information = one.normal if len(known) == len(columns) else one.normal[np.ix_(known, known)]
-        left[np.ix_(at, at)] -= size[:, None] * information * size
-    return left
 
 
 def physical_covariance(space: ParameterSpace, posterior: Posterior) -> np.ndarray:

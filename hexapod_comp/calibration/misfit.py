@@ -9,14 +9,15 @@ is fitted to what is left. The scale of an instrument, which no reading shows, i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Container
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg.lapack import dtrtrs
 
 from ..measurements.readings import ANGULAR_KINDS, AXES, BACKWARD, FORWARD, KINDS, MeasurementSet
-from .linear_problem import LARGE_FOLD, whitened_precision
+from .cell_rows import CellRows
+from .linear_problem import at_once, condense, whitened_precision
 from .parameters import FitSettings
 from .promise import Unexplained
 from .residuals import Residuals
@@ -186,14 +187,12 @@ def _left_out(r: Residuals, everything: Callable[[], tuple[Residuals, np.ndarray
 def _factors(r: Residuals, wanted: Container[str]) -> dict[str, float]:
     """Return what changes the tool too much when it is left out, with the factor on standard deviations."""
     leaving = _Leaving(r)
-    changes: dict[str, list[tuple[float, float, float]]] = {}
-    for what, cells in _groups(r, wanted):
-        changes.setdefault(what, []).append(leaving.change(cells))
     factors = {}
-    for what, listed in changes.items():
-        ratio, limit = _excess(*np.transpose(listed))
-        if ratio > max(limit, 1.0):
-            factors[what] = float(np.sqrt(ratio))
+    for what, groups in _groupings(r).items():
+        if what in wanted and len(np.unique(groups)) > 1:  # not everything at once
+            ratio, limit = _excess(*np.transpose(leaving.changes(groups)))
+            if ratio > max(limit, 1.0):
+                factors[what] = float(np.sqrt(ratio))
     return factors
 
 
@@ -206,24 +205,37 @@ class _Leaving:
 
     def __init__(self, residuals: Residuals) -> None:
         self._residuals, self._posterior = residuals, residuals.solution.posterior
-        self._spread = self._posterior.spread
-        self._precision = whitened_precision(residuals.solution.problem, self._posterior)
+        problem, self._spread = residuals.solution.problem, self._posterior.spread
+        self._precision = whitened_precision(problem, self._posterior)
         values, vectors = np.linalg.eigh(self._spread[:, None] * residuals.metric * self._spread)
         unheeded = NEGLIGIBLE * residuals.expected
         kept = np.cumsum(values) > unheeded  # ascending
         self._effects = vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0))
         self._reached = self._posterior.covariance @ (self._effects / self._spread[:, None])  # C·F
         self._expected = (self._effects / self._spread[:, None]).T @ self._reached
+        few = self._few = condense(problem, self._posterior)
+        scale = 1.0 / self._posterior.noise[problem.kind[few.cell]]
+        self._rows = few.rows.using(self._posterior.used, scale)
+        self._left = scale * few.target - self._rows.times(self._posterior.y)
 
-    def change(self, cells: np.ndarray) -> tuple[float, float, float]:
-        """Return the squared change that leaving cells out makes, what it should be, and its degrees of freedom.
+    def changes(self, groups: np.ndarray) -> list[tuple[float, float, float]]:
+        """Return what leaving out each group of cells does; by condensed rows, unless folds are divided."""
+        rows, left = self._rows, self._left
+        if (groups == groups[self._few.first]).all():
+            groups = groups[self._few.cell]
+        else:
+            rows, left = self._residuals.rows, self._residuals.residual
+        members = (np.flatnonzero(groups == group) for group in np.unique(groups))
+        return at_once(lambda chosen: self._change(rows.select(chosen), left[chosen]), members)
 
-        With R and r the cells' rows and residuals, C₋g = (P − Rᵀ·R)⁻¹ = C + C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·R·C: a matrix of the
-        parameters' size, or of the cells'. Half of either side is enough.
+    def _change(self, rows: CellRows, left: np.ndarray) -> tuple[float, float, float]:
+        """Return the squared change that leaving rows out makes, what it should be, and its degrees of freedom.
+
+        With R and r the rows and their residuals, C₋g = (P − Rᵀ·R)⁻¹ = C + C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·R·C: a matrix of the
+        parameters' size, or of the rows', where they are few. Half of either side is enough.
         """
-        rows, left = self._residuals.rows.select(cells), self._residuals.residual[cells]
-        if len(cells) < LARGE_FOLD:
-            matrix = np.eye(len(cells)) - rows.times(rows.times(self._posterior.covariance).T)
+        if 2 * len(left) < len(self._spread):
+            matrix = np.eye(len(left)) - rows.times(rows.times(self._posterior.covariance).T)
             sides, before = (rows.times(self._reached), left), 0.0
         else:
             matrix = self._precision - self._spread[:, None] * rows.normal() * self._spread
@@ -235,16 +247,12 @@ class _Leaving:
         return float(moved @ moved), expected, expected**2 / float(np.vdot(spread, spread))
 
 
-def _groups(r: Residuals, wanted: Container[str]) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the cells that are left out in turn of what is wanted, by name; nothing where it would be all."""
+def _groupings(r: Residuals) -> dict[str, np.ndarray]:
+    """Return which cells are left out together, by name: a number for each cell."""
     groupings = {LINE: r.run} | {what: groups[r.run] for what, groups in _groupings_of_runs(r).items()}
     groupings["direction"] = r.direction
     groupings["quarter of the time"] = np.floor((r.rank + 0.5) * (QUARTERS - 1e-9))
-    groupings["channel"] = r.estimation.cells.kind
-    for what, groups in groupings.items():
-        different = np.unique(groups)
-        for group in different if len(different) > 1 and what in wanted else ():
-            yield what, np.flatnonzero(groups == group)
+    return groupings | {"channel": r.estimation.cells.kind}
 
 
 def _excess(shown: np.ndarray, expected: np.ndarray, freedom: np.ndarray) -> tuple[float, float]:

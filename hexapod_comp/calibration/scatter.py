@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..measurements.readings import ANGULAR_KINDS, BACKWARD, FORWARD, KINDS
+from ..measurements.readings import ANGULAR_KINDS, BACKWARD, FORWARD, KINDS, different_rows
 from .estimation import MEDIAN_TO_SIGMA
 from .promise import Scatter
 from .residuals import Residuals
@@ -133,9 +133,9 @@ def _pairs(r: Residuals, kind: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the cells of a kind that were read forward, and those read backward at the same places."""
     cells, stations = r.estimation.cells, r.estimation.measurements.stations
     poses = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(9)
-    pose = np.unique(poses, axis=0, return_inverse=True)[1].ravel()[cells.station]
+    pose = different_rows(poses)[1][cells.station]
     keys = np.stack([r.run, cells.channel, pose], axis=1)
-    key = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
+    key = different_rows(keys)[1]
     ways = []
     for direction in (FORWARD, BACKWARD):
         members = np.flatnonzero((cells.kind == kind) & (r.direction == direction))

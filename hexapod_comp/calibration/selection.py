@@ -5,13 +5,13 @@ Where these are too few to tell, the readings' probability with and without a bl
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from .linear_problem import LinearProblem, Posterior, held_out, log_evidence, solve
+from .linear_problem import LinearProblem, Posterior, at_once, condense, held_out_squares, log_evidence, solve
 from .parameters import ParameterSpace
 
 FIRST_ROUNDS, ROUNDS = 10, 4
@@ -108,26 +108,25 @@ def select(
     gains: dict[str, Gain] = {}
     harmonics = [name for name in names if name in HARMONICS]
     if harmonics:
-        gains |= dict.fromkeys(harmonics, trials.gain(("structure", *names), *harmonics))
+        gains |= dict.fromkeys(harmonics, trials.gains(names, [tuple(harmonics)])[0])
         kept = [name for name in names if name not in HARMONICS or gains[name].clear]
     general = [name for name in names if name not in (*EXPECTED, *HARMONICS)]
     while True:
         # A block that helps clearly beside all others helps no less when some of them have gone.
         doubtful = [name for name in general if name in kept and not (name in gains and gains[name].clear)]
-        gains |= {name: trials.gain(("structure", *kept), name) for name in doubtful}
+        gains |= trials.single_gains(kept, doubtful)
         doubtful = [name for name in doubtful if not gains[name].clear]
         if not doubtful:
             break
         kept.remove(min(doubtful, key=lambda name: gains[name].share / max(gains[name].uncertainty, 1e-12)))
     if len(harmonics) > 1:
-        gains |= {name: trials.gain(("structure", *kept), name) for name in harmonics if name in kept}
+        gains |= trials.single_gains(kept, [name for name in harmonics if name in kept])
         kept = [name for name in kept if name not in HARMONICS or gains[name].clear]
-    for name in (name for name in names if name in EXPECTED):
-        gains[name] = trials.gain(("structure", *kept), name)
+    gains |= trials.single_gains(kept, [name for name in names if name in EXPECTED])
     useful = [name for name in EXPECTED if name in kept and (gains[name].share > LEAST_GAIN or gains[name].clear)]
     kept = [name for name in kept if name not in EXPECTED or name in useful]
     decisions = [Decision(name, name in kept, *gains[name]) for name in names]
-    return decisions, trials.everything, trials.fit(("structure", *kept))
+    return decisions, trials.everything, trials.fit(kept)
 
 
 class _Trials:
@@ -140,34 +139,43 @@ class _Trials:
         self._fits: dict[frozenset[str], Posterior] = {}
         self._known: dict[frozenset[str], tuple[np.ndarray, float]] = {}
         self.everything = self._solve(space.start_tolerances(), FIRST_ROUNDS)
+        self._condensed = condense(problem, self.everything)
 
-    def gain(self, names: tuple[str, ...], *blocks: str) -> Gain:
-        """Return what blocks among `names` bring."""
-        with_it, evidence = self._outcome(names)
-        without, less_evidence = self._outcome(tuple(name for name in names if name not in blocks))
-        if len(without) < 2:
-            return Gain(0.0, 0.0, 0.0)
-        less = (without - with_it) / max(without.sum(), np.finfo(float).tiny)
-        return Gain(float(less.sum()), float(np.sqrt(len(less) * less.var())), evidence - less_evidence)
+    def single_gains(self, names: Sequence[str], blocks: Sequence[str]) -> dict[str, Gain]:
+        """Return what each of some blocks brings, by its name; as :meth:`gains`."""
+        return dict(zip(blocks, self.gains(names, [(block,) for block in blocks]), strict=True))
+
+    def gains(self, names: Sequence[str], parts: Sequence[tuple[str, ...]]) -> list[Gain]:
+        """Return what parts of the blocks `names` bring, each alone."""
+        sets = [frozenset(names), *(frozenset(names) - frozenset(part) for part in parts)]
+        new = [blocks for blocks in dict.fromkeys(sets) if blocks not in self._known]
+        for blocks in new:
+            self._progress(f"trying {', '.join(name for name in names if name in blocks)}")
+        self._known |= dict(zip(new, at_once(self._outcome, new), strict=True))
+        with_it, *others = (self._known[blocks] for blocks in sets)
+        return [_gain(with_it, without) for without in others]
 
     def _solve(self, tolerances: np.ndarray, rounds: int) -> Posterior:
         return solve(self._space, self._problem, tolerances, self._noise, rounds)
 
-    def fit(self, names: tuple[str, ...]) -> Posterior:
-        """Return the fit with a set of blocks."""
+    def fit(self, names: Collection[str]) -> Posterior:
+        """Return the fit with the structure and a set of blocks."""
         key = frozenset(names)
         if key not in self._fits:
-            tolerances = np.where([b.name in key for b in self._space.blocks], self.everything.tolerances, 0.0)
-            self._fits[key] = self._solve(tolerances, ROUNDS)
+            kept = [block.name in key or n == 0 for n, block in enumerate(self._space.blocks)]
+            self._fits[key] = self._solve(np.where(kept, self.everything.tolerances, 0.0), ROUNDS)
         return self._fits[key]
 
-    def _outcome(self, names: tuple[str, ...]) -> tuple[np.ndarray, float]:
+    def _outcome(self, names: Collection[str]) -> tuple[np.ndarray, float]:
         """Return the summed squared errors of each fold, in fixed units, and the log evidence, of a set of blocks."""
-        key = frozenset(names)
-        if key not in self._known:
-            self._progress(f"trying {', '.join(names)}")
-            posterior = self.fit(names)
-            errors = held_out(self._problem, posterior) * (posterior.noise / self._noise)[self._problem.kind]
-            of_folds = np.bincount(self._problem.fold, errors**2)
-            self._known[key] = of_folds, log_evidence(self._problem, posterior)
-        return self._known[key]
+        posterior = self.fit(names)
+        of_folds = held_out_squares(self._problem, self._condensed, posterior) @ self._noise**-2
+        return of_folds, log_evidence(self._problem, posterior)
+
+
+def _gain(with_it: tuple[np.ndarray, float], without: tuple[np.ndarray, float]) -> Gain:
+    """Return what blocks bring, by the squared errors of folds and the log evidence with and without them."""
+    if len(without[0]) < 2:
+        return Gain(0.0, 0.0, 0.0)
+    less = (without[0] - with_it[0]) / max(without[0].sum(), np.finfo(float).tiny)
+    return Gain(float(less.sum()), float(np.sqrt(len(less) * less.var())), with_it[1] - without[1])

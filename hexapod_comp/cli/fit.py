@@ -158,11 +158,11 @@ def _details(args: argparse.Namespace) -> Details | None:
     CalibrationError
         There is no certificate that it could be for.
     """
+    if args.details is None:
+        return None
     from ..calibration.certificate import load_details
     from ..errors import CalibrationError
 
-    if args.details is None:
-        return None
     if args.certificate is None:
         raise CalibrationError("--details", "is what a certificate says: --certificate is missing")
     return load_details(args.details)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ..machine.model import MachineModel, MachinesByTemperature, RealMachine
 from ..measurements.campaign import Campaign
-from ..measurements.readings import ABSOLUTE_KINDS, AXES, CHANNELS, KINDS, LENGTH, MeasurementSet
+from ..measurements.readings import ABSOLUTE_KINDS, AXES, CHANNELS, KINDS, LENGTH, MeasurementSet, different_rows
 from .trial import drive, model_commands
 
 VISITS, SLOPES, NOISE, CENTRES = range(4)
@@ -121,8 +121,7 @@ def _station_name(measurements: MeasurementSet, station: int) -> str:
 def _stopping(template: MeasurementSet, repeatability: float, rng: np.random.Generator) -> np.ndarray:
     """Return where the machine stopped beside its usual place, shape (N, 3), m; one draw per visit."""
     visits = np.stack([template.station, template.cycle], axis=1)
-    _, visit = np.unique(visits, axis=0, return_inverse=True)
-    visit = visit.ravel()  # NumPy 2.0 gave it another shape
+    _, visit = different_rows(visits)
     return repeatability * rng.standard_normal((visit.max() + 1, 3))[visit]
 
 
