@@ -294,14 +294,14 @@ def condense(problem: LinearProblem, posterior: Posterior) -> Condensed:
 
 def held_out(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
     """Return the errors, in standard deviations, at cells whose fold the fit did not see, shape (C,)."""
-    answers = _answers_without(problem, condense(problem, posterior), posterior)
+    answers = _solved_without(problem, condense(problem, posterior), posterior)
     return _errors(problem.rows, problem.target, problem.fold, answers) / posterior.noise[problem.kind]
 
 
 def held_out_squares(problem: LinearProblem, condensed: Condensed, posterior: Posterior) -> np.ndarray:
     """Return the sums of squares of :func:`held_out` by fold and kind, over the stated noise, shape (folds, kinds)."""
     squares, (fold, kind) = condensed.rest.copy(), (each[condensed.cell] for each in (problem.fold, problem.kind))
-    errors = _errors(condensed.rows, condensed.target, fold, _answers_without(problem, condensed, posterior))
+    errors = _errors(condensed.rows, condensed.target, fold, _solved_without(problem, condensed, posterior))
     np.add.at(squares, (fold, kind), errors**2)
     return squares
 
@@ -316,7 +316,7 @@ def _errors(rows: CellRows, target: np.ndarray, fold: np.ndarray, answers: np.nd
     return result
 
 
-def _answers_without(problem: LinearProblem, condensed: Condensed, posterior: Posterior) -> np.ndarray:
+def _solved_without(problem: LinearProblem, condensed: Condensed, posterior: Posterior) -> np.ndarray:
     """Return the most probable y of fits that did not see one fold, shape (folds, size): exact, and no fit is repeated.
 
     Without a fold with rows R and residuals r, y changes by −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r, with C the parameters' covariance,
