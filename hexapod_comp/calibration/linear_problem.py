@@ -294,8 +294,8 @@ def condense(problem: LinearProblem, posterior: Posterior) -> Condensed:
 
 def held_out(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
     """Return the errors, in standard deviations, at cells whose fold the fit did not see, shape (C,)."""
-    answers = _solved_without(problem, condense(problem, posterior), posterior)
-    return _errors(problem.rows, problem.target, problem.fold, answers) / posterior.noise[problem.kind]
+    solved = _solved_without(problem, condense(problem, posterior), posterior)
+    return _errors(problem.rows, problem.target, problem.fold, solved) / posterior.noise[problem.kind]
 
 
 def held_out_squares(problem: LinearProblem, condensed: Condensed, posterior: Posterior) -> np.ndarray:
@@ -306,13 +306,13 @@ def held_out_squares(problem: LinearProblem, condensed: Condensed, posterior: Po
     return squares
 
 
-def _errors(rows: CellRows, target: np.ndarray, fold: np.ndarray, answers: np.ndarray) -> np.ndarray:
+def _errors(rows: CellRows, target: np.ndarray, fold: np.ndarray, solved: np.ndarray) -> np.ndarray:
     """Return what is left of targets at each fold's own answer (folds, size)."""
     result = target.copy()
     for part in rows.parts:
         for first in range(0, len(part.cells), TOGETHER):
             cells, values = part.cells[first : first + TOGETHER], part.values[first : first + TOGETHER]
-            result[cells] -= np.einsum("ci,ci->c", values, answers[np.ix_(fold[cells], part.columns)])
+            result[cells] -= np.einsum("ci,ci->c", values, solved[np.ix_(fold[cells], part.columns)])
     return result
 
 
@@ -323,7 +323,7 @@ def _solved_without(problem: LinearProblem, condensed: Condensed, posterior: Pos
     or by −(C⁻¹ − Rᵀ·R)⁻¹·Rᵀ·r: a matrix of the rows' size, where they are few, or of the parameters'.
     """
     used, spread, fold = posterior.used, posterior.spread, problem.fold[condensed.cell]
-    precision, answers = whitened_precision(problem, posterior), np.zeros((len(condensed.rest), problem.rows.shape[1]))
+    precision, solved = whitened_precision(problem, posterior), np.zeros((len(condensed.rest), problem.rows.shape[1]))
     for chosen, ends in _whole_folds(fold, len(used) // 2):
         scale = 1.0 / posterior.noise[problem.kind[condensed.cell[chosen]]]
         rows = condensed.rows.select(chosen).using(used, scale)
@@ -336,8 +336,8 @@ def _solved_without(problem: LinearProblem, condensed: Condensed, posterior: Pos
             changes = np.empty((len(ends) - 1, len(used)))
             for n, (a, b) in enumerate(pairwise(ends)):
                 changes[n] = np.linalg.solve(np.eye(b - a) - shared[a:b] @ whole[a:b].T, left[a:b]) @ shared[a:b]
-        answers[np.ix_(fold[chosen[ends[:-1]]], used)] = posterior.y - changes
-    return answers
+        solved[np.ix_(fold[chosen[ends[:-1]]], used)] = posterior.y - changes
+    return solved
 
 
 def _whole_folds(fold: np.ndarray, small: int) -> Iterator[tuple[np.ndarray, list[int]]]:
