@@ -123,7 +123,7 @@ def test_a_burst_that_would_be_followed_too_late_ends(bench):
     """Ninety commands, 0.29 s at the largest speed; 0.02 s are allowed. What waits is refused, and the struts
     stand. A busy computer may take a quarter of a second for the ninety, and no less may be refused for that.
     """
-    bench.compensator(catch_up_within=0.02)
+    bench.compensator(catch_up_within=0.02, max_command_age=0.0)
     way_told = burst(bench, 90, stride=1.0)
     assert way_told / SPEED > 0.28
     bench.until(lambda: "refused.speed" in bench.values(), "a refusal")
@@ -139,7 +139,7 @@ def test_a_burst_that_would_be_followed_too_late_ends(bench):
 
 def test_where_a_parameter_says_so_only_the_newest_of_a_burst_waits(bench):
     """The first is taken, the newest is 10 mm away, further than a step: refused; the others are dropped."""
-    bench.compensator(catch_up_within=0.0, command_timeout=0.0)
+    bench.compensator(catch_up_within=0.0, command_timeout=0.0, max_command_age=0.0)
     burst(bench, 20)
     bench.until_status(ERROR, "refusing commands: step")
     counters = ("commands_dropped", "commands", "refused")
