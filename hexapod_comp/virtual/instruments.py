@@ -15,7 +15,16 @@ from scipy.spatial.transform import Rotation
 
 from ..machine.model import MachineModel, MachinesByTemperature, RealMachine
 from ..measurements.campaign import Campaign
-from ..measurements.readings import ABSOLUTE_KINDS, AXES, CHANNELS, KINDS, LENGTH, MeasurementSet, different_rows
+from ..measurements.readings import (
+    ABSOLUTE_KINDS,
+    AXES,
+    CHANNELS,
+    KINDS,
+    LEAST_NOISE,
+    LENGTH,
+    MeasurementSet,
+    different_rows,
+)
 from .trial import drive, model_commands
 
 VISITS, SLOPES, NOISE, CENTRES = range(4)
@@ -34,7 +43,8 @@ def measure(
     value = w · (e + where the machine happened to stop) − the same at the run's first reading of that channel
     + slope of the straightness beam × way along the line + noise of the instrument. Positions and attitudes are
     absolute: nothing is subtracted; nor from lengths whose zero is known. Lengths are distances, from centres whose
-    body stands beside its place in the file.
+    body stands beside its place in the file. Each reading states its instrument's noise as its uncertainty, at least
+    :data:`~hexapod_comp.measurements.readings.LEAST_NOISE`; an instrument without noise states nothing.
 
     Parameters
     ----------
@@ -66,7 +76,7 @@ def measure(
     value += _slopes(template, campaign.beam_slope, np.random.default_rng([seed, SLOPES])) * template.along()
     sigma = np.array(campaign.noise)[template.kind]
     value += sigma * np.random.default_rng([seed, NOISE]).standard_normal(len(value))
-    return template.with_values(value)
+    return replace(template, value=value, uncertainty=np.where(sigma > 0.0, np.maximum(sigma, LEAST_NOISE), np.nan))
 
 
 def station_errors(

@@ -143,8 +143,9 @@ def test_repeated_readings_tell_repeatability_from_errors_that_stay():
 
 
 def test_scatter_that_is_stated_is_the_instrument_s():
-    """The same readings, said to be good to √2 µm; then no remark says that the noise is assumed either."""
+    """The same readings, nothing said of their noise, or that it is √2 µm; then no remark says that it is assumed."""
     readings = with_stops(1, 3)
+    readings = replace(readings, uncertainty=np.full(len(readings), np.nan))
     assumed = [note for note in fit_model(readings, FEW).notes if "(linear 1 µm, straightness 1 µm assumed)" in note]
     assert len(assumed) == 1
     stated = np.where(readings.kind == ROTATION, 1e-6, np.sqrt(2.0) * 1e-6)

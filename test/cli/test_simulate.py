@@ -90,8 +90,10 @@ def test_noise_is_as_the_campaign_says() -> None:
     for kind, sigma in zip(KINDS, campaign.noise, strict=True):
         if of_kind(found, kind).any():
             assert found.value[of_kind(found, kind)].std() == pytest.approx(sigma, rel=0.15)
+            assert set(found.uncertainty[of_kind(found, kind)]) == {sigma}
     np.testing.assert_array_equal(filled(campaign, truth).value, found.value)
     assert not np.array_equal(filled(campaign, truth, seed=4).value, found.value)
+    assert np.isnan(filled(QUIET, truth).uncertainty).all()  # nobody reads without noise: nothing is stated
 
 
 def test_beam_slopes_bend_straightness_only_and_one_slope_holds_for_a_run() -> None:
@@ -147,6 +149,7 @@ instrument: 5-D
 diagonals: 4
 poses: 5
 tilt_deg: 5
+noise: {linear_um: 0.5, rotation_arcsec: 0.2, straightness_um: 0}
 """
 
 
@@ -168,8 +171,13 @@ def test_verb_writes_what_it_says(tmp_path: Path, capsys: pytest.CaptureFixture[
     truth = RealMachine(geometry, load_model(config_file("paper_machine"), geometry))
     expected = measure(template(campaign, geometry, 1), campaign, truth, 1)
     assert f"{len(expected)} readings of 21 runs" in text  # 16 lines, 4 diagonals, the poses
-    # The file has what instruments show: a tenth of a nanometre.
-    np.testing.assert_allclose(read_tidy(paths[0], geometry).value, expected.value, rtol=0.0, atol=0.51e-10)
+    # The file has what instruments show, a tenth of a nanometre, and states their noise, to rounding in its unit.
+    found = read_tidy(paths[0], geometry)
+    np.testing.assert_allclose(found.value, expected.value, rtol=0.0, atol=0.51e-10)
+    np.testing.assert_allclose(found.uncertainty, expected.uncertainty, rtol=1e-15)
+    stated = {kind: found.uncertainty[of_kind(found, kind)][0] for kind in ("linear", "rotation", "position")}
+    assert stated == pytest.approx({"linear": 0.5e-6, "rotation": np.radians(0.2 / 3600.0), "position": 10e-6})
+    assert np.isnan(found.uncertainty[of_kind(found, "straightness")]).all()
 
 
 def test_verb_measures_the_compensated_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
