@@ -41,6 +41,8 @@ class Aim:
         With its box.
     tilt : float
         Largest tilt, rad.
+    stops : float
+        How far the tool stops beside its usual place, RMS over all three axes, m: no model takes that away.
 
     Raises
     ------
@@ -48,7 +50,8 @@ class Aim:
         No pose of the box with that tilt is within the limits.
     """
 
-    def __init__(self, space: ParameterSpace, tilt: float) -> None:
+    def __init__(self, space: ParameterSpace, tilt: float, stops: float = 0.0) -> None:
+        self.stops = stops
         self.parts = {"level": _square(space, 0.0)} | ({"tilted": _square(space, tilt)} if tilt > 0.0 else {})
         self.square = np.mean(list(self.parts.values()), axis=0)
         values, vectors = np.linalg.eigh(self.square)
@@ -57,7 +60,8 @@ class Aim:
 
     def errors(self, covariance: np.ndarray) -> dict[str, float]:
         """Return the RMS tool error that a covariance leaves, level and tilted, m."""
-        return {name: float(np.sqrt((square * covariance).sum())) for name, square in self.parts.items()}
+        squares = {name: (square * covariance).sum() + self.stops**2 for name, square in self.parts.items()}
+        return {name: float(np.sqrt(square)) for name, square in squares.items()}
 
 
 def _square(space: ParameterSpace, tilt: float) -> np.ndarray:

@@ -34,6 +34,8 @@ class Plan:
     level, tilted : ToolError or None
         The tool error to expect after a fit, the machine's repeatability included; `before` is that of machines within
         the tolerances.
+    stops : float
+        The machine's repeatability as stated, RMS over all three axes, m; 0 where none is.
     """
 
     measurements: MeasurementSet
@@ -42,6 +44,7 @@ class Plan:
     unseen_errors: tuple[str, ...]
     level: ToolError | None
     tilted: ToolError | None
+    stops: float
 
 
 def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings) -> Plan:
@@ -63,8 +66,7 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
     posterior = solve(space, problem, space.start_tolerances(), noise, rounds=0)
     covariance, x = physical_covariance(space, posterior), np.zeros(space.size)
     prior = space.prior_covariance(space.start_tolerances())
-    stops = float(np.sqrt(3.0)) * campaign.repeatability
-    beyond = Unexplained(displacement=Scatter(stops=stops, most_stops=stops))
+    beyond = Unexplained(displacement=Scatter(stops=campaign.stops, most_stops=campaign.stops))
     level, tilted = (expected_error(space, x, covariance, tilt, prior, None, beyond) for tilt in (0.0, TILT))
     return Plan(
         measurements=measurements,
@@ -73,6 +75,7 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
         unseen_errors=unseen_errors(measurements, settings),
         level=level,
         tilted=tilted,
+        stops=campaign.stops,
     )
 
 

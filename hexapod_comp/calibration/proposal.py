@@ -126,13 +126,14 @@ class Proposal:
     space : ParameterSpace
         The parameters to be fitted.
     before, expected : dict of str to float
-        Tool error before and after, RMS, m, by tilt: ``level`` and, where the goal tilts, ``tilted``.
+        Tool error before and after, the machine's repeatability included, RMS, m, by tilt: ``level`` and, where the
+        goal tilts, ``tilted``.
     seconds : float
         How long measuring takes.
     all_of_them, unseen : float
         The worse of level and tilted after all candidates, and after so many repeats that noise no longer counts, m.
     shares : dict of str to float
-        Blocks' shares of the mean square error left.
+        Shares of blocks, and of the repeatability, in the mean square error left.
     needed : float or None
         Seconds in which the goal would be met; None where these candidates do not meet it.
     """
@@ -223,9 +224,9 @@ def propose(
     progress("what could be measured")
     runs = candidates(place, goal.instruments)
     space = ParameterSpace((place.geometry, region(place, runs)), settings)
-    aim = Aim(space, goal.tilt)
     side = float(np.ptp(place.box, axis=0).min())
     base = base or Campaign(place.box, side, side, runs=tuple(runs[:1]))
+    aim = Aim(space, goal.tilt, base.stops)
     base = replace(
         base, instrument=None, diagonals=0, poses=0, box=place.box, cell=side, step=side, runs=tuple(runs[:1])
     )
@@ -278,7 +279,7 @@ class _Greedy:
             seconds=seconds,
             all_of_them=all_of_them,
             unseen=unseen,
-            shares=_shares(space, self.aim.square * covariance),
+            shares=_shares(space, self.aim.square * covariance, self.aim.stops),
             needed=needed,
         )
 
@@ -344,8 +345,10 @@ class _Try:
         self.seconds, self.errors = seconds, self.selection.errors()
 
 
-def _shares(space: ParameterSpace, left: np.ndarray) -> dict[str, float]:
-    """Return the blocks' shares of a mean square error tr(M·C), given M·C element by element; the largest first."""
-    of_parameter = left.sum(axis=1) / left.sum()
+def _shares(space: ParameterSpace, left: np.ndarray, stops: float) -> dict[str, float]:
+    """Return shares of a mean square error tr(M·C) + stops², given M·C element by element; the largest first."""
+    total = float(left.sum()) + stops**2
+    of_parameter = left.sum(axis=1) / total
     shares = {block.name: float(of_parameter[block.part].sum()) for block in space.blocks}
+    shares["repeatability"] = stops**2 / total
     return dict(sorted(shares.items(), key=lambda item: -item[1]))

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..formats.texts import aligned, number
 from .proposal import Proposal
+from .report import stops_text
 
 MAIN = 0.1
 """Blocks that make up less than this share of what is left are not named."""
@@ -36,6 +37,7 @@ def proposal_json(plan: Proposal) -> dict[str, Any]:
         "needed_s": plan.needed,
         "all_candidates_m": plan.all_of_them,
         "unseen_m": plan.unseen,
+        "repeatability_m": plan.campaign.stops,
         "shares": plan.shares,
         "readings": plan.readings,
         "runs": [
@@ -59,7 +61,11 @@ def verdict(plan: Proposal) -> str:
         return f"the goal is met: {um(plan.worst)} in {plan.seconds / 3600.0:.1f} h"
     goal, named = um(plan.goal.error), ", ".join(plan.goal.instruments)
     lines = [f"the goal is NOT met: {um(plan.worst)} can be had in {plan.goal.seconds / 3600.0:g} h, not {goal}"]
-    if plan.needed is not None:
+    stops = plan.campaign.stops
+    if stops > plan.goal.error:
+        what = f"its stops alone are {um(stops)} off, {um(stops - plan.goal.error)} more than the goal"
+        lines.append(f"  what limits it is the machine's repeatability: {what}, and no model takes that away")
+    elif plan.needed is not None:
         lines.append(f"  what limits it is time: {plan.needed / 3600.0:.1f} h would do")
     elif plan.unseen > plan.goal.error:
         what = f"{um(plan.unseen)} would be left by any number of readings of {named} in this box"
@@ -91,6 +97,7 @@ def _expected(plan: Proposal) -> str:
         shown = "level tool: " if name == "level" else f"tilted {np.degrees(plan.goal.tilt):g}°:"
         before = plan.before[name]
         lines.append(f"  {shown}  {um(before)} → {um(after)} RMS, {100.0 * (1.0 - after / before):.1f} % less")
+    lines.append(f"  {stops_text(plan.campaign.stops)}")
     return "\n".join(lines)
 
 

@@ -93,6 +93,13 @@ def tool_error_text(error: ToolError) -> str:
     )
 
 
+def stops_text(stops: float) -> str:
+    """Return how much of a planned tool error is the machine's repeatability: RMS over all three axes, m."""
+    if stops:
+        return f"counted in: the machine's repeatability, {stops * 1e6:.3g} µm RMS over all three axes"
+    return "not counted: the machine's repeatability, for none is stated (--repeatability-um)"
+
+
 def rotation_interval(error: ToolError) -> str:
     """Return the interval of a tool's rotation in µrad, or that there is none."""
     if error.rotation_low is None or error.rotation_high is None:
@@ -260,8 +267,11 @@ def plan_report(plan: Plan) -> str:
         f"machine {m.geometry.name}: {len(m)} readings of {len(m.runs)} runs at {len(m.stations)} stations, "
         f"{plan.space.size} parameters"
     )
+    expected = [
+        f"{part}\n  {stops_text(plan.stops)}" for part in _expected(plan.level, plan.tilted, plan.observability)
+    ]
     seen = observability_text(plan.observability, plan.unseen_errors)
-    return "\n\n".join([head, *_expected(plan.level, plan.tilted, plan.observability), seen]) + "\n"
+    return "\n\n".join([head, *expected, seen]) + "\n"
 
 
 def plan_json(plan: Plan) -> dict:
@@ -270,5 +280,6 @@ def plan_json(plan: Plan) -> dict:
         "machine": plan.measurements.geometry.name,
         "readings": len(plan.measurements),
         "parameters": plan.space.size,
+        "repeatability_m": plan.stops,
         **_expected_json(plan.level, plan.tilted, plan.observability, plan.unseen_errors),
     }

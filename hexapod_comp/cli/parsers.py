@@ -230,6 +230,8 @@ def _plan(parser: argparse.ArgumentParser) -> None:
     text = "campaign file, or the name of a shipped one; with --goal-um optional: whose box and noise count"
     add("campaign", nargs="?", metavar="CAMPAIGN", help=text)
     _machine(add)
+    text = "standard deviation of where the machine stops, along each axis (default: the campaign's)"
+    add("--repeatability-um", type=arguments.bound, metavar="UM", help=text)
     goal = parser.add_argument_group("proposing a campaign").add_argument
     text = "RMS tool error that may be left, the datum aligned: propose a campaign for it"
     goal("--goal-um", type=arguments.above_zero, metavar="UM", help=text)

@@ -40,7 +40,7 @@ def _judge(args: argparse.Namespace, geometry: HexapodGeometry) -> int:
     from ..calibration.report import plan_json, plan_report
     from ..measurements.campaign import template
 
-    campaign = common.load_campaign(args, geometry)
+    campaign = _campaign(args, geometry)
     common.mention_compiling("model.actual_pose_one")
     with common.stage_line() as say:
         say("laying out the readings")
@@ -60,7 +60,7 @@ def _propose(args: argparse.Namespace, geometry: HexapodGeometry) -> int:
     from ..measurements.campaign import campaign_text
 
     goal = _goal(args)
-    base = common.load_campaign(args, geometry)
+    base = _campaign(args, geometry)
     common.mention_compiling("model.actual_pose_one")
     place = MeasuringBox(geometry, base.box, base.level, goal.tilt)
     with common.stage_line() as say:
@@ -73,6 +73,16 @@ def _propose(args: argparse.Namespace, geometry: HexapodGeometry) -> int:
     else:
         common.show(proposal_report(result) + (f"\ncampaign: {args.out}\n" if args.out else ""))
     return 0 if result.met else 1
+
+
+def _campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campaign:
+    """Return the campaign that the options name, with the repeatability that they state."""
+    from dataclasses import replace
+
+    campaign = common.load_campaign(args, geometry)
+    if args.repeatability_um is None:
+        return campaign
+    return replace(campaign, repeatability=args.repeatability_um * 1e-6)
 
 
 def _goal(args: argparse.Namespace) -> Goal:

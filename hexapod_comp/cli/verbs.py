@@ -205,7 +205,8 @@ example:
         "calibration",
         "what a campaign will determine; or which one a goal needs",
         """Takes a campaign file and says without a single reading which parameters the campaign would determine, which
-it leaves open, and what tool error (µm) a fit of --scheme joint will leave on a machine within the tolerances.
+it leaves open, and what tool error (µm) a fit of --scheme joint will leave on a machine within the tolerances. How far
+the machine stops beside its usual place is in it, where the campaign or --repeatability-um states it.
 
 With --goal-um it proposes a campaign: lines and poses in measuring order, within the limits, that bring the tool error
 (µm, RMS, the datum aligned) down to the goal in the time there is. The box and the noise are those of CAMPAIGN, by

@@ -21,7 +21,17 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.model_blocks import block_text, written
 from ..pose import Pose, rotation_from_angles
 from .campaign_runs import CampaignRun, line_readings, read_runs
-from .readings import ANGULAR_KINDS, AXES, DEFAULT_UNCERTAINTY, KINDS, UNKNOWN, FileLine, MeasurementSet, Reading
+from .readings import (
+    ANGULAR_KINDS,
+    AXES,
+    DEFAULT_UNCERTAINTY,
+    KINDS,
+    LARGEST_READING,
+    UNKNOWN,
+    FileLine,
+    MeasurementSet,
+    Reading,
+)
 from .runs import assemble
 
 CAMPAIGN_FORMAT = "hexapod_comp/campaign"
@@ -111,11 +121,13 @@ class Campaign:
             raise InputFileError("campaign", "cycles, poses", problem, [self.cycles, self.poses])
         if not (self.instrument or self.diagonals or self.poses or self.runs):
             raise InputFileError("campaign", "instrument", "or diagonals, poses or runs: nothing is measured")
-        for name in ("tilt", "beam_slope", "centre_off", "repeatability"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise InputFileError("campaign", name, "must be finite and not negative", getattr(self, name))
-        if len(self.noise) != len(KINDS) or not all(0.0 <= sigma < math.inf for sigma in self.noise):
-            raise InputFileError("campaign", "noise", "must be finite and not negative", list(self.noise))
+        if not 0.0 <= self.tilt < math.inf:
+            raise InputFileError("campaign", "tilt", "must be finite and not negative", self.tilt)
+        for name in ("beam_slope", "centre_off", "repeatability"):
+            if not 0.0 <= getattr(self, name) <= LARGEST_READING:
+                raise InputFileError("campaign", name, f"must be 0…{LARGEST_READING:g} m or rad", getattr(self, name))
+        if len(self.noise) != len(KINDS) or not all(0.0 <= sigma <= LARGEST_READING for sigma in self.noise):
+            raise InputFileError("campaign", "noise", f"must be 0…{LARGEST_READING:g} m or rad", list(self.noise))
         if not self._roughly() <= MOST_READINGS:
             problem = f"would be some {self._roughly():.3g} readings, at most {MOST_READINGS} are allowed"
             raise InputFileError("campaign", "cell, step, cycles, poses, runs", problem)
@@ -128,6 +140,11 @@ class Campaign:
         of_diagonals = 2.0 * self.cycles * self.diagonals * (float(np.linalg.norm(sides)) / self.step + 1.0)
         of_runs = sum(run.count(self.cycles) for run in self.runs)
         return float(of_lines + of_diagonals + 6.0 * self.poses + of_runs)
+
+    @property
+    def stops(self) -> float:
+        """How far the tool stops beside its usual place, RMS over all three axes, m."""
+        return math.sqrt(3.0) * self.repeatability
 
     def nodes(self, axis: int) -> np.ndarray:
         """Return where the grid's lines stand along an axis, m; the last cell may be narrower."""

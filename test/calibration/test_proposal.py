@@ -17,18 +17,20 @@ from hexapod_comp.calibration.proposal_report import proposal_report, verdict
 from hexapod_comp.cli.arguments import INSTRUMENTS
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.measurements.campaign import campaign_text, load_campaign, template
+from hexapod_comp.measurements.campaign import Campaign, campaign_text, load_campaign, template
 from hexapod_comp.measurements.campaign_runs import LISTED_INSTRUMENTS
 
 HOUR = 3600.0
 UM = 1e-6
 
 
-def proposed(error: float, tilt_deg: float, instruments: tuple[str, ...], hours: float) -> Proposal:
+def proposed(
+    error: float, tilt_deg: float, instruments: tuple[str, ...], hours: float, base: Campaign | None = None
+) -> Proposal:
     """Return a plan for the paper's machine in the paper's box; structure, pitch, wave and backlash are fitted."""
     tilt = float(np.radians(tilt_deg))
     place = MeasuringBox(small.paper(), small.BOX, np.eye(3), tilt)
-    return propose(place, Goal(error, tilt, instruments, hours * HOUR), small.FEW)
+    return propose(place, Goal(error, tilt, instruments, hours * HOUR), small.FEW, base)
 
 
 def test_gains_are_those_of_the_whole_matrices() -> None:
@@ -81,6 +83,22 @@ def test_what_limits_a_goal() -> None:
     assert f"{short.needed / HOUR:.1f} h would do" in verdict(short)
     assert proposed(1.5 * UM, 0.0, ("linear",), short.needed / HOUR + 0.01).met
     assert "1: linear, " in proposal_report(short)
+
+
+def test_the_machine_s_repeatability_counts() -> None:
+    """As in ``plan`` for the same campaign. A goal that the stops alone miss is out of reach whatever is measured."""
+    loose = small.campaign(repeatability=1.0 * UM)
+    result = proposed(2.2 * UM, 0.0, ("linear",), 6.0, loose)
+    assert result.met
+    assert 3.0**0.5 * UM < result.worst <= 2.2 * UM
+    judged = plan(template(result.campaign, small.paper()), result.campaign, small.FEW).level
+    assert judged is not None
+    assert result.expected["level"] == pytest.approx(judged.after, rel=0.05)
+    beyond = proposed(1.5 * UM, 0.0, ("linear",), 1.0, loose)
+    assert not beyond.met
+    assert beyond.needed is None
+    assert "its stops alone are 1.73 µm off, 0.232 µm more than the goal" in verdict(beyond)
+    assert sum(beyond.shares.values()) == pytest.approx(1.0)
 
 
 def test_no_time_at_all() -> None:

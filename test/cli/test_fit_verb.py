@@ -379,13 +379,23 @@ ALL = ("--out", "m.yaml", "--report", "r.txt", "--certificate", "c.html", "--pic
 
 
 @pytest.fixture(scope="module")
-def noisy(done: Calibration) -> Path:
-    """Measure with a laser thirty times as noisy as is assumed of one."""
+def stated(done: Calibration) -> Path:
+    """Measure with a laser thirty times as noisy as is assumed of one; its file says so."""
     (done.folder / "noisy").mkdir()
-    campaign, measured = done.folder / "noisy" / "campaign.yaml", done.folder / "noisy" / "noisy.csv"
+    campaign, measured = done.folder / "noisy" / "campaign.yaml", done.folder / "noisy" / "stated.csv"
     campaign.write_text(CAMPAIGN + "noise: {linear_um: 30}\n")
     said_by("simulate", "--campaign", campaign, "--seed", 1, "--out", measured)
     return measured
+
+
+@pytest.fixture(scope="module")
+def noisy(stated: Path) -> Path:
+    """Leave out of these readings how uncertain they are."""
+    header, *rows = (line.rsplit(",", 1) for line in stated.read_text().splitlines())
+    assert (header[1], {end for _, end in rows}) == ("uncertainty", {"30"})
+    path = stated.with_name("noisy.csv")
+    path.write_text("\n".join(start for start, _ in (header, *rows)) + "\n")
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -444,14 +454,12 @@ def test_a_forced_model_says_so(
     assert {path.name for path in tmp_path.iterdir()} == {"m.yaml", "m.posterior.npz", "r.txt", "c.html"}
 
 
-def test_noise_that_is_stated_is_welcome(hexapod: Program, noisy: Path, tmp_path: Path) -> None:
-    """The same readings with the uncertainty that they have."""
-    header, *rows = noisy.read_text().splitlines()
-    stated = tmp_path / "stated.csv"
-    stated.write_text("\n".join([header + ",uncertainty", *(row + ",30" for row in rows)]) + "\n")
+def test_noise_that_is_stated_is_welcome(hexapod: Program, stated: Path, tmp_path: Path) -> None:
+    """The same readings with the uncertainty that they have: nothing is noted of it."""
     code, out, err = hexapod("fit", stated, "--blocks", "pitch", "--out", tmp_path / "m.yaml")
     assert (code, err) == (0, "")
     assert out.startswith("machine paper")
+    assert "uncertainty" not in out
 
 
 def test_micrometres_called_millimetres_write_nothing(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
@@ -775,6 +783,17 @@ def test_plan_says_when_a_goal_cannot_be_met(hexapod: Program, done: Calibration
     assert "the goal is NOT met: " in out
     assert "  what limits it is " in out
     assert "1: linear, " in out
+
+
+def test_no_plan_brings_a_machine_below_its_repeatability(hexapod: Program, done: Calibration) -> None:
+    """Stops that scatter by 1 µm along each axis are √3 µm off in space. Where none is stated both plans say so."""
+    code, out, _ = hexapod("plan", done.campaign, *JOINT, "--goal-um", "1", "--hours", "0.6", "--repeatability-um", "1")
+    assert code == 1
+    assert "counted in: the machine's repeatability, 1.73 µm RMS over all three axes" in out
+    assert "machine's repeatability: its stops alone are 1.73 µm off, 0.732 µm more than the goal" in out
+    planned = json.loads(hexapod("plan", done.campaign, *JOINT, "--repeatability-um", "1", "--json")[1])
+    assert planned["expected_tool_error"]["after_m"] > planned["repeatability_m"] == pytest.approx(3.0**0.5 * 1e-6)
+    assert "not counted: the machine's repeatability" in hexapod("plan", done.campaign, *JOINT)[1]
 
 
 @pytest.mark.parametrize(
