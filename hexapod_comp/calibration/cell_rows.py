@@ -6,8 +6,10 @@ together in a dense matrix, which is a third of the whole or less.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.linalg.lapack import dpstrf
@@ -19,6 +21,16 @@ FEW = 8
 
 FAINT = 1e-11
 """What moves cells by less than this variance, of their noise's, does not count."""
+
+
+Given = TypeVar("Given")
+Result = TypeVar("Result")
+
+
+def at_once(work: Callable[[Given], Result], items: Iterable[Given]) -> list[Result]:
+    """Return the results of independent work with matrices: NumPy lets as many threads work as there are processors."""
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        return list(pool.map(work, items))
 
 
 class Alike(NamedTuple):
@@ -135,8 +147,8 @@ class CellRows:
         draws : ndarray, shape (size, D)
             Parameters as they may be, over √D.
         """
-        parts, of_rows, count = [], [], 0
-        for part in self.parts:
+
+        def few_of(part: Alike) -> list[np.ndarray]:
             order = np.argsort(group[part.cells], kind="stable")
             pieces = np.split(order, np.flatnonzero(np.diff(group[part.cells[order]])) + 1)
             few = np.concatenate([np.zeros(0, dtype=int), *(piece for piece in pieces if len(piece) < FEW)])
@@ -145,17 +157,25 @@ class CellRows:
                 cells = part.cells[piece]
                 rows, along = _moved(part.values[in_a_row(piece)], target[cells], draws[part.columns])
                 listed.append((rows, along, np.full(len(along), group[cells[0]])))
-            values, *own = (np.concatenate(arrays) for arrays in zip(*listed, strict=True))
+            return [np.concatenate(arrays) for arrays in zip(*listed, strict=True)]
+
+        parts, of_rows, count = [], [], 0
+        for part, (values, *own) in zip(self.parts, at_once(few_of, self.parts), strict=True):
             parts.append(Alike(np.arange(count, count + len(values)), part.columns, values))
             of_rows.append(own)
             count += len(values)
         targets, groups = (np.concatenate(arrays) for arrays in zip(*of_rows, strict=True))
         return CellRows((count, self.shape[1]), parts), targets, groups
 
-    def project_out(self, unknown: Unknown) -> None:
-        """Take off, in place, what an unknown of an instrument may explain; its cells stand in one part."""
-        values = self.parts[self._part[unknown.members[0]]].values
-        unknown.project_out(values, in_a_row(self._place[unknown.members]))
+    def project_out(self, unknowns: Sequence[Unknown]) -> None:
+        """Take off, in place, what unknowns of instruments may explain; the cells of each stand in one part."""
+        owner = np.array([self._part[unknown.members[0]] for unknown in unknowns])
+
+        def clear(part: int) -> None:
+            for n in np.flatnonzero(owner == part).tolist():
+                unknowns[n].project_out(self.parts[part].values, in_a_row(self._place[unknowns[n].members]))
+
+        at_once(clear, range(len(self.parts)))
 
 
 def _moved(values: np.ndarray, target: np.ndarray, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -35,7 +35,6 @@ from ..measurements.standards import (
 from ..workspace.overview import corners
 from .cells import Cells
 from .fit import ModelFit
-from .linear_problem import held_out
 from .observability import ToolError
 from .report import tilt_doubt
 
@@ -341,11 +340,11 @@ def left_out(fit: ModelFit) -> np.ndarray:
 
     A run's unknown zero is taken off.
     """
-    m, problem, posterior = fit.measurements, fit.solution.problem, fit.solution.posterior
+    m, solution = fit.measurements, fit.solution
     cell = Cells.of(m).of_reading
-    weights = fit.solution.weights / m.stated**2
+    weights = solution.weights / m.stated**2
     total = np.bincount(cell, weights)
-    errors = held_out(problem, posterior) * posterior.noise[problem.kind] / np.sqrt(total)
+    errors = solution.held_out * solution.posterior.noise[solution.problem.kind] / np.sqrt(total)
     return m.value - (np.bincount(cell, weights * m.value) / total)[cell] + errors[cell]
 
 

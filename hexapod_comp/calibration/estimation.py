@@ -10,15 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import CalibrationError, KinematicsError, ModelError
 from ..measurements.readings import KINDS, LEAST_NOISE, MeasurementSet, refuse_absurd
-from .cell_rows import Alike, CellRows
+from .cell_rows import Alike, CellRows, at_once
 from .cells import Cells
-from .linear_problem import LinearProblem, Posterior, physical_covariance, solve
+from .linear_problem import Condensed, LinearProblem, Posterior, condense, held_out, physical_covariance, solve
 from .parameters import ParameterSpace
 from .sensitivity import Prediction, Slopes, predict
 from .unknowns import Unknown, of_zero
@@ -127,7 +128,7 @@ class Estimation:
             unknown[part.members] += part.explained(target) / scale[part.members]
             part.project_out(target)
             part.project_out(moved)
-            rows.project_out(part)
+        rows.project_out(unknowns)
         residuals = misfit - unknown[c.of_reading]
         scatter = np.bincount(m.kind, weights * (misfit - mean[c.of_reading]) ** 2, len(KINDS))
         # Huber's proposal 2: noise comes from the residuals cut off, weight² · residual², or outliers blow it up.
@@ -140,17 +141,19 @@ class Estimation:
 
         Along directions (C, 6), over the standard deviations of the cells' values.
         """
-        c, space, moved, parts = self.cells, self.space, np.empty(len(self.cells.station)), []
+        c, space, moved = self.cells, self.space, np.empty(len(self.cells.station))
         slopes, y = Slopes(space, prediction, self.measurements.stations, whitened=True), space.whitened_parameters(x)
-        for group in self._groups:
+
+        def rows_of(group: _Group) -> Alike:
             columns = slopes.columns(group.components)
             rows = np.empty((len(group.cells), len(columns)))
             for first in range(0, len(rows), CHUNK):
                 part, cells = rows[first : first + CHUNK], group.cells[first : first + CHUNK]
                 slopes.write(part, columns, c.station[cells], directions[cells], group.components)
                 moved[cells] = part @ y[columns]
-            parts.append(Alike(group.cells, columns, rows))
-        return CellRows((len(moved), space.size), parts), moved
+            return Alike(group.cells, columns, rows)
+
+        return CellRows((len(moved), space.size), at_once(rows_of, self._groups)), moved
 
     def free_of_unknowns(self, rows: np.ndarray) -> np.ndarray:
         """Return what is left of cells' derivatives (C, K) beside all that instruments do not know, over their noise.
@@ -212,8 +215,9 @@ class Estimation:
         freedom = np.bincount(self.measurements.kind, minlength=kinds).astype(float)
         for part in unknowns:
             freedom[kind[part.members[0]]] -= part.share.sum()
-        for group, (_, columns, values) in zip(self._groups, rows.parts, strict=True):
-            normal[group.kind][np.ix_(columns, columns)] += values.T @ values
+        products = at_once(lambda part: part.values.T @ part.values, rows.parts)
+        for group, (_, columns, values), product in zip(self._groups, rows.parts, products, strict=True):
+            normal[group.kind][np.ix_(columns, columns)] += product
             moment[group.kind][columns] += target[group.cells] @ values
             square[group.kind] += target[group.cells] @ target[group.cells]
         least_noise = LEAST_NOISE / np.array([self.measurements.stated_of(k) for k in range(kinds)])
@@ -273,6 +277,16 @@ class Solution:
     weights: np.ndarray
     steps: int
     change: float
+
+    @cached_property
+    def condensed(self) -> Condensed:
+        """The cells in as few rows as the parameters in use can be told by."""
+        return condense(self.problem, self.posterior)
+
+    @cached_property
+    def held_out(self) -> np.ndarray:
+        """Errors, in standard deviations, at cells whose fold a fit does not see, shape (C,)."""
+        return held_out(self.problem, self.condensed, self.posterior)
 
 
 def iterate(

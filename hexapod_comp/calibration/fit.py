@@ -19,7 +19,7 @@ from .courses import with_courses
 from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
 from .estimation import HUBER, OUTLIER, Estimation, Solution, iterate
 from .lead import ScrewLead, look_for_lead
-from .linear_problem import LinearProblem, Posterior, held_out, physical_covariance
+from .linear_problem import LinearProblem, Posterior, physical_covariance
 from .observability import Allowed, Observability, ToolError, observe, without_trace
 from .parameters import WAVES, FitSettings, ParameterSpace
 from .residuals import Residuals
@@ -441,7 +441,7 @@ def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:
 def _channels(estimation: Estimation, solution: Solution) -> list[ChannelFit]:
     """Return how each kind of channel was met."""
     problem, posterior, kinds = solution.problem, solution.posterior, estimation.measurements.kind
-    errors = held_out(problem, posterior) * posterior.noise[problem.kind]
+    errors = solution.held_out * posterior.noise[problem.kind]
     readings_of_cell = np.bincount(estimation.cells.of_reading, minlength=len(problem.kind))
     result = []
     for k in np.unique(kinds):

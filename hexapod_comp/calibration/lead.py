@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..kernels.struts import MOST_HARMONICS
+from .cell_rows import at_once
 from .estimation import HUBER, MEDIAN_TO_SIGMA, Estimation
-from .linear_problem import LinearProblem, Posterior, at_once, solve
+from .linear_problem import LinearProblem, Posterior, solve
 from .parameters import WAVES
 
 SHORTEST, LONGEST = 1e-3, 30e-3

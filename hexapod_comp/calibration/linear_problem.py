@@ -6,12 +6,10 @@ often tolerances and noise are estimated anew.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
@@ -47,16 +45,6 @@ DRAWS, SEED = 160, 5
 
 TOGETHER = 1000
 """Rows of small folds that are looked at together."""
-
-
-Given = TypeVar("Given")
-Result = TypeVar("Result")
-
-
-def at_once(work: Callable[[Given], Result], items: Iterable[Given]) -> list[Result]:
-    """Return the results of independent work with matrices: NumPy lets as many threads work as there are processors."""
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        return list(pool.map(work, items))
 
 
 class Condensed(NamedTuple):
@@ -292,9 +280,9 @@ def condense(problem: LinearProblem, posterior: Posterior) -> Condensed:
     return Condensed(target, rows, cell, first, np.maximum(rest, 0.0).reshape(shape))
 
 
-def held_out(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
+def held_out(problem: LinearProblem, condensed: Condensed, posterior: Posterior) -> np.ndarray:
     """Return the errors, in standard deviations, at cells whose fold the fit did not see, shape (C,)."""
-    solved = _solved_without(problem, condense(problem, posterior), posterior)
+    solved = _solved_without(problem, condensed, posterior)
     return _errors(problem.rows, problem.target, problem.fold, solved) / posterior.noise[problem.kind]
 
 

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.linalg.lapack import dtrtrs
 
 from ..measurements.readings import ANGULAR_KINDS, AXES, BACKWARD, FORWARD, KINDS, MeasurementSet
-from .cell_rows import CellRows
-from .linear_problem import at_once, condense, whitened_precision
+from .cell_rows import CellRows, at_once
+from .linear_problem import whitened_precision
 from .parameters import FitSettings
 from .promise import Unexplained
 from .residuals import Residuals
@@ -213,7 +213,7 @@ class _Leaving:
         self._effects = vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0))
         self._reached = self._posterior.covariance @ (self._effects / self._spread[:, None])  # C·F
         self._expected = (self._effects / self._spread[:, None]).T @ self._reached
-        few = self._few = condense(problem, self._posterior)
+        few = self._few = residuals.solution.condensed
         scale = 1.0 / self._posterior.noise[problem.kind[few.cell]]
         self._rows = few.rows.using(self._posterior.used, scale)
         self._left = scale * few.target - self._rows.times(self._posterior.y)

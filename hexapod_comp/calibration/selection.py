@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .linear_problem import LinearProblem, Posterior, at_once, condense, held_out_squares, log_evidence, solve
+from .cell_rows import at_once
+from .linear_problem import LinearProblem, Posterior, condense, held_out_squares, log_evidence, solve
 from .parameters import ParameterSpace
 
 FIRST_ROUNDS, ROUNDS = 10, 4

@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..machine.late import PARTS, LateGrowth, late
-from ..machine.model import MachinesByTemperature
+from ..machine.model import MachinesByTemperature, RealMachine
 from ..machine.temperatures import REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE
 from ..measurements.readings import Stations
 from ..virtual.trial import drive
@@ -65,10 +65,9 @@ def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Predict
     driven = drive(machines, commanded, sense, stations.commands)
     errors = driven.errors(commanded, space.probe).as_array()
     errors += space.field_errors(x, driven.actual[0] + driven.actual[1] @ space.probe, stations.sense[:, :3])
-    each = {id(machine): machine.structure for machine in machines}
-    number = {key: n for n, key in enumerate(each)}
-    which = np.array([number[id(machine)] for machine in machines])
-    base, platform = (np.array([getattr(s, name) for s in each.values()])[which] for name in JOINTS)
+    number: dict[RealMachine, int] = {}
+    which = np.array([number.setdefault(machine, len(number)) for machine in machines])
+    base, platform = (np.array([getattr(m.structure, name) for m in number])[which] for name in JOINTS)
     return Prediction(errors, *driven.actual, base, platform)
 
 

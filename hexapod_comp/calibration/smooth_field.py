@@ -102,7 +102,8 @@ class SmoothField:
     def _products(self, points: np.ndarray, powers: np.ndarray) -> np.ndarray:
         u = np.clip(2.0 * (points - self.box[0]) / (self.box[1] - self.box[0]) - 1.0, -1.0, 1.0)
         along = [legendre.legvander(u[:, a], self.degree) for a in range(3)]
-        return np.prod([along[a][:, powers[:, a]] for a in range(3)], axis=0)
+        x, y, z = (values[:, power] for values, power in zip(along, powers.T, strict=True))
+        return x * y * z
 
     def evaluate(
         self, coefficients: np.ndarray, reversal: np.ndarray, points: np.ndarray, sense: np.ndarray

@@ -143,3 +143,34 @@ def actual_pose_one(commands, sense, body, struts, field, solver, q_position, q_
             q_rotation[i, j] = r[i, j]
     outside = apply_field(p, r, sense, field, position, rotation)
     return outcome, iterations, condition, outside
+
+
+@compiled
+def actual_pose_many(
+    commands,
+    senses,
+    body,
+    struts,
+    field,
+    solver,
+    q_positions,
+    q_rotations,
+    positions,
+    rotations,
+    outcomes,
+    conditions,
+):
+    """Batch of :func:`actual_pose_one`, each row by itself: commands (N, 6), senses (N, 9), guesses in q."""
+    for n in range(commands.shape[0]):
+        outcomes[n], _, conditions[n], _ = actual_pose_one(
+            commands[n],
+            senses[n],
+            body,
+            struts,
+            field,
+            solver,
+            q_positions[n],
+            q_rotations[n],
+            positions[n],
+            rotations[n],
+        )

@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike
 
 from ..errors import ModelError, NotConvergedError
 from ..kernels import kinematics as kernels
-from ..kernels.model import actual_pose_one, command_one
+from ..kernels.model import actual_pose_many, actual_pose_one, command_one
 from ..pose import Pose
 from .field import GridField, no_field
 from .geometry import HexapodGeometry
-from .kinematics import Structure, forward_error
+from .kinematics import Structure, forward_error, over_chunks
 from .late import AT_ONCE, PARTS, Lag, LateGrowth, late
 from .motion import MotionState
 from .struts import StrutErrors
@@ -354,6 +354,18 @@ class RealMachine:
             actual_rotation,
         )
 
+    def forward_many(
+        self, commands, senses, positions, rotations, actual_positions, actual_rotations, outcomes, conditions
+    ):
+        """Run :func:`actual_pose_many` on preallocated arrays, by several threads where that helps; without checks."""
+
+        def run(rows: slice) -> None:
+            given = commands[rows], senses[rows], self.body, self.strut_arrays, self.field_arrays, self.solver
+            poses = positions[rows], rotations[rows], actual_positions[rows], actual_rotations[rows]
+            actual_pose_many(*given, *poses, outcomes[rows], conditions[rows])
+
+        over_chunks(run, len(commands))
+
 
 def _displacement(nominal: np.ndarray, deviation: np.ndarray, growth: float) -> np.ndarray:
     """Return real minus nominal joints of a body that grows about its origin, shape (6, 3), m."""
@@ -395,9 +407,17 @@ class MachinesByTemperature:
         Where a time is not known, late parts are at rest.
         """
         constants = self._model.late_growth.time_constants
-        timed = bool(constants) and bool(np.isfinite(times).all())
-        behind = late(times, temperatures, constants) if timed else [None] * len(times)
-        return [self.at(*row) for row in zip(temperatures, behind, humidities.tolist(), strict=True)]
+        air = np.column_stack([temperatures, np.nan_to_num(humidities, nan=-1.0)])
+        behind = None
+        if constants and np.isfinite(times).all():
+            behind = late(times, temperatures, constants)
+            air = np.hstack([air, behind.reshape(len(air), -1)])
+        new = np.ones(len(air), dtype=bool)
+        new[1:] = (air[1:] != air[:-1]).any(axis=1)
+        rows = np.flatnonzero(new).tolist()
+        lags = [None] * len(rows) if behind is None else behind[rows]
+        machines = [self.at(*row) for row in zip(temperatures[rows], lags, humidities[rows].tolist(), strict=True)]
+        return [machines[n] for n in (np.cumsum(new) - 1).tolist()]
 
 
 def platform_box(model: MachineModel, level: np.ndarray) -> np.ndarray | None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -138,16 +139,21 @@ def drive(
         A machine has no pose for its row's commands; names the row.
     """
     commands, senses = np.ascontiguousarray(commands, dtype=float), np.ascontiguousarray(senses, dtype=float)
-    modelled = np.array(starts[0]), np.array(starts[1])
+    modelled = np.array(starts[0], order="C"), np.array(starts[1], order="C")
     actual = np.empty_like(modelled[0]), np.empty_like(modelled[1])
-    for row, machine in enumerate(machines):
-        arrays = (modelled[0][row], modelled[1][row], actual[0][row], actual[1][row])
-        outcome, _, condition, _ = machine.forward(commands[row], senses[row], *arrays)
-        if outcome != OK:
-            error = forward_error(outcome, condition, machine.structure.max_condition)
+    outcomes, conditions = np.empty(len(commands), np.int64), np.empty(len(commands))
+    arrays, done = (commands, senses, *modelled, *actual, outcomes, conditions), 0
+    for machine, alike in groupby(machines):
+        rows = slice(done, done + len(list(alike)))
+        machine.forward_many(*(each[rows] for each in arrays))
+        failed = np.flatnonzero(outcomes[rows] != OK)
+        if len(failed):
+            row = done + int(failed[0])
+            error = forward_error(outcomes[row], conditions[row], machine.structure.max_condition)
             where = at(starts[0][row]) if name_of is None else name_of(row)
             raise type(error)(f"{where}: {error}", error.value, error.limit)
-        advance(1)
+        advance(rows.stop - done)
+        done = rows.stop
     return Driven(actual, modelled)
 
 

@@ -52,7 +52,7 @@ def test_some_cells_and_some_parameters(rows: CellRows):
 def test_a_zero_is_taken_off_the_cells_of_its_part_alone(rows: CellRows):
     """What is left of cells of equal noise is what their mean leaves."""
     wanted, members = rows.dense(), np.sort(rows.parts[1].cells[3:9])
-    rows.project_out(of_zero(members, np.ones(6)))
+    rows.project_out([of_zero(members, np.ones(6))])
     wanted[members] -= wanted[members].mean(axis=0)
     close(rows.dense(), wanted)
 

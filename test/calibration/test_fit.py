@@ -195,7 +195,8 @@ def test_held_out_errors_are_those_of_fits_that_left_a_fold_out():
     """Twenty folds of some twelve cells, each really left out and fitted again."""
     space, problem, noise = random_problem()
     tolerances = space.start_tolerances()
-    errors = held_out(problem, solve(space, problem, tolerances, noise, 0))
+    answer = solve(space, problem, tolerances, noise, 0)
+    errors = held_out(problem, condense(problem, answer), answer)
     for fold in range(20):
         out = problem.fold == fold
         y, _ = dense(space, problem, tolerances, noise, np.flatnonzero(~out))
@@ -212,7 +213,8 @@ def test_held_out_lines_are_those_of_fits_without_the_line(few: int, monkeypatch
     monkeypatch.setattr("hexapod_comp.calibration.cell_rows.FEW", few)
     ours = readings()
     space, problem = linearised(ours)
-    errors = held_out(problem, solve(space, problem, space.start_tolerances(), ONES, 0))
+    answer = solve(space, problem, space.start_tolerances(), ONES, 0)
+    errors = held_out(problem, condense(problem, answer), answer)
     estimation = Estimation(ours, space)
     for fold in (0, 7, 20):
         out = estimation.cells.fold == fold
@@ -229,9 +231,10 @@ def test_squares_left_out_are_those_of_the_errors():
     """
     space, problem = linearised(readings())
     posterior = solve(space, problem, space.start_tolerances(), ONES)
-    wanted = np.zeros((problem.fold.max() + 1, len(KINDS)))
-    np.add.at(wanted, (problem.fold, problem.kind), (held_out(problem, posterior) * posterior.noise[problem.kind]) ** 2)
-    np.testing.assert_allclose(held_out_squares(problem, condense(problem, posterior), posterior), wanted, rtol=1e-3)
+    condensed, wanted = condense(problem, posterior), np.zeros((problem.fold.max() + 1, len(KINDS)))
+    errors = held_out(problem, condensed, posterior) * posterior.noise[problem.kind]
+    np.add.at(wanted, (problem.fold, problem.kind), errors**2)
+    np.testing.assert_allclose(held_out_squares(problem, condensed, posterior), wanted, rtol=1e-3)
 
 
 def log_evidence(space: ParameterSpace, problem: LinearProblem, tolerances: np.ndarray, noise: np.ndarray) -> float:
