@@ -12,6 +12,7 @@ from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
 from ..measurements.readings import AXES, Stations
 from ..pose import rotation_from_angles
 from ..virtual.trial import without_datum
+from .cell_rows import at_once
 from .estimation import Estimation
 from .linear_problem import LinearProblem, Posterior, physical_covariance
 from .parameters import ParameterSpace
@@ -312,11 +313,13 @@ def left_errors(
     left, possible : ndarray, shape (M, 6, D)
         m and rad; possible ones also have what the readings do not rule out.
     """
-    left = derivatives(space, prediction, stations) @ _drawn(covariance)
+    slopes = derivatives(space, prediction, stations)
     if allowed is None:
+        left = slopes @ _drawn(covariance)
         return left, left
     wide_space, shift, wide_covariance = allowed
-    return left, derivatives(wide_space, prediction, stations) @ (shift[:, None] + _drawn(wide_covariance))
+    drawn, wide = at_once(_drawn, (covariance, wide_covariance))
+    return slopes @ drawn, derivatives(wide_space, prediction, stations) @ (shift[:, None] + wide)
 
 
 def _aligned_rms(points: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -200,19 +200,21 @@ class Table:
     def numbers(self, columns: list[tuple[int, float]]) -> np.ndarray:
         """Return the finite numbers of some columns in SI, shape (rows, columns)."""
         values = np.empty((len(self.rows), len(columns)))
-        known: list[dict[str, float]] = [{} for _ in columns]  # places come again and again
-        for n, (line, row) in enumerate(self.rows):
-            for k, (index, unit) in enumerate(columns):
+        for k, (index, unit) in enumerate(columns):
+            known: dict[str, float] = {}  # places come again and again
+            for line, row in self.rows:
                 text = row[index]
-                if text not in known[k]:
-                    known[k][text] = si_from_text(text, self.number(line, index, text), unit)
-                values[n, k] = known[k][text]
+                if text not in known:
+                    known[text] = si_from_text(text, self.number(line, index, text), unit)
+            values[:, k] = [known[row[index]] for _, row in self.rows]
         return values
 
     def texts(self, name: str) -> list[str]:
         """Return the cells of a column that must be there, without spaces around them."""
         index = self.required((name,), None)[0][0]
-        return [unmarked(row[index].strip()) for _, row in self.rows]
+        cells = [row[index] for _, row in self.rows]
+        known = {cell: unmarked(cell.strip()) for cell in set(cells)}
+        return [known[cell] for cell in cells]
 
     def poses(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the poses of the columns that :func:`read_poses` describes, shapes (N, 3), (N, 3, 3)."""

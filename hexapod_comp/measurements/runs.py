@@ -5,16 +5,18 @@ Runs are recognised as lines, equal commands become one station, poses out of re
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
+from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import InputFileError
 from ..machine.geometry import HexapodGeometry
-from ..machine.kinematics import Structure, strut_lengths
-from ..machine.passes import Passes
-from ..pose import Pose
+from ..machine.kinematics import Structure, strut_lengths_batch
+from ..machine.passes import Passes, Poses
+from ..pose import Pose, stacked
 from .readings import (
     ANGULAR_KINDS,
     BACKWARD,
@@ -37,6 +39,12 @@ SAME = 1e-9
 
 SHORTEST_LENGTH = 1e-3
 """A length shorter than this, m, has no direction: its centre is known to some millimetres only."""
+
+NUMBER_OF = {channel: number for number, channel in enumerate(CHANNELS)}
+"""Index into :data:`CHANNELS`."""
+
+OF_LINES = np.isin(np.array(KINDS)[KIND_OF], LINE_KINDS)
+"""Whether each channel is read along a line."""
 
 LARGEST_READING = 10.0
 """No machine errs by more, and no instrument's zero lies further off, m or rad."""
@@ -72,12 +80,21 @@ def assemble(
         No readings, an unknown channel, values not finite, poses out of reach, line channels without a line.
     """
     probe = np.array(geometry.tool.position if probe is None else probe, dtype=float)
-    _check_readings(readings)
-    poses = _platform_poses(geometry, readings)
-    points = np.array([pose.position + pose.rotation @ probe for pose in poses])
+    _check_channels(readings)
+    arrays = _Arrays(
+        cycle=np.array([r.cycle for r in readings]),
+        direction=np.array([r.direction for r in readings]),
+        channel=np.array([NUMBER_OF[r.channel] for r in readings]),
+        value=np.array([r.value for r in readings], dtype=float),
+        uncertainty=np.array([r.uncertainty for r in readings], dtype=float),
+    )
+    _check_values(readings, arrays)
+    poses, place = _platform_poses(geometry, readings)
+    points = (poses[0] + poses[1] @ probe)[place]
     centre = _centres(geometry, readings, points)
-    runs, run_of, swapped = _runs(readings, points, geometry.work.rotation.T)
-    stations, station = _collect_stations(geometry, readings, poses, [runs[i] for i in run_of], in_reach)
+    runs, run_of, swapped = _runs(readings, arrays, points, geometry.work.rotation.T)
+    of_readings = zip(readings, place.tolist(), [runs[i] for i in run_of.tolist()], strict=True)
+    stations, station = _collect_stations(geometry, list(of_readings), poses, in_reach)
     return MeasurementSet(
         geometry=geometry,
         probe=probe,
@@ -85,11 +102,7 @@ def assemble(
         stations=stations,
         station=station,
         run=run_of,
-        cycle=np.array([r.cycle for r in readings]),
-        direction=np.array([r.direction for r in readings]),
-        channel=np.array([CHANNELS.index(r.channel) for r in readings]),
-        value=np.array([r.value for r in readings], dtype=float),
-        uncertainty=np.array([r.uncertainty for r in readings], dtype=float),
+        **arrays._asdict(),
         centre=centre,
         sources=tuple(r.source for r in readings),
         files=tuple(files),
@@ -97,30 +110,46 @@ def assemble(
     )
 
 
+class _Arrays(NamedTuple):
+    """What a set has of each reading as it stands there, shape (N,) each; or a part of that."""
+
+    cycle: np.ndarray
+    direction: np.ndarray
+    channel: np.ndarray
+    value: np.ndarray
+    uncertainty: np.ndarray
+
+    def select(self, rows: list[int]) -> _Arrays:
+        """Return those of some readings."""
+        return _Arrays(*(array[rows] for array in self))
+
+
 def _runs(
-    readings: Sequence[Reading], points: np.ndarray, along: np.ndarray
+    readings: Sequence[Reading], arrays: _Arrays, points: np.ndarray, along: np.ndarray
 ) -> tuple[tuple[Run, ...], np.ndarray, list[str]]:
     """Return the runs, each reading's run, and remarks on runs whose directions look swapped."""
     members: dict[str, list[int]] = {}
     for index, reading in enumerate(readings):
         members.setdefault(reading.run, []).append(index)
-    parts = [([readings[i] for i in rows], points[rows]) for rows in members.values()]
+    parts = [([readings[i] for i in rows], arrays.select(rows), points[rows]) for rows in members.values()]
     runs = tuple(_recognise(*part, along) for part in parts)
     number = {name: index for index, name in enumerate(members)}
     notes = [_swapped_note(run, *part) for run, part in zip(runs, parts, strict=True)]
     return runs, np.array([number[r.run] for r in readings]), [note for note in notes if note]
 
 
-def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> list[Pose]:
-    """Return the commanded ``pose_platform_in_base`` of each reading; equal poses are one object."""
-    known: dict[bytes, Pose] = {}
-    poses = []
-    for reading in readings:
-        key = reading.pose.position.tobytes() + reading.pose.rotation.tobytes()
-        if key not in known:
-            known[key] = geometry.platform_pose(reading.pose)
-        poses.append(known[key])
-    return poses
+def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> tuple[Poses, np.ndarray]:
+    """Return the different commanded ``pose_platform_in_base``, and the number of each reading's."""
+    objects: dict[int, int] = {}
+    values: dict[bytes, int] = {}
+    poses: list[Pose] = []
+    for pose in (reading.pose for reading in readings):
+        if id(pose) not in objects:
+            key = pose.position.tobytes() + pose.rotation.tobytes()
+            objects[id(pose)] = values.setdefault(key, len(poses))
+            if objects[id(pose)] == len(poses):
+                poses.append(pose)
+    return geometry.platform_poses(*stacked(poses)), np.array([objects[id(reading.pose)] for reading in readings])
 
 
 def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.ndarray) -> np.ndarray:
@@ -152,31 +181,40 @@ def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.
     return centres
 
 
-def _check_readings(readings: Sequence[Reading]) -> None:
+def _check_channels(readings: Sequence[Reading]) -> None:
     """Refuse what no instrument reads."""
     if not readings:
         raise InputFileError("measurements", "", "hold no reading")
     for r in readings:
-        if r.channel not in CHANNELS:
+        if r.channel not in NUMBER_OF:
             raise InputFileError(r.source.file, _line(r), f"channel must be one of {', '.join(CHANNELS)}", r.channel)
-        unit = "rad" if KINDS[KIND_OF[CHANNELS.index(r.channel)]] in ANGULAR_KINDS else "m"
-        if not np.isfinite(r.value):
-            raise InputFileError(r.source.file, _line(r), "value must be finite", r.value)
-        if abs(r.value) > LARGEST_READING:
-            problem = f"value must be within ±{LARGEST_READING:g} {unit}: it is the error, actual minus commanded"
-            raise InputFileError(r.source.file, _line(r), problem, r.value)
-        if r.uncertainty <= 0.0 or np.isinf(r.uncertainty):
-            raise InputFileError(r.source.file, _line(r), "uncertainty must be finite and above zero", r.uncertainty)
-        if not (np.isnan(r.uncertainty) or SMALLEST_UNCERTAINTY <= r.uncertainty <= LARGEST_READING):
-            problem = f"uncertainty must be {SMALLEST_UNCERTAINTY:g}…{LARGEST_READING:g} {unit}"
-            raise InputFileError(r.source.file, _line(r), problem, r.uncertainty)
+
+
+def _check_values(readings: Sequence[Reading], arrays: _Arrays) -> None:
+    """Refuse values and uncertainties that no instrument has."""
+    value, uncertainty = arrays.value, arrays.uncertainty
+    possible = (uncertainty >= SMALLEST_UNCERTAINTY) & (uncertainty <= LARGEST_READING)
+    wrong = np.flatnonzero(~((np.abs(value) <= LARGEST_READING) & (np.isnan(uncertainty) | possible)))
+    if not len(wrong):
+        return
+    r = readings[wrong[0]]
+    unit = "rad" if KINDS[KIND_OF[NUMBER_OF[r.channel]]] in ANGULAR_KINDS else "m"
+    if not np.isfinite(r.value):
+        raise InputFileError(r.source.file, _line(r), "value must be finite", r.value)
+    if abs(r.value) > LARGEST_READING:
+        problem = f"value must be within ±{LARGEST_READING:g} {unit}: it is the error, actual minus commanded"
+        raise InputFileError(r.source.file, _line(r), problem, r.value)
+    if r.uncertainty <= 0.0 or np.isinf(r.uncertainty):
+        raise InputFileError(r.source.file, _line(r), "uncertainty must be finite and above zero", r.uncertainty)
+    problem = f"uncertainty must be {SMALLEST_UNCERTAINTY:g}…{LARGEST_READING:g} {unit}"
+    raise InputFileError(r.source.file, _line(r), problem, r.uncertainty)
 
 
 def _line(reading: Reading) -> str:
     return f"line {reading.source.line}" if reading.source.line else f"run {reading.run}"
 
 
-def _recognise(readings: list[Reading], points: np.ndarray, work_axes: np.ndarray) -> Run:
+def _recognise(readings: list[Reading], arrays: _Arrays, points: np.ndarray, work_axes: np.ndarray) -> Run:
     """Return a run from its readings and their commanded points (n, 3), with its line if it has line channels.
 
     Which way along the line is forward is a matter of the work frame, whose axes are the rows of `work_axes`.
@@ -188,10 +226,10 @@ def _recognise(readings: list[Reading], points: np.ndarray, work_axes: np.ndarra
         mixed.
     """
     first, name = readings[0], readings[0].run
-    of_lines = {KINDS[KIND_OF[CHANNELS.index(r.channel)]] in LINE_KINDS for r in readings}
-    if len(of_lines) == 2:
+    of_line = OF_LINES[arrays.channel]
+    if of_line.any() and not of_line.all():
         raise InputFileError(first.source.file, f"run {name}", "mixes channels of a line with others")
-    if of_lines == {False}:
+    if not of_line.any():
         return Run(name, np.zeros(3), points[0], first.known_zero)
     spread = points - points[0]
     far = spread[np.linalg.norm(spread, axis=1).argmax()]
@@ -209,74 +247,82 @@ def _recognise(readings: list[Reading], points: np.ndarray, work_axes: np.ndarra
 
 
 def _collect_stations(
-    geometry: HexapodGeometry, readings: Sequence[Reading], poses: list[Pose], runs: list[Run], in_reach: bool
+    geometry: HexapodGeometry, readings: Sequence[tuple[Reading, int, Run]], poses: Poses, in_reach: bool
 ) -> tuple[Stations, np.ndarray]:
-    """Return the distinct stations and each reading's index among them; poses and runs per reading."""
+    """Return the distinct stations and each reading's index among them; readings with the numbers of their poses."""
     known: dict[tuple, int] = {}
     rows: list[tuple] = []
     ways: list[np.ndarray] = []  # of travel, where a run is a line that is passed forward or backward
-    index = np.empty(len(readings), dtype=int)
-    nominal = Structure.of(geometry)
-    warming = len({r.temperatures for r in readings}) > 1  # else when it was does not matter, and passes are alike
+    index: list[int] = []
+    lengths = strut_lengths_batch(Structure.of(geometry), *poses)
+    warming = (
+        len({r.temperatures for r, _, _ in readings}) > 1
+    )  # else when it was does not matter, and passes are alike
     here: tuple | None = None
     before: int | None = None
-    for n, (r, pose, run) in enumerate(zip(readings, poses, runs, strict=True)):
-        place = (r.run, id(pose), r.commands)
+    for r, pose, run in readings:
+        place = (r.run, pose, r.commands)
         if here is not None and place != here:
-            before = int(index[n - 1]) if readings[n - 1].run == r.run else None
+            before = index[-1] if here[0] == r.run else None
         here = place
         # A station belongs to a run: lines that cross at a point pass it in different ways.
-        came_from = rows[before] if before is not None and r.direction == FROM_PREVIOUS else None
-        time = r.time if warming else np.nan
-        key = (place, r.direction, None if came_from is None else before, r.temperatures, str(time), str(r.humidity))
+        came_from = before if r.direction == FROM_PREVIOUS else None
+        time = r.time if warming else math.nan
+        air = (None if math.isnan(time) else time, None if math.isnan(r.humidity) else r.humidity)
+        key = (place, r.direction, came_from, r.temperatures, air)
         if key not in known:
-            lengths = strut_lengths(nominal, pose)
+            own = poses[0][pose], poses[1][pose], lengths[pose]
             if in_reach:
-                _check_reach(geometry, pose, lengths, r)
-            commands = np.array(lengths if r.commands is None else r.commands, dtype=float)
+                _check_reach(geometry, *own, r)
+            commands = own[2] if r.commands is None else np.array(r.commands, dtype=float)
             known[key] = len(rows)
-            sense = _sense(pose, commands, came_from)
-            rows.append((pose.position, pose.rotation, commands, sense, r.temperatures, time, r.humidity))
+            sense = _sense(own[0], commands, None if came_from is None else rows[came_from])
+            rows.append((*own[:2], commands, sense, r.temperatures, time, r.humidity))
             ways.append(r.direction * run.axis if r.direction in (FORWARD, BACKWARD) else np.zeros(3))
-        index[n] = known[key]
+        index.append(known[key])
     columns = [np.array(column, dtype=float) for column in zip(*rows, strict=True)]
     along = np.array(ways).any(axis=1)
     columns[3][along] = Passes(geometry, *(part[along] for part in (*columns[:2], np.array(ways)))).senses()
-    return Stations(*columns), index
+    return Stations(*columns), np.array(index)
 
 
-def _check_reach(geometry: HexapodGeometry, pose: Pose, lengths: np.ndarray, reading: Reading) -> None:
+def _check_reach(
+    geometry: HexapodGeometry, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray, reading: Reading
+) -> None:
     """Refuse a commanded pose that the machine cannot have taken."""
-    refusal = geometry.refusal(pose.position, pose.rotation, lengths)
+    refusal = geometry.refusal(position, rotation, lengths)
     if refusal is not None:
         problem = f"the commanded pose is out of the machine's reach: {refusal}"
         raise InputFileError(reading.source.file, _line(reading), problem)
 
 
-def _sense(pose: Pose, commands: np.ndarray, came_from: tuple | None) -> np.ndarray:
+def _sense(position: np.ndarray, commands: np.ndarray, came_from: tuple | None) -> np.ndarray:
     """Return the directions of motion at a station that is reached from the one before, shape (9,)."""
     if came_from is not None:
-        change = np.concatenate([pose.position - came_from[0], commands - came_from[2]])
+        change = np.concatenate([position - came_from[0], commands - came_from[2]])
         return np.sign(change) * (np.abs(change) > SAME)
     return np.zeros(9)
 
 
-def _swapped_note(run: Run, readings: list[Reading], points: np.ndarray) -> str:
+def _swapped_note(run: Run, readings: list[Reading], arrays: _Arrays, points: np.ndarray) -> str:
     """Return a remark on a line whose rows run against both their directions, else nothing."""
     if not run.is_line:
         return ""
     along = points @ run.axis
-    way = {direction: _way(readings, along, direction) for direction in (FORWARD, BACKWARD)}
+    way = {direction: _way(arrays, along, direction) for direction in (FORWARD, BACKWARD)}
     if not way[FORWARD] < 0.0 < way[BACKWARD]:
         return ""
     return f"{readings[0].source}: run {run.name}: rows called forward run backward and vice versa; swapped?"
 
 
-def _way(readings: list[Reading], along: np.ndarray, direction: int) -> float:
+def _way(arrays: _Arrays, along: np.ndarray, direction: int) -> float:
     """Return the way from the first to the last row of the first pass in a direction, m."""
-    chosen = [(r.cycle, r.channel, a) for r, a in zip(readings, along, strict=True) if r.direction == direction]
-    first_pass = [a for cycle, channel, a in chosen if (cycle, channel) == chosen[0][:2]]
-    return float(first_pass[-1] - first_pass[0]) if first_pass else 0.0
+    chosen = np.flatnonzero(arrays.direction == direction)
+    if not len(chosen):
+        return 0.0
+    alike = (each[chosen] == each[chosen[0]] for each in (arrays.cycle, arrays.channel))
+    first_pass = along[chosen[np.logical_and(*alike)]]
+    return float(first_pass[-1] - first_pass[0])
 
 
 def joined(sets: Sequence[MeasurementSet]) -> MeasurementSet:

@@ -70,7 +70,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import InputFileError, PoseError
-from ..formats.csv import Table
+from ..formats.csv import Table, exact
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..pose import Pose
 from .air import Air, correct_displacement
@@ -179,7 +179,7 @@ def _file_readings(
         for channel, value in pairs:
             reading = (names[row.run], row.cycle, row.direction, row.pose, channel, value, row.uncertainty)
             source = FileLine(file, row.line)
-            state = row.temperatures, commands.get(visits[n]), source, row.time
+            state = row.temperatures, commands.get(visits[n]) if commands else None, source, row.time
             readings.append(Reading(*reading, *state, row.centre, row.known_zero, row.humidity))
     if not readings:
         raise InputFileError(file, "", "holds strut readings only: nothing that was measured")
@@ -320,4 +320,4 @@ def _minus(row: TidyRow, commanded: float) -> float:
     power = round(math.log10(row.unit))
     if 10.0**power != row.unit:
         return row.value - commanded
-    return float(row.decimal.scaleb(power) - Decimal(repr(commanded)))
+    return float(exact(row.text, float(row.text)).scaleb(power) - Decimal(repr(commanded)))

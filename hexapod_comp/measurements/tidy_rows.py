@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from decimal import Decimal
 from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import InputFileError
-from ..formats.csv import Table, exact, si_from_text
+from ..formats.csv import Table, si_from_text
 from ..formats.yaml import UNITS, spellings
 from ..machine.geometry import STRUT_NAMES
 from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
@@ -48,7 +47,7 @@ FURTHEST_CENTRE = 100.0
 
 
 class TidyRow(NamedTuple):
-    """A row of a file; value and uncertainty in SI, `decimal` is the value as it stands there, in `unit`."""
+    """A row of a file; value and uncertainty in SI, `text` is the value as it stands there, in `unit`."""
 
     run: str
     cycle: int
@@ -56,7 +55,7 @@ class TidyRow(NamedTuple):
     pose: Pose
     channel: str
     value: float
-    decimal: Decimal
+    text: str
     unit: float
     uncertainty: float
     temperatures: tuple[float, ...]
@@ -88,7 +87,7 @@ def read_rows(table: Table) -> list[TidyRow]:
             sizes[key] = _unit_size(table, line, *key)
         text = cells[value_column]
         number = table.number(line, value_column, text)
-        value = (si_from_text(text, number, sizes[key]), exact(text, number), sizes[key])
+        value = (si_from_text(text, number, sizes[key]), text, sizes[key])
         uncertainty = _uncertainty(table, line, cells, uncertainty_column, sizes[key])
         place = (runs[n], cycles[n], directions[n], poses[n], channels[n])
         set_up = air[n], centres[n], known[n]
@@ -120,26 +119,29 @@ def _directions(table: Table) -> list[int]:
 def _poses(table: Table) -> list[Pose]:
     """Return the commanded poses; rows with the same one share the object."""
     positions, rotations = table.poses()
+    new = np.ones(len(positions), dtype=bool)  # most rows have the pose of the one before
+    new[1:] = (positions[1:] != positions[:-1]).any(axis=1) | (rotations[1:] != rotations[:-1]).any(axis=(1, 2))
     known: dict[bytes, Pose] = {}
     poses = []
-    for position, rotation in zip(positions, rotations, strict=True):
+    for position, rotation in zip(positions[new], rotations[new], strict=True):
         key = position.tobytes() + rotation.tobytes()
         if key not in known:
             known[key] = Pose(position, rotation)
         poses.append(known[key])
-    return poses
+    return [poses[n] for n in (np.cumsum(new) - 1).tolist()]
 
 
 def _cycles(table: Table) -> list[int]:
     """Return the numbers of the passes, 1 without a column."""
     if table.column("cycle", None) is None:
         return [1] * len(table.rows)
-    cycles = []
-    for (line, _), text in zip(table.rows, table.texts("cycle"), strict=True):
-        if not (text.isascii() and text.isdigit() and int(text[:9]) >= 1 and len(text) < 10):
-            raise InputFileError(table.path, f"line {line}, column cycle", "must be a whole number from 1", text)
-        cycles.append(int(text))
-    return cycles
+    texts, numbers = table.texts("cycle"), dict[str, int]()
+    for (line, _), text in zip(table.rows, texts, strict=True):
+        if text not in numbers:
+            if not (text.isascii() and text.isdigit() and int(text[:9]) >= 1 and len(text) < 10):
+                raise InputFileError(table.path, f"line {line}, column cycle", "must be a whole number from 1", text)
+            numbers[text] = int(text)
+    return [numbers[text] for text in texts]
 
 
 def _optional(
@@ -174,7 +176,10 @@ def _temperatures(table: Table) -> list[tuple[float, ...]]:
 
     everywhere = np.nan_to_num(read("temperature"), nan=REFERENCE_TEMPERATURE)
     columns = [np.where(np.isnan(own := read(name)), everywhere, own) for name in Temperatures.NAMES]
-    return list(map(tuple, np.stack(columns, axis=1).tolist()))
+    rows = np.stack(columns, axis=1)
+    if (rows == rows[0]).all():
+        return [tuple(rows[0].tolist())] * len(rows)
+    return list(map(tuple, rows.tolist()))
 
 
 def _air(table: Table) -> tuple[list[tuple[float, ...] | None], list[float]]:
@@ -196,6 +201,8 @@ def _air(table: Table) -> tuple[list[tuple[float, ...] | None], list[float]]:
             )
         )
     air: list[tuple[float, ...] | None] = []
+    if np.isnan(index).all():
+        return [None] * len(index), columns[-1]
     for (line, _), *row in zip(table.rows, *columns, strict=True):
         if math.isnan(row[0]):
             air.append(None)
@@ -214,8 +221,11 @@ def _centres(table: Table) -> list[tuple[float, ...] | None]:
         allowed = f"±{FURTHEST_CENTRE:g} m"
         return _optional(table, f"centre_{axis}", "length", lambda v: abs(v) <= FURTHEST_CENTRE, allowed, blank=True)
 
+    columns = [read(axis) for axis in AXES]
+    if np.isnan(columns).all():
+        return [None] * len(table.rows)
     centres: list[tuple[float, ...] | None] = []
-    for (line, _), *centre in zip(table.rows, *map(read, AXES), strict=True):
+    for (line, _), *centre in zip(table.rows, *columns, strict=True):
         missing = [axis for axis, value in zip(AXES, centre, strict=True) if math.isnan(value)]
         if len(missing) in (1, 2):
             raise InputFileError(table.path, f"line {line}", f"has a centre without its centre_{missing[0]}")
