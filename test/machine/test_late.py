@@ -9,13 +9,16 @@ import pytest
 from calibration_helpers import paper
 from scipy.integrate import solve_ivp
 
-from hexapod_comp.errors import InputFileError, ModelError
+from hexapod_comp.errors import InputFileError, KinematicsError, ModelError
 from hexapod_comp.kernels.struts import GROWTH
+from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
 from hexapod_comp.machine.late import PARTS, LateGrowth, late
 from hexapod_comp.machine.model import MachineModel, MachinesByTemperature, ModelOrigin, RealMachine
 from hexapod_comp.machine.model_file import load_model, save_model
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.temperatures import Temperatures
+from hexapod_comp.pose import Pose
+from hexapod_comp.virtual.trial import drive
 
 TIMES = np.array([5.0, 65.0, 66.0, 200.0, 900.0, 1000.0])
 VALUES = np.array([20.0, 20.4, 20.4, 21.5, 23.0, 22.1])
@@ -82,6 +85,27 @@ def test_a_machine_grows_by_one_thermometer_and_what_is_behind_it():
     np.testing.assert_allclose(warm.structure.base_joints - nominal, -11.5e-6 * nominal, atol=1e-15)
     own = RealMachine(paper(), warming_model(thermometer=""), Temperatures({"strut_3": 24.0, "base": 22.0}))
     assert own.strut_arrays[0][2, GROWTH] == pytest.approx(44e-6)  # its own reading; at rest
+
+
+def test_stations_driven_together_go_where_each_goes_alone():
+    """Four in a row, the middle two alike: to the bit. The third is then told a length that no pose has, and named."""
+    temperatures, humidity = np.full((4, 8), 20.0), np.full(4, np.nan)
+    temperatures[1:3, 6], temperatures[3, 2] = 23.0, 25.0
+    machines = MachinesByTemperature(paper(), warming_model()).at_each(temperatures, np.full(4, np.nan), humidity)
+    assert machines[1] is machines[2]
+    assert len(set(machines)) == 3
+    home = paper().home
+    positions = home.position + 1e-3 * np.arange(12.0).reshape(4, 3)
+    rotations, senses = np.tile(home.rotation, (4, 1, 1)), np.tile([1.0, -1.0, 1.0], (4, 3))
+    commands = strut_lengths_batch(Structure.of(paper()), positions, rotations)
+    driven = drive(machines, (positions, rotations), senses, commands).actual
+    for n, machine in enumerate(machines):
+        alone, _ = machine.pose_for(commands[n], senses[n], Pose(positions[n], rotations[n]))
+        assert (driven[0][n] == alone.position).all()
+        assert (driven[1][n] == alone.rotation).all()
+    commands[2, 0] = 100.0
+    with pytest.raises(KinematicsError, match="row 2"):
+        drive(machines, (positions, rotations), senses, commands, lambda n: f"row {n}")
 
 
 def test_a_file_brings_the_same_model_back(tmp_path: Path):
