@@ -95,7 +95,8 @@ def random_struts(rng: np.random.Generator) -> StrutErrors:
     )
     harmonics = np.arange(1, rng.integers(1, 5) + 1)
     waves = rng.uniform(-20e-6, 20e-6, (2, 6, len(harmonics))) / harmonics**2  # steep enough for a screw
-    return replace(struts, cosine=waves[0], sine=waves[1])
+    worn = rng.uniform(-25e-6, 25e-6, (6, 5))
+    return replace(struts, cosine=waves[0], sine=waves[1], map_backlash=worn)
 
 
 def random_model(rng: np.random.Generator, machine: str) -> MachineModel:

@@ -60,7 +60,7 @@ ALL = (
 )
 """What is left out in turn."""
 
-GENERAL, FINE_TERMS = ("map", "field displacement", "field rotation", "field reversal"), 0.3
+GENERAL, FINE_TERMS = ("map", "backlash map", "field displacement", "field rotation", "field reversal"), 0.3
 """Blocks of coarse and fine terms; and how well the size of the fine ones is known by that of the coarse, as the
 standard deviation of its logarithm."""
 

@@ -21,7 +21,7 @@ from ..machine.model import MachineModel
 from ..machine.struts import StrutErrors
 from ..machine.temperatures import REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE
 from ..measurements.readings import AXES, MeasurementSet, Stations, spans
-from .smooth_field import COMPONENT_UNITS, SmoothField, map_knots, map_root
+from .smooth_field import COMPONENT_UNITS, SmoothField, map_knots, map_root, wear_knots
 
 MOST_BEYOND = 0.05
 """Encoders may read this far beyond the stroke, m: their zeros are not the geometry's."""
@@ -48,6 +48,7 @@ TOLERANCES = {
     "wave 4": 1e-6,
     "backlash": 5e-6,
     "map": 5e-6,
+    "backlash map": 2e-6,
     "field displacement": 5e-6,
     "field rotation": 20e-6,
     "field reversal": 1e-6,
@@ -229,8 +230,8 @@ class ParameterSpace:
         Which ball joint each strut ends in.
     periods : ndarray, shape (6,)
         Screw wave period, m.
-    knots : ndarray, shape (n,)
-        Commands of the length map's knots, m.
+    knots : dict of ndarray, shape (n,)
+        Commands of the knots of the length map and of the backlash map, m.
     field : SmoothField
         The field's basis.
     """
@@ -244,13 +245,14 @@ class ParameterSpace:
         self.home_lengths = strut_lengths(Structure.of(geometry), geometry.home)
         self.platform_groups = _groups(geometry, settings.shared_platform_joints)
         self.periods = _periods(geometry, settings.lead)
-        self.knots = map_knots(*region.commands)
+        knots = map_knots(*region.commands)
+        self.knots = {"map": knots, "backlash map": wear_knots(knots)}
         self.box, self.platform_box, self.work_box = region.box, region.platform_box, region.work_box
         self.level, self.probe = region.level, region.probe
         self.field = SmoothField(self.box, settings.field_degree)
         self.blocks = tuple(self._make_blocks())
         self.size = self.blocks[-1].part.stop
-        self._cardinal = CubicSpline(self.knots, np.eye(len(self.knots)), bc_type="natural")
+        self._cardinal = {n: CubicSpline(k, np.eye(len(k)), bc_type="natural") for n, k in self.knots.items()}
 
     def places(self, in_work: np.ndarray) -> np.ndarray:
         """Return points (n, 3) of the work frame in ``base``, m."""
@@ -285,9 +287,9 @@ class ParameterSpace:
         if name in WAVES:
             labels = [f"{s} {name} {part}" for s in STRUT_NAMES for part in ("cosine", "sine")]
             return np.eye(12), tuple(labels), "m"
-        if name == "map":
-            root = np.kron(np.eye(6), map_root(self.knots))
-            labels = [f"{s} map at {1e3 * k:.0f} mm" for s in STRUT_NAMES for k in self.knots]
+        if name in self.knots:
+            root = np.kron(np.eye(6), map_root(self.knots[name]))
+            labels = [f"{s} {name} at {1e3 * k:.0f} mm" for s in STRUT_NAMES for k in self.knots[name]]
             return root, tuple(labels), "m"
         if name == "field reversal":
             terms = self.field.reversal_terms
@@ -359,9 +361,9 @@ class ParameterSpace:
         """Return the prior's covariance of x, shape (size, size), SI."""
         return self.physical(self.physical(np.diag(self.spread(tolerances) ** 2)).T)
 
-    def spline_weights(self, commands: np.ndarray) -> np.ndarray:
-        """Return what each knot's value adds at some commands (n,), shape (n, knots)."""
-        return self._cardinal(np.clip(commands, self.knots[0], self.knots[-1]))
+    def spline_weights(self, commands: np.ndarray, name: str = "map") -> np.ndarray:
+        """Return what each value at a map's knots adds at some commands (n,), shape (n, knots)."""
+        return self._cardinal[name](np.clip(commands, *self.knots[name][[0, -1]]))
 
     def model(self, x: np.ndarray, name: str = "joint calibration", with_field: bool = True) -> MachineModel:
         """Return the machine that a parameter vector means.
@@ -381,8 +383,8 @@ class ParameterSpace:
         joints, offset = np.split(self._values(x, "structure"), [-6])
         structure = joints.reshape(-1, 3)
         waves = np.stack([self._values(x, name, 12).reshape(6, 2) for name in WAVES], axis=1)
-        values = self._values(x, "map", 0).reshape(6, -1)
-        has_map = bool(values.size) and bool(values.any())
+        lengths, backlash = (self._values(x, name, 6 * len(k)).reshape(6, -1) for name, k in self.knots.items())
+        knots = self.knots["map"] if lengths.any() or backlash.any() else np.zeros(0)
         expansion = self.stated_expansion + self._values(x, "expansion", len(PARTS))
         struts = StrutErrors(
             offset=offset,
@@ -394,8 +396,9 @@ class ParameterSpace:
             backlash=np.maximum(self._values(x, "backlash", 6), 0.0),
             expansion=expansion[:6],
             moisture=np.full(6, (self.settings.strut_moisture or 0.0) + self._values(x, "moisture", 1)[0]),
-            map_knots=self.knots if has_map else np.zeros(0),
-            map_values=values if has_map else np.zeros((6, 0)),
+            map_knots=knots,
+            map_values=lengths[:, : len(knots)],
+            map_backlash=backlash @ self.spline_weights(knots, "backlash map").T,
         )
         return MachineModel(
             machine=self.geometry.name,

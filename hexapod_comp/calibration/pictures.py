@@ -196,7 +196,7 @@ def _strut_panel(axes: Axes, fit: ModelFit) -> None:
     commands = fit.measurements.stations.commands
     for strut, name in enumerate(STRUT_NAMES):
         at = np.linspace(commands[:, strut].min(), commands[:, strut].max(), 4 * SAMPLES)
-        errors = [smooth_error(c, *struts, strut)[0] - fit.model.struts.offset[strut] for c in at]
+        errors = [smooth_error(c, 0.0, *struts, strut)[0] - fit.model.struts.offset[strut] for c in at]
         axes.plot(at * 1e3, np.array(errors) * 1e6, lw=0.8, label=name)
     axes.set(title="strut errors: pitch, screw wave, length map", xlabel="command, mm", ylabel="error, µm")
     axes.legend(ncols=2, fontsize=7)

@@ -26,7 +26,8 @@ LEAST_GAIN = 1e-4
 """A block does not help when its gain is below this: it is rounding, which depends on the libraries, or of no use."""
 
 HARMONICS = ("wave 2", "wave 3", "wave 4")
-"""What not every screw has, and no general block explains."""
+RARE = (HARMONICS, ("backlash map",))
+"""What not every screw has, and no general block explains: harmonics, and wear."""
 
 EXPECTED = ("pitch", "wave", "backlash", "expansion", "moisture", "late")
 """Errors that every screw has, and growth: they stay when they help at all. Of a length map or a field nobody knows
@@ -81,10 +82,10 @@ def select(
 
     Where there is only one, nothing is left to fit without it, and no block is kept.
 
-    All blocks start in. The screw waves' harmonics go first, if all together do not help clearly. Then the general
-    block that helps least goes, until every one that is left helps clearly; then the harmonics that do not help
-    clearly, and the expected ones that do not even seem to help. Taking them in one by one instead can let a field
-    explain what a length map does better.
+    All blocks start in. The screw waves' harmonics go first, if all together do not help clearly, and the wear of the
+    screws in the same way. Then the general block that helps least goes, until every one that is left helps clearly;
+    then the harmonics that do not help clearly, and the expected ones that do not even seem to help. Taking them in one
+    by one instead can let a field explain what a length map does better.
 
     Parameters
     ----------
@@ -107,11 +108,12 @@ def select(
     names = [b.name for b in space.blocks[1:]]
     kept = list(names)
     gains: dict[str, Gain] = {}
-    harmonics = [name for name in names if name in HARMONICS]
-    if harmonics:
-        gains |= dict.fromkeys(harmonics, trials.gains(names, [tuple(harmonics)])[0])
-        kept = [name for name in names if name not in HARMONICS or gains[name].clear]
-    general = [name for name in names if name not in (*EXPECTED, *HARMONICS)]
+    rare = [part for every in RARE if (part := tuple(name for name in every if name in names))]
+    for part in rare:
+        gains |= dict.fromkeys(part, trials.gains(kept, [part])[0])
+        kept = [name for name in kept if name not in part or gains[name].clear]
+    trials.leave_out_the_rest(kept)
+    general = [name for name in names if name not in (*EXPECTED, *gains)]
     while True:
         # A block that helps clearly beside all others helps no less when some of them have gone.
         doubtful = [name for name in general if name in kept and not (name in gains and gains[name].clear)]
@@ -120,9 +122,9 @@ def select(
         if not doubtful:
             break
         kept.remove(min(doubtful, key=lambda name: gains[name].share / max(gains[name].uncertainty, 1e-12)))
-    if len(harmonics) > 1:
-        gains |= trials.single_gains(kept, [name for name in harmonics if name in kept])
-        kept = [name for name in kept if name not in HARMONICS or gains[name].clear]
+    for part in (part for part in rare if len(part) > 1):
+        gains |= trials.single_gains(kept, [name for name in part if name in kept])
+        kept = [name for name in kept if name not in part or gains[name].clear]
     gains |= trials.single_gains(kept, [name for name in names if name in EXPECTED])
     useful = [name for name in EXPECTED if name in kept and (gains[name].share > LEAST_GAIN or gains[name].clear)]
     kept = [name for name in kept if name not in EXPECTED or name in useful]
@@ -155,6 +157,10 @@ class _Trials:
         self._known |= dict(zip(new, at_once(self._outcome, new), strict=True))
         with_it, *others = (self._known[blocks] for blocks in sets)
         return [_gain(with_it, without) for without in others]
+
+    def leave_out_the_rest(self, names: Collection[str]) -> None:
+        """Look at folds by fewer rows from here on: all that is tried are parts of the blocks `names`."""
+        self._condensed = condense(self._problem, self.fit(names))
 
     def _solve(self, tolerances: np.ndarray, rounds: int) -> Posterior:
         return solve(self._space, self._problem, tolerances, self._noise, rounds)

@@ -79,12 +79,15 @@ def _without_negative_backlash(
     A nut cannot lead its screw, but an estimate can say so: by noise, or for swapped directions. Backlash −b
     in one direction is b in the other; cutting it off here would make the fit add it again in every step.
     """
-    block = space.block("backlash")
+    block, change = space.block("backlash"), space.block("backlash map")
     if block is None:
         return x, sense
     x, sense = x.copy(), sense.copy()
-    sense[:, 3:] *= np.where(x[block.part] < 0.0, -1.0, 1.0)
-    x[block.part] = np.abs(x[block.part])
+    turned = np.where(x[block.part] < 0.0, -1.0, 1.0)
+    sense[:, 3:] *= turned
+    x[block.part] *= turned
+    if change is not None:
+        x[change.part] *= np.repeat(turned, len(change.labels) // 6)
     return x, sense
 
 
@@ -201,6 +204,8 @@ def _factors(space: ParameterSpace, name: str, links: _Links, stations: Stations
         return np.stack([np.cos(phase), np.sin(phase)], axis=-1)
     if name == "map":
         return space.spline_weights(commands)
+    if name == "backlash map":
+        return -0.5 * stations.sense[:, 3:, None] * space.spline_weights(commands, name)
     factors = {"pitch": commands - space.home_lengths, "backlash": -0.5 * stations.sense[:, 3:]}
     factors["moisture"] = links.lengths * np.nan_to_num(stations.humidity - REFERENCE_HUMIDITY)[:, None]
     return factors[name][..., None]

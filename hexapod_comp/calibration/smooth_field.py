@@ -35,6 +35,9 @@ MOST_NODES = 17
 KNOT_DISTANCE = 0.017
 """Largest distance of the length map's knots, m: a wave of 60 mm has then three and a half knots."""
 
+WEAR_KNOTS = 2
+"""Wear is smoother than a length map: every second of its knots is enough."""
+
 MAP_CORRELATION_LENGTH = 0.04
 """How far the errors of a length map are alike, m (Matérn 5/2)."""
 
@@ -43,6 +46,15 @@ def map_knots(low: float, high: float) -> np.ndarray:
     """Return equidistant knots over the commands seen, at most :data:`KNOT_DISTANCE` apart."""
     span = max(high - low, KNOT_DISTANCE)
     return np.linspace(low, low + span, int(np.ceil(span / KNOT_DISTANCE)) + 1)
+
+
+def wear_knots(knots: np.ndarray) -> np.ndarray:
+    """Return those of a length map's knots that wear needs, both ends among them.
+
+    A natural spline through them is one through all knots.
+    """
+    last = len(knots) - 1
+    return knots[np.linspace(0, last, last // WEAR_KNOTS + 1 if last > WEAR_KNOTS else 2).round().astype(int)]
 
 
 def map_root(knots: np.ndarray) -> np.ndarray:

@@ -145,7 +145,7 @@ def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray) -> lis
     back = read_table(args.table)
     by_struts = trial.check(partial(commands_by_struts, back))
     by_poses = trial.check(partial(commands_by_poses, back))
-    lost = model.struts.backlash.max() * 1e6
+    lost = model.struts.largest_backlash.max() * 1e6
     backlash = [f"backlash of struts, up to {lost:.3f} µm: no pose correction fits six directions"] if lost else []
     return [("table, struts", by_struts, left_out), ("table, poses", by_poses, [*left_out, *backlash])]
 

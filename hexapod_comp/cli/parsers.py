@@ -277,6 +277,7 @@ def _bounds(parser: argparse.ArgumentParser) -> None:
         ("wave-period-mm", arguments.above_zero, one, "its period, mm (default: the geometry's lead, else 10)"),
         ("map-um", arguments.bound, one, "smooth length error of every strut, RMS µm (default 1)"),
         ("backlash-um", arguments.span, spans, "backlash of every strut, µm (default 2,4)"),
+        ("wear-um", arguments.bound, one, "how much more of it a screw has where it is worn most, µm (default 0)"),
         ("strut-expansion-ppm-per-k", arguments.span, spans, "thermal expansion of the struts (default 0)"),
         ("body-expansion-ppm-per-k", arguments.span, spans, "the same of base and platform (default 0)"),
         ("field-um", arguments.bound, one, "largest displacement by a field in space, µm (default 0)"),

@@ -89,8 +89,11 @@ def wave_error(cosine, sine, table, i):
 
 
 @compiled
-def error_at(command, cosine, sine, table, knots, pieces, i):
-    """Return (error, slope) as :func:`smooth_error`, for a screw whose angle is known."""
+def error_at(command, cosine, sine, sense, table, knots, pieces, i):
+    """Return (error, slope) as :func:`smooth_error`, for a screw whose angle is known.
+
+    Of `pieces`, the first four columns are the length map's, the others those of the change of the backlash.
+    """
     error = table[i, OFFSET] + table[i, PITCH] * (command - table[i, REFERENCE])
     slope = table[i, PITCH]
     if table[i, HARMONICS] != 0.0:
@@ -102,7 +105,9 @@ def error_at(command, cosine, sine, table, knots, pieces, i):
         held = min(knots[last], max(knots[0], command))
         piece = min(np.searchsorted(knots, held, side="right") - 1, last - 1)
         x = held - knots[piece]
-        a, b, c3, d = pieces[i, piece, 0], pieces[i, piece, 1], pieces[i, piece, 2], pieces[i, piece, 3]
+        half = -0.5 * sense
+        a, b = pieces[i, piece, 0] + half * pieces[i, piece, 4], pieces[i, piece, 1] + half * pieces[i, piece, 5]
+        c3, d = pieces[i, piece, 2] + half * pieces[i, piece, 6], pieces[i, piece, 3] + half * pieces[i, piece, 7]
         error += ((a * x + b) * x + c3) * x + d
         if held == command:
             slope += (3.0 * a * x + 2.0 * b) * x + c3
@@ -110,16 +115,16 @@ def error_at(command, cosine, sine, table, knots, pieces, i):
 
 
 @compiled
-def smooth_error(command, table, knots, pieces, i):
-    """Return (error, slope) of the part that depends on the command alone: offset, pitch, waves, map."""
+def smooth_error(command, sense, table, knots, pieces, i):
+    """Return (error, slope) of what depends on the command: offset, pitch, waves, map, and the backlash's change."""
     cosine, sine = screw_turn(command, table, i)
-    return error_at(command, cosine, sine, table, knots, pieces, i)
+    return error_at(command, cosine, sine, sense, table, knots, pieces, i)
 
 
 @compiled
 def actual_length(command, sense, shift, table, knots, pieces, i):
     """Return the real length of strut `i` for a command, m; `sense` is its direction of motion, −1…1."""
-    error, _ = smooth_error(command, table, knots, pieces, i)
+    error, _ = smooth_error(command, sense, table, knots, pieces, i)
     return (1.0 + table[i, GROWTH]) * (command + error - 0.5 * sense * table[i, BACKLASH] - shift)
 
 
@@ -135,7 +140,7 @@ def command_for_length(length, sense, shift, table, knots, pieces, i):
     command -= table[i, PITCH] * (command - table[i, REFERENCE])
     cosine, sine = screw_turn(command, table, i)
     for _ in range(8):
-        error, slope = error_at(command, cosine, sine, table, knots, pieces, i)
+        error, slope = error_at(command, cosine, sine, sense, table, knots, pieces, i)
         step = (wanted - command - error) / (1.0 + slope)
         command += step
         if abs(step) < 1e-9:  # Newton squares it: the rest is below rounding

@@ -128,6 +128,8 @@ def struts_block(struts: StrutErrors) -> dict[str, Any]:
     if len(struts.map_knots):
         knots = written(struts.map_knots, "length", "mm")
         block["map"] = {"knots_mm": knots, "values_um": written(struts.map_values, "length", "um")}
+        if struts.map_backlash.any():
+            block["map"]["backlash_um"] = written(struts.map_backlash, "length", "um")
     return block
 
 

@@ -48,6 +48,7 @@ all six or a list of six. Everything marked optional may be left out and is then
       map:                            # optional: natural cubic spline, end values held outside
         knots_mm: [330, 600, 880]     # commands, increasing
         values_um:                    # 6×n, one row per strut
+        backlash_um:                  # optional, 6×n: by how much the lost motion is larger there than backlash_um
 
     thermal:                          # optional: bodies about their origins
       base_expansion_ppm_per_K: 0.0
@@ -367,6 +368,7 @@ def _read_struts(section: Section) -> StrutErrors:
         length_map = section.section("map")
         values["map_knots"] = length_map.quantity("knots", "length", (None,))
         values["map_values"] = length_map.quantity("values", "length", (6, None))
+        values["map_backlash"] = length_map.quantity("backlash", "length", (6, None), np.zeros((6, 0)))
         length_map.finish()
     section.finish()
     return StrutErrors(**values)

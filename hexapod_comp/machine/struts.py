@@ -2,11 +2,11 @@
 
 One strut, command c (what its encoder counts, m) to actual length L (m):
 
-    L = (1 + g) · (c + o + p·(c − c₀) + Σ (Aₙ·cos(nkc) + Bₙ·sin(nkc)) + map(c) − s·b/2 + l·θ/2π)
+    L = (1 + g) · (c + o + p·(c − c₀) + Σ (Aₙ·cos(nkc) + Bₙ·sin(nkc)) + map(c) − s·b(c)/2 + l·θ/2π)
 
 with offset o, pitch error p about the length c₀, screw waves Aₙ, Bₙ of period 2π/k and its harmonics n = 1…4, length
-map, backlash b by the sense of motion s, screw lead l times the rotation θ that the cardan joints force on the screw
-since home, and growth g, by heat and by humidity. The compensator solves it for c.
+map, backlash b by the sense of motion s, which may change along a worn screw, screw lead l times the rotation θ that
+the cardan joints force on the screw since home, and growth g, by heat and by humidity. The compensator solves it for c.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 STEEPEST_ERROR = 0.2
 """Largest slope of the strut error against the command: below it, undoing the error is a contraction."""
 
-WAVE_PARTS, MAP_PARTS = ("cosine", "sine"), ("map_knots", "map_values")
+WAVE_PARTS, MAP_PARTS = ("cosine", "sine"), ("map_knots", "map_values", "map_backlash")
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,9 @@ class StrutErrors:
         Commands of the length map, m, increasing; empty for none.
     map_values : ndarray, shape (6, n)
         Length error at the knots, m; a natural cubic spline runs between, the end values hold outside.
+    map_backlash : ndarray, shape (6, n)
+        By how much the lost motion on reversal is larger at the knots than `backlash`, m; in the same way. Left out, it
+        is the same everywhere.
 
     Raises
     ------
@@ -88,6 +91,7 @@ class StrutErrors:
     moisture: np.ndarray = field(default_factory=lambda: np.zeros(6))
     map_knots: np.ndarray = field(default_factory=lambda: np.zeros(0))
     map_values: np.ndarray = field(default_factory=lambda: np.zeros((6, 0)))
+    map_backlash: np.ndarray = field(default_factory=lambda: np.zeros((6, 0)))
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -127,9 +131,13 @@ class StrutErrors:
 
     def _check_map(self) -> None:
         knots = self.map_knots
-        if knots.ndim != 1 or self.map_values.shape != (6, len(knots)):
-            problem = f"must have shape (6, {knots.size}), one value per knot, not {self.map_values.shape}"
-            raise ModelError("struts.map_values", problem)
+        if knots.ndim == 1 and not self.map_backlash.any():
+            object.__setattr__(self, "map_backlash", np.zeros((6, len(knots))))
+        for name in MAP_PARTS[1:]:
+            shape = getattr(self, name).shape
+            if knots.ndim != 1 or shape != (6, len(knots)):
+                problem = f"must have shape (6, {knots.size}), one value per knot, not {shape}"
+                raise ModelError(f"struts.{name}", problem)
         if len(knots) == 1 or (np.diff(knots) <= 0.0).any():
             raise ModelError("struts.map_knots", "needs at least two increasing lengths", knots.tolist())
 
@@ -145,20 +153,30 @@ class StrutErrors:
         if len(self.map_knots):
             spline = self._spline().derivative()
             dense = np.linspace(self.map_knots[0], self.map_knots[-1], 20 * len(self.map_knots))
-            steep = steep + np.abs(spline(dense)).max(axis=1)
+            lengths, backlash = np.abs(spline(dense)).reshape(2, 6, -1).max(axis=2)
+            steep = steep + lengths + 0.5 * backlash
         return steep
 
+    @property
+    def largest_backlash(self) -> np.ndarray:
+        """Lost motion where it is largest, m, shape (6,)."""
+        return self.backlash + self.map_backlash.max(axis=1, initial=0.0)
+
     def _spline(self) -> CubicSpline:
+        """Return the length errors of struts 1–6, and then the changes of their backlash."""
         from scipy.interpolate import CubicSpline  # 14 MB with all that it needs, which a node without a map does not
 
-        return CubicSpline(self.map_knots, self.map_values, axis=1, bc_type="natural")
+        return CubicSpline(self.map_knots, np.vstack([self.map_values, self.map_backlash]), axis=1, bc_type="natural")
 
     def spline_coefficients(self) -> np.ndarray:
-        """Return the map's cubic pieces, shape (6, n − 1, 4), highest power first, about each left knot."""
+        """Return the cubic pieces of the map and of the backlash's change, shape (6, n − 1, 8).
+
+        Of each four, the highest power comes first; they are about each left knot.
+        """
         if not len(self.map_knots):
-            return np.zeros((6, 0, 4))
-        spline = self._spline()
-        return np.ascontiguousarray(np.transpose(spline.c, (2, 1, 0)))
+            return np.zeros((6, 0, 8))
+        lengths, backlash = np.split(np.transpose(self._spline().c, (2, 1, 0)), 2)
+        return np.ascontiguousarray(np.concatenate([lengths, backlash], axis=2))
 
     def parameter_table(self, geometry: HexapodGeometry, growth: np.ndarray) -> np.ndarray:
         """Return the kernels' table, shape (6, PARAMETERS), for a growth (6,) of the struts."""

@@ -31,6 +31,9 @@ MAP_WAVES, KNOTS_PER_WAVE = 8, 15
 WAVES_OF_STROKE, LEAST_WAVES = (0.1, 0.35), (0.06, 0.2)
 """Shortest and longest of them where bounds draw them: shares of the stroke, but no shorter than this, m."""
 
+WORN_PART = (0.1, 0.3)
+"""Shortest and longest worn part of a screw, from its middle to where 61 % of the wear is left, in strokes."""
+
 SPANS = {"wave": "m", "harmonics": "m", "backlash": "m", "strut_expansion": "1/K", "body_expansion": "1/K"}
 """Bounds that have a lowest and a highest value, and their units."""
 
@@ -68,6 +71,8 @@ class ImperfectionBounds:
     length_map : float
         Root mean square of every strut's smooth length error, m: waves from a tenth to a third of its stroke,
         but not below 60 and 200 mm.
+    wear : float
+        By how much the lost motion of a strut is larger, at most, where its screw is worn most, m.
     strut_expansion, body_expansion : (float, float)
         Lowest and highest thermal expansion of a strut, and of base and platform, 1/K.
     shared_platform_joints : bool
@@ -95,6 +100,7 @@ class ImperfectionBounds:
     body_expansion: tuple[float, float] = (0.0, 0.0)
     shared_platform_joints: bool = True
     harmonics: tuple[float, float] = (0.0, 0.0)
+    wear: float = 0.0
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -163,9 +169,9 @@ def draw_model(geometry: HexapodGeometry, bounds: ImperfectionBounds, seed: int,
         platform_expansion=float(bodies[1]),
         origin=ModelOrigin(note=f"virtual machine drawn with seed {seed}"),
     )
-    if not bounds.length_map:
-        return model
-    return with_length_map(model, geometry, seed, bounds.length_map, _waves_of(geometry))
+    if bounds.length_map:
+        model = with_length_map(model, geometry, seed, bounds.length_map, _waves_of(geometry))
+    return with_wear(model, geometry, seed, bounds.wear) if bounds.wear else model
 
 
 def _waves_of(geometry: HexapodGeometry) -> tuple[float, float]:
@@ -187,7 +193,7 @@ def with_length_map(
     Parameters
     ----------
     model : MachineModel
-        The machine so far.
+        The machine so far; a map and wear that it has are replaced.
     geometry : HexapodGeometry
         Tells the struts' stroke.
     seed : int
@@ -198,13 +204,45 @@ def with_length_map(
         Shortest and longest wave, m.
     """
     rng = seeded(seed, "length map")
-    low, high = geometry.limits.stroke[:, 0].min(), geometry.limits.stroke[:, 1].max()
-    knots = np.linspace(low, high, int(np.ceil((high - low) / waves[0] * KNOTS_PER_WAVE)) + 1)
+    knots = _knots(geometry, waves[0])
     lengths, phases = rng.uniform(*waves, (6, MAP_WAVES)), rng.uniform(0.0, 2.0 * np.pi, (6, MAP_WAVES))
     sizes = rng.standard_normal((6, MAP_WAVES))
     values = np.einsum("sw,swk->sk", sizes, np.sin(2.0 * np.pi * knots / lengths[..., None] + phases[..., None]))
     values *= rms / np.sqrt((values**2).mean(axis=1, keepdims=True))
-    return replace(model, struts=replace(model.struts, map_knots=knots, map_values=values))
+    struts = replace(model.struts, map_knots=knots, map_values=values, map_backlash=np.zeros((6, 0)))
+    return replace(model, struts=struts)
+
+
+def with_wear(model: MachineModel, geometry: HexapodGeometry, seed: int, most: float = 5e-6) -> MachineModel:
+    """Return a model whose screws are worn where they ran most: their lost motion is larger there.
+
+    Parameters
+    ----------
+    model : MachineModel
+        The machine so far; wear that it has is replaced.
+    geometry : HexapodGeometry
+        Tells the struts' stroke.
+    seed : int
+        0 or above.
+    most : float
+        By how much the lost motion is larger in the middle of the worn part, at most, m; at least half of it.
+    """
+    rng, stroke = seeded(seed, "wear"), geometry.limits.stroke
+    struts = model.struts
+    if not len(struts.map_knots):
+        knots = _knots(geometry, LEAST_WAVES[0])
+        struts = replace(struts, map_knots=knots, map_values=np.zeros((6, len(knots))))
+    middles = stroke[:, :1] + np.ptp(stroke, axis=1, keepdims=True) * rng.uniform(0.3, 0.7, (6, 1))
+    widths = np.ptp(stroke, axis=1, keepdims=True) * rng.uniform(*WORN_PART, (6, 1))
+    sizes = most * rng.uniform(0.5, 1.0, (6, 1))
+    wear = sizes * np.exp(-0.5 * ((struts.map_knots - middles) / widths) ** 2)
+    return replace(model, struts=replace(struts, map_backlash=wear))
+
+
+def _knots(geometry: HexapodGeometry, shortest: float) -> np.ndarray:
+    """Return knots over the strokes on which waves of a length, m, and longer ones are what the spline between is."""
+    low, high = geometry.limits.stroke[:, 0].min(), geometry.limits.stroke[:, 1].max()
+    return np.linspace(low, high, int(np.ceil((high - low) / shortest * KNOTS_PER_WAVE)) + 1)
 
 
 def seeded(seed: int, what: str = "") -> np.random.Generator:

@@ -74,7 +74,7 @@ class StrutDrive:
         self._position = self._commands.copy()
         self._speed = np.zeros(6)
         self._motor = to_step(self._commands, p.step)
-        self._half_play = 0.5 * self.machine.model.struts.backlash
+        self._half_play = 0.5 * self.machine.model.struts.largest_backlash
         self._play = np.zeros(6)
         self._stuck, self._stopped = np.zeros(6, bool), np.zeros(6, bool)
 

@@ -36,7 +36,7 @@ FORWARD, BACKWARD = np.ones(3), -np.ones(3)
 def strut_errors(model: MachineModel) -> np.ndarray:
     """Return what the machine's struts do with :data:`COMMANDS`, shape (6, n), m."""
     arrays = RealMachine(PAPER, model).strut_arrays
-    return np.array([[smooth_error(c, *arrays, strut)[0] for c in COMMANDS] for strut in range(6)])
+    return np.array([[smooth_error(c, 0.0, *arrays, strut)[0] for c in COMMANDS] for strut in range(6)])
 
 
 def field_errors(model: MachineModel, points: np.ndarray, sense: np.ndarray = FORWARD) -> np.ndarray:
@@ -102,7 +102,7 @@ def test_a_map_changes_nothing_but_the_map() -> None:
     before = random_model(np.random.default_rng(5), "paper")
     after = with_length_map(before, PAPER, 1)
     one, two = asdict(before), asdict(after)
-    for name in ("map_knots", "map_values"):
+    for name in ("map_knots", "map_values", "map_backlash"):
         assert not np.array_equal(one["struts"].pop(name), two["struts"].pop(name))
     np.testing.assert_equal(two, one)
     assert after.struts.map_knots[[0, -1]] == pytest.approx(STROKE)

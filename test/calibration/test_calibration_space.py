@@ -153,8 +153,9 @@ def test_boxes_flat_but_for_rounding_are_flat():
 def test_vector_names_and_sizes(space: ParameterSpace):
     """Twelve joints (three shared ones on the platform) and six offsets are 33; every parameter has a name."""
     sizes = {block.name: len(block.labels) for block in space.blocks}
-    knots, terms, turning = len(space.knots), len(space.field.terms), len(space.field.reversal_terms)
-    expected = (33, 6, 12, 12, 12, 12, 6, 6 * knots, 3 * terms, 3 * terms, 18 * turning)
+    knots, worn = (len(knots) for knots in space.knots.values())
+    terms, turning = len(space.field.terms), len(space.field.reversal_terms)
+    expected = (33, 6, 12, 12, 12, 12, 6, 6 * knots, 6 * worn, 3 * terms, 3 * terms, 18 * turning)
     cold = [name for name in BLOCKS if name not in ("expansion", "moisture", "late")]  # nothing grew
     assert sizes == dict(zip(cold, expected, strict=True))
     labels = [label for block in space.blocks for label in block.labels]
@@ -185,16 +186,19 @@ def test_without_a_lead_there_are_no_waves(readings: MeasurementSet):
 
 def test_knots_cover_the_commands_close_enough(space: ParameterSpace, readings: MeasurementSet):
     commands = readings.stations.commands
-    assert space.knots[0] <= commands.min() < commands.max() <= space.knots[-1]
-    assert np.diff(space.knots).max() <= KNOT_DISTANCE * (1.0 + 1e-12)
+    knots, worn = space.knots["map"], space.knots["backlash map"]
+    assert knots[0] <= commands.min() < commands.max() <= knots[-1]
+    assert np.diff(knots).max() <= KNOT_DISTANCE * (1.0 + 1e-12)
+    assert set(worn) <= set(knots)
+    assert worn[[0, -1]].tolist() == knots[[0, -1]].tolist()
 
 
 def test_prior_of_the_map_is_matern(space: ParameterSpace):
     """Matérn 5/2 as in Rasmussen and Williams, eq. 4.17; 1e-9 of independent variance keep it regular."""
-    root = space.block("map").root
-    distance = np.sqrt(5.0) * cdist(space.knots[:, None], space.knots[:, None]) / MAP_CORRELATION_LENGTH
+    root, knots = space.block("map").root, space.knots["map"]
+    distance = np.sqrt(5.0) * cdist(knots[:, None], knots[:, None]) / MAP_CORRELATION_LENGTH
     wanted = (1.0 + distance + distance**2 / 3.0) * np.exp(-distance)
-    n = len(space.knots)
+    n = len(knots)
     np.testing.assert_allclose((root @ root.T)[:n, :n], wanted, atol=2e-9)
     assert not (root @ root.T)[:n, n:].any()
 
@@ -219,10 +223,11 @@ def test_whitening_is_the_chain_rule(space: ParameterSpace):
 
 
 def test_spline_weights_are_the_natural_spline(space: ParameterSpace):
-    values = np.random.default_rng(8).standard_normal(len(space.knots))
-    commands = np.linspace(space.knots[0] - 0.01, space.knots[-1] + 0.01, 50)
-    spline = CubicSpline(space.knots, values, bc_type="natural")
-    held = np.clip(commands, space.knots[0], space.knots[-1])
+    knots = space.knots["map"]
+    values = np.random.default_rng(8).standard_normal(len(knots))
+    commands = np.linspace(knots[0] - 0.01, knots[-1] + 0.01, 50)
+    spline = CubicSpline(knots, values, bc_type="natural")
+    held = np.clip(commands, knots[0], knots[-1])
     np.testing.assert_allclose(space.spline_weights(commands) @ values, spline(held), atol=1e-13)
 
 

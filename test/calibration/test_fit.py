@@ -344,6 +344,17 @@ def test_blocks_that_the_machine_has_are_kept_and_no_others():
     assert not any(d.kept for d in fit.decisions)
 
 
+def test_worn_screws_are_told_from_others():
+    """Wear of up to 8 µm is kept and leaves what a fit without it leaves three times over; others have none (above)."""
+    truth = small.virtual_machine(2, replace(small.BOUNDS, wear=8e-6))
+    ours = small.measured(truth, small.campaign("5-D", 16), 2)
+    fit = fit_model(ours, replace(SOME, blocks=(*SOME.blocks, "backlash map")))
+    assert {d.block for d in fit.decisions if d.kept} == {"pitch", "wave", "backlash", "backlash map"}
+    left, without = (small.tool_error(truth, model)[0] for model in (fit.model, fit_model(ours, FEW).model))
+    assert fit.level.low < left < fit.level.high
+    assert 3.0 * left < without
+
+
 def test_a_field_is_found(unsuspected: None):
     """A field of 30 µm and 60 µrad, with terms up to degree six, is kept and takes a good part of it away."""
     bounds = replace(small.BOUNDS, field_displacement=30e-6, field_rotation=60e-6, field_box=small.BOX,

@@ -53,7 +53,7 @@ def test_every_bound_ends_where_it_belongs(tmp_path: Path, capsys: pytest.Captur
     """The file's keys carry the units; each value lies within its option's bound, and only then."""
     out = tmp_path / "truth.yaml"
     words = ["--joints-um", "0", "--struts-um", "0", "--pitch-ppm", "0", "--wave-um", "2,3", "--wave-period-mm", "4"]
-    words += ["--map-um", "1.5", "--backlash-um", "5,6", "--strut-expansion-ppm-per-k", "10,11"]
+    words += ["--map-um", "1.5", "--backlash-um", "5,6", "--wear-um", "3", "--strut-expansion-ppm-per-k", "10,11"]
     words += ["--body-expansion-ppm-per-k", "12,13", "--field-um", "7", "--field-urad", "9"]
     words += ["--field-reversal-percent", "20", "--box", "-50,-50,360,50,50,440", "--name", "all of it"]
     assert cli.main(["imagine", *words, "--seed", "2", "--json", "--out", str(out)]) == 0
@@ -68,6 +68,8 @@ def test_every_bound_ends_where_it_belongs(tmp_path: Path, capsys: pytest.Captur
     assert ((amplitude >= 2.0) & (amplitude <= 3.0)).all()
     assert model.struts.period.tolist() == [0.004] * 6
     assert np.sqrt((model.struts.map_values**2).mean(axis=1)) / UM == pytest.approx([1.5] * 6)
+    wear = model.struts.map_backlash.max(axis=1) / UM
+    assert ((wear > 1.4) & (wear <= 3.0)).all()  # at least half of it, between knots
     for values, low, high in (
         (struts["backlash_um"], 5.0, 6.0),
         (model.struts.expansion * 1e6, 10.0, 11.0),

@@ -199,6 +199,7 @@ struts:
   map:
     knots_mm: [330, 600, 880]
     values_um: [[0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2]]
+    backlash_um: [[0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2]]
 thermal:
   platform_expansion_ppm_per_K: 23
 """
@@ -236,6 +237,7 @@ def same_model(found: MachineModel, tree: dict[str, Any]) -> None:
     if "map" in struts:
         same(found.struts.map_knots, quantity(struts["map"], "knots", "length"))
         same(found.struts.map_values, quantity(struts["map"], "values", "length"))
+        same(found.struts.map_backlash, quantity(struts["map"], "backlash", "length", 0.0))
     if "field" in tree:
         same_field(found.field, tree["field"])
 

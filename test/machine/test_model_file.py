@@ -49,6 +49,7 @@ struts:
   map:
     knots_mm: [330, 880]
     values_um: [[0, 1], [0, 2], [0, 3], [0, 4], [0, 5], [0, 6]]
+    backlash_mm: [[0, 0.003], [0, 0], [0, 0], [0, 0], [0, 0], [0, 0]]
 thermal:
   platform_expansion_ppm_per_K: 23.1
 field:
@@ -233,6 +234,7 @@ def test_a_file_written_by_hand(tmp_path):
     np.testing.assert_array_equal(struts.expansion, np.full(6, 11.7e-6))
     np.testing.assert_array_equal(struts.map_knots, [0.33, 0.88])
     np.testing.assert_array_equal(struts.map_values[:, 1], np.array([1, 2, 3, 4, 5, 6]) / 1e6)
+    np.testing.assert_array_equal(struts.map_backlash, np.outer([3e-6, 0, 0, 0, 0, 0], [0, 1]))
     assert (model.base_expansion, model.platform_expansion) == (0.0, 23.1e-6)
 
 

@@ -126,6 +126,21 @@ def test_length_map_is_the_natural_spline():
             assert length(only_map, knot, strut=strut) - knot == pytest.approx(value, abs=2e-16)
 
 
+def test_lost_motion_changes_along_a_worn_screw():
+    """Truth: the definition, −s·b(c)/2, with SciPy's B-spline through the changes of b; tolerance as above."""
+    knots, change = np.array([0.3, 0.4, 0.55, 0.7]), 1e-6 * np.array([[0.0, 6.0, 2.0, 1.0]])
+    struts = StrutErrors(
+        backlash=np.full(6, 4e-6), map_knots=knots, map_values=np.zeros((6, 4)), map_backlash=change * np.ones((6, 1))
+    )
+    spline = make_interp_spline(knots, change[0], k=3, bc_type=([(2, 0.0)], [(2, 0.0)]))
+    for sense in (-1.0, 0.0, 0.5, 1.0):
+        for command in np.linspace(0.25, 0.75, 21):
+            lost = 4e-6 + spline(np.clip(command, knots[0], knots[-1]))
+            assert length(struts, command, sense) - command == pytest.approx(-0.5 * sense * lost, abs=2e-16)
+    assert struts.largest_backlash == pytest.approx([10e-6] * 6, rel=1e-12)
+    assert StrutErrors(map_knots=knots, map_values=np.zeros((6, 4))).map_backlash.shape == (6, 4)
+
+
 @pytest.mark.parametrize("count", [2, 3])
 def test_length_map_of_few_knots(count):
     """Truth: a natural spline through two points is their straight line; through three, SciPy's."""
@@ -187,6 +202,10 @@ def test_undone_also_where_the_error_is_as_steep_as_allowed(period, offset, phas
         ({"map_knots": np.array([0.4]), "map_values": np.zeros((6, 1))}, "struts.map_knots.*two"),
         ({"map_knots": np.array([0.4, 0.4]), "map_values": np.zeros((6, 2))}, "struts.map_knots.*increasing"),
         ({"map_knots": np.array([0.4, 0.5]), "map_values": np.zeros((6, 3))}, r"struts.map_values.*\(6, 3\)"),
+        (
+            {"map_knots": np.array([0.4, 0.5]), "map_values": np.zeros((6, 2)), "map_backlash": np.ones((6, 3))},
+            r"struts.map_backlash.*\(6, 3\)",
+        ),
     ],
 )
 def test_refused(bad, message):

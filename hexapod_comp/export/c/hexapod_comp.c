@@ -967,8 +967,8 @@ static double wave_error(const hc_strut *strut, turn at, double *slope)
     return error;
 }
 
-/* error_at: error and slope of what depends on the command alone: offset, pitch, waves, map */
-static double error_at(const hc_model *model, int i, double command, turn at, double *slope)
+/* error_at: error and slope of what depends on the command: offset, pitch, waves, map, and the backlash's change */
+static double error_at(const hc_model *model, int i, double command, turn at, double sense, double *slope)
 {
     const hc_strut *strut = &model->struts[i];
     const hc_map *map = &model->map;
@@ -982,9 +982,9 @@ static double error_at(const hc_model *model, int i, double command, turn at, do
     if (map->knot_count > 1) {
         const int last = map->knot_count - 1;
         const double inside = fmin(map->knots[last], fmax(map->knots[0], command));
-        const double *piece;
-        double x;
-        int low = 0, high = last;
+        const double *piece, half = -0.5 * sense;
+        double x, c[4];
+        int low = 0, high = last, n;
         while (high - low > 1) {
             const int middle = low + (high - low) / 2;
             if (map->knots[middle] <= inside) {
@@ -994,10 +994,13 @@ static double error_at(const hc_model *model, int i, double command, turn at, do
             }
         }
         x = inside - map->knots[low];
-        piece = map->pieces + (i * last + low) * 4;
-        error += ((piece[0] * x + piece[1]) * x + piece[2]) * x + piece[3];
+        piece = map->pieces + (i * last + low) * 8;
+        for (n = 0; n < 4; n++) {
+            c[n] = piece[n] + half * piece[4 + n];
+        }
+        error += ((c[0] * x + c[1]) * x + c[2]) * x + c[3];
         if (inside == command) {
-            *slope += (3.0 * piece[0] * x + 2.0 * piece[1]) * x + piece[2];
+            *slope += (3.0 * c[0] * x + 2.0 * c[1]) * x + c[2];
         }
     }
     return error;
@@ -1007,7 +1010,7 @@ static double actual_length(const hc_state *state, int i, double command, double
 {
     const hc_strut *strut = &state->model->struts[i];
     double slope;
-    const double error = error_at(state->model, i, command, screw_turn(strut, command), &slope);
+    const double error = error_at(state->model, i, command, screw_turn(strut, command), sense, &slope);
     const double play = 0.5 * sense * strut->backlash;
     return (1.0 + state->growth[i]) * (command + error - play - shift);
 }
@@ -1023,7 +1026,7 @@ static double command_for_length(const hc_state *state, int i, double length, do
     at = screw_turn(strut, command);
     for (count = 0; count < COMMAND_ITERATIONS; count++) {
         double slope, angle;
-        const double error = error_at(state->model, i, command, at, &slope);
+        const double error = error_at(state->model, i, command, at, sense, &slope);
         const double step = (wanted - command - error) / (1.0 + slope);
         command += step;
         if (fabs(step) < 1e-9) {

@@ -72,11 +72,11 @@ typedef struct {
     double wave[4][2]; /* m, cosine and sine of the periodic error once, twice, three and four times a turn */
 } hc_strut;
 
-/* Cubic pieces of the struts' length maps; no knots where there is no map. */
+/* Cubic pieces of the struts' length maps and of their backlash's change; no knots where there is no map. */
 typedef struct {
     int knot_count;
     const double *knots;  /* knot_count, m */
-    const double *pieces; /* 6 x (knot_count - 1) x 4, highest power first */
+    const double *pieces; /* 6 x (knot_count - 1) x 2 x 4, lengths before backlash, highest power first */
 } hc_map;
 
 /* Error field: three families of lines through the nodes of a grid, see GridField. */
