@@ -19,7 +19,7 @@ from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import MachineModel
 from ..machine.passes import Passes
-from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, MeasurementSet, Stations
+from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_KINDS, MeasurementSet, Stations
 from ..virtual.instruments import compensated
 from .estimation import Estimation
 from .linear_problem import LinearProblem, Posterior, physical_covariance, solve
@@ -33,9 +33,10 @@ PLAIN = ("pitch", *WAVES, "backlash")
 BETTER, SURELY = 3.0, 1.2
 """Another reading is named when some kind of channel fits so many times better, and all together so many times."""
 
-SCATTERED, AS_STATED = 1.5, 1.15
-"""Readings that scatter so many times as much as stated are looked into. What brings all of them down to so many times
-their stated noise is named too, however little better it is: nothing but the truth does that."""
+SCATTERED, AS_STATED, ODDS = 1.5, 1.15, 25.0
+"""Readings that scatter so many times as much as stated are looked into. What brings all that it changes down to so
+many times their stated noise, and makes none worse, is named too where its log odds are above that: nothing but the
+truth does that."""
 
 AS_GOOD = 1.05
 """Others that fit all together as well, to this factor, are named too."""
@@ -60,6 +61,9 @@ SWAPPED = "forward and backward look swapped, or the sign of all readings revers
 STRANGE, PLAUSIBLE = 100.0, 10.0
 """χ² per number above which check readings may have been taken for something else, and that of what they then are: of
 ten and of three times the noise to expect."""
+
+FAINT = 1e3
+"""Factor on the uncertainty of readings that a fit is not to see."""
 
 ROUNDS = 3
 """Rounds in which each run's sign is looked at with the others' as they are."""
@@ -101,8 +105,8 @@ def suspicions(
     progress : callable
         Called with what is tried.
     left : mapping of int to float, optional
-        Standard deviation that their fit leaves of each kind, m or rad. Where that is as stated, and a plain model
-        leaves little more, nothing could be far better, and nothing is tried.
+        Standard deviation that a fit beyond doubt leaves of each kind, m or rad. Where that is as stated, and a plain
+        model leaves little more, nothing could be far better, and nothing is tried.
     """
     measurements, plain = _thinned(measurements), _Plain(settings)
     present = np.unique(measurements.kind)
@@ -123,7 +127,10 @@ def suspicions(
             continue
         gains = as_they_are[present] / noise[present]
         total, best = float(np.exp(shares @ np.log(gains))), float(gains.max())
-        if total > SURELY and (best > BETTER or (noise[present] < AS_STATED * stated).all()):
+        changed = gains > SURELY
+        as_stated = changed.any() and (noise[present] < AS_STATED * stated)[changed].all()
+        as_stated = as_stated and (gains > 1.0 / AS_GOOD).all()
+        if (total > SURELY and best > BETTER) or (as_stated and len(measurements) * np.log(total) > ODDS):
             clear.append((total, best, other.name))
     clear.sort(reverse=True)
     return [f"{name} fits {best:.3g} times better" for total, best, name in clear if total > clear[0][0] / AS_GOOD]
@@ -200,15 +207,25 @@ def _thinned(m: MeasurementSet) -> MeasurementSet:
     return m.select(chosen)
 
 
+_Fitted = tuple[Estimation, LinearProblem, Posterior] | None
+
+
 class _Plain:
     """Plain fits; the nominal machine is sent once where readings of the same stations are read differently."""
 
     def __init__(self, settings: FitSettings) -> None:
         self._settings = replace(settings, blocks=PLAIN)
         self._sent: dict[int, tuple[Stations, Prediction]] = {}
+        self._last: tuple[MeasurementSet, _Fitted] | None = None
 
-    def _fitted(self, m: MeasurementSet) -> tuple[Estimation, LinearProblem, Posterior] | None:
+    def _fitted(self, m: MeasurementSet) -> _Fitted:
         """Return readings, their problem at the nominal machine and its solution; None where it cannot be."""
+        if self._last is None or self._last[0] is not m:
+            self._last = m, self._fit(m)
+        return self._last[1]
+
+    def _fit(self, m: MeasurementSet) -> _Fitted:
+        """Return the same, fitted anew."""
         try:
             space = ParameterSpace(m, self._settings)
             estimation, x = Estimation(m, space, alone=False), np.zeros(space.size)
@@ -236,14 +253,26 @@ class _Plain:
         deviation = np.sqrt(np.diag(physical_covariance(space, posterior))[block.part])
         return space.physical(posterior.y)[block.part], deviation
 
-    def unlike(self, m: MeasurementSet) -> np.ndarray:
-        """Return which runs are rather the opposite of what a plain fit to all says, shape (runs,)."""
+    def unlike(self, m: MeasurementSet, members: np.ndarray, blind: bool = False) -> np.ndarray:
+        """Return in which runs members (N,) are rather the opposite of what a plain fit says, shape (runs,).
+
+        The fit is to all readings; a blind one to all but members, with the noise and the tolerances of the other.
+        """
         fitted = self._fitted(m)
         if fitted is None:
             return np.zeros(len(m.runs), dtype=bool)
         estimation, problem, posterior = fitted
-        products = problem.target * problem.rows.times(posterior.y)
-        return np.bincount(m.run[estimation.cells.first], products, len(m.runs)) < 0.0
+        if blind:
+            space, stated = estimation.space, np.where(members, FAINT * m.stated, m.stated)
+            estimation = Estimation(replace(m, uncertainty=stated), space, alone=False)
+            problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(m)), self._sent[id(m.stations)][1])
+            posterior = solve(space, problem, posterior.tolerances, posterior.noise, rounds=0)
+        cells, weights = estimation.cells, estimation.uncertainty**-2
+        values = np.bincount(cells.of_reading, weights * m.value) / np.bincount(cells.of_reading, weights)
+        values = members[cells.first] * estimation.free_of_unknowns(values[:, None])[:, 0]
+        # A nominal machine whose screws turn errs too: what is fitted is not all that should have been read.
+        expected = values - (problem.target - problem.rows.times(posterior.y))
+        return np.bincount(m.run[cells.first], values * expected, len(m.runs)) < 0.0
 
 
 def _others(m: MeasurementSet, plain: _Plain) -> Iterator[Reinterpretation]:
@@ -293,11 +322,14 @@ def _multiplied(m: MeasurementSet, name: str, members: np.ndarray, factor: float
 
 
 def _in_other_units(m: MeasurementSet) -> Iterator[Reinterpretation]:
-    """Yield each kind of channel in each other unit, and all lengths or angles together."""
+    """Yield each kind of channel in each other unit, those of lines together, and all lengths or angles."""
     present = np.unique(m.kind)
     angular = np.array([KINDS[k] in ANGULAR_KINDS for k in present])
     for which, meant, kinds in (("length", "µm", present[~angular]), ("angle", "µrad", present[angular])):
         together = [(f"all {which}s", kinds)] if len(kinds) > 1 else []
+        of_lines = [k for k in kinds if KINDS[k] in LINE_KINDS]
+        if 1 < len(of_lines) < len(kinds):
+            together.append((" and ".join(KINDS[k] for k in of_lines), np.array(of_lines)))
         for (name, members), (unit, factor) in product([*together, *((KINDS[k], k) for k in kinds)], UNITS[which]):
             yield _multiplied(m, f"{name}: {unit} in place of {meant}", np.isin(m.kind, members), factor)
 
@@ -312,30 +344,49 @@ def _exchanged_channels(m: MeasurementSet) -> Iterator[Reinterpretation]:
         common = [n for n in np.unique(family[both]) if {a, b} <= set(m.channel[family == n].tolist())]
         for name, where in [("", both), *((f"{FAMILIES[n]}, ", both & (family == n)) for n in common)]:
             channel = np.where(where, a + b - m.channel, m.channel)
-            if where is both and (family[both] < 3).any():
-                continue  # a straightness along its own line is none
+            if where is both and CHANNELS[a].startswith("straightness") and (family[both] < 3).any():
+                continue  # along its own line it is none
             title = f"{name}{CHANNELS[a]} and {CHANNELS[b]}: exchanged"
             yield Reinterpretation(title, replace(m, channel=channel), np.ones(len(KINDS)))
 
 
 def _reversed_runs(m: MeasurementSet, plain: _Plain) -> Iterator[Reinterpretation]:
-    """Yield sets with the signs of some runs reversed, where the runs of a family differ in sign."""
+    """Yield sets with the signs of some runs reversed, of all channels or of one, where runs of a family differ."""
     family, slopes = family_of_run(m), _slopes(m)
-    present = np.unique(family)
+    present, everything = np.unique(family), np.ones(len(m), dtype=bool)
     for ways in product((1.0, -1.0), repeat=len(present)):
         way = dict(zip(present.tolist(), ways, strict=True))
         signs = np.where(slopes < 0.0, -1.0, 1.0) * [way[n] for n in family.tolist()]
-        for _ in range(ROUNDS):
-            unlike = plain.unlike(m.with_values(m.value * signs[m.run]))
-            signs = np.where(unlike, -signs, signs)
-            if not unlike.any():
-                break
-        names = [r.name for r, sign in zip(m.runs, signs, strict=True) if sign < 0.0]
-        mixed = any(len(np.unique(signs[family == n])) > 1 for n in present)
-        if mixed and 2 * len(names) <= len(m.runs):
-            listed = ", ".join(names[:3]) + (", …" if len(names) > 3 else "")
-            title = f"{len(names)} of {len(m.runs)} runs ({listed}): sign reversed"
-            yield Reinterpretation(title, m.with_values(m.value * signs[m.run]), np.ones(len(KINDS)))
+        yield from _with_signs("", m, everything, signs, plain)
+    channels = np.unique(m.channel)
+    for channel in channels if len(channels) > 1 else ():  # the others tell what one should have been
+        members = m.channel == channel
+        signs = np.where(plain.unlike(m, members, blind=True), -1.0, 1.0)
+        yield from _with_signs(f"{CHANNELS[channel]} of ", m, members, signs, plain)
+
+
+def _with_signs(
+    what: str, m: MeasurementSet, members: np.ndarray, signs: np.ndarray, plain: _Plain
+) -> Iterator[Reinterpretation]:
+    """Yield a set whose members (N,) are reversed in those runs where a plain fit says so, from signs (runs,) on."""
+
+    def signed() -> MeasurementSet:
+        if (signs > 0.0).all():
+            return m
+        return m.with_values(np.where(members, m.value * signs[m.run], m.value))
+
+    for _ in range(ROUNDS):
+        unlike = plain.unlike(signed(), members)
+        signs = np.where(unlike, -signs, signs)
+        if not unlike.any():
+            break
+    family, runs = family_of_run(m), np.unique(m.run[members])
+    names = [m.runs[n].name for n in runs if signs[n] < 0.0]
+    mixed = any(len(np.unique(signs[runs[family[runs] == n]])) > 1 for n in np.unique(family[runs]))
+    if mixed and (what or 2 * len(names) <= len(runs)):  # all channels may as well be reversed in the others
+        listed = ", ".join(names[:3]) + (", …" if len(names) > 3 else "")
+        title = f"{what}{len(names)} of {len(runs)} runs ({listed}): sign reversed"
+        yield Reinterpretation(title, signed(), np.ones(len(KINDS)))
 
 
 def _slopes(m: MeasurementSet) -> np.ndarray:

@@ -105,7 +105,8 @@ def judge(
     families, runs = chi_squares(residuals)
     far_off, doubtful = measurements.misfit(noise, MISFIT), measurements.misfit(noise, DOUBTFUL)
     doubts = [*([] if far_off else [doubtful]), *beyond.doubts(), _unsettled(solution)]
-    refusals = [far_off, _useless(level), _held(residuals), *suspicions(measurements, settings, progress, noise)]
+    left = None if any(doubts) else noise
+    refusals = [far_off, _useless(level), _held(residuals), *suspicions(measurements, settings, progress, left)]
     remarks = [*beyond.remarks(), _unstated(measurements), NOT_TILTED if level_only else ""]
     listed = (tuple(filter(None, part)) for part in (refusals, doubts, remarks))
     return Verdict(level, tilted, beyond, families, runs, *listed)

@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 import pytest
 from calibration_helpers import BOX, FEW, SETTINGS, campaign, measured, virtual_machine
+from foreign_machines import machines
 
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
@@ -22,8 +23,13 @@ from hexapod_comp.calibration.promise import Scatter, Unexplained
 from hexapod_comp.calibration.report import as_json, fit_report
 from hexapod_comp.calibration.suspicions import SWAPPED, causes, suspicions
 from hexapod_comp.errors import CalibrationError, ModelError
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.model import RealMachine
+from hexapod_comp.measurements.campaign import Campaign
 from hexapod_comp.measurements.readings import BACKWARD, CHANNELS, FORWARD, KINDS, MeasurementSet
+from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
 
+ROTATION_X = CHANNELS.index("rotation_x")
 LINEAR, STRAIGHTNESS, ROTATION = (KINDS.index(kind) for kind in ("linear", "straightness", "rotation"))
 
 
@@ -238,6 +244,8 @@ CAUSES = {
     "rotation: arcsec in place of µrad": lambda m: m.with_values(
         np.where(m.kind == ROTATION, m.value / np.radians(1e6 / 3600.0), m.value)
     ),
+    # Every second of sixteen; one of them has no rotation about x among those that are looked at.
+    "rotation_x of 7 of 15 runs": lambda m: reversed_where(m, (m.channel == ROTATION_X) & (m.run % 2 == 0)),
     "13 of 25 runs": lambda m: m.with_values(m.value * np.where(np.arange(len(m.runs)) % 2, 1.0, -1.0)[m.run]),
 }
 
@@ -248,6 +256,19 @@ def test_the_cause_is_named(some, cause):
     named = suspicions(CAUSES[cause](some), FEW)
     assert named
     assert named[0].startswith(cause) or ("of 25 runs" in cause and "12 of 25 runs" in named[0])
+
+
+def test_runs_with_a_reversed_channel_are_named_where_screws_turn(tmp_path):
+    """Nominal lengths then leave errors of their own, whose sign nobody has reversed: they must not hide the runs'."""
+    machine = machines()["left-hand"]
+    geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
+    side = float(np.ptp(machine.box, axis=0).min())
+    truth = RealMachine(geometry, draw_model(geometry, ImperfectionBounds(joint=500e-6), 3))
+    m = measured(truth, Campaign(machine.box, side, 0.5 * side, "5-D", 4), 3)
+    assert suspicions(m, FitSettings()) == []
+    named = suspicions(reversed_where(m, (m.channel == ROTATION_X) & (m.run % 2 == 0)), FitSettings())
+    assert named[0].startswith("rotation_x of ")
+    assert " runs (" in named[0]
 
 
 def test_nothing_is_suspected_without_a_cause(some):
