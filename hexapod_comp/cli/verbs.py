@@ -273,7 +273,7 @@ example:
         """Weighs 6 to 20 check readings, spread over the box, against the model and what its fit knows of its
 parameters. If the machine has changed it says what has probably happened: the datum has moved, a strut's offset has
 changed (which, by how much), a temperature acts, the whole has aged, a single reading is wrong, or none of these. One
-machine in a hundred that has not changed is called changed. Where two explanations stay close it says which further
+machine in eighty that has not changed is called changed. Where two explanations stay close it says which further
 readings would tell them apart. Readings that are far off are tried in other units, with other signs, axes
 exchanged, and with the compensation on or off: the report opens with what fits.
 
