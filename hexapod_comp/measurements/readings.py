@@ -74,6 +74,9 @@ LEAST_SIDE = 1e-6
 LEAST_NOISE = 1e-9
 """No instrument reads better, m or rad; also keeps readings without noise from having infinite weight."""
 
+COARSEST = 300.0
+"""Trackers and cameras apart, no instrument is so many times worse than its kind is assumed to be: a unit is wrong."""
+
 LARGEST_READING = 1.0
 """No machine errs by more, m or rad."""
 
@@ -293,7 +296,7 @@ class MeasurementSet:
         return rms(members) if len(members) else 1.0
 
     def misfit(self, noise: Mapping[int, float], times: float) -> str:
-        """Return what is wrong when kinds of reading are further off than they may be; empty when none is.
+        """Return what is wrong with kinds of reading that are further off, or stated to be, than they may; or nothing.
 
         Parameters
         ----------
@@ -302,17 +305,22 @@ class MeasurementSet:
         times : float
             How many times the stated one it may be.
         """
-        far = []
+        far, coarse = [], []
         for kind, value in noise.items():
-            stated = self.stated_of(kind)
+            stated, unit = self.stated_of(kind), "µrad" if KINDS[kind] in ANGULAR_KINDS else "µm"
+            usual = DEFAULT_UNCERTAINTY[KINDS[kind]]
+            if stated > COARSEST * usual and KINDS[kind] not in ("position", "attitude"):
+                coarse.append(f"{KINDS[kind]} by {stated * 1e6:.3g} {unit}, where {usual * 1e6:.3g} {unit} are usual")
             if value > times * stated:
-                unit = "µrad" if KINDS[kind] in ANGULAR_KINDS else "µm"
                 given = np.isfinite(self.uncertainty[self.kind == kind]).any()
                 source = "stated" if given else "assumed, since the file states none"
                 ratio = f"{value / stated:.3g} times the {stated * 1e6:.3g} {unit} {source}"
                 far.append(f"{KINDS[kind]} by {value * 1e6:.3g} {unit}, {ratio}")
-        problem = f"readings are off by more than {times:g} times their noise"
-        return f"{problem}: {'; '.join(far)}" if far else ""
+        problems = {
+            f"readings are off by more than {times:g} times their noise": far,
+            "readings are stated to be uncertain as no such instrument is, do units fit": coarse,
+        }
+        return "; ".join(f"{problem}: {'; '.join(kinds)}" for problem, kinds in problems.items() if kinds)
 
     def directions(self) -> np.ndarray:
         """Return w of each reading, shape (N, 6): value = w · (dx, dy, dz, rx, ry, rz) in ``base``."""
