@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..measurements.readings import ABSOLUTE_KINDS, KINDS, LEAST_TRAVEL, LENGTH, MeasurementSet, different_rows
+from ..machine.rows import different_rows
+from ..measurements.readings import ABSOLUTE_KINDS, KINDS, LEAST_TRAVEL, LENGTH, MeasurementSet
 from .unknowns import Lengths
 
 

@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..measurements.readings import ANGULAR_KINDS, BACKWARD, FORWARD, KINDS, different_rows
+from ..machine.rows import different_rows
+from ..measurements.readings import ANGULAR_KINDS, BACKWARD, FORWARD, KINDS
 from .estimation import MEDIAN_TO_SIGMA
 from .promise import Scatter
 from .residuals import Residuals

@@ -160,7 +160,8 @@ class _Trials:
 
     def leave_out_the_rest(self, names: Collection[str]) -> None:
         """Look at folds by fewer rows from here on: all that is tried are parts of the blocks `names`."""
-        self._condensed = condense(self._problem, self.fit(names))
+        if len(names) < len(self._space.blocks) - 1:  # else none is left out
+            self._condensed = condense(self._problem, self.fit(names))
 
     def _solve(self, tolerances: np.ndarray, rounds: int) -> Posterior:
         return solve(self._space, self._problem, tolerances, self._noise, rounds)

@@ -54,7 +54,7 @@ def wear_knots(knots: np.ndarray) -> np.ndarray:
     A natural spline through them is one through all knots.
     """
     last = len(knots) - 1
-    return knots[np.linspace(0, last, last // WEAR_KNOTS + 1 if last > WEAR_KNOTS else 2).round().astype(int)]
+    return knots[np.linspace(0, last, max(2, last // WEAR_KNOTS + 1)).round().astype(int)]
 
 
 def map_root(knots: np.ndarray) -> np.ndarray:

@@ -22,6 +22,7 @@ from .geometry import HexapodGeometry
 from .kinematics import Structure, forward_error, over_chunks
 from .late import AT_ONCE, PARTS, Lag, LateGrowth, late
 from .motion import MotionState
+from .rows import changed_rows
 from .struts import StrutErrors
 from .temperatures import HUMIDITY, Temperatures
 
@@ -412,12 +413,10 @@ class MachinesByTemperature:
         if constants and np.isfinite(times).all():
             behind = late(times, temperatures, constants)
             air = np.hstack([air, behind.reshape(len(air), -1)])
-        new = np.ones(len(air), dtype=bool)
-        new[1:] = (air[1:] != air[:-1]).any(axis=1)
-        rows = np.flatnonzero(new).tolist()
+        rows, number = changed_rows(air)
         lags = [None] * len(rows) if behind is None else behind[rows]
         machines = [self.at(*row) for row in zip(temperatures[rows], lags, humidities[rows].tolist(), strict=True)]
-        return [machines[n] for n in (np.cumsum(new) - 1).tolist()]
+        return [machines[n] for n in number.tolist()]
 
 
 def platform_box(model: MachineModel, level: np.ndarray) -> np.ndarray | None:

@@ -448,16 +448,3 @@ def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:
         Rotation matrices.
     """
     return Rotation.from_matrix(actual @ np.swapaxes(commanded, -1, -2)).as_rotvec()
-
-
-def different_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where each different row of a matrix stands first, in the rows' order by size, and the number of each row.
-
-    As NumPy's ``unique`` along an axis, ten times as fast.
-    """
-    order = np.lexsort(rows.T[::-1])
-    new = np.ones(len(rows), dtype=bool)
-    new[1:] = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
-    number = np.empty(len(rows), dtype=int)
-    number[order] = np.cumsum(new) - 1
-    return order[new], number

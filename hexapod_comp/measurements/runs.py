@@ -255,9 +255,8 @@ def _collect_stations(
     ways: list[np.ndarray] = []  # of travel, where a run is a line that is passed forward or backward
     index: list[int] = []
     lengths = strut_lengths_batch(Structure.of(geometry), *poses)
-    warming = (
-        len({r.temperatures for r, _, _ in readings}) > 1
-    )  # else when it was does not matter, and passes are alike
+    # At one temperature it does not matter when it was, and passes are alike.
+    warming = len({r.temperatures for r, _, _ in readings}) > 1
     here: tuple | None = None
     before: int | None = None
     for r, pose, run in readings:

@@ -12,6 +12,7 @@ from ..errors import InputFileError
 from ..formats.csv import Table, si_from_text
 from ..formats.yaml import UNITS, spellings
 from ..machine.geometry import STRUT_NAMES
+from ..machine.rows import changed_rows
 from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
 from ..pose import Pose
 from .air import AIR_RANGES, LARGEST_INDEX
@@ -119,16 +120,15 @@ def _directions(table: Table) -> list[int]:
 def _poses(table: Table) -> list[Pose]:
     """Return the commanded poses; rows with the same one share the object."""
     positions, rotations = table.poses()
-    new = np.ones(len(positions), dtype=bool)  # most rows have the pose of the one before
-    new[1:] = (positions[1:] != positions[:-1]).any(axis=1) | (rotations[1:] != rotations[:-1]).any(axis=(1, 2))
+    first, number = changed_rows(np.hstack([positions, rotations.reshape(-1, 9)]))
     known: dict[bytes, Pose] = {}
     poses = []
-    for position, rotation in zip(positions[new], rotations[new], strict=True):
+    for position, rotation in zip(positions[first], rotations[first], strict=True):
         key = position.tobytes() + rotation.tobytes()
         if key not in known:
             known[key] = Pose(position, rotation)
         poses.append(known[key])
-    return [poses[n] for n in (np.cumsum(new) - 1).tolist()]
+    return [poses[n] for n in number.tolist()]
 
 
 def _cycles(table: Table) -> list[int]:

@@ -227,13 +227,14 @@ def with_wear(model: MachineModel, geometry: HexapodGeometry, seed: int, most: f
     most : float
         By how much the lost motion is larger in the middle of the worn part, at most, m; at least half of it.
     """
-    rng, stroke = seeded(seed, "wear"), geometry.limits.stroke
+    rng, shortest = seeded(seed, "wear"), geometry.limits.stroke[:, :1]
+    stroke = geometry.limits.stroke[:, 1:] - shortest
     struts = model.struts
     if not len(struts.map_knots):
         knots = _knots(geometry, LEAST_WAVES[0])
         struts = replace(struts, map_knots=knots, map_values=np.zeros((6, len(knots))))
-    middles = stroke[:, :1] + np.ptp(stroke, axis=1, keepdims=True) * rng.uniform(0.3, 0.7, (6, 1))
-    widths = np.ptp(stroke, axis=1, keepdims=True) * rng.uniform(*WORN_PART, (6, 1))
+    middles = shortest + stroke * rng.uniform(0.3, 0.7, (6, 1))
+    widths = stroke * rng.uniform(*WORN_PART, (6, 1))
     sizes = most * rng.uniform(0.5, 1.0, (6, 1))
     wear = sizes * np.exp(-0.5 * ((struts.map_knots - middles) / widths) ** 2)
     return replace(model, struts=replace(struts, map_backlash=wear))

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..machine.model import MachineModel, MachinesByTemperature, RealMachine
+from ..machine.rows import different_rows
 from ..measurements.campaign import Campaign
 from ..measurements.readings import (
     ABSOLUTE_KINDS,
@@ -23,7 +24,6 @@ from ..measurements.readings import (
     LEAST_NOISE,
     LENGTH,
     MeasurementSet,
-    different_rows,
 )
 from .trial import drive, model_commands
 

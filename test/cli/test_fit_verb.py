@@ -463,9 +463,16 @@ def test_noise_that_is_stated_is_welcome(hexapod: Program, stated: Path, tmp_pat
 
 
 def test_micrometres_called_millimetres_write_nothing(hexapod: Program, done: Calibration, tmp_path: Path) -> None:
-    """By either scheme, though the stated noise is in millimetres then, too."""
-    wrong = tmp_path / "mm.csv"
-    wrong.write_text(done.measured.read_text().replace(",um,", ",mm,"))
+    """By either scheme, whether the file states no noise, or noise that is in millimetres then, too.
+
+    Scheme lines leaves the screws' waves, a few micrometres, which now are millimetres.
+    """
+    wrong, text = tmp_path / "mm.csv", done.measured.read_text().replace(",um,", ",mm,")
+    wrong.write_text("".join(line.rsplit(",", 1)[0] + "\n" for line in text.splitlines()))
+    code, out, _ = hexapod("fit", wrong, "--scheme", "lines", "--out", tmp_path / "m.yaml")
+    assert code == 1
+    assert re.match(r"NOT WRITTEN: .*readings are off by more than 10 times their noise: linear by .* assumed", out)
+    wrong.write_text(text)
     code, out, _ = hexapod("fit", wrong, "--scheme", "lines", "--out", tmp_path / "m.yaml")
     assert code == 1
     problem = "readings are stated to be uncertain as no such instrument is, do units fit: linear by 1e+03 µm"
