@@ -6,9 +6,7 @@ import argparse
 import contextlib
 import math
 import os
-import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
@@ -163,14 +161,6 @@ def progress_bar(total: int, unit: str) -> Any:
     from tqdm import tqdm
 
     return tqdm(total=total, unit=unit, delay=1.0, disable=None, leave=False, file=own_terminal())
-
-
-def until_interrupted() -> threading.Event:
-    """Return what is set by Ctrl-C or SIGTERM, from now on, in place of their usual effect."""
-    stop = threading.Event()
-    for one in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(one, lambda *_: stop.set())
-    return stop
 
 
 def say_notes(notes: Iterable[str]) -> None:

@@ -12,12 +12,13 @@ from . import common
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb; 0 when there is something to be replayed."""
+    from ..nodes import heard_signals
     from ..nodes.recorder import BagRecorder
 
-    stop, end = common.until_interrupted(), time.monotonic() + (args.seconds or math.inf)
+    heard, end = heard_signals(), time.monotonic() + (args.seconds or math.inf)
     with BagRecorder(args.folder, args.namespace) as recorder, common.progress_bar(0, " messages") as bar:
         print(f"hexapod_comp: recording to {args.folder} until Ctrl-C", file=sys.stderr)
-        recorder.run(lambda: not stop.is_set() and time.monotonic() < end, bar.update)
+        recorder.run(lambda: not heard and time.monotonic() < end, bar.update)
     if args.json:
         common.show({"bag": args.folder, "messages": recorder.counts})
     else:

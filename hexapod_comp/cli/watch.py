@@ -5,21 +5,20 @@ from __future__ import annotations
 import argparse
 import sys
 
-from . import common
-
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb until Ctrl-C."""
     from ..machine.geometry import load_geometry
+    from ..nodes import heard_signals
     from ..nodes.page import WatchPage
     from ..nodes.watching import watch
 
     geometry = load_geometry(args.machine)
     page = WatchPage(geometry, args.host, args.port)
-    stop = common.until_interrupted()
+    heard = heard_signals()
     print(f"hexapod_comp: {geometry.name} is shown on {page.address} until Ctrl-C", file=sys.stderr)
     try:
-        watch(geometry, page.show, lambda: not stop.is_set(), args.namespace)
+        watch(geometry, page.show, lambda: not heard, args.namespace)
     finally:
         page.close()
     return 0

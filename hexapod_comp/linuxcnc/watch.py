@@ -15,9 +15,7 @@ origin of LinuxCNC's axes up by T, so that a level tool does not move when a len
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
-import threading
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -32,6 +30,7 @@ from ..kernels.motion import follow
 from ..machine.geometry import load_geometry
 from ..machine.model import RealMachine
 from ..machine.motion import MotionState
+from ..nodes import heard_signals
 from ..pose import Pose
 from ..virtual.named import find_model
 from .hal import METRES, HalComponent, pins, quaternion_from_axes
@@ -46,6 +45,9 @@ PINS = (
     *pins("out", "float", *TRUE, *ERRORS),
     *pins("out", "bit", "valid"),
 )
+
+HEARD_WITHIN = 0.1
+"""Longest sleep, s: how soon a signal ends the component."""
 
 
 class WatchedMachine:
@@ -153,7 +155,6 @@ class MachineComponent:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the component until SIGINT or SIGTERM; the entry of the executable ``linuxcnc_machine``."""
     options = _parser().parse_args(argv)
-    stop = threading.Event()
     try:
         geometry = load_geometry(options.geometry)
         machine = RealMachine(geometry, find_model(options.truth, geometry))
@@ -162,11 +163,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"cannot start: {error}", file=sys.stderr)
         return 1
     shown.cycle()  # compiles the kernels before LinuxCNC goes on; until then a signal ends the process at once
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    heard = heard_signals()
     shown.component.ready()
     period, due = 1.0 / options.rate, time.monotonic()
-    while not stop.wait(max(0.0, due - time.monotonic())):
+    while not heard:
+        if (now := time.monotonic()) < due:
+            time.sleep(min(due - now, HEARD_WITHIN))
+            continue
         shown.cycle()
         due = max(due + period, time.monotonic())
     shown.component.exit()

@@ -30,6 +30,18 @@ def start(module: str) -> int:
     return int(main())
 
 
+def heard_signals() -> list[int]:
+    """Return a list that SIGINT and SIGTERM are added to, from now on, in place of their usual effect.
+
+    Not an event: setting one takes its lock, and the signal may have interrupted whoever holds that, a main thread
+    about to wait for the event or another signal's handler. Then the process waits for itself for ever.
+    """
+    heard: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: heard.append(number))
+    return heard
+
+
 def start_compensator() -> int:
     """Run the executable ``compensator``."""
     return start("hexapod_comp.nodes.compensator")

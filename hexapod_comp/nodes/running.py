@@ -8,7 +8,6 @@ import gc
 import os
 import signal
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from typing import TextIO
@@ -19,6 +18,7 @@ from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 
 from ..errors import LONGEST_TEXT, HexapodError, printable
+from . import heard_signals
 from .arguments import Program
 from .log_relay import LogRelay
 from .memory import give_blocks_back, give_code_back
@@ -35,10 +35,10 @@ ENDED_WITHIN = 4.0
 """What the end of a process may take from its signal on, s; usually it is a fraction of a second."""
 
 
-def autostart(node: LifecycleNode, stop: threading.Event | None = None) -> bool:
-    """Configure and activate a node, unless `stop` is set meanwhile; return whether what was done went well."""
+def autostart(node: LifecycleNode, heard: Sequence[int] = ()) -> bool:
+    """Configure and activate a node, unless a signal is `heard` meanwhile; return whether what was done went well."""
     for step in (node.trigger_configure, node.trigger_activate):
-        if stop is not None and stop.is_set():
+        if heard:
             break
         if step() != TransitionCallbackReturn.SUCCESS:
             return False
@@ -69,7 +69,7 @@ def run(
 ) -> int:
     """Run a node until SIGINT or SIGTERM.
 
-    Signals only set a flag, since rclpy's own handling loses the last message and exits non-zero on a
+    Signals are only noted, since rclpy's own handling loses the last message and exits non-zero on a
     second Ctrl-C, which ``ros2 launch`` sends.
 
     Parameters
@@ -93,12 +93,10 @@ def run(
     if refusal is not None:
         return refusal
     give_blocks_back()
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    heard = heard_signals()
     with _own_stderr() as stderr:
         with LogRelay():
-            code = _run_until(stop, make_node, kernels, arguments, stderr)
+            code = _run_until(heard, make_node, kernels, arguments, stderr)
         if argv is None:
             # Python's own end waits for threads of DDS, which now and then never end, though all has been closed.
             for stream in filter(None, (sys.stdout, sys.stderr)):  # None: it was closed from the beginning
@@ -119,7 +117,7 @@ def _own_stderr() -> TextIO:
 
 
 def _run_until(
-    stop: threading.Event,
+    heard: Sequence[int],
     make_node: Callable[[], MachineNode],
     kernels: Callable[[], None],
     arguments: list[str],
@@ -147,15 +145,15 @@ def _run_until(
         for end in (rclpy.try_shutdown, node.destroy_node, executor.shutdown, node.say_goodbye, starting.close):
             ending.callback(end)
         ending.callback(_end_within, ENDED_WITHIN, stderr)
-        while not (stop.is_set() or starting.look()) and rclpy.ok():
+        while not (heard or starting.look()) and rclpy.ok():
             spin()
-        if node.wants_autostart and node.unconfigured and not autostart(node, stop):
+        if node.wants_autostart and node.unconfigured and not autostart(node, heard):
             return 1
         # What is loaded by now stays; the collector need not look at it again while the machine moves.
         gc.collect()
         gc.freeze()
         give_code_back()
-        while not stop.is_set() and rclpy.ok():
+        while not heard and rclpy.ok():
             spin()
     return 0
 

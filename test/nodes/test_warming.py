@@ -315,8 +315,11 @@ def test_a_node_without_anybody_to_print_to_ends_in_order(isolated_ros):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_while_modules_load_ends_a_program_without_a_traceback(tmp_path: Path, number: int):
-    """Loading takes seconds on a busy computer; here it takes for ever."""
-    (tmp_path / "endless.py").write_text("import threading\nprint('loading', flush=True)\nthreading.Event().wait()\n")
+    """Loading takes seconds on a busy computer; here it takes for ever, in small steps as there.
+
+    In one long wait a signal would be lost that came just before it: Python looks at it between two steps only.
+    """
+    (tmp_path / "endless.py").write_text("import time\nprint('loading', flush=True)\nwhile True: time.sleep(0.01)\n")
     program = "from hexapod_comp.nodes import start; start('endless')"
     process = subprocess.Popen(
         [sys.executable, "-c", program],
@@ -329,6 +332,26 @@ def test_a_signal_while_modules_load_ends_a_program_without_a_traceback(tmp_path
     process.send_signal(number)
     rest, _ = process.communicate(timeout=STOP_WITHIN)
     assert (process.returncode, rest) == (0, "")
+
+
+def test_a_signal_within_anothers_handler_does_not_wait_for_it():
+    """``ros2 launch`` and its terminal send one each. At every line that Python runs for the first comes a second."""
+    program = """
+import signal, sys
+from hexapod_comp.nodes import heard_signals
+
+def second(*_):
+    signal.raise_signal(signal.SIGTERM)
+    return second
+
+heard = heard_signals()
+sys.settrace(second)
+signal.raise_signal(signal.SIGINT)
+sys.settrace(None)
+print(*sorted(set(heard)))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60.0, check=False)
+    assert (done.returncode, done.stdout) == (0, "2 15\n"), done.stderr
 
 
 def test_a_node_loads_no_scipy_that_it_does_not_need():
