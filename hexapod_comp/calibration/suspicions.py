@@ -19,6 +19,7 @@ from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import MachineModel
 from ..machine.passes import Passes
+from ..measurements.reach import GEOMETRIES
 from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_KINDS, MeasurementSet, Stations
 from ..virtual.instruments import compensated
 from .estimation import Estimation
@@ -49,9 +50,6 @@ UNITS = {
     "angle": (("arcsec", np.pi / 0.648), ("mrad", 1e3), ("mdeg", np.pi / 0.18)),
 }
 """Units in which readings may stand that are said to be µm or µrad."""
-
-GEOMETRIES = ("paper.yaml", "example_6_6.yaml", "jugglebot.yaml", "positioning_unit.yaml")
-"""Machines whose readings may have been mixed up: the shipped ones."""
 
 SURE = 4.0
 """Backlash so many standard deviations below zero is no noise."""

@@ -17,6 +17,7 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.passes import Passes, Poses
 from ..pose import Pose, stacked
+from .reach import impossible, meant
 from .readings import (
     ANGULAR_KINDS,
     BACKWARD,
@@ -45,6 +46,9 @@ NUMBER_OF = {channel: number for number, channel in enumerate(CHANNELS)}
 
 OF_LINES = np.isin(np.array(KINDS)[KIND_OF], LINE_KINDS)
 """Whether each channel is read along a line."""
+
+NO_COMMANDS = (math.nan,) * 6
+"""Commanded strut lengths of a reading without any."""
 
 LARGEST_READING = 10.0
 """No machine errs by more, and no instrument's zero lies further off, m or rad."""
@@ -94,7 +98,9 @@ def assemble(
     centre = _centres(geometry, readings, points)
     runs, run_of, swapped = _runs(readings, arrays, points, geometry.work.rotation.T)
     of_readings = zip(readings, place.tolist(), [runs[i] for i in run_of.tolist()], strict=True)
-    stations, station = _collect_stations(geometry, list(of_readings), poses, in_reach)
+    if in_reach:
+        _check_possible(geometry, readings, place, poses)
+    stations, station = _collect_stations(geometry, list(of_readings), poses)
     return MeasurementSet(
         geometry=geometry,
         probe=probe,
@@ -247,7 +253,7 @@ def _recognise(readings: list[Reading], arrays: _Arrays, points: np.ndarray, wor
 
 
 def _collect_stations(
-    geometry: HexapodGeometry, readings: Sequence[tuple[Reading, int, Run]], poses: Poses, in_reach: bool
+    geometry: HexapodGeometry, readings: Sequence[tuple[Reading, int, Run]], poses: Poses
 ) -> tuple[Stations, np.ndarray]:
     """Return the distinct stations and each reading's index among them; readings with the numbers of their poses."""
     known: dict[tuple, int] = {}
@@ -271,8 +277,6 @@ def _collect_stations(
         key = (place, r.direction, came_from, r.temperatures, air)
         if key not in known:
             own = poses[0][pose], poses[1][pose], lengths[pose]
-            if in_reach:
-                _check_reach(geometry, *own, r)
             commands = own[2] if r.commands is None else np.array(r.commands, dtype=float)
             known[key] = len(rows)
             sense = _sense(own[0], commands, None if came_from is None else rows[came_from])
@@ -285,14 +289,22 @@ def _collect_stations(
     return Stations(*columns), np.array(index)
 
 
-def _check_reach(
-    geometry: HexapodGeometry, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray, reading: Reading
-) -> None:
-    """Refuse a commanded pose that the machine cannot have taken."""
-    refusal = geometry.refusal(position, rotation, lengths)
-    if refusal is not None:
-        problem = f"the commanded pose is out of the machine's reach: {refusal}"
-        raise InputFileError(reading.source.file, _line(reading), problem)
+def _check_possible(geometry: HexapodGeometry, readings: Sequence[Reading], place: np.ndarray, poses: Poses) -> None:
+    """Refuse what the machine cannot have been commanded; `place` is the number of each reading's pose."""
+    first: dict[tuple, int] = {}
+    for row, r in enumerate(readings):
+        first.setdefault((place[row], r.commands), row)
+    rows = list(first.values())
+    own = poses[0][place[rows]], poses[1][place[rows]]
+    commands = np.array([readings[row].commands or NO_COMMANDS for row in rows], dtype=float)
+    refused = list(impossible(geometry, own, commands))
+    if not refused:
+        return
+    number, problem = refused[0]
+    if ways := meant(geometry, own, commands):
+        problem += f"; {len(refused)} of {len(rows)} commands are refused; none would be {', or '.join(ways)}"
+    where = readings[rows[number]]
+    raise InputFileError(where.source.file, _line(where), problem)
 
 
 def _sense(position: np.ndarray, commands: np.ndarray, came_from: tuple | None) -> np.ndarray:

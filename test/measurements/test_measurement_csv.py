@@ -109,10 +109,10 @@ def test_the_measured_point_may_be_another_than_the_tools_tip(tmp_path: Path) ->
 
 
 def test_strut_rows_are_commands_of_their_pose(tmp_path: Path) -> None:
-    lengths = [401.5, 402.5, 403.5, 404.5, 405.5, 406.5]
+    lengths = [516.5, 502.5, 507.5, 508.5, 505.5, 512.5]
     rows = "".join(f"a,forward,-10,0,400,strut_{i},{v},mm\n" for i, v in enumerate(lengths, start=1))
     found = read(tmp_path, rows + LINE)
-    np.testing.assert_array_equal(found.stations.commands[0], [0.4015, 0.4025, 0.4035, 0.4045, 0.4055, 0.4065])
+    np.testing.assert_array_equal(found.stations.commands[0], [0.5165, 0.5025, 0.5075, 0.5085, 0.5055, 0.5125])
     nominal = strut_lengths(Structure.of(paper_geometry()), Pose([0.01, 0.0, 0.4], np.eye(3)))
     np.testing.assert_array_equal(found.stations.commands[1], nominal)
     assert len(found) == 2
@@ -257,7 +257,7 @@ def test_round_trip_of_everything(tmp_path: Path) -> None:
 
 
 def test_round_trip_of_sequences_and_of_another_point(tmp_path: Path) -> None:
-    lengths = ("400.5", "401.5", "402.5", "403.5", "404.5", "405.5")
+    lengths = ("515.5", "516.0", "516.5", "517.0", "517.5", "518.0")
     rows = ""
     for z in (400, 410, 420, 410, 400):
         rows += "".join(f"t,sequence,0,0,{z},strut_{i + 1},{v},mm\n" for i, v in enumerate(lengths))

@@ -6,18 +6,21 @@ The truth is what the readings say themselves, and closed-form strut lengths fro
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from foreign_machines import Machine, machines
 from strategies import paper_geometry
 
 from hexapod_comp.errors import InputFileError
-from hexapod_comp.machine.geometry import HexapodGeometry
+from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.files import read_measurements
 from hexapod_comp.measurements.readings import (
+    AXES,
     BACKWARD,
     FORWARD,
     FROM_PREVIOUS,
@@ -315,6 +318,71 @@ def test_what_no_machine_or_instrument_does_is_refused(change: dict[str, object]
         rows.append(row._replace(source=FileLine("test", 8)))
     with pytest.raises(InputFileError, match=complaint):
         assemble(PAPER, rows)
+
+
+def went(machine: Machine, tips: np.ndarray, written: np.ndarray, counted_from: float | None = 0.0) -> list[Reading]:
+    """Return readings of a level tool whose file has other places, with the lengths that the struts went to or none."""
+    rotations = np.tile(machine.level(), (len(tips), 1, 1))
+    lengths = machine.lengths(machine.platforms(tips), rotations)
+    commands = [None if counted_from is None else tuple(row - counted_from) for row in lengths]
+    poses = [Pose(tip, LEVEL) for tip in written]
+    rows = zip(poses, commands, strict=True)
+    return [Reading("all", 1, FROM_PREVIOUS, pose, "position_x", 0.0, commands=struts) for pose, struts in rows]
+
+
+def in_box(machine: Machine) -> np.ndarray:
+    """Return 20 random tips, (20, 3) m."""
+    return machine.box[0] + np.random.default_rng(1).random((20, 3)) * np.ptp(machine.box, axis=0)
+
+
+@pytest.mark.parametrize("name", machines())
+@pytest.mark.parametrize("order", [(1, 0, 2), (2, 1, 0), (0, 2, 1)], ids=["x and y", "x and z", "y and z"])
+def test_exchanged_axes_are_named(name: str, order: tuple[int, ...], tmp_path: Path) -> None:
+    machine = machines()[name]
+    geometry, tips = load_geometry(machine.write(tmp_path / "machine.yaml")), in_box(machine)
+    one, other = (axis for axis, place in enumerate(order) if axis != place)
+    with pytest.raises(InputFileError, match=f"are refused; none would be .*with {AXES[one]} and {AXES[other]} exchanged"):
+        assemble(geometry, went(machine, tips, tips[:, order]))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "way"),
+    [
+        ("unit", lambda tips: tips / 25.4, "with coordinates in inches"),
+        ("mirror", lambda tips: tips * [1.0, 1.0, -1.0], "with the sign of z reversed"),
+        ("framed", lambda tips: tips[:, [2, 1, 0]], "with x and z exchanged"),
+    ],
+)
+def test_what_poses_may_mean_is_named_without_commanded_lengths(
+    name: str, change: Callable[[np.ndarray], np.ndarray], way: str, tmp_path: Path
+) -> None:
+    machine = machines()[name]
+    geometry, tips = load_geometry(machine.write(tmp_path / "machine.yaml")), in_box(machine)
+    with pytest.raises(InputFileError, match=f"out of the machine's reach: .* are refused; none would be .*{way}"):
+        assemble(geometry, went(machine, tips, change(tips), counted_from=None))
+
+
+def test_another_machines_poses_name_it() -> None:
+    """Four millimetres above the base of the positioning unit, and within the paper's machine's reach."""
+    tips = np.array([[0.0, 0.0, 0.4]]) + 0.05 * np.random.default_rng(1).random((20, 3))
+    readings = [Reading("all", 1, FROM_PREVIOUS, Pose(tip, LEVEL), "position_x", 0.0) for tip in tips]
+    with pytest.raises(InputFileError, match=r"20 of 20 commands are refused; none would be .*with --machine paper"):
+        assemble(load_geometry("positioning_unit"), readings)
+
+
+@pytest.mark.parametrize(("counted_from", "fine"), [(-0.0119, True), (-0.0120, False), (0.25, False)])
+def test_strut_lengths_that_do_not_belong_to_the_pose_are_refused(
+    counted_from: float, fine: bool, tmp_path: Path
+) -> None:
+    """2 % of the shortest, 596.16 mm, are 11.92 mm; a control that counts from where struts are in is off by more."""
+    machine = machines()["inches"]
+    geometry, tips = load_geometry(machine.write(tmp_path / "machine.yaml")), in_box(machine)
+    readings = went(machine, tips, tips, counted_from)
+    if fine:
+        assert len(assemble(geometry, readings)) == len(tips)
+        return
+    with pytest.raises(InputFileError, match=r"strut_\d: .* mm was commanded, the pose needs .* differ by 2 %\)$"):
+        assemble(geometry, readings)
 
 
 def test_no_reading_is_refused() -> None:
