@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
 
 from ..errors import CalibrationError
-from .cell_rows import CellRows
+from .cell_rows import CellRows, at_once
 from .parameters import ParameterSpace
 from .unknowns import Unknown
 
@@ -130,6 +130,8 @@ class Posterior:
         Share of each parameter that comes from the data; the rest comes from the prior.
     spread : ndarray, shape (n,)
         The prior's standard deviation of each y.
+    log_determinant : float
+        Logarithm of the determinant of the precision of y over that.
     """
 
     used: np.ndarray
@@ -139,6 +141,7 @@ class Posterior:
     noise: np.ndarray
     determined: np.ndarray
     spread: np.ndarray
+    log_determinant: float
 
 
 def solve(
@@ -173,11 +176,11 @@ def solve(
         whitened = np.tensordot(noise[kinds] ** -2, normal, 1)
         whitened *= spread[:, None] * spread
         whitened[np.diag_indices_from(whitened)] += 1.0
-        inverse = _inverse(whitened)
+        inverse, log_determinant = _inverse(whitened)
         z = inverse @ (spread * (noise[kinds] ** -2 @ moment))
         determined = 1.0 - np.diag(inverse)
         inverse *= spread[:, None] * spread
-        posterior = Posterior(used, spread * z, inverse, tolerances, noise, determined, spread)
+        posterior = Posterior(used, spread * z, inverse, tolerances, noise, determined, spread, log_determinant)
         if turn < rounds:
             noise, tolerances = _noise(problem, kinds, normal, moment, posterior), _tolerances(space, posterior, z)
             scales.append(np.concatenate([tolerances, noise]))
@@ -205,8 +208,8 @@ def _extrapolated(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> n
     return result
 
 
-def _inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverse of a positive definite matrix, which is overwritten.
+def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the inverse of a positive definite matrix, which is overwritten, and the logarithm of its determinant.
 
     Raises
     ------
@@ -217,10 +220,11 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
     if failed:
         problem = "are too few to tell noise from the machine's errors, or their uncertainty is below any instrument's"
         raise CalibrationError("measurements", problem)
+    log_determinant = 2.0 * float(np.log(np.diag(factor)).sum())
     lower, _ = dpotri(factor, lower=1, overwrite_c=1)
     inverse = lower.T + lower  # dpotrf has left zeros above
     inverse[np.diag_indices_from(inverse)] *= 0.5
-    return inverse
+    return inverse, log_determinant
 
 
 def _noise(
@@ -259,9 +263,8 @@ def log_evidence(problem: LinearProblem, posterior: Posterior) -> float:
     """
     kinds = np.unique(problem.kind)
     weights, moment = posterior.noise[kinds] ** -2, problem.moment[np.ix_(kinds, posterior.used)]
-    _, determinant = np.linalg.slogdet(whitened_precision(problem, posterior))
     unmet = weights @ (problem.square[kinds] - moment @ posterior.y)
-    return float(-0.5 * (unmet + determinant - problem.freedom[kinds] @ np.log(weights)))
+    return float(-0.5 * (unmet + posterior.log_determinant - problem.freedom[kinds] @ np.log(weights)))
 
 
 def condense(problem: LinearProblem, posterior: Posterior) -> Condensed:
@@ -311,13 +314,20 @@ def _solved_without(problem: LinearProblem, condensed: Condensed, posterior: Pos
     or by −(C⁻¹ − Rᵀ·R)⁻¹·Rᵀ·r: a matrix of the rows' size, where they are few, or of the parameters'.
     """
     used, spread, fold = posterior.used, posterior.spread, problem.fold[condensed.cell]
-    precision, solved = whitened_precision(problem, posterior), np.zeros((len(condensed.rest), problem.rows.shape[1]))
-    for chosen, ends in _whole_folds(fold, len(used) // 2):
+    solved = np.zeros((len(condensed.rest), problem.rows.shape[1]))
+    any_large = 2 * np.bincount(fold).max() > len(used)
+    precision = whitened_precision(problem, posterior) if any_large else np.zeros((0, 0))
+
+    def solve_without(some: tuple[np.ndarray, list[int]]) -> None:
+        chosen, ends = some
         scale = 1.0 / posterior.noise[problem.kind[condensed.cell[chosen]]]
         rows = condensed.rows.select(chosen).using(used, scale)
         left = scale * condensed.target[chosen] - rows.times(posterior.y)
         if 2 * ends[1] > len(used):
-            factor = np.linalg.cholesky(precision - spread[:, None] * rows.normal() * spread)
+            seen = rows.normal()
+            seen *= spread[:, None]
+            seen *= spread
+            factor = np.linalg.cholesky(np.subtract(precision, seen, out=seen))
             changes = spread * dpotrs(factor, spread * rows.transposed_times(left), lower=1)[0]
         else:
             shared, whole = rows.times(posterior.covariance), rows.dense()
@@ -325,6 +335,8 @@ def _solved_without(problem: LinearProblem, condensed: Condensed, posterior: Pos
             for n, (a, b) in enumerate(pairwise(ends)):
                 changes[n] = np.linalg.solve(np.eye(b - a) - shared[a:b] @ whole[a:b].T, left[a:b]) @ shared[a:b]
         solved[np.ix_(fold[chosen[ends[:-1]]], used)] = posterior.y - changes
+
+    at_once(solve_without, _whole_folds(fold, len(used) // 2))
     return solved
 
 
