@@ -80,7 +80,8 @@ def command(readings: MeasurementSet) -> dict[str, float]:
 def main() -> None:
     """Print a line for each density."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--dense", type=float, nargs="+", default=[1.3, 14], help="times as many readings (default 1.3 14)")
+    text = "times as many readings (default 1.3 14)"
+    parser.add_argument("--dense", type=float, nargs="+", default=[1.3, 14], help=text)
     parser.add_argument("--json", action="store_true", help="JSON instead of a table")
     parser.add_argument("--save", type=Path, metavar="FILE", help="keep the answers (.npz)")
     parser.add_argument("--against", type=Path, metavar="FILE", help="compare the answers with kept ones")

@@ -341,7 +341,8 @@ def test_exchanged_axes_are_named(name: str, order: tuple[int, ...], tmp_path: P
     machine = machines()[name]
     geometry, tips = load_geometry(machine.write(tmp_path / "machine.yaml")), in_box(machine)
     one, other = (axis for axis, place in enumerate(order) if axis != place)
-    with pytest.raises(InputFileError, match=f"are refused; none would be .*with {AXES[one]} and {AXES[other]} exchanged"):
+    way = f"with {AXES[one]} and {AXES[other]} exchanged"
+    with pytest.raises(InputFileError, match=f"are refused; none would be .*{way}"):
         assemble(geometry, went(machine, tips, tips[:, order]))
 
 
