@@ -42,6 +42,7 @@ from benchmarks.warm_up import (
     pulls_of,
 )
 from hexapod_comp.compensation.thermal import DEFAULT_TIME_CONSTANT, TemperatureFilter
+from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.passes import Passes, random_passes
@@ -245,8 +246,10 @@ def pulled(args: argparse.Namespace) -> list[PullRow]:
         for draw in range(args.draws):
             kind = PULLED[draw % len(PULLED)]
             seed = 100 + draw
-            # Kinds, machines and thermometers in turn, each with each.
-            pulls += pulls_of(kind, thermometers[seed // len(PULLED) % 2], seed + seed // len(PULLED))
+            try:  # kinds, machines and thermometers in turn, each with each
+                pulls += pulls_of(kind, thermometers[seed // len(PULLED) % 2], seed + seed // len(PULLED))
+            except CalibrationError as error:
+                tqdm.write(f"draw {draw}, {kind}: refused: {error}")
             bar.update()
     names = list(dict.fromkeys(p.parameter for p in pulls))
     rows = [pull_row(name, pulls) for name in (*names, "")]

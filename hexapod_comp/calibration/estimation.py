@@ -310,7 +310,7 @@ def iterate(
         problem, residuals = estimation.linearise(x, weights)
         posterior = solve(estimation.space, problem, tolerances, noise)
         tolerances, noise = posterior.tolerances, posterior.noise
-        change = _change(estimation.space.physical(posterior.y) - x, estimation.space, posterior)
+        change, block = _change(estimation.space.physical(posterior.y) - x, estimation.space, posterior)
         progress(f"step {step}: largest change {change:.2g} standard deviations")
         if step > all_alike + (2 if robust else 1) and change > SLOW * last:  # the first with weights may change more
             share = max(LEAST_SHARE, 0.5 * share)
@@ -320,11 +320,14 @@ def iterate(
         if robust and step > all_alike:
             weights = estimation.robust_weights(residuals)
     if change > 1.0:
-        raise CalibrationError("fit", f"did not settle within {STEPS} steps")
+        problem = f"did not settle within {STEPS} steps: {block} still changes by {change:.2g} standard deviations"
+        raise CalibrationError("fit", f"{problem}; are all blocks allowed, and is it measured in enough places?")
     return Solution(problem, posterior, x, residuals, weights, step, change)
 
 
-def _change(change: np.ndarray, space: ParameterSpace, posterior: Posterior) -> float:
-    """Return the largest change of a parameter x in its standard deviation."""
+def _change(change: np.ndarray, space: ParameterSpace, posterior: Posterior) -> tuple[float, str]:
+    """Return the largest change of a parameter x in its standard deviation, and the block that it belongs to."""
     deviations = np.sqrt(np.diag(physical_covariance(space, posterior)))
-    return float((np.abs(change) / deviations).max())
+    sizes = np.abs(change) / deviations
+    block = max(space.blocks, key=lambda block: sizes[block.part].max())
+    return float(sizes[block.part].max()), block.name

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2, multivariate_normal
 
 from hexapod_comp.calibration.cell_rows import CellRows
-from hexapod_comp.calibration.estimation import Estimation
+from hexapod_comp.calibration.estimation import Estimation, iterate
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.linear_problem import (
     HYPER,
@@ -419,6 +419,17 @@ def test_struts_without_backlash_do_not_upset_the_fit():
 
 
 # ---------------------------------------------------------------- what must be refused
+
+
+def test_a_fit_that_does_not_settle_says_what_still_moves(monkeypatch):
+    """One step from the nominal machine, with nothing but the struts' pitch: only that can have moved."""
+    monkeypatch.setattr("hexapod_comp.calibration.estimation.STEPS", 1)
+    settings = replace(FEW, blocks=("pitch",), tolerances=(("structure", 1e-12), ("pitch", 100e-6)))
+    space = ParameterSpace(readings(), settings)
+    start = np.zeros(space.size), space.start_tolerances(), ONES
+    text = r"did not settle within 1 steps: pitch still changes by \d.* standard deviations; .* enough places\?$"
+    with pytest.raises(CalibrationError, match=text):
+        iterate(Estimation(readings(), space), *start, lambda _: None)
 
 
 def swapped(ours: MeasurementSet) -> MeasurementSet:
