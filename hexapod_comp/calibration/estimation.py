@@ -320,8 +320,8 @@ def iterate(
         if robust and step > all_alike:
             weights = estimation.robust_weights(residuals)
     if change > 1.0:
-        problem = f"did not settle within {STEPS} steps: {block} still changes by {change:.2g} standard deviations"
-        raise CalibrationError("fit", f"{problem}; are all blocks allowed, and is it measured in enough places?")
+        moving = f"did not settle within {STEPS} steps: {block} still changes by {change:.2g} standard deviations"
+        raise CalibrationError("fit", f"{moving}; are all blocks allowed, and is it measured in enough places?")
     return Solution(problem, posterior, x, residuals, weights, step, change)
 
 
