@@ -173,10 +173,7 @@ def solve(
     for turn in range(rounds + 1):
         tolerances, noise = scales[-1][: len(tolerances)], scales[-1][len(tolerances) :]
         spread = space.spread(tolerances)[used]
-        whitened = np.tensordot(noise[kinds] ** -2, normal, 1)
-        whitened *= spread[:, None] * spread
-        whitened[np.diag_indices_from(whitened)] += 1.0
-        inverse, log_determinant = _inverse(whitened)
+        inverse, log_determinant = _inverse(_whitened(noise[kinds], normal, spread))
         z = inverse @ (spread * (noise[kinds] ** -2 @ moment))
         determined = 1.0 - np.diag(inverse)
         inverse *= spread[:, None] * spread
@@ -314,16 +311,16 @@ def _solved_without(problem: LinearProblem, condensed: Condensed, posterior: Pos
     or by −(C⁻¹ − Rᵀ·R)⁻¹·Rᵀ·r: a matrix of the rows' size, where they are few, or of the parameters'.
     """
     used, spread, fold = posterior.used, posterior.spread, problem.fold[condensed.cell]
-    solved = np.zeros((len(condensed.rest), problem.rows.shape[1]))
-    any_large = 2 * np.bincount(fold).max() > len(used)
-    precision = whitened_precision(problem, posterior) if any_large else np.zeros((0, 0))
+    solved, small = np.zeros((len(condensed.rest), problem.rows.shape[1])), len(used) // 2
+    # It is not needed where no fold is large.
+    precision = whitened_precision(problem, posterior) if np.bincount(fold).max() > small else np.zeros((0, 0))
 
     def solve_without(some: tuple[np.ndarray, list[int]]) -> None:
         chosen, ends = some
         scale = 1.0 / posterior.noise[problem.kind[condensed.cell[chosen]]]
         rows = condensed.rows.select(chosen).using(used, scale)
         left = scale * condensed.target[chosen] - rows.times(posterior.y)
-        if 2 * ends[1] > len(used):
+        if ends[1] > small:
             seen = rows.normal()
             seen *= spread[:, None]
             seen *= spread
@@ -336,7 +333,7 @@ def _solved_without(problem: LinearProblem, condensed: Condensed, posterior: Pos
                 changes[n] = np.linalg.solve(np.eye(b - a) - shared[a:b] @ whole[a:b].T, left[a:b]) @ shared[a:b]
         solved[np.ix_(fold[chosen[ends[:-1]]], used)] = posterior.y - changes
 
-    at_once(solve_without, _whole_folds(fold, len(used) // 2))
+    at_once(solve_without, _whole_folds(fold, small))
     return solved
 
 
@@ -356,8 +353,13 @@ def whitened_precision(problem: LinearProblem, posterior: Posterior) -> np.ndarr
     """Return the precision of y over the prior's spread, shape (n, n)."""
     kinds = np.unique(problem.kind)
     information = problem.normal[np.ix_(kinds, posterior.used, posterior.used)]
-    precision = np.tensordot(posterior.noise[kinds] ** -2, information, 1)
-    precision *= posterior.spread[:, None] * posterior.spread
+    return _whitened(posterior.noise[kinds], information, posterior.spread)
+
+
+def _whitened(noise: np.ndarray, information: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Return the same from the noise (kinds,) and the information (kinds, n, n) of each kind, and the spread (n,)."""
+    precision = np.tensordot(noise**-2, information, 1)
+    precision *= spread[:, None] * spread
     precision[np.diag_indices_from(precision)] += 1.0
     return precision
 

@@ -19,7 +19,7 @@ from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import MachineModel
 from ..machine.passes import Passes
-from ..measurements.reach import GEOMETRIES
+from ..measurements.reach import GEOMETRIES, exchanged
 from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_KINDS, MeasurementSet, Stations
 from ..virtual.instruments import compensated
 from .estimation import Estimation
@@ -408,12 +408,11 @@ def _exchanged_axes(m: MeasurementSet, a: int, b: int) -> MeasurementSet:
     order[[a, b]] = b, a
     work = m.geometry.work
     turn = work.rotation @ np.eye(3)[order] @ work.rotation.T
-    tips, tools = m.geometry.tool_poses(m.stations.positions, m.stations.rotations)
-    positions, rotations = m.geometry.platform_poses(tips[:, order], tools)
+    poses = exchanged(m.geometry, (m.stations.positions, m.stations.rotations), a, b)
     runs = tuple(replace(run, axis=turn @ run.axis) for run in m.runs)
     channels = [CHANNELS.index(_renamed(name, a, b)) for name in CHANNELS]
-    exchanged = replace(m, runs=runs, channel=np.array(channels)[m.channel])
-    return _sent(exchanged, m.geometry, positions, rotations, turn)
+    renamed = replace(m, runs=runs, channel=np.array(channels)[m.channel])
+    return _sent(renamed, m.geometry, *poses, turn)
 
 
 def _renamed(channel: str, a: int, b: int) -> str:

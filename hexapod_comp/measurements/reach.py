@@ -58,13 +58,18 @@ def meant(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) -> list
     return [how for how, machine, other in others if next(impossible(machine, other, commands), None) is None]
 
 
+def exchanged(geometry: HexapodGeometry, poses: Poses, a: int, b: int) -> Poses:
+    """Return the platform's poses with two coordinates of the tool in the work frame exchanged, not its attitude."""
+    tips, tools = geometry.tool_poses(*poses)
+    tips[:, [a, b]] = tips[:, [b, a]]
+    return geometry.platform_poses(tips, tools)
+
+
 def _others(geometry: HexapodGeometry, poses: Poses) -> Iterator[tuple[str, HexapodGeometry, Poses]]:
     """Yield other ways to read commanded poses: how, with which machine, and where its platform then is."""
     tips, tools = geometry.tool_poses(*poses)
     for a, b in combinations(range(3), 2):
-        order = np.arange(3)
-        order[[a, b]] = b, a
-        yield f"with {AXES[a]} and {AXES[b]} exchanged", geometry, geometry.platform_poses(tips[:, order], tools)
+        yield f"with {AXES[a]} and {AXES[b]} exchanged", geometry, exchanged(geometry, poses, a, b)
     for axis, sign in zip(AXES, 1.0 - 2.0 * np.eye(3), strict=True):
         yield f"with the sign of {axis} reversed", geometry, geometry.platform_poses(sign * tips, tools)
     for unit, factor in UNITS:

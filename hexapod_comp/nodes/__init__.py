@@ -6,6 +6,8 @@ import importlib
 import os
 import signal
 import sys
+from collections.abc import Callable
+from types import FrameType
 
 
 def start(module: str) -> int:
@@ -18,8 +20,7 @@ def start(module: str) -> int:
     module : str
         Full name of a module with a function ``main``.
     """
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: os._exit(0))
+    _at_the_end(lambda *_: os._exit(0))
     try:
         main = importlib.import_module(module).main
     except ImportError as error:
@@ -37,9 +38,14 @@ def heard_signals() -> list[int]:
     about to wait for the event or another signal's handler. Then the process waits for itself for ever.
     """
     heard: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: heard.append(number))
+    _at_the_end(lambda number, _: heard.append(number))
     return heard
+
+
+def _at_the_end(handler: Callable[[int, FrameType | None], object]) -> None:
+    """Let a function handle the signals that end a program, from now on."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handler)
 
 
 def start_compensator() -> int:

@@ -364,7 +364,7 @@ def test_what_poses_may_mean_is_named_without_commanded_lengths(
 
 
 def test_another_machines_poses_name_it() -> None:
-    """Four millimetres above the base of the positioning unit, and within the paper's machine's reach."""
+    """400 mm above the base of the positioning unit, whose struts end at 218 mm; the paper's machine reaches there."""
     tips = np.array([[0.0, 0.0, 0.4]]) + 0.05 * np.random.default_rng(1).random((20, 3))
     readings = [Reading("all", 1, FROM_PREVIOUS, Pose(tip, LEVEL), "position_x", 0.0) for tip in tips]
     with pytest.raises(InputFileError, match=r"20 of 20 commands are refused; none would be .*with --machine paper"):
