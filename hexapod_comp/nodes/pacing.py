@@ -15,7 +15,7 @@ SHOWN_FOR = 1.0
 """That commands are taken late is spoken of for this long, s."""
 
 JITTER = 0.02
-"""A wait up to this, s, is nothing to speak of."""
+"""A wait up to this, s, is nothing to speak of, nor is an alarm that rings so late."""
 
 
 class Pacing:
@@ -26,8 +26,9 @@ class Pacing:
     node : MachineNode
         In whose executor what waits is taken.
     options : dict
-        The node's parameter ``catch_up_within``: how long a command may wait, s; all that wait are refused when one
-        has waited longer. 0: only the newest waits, and those that it replaces are dropped.
+        The node's parameter ``catch_up_within``: how long a command may wait for the struts, s; all that wait are
+        refused when one has waited longer. While the node itself stood still, none has waited for the struts. 0: only
+        the newest waits, and those that it replaces are dropped.
     take : callable
         Takes a message at a monotonic time, s; returns how long it must wait still, s, 0 when it is settled.
     refuse : callable
@@ -49,6 +50,7 @@ class Pacing:
         self._node, self._options, self._take, self._refuse = node, options, take, refuse
         self._waiting: deque[tuple[float, bytes]] = deque()
         self._behind_at = -float("inf")
+        self._due = self._stood_still = 0.0
         self.waited = self.dropped = 0
         self._alarm = Alarm(node, node.guard.around("go_on", self._go_on))
 
@@ -60,9 +62,8 @@ class Pacing:
         """Take a command that comes at the monotonic time `now`, s, now or in its turn."""
         if not self._waiting:
             if (wait := self._take(message, now)) > 0.0:
-                self._waiting.append((now, message))
-                self.waited += 1
-                self._alarm.set(wait)
+                self._wait_in_line(message, now)
+                self._wait_for_struts(now, wait)
             return
         if not self._longest:
             self.dropped += len(self._waiting)
@@ -70,8 +71,7 @@ class Pacing:
             self._behind_at = now
         elif len(self._waiting) == COMMAND_QOS.depth:
             self._refuse_all(now)
-        self._waiting.append((now, message))
-        self.waited += 1
+        self._wait_in_line(message, now)
 
     def behind(self, now: float) -> bool:
         """Return whether commands were taken late, or dropped, of late: jitter is nothing to speak of."""
@@ -86,26 +86,40 @@ class Pacing:
         self.clear()
         self._alarm.close()
 
+    def _wait_in_line(self, message: bytes, now: float) -> None:
+        self._waiting.append((now - self._stood_still, message))
+        self.waited += 1
+
+    def _wait_for_struts(self, now: float, wait: float) -> None:
+        self._due = now + wait
+        self._alarm.set(wait)
+
+    def _age(self, came: float, now: float) -> float:
+        """Return how long a command has waited for the struts; `came` counts no time in which the node stood still."""
+        return now - self._stood_still - came
+
     def _go_on(self) -> None:
         """Take what waits, as far as the struts may go by now."""
+        if (late := time.monotonic() - self._due) > JITTER:
+            self._stood_still += late
         if not self._node.active:
             self._waiting.clear()
         while self._waiting:
             now = time.monotonic()
             came, message = self._waiting[0]
-            if 0.0 < self._longest < now - came:
+            if 0.0 < self._longest < self._age(came, now):
                 self._refuse_all(now)
                 return
             if (wait := self._take(message, now)) > 0.0:
-                self._alarm.set(wait)
+                self._wait_for_struts(now, wait)
                 return
-            if now - came > JITTER:
+            if self._age(came, now) > JITTER:
                 self._behind_at = now
             if self._waiting:  # else what was taken has cleared it
                 self._waiting.popleft()
 
     def _refuse_all(self, now: float) -> None:
-        waited = now - self._waiting[0][0]
+        waited = self._age(self._waiting[0][0], now)
         text = f"commands come faster than the struts may move: {waited:.3f} s behind, allowed {self._longest:g} s"
         while self._waiting:
             error = LimitError("speed", text, waited, self._longest, None, "compensated")

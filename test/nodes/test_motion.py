@@ -137,6 +137,18 @@ def test_a_burst_that_would_be_followed_too_late_ends(bench):
     bench.ask(risen(bench, last + 0.5, 0.0))
 
 
+def test_a_node_that_stood_still_blames_no_commands(bench):
+    """Twenty commands need 32 ms of the struts and may wait for 1 s; meanwhile nothing runs in the node for 1.5 s, as
+    when the computer is busy or swaps: they are late, but not too fast.
+    """
+    node = bench.compensator(catch_up_within=1.0, max_command_age=0.0)
+    burst(bench, 20)
+    bench.until(lambda: node._pacing.waited, "that one waits")
+    time.sleep(1.5)
+    bench.until(lambda: bench.values().get("commands") == "21", "all of them")
+    assert bench.values()["refused"] == "0"
+
+
 def test_where_a_parameter_says_so_only_the_newest_of_a_burst_waits(bench):
     """The first is taken, the newest is 10 mm away, further than a step: refused; the others are dropped."""
     bench.compensator(catch_up_within=0.0, command_timeout=0.0, max_command_age=0.0)
