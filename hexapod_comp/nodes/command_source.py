@@ -14,12 +14,10 @@ from rclpy.lifecycle import LifecycleNode
 
 from ..errors import shorten
 from .guarding import described
+from .health import Lately
 
 SPEAKERS_WITHIN = 1.0
 """Who speaks again this long after another has taken over is not a predecessor that was stopped, s."""
-
-MISSED_SHOWN_FOR = 1.0
-"""A message that went missing is spoken of for this long, s."""
 
 SPEAKERS_HELD = 2.0
 """Two that spoke in turn count as two for this long after the last turn, s."""
@@ -41,8 +39,9 @@ class Sequence:
 
     def __init__(self) -> None:
         self.missed, self.counted = 0, True
-        self._missed_at = self._turned_at = self._changed_at = -float("inf")
+        self._turned_at = self._changed_at = -float("inf")
         self._last = self._other = 0
+        self._misses = Lately()
 
     def hear(self, number: int | None, now: float) -> bool:
         """Take the number of a message at the monotonic time `now`; return whether two speak in turn.
@@ -69,11 +68,12 @@ class Sequence:
 
     def _miss(self, count: int, now: float) -> None:
         if count > 0:
-            self.missed, self._missed_at = self.missed + count, now
+            self.missed += count
+            self._misses.note(now)
 
     def missing(self, now: float) -> bool:
         """Return whether messages have gone missing of late."""
-        return now - self._missed_at < MISSED_SHOWN_FOR
+        return self._misses.holds(now)
 
     def two_speak(self, now: float) -> bool:
         """Return whether two publishers have spoken in turn of late."""

@@ -177,7 +177,7 @@ class CompensatorStatus:
             yield WARN, f"temperatures stale: {stale}"
         if HUMIDITY in self.thermometers.stale(now):
             yield WARN, "humidity stale"
-        if not silent and self.source.sequence.missing(now):
+        if self.source.sequence.missing(now) and not silent:
             yield WARN, "running, commands are being missed"
         if self.pacing.behind(now):
             yield WARN, "running, catching up with commands that came late"

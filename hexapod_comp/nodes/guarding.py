@@ -21,7 +21,7 @@ class CallbackGuard:
     """Catches what a callback raises, counts it, and lets it be said.
 
     A message, a timer, an event or a request must not end a node, whoever sent it and whatever is wrong with it or
-    with us. What is caught here was foreseen nowhere else, so it is an error for :data:`~.health.REFUSAL_SHOWN_FOR`.
+    with us. What is caught here was foreseen nowhere else, so it is an error for :data:`~.health.SHOWN_FOR`.
     A service also answers: anybody may ask for a transition that is not allowed now, and rclpy raises then.
 
     Parameters

@@ -13,8 +13,8 @@ from ..errors import LONGEST_TEXT, printable
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
-REFUSAL_SHOWN_FOR = 1.0
-"""A refusal colours the status for this long, s."""
+SHOWN_FOR = 1.0
+"""What has happened colours the status for this long, s."""
 
 
 def status_prefix(namespace: str, node: str) -> str:
@@ -60,30 +60,50 @@ class Flow:
         return self._rate
 
 
+class Lately:
+    """Whether something has happened of late: within :data:`SHOWN_FOR`, or since this was asked before.
+
+    So a node that is asked now and then says everything at least once, however long it stood still in between.
+    """
+
+    def __init__(self) -> None:
+        self._at = self._asked = self._before = -float("inf")
+
+    def note(self, now: float) -> None:
+        """Take it that it happens at the monotonic time `now`, s."""
+        self._at = now
+
+    def holds(self, now: float) -> bool:
+        """Return whether it has happened of late; the same as often as one asks at the same time."""
+        if now > self._asked:
+            self._before, self._asked = self._asked, now
+        return now - self._at < SHOWN_FOR or self._at > self._before
+
+
 class Refusals:
     """Refused messages, counted by reason."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self._times: dict[str, float] = {}
+        self._lately: dict[str, Lately] = {}
         self.last_reason = ""
         self.last_text = ""
-        self.last_time = -float("inf")
 
     def add(self, reason: str, text: str, now: float) -> None:
         """Count one refusal."""
         self.counts[reason] += 1
-        self._times[reason] = now
-        self.last_reason, self.last_text, self.last_time = reason, text, now
+        self._lately[reason] = self._lately.pop(reason, Lately())  # the newest comes last
+        self._lately[reason].note(now)
+        self.last_reason, self.last_text = reason, text
 
     def recent(self, now: float) -> bool:
         """Return whether one is recent enough to be shown as an error."""
-        return now - self.last_time < REFUSAL_SHOWN_FOR
+        return bool(self.reasons(now))
 
     def reasons(self, now: float, but: str = "") -> str:
         """Return all reasons `but` one recent enough to be shown, the newest first: none must hide another."""
-        recent = [reason for reason, at in self._times.items() if now - at < REFUSAL_SHOWN_FOR and reason != but]
-        return ", ".join(sorted(recent, key=lambda reason: -self._times[reason]))
+        recent = [reason for reason, lately in self._lately.items() if lately.holds(now)]
+        return ", ".join(reason for reason in reversed(recent) if reason != but)
 
     def values(self) -> dict[str, str]:
         """Return the counters as key and value."""

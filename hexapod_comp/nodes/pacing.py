@@ -9,10 +9,8 @@ from typing import Any
 
 from ..errors import HexapodError, LimitError
 from .callbacks import Alarm
+from .health import Lately
 from .runtime import COMMAND_QOS, MachineNode
-
-SHOWN_FOR = 1.0
-"""That commands are taken late is spoken of for this long, s."""
 
 JITTER = 0.02
 """A wait up to this, s, is nothing to speak of, nor is an alarm that rings so late."""
@@ -49,7 +47,7 @@ class Pacing:
     ) -> None:
         self._node, self._options, self._take, self._refuse = node, options, take, refuse
         self._waiting: deque[tuple[float, bytes]] = deque()
-        self._behind_at = -float("inf")
+        self._behind = Lately()
         self._due = self._stood_still = 0.0
         self.waited = self.dropped = 0
         self._alarm = Alarm(node, node.guard.around("go_on", self._go_on))
@@ -68,14 +66,14 @@ class Pacing:
         if not self._longest:
             self.dropped += len(self._waiting)
             self._waiting.clear()
-            self._behind_at = now
+            self._behind.note(now)
         elif len(self._waiting) == COMMAND_QOS.depth:
             self._refuse_all(now)
         self._wait_in_line(message, now)
 
     def behind(self, now: float) -> bool:
         """Return whether commands were taken late, or dropped, of late: jitter is nothing to speak of."""
-        return now - self._behind_at < SHOWN_FOR
+        return self._behind.holds(now)
 
     def clear(self) -> None:
         """Forget what waits."""
@@ -114,7 +112,7 @@ class Pacing:
                 self._wait_for_struts(now, wait)
                 return
             if self._age(came, now) > JITTER:
-                self._behind_at = now
+                self._behind.note(now)
             if self._waiting:  # else what was taken has cleared it
                 self._waiting.popleft()
 

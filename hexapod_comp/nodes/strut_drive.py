@@ -217,9 +217,10 @@ class StrutDriveNode(MachineNode):
             yield ERROR, f"refusing commands: {self._source.reason}: {self._source.problem}"
         if reasons := self._refusals.reasons(now, self._source.reason if self._source.problem else ""):
             yield ERROR, f"refusing commands: {reasons}"
+        missing = self._source.sequence.missing(now)
         if self._commands.count and 0.0 < self._options["command_timeout"] < self._commands.age(now):
             yield WARN, "no new command"
-        elif self._source.sequence.missing(now):
+        elif missing:
             yield WARN, "running, commands are being missed"
         if self._log_space.problem:
             yield WARN, self._log_space.problem

@@ -157,7 +157,7 @@ def test_with_the_papers_lines_the_loop_shows_what_the_core_predicts(bench, geom
 
 def test_lost_encoder_is_said_and_the_loop_goes_on(bench, monkeypatch):
     """A NaN among the readings: none is used, the estimate comes from the commands, the tool goes on."""
-    monkeypatch.setattr(health, "REFUSAL_SHOWN_FOR", 0.2)
+    monkeypatch.setattr(health, "SHOWN_FOR", 0.2)
     loop(bench, model_file=TRUE_MODEL, command_timeout=0.0)
     bench.ask(HOME)
     drive = next(node for node in bench.nodes if node.get_name() == "strut_drive")

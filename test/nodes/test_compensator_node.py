@@ -61,7 +61,7 @@ ROUNDING = 1e-12
 @pytest.fixture
 def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a refusal colour the status for 0.2 s instead of 1 s, so that tests of the recovery are short."""
-    monkeypatch.setattr(health, "REFUSAL_SHOWN_FOR", 0.2)
+    monkeypatch.setattr(health, "SHOWN_FOR", 0.2)
 
 
 def values_of(bench: Bench, key: str, value: str) -> dict[str, str]:
@@ -979,6 +979,16 @@ def test_counters_by_reason():
     assert (refusals.last_reason, refusals.last_text) == ("step", "step at 3.0")
     assert refusals.recent(3.9)
     assert not refusals.recent(4.1)
+
+
+def test_what_happened_while_a_node_stood_still_is_said_once():
+    """A refusal is shown for 1 s, and the node looks after 5 s: asked twice at that time, it says it, then no more."""
+    refusals = Refusals()
+    assert not refusals.recent(0.0)
+    refusals.add("step", "3 mm", 1.0)
+    assert refusals.recent(6.0)
+    assert refusals.reasons(6.0) == "step"
+    assert not refusals.recent(6.05)
 
 
 def test_rate_and_age_of_a_flow(monkeypatch):

@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from hexapod_comp.machine.geometry import STRUT_NAMES
-from hexapod_comp.nodes import health, pacing
+from hexapod_comp.nodes import health
 from hexapod_comp.nodes.compensator import CHECK_PERIOD, CompensatorNode
 from hexapod_comp.nodes.following import FOLLOWED_WITHIN, Recent, Standing
 from hexapod_comp.nodes.health import ERROR, OK, WARN
@@ -32,8 +32,7 @@ SPEED = 0.25
 @pytest.fixture(autouse=True)
 def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """What colours a status for a second does so for 0.3 s."""
-    monkeypatch.setattr(health, "REFUSAL_SHOWN_FOR", 0.3)
-    monkeypatch.setattr(pacing, "SHOWN_FOR", 0.3)
+    monkeypatch.setattr(health, "SHOWN_FOR", 0.3)
 
 
 def risen(bench: Bench, millimetres: float, seconds: float | None = None):

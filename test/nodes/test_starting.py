@@ -22,7 +22,7 @@ ROUNDING = 1e-12
 @pytest.fixture(autouse=True)
 def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """A refusal colours the status for 0.3 s."""
-    monkeypatch.setattr(health, "REFUSAL_SHOWN_FOR", 0.3)
+    monkeypatch.setattr(health, "SHOWN_FOR", 0.3)
 
 
 NEVER = {"start_without_feedback_after": 0.0}

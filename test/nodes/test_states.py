@@ -41,8 +41,7 @@ ROUNDING = 1e-12
 @pytest.fixture(autouse=True)
 def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """What colours a status for one or two seconds does so for 0.3 s."""
-    monkeypatch.setattr(health, "REFUSAL_SHOWN_FOR", 0.3)
-    monkeypatch.setattr(command_source, "MISSED_SHOWN_FOR", 0.3)
+    monkeypatch.setattr(health, "SHOWN_FOR", 0.3)
     monkeypatch.setattr(command_source, "SPEAKERS_HELD", 0.3)
 
 
@@ -162,8 +161,7 @@ def test_commands_end(bench):
     assert bench.seen["strut_commands"][-1].header.stamp == last.command.header.stamp
     np.testing.assert_allclose(measured(bench), last.lengths, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(bench.ask(HOME).lengths, last.lengths, rtol=0.0, atol=ROUNDING)
-    bench.until_status(OK, "running")
-    bench.until_status(OK, "running", DRIVE)
+    bench.until(lambda: bench.ask(HOME) and bench.message() == bench.message(DRIVE) == "running", "both to run again")
 
 
 def test_singular_pose_near(bench, tmp_path):

@@ -23,7 +23,7 @@ from hexapod_comp.nodes.vital_signs import LATCHED_QOS
 @pytest.fixture(autouse=True)
 def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """A refusal colours the status for 0.3 s."""
-    monkeypatch.setattr(health, "REFUSAL_SHOWN_FOR", 0.3)
+    monkeypatch.setattr(health, "SHOWN_FOR", 0.3)
 
 
 def hear(bench: Bench, kind: type, topic: str, qos: QoSProfile = RELIABLE, **options: Any) -> list[Any]:
