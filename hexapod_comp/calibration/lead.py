@@ -44,7 +44,7 @@ REFINEMENTS = 4
 PROMISING = 3.0
 """Lines of so many times the spectrum's median may belong to the strongest one: of noise, one in a thousand does."""
 
-PLENTY = 10_000
+PLENTY = 5_000
 """A period is looked for in so many readings, at random, and in all only where these do not show it."""
 
 SCALE_ROUNDS = 5

@@ -150,6 +150,7 @@ def solve(
     tolerances: np.ndarray,
     noise: np.ndarray,
     rounds: int = SCALE_ROUNDS,
+    silent: np.ndarray | None = None,
 ) -> Posterior:
     """Return the posterior of a linear problem; tolerances and noise factors are estimated with it.
 
@@ -165,8 +166,10 @@ def solve(
         To start from.
     rounds : int
         Fixed-point rounds; 0 takes tolerances and noise as they are.
+    silent : ndarray of int, optional
+        Parameters of which the readings say nothing: they are left out.
     """
-    used = np.flatnonzero(space.spread(tolerances))
+    used = np.setdiff1d(np.flatnonzero(space.spread(tolerances)), [] if silent is None else silent)
     kinds = np.unique(problem.kind)
     normal, moment = problem.normal[np.ix_(kinds, used, used)], problem.moment[np.ix_(kinds, used)]
     scales = [np.concatenate([tolerances, noise])]

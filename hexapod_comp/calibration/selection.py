@@ -18,6 +18,9 @@ from .parameters import ParameterSpace
 FIRST_ROUNDS, ROUNDS = 10, 4
 """Rounds of estimating tolerances and noise: for all blocks, and for each set with fewer, which starts there."""
 
+SILENT = 1e-9
+"""Parameters of which readings determine a smaller share with all blocks in are left out: they move nothing."""
+
 CLEAR = 2.0
 """The folds tell whether a block helps if its gain is so many times its standard error from zero. Otherwise it helps if
 the readings are as much more probable with it as with a number that is found so many standard errors from zero."""
@@ -141,7 +144,8 @@ class _Trials:
         self._space, self._problem, self._noise, self._progress = space, problem, noise, progress
         self._fits: dict[frozenset[str], Posterior] = {}
         self._known: dict[frozenset[str], tuple[np.ndarray, float]] = {}
-        self.everything = self._solve(space.start_tolerances(), FIRST_ROUNDS)
+        self.everything = solve(space, problem, space.start_tolerances(), noise, FIRST_ROUNDS)
+        self._silent = self.everything.used[self.everything.determined < SILENT]
         self._condensed = condense(problem, self.everything)
 
     def single_gains(self, names: Sequence[str], blocks: Sequence[str]) -> dict[str, Gain]:
@@ -163,15 +167,13 @@ class _Trials:
         if len(names) < len(self._space.blocks) - 1:  # else none is left out
             self._condensed = condense(self._problem, self.fit(names))
 
-    def _solve(self, tolerances: np.ndarray, rounds: int) -> Posterior:
-        return solve(self._space, self._problem, tolerances, self._noise, rounds)
-
     def fit(self, names: Collection[str]) -> Posterior:
         """Return the fit with the structure and a set of blocks."""
         key = frozenset(names)
         if key not in self._fits:
             kept = [block.name in key or n == 0 for n, block in enumerate(self._space.blocks)]
-            self._fits[key] = self._solve(np.where(kept, self.everything.tolerances, 0.0), ROUNDS)
+            tolerances = np.where(kept, self.everything.tolerances, 0.0)
+            self._fits[key] = solve(self._space, self._problem, tolerances, self._noise, ROUNDS, self._silent)
         return self._fits[key]
 
     def _outcome(self, names: Collection[str]) -> tuple[np.ndarray, float]:

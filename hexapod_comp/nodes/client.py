@@ -27,8 +27,8 @@ LISTENER_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
 
 TRACK_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 
-ANSWER_TIMEOUT = 1.0
-"""A command without an answer after this long is lost or refused, s: longer than a diagnostics period."""
+ANSWER_TIMEOUT = 5.0
+"""A command without an answer after this long is lost, s: a busy computer may hold it up for seconds."""
 
 
 @dataclass
@@ -39,11 +39,14 @@ class Sent:
     ----------
     sent_at, answered_at : float
         Monotonic times, s; NaN while unanswered.
+    refused : str
+        How many commands the compensator had refused before, as it says itself.
     command, correction : ndarray, shape (6,)
         The answer, m.
     """
 
     sent_at: float
+    refused: str
     answered_at: float = float("nan")
     command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))
     correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))
@@ -190,7 +193,7 @@ class LoopClient:
     def _send(self, message: PoseStamped) -> Sent:
         stamp = self.node.get_clock().now()
         message.header.stamp = stamp.to_msg()
-        entry = self.sent[stamp.nanoseconds] = Sent(time.monotonic())
+        entry = self.sent[stamp.nanoseconds] = Sent(time.monotonic(), self._refused())
         self._publisher.publish(message)
         return entry
 
@@ -200,14 +203,18 @@ class LoopClient:
         Raises
         ------
         NoAnswerError
-            The command was lost or refused; carries the compensator's last refusal.
+            The command was lost, or refused, with the compensator's reason.
         """
         end = entry.sent_at + timeout
         while not _answered(entry):
+            if self._refused() != entry.refused:
+                raise NoAnswerError(f"a command was refused: {self.diagnostics['last_refusal']}")
             if time.monotonic() > end:
-                refusal = self.diagnostics.get("last_refusal") or "none"
-                raise NoAnswerError(f"no answer to a command within {timeout:g} s; last refusal: {refusal}")
+                raise NoAnswerError(f"no answer to a command within {timeout:g} s")
             self._spin_once(0.01)
+
+    def _refused(self) -> str:
+        return self.diagnostics.get("refused", "0")
 
     def stream(self, path: Path, each: Callable[[int], None] | None = None) -> list[Sent]:
         """Send a path at its rate and return the records; :attr:`track` then holds where the tool went.

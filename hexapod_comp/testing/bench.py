@@ -302,26 +302,42 @@ class Bench:
 
     def send(self, pose: Pose | PoseStamped, frame_id: str = "base") -> PoseStamped:
         """Send one command, stamped now, and return it; a message is sent as it is."""
-        message = pose
-        if isinstance(pose, Pose):
-            message = pose_message(pose, frame_id)
-            message.header.stamp = self.now()
+        message = self._stamped(pose, frame_id)
         self.publish("tool_pose_command", message)
         return message
 
+    def _stamped(self, pose: Pose | PoseStamped, frame_id: str) -> PoseStamped:
+        """Return a pose as a message stamped now, a message as it is."""
+        if not isinstance(pose, Pose):
+            return pose
+        message = pose_message(pose, frame_id)
+        message.header.stamp = self.now()
+        return message
+
     def ask(self, pose: Pose | PoseStamped, frame_id: str = "base") -> Answer:
-        """Send one command and wait for its answer."""
-        began = time.monotonic()
-        stamp = self.send(pose, frame_id).header.stamp
+        """Send one command and wait for its answer.
 
-        def find(topic: str) -> list[JointState]:
-            return [m for m in self.seen[topic][-5:] if m.header.stamp == stamp]
-
+        A pose that is refused as too old, since a busy computer had no time for it, is sent once more.
+        """
+        began, too_old = time.monotonic(), self._too_old()
+        message = self.send(pose, frame_id)
         self.until(
-            lambda: find("strut_commands") and find("strut_corrections"),
+            lambda: self._answers(message) or (message is not pose and self._too_old() > too_old),
             f"answer to a command; {self.message()}",
         )
-        return Answer(find("strut_commands")[0], find("strut_corrections")[0], began, time.monotonic())
+        answers = self._answers(message)
+        return Answer(*answers, began, time.monotonic()) if answers else self.ask(self._stamped(pose, frame_id))
+
+    def _answers(self, asked: PoseStamped) -> tuple[JointState, JointState] | None:
+        """Return command and correction that answer a command, when both have come."""
+        command, correction = (
+            next((m for m in self.seen[topic][-5:] if m.header.stamp == asked.header.stamp), None)
+            for topic in ("strut_commands", "strut_corrections")
+        )
+        return (command, correction) if command and correction else None
+
+    def _too_old(self) -> int:
+        return int(self.values().get("refused.stamp_past", "0"))
 
     def settle(self, pose: Pose) -> Answer:
         """Hold a pose until the corrections have ramped in: until two answers in turn are alike."""

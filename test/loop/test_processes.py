@@ -17,7 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from node_helpers import HOME, closed_form_lengths, near
 from sensor_msgs.msg import JointState
 
-from hexapod_comp.errors import printable
+from hexapod_comp.errors import NoAnswerError, printable
 from hexapod_comp.loop.processes import NodeProcess
 from hexapod_comp.loop.session import connect
 from hexapod_comp.nodes.arguments import outside_ros
@@ -114,6 +114,14 @@ def test_loop_between_processes(client, pair):
     for node in pair:
         assert "ready" in node.output()
         assert_ends_well(node, signal.SIGINT)
+
+
+def test_a_refused_command_is_said_with_its_reason(client, pair):
+    """At once, not when an answer is overdue: half a metre up is beyond the struts."""
+    ask(client, HOME)
+    entry = client.send(near(HOME, (0.0, 0.0, 0.5)))
+    with pytest.raises(NoAnswerError, match=r"a command was refused: strut_\d: nominal length .* outside the stroke"):
+        client.wait_for_answer(entry, timeout=60.0)
 
 
 @pytest.mark.parametrize(
