@@ -322,13 +322,13 @@ class Bench:
         began, too_old = time.monotonic(), self._too_old()
         message = self.send(pose, frame_id)
         self.until(
-            lambda: self._answers(message) or (message is not pose and self._too_old() > too_old),
+            lambda: self._replies(message) or (message is not pose and self._too_old() > too_old),
             f"answer to a command; {self.message()}",
         )
-        answers = self._answers(message)
-        return Answer(*answers, began, time.monotonic()) if answers else self.ask(self._stamped(pose, frame_id))
+        replies = self._replies(message)
+        return Answer(*replies, began, time.monotonic()) if replies else self.ask(self._stamped(pose, frame_id))
 
-    def _answers(self, asked: PoseStamped) -> tuple[JointState, JointState] | None:
+    def _replies(self, asked: PoseStamped) -> tuple[JointState, JointState] | None:
         """Return command and correction that answer a command, when both have come."""
         command, correction = (
             next((m for m in self.seen[topic][-5:] if m.header.stamp == asked.header.stamp), None)
