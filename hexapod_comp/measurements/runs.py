@@ -20,6 +20,7 @@ from ..pose import Pose, stacked
 from .reach import impossible, meant
 from .readings import (
     ANGULAR_KINDS,
+    AXES,
     BACKWARD,
     CHANNELS,
     FORWARD,
@@ -46,6 +47,12 @@ NUMBER_OF = {channel: number for number, channel in enumerate(CHANNELS)}
 
 OF_LINES = np.isin(np.array(KINDS)[KIND_OF], LINE_KINDS)
 """Whether each channel is read along a line."""
+
+STRAIGHTNESS = np.array([NUMBER_OF[f"straightness_{axis}"] for axis in AXES])
+"""The channels across a line, by their axis of the work frame."""
+
+OWN_LINE = 0.99
+"""A line whose direction has such a share of an axis, or more, runs along it."""
 
 NO_COMMANDS = (math.nan,) * 6
 """Commanded strut lengths of a reading without any."""
@@ -248,8 +255,18 @@ def _recognise(readings: list[Reading], arrays: _Arrays, points: np.ndarray, wor
         problem = f"run {name}: the commanded point is {off.max() * 1e3:.4f} mm off the run's line"
         raise InputFileError(where.source.file, _line(where), problem)
     in_work = work_axes @ far
+    _check_straightness(readings, arrays, in_work / np.linalg.norm(far))
     leading = in_work[np.abs(in_work) > LEAST_TRAVEL][0]
     return Run(name, axis * np.sign(leading), points[0])
+
+
+def _check_straightness(readings: list[Reading], arrays: _Arrays, along: np.ndarray) -> None:
+    """Refuse a straightness along its own line, whose direction in the work frame is `along`."""
+    wrong = np.flatnonzero(np.isin(arrays.channel, STRAIGHTNESS[np.abs(along) > OWN_LINE]))
+    if len(wrong):
+        r = readings[wrong[0]]
+        problem = f"run {r.run}: {r.channel} is along the line itself; straightness is read across it"
+        raise InputFileError(r.source.file, _line(r), problem)
 
 
 def _collect_stations(

@@ -308,6 +308,7 @@ def test_a_joined_set_survives_its_file(tmp_path: Path) -> None:
         ({"channel": "position_x"}, "mixes channels of a line with others"),
         ({"pose": at((5, 1, 400))[0]}, "test: line 7: run line: the commanded point is 1.0000 mm off the run's line"),
         ({"pose": at((0, 0, 400))[0]}, "run line: has one commanded point only"),
+        ({"channel": "straightness_x"}, "test: line 7: run line: straightness_x is along the line itself"),
     ],
 )
 def test_what_no_machine_or_instrument_does_is_refused(change: dict[str, object], complaint: str) -> None:
