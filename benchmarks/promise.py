@@ -201,12 +201,14 @@ def left(truth: RealMachine, hidden: Hidden, model: MachineModel, plan: Campaign
     return float(np.sqrt((errors.aligned().displacement ** 2).sum(axis=1).mean()))
 
 
-def setting(kind: str, seed: int, folder: Path) -> tuple[Campaign, RealMachine, Hidden, MeasurementSet]:
-    """Return the campaign, the machine and the readings of one seed of a kind."""
+def setting(
+    kind: str, seed: int, folder: Path, plan_of: tuple[str, int] | None = None
+) -> tuple[Campaign, RealMachine, Hidden, MeasurementSet]:
+    """Return the campaign, its instruments one of the :data:`PLANS` or given, the machine and the readings of a seed."""
     machine = zoo()[GEOMETRIES[seed % len(GEOMETRIES)]]
     geometry = load_geometry(machine.write(folder / "geometry.yaml"))
     sides = 2.0 * np.array(machine.half)
-    instrument, diagonals = PLANS[seed // len(GEOMETRIES) % len(PLANS)]
+    instrument, diagonals = plan_of or PLANS[seed // len(GEOMETRIES) % len(PLANS)]
     plan = Campaign(machine.box, min(sides.max() / 2.0, sides.min()), sides.max() / 10.0, instrument, diagonals)
     truth = RealMachine(geometry, truth_of(geometry, kind, machine.box, seed))
     hidden = hidden_of(geometry, kind, np.random.default_rng([seed, 5]))

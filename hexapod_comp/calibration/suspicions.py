@@ -34,10 +34,14 @@ PLAIN = ("pitch", *WAVES, "backlash")
 BETTER, SURELY = 3.0, 1.2
 """Another reading is named when some kind of channel fits so many times better, and all together so many times."""
 
+RIGHTLY = 1.05
+"""What leaves nothing to choose, no unit and no set of runs, is named too where all together fit so many times better:
+readings that were taken rightly fit no better in any such way, whatever else is wrong with them."""
+
 SCATTERED, AS_STATED, ODDS = 1.5, 1.15, 25.0
-"""Readings that scatter so many times as much as stated are looked into. What brings all that it changes down to so
-many times their stated noise, and makes none worse, is named too where its log odds are above that: nothing but the
-truth does that."""
+"""Readings that scatter so many times as much as stated, or as a fit leaves, are looked into. What brings all that it
+changes down to so many times their stated noise, and makes none worse, is named too: nothing but the truth does that.
+Log odds of both are above the last."""
 
 AS_GOOD = 1.05
 """Others that fit all together as well, to this factor, are named too."""
@@ -79,11 +83,14 @@ class Reinterpretation:
         As they would then be.
     scale : ndarray, shape (kinds,)
         By what the values of each kind were multiplied.
+    chosen : bool
+        A fit has chosen what was changed.
     """
 
     name: str
     measurements: MeasurementSet
     scale: np.ndarray
+    chosen: bool = False
 
 
 def suspicions(
@@ -114,7 +121,7 @@ def suspicions(
         return []
     if left is not None:
         by_fit = np.array([left[k] for k in present])
-        if (by_fit < SCATTERED * stated).all() and (as_they_are[present] < BETTER * by_fit).all():
+        if (by_fit < SCATTERED * stated).all() and (as_they_are[present] < SCATTERED * by_fit).all():
             return []
     shares = np.bincount(measurements.kind)[present] / len(measurements)
     clear = []
@@ -128,7 +135,9 @@ def suspicions(
         changed = gains > SURELY
         as_stated = changed.any() and (noise[present] < AS_STATED * stated)[changed].all()
         as_stated = as_stated and (gains > 1.0 / AS_GOOD).all()
-        if (total > SURELY and best > BETTER) or (as_stated and len(measurements) * np.log(total) > ODDS):
+        rightly = total > RIGHTLY and not other.chosen and (other.scale == 1.0).all()
+        likely = (as_stated or rightly) and len(measurements) * np.log(total) > ODDS
+        if likely or (total > SURELY and best > BETTER):
             clear.append((total, best, other.name))
     clear.sort(reverse=True)
     return [f"{name} fits {best:.3g} times better" for total, best, name in clear if total > clear[0][0] / AS_GOOD]
@@ -384,7 +393,7 @@ def _with_signs(
     if mixed and (what or 2 * len(names) <= len(runs)):  # all channels may as well be reversed in the others
         listed = ", ".join(names[:3]) + (", …" if len(names) > 3 else "")
         title = f"{what}{len(names)} of {len(runs)} runs ({listed}): sign reversed"
-        yield Reinterpretation(title, signed(), np.ones(len(KINDS)))
+        yield Reinterpretation(title, signed(), np.ones(len(KINDS)), chosen=True)
 
 
 def _slopes(m: MeasurementSet) -> np.ndarray:

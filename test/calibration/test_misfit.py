@@ -27,7 +27,7 @@ from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.measurements.campaign import Campaign
 from hexapod_comp.measurements.readings import BACKWARD, CHANNELS, FORWARD, KINDS, MeasurementSet
-from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model
+from hexapod_comp.virtual.imperfections import ImperfectionBounds, draw_model, with_length_map
 
 ROTATION_X = CHANNELS.index("rotation_x")
 LINEAR, STRAIGHTNESS, ROTATION = (KINDS.index(kind) for kind in ("linear", "straightness", "rotation"))
@@ -269,6 +269,21 @@ def test_runs_with_a_reversed_channel_are_named_where_screws_turn(tmp_path):
     named = suspicions(reversed_where(m, (m.channel == ROTATION_X) & (m.run % 2 == 0)), FitSettings())
     assert named[0].startswith("rotation_x of ")
     assert " runs (" in named[0]
+
+
+def test_exchanged_channels_are_named_where_the_plain_model_lacks_much(tmp_path):
+    """Length maps leave rotations off by 54 times their noise: an exchange adds a quarter of that."""
+    machine = machines()["framed"]
+    geometry = load_geometry(machine.write(tmp_path / "machine.yaml"))
+    truth = RealMachine(
+        geometry, with_length_map(draw_model(geometry, ImperfectionBounds(joint=800e-6), 3), geometry, 3)
+    )
+    m = measured(truth, Campaign(machine.box, float(np.ptp(machine.box, axis=0).min()), 0.02, "5-D", 4), 3)
+    assert suspicions(m, FitSettings()) == []
+    x, y = ROTATION_X, CHANNELS.index("rotation_y")
+    both = np.isin(m.channel, (x, y))
+    named = suspicions(replace(m, channel=np.where(both, x + y - m.channel, m.channel)), FitSettings())
+    assert named[0].startswith("rotation_x and rotation_y: exchanged")
 
 
 def test_nothing_is_suspected_without_a_cause(some):

@@ -1,0 +1,100 @@
+"""Is a mix-up in the readings named, also on machines that the model does not know?
+
+Machines as of ``promise``, read by a 5-D laser, rightly and with channels exchanged or signs reversed. Counted: where
+the first cause that is named is the one that was made; of readings that were taken rightly, where any is named. Only
+causes are sought, nothing is fitted: what is written or not follows from them.
+
+Usage: python -m benchmarks.mixed_up [--machines 4] [--first 600] [--workers 2] [--kind NAME ...]
+
+Exits 1 when a cause is named of readings that were taken rightly.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.calibration import LEAD
+from benchmarks.promise import FOREIGN, KNOWN, OWN, setting
+from hexapod_comp.calibration.misfit import FAMILIES, family_of_run
+from hexapod_comp.calibration.parameters import FitSettings
+from hexapod_comp.calibration.suspicions import suspicions
+from hexapod_comp.measurements.readings import CHANNELS, MeasurementSet
+
+MADE = {
+    "": lambda m: m,
+    "rotation_x and rotation_y: exchanged": lambda m: exchanged(m, "rotation_x", "rotation_y"),
+    "rotation_y and rotation_z: exchanged": lambda m: exchanged(m, "rotation_y", "rotation_z"),
+    "x lines, straightness_y and straightness_z: exchanged": lambda m: exchanged(
+        m, "straightness_y", "straightness_z", "x lines"
+    ),
+    "x lines, rotation_y: sign reversed": lambda m: reversed_sign(m, "rotation_y", "x lines"),
+    "y lines, straightness_z: sign reversed": lambda m: reversed_sign(m, "straightness_z", "y lines"),
+}
+"""What was done to readings, by the name that it should get; empty: nothing."""
+
+
+def of_family(m: MeasurementSet, family: str) -> np.ndarray:
+    """Return which readings are of a family of runs, of any if empty, shape (N,)."""
+    return np.ones(len(m), dtype=bool) if not family else family_of_run(m)[m.run] == FAMILIES.index(family)
+
+
+def exchanged(m: MeasurementSet, one: str, other: str, family: str = "") -> MeasurementSet:
+    """Return readings with two channels exchanged."""
+    a, b = CHANNELS.index(one), CHANNELS.index(other)
+    where = np.isin(m.channel, (a, b)) & of_family(m, family)
+    return replace(m, channel=np.where(where, a + b - m.channel, m.channel))
+
+
+def reversed_sign(m: MeasurementSet, channel: str, family: str) -> MeasurementSet:
+    """Return readings with the sign of a channel reversed."""
+    where = (m.channel == CHANNELS.index(channel)) & of_family(m, family)
+    return m.with_values(np.where(where, -m.value, m.value))
+
+
+def first_named(kind: str, seed: int, made: str) -> str:
+    """Return the first cause that is named of a machine's readings, empty if none is."""
+    with tempfile.TemporaryDirectory() as folder:
+        readings = setting(kind, seed, Path(folder), ("5-D", 4))[-1]
+    change: Callable[[MeasurementSet], MeasurementSet] = MADE[made]
+    return next(iter(suspicions(change(readings), FitSettings(blocks=KNOWN, lead=LEAD))), "")
+
+
+def main() -> int:
+    """Run the kinds and print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--machines", type=int, default=4, help="machines of each kind (default 4)")
+    parser.add_argument("--first", type=int, default=600, help="seed of the first machine (default 600)")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: all cores)")
+    parser.add_argument("--kind", action="append", choices=(*OWN, *FOREIGN), help="only this; may be repeated")
+    args = parser.parse_args()
+    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    seeds = range(args.first, args.first + args.machines)
+    cases = list(product(args.kind or (*OWN, *FOREIGN), seeds, MADE))
+    named, otherwise = Counter[str](), Counter[str]()
+    with ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        causes = pool.map(first_named, *zip(*cases, strict=True))
+        for (_, _, made), cause in tqdm(zip(cases, causes, strict=True), total=len(cases), disable=None):
+            named[made] += bool(made) and cause.startswith(made)
+            otherwise[made] += bool(cause) and not (made and cause.startswith(made))
+    print("| made | machines | named | another named |")
+    print("|---|---:|---:|---:|")
+    for made in MADE:
+        print(f"| {made or 'nothing'} | {len(cases) // len(MADE)} | {named[made]} | {otherwise[made]} |")
+    return 1 if otherwise[""] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
