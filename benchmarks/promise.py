@@ -204,7 +204,7 @@ def left(truth: RealMachine, hidden: Hidden, model: MachineModel, plan: Campaign
 def setting(
     kind: str, seed: int, folder: Path, plan_of: tuple[str, int] | None = None
 ) -> tuple[Campaign, RealMachine, Hidden, MeasurementSet]:
-    """Return the campaign, its instruments one of the :data:`PLANS` or given, the machine and the readings of a seed."""
+    """Return the campaign, one of the :data:`PLANS` or as given, the machine and the readings of a seed."""
     machine = zoo()[GEOMETRIES[seed % len(GEOMETRIES)]]
     geometry = load_geometry(machine.write(folder / "geometry.yaml"))
     sides = 2.0 * np.array(machine.half)
