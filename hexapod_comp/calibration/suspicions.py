@@ -31,8 +31,9 @@ from .sensitivity import Prediction, predict
 PLAIN = ("pitch", *WAVES, "backlash")
 """Blocks beside the structure: of the struts alone, and enough to tell one reading of the data from another."""
 
-BETTER, SURELY = 3.0, 1.2
-"""Another reading is named when some kind of channel fits so many times better, and all together so many times."""
+BETTER, SURELY, HALF = 3.0, 1.2, 0.5
+"""Another reading is named when some kind of channel fits so many times better, all together so many times, and none
+less well than so many times."""
 
 RIGHTLY = 1.05
 """What leaves nothing to choose, no unit and no set of runs, is named too where all together fit so many times better:
@@ -131,16 +132,24 @@ def suspicions(
         if noise is None:
             continue
         gains = as_they_are[present] / noise[present]
-        total, best = float(np.exp(shares @ np.log(gains))), float(gains.max())
-        changed = gains > SURELY
-        as_stated = changed.any() and (noise[present] < AS_STATED * stated)[changed].all()
-        as_stated = as_stated and (gains > 1.0 / AS_GOOD).all()
-        rightly = total > RIGHTLY and not other.chosen and (other.scale == 1.0).all()
-        likely = (as_stated or rightly) and len(measurements) * np.log(total) > ODDS
-        if likely or (total > SURELY and best > BETTER):
-            clear.append((total, best, other.name))
+        total = float(np.exp(shares @ np.log(gains)))
+        if _convinces(other, gains, total, noise[present] < AS_STATED * stated, len(measurements)):
+            clear.append((total, float(gains.max()), other.name))
     clear.sort(reverse=True)
     return [f"{name} fits {best:.3g} times better" for total, best, name in clear if total > clear[0][0] / AS_GOOD]
+
+
+def _convinces(other: Reinterpretation, gains: np.ndarray, total: float, as_stated: np.ndarray, count: int) -> bool:
+    """Return whether another reading of `count` readings is the right one.
+
+    By how many times better it fits, each kind that there is and all together, and which kinds then scatter as stated.
+    """
+    if total > SURELY and gains.max() > BETTER and gains.min() > HALF:
+        return True
+    changed = gains > SURELY
+    restored = changed.any() and as_stated[changed].all() and (gains > 1.0 / AS_GOOD).all()
+    rightly = total > RIGHTLY and not other.chosen and (other.scale == 1.0).all()
+    return bool((restored or rightly) and count * np.log(total) > ODDS)
 
 
 def misread(
