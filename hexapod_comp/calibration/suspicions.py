@@ -40,9 +40,9 @@ RIGHTLY = 1.05
 readings that were taken rightly fit no better in any such way, whatever else is wrong with them."""
 
 SCATTERED, AS_STATED, ODDS = 1.5, 1.15, 25.0
-"""Readings that scatter so many times as much as stated, or as a fit leaves, are looked into. What brings all that it
-changes down to so many times their stated noise, and makes none worse, is named too: nothing but the truth does that.
-Log odds of both are above the last."""
+"""Causes are sought where a fit leaves so many times what is stated, or a plain model so many times what the fit does.
+What brings all that it changes down to so many times their stated noise, and makes none worse, is named too: nothing
+but the truth does that. Log odds of this and of the above are above the last."""
 
 AS_GOOD = 1.05
 """Others that fit all together as well, to this factor, are named too."""
