@@ -92,16 +92,15 @@ class Feedback:
             self._hear(self._measuring, number, now)
             header = self._reader.take(data).header
             stamp = nanoseconds_of(header.stamp)
-            if stamp:
-                self._stamps.check(stamp, now)
+            made = now - (self._stamps.check(stamp, now) if stamp else 0.0)  # of late, where this node stood still
             self._range.check(struts)
-            self._watch_following(struts, now)  # also of what cannot be: then the strut or its encoder is broken
+            self._watch_following(struts, made, now)  # also of what cannot be: then the strut or its encoder is broken
             self._jumps.check(struts, stamp, now)
             pose = self._compensator.estimate(struts)
         except HexapodError as error:
             self._ignore("feedback " + error.reason, error.reason, f"strut_states ignored: {error}", str(error), now)
             return
-        self._status.last_known.measure(struts, now)
+        self._status.last_known.measure(struts, made)
         self._status.standing.measure(struts, now)
         self._jumps.passed(struts, stamp, now)
         if stamp:
@@ -117,13 +116,13 @@ class Feedback:
         if owner.problem:
             raise CommandError(owner.reason, owner.problem)
 
-    def _watch_following(self, measured: np.ndarray, now: float) -> None:
+    def _watch_following(self, measured: np.ndarray, made: float, now: float) -> None:
         """Hold the measured struts against their commands; even one reading that is off is said."""
         if not self._node.active:
             return
         following = self._status.following
         known = following.problem
-        following.check(measured, now)
+        following.check(measured, made)
         if following.problem and not known:
             self._look()
             self._status.bad_feedback.add(following.reason, following.problem, now)

@@ -87,10 +87,10 @@ class Recent:
 class Following:
     """Guards the difference of measured and commanded struts.
 
-    Drives lag, and readings are on their way for a while, so a reading is compared with all that was commanded
-    in the last :data:`FOLLOWED_WITHIN`: it must lie between the least and the most of it, or within the limit. Once it
-    does not, the problem stays until it is released, as on servo drives and in LinuxCNC: a strut that comes back by
-    itself has all the same been where nobody told it to be.
+    Drives lag, and readings are on their way for a while, so a reading is compared with all that was commanded since
+    :data:`FOLLOWED_WITHIN` before it was made: it must lie between the least and the most of it, or within the limit.
+    Once it does not, the problem stays until it is released, as on servo drives and in LinuxCNC: a strut that comes
+    back by itself has all the same been where nobody told it to be.
 
     Parameters
     ----------
@@ -126,13 +126,13 @@ class Following:
         """Take what was found as settled."""
         self.problem = ""
 
-    def check(self, measured: np.ndarray, arrived: float) -> None:
-        """Compare measured struts, shape (6,), m, that arrived at the monotonic time `arrived`, s."""
+    def check(self, measured: np.ndarray, made: float) -> None:
+        """Compare measured struts, shape (6,), m; the reading was made at the monotonic time `made`, s."""
         if self.problem or not (self.commands and self.limit):
             return
         if within(measured, self.commands.last, self.limit):  # as they nearly always are
             return
-        low, high = self.commands.range(arrived - FOLLOWED_WITHIN)
+        low, high = self.commands.range(made - FOLLOWED_WITHIN)
         off = np.maximum(low - measured, measured - high)
         strut = int(off.argmax())
         if off[strut] > self.limit:
@@ -196,9 +196,9 @@ class LastKnown:
         """Start, at the monotonic time `now`, s."""
         self._began = now
 
-    def measure(self, struts: np.ndarray, now: float) -> None:
-        """Take a good reading, shape (6,), m, that came at the monotonic time `now`, s."""
-        self._measured[:], self._measured_at = struts, now
+    def measure(self, struts: np.ndarray, made: float) -> None:
+        """Take a good reading, shape (6,), m, that was made at the monotonic time `made`, s."""
+        self._measured[:], self._measured_at = struts, made
 
     def tell(self, command: np.ndarray, at: float) -> None:
         """Take the last command before all of them are forgotten, shape (6,), m, published at a monotonic time, s."""

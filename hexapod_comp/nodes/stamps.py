@@ -74,8 +74,8 @@ class StampCheck:
         """Return a check of readings' stamps by the same clock."""
         return StampCheck(self.largest_age, self._clock if self._simulated else None, capped=True)
 
-    def check(self, nanoseconds: int, now: float) -> None:
-        """Check a stamp at the monotonic time `now`, s.
+    def check(self, nanoseconds: int, now: float) -> float:
+        """Check a stamp at the monotonic time `now`, s; return how old it is, s, or 0 where it may be any age.
 
         Raises
         ------
@@ -89,6 +89,7 @@ class StampCheck:
             raise CommandError(reason, f"stamp is {abs(age):.3f} s {word}, allowed {self.largest_age:g} s")
         if nanoseconds < self._last and now - self._then < FORGET_ORDER_AFTER and not self._was_set_back(clock, now):
             raise CommandError("stamp_order", "stamp is earlier than the last one's")
+        return max(age, 0.0) if self.largest_age else 0.0
 
     def accept(self, nanoseconds: int, now: float) -> None:
         """Remember the stamp that was just checked as that of the last message accepted."""

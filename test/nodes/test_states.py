@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -493,6 +494,21 @@ def test_following_error_ends_with_a_reset(bench):
     assert bench.trigger("reset").success
     bench.ask(elsewhere)
     bench.until_status(OK, "running")
+
+
+def test_a_reading_is_held_against_the_commands_of_its_own_time(bench):
+    """It comes half a second late, as when a busy computer or network holds it up: then it is old, and not wrong."""
+    bench.compensator(command_timeout=0.0, feedback_timeout=60.0, max_reading_age=10.0, max_command_age=0.0)
+    bench.ask(HOME)
+    began = time.monotonic()
+    for n in range(1, 21):
+        bench.ask(near(HOME, (0.0, 0.0, 5e-4 * n)))
+    half_way = closed_form_lengths(near(HOME, (0.0, 0.0, 5e-3)))
+    bench.until(lambda: time.monotonic() > began + 0.5, "half a second to pass")
+    bench.estimate(bench.feed(half_way, later=began - time.monotonic()))
+    bench.ask(near(HOME, (0.0, 0.0, 1e-2)))
+    bench.feed(half_way)
+    bench.until_status(ERROR, "refusing commands: following_error: strut_")
 
 
 def test_following_error_may_be_switched_off(bench):
