@@ -4,7 +4,7 @@ genhexkins takes a small rotation for a change of roll, pitch and yaw. At a yaw 
 error left by a step is 2·sin(ψ/2) of the one before: linear convergence, and from 60° on none, however near the guess.
 
 Run ``python -m benchmarks.convergence``; exits 1 when ours fails at a yaw of 60–80°, or calls something solved that
-is not. Says so where there is no genhexkins (see :mod:`benchmarks.genhexkins`).
+is not, 2 where there is no genhexkins (see :mod:`benchmarks.genhexkins`).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from hexapod_comp.kernels import kinematics as kernels
 from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
 
+from . import cannot_run
 from .genhexkins import Genhexkins, NotHere, emc_poses, si_poses
 from .poses import make_poses
 
@@ -226,8 +227,7 @@ def main() -> int:
     try:
         rows, worth, caught = convergence(YAWS), honesty(), traps()
     except NotHere as reason:
-        print(f"skipped: {reason}")
-        return 0
+        return cannot_run(str(reason))
     print(report(rows, worth, caught))
     return 0 if bars_kept(rows, worth) else 1
 

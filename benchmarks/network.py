@@ -1,7 +1,7 @@
 """Compensator and drive on two hosts: network namespaces, and a cable that is cut, loses frames or delays them.
 
 The controller stands beside the compensator. The cable is one of ours in user space (benchmarks/faults/cable.py),
-since not every kernel has netem. Skipped, with the reason, where namespaces are not permitted.
+since not every kernel has netem. Exits 2, with the reason, where namespaces are not permitted.
 
 Usage: python -m benchmarks.network [--rounds 3] [--seconds 5] [--seed 0] [--only cut,loss,delay,long_cut]
 """
@@ -20,6 +20,7 @@ import numpy as np
 from hexapod_comp.formats.texts import aligned
 from hexapod_comp.nodes.middleware import avoid_shared_memory
 
+from . import cannot_run
 from .faults import visible
 from .faults.cable import Cable
 from .faults.campaign import RUNS_AGAIN_WITHIN, WARM_UP, Episode, Outcome, run_episode
@@ -159,8 +160,7 @@ def main() -> int:
         return harness(args, int(role))
     why_not = refusal()
     if why_not:
-        print(f"skipped: no network namespaces here: {why_not}", file=sys.stderr)
-        return 0
+        return cannot_run(f"no network namespaces here: {why_not}")
     command = [*OWN_NETWORK, sys.executable, "-m", "benchmarks.network", *sys.argv[1:]]
     return subprocess.run(command, env={**os.environ, INSIDE: "cable"}, check=False).returncode
 

@@ -339,6 +339,15 @@ def test_setup_py_agrees_with_the_imports_and_package_xml(monkeypatch: pytest.Mo
         assert package_xml.findtext(field) == metadata[field]
 
 
+def test_every_licence_that_a_file_has_is_there_in_full():
+    """As the REUSE specification wants it: LICENSES/<SPDX identifier>.txt. ``reuse lint`` says the rest."""
+    named = set(re.findall(r'^SPDX-License-Identifier = "(.*)"$', (ROOT / "REUSE.toml").read_text(), re.MULTILINE))
+    texts = {file.stem: file.read_text() for file in (ROOT / "LICENSES").iterdir()}
+    assert set(texts) == named == {"Apache-2.0", "MIT"}
+    assert "Apache License" in texts["Apache-2.0"]
+    assert texts["MIT"].startswith("MIT License\n\nCopyright (c) 2022 Jugleer")
+
+
 def _ros_dependencies() -> set[str]:
     """Return the dependencies of package.xml that are ROS packages."""
     return {key for key in _package_xml("exec_depend") if not key.startswith("python3-")}

@@ -28,7 +28,7 @@ from hexapod_comp.measurements.wide_csv import read_wide
 from hexapod_comp.measurements.writing import write_measurements
 from hexapod_comp.pose import Pose
 
-SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "jugglebot_hexapod"
+JUGGLEBOT = Path(__file__).resolve().parents[2] / "benchmarks" / "data" / "jugglebot"
 HEADER = "run,direction,x_mm,y_mm,z_mm,channel,value,unit"
 BAD_CHANNEL = "line 2, column channel: must be one of linear, .*'liner'"
 AGAIN = "line 4: reads linear again at the place of line 3"
@@ -415,10 +415,6 @@ def position_rms_mm(found: MeasurementSet) -> float:
     return float(np.sqrt((errors**2).sum(axis=1).mean()))
 
 
-needs_data = pytest.mark.skipif(not SHARED.is_dir(), reason=f"the measured hexapod data are not at {SHARED}")
-
-
-@needs_data
 @pytest.mark.parametrize(
     ("name", "columns", "poses", "rms"),
     [
@@ -431,12 +427,11 @@ def test_jugglebot_before_calibration(name: str, columns: str, poses: int, rms: 
     """Truth: the figures of the data's README. 11.10 there is cross-validated: its six zero lengths come from five
     sixths of the poses, here from all (11.05). 0.93 is printed there where the file gives 0.925."""
     geometry = load_geometry(config_file("jugglebot"))
-    found = read_wide(SHARED / f"{name}.csv", config_file(columns), geometry)
+    found = read_wide(JUGGLEBOT / f"{name}.csv", config_file(columns), geometry)
     assert len(found) == 6 * poses
     assert position_rms_mm(found) == pytest.approx(rms, abs=0.06 if poses == 108 else 0.0055)
 
 
-@needs_data
 def test_jugglebot_commands_are_the_leg_readings(tmp_path: Path) -> None:
     """Truth: leg lengths and a least-squares forward kinematics written out here, from the README's own numbers.
 
@@ -445,10 +440,10 @@ def test_jugglebot_commands_are_the_leg_readings(tmp_path: Path) -> None:
     geometry = load_geometry(config_file("jugglebot"))
     text = config_file("jugglebot_columns").read_text().replace("zero: measured", "zero: home")
     (tmp_path / "home.yaml").write_text(text)
-    found = read_wide(SHARED / "108_calibration_poses.csv", tmp_path / "home.yaml", geometry)
+    found = read_wide(JUGGLEBOT / "108_calibration_poses.csv", tmp_path / "home.yaml", geometry)
     assert position_rms_mm(found) == pytest.approx(55.28, abs=0.005)
     scale = np.array([75.692, 71.197, 72.342, 70.801, 70.621, 71.263])
-    turns = np.loadtxt(SHARED / "108_calibration_poses.csv", delimiter=",", skiprows=1)[:, :6]
+    turns = np.loadtxt(JUGGLEBOT / "108_calibration_poses.csv", delimiter=",", skiprows=1)[:, :6]
     base, platform = geometry.base_joints * 1e3, geometry.platform_joints * 1e3
 
     def legs(x: np.ndarray) -> np.ndarray:
