@@ -59,7 +59,9 @@ setup(
     ],
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "export/c/*"]},
+    package_data={NAME: ["py.typed", "core/*.[ch]", "export/c/*"]},
+    cffi_modules=["hexapod_comp/core/build.py:ffi"],
+    options={"bdist_wheel": {"py_limited_api": "cp310"}},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -72,6 +74,7 @@ setup(
         "numpy>=1.26",
         "scipy>=1.11",
         "numba>=0.58",
+        "cffi>=1.16",
         "PyYAML>=6.0",
         "matplotlib>=3.6",
         "tqdm>=4.66",

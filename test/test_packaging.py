@@ -31,7 +31,7 @@ FILES = ("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "LICENSE", "R
 
 # Import name → key in rosdep's python.yaml and name on PyPI, where the three differ. ROS packages are
 # imported under their own name, which is also their key.
-PYTHON3 = ("hypothesis", "matplotlib", "numba", "numpy", "packaging", "pytest", "scipy", "tqdm", "yaml")
+PYTHON3 = ("cffi", "hypothesis", "matplotlib", "numba", "numpy", "packaging", "pytest", "scipy", "tqdm", "yaml")
 ROSDEP_KEYS = {name: f"python3-{name}" for name in PYTHON3}
 PYPI_NAMES = {"yaml": "pyyaml"}
 # setuptools runs setup.py wherever that is read, mpl_toolkits comes with matplotlib and llvmlite with Numba, apsw

@@ -1,6 +1,6 @@
 """A machine and its error model as constants in C, beside the core that runs them in a servo thread.
 
-The core, ``c/hexapod_comp.c`` and ``.h``, is the same for all machines and is copied; ``hexapod_model.h`` holds this
+The core, the folder ``hexapod_comp/core``, is the same for all machines and is copied; ``hexapod_model.h`` holds this
 machine, ``hexapod_vectors.h`` commands that the Python compensator has answered, which the self-test runs on
 the target. Numbers are written with the digits that bring back the very same double.
 """
@@ -25,8 +25,8 @@ from ..machine.temperatures import Temperatures
 from ..machine.trajectory import moves
 from ..pose import Pose, rotation_from_angles, stacked
 
-SOURCES = Path(__file__).parent / "c"
-"""Where the core's own files lie."""
+SOURCES = Path(__file__).parents[1] / "core", Path(__file__).parent / "c"
+"""Where the core lies, and what is written around it."""
 
 PERIOD = 0.004
 """Between two commands of the self-test, s."""
@@ -102,7 +102,8 @@ def write_c(folder: str | Path, geometry: HexapodGeometry, model: MachineModel, 
     list of Path
         The files.
     """
-    files = {path.name: path.read_text(encoding="utf-8") for path in sorted(SOURCES.iterdir())}
+    paths = [path for folder in SOURCES for path in sorted(folder.iterdir()) if path.suffix in (".c", ".h", ".comp")]
+    files = {path.name: path.read_text(encoding="utf-8") for path in paths}
     files[MODEL_FILE] = model_header(geometry, model, hashes)
     files[VECTORS_FILE] = vectors_header(self_test(geometry, model))
     folder = Path(folder)

@@ -117,7 +117,7 @@ def test_the_loop_of_the_page_compiles_and_answers(tmp_path):
 
 def test_names_of_refusals_are_the_header_s_in_its_order():
     """The enumeration is counted by hand on both sides."""
-    header = (SOURCES / "hexapod_comp.h").read_text()
+    header = (SOURCES[0] / "hexapod_comp.h").read_text()
     names = re.findall(r"^    HC_(\w+)", header, re.MULTILINE)
     assert [name.lower() for name in names] == [
         {"other_assembly_mode": "other_assembly"}.get(name, name) for name in STATUS
@@ -126,7 +126,7 @@ def test_names_of_refusals_are_the_header_s_in_its_order():
 
 def test_core_has_no_globals_and_needs_nothing_but_mathematics(tmp_path):
     """nm: no data of its own (no D, B, C symbols), and what is undefined is from the mathematical library."""
-    shutil.copytree(SOURCES, tmp_path, dirs_exist_ok=True)
+    shutil.copytree(SOURCES[0], tmp_path, dirs_exist_ok=True)
     assert compiled(tmp_path, "-c", "hexapod_comp.c", "-o", "core.o").returncode == 0
     lines = subprocess.run(["nm", "core.o"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
     symbols = [line.split()[-2:] for line in lines.splitlines()]

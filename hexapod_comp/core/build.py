@@ -1,0 +1,60 @@
+"""What setup.py builds of the C core: the extension module ``_core``, by cffi in API mode.
+
+cffi reads the declarations out of the headers, so nothing is declared twice. The module uses Python's stable ABI: one
+build serves all versions of Python.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from pathlib import Path
+
+from cffi import FFI
+
+FOLDER = Path("hexapod_comp", "core")  # setup.py runs in the root of the sources
+
+HEADERS = ("hexapod_comp.h",)
+"""What Python calls; the first is the public one, which ``export --c`` copies."""
+
+UNITS = ("hexapod_comp.c",)
+"""Compiled as one unit, in this order."""
+
+FLAGS = ["-std=c99", "-O3", "-ffp-contract=off", "-fno-math-errno"]
+"""The same bits on every machine: products and sums are not contracted, and nothing is reordered."""
+
+
+def declarations(header: str) -> str:
+    """Return what cffi is to declare: the header without its preprocessor's lines."""
+    plain = re.sub(r"^#ifdef __cplusplus.*?^#endif", "", header, flags=re.MULTILINE | re.DOTALL)
+    return re.sub(r"^#.*$", "", plain, flags=re.MULTILINE)
+
+
+def sources_hash(folder: Path) -> str:
+    """Return the SHA-256 of the core's files, by name."""
+    digest = hashlib.sha256()
+    for path in sorted(folder.glob("*.[ch]")):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+def extension() -> FFI:
+    """Return the module that setup.py builds."""
+    made = FFI()
+    made.cdef("".join(declarations((FOLDER / name).read_text(encoding="utf-8")) for name in HEADERS))
+    made.cdef("const char *hc_sources(void);")
+    code = "".join(f'#include "{name}"\n' for name in (*HEADERS, *UNITS))
+    code += f'static const char *hc_sources(void) {{ return "{sources_hash(FOLDER)}"; }}\n'
+    made.set_source(
+        "hexapod_comp.core._core",
+        code,
+        include_dirs=[str(FOLDER)],
+        depends=[str(path) for path in sorted(FOLDER.glob("*.[ch]"))],
+        extra_compile_args=FLAGS,
+        libraries=["m"],
+    )
+    return made
+
+
+if __name__ == "__cffi__":  # as setup.py's cffi_modules runs this file
+    ffi = extension()

@@ -1,0 +1,549 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * The whole model backwards and forwards, and a compensator at work. doc/theory.md, 11.
+ */
+#include "core.h"
+
+/* command_one: the model backwards for one platform pose */
+static int run_backwards(const hc_state *state, const hc_pose *platform, double low[9], double sense[9], hc_pose *q,
+                         six_struts *now, double commands[6], int *outside)
+{
+    const hc_model *model = state->model;
+    const vec point = add(row_of(platform->position), lever(platform, model->field.probe));
+    int solved, i;
+    follow(point.x, model->axis_threshold, low, sense, 0);
+    follow(point.y, model->axis_threshold, low, sense, 1);
+    follow(point.z, model->axis_threshold, low, sense, 2);
+    solved = undo_field(&model->field, platform, sense, q, outside);
+    *now = struts_of(state->base_joints, state->platform_joints, q);
+    for (i = 0; i < 6; i++) {
+        const double direction = follow(now->length[i], model->strut_threshold, low, sense, 3 + i);
+        commands[i] = command_for_length(state, i, now->length[i], direction, screw_shift(model, q, now, i));
+    }
+    return solved;
+}
+
+static void shrink_ramp(const hc_last *last, hc_last *next, double ramp_rate)
+{
+    const double by_stamp = next->time - last->time;
+    const double pause = by_stamp == by_stamp ? by_stamp : next->received - last->received;
+    double step = 0.0, largest = 0.0, keep;
+    int i;
+    if (pause == pause && last->nominal[0] == last->nominal[0]) { /* the first command stands where the struts are */
+        step = ramp_rate * fmin(fmax(pause, 0.0), LONGEST_RAMP_STEP);
+    }
+    for (i = 0; i < 6; i++) {
+        if (last->changed && last->correction[i] == last->correction[i]) {
+            next->ramp[i] = last->correction[i] - next->correction[i];
+        }
+        largest = fmax(largest, fabs(next->ramp[i]));
+    }
+    keep = largest <= step ? 0.0 : 1.0 - step / largest;
+    for (i = 0; i < 6; i++) {
+        next->ramp[i] *= keep;
+    }
+}
+
+/* elapsed: time since the last command by the stamps and by the receipt, s; -1: not known */
+static hc_time elapsed(const hc_last *last, const hc_last *next)
+{
+    hc_time since;
+    since.made = next->time - last->time;
+    since.received = next->received - last->received;
+    since.made = since.made >= 0.0 ? since.made : -1.0;
+    since.received = since.received >= 0.0 ? since.received : -1.0;
+    return since;
+}
+
+/* The struts' speed by both clocks; writes how far they are ahead of what is allowed. */
+static finding check_speed(const hc_last *last, hc_last *next, double limit)
+{
+    const hc_time since = elapsed(last, next);
+    const double late = last->published - last->received, held_up = late == late ? late : 0.0;
+    double speed = 0.0, wait = 0.0;
+    int hurried = -1, early = -1, i;
+    for (i = 0; i < 6; i++) {
+        const double moved = fabs(next->command[i] - last->command[i]), change = moved == moved ? moved : 0.0;
+        if (since.made >= 0.0) {
+            const double ahead = fmax(0.0, last->ahead_by_stamp[i] + change - limit * since.made);
+            next->ahead_by_stamp[i] = ahead;
+            if (ahead > limit * AHEAD_BY_STAMP && change > speed * since.made) {
+                hurried = i;
+                speed = change / fmax(since.made, 1e-9);
+            }
+        }
+        if (since.received >= 0.0) {
+            double ahead = fmax(0.0, last->ahead_by_receipt[i] - limit * held_up);
+            ahead = fmax(0.0, ahead + change - limit * (since.received - held_up));
+            next->ahead_by_receipt[i] = ahead;
+            if (ahead / limit - AHEAD_BY_RECEIPT > wait) {
+                early = i;
+                wait = ahead / limit - AHEAD_BY_RECEIPT;
+            }
+        }
+    }
+    if (hurried >= 0) {
+        return found(HC_SPEED, hurried, speed);
+    }
+    return early >= 0 ? found(HC_EARLY, early, wait) : found(HC_OK, -1, 0.0);
+}
+
+/* How fast the struts' smoothed speeds change; writes them. */
+static finding check_acceleration(const hc_last *last, hc_last *next, double limit)
+{
+    const hc_time since = elapsed(last, next);
+    const double period = fmax(since.made >= 0.0 ? since.made : since.received, SHORTEST_PERIOD);
+    const double keep = exp(-period / SMOOTHED_OVER);
+    finding worst = found(HC_OK, -1, limit);
+    int i;
+    for (i = 0; i < 6; i++) {
+        const double before = last->smooth_speed[i], speed = (next->command[i] - last->command[i]) / period;
+        const double smooth = speed == speed ? keep * before + (1.0 - keep) * speed : 0.0;
+        const double acceleration = fabs(smooth - before) / period;
+        next->smooth_speed[i] = smooth;
+        if (acceleration > worst.value) {
+            worst = found(HC_ACCELERATION, i, acceleration);
+        }
+    }
+    return worst;
+}
+
+/* check_command: correction, steps, speed and acceleration; `compensated` tells the stage */
+static finding check_command(const hc_last *last, hc_last *next, const hc_limits *limits, int *compensated)
+{
+    finding f;
+    int i;
+    *compensated = 1;
+    for (i = 0; i < 6; i++) {
+        if (!(fabs(next->correction[i]) <= limits->correction)) {
+            return found(HC_CORRECTION, i, next->correction[i]);
+        }
+    }
+    f = check_change(next->nominal, last->nominal, limits->step);
+    if (f.status != HC_OK) {
+        *compensated = 0;
+        return f;
+    }
+    f = check_change(next->command, last->command, limits->step);
+    if (f.status == HC_OK) {
+        f = check_speed(last, next, limits->speed);
+    }
+    if (f.status == HC_OK && limits->acceleration > 0.0) {
+        f = check_acceleration(last, next, limits->acceleration);
+    }
+    return f;
+}
+
+/* compensate_one from the platform's pose on: work out the next command; `next` counts only when nothing was found */
+static finding work_out(const hc_state *state, const hc_pose *platform, hc_time time, hc_last *next, hc_answer *answer)
+{
+    const hc_model *model = state->model;
+    const hc_last *last = &state->last;
+    const hc_limits *limits = &model->limits;
+    six_struts now = struts_of(model->base.joints, model->platform.joints, platform);
+    finding f;
+    double unused;
+    int i;
+    *next = *last;
+    answer->compensated = 0;
+    answer->outside_field = 0;
+    next->platform = *platform;
+    for (i = 0; i < 6; i++) {
+        next->nominal[i] = now.length[i];
+    }
+    f = check_stage(model->base.joints, platform, &now, next->nominal, limits, &answer->condition);
+    if (f.status != HC_OK) {
+        return f;
+    }
+    answer->compensated = 1;
+    if (!run_backwards(state, platform, next->motion_low, next->motion_sense, &next->model, &now, next->command,
+                       &answer->outside_field)) {
+        return found(HC_NOT_CONVERGED, -1, NAN);
+    }
+    for (i = 0; i < 6; i++) {
+        next->correction[i] = (double)last->enabled * (next->command[i] - next->nominal[i]);
+    }
+    next->time = time.made;
+    next->received = time.received;
+    next->published = NAN;
+    next->changed = 0;
+    next->resumes = 0;
+    shrink_ramp(last, next, state->ramp_rate);
+    for (i = 0; i < 6; i++) {
+        next->correction[i] += next->ramp[i];
+        next->command[i] = next->nominal[i] + next->correction[i];
+    }
+    if (answer->outside_field && model->field.refuse_outside) {
+        return found(HC_OUTSIDE_FIELD, -1, NAN);
+    }
+    f = check_command(last, next, limits, &answer->compensated);
+    if (f.status != HC_OK) {
+        return f;
+    }
+    answer->compensated = 1;
+    return check_stage(state->base_joints, &next->model, &now, next->command, limits, &unused);
+}
+
+/* Compensator._resume: take what measured struts differ from nominal lengths for the correction that they stand at */
+static void take_standing(const hc_state *state, const hc_last *trial, hc_last *last)
+{
+    double standing[6];
+    int i;
+    for (i = 0; i < 6; i++) {
+        standing[i] = last->command[i] - trial->nominal[i];
+        if (!(fabs(standing[i]) <= state->model->limits.correction)) {
+            return;
+        }
+    }
+    for (i = 0; i < 6; i++) {
+        last->correction[i] = standing[i];
+    }
+    last->changed = 1;
+}
+
+static void fill_answer(const hc_last *last, finding f, hc_answer *answer)
+{
+    int i;
+    answer->status = f.status;
+    answer->strut = f.strut;
+    answer->value = f.value;
+    for (i = 0; i < 6; i++) {
+        answer->nominal[i] = last->nominal[i];
+        answer->correction[i] = last->correction[i];
+        answer->command[i] = last->command[i];
+    }
+}
+
+/* Compensator.step from the platform's pose on, when there is one */
+static hc_status command_platform(hc_state *state, hc_status status, const hc_pose *platform, hc_time time,
+                                  hc_answer *answer)
+{
+    hc_last next;
+    finding f = found(status, -1, NAN);
+    answer->condition = NAN;
+    answer->compensated = 0;
+    answer->outside_field = 0;
+    if (status == HC_OK) {
+        f = work_out(state, platform, time, &next, answer);
+        if (state->last.resumes) {
+            const hc_last before = state->last;
+            take_standing(state, &next, &state->last);
+            f = work_out(state, platform, time, &next, answer);
+            state->last = before;
+        }
+        if (f.status == HC_OK) {
+            state->last = next;
+        }
+    }
+    fill_answer(&state->last, f, answer);
+    return f.status;
+}
+
+hc_status hc_command(hc_state *state, const double numbers[7], hc_time time, const hc_pose *frame, hc_answer *answer)
+{
+    const hc_model *model = state->model;
+    hc_pose pose, platform;
+    const hc_status status = read_pose(numbers, &pose);
+    if (status == HC_OK) {
+        const hc_pose in_base = compose(frame ? frame : &model->work, &pose);
+        platform = compose(&in_base, &model->tool_inverse);
+    }
+    return command_platform(state, status, &platform, time, answer);
+}
+
+hc_status hc_command_lengths(hc_state *state, const double nominal[6], hc_time time, hc_answer *answer)
+{
+    const hc_model *model = state->model;
+    hc_pose platform = state->last.platform;
+    double unused;
+    const hc_status status = solve_pose(model->base.joints, model->platform.joints, nominal, &model->limits, &platform,
+                                        &unused);
+    return command_platform(state, status, &platform, time, answer);
+}
+
+void hc_published(hc_state *state, double time)
+{
+    state->last.published = time;
+}
+
+/* actual_pose_one: the model forwards; lengths and screw rotation are settled in turn */
+static hc_status run_forwards(const hc_state *state, const double commands[6], hc_pose *q, double *condition)
+{
+    const hc_model *model = state->model;
+    double lengths[6], shifts[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
+    hc_status outcome = HC_NOT_CONVERGED;
+    int turning = 0, count, i;
+    for (i = 0; i < 6; i++) {
+        turning = turning || model->struts[i].lead != 0.0;
+    }
+    for (count = 0; count < LEAD_ITERATIONS; count++) {
+        six_struts now;
+        double change = 0.0;
+        if (turning) {
+            now = struts_of(state->base_joints, state->platform_joints, q);
+        }
+        for (i = 0; i < 6; i++) {
+            const double shift = screw_shift(model, q, &now, i);
+            change = fmax(change, fabs(shift - shifts[i]));
+            shifts[i] = shift;
+            lengths[i] = actual_length(state, i, commands[i], state->last.motion_sense[3 + i], shift);
+        }
+        if (turning && outcome == HC_OK && change < 1e-15) {
+            break;
+        }
+        outcome = solve_pose(state->base_joints, state->platform_joints, lengths, &model->limits, q, condition);
+        if (outcome != HC_OK || !turning) {
+            break;
+        }
+    }
+    return outcome;
+}
+
+hc_status hc_estimate(hc_state *state, const double lengths[6], hc_estimated *estimated)
+{
+    hc_pose q = state->estimate, actual;
+    estimated->condition = NAN;
+    estimated->status = run_forwards(state, lengths, &q, &estimated->condition);
+    if (estimated->status == HC_OK) {
+        state->estimate = q;
+        apply_field(&state->model->field, &q, state->last.motion_sense, &actual);
+        estimated->tool = compose(&actual, &state->model->tool);
+    }
+    return estimated->status;
+}
+
+static void place_joints(const hc_body *body, double growth, double joints[6][3])
+{
+    int i, k;
+    for (i = 0; i < 6; i++) {
+        for (k = 0; k < 3; k++) {
+            const double nominal = body->joints[i][k], deviation = body->deviation[i][k];
+            joints[i][k] = nominal + (deviation + growth * (nominal + deviation));
+        }
+    }
+}
+
+/* RealMachine._growth: by which share a part has grown since 20 degrees */
+static double part_growth(const hc_state *state, int part, double expansion)
+{
+    const hc_late *late = &state->model->late;
+    const int sensor = late->sensors[part];
+    double growth = expansion * (state->temperatures[sensor] - REFERENCE_TEMPERATURE);
+    int k;
+    for (k = 0; k < late->count && finite_number(state->began[sensor]); k++) {
+        growth += late->expansion[part][k] * state->behind[sensor][k];
+    }
+    return growth;
+}
+
+/* RealMachine: the structure and the struts' growth at the present temperatures */
+static void place_machine(hc_state *state)
+{
+    int i;
+    for (i = 0; i < 6; i++) {
+        state->growth[i] = part_growth(state, i, state->model->struts[i].expansion);
+    }
+    place_joints(&state->model->base, part_growth(state, 6, state->model->base.expansion), state->base_joints);
+    place_joints(&state->model->platform, part_growth(state, 7, state->model->platform.expansion), state->platform_joints);
+}
+
+/* Temperatures.follow and Lag.take */
+static void follow_late(hc_state *state, int index, double value, double time)
+{
+    const hc_late *late = &state->model->late;
+    const double change = value - state->temperatures[index];
+    const double elapsed = fmax(0.0, time - state->newest[index]);
+    int k;
+    if (!finite_number(state->began[index])) {
+        state->began[index] = time;
+        state->newest[index] = time;
+        return;
+    }
+    state->newest[index] = fmax(state->newest[index], time);
+    for (k = 0; k < late->count; k++) {
+        const double ages = elapsed / late->time_constants[k];
+        const double gone = -expm1(-ages);
+        const double kept = ages > 0.0 ? gone / ages : 1.0;
+        state->behind[index][k] = state->behind[index][k] * (1.0 - gone) - change * kept;
+    }
+}
+
+/* Compensator._followed: the lengths whose directions are followed, at the last command; 0 where there are none */
+static int followed(const hc_state *state, double lengths[6])
+{
+    hc_last copy = state->last;
+    six_struts now;
+    double commands[6];
+    int outside, i;
+    for (i = 0; i < 6; i++) {
+        if (!finite_number(copy.nominal[i])) {
+            return 0;
+        }
+    }
+    if (!run_backwards(state, &copy.platform, copy.motion_low, copy.motion_sense, &copy.model, &now, commands, &outside)) {
+        return 0;
+    }
+    for (i = 0; i < 6; i++) {
+        lengths[i] = now.length[i];
+    }
+    return 1;
+}
+
+hc_status hc_set_temperature(hc_state *state, int index, double value, double time)
+{
+    double before[6], after[6];
+    int comparable, i;
+    if (index < 0 || index > 7 || !(value >= LOWEST_TEMPERATURE && value <= HIGHEST_TEMPERATURE)) {
+        return HC_TEMPERATURE;
+    }
+    if (state->model->late.count && !finite_number(time)) {
+        return HC_TEMPERATURE;
+    }
+    comparable = followed(state, before);
+    if (state->model->late.count) {
+        follow_late(state, index, value, time);
+    }
+    state->temperatures[index] = value;
+    place_machine(state);
+    comparable = followed(state, after) && comparable;
+    for (i = 0; i < 6 && comparable; i++) {
+        /* The model's lengths jump, the struts do not: without this the jump would count as a motion. */
+        state->last.motion_low[3 + i] += after[i] - before[i];
+    }
+    state->last.changed = 1;
+    return HC_OK;
+}
+
+static void must_ramp(hc_last *last)
+{
+    last->changed = last->correction[0] == last->correction[0];
+}
+
+/* Compensator._check_whole: whether the whole correction, without ramp or switch, is allowed at the last command */
+static hc_status check_whole(const hc_state *state)
+{
+    hc_state trial = *state;
+    hc_last unused;
+    hc_answer answer;
+    hc_time unknown;
+    int i, home = 0;
+    for (i = 0; i < 6; i++) {
+        home = home || !finite_number(state->last.nominal[i]);
+        trial.last.nominal[i] = NAN;
+        trial.last.correction[i] = NAN;
+        trial.last.command[i] = NAN;
+        trial.last.ramp[i] = 0.0;
+    }
+    trial.last.time = NAN;
+    trial.last.received = NAN;
+    unknown.made = NAN;
+    unknown.received = NAN;
+    trial.last.enabled = 1;
+    trial.last.changed = 0;
+    return work_out(&trial, home ? &state->model->home : &state->last.platform, unknown, &unused, &answer).status;
+}
+
+hc_status hc_enable(hc_state *state, int enabled)
+{
+    const int wanted = enabled != 0;
+    if (wanted != state->last.enabled) {
+        const hc_status status = wanted ? check_whole(state) : HC_OK;
+        if (status != HC_OK) {
+            return status;
+        }
+        state->last.enabled = wanted;
+        must_ramp(&state->last);
+    }
+    return HC_OK;
+}
+
+/* CommandState.clear: the correction stays, as what the struts stand at */
+static void forget(hc_state *state)
+{
+    hc_last *last = &state->last;
+    int i;
+    for (i = 0; i < 9; i++) {
+        last->motion_low[i] = NAN;
+        last->motion_sense[i] = 0.0;
+    }
+    for (i = 0; i < 6; i++) {
+        last->nominal[i] = NAN;
+        last->command[i] = NAN;
+        last->ahead_by_stamp[i] = 0.0;
+        last->smooth_speed[i] = 0.0;
+    }
+    last->time = NAN;
+    last->resumes = 0;
+    must_ramp(last);
+    state->estimate = state->model->home;
+}
+
+hc_status hc_reset(hc_state *state, const double measured[6])
+{
+    int i;
+    for (i = 0; measured && i < 6; i++) {
+        if (!finite_number(measured[i])) {
+            return HC_NOT_FINITE;
+        }
+    }
+    forget(state);
+    for (i = 0; measured && i < 6; i++) {
+        state->last.command[i] = measured[i];
+        state->last.resumes = 1;
+    }
+    return HC_OK;
+}
+
+void hc_init(hc_state *state, const hc_model *model, double ramp_rate)
+{
+    int i;
+    state->model = model;
+    state->ramp_rate = ramp_rate;
+    for (i = 0; i < 8; i++) {
+        state->temperatures[i] = REFERENCE_TEMPERATURE;
+        state->began[i] = NAN;
+        state->newest[i] = NAN;
+        state->behind[i][0] = 0.0;
+        state->behind[i][1] = 0.0;
+    }
+    for (i = 0; i < 6; i++) {
+        state->last.correction[i] = NAN;
+        state->last.ramp[i] = 0.0;
+        state->last.ahead_by_receipt[i] = 0.0;
+    }
+    state->last.received = NAN;
+    state->last.published = NAN;
+    state->last.platform = model->home;
+    state->last.model = model->home;
+    state->last.enabled = 1;
+    forget(state);
+    place_machine(state);
+}
+
+const char *hc_reason(hc_status status)
+{
+    switch (status) {
+    case HC_OK: return "";
+    case HC_STROKE_SHORT: return "stroke";
+    case HC_STROKE_LONG: return "stroke";
+    case HC_BASE_CONE: return "base_cone";
+    case HC_PLATFORM_CONE: return "platform_cone";
+    case HC_CLEARANCE: return "clearance";
+    case HC_CONDITION: return "condition";
+    case HC_ASSEMBLY: return "assembly";
+    case HC_NOT_FINITE: return "not_finite";
+    case HC_CORRECTION: return "correction";
+    case HC_STEP: return "step";
+    case HC_SPEED: return "speed";
+    case HC_EARLY: return "speed";
+    case HC_ACCELERATION: return "acceleration";
+    case HC_NOT_CONVERGED: return "not_converged";
+    case HC_OUTSIDE_FIELD: return "outside_field";
+    case HC_QUATERNION: return "quaternion";
+    case HC_SINGULAR: return "singular";
+    case HC_UNREACHABLE: return "unreachable";
+    case HC_OTHER_ASSEMBLY: return "other_assembly_mode";
+    case HC_TEMPERATURE: return "bad_model";
+    }
+    return "unknown";
+}

@@ -1,0 +1,123 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What the files of the core share: constants and three-vectors. hexapod_comp.c takes them together as one unit, so
+ * everything is static and the compiler sees through all calls; nothing but the functions of hexapod_comp.h is visible.
+ */
+#ifndef HEXAPOD_CORE_H
+#define HEXAPOD_CORE_H
+
+#include "hexapod_comp.h"
+
+#include <math.h>
+#include <stddef.h>
+
+#define PI 3.14159265358979323846
+
+#define STEP_TOLERANCE 1e-8    /* Newton stops after a shorter step, m and rad: its square is below rounding */
+#define MAX_ITERATIONS 30
+#define MAX_ROTATION_STEP 0.6  /* rad: a linearisation means nothing beyond */
+#define CLOSURE 1e-13          /* m, what rounding may leave in the six loop closures ... */
+#define CLOSURE_RELATIVE 1e-14 /* ... and its part relative to the lengths */
+#define ROTATION_ROUNDING 1e-13
+#define COPLANAR 1e-3          /* smaller volumes of three unit struts need pivoting */
+#define SMALLEST_PIVOT 1e-14
+#define LONGEST_RAMP_STEP 0.02 /* s */
+#define AHEAD_BY_STAMP 5e-3    /* s of motion at the largest speed that a command may be ahead by its stamp ... */
+#define AHEAD_BY_RECEIPT 8e-4  /* ... and by its receipt */
+#define SHORTEST_PERIOD 1e-4   /* s */
+#define SMOOTHED_OVER 0.02     /* s */
+#define QUATERNION_TOLERANCE 1e-3
+#define REFERENCE_TEMPERATURE 20.0
+#define LOWEST_TEMPERATURE (-40.0)
+#define HIGHEST_TEMPERATURE 120.0
+#define FIELD_ITERATIONS 50
+#define COMMAND_ITERATIONS 8
+#define SMALL_ANGLE (1.0 / 64.0) /* rad */
+#define LEAD_ITERATIONS 20
+
+typedef struct {
+    double x, y, z;
+} vec;
+
+typedef struct {
+    vec row[3];
+} mat;
+
+static inline vec vector(double x, double y, double z)
+{
+    vec v;
+    v.x = x;
+    v.y = y;
+    v.z = z;
+    return v;
+}
+
+static inline vec row_of(const double a[3])
+{
+    return vector(a[0], a[1], a[2]);
+}
+
+static inline mat three_rows(const double r[3][3])
+{
+    mat m;
+    m.row[0] = row_of(r[0]);
+    m.row[1] = row_of(r[1]);
+    m.row[2] = row_of(r[2]);
+    return m;
+}
+
+static inline double dot(vec a, vec b)
+{
+    return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
+static inline double norm(vec a)
+{
+    return sqrt(dot(a, a));
+}
+
+static inline vec cross(vec a, vec b)
+{
+    return vector(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x);
+}
+
+static inline vec add(vec a, vec b)
+{
+    return vector(a.x + b.x, a.y + b.y, a.z + b.z);
+}
+
+static inline vec subtract(vec a, vec b)
+{
+    return vector(a.x - b.x, a.y - b.y, a.z - b.z);
+}
+
+static inline vec scale(double factor, vec a)
+{
+    return vector(factor * a.x, factor * a.y, factor * a.z);
+}
+
+/* k.x a + k.y b + k.z c */
+static inline vec combine(vec k, vec a, vec b, vec c)
+{
+    return vector(k.x * a.x + k.y * b.x + k.z * c.x, k.x * a.y + k.y * b.y + k.z * c.y,
+                  k.x * a.z + k.y * b.z + k.z * c.z);
+}
+
+static inline vec combine_rows(vec k, const vec rows[3])
+{
+    return combine(k, rows[0], rows[1], rows[2]);
+}
+
+static inline void store(vec v, double to[3])
+{
+    to[0] = v.x;
+    to[1] = v.y;
+    to[2] = v.z;
+}
+
+static int finite_number(double a)
+{
+    return a - a == 0.0;
+}
+
+#endif

@@ -1,0 +1,159 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * One strut's own error, forwards and backwards, and its direction of motion. doc/theory.md, 8 and 10.
+ */
+#include "core.h"
+
+/* follow: direction of motion with a reversal threshold */
+static double follow(double value, double threshold, double low[9], double sense[9], int index)
+{
+    if (low[index] != low[index]) {
+        low[index] = value - 0.5 * threshold;
+    } else if (value > low[index] + threshold) {
+        low[index] = value - threshold;
+        sense[index] = 1.0;
+    } else if (value < low[index]) {
+        low[index] = value;
+        sense[index] = -1.0;
+    }
+    return sense[index];
+}
+
+/* screw_shift: how much longer the command must be for the screw's rotation, m (screw_twist is part of it); `now` are
+ * the struts at the pose */
+static double screw_shift(const hc_model *model, const hc_pose *pose, const six_struts *now, int i)
+{
+    const hc_strut *strut = &model->struts[i];
+    vec s, u, b, p;
+    double length, sine, cosine, turns;
+    if (strut->lead == 0.0) {
+        return 0.0;
+    }
+    s = now->strut[i];
+    length = now->length[i];
+    u = vector(s.x / length, s.y / length, s.z / length);
+    b = row_of(model->base.axes[i]);
+    p = lever(pose, model->platform.axes[i]);
+    sine = dot(b, cross(p, u));
+    cosine = dot(b, p) - dot(b, u) * dot(p, u);
+    turns = (atan2(sine, cosine) - strut->twist_home) / (2.0 * PI);
+    return -strut->lead * (turns - floor(turns + 0.5));
+}
+
+/* Cosine and sine of the angle that a screw has turned. */
+typedef struct {
+    double cosine, sine;
+} turn;
+
+/* screw_turn */
+static turn screw_turn(const hc_strut *strut, double command)
+{
+    turn at = {1.0, 0.0};
+    if (strut->harmonics != 0.0) {
+        const double angle = strut->wavenumber * command;
+        at.cosine = cos(angle);
+        at.sine = sin(angle);
+    }
+    return at;
+}
+
+/* turned_on: increased by a small angle */
+static turn turned_on(turn at, double angle)
+{
+    const double square = angle * angle;
+    const double c = 1.0 - square * (0.5 - square * (1.0 / 24.0));
+    const double s = angle * (1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0)));
+    turn on;
+    on.cosine = at.cosine * c - at.sine * s;
+    on.sine = at.sine * c + at.cosine * s;
+    return on;
+}
+
+/* wave_error: error and slope of the periodic error; harmonics by the addition theorem */
+static double wave_error(const hc_strut *strut, turn at, double *slope)
+{
+    const double (*wave)[2] = strut->wave;
+    double error = wave[0][0] * at.cosine + wave[0][1] * at.sine;
+    double c = at.cosine, s = at.sine, steep = wave[0][1] * c - wave[0][0] * s;
+    int n;
+    for (n = 2; n <= strut->harmonics; n++) {
+        const double a = wave[n - 1][0], b = wave[n - 1][1], next = c * at.cosine - s * at.sine;
+        s = s * at.cosine + c * at.sine;
+        c = next;
+        error += a * c + b * s;
+        steep += n * (b * c - a * s);
+    }
+    *slope = strut->wavenumber * steep;
+    return error;
+}
+
+/* error_at: error and slope of what depends on the command: offset, pitch, waves, map, and the backlash's change */
+static double error_at(const hc_model *model, int i, double command, turn at, double sense, double *slope)
+{
+    const hc_strut *strut = &model->struts[i];
+    const hc_map *map = &model->map;
+    double error = strut->offset + strut->pitch * (command - strut->reference);
+    *slope = strut->pitch;
+    if (strut->harmonics != 0.0) {
+        double steep;
+        error += wave_error(strut, at, &steep);
+        *slope += steep;
+    }
+    if (map->knot_count > 1) {
+        const int last = map->knot_count - 1;
+        const double inside = fmin(map->knots[last], fmax(map->knots[0], command));
+        const double *piece, half = -0.5 * sense;
+        double x, c[4];
+        int low = 0, high = last, n;
+        while (high - low > 1) {
+            const int middle = low + (high - low) / 2;
+            if (map->knots[middle] <= inside) {
+                low = middle;
+            } else {
+                high = middle;
+            }
+        }
+        x = inside - map->knots[low];
+        piece = map->pieces + (i * last + low) * 8;
+        for (n = 0; n < 4; n++) {
+            c[n] = piece[n] + half * piece[4 + n];
+        }
+        error += ((c[0] * x + c[1]) * x + c[2]) * x + c[3];
+        if (inside == command) {
+            *slope += (3.0 * c[0] * x + 2.0 * c[1]) * x + c[2];
+        }
+    }
+    return error;
+}
+
+static double actual_length(const hc_state *state, int i, double command, double sense, double shift)
+{
+    const hc_strut *strut = &state->model->struts[i];
+    double slope;
+    const double error = error_at(state->model, i, command, screw_turn(strut, command), sense, &slope);
+    const double play = 0.5 * sense * strut->backlash;
+    return (1.0 + state->growth[i]) * (command + error - play - shift);
+}
+
+static double command_for_length(const hc_state *state, int i, double length, double sense, double shift)
+{
+    const hc_strut *strut = &state->model->struts[i];
+    const double wanted = length / (1.0 + state->growth[i]) + 0.5 * sense * strut->backlash + shift;
+    double command = wanted - strut->offset;
+    turn at;
+    int count;
+    command -= strut->pitch * (command - strut->reference);
+    at = screw_turn(strut, command);
+    for (count = 0; count < COMMAND_ITERATIONS; count++) {
+        double slope, angle;
+        const double error = error_at(state->model, i, command, at, sense, &slope);
+        const double step = (wanted - command - error) / (1.0 + slope);
+        command += step;
+        if (fabs(step) < 1e-9) {
+            break;
+        }
+        angle = strut->wavenumber * step;
+        at = fabs(angle) < SMALL_ANGLE ? turned_on(at, angle) : screw_turn(strut, command);
+    }
+    return command;
+}
