@@ -196,6 +196,16 @@ def _watch(parser: argparse.ArgumentParser) -> None:
     add("--port", type=arguments.port, default=8080, metavar="N", help="port to serve on (default 8080)")
 
 
+def _echo(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("topic", nargs="?", metavar="TOPIC", help="name of a topic (default: list those that are published)")
+    add("--namespace", default="", metavar="NAME", help="where the machine's nodes are (default: none)")
+    add("--count", type=arguments.count, metavar="N", help="end after N messages")
+    add("--seconds", type=arguments.above_zero, metavar="S", help="end after S seconds (default: at Ctrl-C)")
+    add("--hz", action="store_true", help="print the rate once a second in place of the messages")
+    _json(add)
+
+
 def _record(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     text = "folder for the bag (MCAP); must not be there yet"
@@ -482,6 +492,7 @@ OPTIONS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     "run": _run,
     "demo": _demo,
     "watch": _watch,
+    "echo": _echo,
     "record": _record,
     "replay": _replay,
     "plan": _plan,

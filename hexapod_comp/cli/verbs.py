@@ -171,6 +171,22 @@ example:
   $ hexapod_comp watch --machine mine.yaml
   hexapod_comp: mine is shown on http://127.0.0.1:8080 until Ctrl-C""",
     ),
+    "echo": Verb(
+        "loop",
+        "print a topic of a running machine with units, rate and age",
+        """Prints each message of TOPIC, whatever its type: struts in mm, corrections in µm, poses in mm and degrees,
+predicted errors in µm and µrad with their standard deviations, diagnostics by name. Its rate over the last 2 s and its
+age, from its stamp to its receipt, stand above it. --hz prints the rate alone, as `ros2 topic hz` does. Without TOPIC
+it lists the topics that are published. With --json each message is one line. It needs no ROS 2 installation, and it
+publishes nothing. Exit code: 0 a message came, 1 none came, 2 bad input, or nobody publishes the topic.
+
+example:
+  $ hexapod_comp echo strut_corrections --count 1
+  /strut_corrections, 0.4 ms old
+    strut_1           18.203 µm
+  …
+  $ hexapod_comp echo strut_commands --hz --seconds 10""",
+    ),
     "record": Verb(
         "loop",
         "record a running machine's topics, for replay",

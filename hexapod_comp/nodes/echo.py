@@ -1,0 +1,318 @@
+"""A topic's messages with units, rate and age, where there is no ``ros2`` command: what the verb ``echo`` prints."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from difflib import get_close_matches
+from typing import Any, NamedTuple
+
+import numpy as np
+from builtin_interfaces.msg import Duration, Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState, RelativeHumidity, Temperature, TimeReference
+from std_msgs.msg import Float64MultiArray
+
+from ..errors import HexapodError, printable
+from ..machine.geometry import STRUT_NAMES
+from ..pose import Pose
+from .stamps import nanoseconds_of
+
+DISCOVERY_TIME = 3.0
+"""How long a topic may take to be discovered, s; Fast DDS needs 0.1 to 1 s."""
+
+RATE_WINDOW = 2.0
+"""The rate is that of the messages of this last time, s."""
+
+QUEUE = 1000
+"""Messages that may wait while the terminal is slow: a second of commands."""
+
+ANGLES = ("alpha", "beta", "gamma")
+
+
+class Row(NamedTuple):
+    """A number or text of a message; the unit is as JSON keys spell it: mm, um, deg, urad, mm_s, degC, percent, s."""
+
+    name: str
+    value: Any
+    unit: str = ""
+
+    @property
+    def key(self) -> str:
+        """Name with unit, as in the package's other JSON and CSV."""
+        return f"{self.name}_{self.unit}" if self.unit else self.name
+
+
+UNITS = {"um": "µm", "urad": "µrad", "deg": "°", "mm_s": "mm/s", "degC": "°C", "percent": "%"}
+"""Units as people read them, where that is not how keys spell them."""
+
+DIGITS = {"mm": 6, "um": 3, "deg": 6, "urad": 3, "mm_s": 3, "degC": 2, "percent": 1, "s": 6, "m": 9, "rad": 9}
+"""Digits after the point: a nanometre; SI numbers of topics that are not ours get nine."""
+
+
+def message_rows(topic: str, message: Any) -> list[Row]:
+    """Return a message's numbers with their units; types and topics that are not the package's are shown in SI."""
+    if isinstance(message, PoseStamped):
+        return _pose_rows(message)
+    if isinstance(message, PoseWithCovarianceStamped):
+        return _error_rows(message)
+    if isinstance(message, JointState) and set(message.name) == set(STRUT_NAMES) and not message.effort:
+        return _strut_rows(message.name, message.position, message.velocity, topic.endswith("strut_corrections"))
+    if isinstance(message, Float64MultiArray) and topic.endswith("strut_commands_array"):
+        return _strut_rows(STRUT_NAMES, message.data, (), False)
+    if isinstance(message, DiagnosticArray):
+        return [row for status in message.status for row in _status_rows(status)]
+    if isinstance(message, DiagnosticStatus):
+        return _status_rows(message)
+    if isinstance(message, Temperature):
+        return [Row(message.header.frame_id or "temperature", message.temperature, "degC")]
+    if isinstance(message, RelativeHumidity):
+        return [Row("humidity", message.relative_humidity * 100.0, "percent")]
+    if isinstance(message, TimeReference):
+        valid = (nanoseconds_of(message.time_ref) - nanoseconds_of(message.header.stamp)) * 1e-9
+        return [Row("valid_for", valid, "s"), Row("source", message.source)]
+    return list(_plain_rows("", message))
+
+
+def _pose_rows(message: PoseStamped) -> list[Row]:
+    p, q = message.pose.position, message.pose.orientation
+    quaternion = (q.x, q.y, q.z, q.w)
+    try:
+        degrees = np.degrees(Pose.from_quaternion((0.0, 0.0, 0.0), quaternion).angles())
+        turned = [Row(name, angle, "deg") for name, angle in zip(ANGLES, degrees.tolist(), strict=True)]
+    except HexapodError:  # not of norm 1: a listener shows what was sent
+        turned = [Row(f"q{axis}", value) for axis, value in zip("xyzw", quaternion, strict=True)]
+    places = [Row(axis, value * 1e3, "mm") for axis, value in zip("xyz", (p.x, p.y, p.z), strict=True)]
+    return [Row("frame", message.header.frame_id), *places, *turned]
+
+
+def _error_rows(message: PoseWithCovarianceStamped) -> list[Row]:
+    """Return a small displacement and rotation vector, each with its standard deviation."""
+    p, q = message.pose.pose.position, message.pose.pose.orientation
+    deviations = np.sqrt(np.diag(np.reshape(message.pose.covariance, (6, 6)))) * 1e6
+    vector = [2.0 * math.copysign(1.0, q.w) * part for part in (q.x, q.y, q.z)]  # sin(ω/2) = ω/2 to 1e-13 at 100 µrad
+    rows = [Row("frame", message.header.frame_id)]
+    for n, (name, value) in enumerate(zip(("x", "y", "z", "rx", "ry", "rz"), (p.x, p.y, p.z, *vector), strict=True)):
+        unit = "um" if n < 3 else "urad"
+        rows += [Row(name, value * 1e6, unit), Row(f"{name}_sigma", float(deviations[n]), unit)]
+    return rows
+
+
+def _strut_rows(names: Sequence[str], lengths: Sequence[float], speeds: Sequence[float], micro: bool) -> list[Row]:
+    scale, unit = (1e6, "um") if micro else (1e3, "mm")
+    rows = [Row(name, length * scale, unit) for name, length in zip(names, lengths, strict=False)]
+    if any(speeds):
+        rows += [Row(f"{name}_speed", speed * 1e3, "mm_s") for name, speed in zip(names, speeds, strict=False)]
+    return rows
+
+
+LEVELS = {b"\x00": "OK", b"\x01": "WARN", b"\x02": "ERROR", b"\x03": "STALE"}
+
+
+def _status_rows(status: DiagnosticStatus) -> list[Row]:
+    level = LEVELS.get(status.level, repr(status.level))
+    return [Row(status.name, f"{level}: {status.message}"), *(Row(f"  {v.key}", v.value) for v in status.values)]
+
+
+def _plain_rows(prefix: str, value: Any) -> Iterator[Row]:
+    """Yield the fields of any message, in SI, by their dotted names; long sequences by their first items."""
+    if isinstance(value, Time | Duration):
+        yield Row(prefix, value.sec + value.nanosec * 1e-9, "s")
+    elif hasattr(value, "get_fields_and_field_types"):
+        for name in value.get_fields_and_field_types():
+            yield from _plain_rows(f"{prefix}.{name}" if prefix else name, getattr(value, name))
+    elif isinstance(value, str | bytes | bool | int | float):
+        yield Row(prefix, value if not isinstance(value, bytes) else value.hex())
+    else:
+        items = list(value)
+        for n, item in enumerate(items[:12]):
+            yield from _plain_rows(f"{prefix}[{n}]", item)
+        if len(items) > 12:
+            yield Row(prefix, f"… {len(items)} items")
+
+
+class Received(NamedTuple):
+    """One message.
+
+    Attributes
+    ----------
+    topic : str
+        Full name.
+    rows : list of Row
+        What it holds.
+    stamp : float
+        Of its header, s since 1970; NaN where it has none.
+    age : float
+        From that stamp to its receipt, s; NaN likewise.
+    rate : float
+        Of the last messages, Hz; NaN for the first one.
+    """
+
+    topic: str
+    rows: list[Row]
+    stamp: float
+    age: float
+    rate: float
+
+    def text(self) -> str:
+        """Return it for people: a line with rate and age, then a line for each number."""
+        parts = [self.topic]
+        parts += [f"{self.rate:.1f} Hz"] if math.isfinite(self.rate) else []
+        parts += [f"{self.age * 1e3:.1f} ms old"] if math.isfinite(self.age) else ["no stamp"]
+        width = max((len(row.name) for row in self.rows), default=0)
+        lines = [f"  {row.name:<{width}}  {_shown(row)}".rstrip() for row in self.rows]
+        return "\n".join([", ".join(parts), *lines])
+
+    def record(self) -> dict[str, Any]:
+        """Return it for programs: one flat object, units in the keys."""
+        head = {"topic": self.topic, "stamp_s": self.stamp, "age_ms": self.age * 1e3, "rate_hz": self.rate}
+        return {**head, **{row.key.strip(): row.value for row in self.rows}}
+
+
+def _shown(row: Row) -> str:
+    if not isinstance(row.value, float):
+        return printable(str(row.value), 1000)
+    digits = DIGITS.get(row.unit, 9)
+    return f"{row.value + 0.0:{digits + 6}.{digits}f} {UNITS.get(row.unit, row.unit)}"
+
+
+class Echo:
+    """Subscribes to one topic, whatever its type, with the QoS that its publishers offer.
+
+    Parameters
+    ----------
+    node : Node
+        Subscribes, in the namespace that relative names are resolved in.
+    spin_once : callable
+        Handles the node's events for so many seconds.
+    topic : str
+        Name of the topic.
+    receive : callable
+        Called with each message, a :class:`Received`.
+
+    Raises
+    ------
+    HexapodError
+        Nobody publishes it within :data:`DISCOVERY_TIME`, or its type is not installed here.
+    """
+
+    def __init__(
+        self, node: Node, spin_once: Callable[[float], None], topic: str, receive: Callable[[Received], None]
+    ) -> None:
+        self._node, self._receive = node, receive
+        try:
+            self.topic = node.resolve_topic_name(topic)
+        except RuntimeError as error:  # rcl's, with the place in its sources
+            raise HexapodError(
+                f"{printable(topic)!r} is not a valid topic name: {str(error).partition(', at ')[0]}"
+            ) from error
+        self._times: deque[float] = deque()
+        self._intervals = Intervals()
+        self._kind = _message_type(self._wait_for_type(spin_once))
+        node.create_subscription(self._kind, self.topic, self._on_message, self._offered_qos(), raw=True)
+
+    @property
+    def intervals(self) -> Intervals:
+        """Times between the messages so far."""
+        return self._intervals
+
+    def _wait_for_type(self, spin_once: Callable[[float], None]) -> str:
+        end = time.monotonic() + DISCOVERY_TIME
+        while time.monotonic() < end:
+            publishers = self._node.get_publishers_info_by_topic(self.topic)
+            if publishers:
+                return str(publishers[0].topic_type)
+            spin_once(0.05)
+        known = published_topics(self._node)
+        close = get_close_matches(self.topic, known, n=3)
+        listed = f"did you mean {' or '.join(close)}?" if close else f"published are: {', '.join(known) or 'none'}"
+        raise HexapodError(f"nobody publishes {self.topic} in this ROS domain (waited {DISCOVERY_TIME:g} s); {listed}")
+
+    def _offered_qos(self) -> QoSProfile:
+        """Return reliable and latched only where all publishers are: a stricter subscription would get nothing."""
+        offered = [info.qos_profile for info in self._node.get_publishers_info_by_topic(self.topic)]
+        reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
+        latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
+        return QoSProfile(
+            depth=QUEUE,
+            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+
+    def _on_message(self, data: bytes) -> None:
+        came, now = time.monotonic(), self._node.get_clock().now().nanoseconds
+        message = deserialize_message(data, self._kind)
+        self._intervals.add(came)
+        self._times.append(came)
+        while came - self._times[0] > RATE_WINDOW:
+            self._times.popleft()
+        span = came - self._times[0]
+        stamp = nanoseconds_of(message.header.stamp) if hasattr(message, "header") else 0
+        self._receive(
+            Received(
+                self.topic,
+                message_rows(self.topic, message),
+                stamp * 1e-9 if stamp else math.nan,
+                (now - stamp) * 1e-9 if stamp else math.nan,
+                (len(self._times) - 1) / span if span > 0.0 else math.nan,
+            )
+        )
+
+
+class Intervals:
+    """Counts messages and the times between them, s."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.shortest, self.longest = math.inf, 0.0
+        self._first = self._last = math.nan
+
+    def add(self, time: float) -> None:
+        """Count a message that came at a time."""
+        if self.count == 0:
+            self._first = time
+        else:
+            self.shortest = min(self.shortest, time - self._last)
+            self.longest = max(self.longest, time - self._last)
+        self._last = time
+        self.count += 1
+
+    @property
+    def rate(self) -> float:
+        """Mean rate, Hz; NaN for fewer than two messages."""
+        span = self._last - self._first
+        return (self.count - 1) / span if span > 0.0 else math.nan
+
+    def text(self) -> str:
+        """Return it for people, as ``ros2 topic hz`` does."""
+        if self.count < 2:
+            return f"messages: {self.count}"
+        between = f"{self.shortest * 1e3:.1f} to {self.longest * 1e3:.1f} ms apart"
+        return f"messages: {self.count}, {self.rate:.2f} Hz, {between}"
+
+    def record(self) -> dict[str, Any]:
+        """Return it for programs."""
+        apart = {"shortest_ms": self.shortest * 1e3, "longest_ms": self.longest * 1e3}
+        return {"messages": self.count, "rate_hz": self.rate, **(apart if self.count > 1 else {})}
+
+
+def published_topics(node: Node) -> dict[str, str]:
+    """Return the topics that somebody publishes, by name, each with its type."""
+    topics = sorted(node.get_topic_names_and_types())
+    return {name: kinds[0] for name, kinds in topics if node.count_publishers(name)}
+
+
+def _message_type(name: str) -> type:
+    """Return the class of ``package/msg/Type``."""
+    package, _, kind = name.partition("/msg/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), kind)  # type: ignore[no-any-return]
+    except (ImportError, AttributeError) as error:
+        raise HexapodError(f"messages of type {name} cannot be read: {package} is not installed here") from error
