@@ -17,7 +17,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the verb until Ctrl-C, --count or --seconds; 0 when a message has come."""
     from ..formats.json import json_text
     from ..nodes import heard_signals
-    from ..nodes.echo import DISCOVERY_TIME, Echo, Received, published_topics
+    from ..nodes.echo import DISCOVERY_TIME, Echo, EchoedMessage, published_topics
     from ..nodes.ros_session import RosSession
     from ..nodes.running import SPIN_PERIOD, keep_discovery_local
     from ..nodes.watching import QUIET
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
             common.show(topics if args.json else "\n".join(f"{name}  {kind}" for name, kind in topics.items()))
             return 0 if topics else 1
 
-        def print_message(received: Received) -> None:
+        def print_message(received: EchoedMessage) -> None:
             if not args.hz and (args.count is None or echo.intervals.count <= args.count):
                 print(json_text(received.record(), indent=None) if args.json else received.text() + "\n")
 

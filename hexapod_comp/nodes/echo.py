@@ -37,7 +37,7 @@ QUEUE = 1000
 ANGLES = ("alpha", "beta", "gamma")
 
 
-class Row(NamedTuple):
+class Quantity(NamedTuple):
     """A number or text of a message; the unit is as JSON keys spell it: mm, um, deg, urad, mm_s, degC, percent, s."""
 
     name: str
@@ -57,7 +57,7 @@ DIGITS = {"mm": 6, "um": 3, "deg": 6, "urad": 3, "mm_s": 3, "degC": 2, "percent"
 """Digits after the point: a nanometre; SI numbers of topics that are not ours get nine."""
 
 
-def message_rows(topic: str, message: Any) -> list[Row]:
+def message_quantities(topic: str, message: Any) -> list[Quantity]:
     """Return a message's numbers with their units; types and topics that are not the package's are shown in SI."""
     if isinstance(message, PoseStamped):
         return _pose_rows(message)
@@ -72,80 +72,83 @@ def message_rows(topic: str, message: Any) -> list[Row]:
     if isinstance(message, DiagnosticStatus):
         return _status_rows(message)
     if isinstance(message, Temperature):
-        return [Row(message.header.frame_id or "temperature", message.temperature, "degC")]
+        return [Quantity(message.header.frame_id or "temperature", message.temperature, "degC")]
     if isinstance(message, RelativeHumidity):
-        return [Row("humidity", message.relative_humidity * 100.0, "percent")]
+        return [Quantity("humidity", message.relative_humidity * 100.0, "percent")]
     if isinstance(message, TimeReference):
         valid = (nanoseconds_of(message.time_ref) - nanoseconds_of(message.header.stamp)) * 1e-9
-        return [Row("valid_for", valid, "s"), Row("source", message.source)]
+        return [Quantity("valid_for", valid, "s"), Quantity("source", message.source)]
     return list(_plain_rows("", message))
 
 
-def _pose_rows(message: PoseStamped) -> list[Row]:
+def _pose_rows(message: PoseStamped) -> list[Quantity]:
     p, q = message.pose.position, message.pose.orientation
     quaternion = (q.x, q.y, q.z, q.w)
     try:
         degrees = np.degrees(Pose.from_quaternion((0.0, 0.0, 0.0), quaternion).angles())
-        turned = [Row(name, angle, "deg") for name, angle in zip(ANGLES, degrees.tolist(), strict=True)]
+        turned = [Quantity(name, angle, "deg") for name, angle in zip(ANGLES, degrees.tolist(), strict=True)]
     except HexapodError:  # not of norm 1: a listener shows what was sent
-        turned = [Row(f"q{axis}", value) for axis, value in zip("xyzw", quaternion, strict=True)]
-    places = [Row(axis, value * 1e3, "mm") for axis, value in zip("xyz", (p.x, p.y, p.z), strict=True)]
-    return [Row("frame", message.header.frame_id), *places, *turned]
+        turned = [Quantity(f"q{axis}", value) for axis, value in zip("xyzw", quaternion, strict=True)]
+    places = [Quantity(axis, value * 1e3, "mm") for axis, value in zip("xyz", (p.x, p.y, p.z), strict=True)]
+    return [Quantity("frame", message.header.frame_id), *places, *turned]
 
 
-def _error_rows(message: PoseWithCovarianceStamped) -> list[Row]:
+def _error_rows(message: PoseWithCovarianceStamped) -> list[Quantity]:
     """Return a small displacement and rotation vector, each with its standard deviation."""
     p, q = message.pose.pose.position, message.pose.pose.orientation
     deviations = np.sqrt(np.diag(np.reshape(message.pose.covariance, (6, 6)))) * 1e6
     vector = [2.0 * math.copysign(1.0, q.w) * part for part in (q.x, q.y, q.z)]  # sin(ω/2) = ω/2 to 1e-13 at 100 µrad
-    rows = [Row("frame", message.header.frame_id)]
+    rows = [Quantity("frame", message.header.frame_id)]
     for n, (name, value) in enumerate(zip(("x", "y", "z", "rx", "ry", "rz"), (p.x, p.y, p.z, *vector), strict=True)):
         unit = "um" if n < 3 else "urad"
-        rows += [Row(name, value * 1e6, unit), Row(f"{name}_sigma", float(deviations[n]), unit)]
+        rows += [Quantity(name, value * 1e6, unit), Quantity(f"{name}_sigma", float(deviations[n]), unit)]
     return rows
 
 
-def _strut_rows(names: Sequence[str], lengths: Sequence[float], speeds: Sequence[float], micro: bool) -> list[Row]:
+def _strut_rows(names: Sequence[str], lengths: Sequence[float], speeds: Sequence[float], micro: bool) -> list[Quantity]:
     scale, unit = (1e6, "um") if micro else (1e3, "mm")
-    rows = [Row(name, length * scale, unit) for name, length in zip(names, lengths, strict=False)]
+    rows = [Quantity(name, length * scale, unit) for name, length in zip(names, lengths, strict=False)]
     if any(speeds):
-        rows += [Row(f"{name}_speed", speed * 1e3, "mm_s") for name, speed in zip(names, speeds, strict=False)]
+        rows += [Quantity(f"{name}_speed", speed * 1e3, "mm_s") for name, speed in zip(names, speeds, strict=False)]
     return rows
 
 
 LEVELS = {b"\x00": "OK", b"\x01": "WARN", b"\x02": "ERROR", b"\x03": "STALE"}
 
 
-def _status_rows(status: DiagnosticStatus) -> list[Row]:
+def _status_rows(status: DiagnosticStatus) -> list[Quantity]:
     level = LEVELS.get(status.level, repr(status.level))
-    return [Row(status.name, f"{level}: {status.message}"), *(Row(f"  {v.key}", v.value) for v in status.values)]
+    return [
+        Quantity(status.name, f"{level}: {status.message}"),
+        *(Quantity(f"  {v.key}", v.value) for v in status.values),
+    ]
 
 
-def _plain_rows(prefix: str, value: Any) -> Iterator[Row]:
+def _plain_rows(prefix: str, value: Any) -> Iterator[Quantity]:
     """Yield the fields of any message, in SI, by their dotted names; long sequences by their first items."""
     if isinstance(value, Time | Duration):
-        yield Row(prefix, value.sec + value.nanosec * 1e-9, "s")
+        yield Quantity(prefix, value.sec + value.nanosec * 1e-9, "s")
     elif hasattr(value, "get_fields_and_field_types"):
         for name in value.get_fields_and_field_types():
             yield from _plain_rows(f"{prefix}.{name}" if prefix else name, getattr(value, name))
     elif isinstance(value, str | bytes | bool | int | float):
-        yield Row(prefix, value if not isinstance(value, bytes) else value.hex())
+        yield Quantity(prefix, value if not isinstance(value, bytes) else value.hex())
     else:
         items = list(value)
         for n, item in enumerate(items[:12]):
             yield from _plain_rows(f"{prefix}[{n}]", item)
         if len(items) > 12:
-            yield Row(prefix, f"… {len(items)} items")
+            yield Quantity(prefix, f"… {len(items)} items")
 
 
-class Received(NamedTuple):
+class EchoedMessage(NamedTuple):
     """One message.
 
     Attributes
     ----------
     topic : str
         Full name.
-    rows : list of Row
+    rows : list of Quantity
         What it holds.
     stamp : float
         Of its header, s since 1970; NaN where it has none.
@@ -156,7 +159,7 @@ class Received(NamedTuple):
     """
 
     topic: str
-    rows: list[Row]
+    rows: list[Quantity]
     stamp: float
     age: float
     rate: float
@@ -176,7 +179,7 @@ class Received(NamedTuple):
         return {**head, **{row.key.strip(): row.value for row in self.rows}}
 
 
-def _shown(row: Row) -> str:
+def _shown(row: Quantity) -> str:
     if not isinstance(row.value, float):
         return printable(str(row.value), 1000)
     digits = DIGITS.get(row.unit, 9)
@@ -195,7 +198,7 @@ class Echo:
     topic : str
         Name of the topic.
     receive : callable
-        Called with each message, a :class:`Received`.
+        Called with each message, a :class:`EchoedMessage`.
 
     Raises
     ------
@@ -204,7 +207,7 @@ class Echo:
     """
 
     def __init__(
-        self, node: Node, spin_once: Callable[[float], None], topic: str, receive: Callable[[Received], None]
+        self, node: Node, spin_once: Callable[[float], None], topic: str, receive: Callable[[EchoedMessage], None]
     ) -> None:
         self._node, self._receive = node, receive
         try:
@@ -214,12 +217,12 @@ class Echo:
                 f"{printable(topic)!r} is not a valid topic name: {str(error).partition(', at ')[0]}"
             ) from error
         self._times: deque[float] = deque()
-        self._intervals = Intervals()
+        self._intervals = MessageIntervals()
         self._kind = _message_type(self._wait_for_type(spin_once))
         node.create_subscription(self._kind, self.topic, self._on_message, self._offered_qos(), raw=True)
 
     @property
-    def intervals(self) -> Intervals:
+    def intervals(self) -> MessageIntervals:
         """Times between the messages so far."""
         return self._intervals
 
@@ -256,9 +259,9 @@ class Echo:
         span = came - self._times[0]
         stamp = nanoseconds_of(message.header.stamp) if hasattr(message, "header") else 0
         self._receive(
-            Received(
+            EchoedMessage(
                 self.topic,
-                message_rows(self.topic, message),
+                message_quantities(self.topic, message),
                 stamp * 1e-9 if stamp else math.nan,
                 (now - stamp) * 1e-9 if stamp else math.nan,
                 (len(self._times) - 1) / span if span > 0.0 else math.nan,
@@ -266,7 +269,7 @@ class Echo:
         )
 
 
-class Intervals:
+class MessageIntervals:
     """Counts messages and the times between them, s."""
 
     def __init__(self) -> None:

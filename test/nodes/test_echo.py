@@ -15,11 +15,11 @@ from std_msgs.msg import Float64MultiArray, String
 
 from hexapod_comp import cli
 from hexapod_comp.machine.geometry import STRUT_NAMES
-from hexapod_comp.nodes.echo import Intervals, message_rows
+from hexapod_comp.nodes.echo import MessageIntervals, message_quantities
 
 
 def keyed(topic: str, message: object) -> dict[str, object]:
-    return {row.key: row.value for row in message_rows(topic, message)}
+    return {row.key: row.value for row in message_quantities(topic, message)}
 
 
 def struts(*lengths: float) -> JointState:
@@ -81,7 +81,7 @@ def test_what_has_no_unit_of_ours_is_named_by_its_fields():
 
 
 def test_rates_are_of_the_intervals():
-    intervals = Intervals()
+    intervals = MessageIntervals()
     for time in (0.0, 0.1, 0.4):
         intervals.add(time)
     assert intervals.rate == pytest.approx(5.0)
