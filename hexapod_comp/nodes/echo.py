@@ -37,7 +37,7 @@ QUEUE = 1000
 ANGLES = ("alpha", "beta", "gamma")
 
 
-class Quantity(NamedTuple):
+class MessageField(NamedTuple):
     """A number or text of a message; the unit is as JSON keys spell it: mm, um, deg, urad, mm_s, degC, percent, s."""
 
     name: str
@@ -57,7 +57,7 @@ DIGITS = {"mm": 6, "um": 3, "deg": 6, "urad": 3, "mm_s": 3, "degC": 2, "percent"
 """Digits after the point: a nanometre; SI numbers of topics that are not ours get nine."""
 
 
-def message_quantities(topic: str, message: Any) -> list[Quantity]:
+def message_fields(topic: str, message: Any) -> list[MessageField]:
     """Return a message's numbers with their units; types and topics that are not the package's are shown in SI."""
     if isinstance(message, PoseStamped):
         return _pose_rows(message)
@@ -72,73 +72,75 @@ def message_quantities(topic: str, message: Any) -> list[Quantity]:
     if isinstance(message, DiagnosticStatus):
         return _status_rows(message)
     if isinstance(message, Temperature):
-        return [Quantity(message.header.frame_id or "temperature", message.temperature, "degC")]
+        return [MessageField(message.header.frame_id or "temperature", message.temperature, "degC")]
     if isinstance(message, RelativeHumidity):
-        return [Quantity("humidity", message.relative_humidity * 100.0, "percent")]
+        return [MessageField("humidity", message.relative_humidity * 100.0, "percent")]
     if isinstance(message, TimeReference):
         valid = (nanoseconds_of(message.time_ref) - nanoseconds_of(message.header.stamp)) * 1e-9
-        return [Quantity("valid_for", valid, "s"), Quantity("source", message.source)]
+        return [MessageField("valid_for", valid, "s"), MessageField("source", message.source)]
     return list(_plain_rows("", message))
 
 
-def _pose_rows(message: PoseStamped) -> list[Quantity]:
+def _pose_rows(message: PoseStamped) -> list[MessageField]:
     p, q = message.pose.position, message.pose.orientation
     quaternion = (q.x, q.y, q.z, q.w)
     try:
         degrees = np.degrees(Pose.from_quaternion((0.0, 0.0, 0.0), quaternion).angles())
-        turned = [Quantity(name, angle, "deg") for name, angle in zip(ANGLES, degrees.tolist(), strict=True)]
+        turned = [MessageField(name, angle, "deg") for name, angle in zip(ANGLES, degrees.tolist(), strict=True)]
     except HexapodError:  # not of norm 1: a listener shows what was sent
-        turned = [Quantity(f"q{axis}", value) for axis, value in zip("xyzw", quaternion, strict=True)]
-    places = [Quantity(axis, value * 1e3, "mm") for axis, value in zip("xyz", (p.x, p.y, p.z), strict=True)]
-    return [Quantity("frame", message.header.frame_id), *places, *turned]
+        turned = [MessageField(f"q{axis}", value) for axis, value in zip("xyzw", quaternion, strict=True)]
+    places = [MessageField(axis, value * 1e3, "mm") for axis, value in zip("xyz", (p.x, p.y, p.z), strict=True)]
+    return [MessageField("frame", message.header.frame_id), *places, *turned]
 
 
-def _error_rows(message: PoseWithCovarianceStamped) -> list[Quantity]:
+def _error_rows(message: PoseWithCovarianceStamped) -> list[MessageField]:
     """Return a small displacement and rotation vector, each with its standard deviation."""
     p, q = message.pose.pose.position, message.pose.pose.orientation
     deviations = np.sqrt(np.diag(np.reshape(message.pose.covariance, (6, 6)))) * 1e6
     vector = [2.0 * math.copysign(1.0, q.w) * part for part in (q.x, q.y, q.z)]  # sin(ω/2) = ω/2 to 1e-13 at 100 µrad
-    rows = [Quantity("frame", message.header.frame_id)]
+    rows = [MessageField("frame", message.header.frame_id)]
     for n, (name, value) in enumerate(zip(("x", "y", "z", "rx", "ry", "rz"), (p.x, p.y, p.z, *vector), strict=True)):
         unit = "um" if n < 3 else "urad"
-        rows += [Quantity(name, value * 1e6, unit), Quantity(f"{name}_sigma", float(deviations[n]), unit)]
+        rows += [MessageField(name, value * 1e6, unit), MessageField(f"{name}_sigma", float(deviations[n]), unit)]
     return rows
 
 
-def _strut_rows(names: Sequence[str], lengths: Sequence[float], speeds: Sequence[float], micro: bool) -> list[Quantity]:
+def _strut_rows(
+    names: Sequence[str], lengths: Sequence[float], speeds: Sequence[float], micro: bool
+) -> list[MessageField]:
     scale, unit = (1e6, "um") if micro else (1e3, "mm")
-    rows = [Quantity(name, length * scale, unit) for name, length in zip(names, lengths, strict=False)]
+    rows = [MessageField(name, length * scale, unit) for name, length in zip(names, lengths, strict=False)]
     if any(speeds):
-        rows += [Quantity(f"{name}_speed", speed * 1e3, "mm_s") for name, speed in zip(names, speeds, strict=False)]
+        rows += [MessageField(f"{name}_speed", speed * 1e3, "mm_s") for name, speed in zip(names, speeds, strict=False)]
     return rows
 
 
 LEVELS = {b"\x00": "OK", b"\x01": "WARN", b"\x02": "ERROR", b"\x03": "STALE"}
 
 
-def _status_rows(status: DiagnosticStatus) -> list[Quantity]:
+def _status_rows(status: DiagnosticStatus) -> list[MessageField]:
     level = LEVELS.get(status.level, repr(status.level))
     return [
-        Quantity(status.name, f"{level}: {status.message}"),
-        *(Quantity(f"  {v.key}", v.value) for v in status.values),
+        MessageField(status.name, f"{level}: {status.message}"),
+        *(MessageField(f"  {v.key}", v.value) for v in status.values),
     ]
 
 
-def _plain_rows(prefix: str, value: Any) -> Iterator[Quantity]:
+def _plain_rows(prefix: str, value: Any) -> Iterator[MessageField]:
     """Yield the fields of any message, in SI, by their dotted names; long sequences by their first items."""
     if isinstance(value, Time | Duration):
-        yield Quantity(prefix, value.sec + value.nanosec * 1e-9, "s")
+        yield MessageField(prefix, value.sec + value.nanosec * 1e-9, "s")
     elif hasattr(value, "get_fields_and_field_types"):
         for name in value.get_fields_and_field_types():
             yield from _plain_rows(f"{prefix}.{name}" if prefix else name, getattr(value, name))
     elif isinstance(value, str | bytes | bool | int | float):
-        yield Quantity(prefix, value if not isinstance(value, bytes) else value.hex())
+        yield MessageField(prefix, value if not isinstance(value, bytes) else value.hex())
     else:
         items = list(value)
         for n, item in enumerate(items[:12]):
             yield from _plain_rows(f"{prefix}[{n}]", item)
         if len(items) > 12:
-            yield Quantity(prefix, f"… {len(items)} items")
+            yield MessageField(prefix, f"… {len(items)} items")
 
 
 class EchoedMessage(NamedTuple):
@@ -148,7 +150,7 @@ class EchoedMessage(NamedTuple):
     ----------
     topic : str
         Full name.
-    rows : list of Quantity
+    rows : list of MessageField
         What it holds.
     stamp : float
         Of its header, s since 1970; NaN where it has none.
@@ -159,7 +161,7 @@ class EchoedMessage(NamedTuple):
     """
 
     topic: str
-    rows: list[Quantity]
+    rows: list[MessageField]
     stamp: float
     age: float
     rate: float
@@ -179,7 +181,7 @@ class EchoedMessage(NamedTuple):
         return {**head, **{row.key.strip(): row.value for row in self.rows}}
 
 
-def _shown(row: Quantity) -> str:
+def _shown(row: MessageField) -> str:
     if not isinstance(row.value, float):
         return printable(str(row.value), 1000)
     digits = DIGITS.get(row.unit, 9)
@@ -261,7 +263,7 @@ class Echo:
         self._receive(
             EchoedMessage(
                 self.topic,
-                message_quantities(self.topic, message),
+                message_fields(self.topic, message),
                 stamp * 1e-9 if stamp else math.nan,
                 (now - stamp) * 1e-9 if stamp else math.nan,
                 (len(self._times) - 1) / span if span > 0.0 else math.nan,

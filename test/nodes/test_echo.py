@@ -15,11 +15,11 @@ from std_msgs.msg import Float64MultiArray, String
 
 from hexapod_comp import cli
 from hexapod_comp.machine.geometry import STRUT_NAMES
-from hexapod_comp.nodes.echo import MessageIntervals, message_quantities
+from hexapod_comp.nodes.echo import MessageIntervals, message_fields
 
 
 def keyed(topic: str, message: object) -> dict[str, object]:
-    return {row.key: row.value for row in message_quantities(topic, message)}
+    return {row.key: row.value for row in message_fields(topic, message)}
 
 
 def struts(*lengths: float) -> JointState:
