@@ -56,20 +56,18 @@ class HeldDatum:
         """What a model file says of it."""
         return Datum.at(self.pose, self.held)
 
-    def taken(self, moves: np.ndarray, arms: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """Return what holding takes off small errors beside the datum, shape (N, 6, K).
+    def moved(self, arms: np.ndarray, axes: np.ndarray) -> np.ndarray:
+        """Return by how much holding moved the whole machine, at places beside the datum, shape (N, 6), m and rad.
 
         Parameters
         ----------
-        moves : ndarray, shape (6, K)
-            Errors at the datum, m and rad.
         arms : ndarray, shape (N, 3)
             From the tool at the datum to the places, m.
         axes : ndarray, shape (3, 3)
             In ``base``: all is along and about its columns.
         """
-        turn = np.kron(np.eye(2), axes)
-        return carried((turn.T @ self.part @ turn @ moves)[None], arms)
+        there = np.kron(np.eye(2), axes).T @ self.part @ self.given_up
+        return carried(np.tile(there[:, None], (len(arms), 1, 1)), arms)[:, :, 0]
 
     def report(self) -> str:
         """Return what is held and why, for people."""

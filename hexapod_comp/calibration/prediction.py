@@ -19,7 +19,6 @@ from ..machine.motion import FOLLOWED
 from ..machine.passes import Poses
 from ..machine.temperatures import HUMIDITY, Temperatures
 from ..measurements.readings import Stations, attitude_error
-from .datum import HeldDatum
 from .parameters import ParameterSpace
 from .posterior import FittedParameters
 from .sensitivity import Prediction, carried, derivatives
@@ -67,6 +66,17 @@ class _FirstOrder(NamedTuple):
         arms = self.tips - datum.centre
         return _FirstOrder(self.tips, self.values - datum.at(arms, 0), self.slopes - datum.at(arms, 1))
 
+    def known(self, covariance: np.ndarray | None, moved: np.ndarray | float = 0.0) -> PredictedError:
+        """Return the errors with their mean squares about the truth, by the parameters' covariance.
+
+        `moved`, shape (N, 6): how far they were moved away from the parameters' own.
+        """
+        if covariance is None:
+            return PredictedError(self.values, None)
+        moves = np.broadcast_to(moved, self.values.shape)
+        spread = self.slopes @ covariance @ np.swapaxes(self.slopes, 1, 2)
+        return PredictedError(self.values, spread + moves[:, :, None] * moves[:, None, :])
+
 
 class ErrorPredictor:
     """Predicts the tool's error without compensation, by a model, at any pose.
@@ -81,21 +91,23 @@ class ErrorPredictor:
     Notes
     -----
     The covariance is J·Σ·Jᵀ, J the derivatives of the error by the fit's parameters and Σ their covariance: to first
-    order, and of what the fit's blocks describe.
+    order, and of what the fit's blocks describe. Σ has the prior of what no reading showed, so that the uncertainty of
+    an error as the machine stands includes where it stands as a whole. A model whose datum is held has been moved away
+    from the most probable machine by h: about what it predicts the truth then scatters by J·Σ·Jᵀ + h·hᵀ.
     """
 
     def __init__(self, machine: RealMachine, fitted: FittedParameters | None) -> None:
         self._machine, self._fitted = machine, fitted
-        self._at_held = None if fitted is None or fitted.held is None else self._slopes_at(fitted.held)
         self._datum = self._find_datum()
 
     def predict(self, poses: Poses, senses: np.ndarray | None = None) -> tuple[PredictedError, PredictedError | None]:
         """Return the errors as the machine stands, and with the datum aligned.
 
-        As it stands, an error holds where the machine is as a whole, which lines of a laser do not see. Aligned, it
-        loses the shift and the turn that best explain the displacements in the box for which the model was measured,
-        and the mean rotation there: what a shop takes out that sets its zero and squares its work. None for a model
-        that tells of no box.
+        As it stands, an error includes where the machine is as a whole. Lines of a laser do not show that: the model
+        then assumes that the tool is right at the held datum, and the covariance has the prior of where it really is.
+        Aligned, an error loses the shift and the turn that best explain the displacements in the box for which the
+        model was measured, and the mean rotation there: what a shop takes out that sets its zero and squares its work.
+        None for a model that tells of no box.
 
         Parameters
         ----------
@@ -118,12 +130,13 @@ class ErrorPredictor:
         for start in range(0, max(count, 1), CHUNK):
             chosen = slice(start, start + CHUNK)
             errors = self._errors((positions[chosen], rotations[chosen]), senses[chosen])
-            standing.append(self._with_covariance(errors))
+            covariance = None if self._fitted is None else self._fitted.covariance
+            standing.append(errors.known(covariance, self._given_up(errors.tips)))
             if self._datum is not None:
-                aligned.append(self._with_covariance(errors.without(self._datum)))
+                aligned.append(errors.without(self._datum).known(covariance))
         return _joined(standing), _joined(aligned) if aligned else None
 
-    def slopes(self, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def slopes(self, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return how the fit's parameters move the tool at poses, directions of motion not known.
 
         Returns
@@ -133,6 +146,8 @@ class ErrorPredictor:
         standing, aligned : ndarray, shape (N, 6, size)
             Derivatives of the errors as the machine stands, and with the datum aligned; NaN where the machine has no
             pose.
+        given_up : ndarray, shape (N, 6)
+            What holding the datum took off the errors as the machine stands, m and rad.
 
         Raises
         ------
@@ -142,29 +157,19 @@ class ErrorPredictor:
         if self._fitted is None or self._datum is None:
             raise CalibrationError("model", "tells neither how well it is known, nor where it was measured")
         errors = self._errors(poses)
-        return errors.tips, errors.slopes, errors.without(self._datum).slopes
-
-    def _slopes_at(self, held: HeldDatum) -> np.ndarray:
-        """Return how the parameters move the tool at the held datum, at 20 °C, shape (6, size)."""
-        machine = RealMachine(self._machine.geometry, self._machine.model)
-        poses = held.pose.position[None], held.pose.rotation[None]
-        return _first_order(machine, self._fitted, _stations(machine, poses, np.zeros((1, FOLLOWED)))).slopes[0]
+        return errors.tips, errors.slopes, errors.without(self._datum).slopes, self._given_up(errors.tips)
 
     def _errors(self, poses: Poses, senses: np.ndarray | None = None) -> _FirstOrder:
-        """Return the errors at poses: parameters move the whole machine by nothing that is held at the datum."""
         senses = np.zeros((len(poses[0]), FOLLOWED)) if senses is None else senses
-        errors = _first_order(self._machine, self._fitted, _stations(self._machine, poses, senses))
-        if self._at_held is None:
-            return errors
-        geometry, held = self._machine.geometry, self._fitted.held  # type: ignore[union-attr]
-        arms = errors.tips - geometry.tool_pose(held.pose).position  # type: ignore[union-attr]
-        taken = held.taken(self._at_held, arms, geometry.work.rotation)  # type: ignore[union-attr]
-        return errors._replace(slopes=errors.slopes - taken)
+        return _first_order(self._machine, self._fitted, _stations(self._machine, poses, senses))
 
-    def _with_covariance(self, errors: _FirstOrder) -> PredictedError:
-        if self._fitted is None:
-            return PredictedError(errors.values, None)
-        return PredictedError(errors.values, errors.slopes @ self._fitted.covariance @ np.swapaxes(errors.slopes, 1, 2))
+    def _given_up(self, tips: np.ndarray) -> np.ndarray:
+        """Return the errors that the most probable machine has at tips (N, 3) in ``work`` beyond the model that holds
+        the datum, shape (N, 6): a motion of the whole machine."""
+        if self._fitted is None or self._fitted.held is None:
+            return np.zeros((len(tips), 6))
+        geometry, held = self._machine.geometry, self._fitted.held
+        return held.moved(tips - geometry.tool_pose(held.pose).position, geometry.work.rotation)
 
     def _find_datum(self) -> _Datum | None:
         """Return the motion of the whole machine that is no error once the datum is set."""

@@ -158,11 +158,11 @@ def remaining(
 
 def _left(predictor: ErrorPredictor, poses: Poses, factor: np.ndarray, where: str) -> tuple[Left, np.ndarray]:
     """Return what is left over some poses, and the independent effects that make it up, shape (N, size, 6)."""
-    tips, standing, slopes = predictor.slopes(poses)
+    tips, standing, slopes, given_up = predictor.slopes(poses)
     reached = np.isfinite(slopes).all(axis=(1, 2))
     tips, effects = tips[reached], np.swapaxes(slopes[reached] @ factor, 1, 2)
     sizes = root_sum_of_squares(effects)
-    as_it_stands = root_sum_of_squares(np.swapaxes(standing[reached] @ factor, 1, 2))[:, 0]
+    as_it_stands = np.concatenate([standing[reached] @ factor, given_up[reached, :, None]], axis=2)[:, :3]
     drawn = monte_carlo(effects, DRAWS, percentiles=(95.0,), distribution=NORMAL)
     worst = int(sizes[:, 0].argmax())
     return (
@@ -173,7 +173,7 @@ def _left(predictor: ErrorPredictor, poses: Poses, factor: np.ndarray, where: st
             worst=float(sizes[worst, 0]),
             at=tips[worst],
             most=float(drawn.worst_values[0, 0]),
-            standing=float(np.sqrt((as_it_stands**2).mean())),
+            standing=float(np.sqrt((as_it_stands**2).sum(axis=(1, 2)).mean())),
         ),
         effects,
     )

@@ -238,7 +238,7 @@ def _tool(
     places = np.random.default_rng(SEED).uniform(low, high, (POSES, 3))
     predictor = ErrorPredictor(RealMachine(space.geometry, model), fitted)
     try:
-        _, *slopes = predictor.slopes((places, np.tile(space.level, (POSES, 1, 1))))
+        _, *slopes, _ = predictor.slopes((places, np.tile(space.level, (POSES, 1, 1))))
     except CalibrationError:  # no box in which a datum could be aligned
         return None
     mean = explained(check, fitted, candidate.change, candidate.scale).mean

@@ -91,6 +91,7 @@ class _Predicted:
     standing: PredictedError
     aligned: PredictedError | None
     unknown: str
+    unseen: int  # ways of the whole machine to shift and turn that readings did not show
 
     @staticmethod
     def of(machine: RealMachine, model_file: str, poses: Poses) -> _Predicted:
@@ -100,7 +101,8 @@ class _Predicted:
 
         fitted, unknown = load_posterior(machine.model, machine.geometry, model_file)
         standing, aligned = ErrorPredictor(machine, fitted).predict(poses)
-        return _Predicted(standing, aligned, unknown)
+        held = None if fitted is None else fitted.held
+        return _Predicted(standing, aligned, unknown, 0 if held is None else held.held)
 
     def columns(self, row: int) -> dict[str, Any]:
         """Return one row's errors and their standard deviations, units in the names."""
@@ -128,6 +130,11 @@ class _Predicted:
         )
         title += "direction of motion not known: midway; ± is one standard deviation"
         title += f", not known: {self.unknown}" if self.unknown else " of the fit"
+        if self.unseen:
+            title += (
+                f";\nin {self.unseen} of 6 ways the readings did not show where the machine stands as a whole: there "
+            )
+            title += "the error as it stands is zero at the\nheld datum, and ± has the tolerance of the structure"
         return f"{title}\n{texts.aligned(header, body)}\n"
 
 

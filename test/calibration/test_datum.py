@@ -127,7 +127,7 @@ def test_scheme_lines_holds_it_too() -> None:
     assert np.abs(tool_move(small.paper(), fit_lines(readings, datum=pose).model, pose)).max() < STILL
 
 
-def test_the_predicted_error_is_known_at_the_datum_and_as_well_as_before_when_aligned(tmp_path: Path) -> None:
+def test_holding_the_datum_leaves_the_deviations_as_they_were_but_for_what_it_moved(tmp_path: Path) -> None:
     fit, home = laser_fit(), small.paper().home
     fitted = FittedParameters.of(fit)
     save_with_posterior(fit.model, fitted, tmp_path / "model.yaml")
@@ -140,10 +140,16 @@ def test_the_predicted_error_is_known_at_the_datum_and_as_well_as_before_when_al
     machine = RealMachine(small.paper(), model)
     standing, aligned = ErrorPredictor(machine, stored).predict(poses)
     assert np.abs(standing.values[0]).max() < STILL
-    assert standing.deviations is not None
-    assert standing.deviations[0].max() < STILL
-    assert standing.deviations[1, :3].min() > STILL
-    _, before = ErrorPredictor(machine, replace(fitted, held=None)).predict(poses)
+    free, before = ErrorPredictor(
+        RealMachine(small.paper(), fit.space.model(fit.solution.x)), replace(fitted, held=None)
+    ).predict(poses)
+    moved = free.values - standing.values
+    assert np.abs(moved).max() > 1e-6
+    assert standing.covariance is not None
+    assert free.covariance is not None
+    wanted = free.covariance + moved[:, :, None] * moved[:, None, :]
+    scale = np.sqrt(np.diagonal(wanted, axis1=1, axis2=2))
+    np.testing.assert_allclose((standing.covariance - wanted) / scale[:, :, None] / scale[:, None, :], 0.0, atol=1e-3)
     assert aligned is not None
     assert before is not None
     np.testing.assert_allclose(aligned.deviations, before.deviations, rtol=1e-3)
@@ -167,10 +173,8 @@ def test_the_model_file_keeps_it_and_older_ones_have_none() -> None:
         MachineModel("paper", base_axes_turn=np.full(3, np.nan))
 
 
-def test_what_is_taken_off_errors_beside_the_datum_is_a_rigid_motion() -> None:
+def test_holding_moves_the_machine_as_a_rigid_body() -> None:
     """A turn of 1 mrad about z at the datum moves a point 0.1 m along x by 0.1 mm along y."""
-    held = HeldDatum(Pose.identity(), np.eye(6), np.zeros(6))
-    turn = np.zeros((6, 1))
-    turn[5] = 1e-3
-    taken = held.taken(turn, np.array([[0.1, 0.0, 0.0]]), np.eye(3))
-    np.testing.assert_allclose(taken[0, :, 0], [0.0, 1e-4, 0.0, 0.0, 0.0, 1e-3], atol=1e-18)
+    held = HeldDatum(Pose.identity(), np.eye(6), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1e-3]))
+    moved = held.moved(np.array([[0.1, 0.0, 0.0]]), np.eye(3))
+    np.testing.assert_allclose(moved[0], [0.0, 1e-4, 0.0, 0.0, 0.0, 1e-3], atol=1e-18)

@@ -79,7 +79,7 @@ def test_known_and_measured_are_the_textbooks(lines: Fitted, result: Remaining) 
     """Known: the conditional covariance. Measured: the inverse of the sum of both informations. In SI units."""
     machine, parameters = lines
     sigma = parameters.covariance
-    _, _, slopes = ErrorPredictor(machine, parameters).slopes(tilted())
+    _, _, slopes, _ = ErrorPredictor(machine, parameters).slopes(tilted())
 
     def rms(covariance: np.ndarray) -> float:
         return float(np.sqrt(np.einsum("ncp,pq,ncq->", slopes[:, :3], covariance, slopes[:, :3]) / len(slopes)))
