@@ -29,7 +29,7 @@ from ..nodes.health import OK
 from ..nodes.messages import StrutMessage, StrutReader
 from ..nodes.running import keep_discovery_local, run
 from ..nodes.runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, STATE_QOS, MachineNode
-from ..nodes.stamps import nanoseconds_of, stamp_of
+from ..nodes.stamps import StampClock, StampGate, nanoseconds_of, stamp_of
 from ..nodes.warming import warm_messages
 from .bridge_status import BridgeStatus
 from .guard import CorrectionGuard, GuardStatus
@@ -81,6 +81,8 @@ class LinuxcncBridgeNode(MachineNode):
         self._sent, self._states, self._heard = status.sent, status.states, status.heard
         self._refusals = status.refusals
         self._reader = StrutReader()
+        self.clock = StampClock()  # the system's: what the bridge stamps with
+        self._stamps = StampGate("correction", self.clock)
         self._streaming_since, self._moved_at = math.inf, -math.inf
         self._beat, self._last_text = False, ""
         self._reset: CompensatorReset | None = None  # while topics are open
@@ -253,18 +255,20 @@ class LinuxcncBridgeNode(MachineNode):
         try:
             if self._source.problem:
                 raise CommandError(self._source.reason, self._source.problem)
-            self._check_stamp(self._reader.take(data).header.stamp)
+            stamp = nanoseconds_of(self._reader.take(data).header.stamp)
+            self._check_stamp(stamp, now)
             self._guard.offer(self._reader.lengths.tolist(), now)
+            self._stamps.accept(stamp, now)
         except CommandError as error:
             self._refusals.add(error.reason, str(error), now)
             self.warn_of(error.reason, f"correction refused ({error.reason}): {error}")
 
-    def _check_stamp(self, stamp: Time) -> None:
+    def _check_stamp(self, stamp: int, now: float) -> None:
         """Refuse a correction of a command that is long past: its stamp is ours, and comes from this clock."""
-        age = (time.time_ns() - nanoseconds_of(stamp)) * 1e-9
-        if not abs(age) <= self._options["timeout"]:
-            raise CommandError("stamp", f"it answers a command of {age:.3f} s ago, or somebody else's")
-        self._status.latency = age
+        if not stamp:
+            raise CommandError("stamp_past", "it has no stamp, and answers no command of ours")
+        self._stamps.max_age = self._options["timeout"]
+        self._status.latency = self._stamps.check(stamp, now)
 
     # ---- state ----
 

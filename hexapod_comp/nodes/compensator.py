@@ -32,7 +32,7 @@ from .pacing import Pacing
 from .reloading import ReloadService
 from .running import keep_discovery_local, run
 from .runtime import ACKNOWLEDGED_WITHIN, MachineNode
-from .stamps import StampCheck, stamp_of
+from .stamps import stamp_of
 from .tools import ToolChoice, frame_ids
 from .travel import TravelReports
 from .warming import warm_compensator, warm_up
@@ -50,8 +50,8 @@ class CompensatorNode(MachineNode):
     def __init__(self, **options: Any) -> None:
         super().__init__("compensator", PARAMETERS, **options)
         self._files = MachineFiles(self._options)
-        self._stamps = StampCheck(self._options["max_command_age"], self.simulated_time())
-        self._status = status = CompensatorStatus(self._options, self._stamps)
+        self._status = status = CompensatorStatus(self._options, self.clock)
+        self._stamps = status.command_stamps
         self._commands, self._following, self._last_known = status.commands, status.following, status.last_known
         self._fresh_start = self._looks_closer = True
         self._logged_problem = ""
@@ -179,8 +179,7 @@ class CompensatorNode(MachineNode):
             frame = self._frames.get(frame_id)
             if frame is None or self._looks_closer:
                 self._examine(frame_id, now)
-            if stamp:
-                self._stamps.check(stamp, now)
+            self._stamps.check(stamp, now)
             when = stamp or self.get_clock().now().nanoseconds  # zero means now
             self.compensator.step(numbers, time_of(stamp, bool(stamp)), frame, now)
         except TooEarlyError as error:
@@ -194,8 +193,7 @@ class CompensatorNode(MachineNode):
         if self._fresh_start:
             self._fresh_start = False
             self._look_closer()
-        if stamp:
-            self._stamps.accept(stamp, now)
+        self._stamps.accept(stamp, now)
         self._status.answered(self.compensator.command, frame_id, now)
         self._unestimated = when
         return 0.0

@@ -15,7 +15,7 @@ from .following import Following, LastKnown, Standing
 from .health import ERROR, OK, WARN, Flow, Refusals, joined, seconds
 from .log_space import LogSpace
 from .pacing import Pacing
-from .stamps import StampCheck
+from .stamps import StampClock, StampGate
 
 NEAR_SINGULAR = 0.9
 """From this share of the largest allowed condition number on, diagnostics warn."""
@@ -40,8 +40,8 @@ class CompensatorStatus:
     ----------
     options : dict
         The node's parameters.
-    stamps : StampCheck
-        Of the commands.
+    clock : StampClock
+        The node's.
 
     Attributes
     ----------
@@ -61,8 +61,8 @@ class CompensatorStatus:
         Who publishes temperatures and humidity, by topic.
     thermometers : Thermometers
         Which of them no longer tell.
-    reading_stamps : StampCheck
-        Of the measured struts.
+    command_stamps, reading_stamps : StampGate
+        Of the commands, and of the measured struts.
     following : Following
         Whether the struts go where they are told.
     standing : Standing
@@ -75,9 +75,9 @@ class CompensatorStatus:
         Whether the log can be written.
     """
 
-    def __init__(self, options: dict[str, Any], stamps: StampCheck) -> None:
-        self._options, self._stamps = options, stamps
-        self.reading_stamps = stamps.for_readings()
+    def __init__(self, options: dict[str, Any], clock: StampClock) -> None:
+        self._options, self._clock = options, clock
+        self.command_stamps, self.reading_stamps = StampGate("command", clock), StampGate("reading", clock, capped=True)
         self.commands, self.feedback = Flow(), Flow()
         self.refusals, self.bad_feedback = Refusals(), Refusals()
         self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
@@ -90,8 +90,8 @@ class CompensatorStatus:
     def take_parameters(self) -> None:
         """Take the parameters as they are now; others are looked up where they are needed."""
         options = self._options
-        self._stamps.largest_age = options["max_command_age"]
-        self.reading_stamps.largest_age = options["max_reading_age"]
+        self.command_stamps.max_age = options["max_command_age"]
+        self.reading_stamps.max_age = options["max_reading_age"]
         self.following.limit = options["following_error_limit"]
         self.last_known.anywhere_after = options["start_without_feedback_after"]
 
@@ -233,5 +233,7 @@ class CompensatorStatus:
             "command_age_s": seconds(self.commands.age(now)),
             "feedback_rate_hz": f"{self.feedback.rate(now):.1f}",
             "feedback_age_s": seconds(self.feedback.age(now)),
-            "clock_set_back": str(self._stamps.clock_set_back),
+            "clock_set_back": str(self._clock.set_back),
+            "clock_set_forward": str(self._clock.set_forward),
+            "senders_clock_set_back": str(self.command_stamps.sender_set_back + self.reading_stamps.sender_set_back),
         }

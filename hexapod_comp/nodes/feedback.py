@@ -92,7 +92,7 @@ class Feedback:
             self._hear(self._measuring, number, now)
             header = self._reader.take(data).header
             stamp = nanoseconds_of(header.stamp)
-            made = now - (self._stamps.check(stamp, now) if stamp else 0.0)  # of late, where this node stood still
+            made = now - self._stamps.check(stamp, now)  # of late, where this node stood still
             self._range.check(struts)
             self._watch_following(struts, made, now)  # also of what cannot be: then the strut or its encoder is broken
             self._jumps.check(struts, stamp, now)
@@ -103,8 +103,7 @@ class Feedback:
         self._status.last_known.measure(struts, made)
         self._status.standing.measure(struts, now)
         self._jumps.passed(struts, stamp, now)
-        if stamp:
-            self._stamps.accept(stamp, now)
+        self._stamps.accept(stamp, now)
         self._status.feedback.tick(now)
         if self._node.active:
             self._publish(struts, pose, header.stamp)

@@ -1,58 +1,13 @@
-"""Messages that must not be obeyed although each by itself is good: overtaken ones, and steps that nobody sends."""
+"""Strut commands that must not be obeyed although each by itself is good: steps that nobody sends."""
 
 from __future__ import annotations
 
 import math
-import time
 
 import numpy as np
 
-from ..errors import CommandError, LimitError
+from ..errors import LimitError
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
-from .stamps import FORGET_ORDER_AFTER
-
-OVERTAKEN_BY = 1_000_000_000
-"""No message is overtaken by more than this, ns: an earlier stamp means that the sender's clock was set back."""
-
-
-class InOrder:
-    """Refuses a message with an earlier stamp than the last good one's; equal ones, and zero, may pass.
-
-    Parameters
-    ----------
-    what : str
-        Of what, for the text.
-    valid_for : float
-        Refused as well is what is older than this by this computer's clock, s; 0: nothing.
-
-    Attributes
-    ----------
-    valid_for : float
-        As given; may be set.
-    """
-
-    def __init__(self, what: str, valid_for: float = 0.0) -> None:
-        self._what, self.valid_for = what, valid_for
-        self._last, self._at = 0, -float("inf")
-
-    def check(self, stamp: int, now: float) -> None:
-        """Check a stamp, ns, at the monotonic time `now`, s.
-
-        Raises
-        ------
-        CommandError
-            ``stamp_order``, ``stamp_past``.
-        """
-        if stamp and 0.0 < self.valid_for < (age := (time.time_ns() - stamp) * 1e-9):
-            raise CommandError("stamp_past", f"{self._what} is {age:.3f} s old, valid for {self.valid_for:g} s")
-        late = self._last - stamp
-        if stamp and 0 < late < OVERTAKEN_BY and now - self._at < FORGET_ORDER_AFTER:
-            raise CommandError("stamp_order", f"{self._what} is {late * 1e-6:.1f} ms older than the one before")
-
-    def passed(self, stamp: int, now: float) -> None:
-        """Take a stamp, ns, as the last good one's."""
-        self._last, self._at = stamp or self._last, now
-
 
 BUNCHED_WITHIN = 0.1
 """Commands that were held up on their way for up to this time, s, may come all at once."""

@@ -28,6 +28,7 @@ from .guarding import CallbackGuard, PlainLogger, Throttle
 from .health import HealthReport, joined
 from .messages import read_message
 from .parameters import Parameter, Parameters
+from .stamps import StampClock
 
 NEVER = 3600.0
 """Period of a timer that rests, s: it is stopped then."""
@@ -103,6 +104,8 @@ class MachineNode(LifecycleNode):
         self.speak_for("")
         self._at_rate: dict[str, Timer] = {}
         self._options = Parameters(self, table, self._on_parameters)
+        self.clock = StampClock(self.simulated_time())
+        self._steps_said = 0
         self.wants_autostart = bool(self._options.get("autostart", True))
 
     def _on_parameters(self, names: set[str]) -> None:
@@ -198,11 +201,21 @@ class MachineNode(LifecycleNode):
     def tell(self, level: bytes, text: str, values: Callable[[], dict[str, str]]) -> None:
         """Publish level, text and values when they are due, with what the guard has caught."""
         now = time.monotonic()
+        self._look_at_clock()
         level, text = joined([*self.guard.findings(now), (level, text)])
         if self._report.due(level, text, now):
             stamp = self.get_clock().now().to_msg()
             everything = {**values(), **self.guard.values()}
             self._diagnostics_pub.publish(self._report.message(level, text, everything, stamp))
+
+    def _look_at_clock(self) -> None:
+        """Find out whether the clock was set, also while no messages come, and say so."""
+        self.clock.read()
+        steps = self.clock.set_back + self.clock.set_forward
+        if steps != self._steps_said:
+            self._steps_said = steps
+            step = self.clock.last_step * 1e-9
+            self.warn_of("clock", f"the clock was set {'back' if step < 0 else 'forward'} by {abs(step):.3f} s")
 
     def publish_on(self, message_type: type, topic: str, qos: QoSProfile, deadline: float = 0.0) -> Publisher:
         """Return a publisher; it offers to publish every `deadline` s at least, 0: it offers nothing."""

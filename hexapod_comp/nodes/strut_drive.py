@@ -27,10 +27,10 @@ from .command_source import CommandSource
 from .health import ERROR, OK, WARN, Flow, Refusals, joined, seconds
 from .log_space import LogSpace
 from .messages import StrutMessage, StrutReader, write_pose
-from .order import InOrder, NoStep
+from .order import NoStep
 from .running import keep_discovery_local, run
 from .runtime import ACKNOWLEDGED_WITHIN, STATE_QOS, MachineNode
-from .stamps import nanoseconds_of
+from .stamps import StampGate, nanoseconds_of
 from .strut_drive_parameters import PARAMETERS, PROGRAM
 from .warming import warm_drive
 
@@ -74,7 +74,7 @@ class StrutDriveNode(MachineNode):
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
         self._open_topics()
-        self._order = InOrder("strut_commands", options["command_validity"])
+        self._stamps = StampGate("command", self.clock, options["command_validity"], future=False)
         self._no_step, self._log_space = NoStep(geometry), LogSpace()
         self.get_logger().info(f"configured machine {geometry.name!r} with hidden truth {machine.model.name!r}")
         return super().on_configure(state)
@@ -134,7 +134,7 @@ class StrutDriveNode(MachineNode):
     def on_parameters(self, names: set[str]) -> None:
         """Take what has been set while the node runs; a knock only where it has been asked for anew."""
         if self._drive is not None:
-            self._order.valid_for = self._options["command_validity"]
+            self._stamps.max_age = self._options["command_validity"]
             faults = self._faults()
             self._drive.faults = faults if "fault_jump" in names else replace(faults, jump=None)
 
@@ -174,10 +174,10 @@ class StrutDriveNode(MachineNode):
     def _obey_commands(self, data: bytes, now: float) -> None:
         """Take commands that are six lengths, in order, and no step from the last ones."""
         stamp, lengths = nanoseconds_of(self._reader.take(data).header.stamp), self._reader.lengths
-        self._order.check(stamp, now)
+        self._stamps.check(stamp, now)
         self._no_step.check(lengths, now)
         self.drive.set_command(lengths)
-        self._order.passed(stamp, now)
+        self._stamps.accept(stamp, now)
         self._no_step.passed(lengths, now)
 
     def _run(self) -> None:
@@ -240,6 +240,9 @@ class StrutDriveNode(MachineNode):
             "commands_missed": str(self._source.sequence.missed),
             "command_rate_hz": f"{self._commands.rate(now):.1f}",
             "command_age_s": seconds(self._commands.age(now)),
+            "clock_set_back": str(self.clock.set_back),
+            "clock_set_forward": str(self.clock.set_forward),
+            "senders_clock_set_back": str(self._stamps.sender_set_back),
             "last_refusal": self._refusals.last_text,
             **self._refusals.values(),
         }

@@ -9,39 +9,11 @@ from rclpy.duration import Duration
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
 
-from hexapod_comp.errors import CommandError, LimitError
+from hexapod_comp.errors import LimitError
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.nodes.health import ERROR, WARN
 from hexapod_comp.nodes.log_space import LogSpace
-from hexapod_comp.nodes.order import InOrder, NoStep
-
-SECOND = 1_000_000_000
-
-
-@pytest.mark.parametrize(
-    ("stamp", "now"),
-    [
-        (10 * SECOND, 1.004),  # the same once more
-        (10 * SECOND + 1, 1.004),
-        (0, 1.004),  # says nothing
-        (9 * SECOND, 1.004),  # set back by a second: a clock, not a late message
-        (10 * SECOND - 1, 1.5),  # a sender that was restarted
-    ],
-)
-def test_what_is_in_order(stamp, now):
-    order = InOrder("reading")
-    order.check(5, 0.0)
-    order.passed(10 * SECOND, 1.0)
-    order.check(stamp, now)
-
-
-def test_an_overtaken_message_is_refused_and_says_by_how_much():
-    order = InOrder("reading")
-    order.passed(10 * SECOND, 1.0)
-    order.passed(0, 1.0)
-    with pytest.raises(CommandError, match=r"reading is 60\.0 ms older") as caught:
-        order.check(10 * SECOND - 60_000_000, 1.1)
-    assert caught.value.reason == "stamp_order"
+from hexapod_comp.nodes.order import NoStep
 
 
 @pytest.mark.parametrize(

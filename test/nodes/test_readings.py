@@ -26,7 +26,7 @@ from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.nodes import command_source
 from hexapod_comp.nodes.health import ERROR, OK, WARN
 from hexapod_comp.nodes.plausible import NoJump
-from hexapod_comp.nodes.stamps import StampCheck
+from hexapod_comp.nodes.stamps import StampClock, StampGate
 
 AT_HOME = closed_form_lengths(HOME)
 SECOND = 1_000_000_000
@@ -162,15 +162,15 @@ def test_the_age_of_readings_need_not_matter(bench):
 @pytest.mark.parametrize("capped", [True, False])
 def test_a_stamp_ahead_counts_as_now_where_it_must_not_shut_out(capped):
     """Of readings, not of commands: there the order matters more."""
-    check = StampCheck(0.5, lambda: 100 * SECOND, capped)
+    check = StampGate("reading", StampClock(lambda: 100 * SECOND), 0.5, capped=capped)
     check.check(100 * SECOND + 400_000_000, 1.0)
     check.accept(100 * SECOND + 400_000_000, 1.0)
     if capped:
         check.check(100 * SECOND, 1.0)
-        with pytest.raises(CommandError, match="earlier than the last one's"):
+        with pytest.raises(CommandError, match="ms earlier than the one before"):
             check.check(100 * SECOND - 1, 1.0)
     else:
-        with pytest.raises(CommandError, match="earlier than the last one's"):
+        with pytest.raises(CommandError, match="ms earlier than the one before"):
             check.check(100 * SECOND, 1.0)
 
 
