@@ -266,8 +266,7 @@ example:
     "fit": Verb(
         "calibration",
         "fit a model of the machine's errors to measurements",
-        """Reads tidy CSV (one reading a row, what simulate writes), .rtl and .rtx files of the laser software (each
-with its line file NAME.rtl.yaml beside it), or with --columns the wide CSV files of other labs.
+        """Reads tidy CSV (one reading a row, what simulate writes), or with --columns the wide CSV files of other labs.
 
 --scheme joint fits structure, struts and field to all readings at once. It keeps only what helps on readings that
 the fit did not see. --scheme lines is that of Mou & King 1998: a polynomial per grid line, direction and channel.

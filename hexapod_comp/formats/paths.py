@@ -18,7 +18,7 @@ PACKAGE = "hexapod_comp"
 FORMAT = re.compile(r"^format: hexapod_comp/(\w+)", re.MULTILINE)
 """What a YAML file says that it is."""
 
-SUFFIXES = {"poses": (".csv",), "lengths": (".csv",), "readings": (".csv", ".rtl", ".rtx")}
+SUFFIXES = {"poses": (".csv",), "lengths": (".csv",), "readings": (".csv",)}
 """Kinds of files that go by their suffixes; all others are YAML files that say what they are."""
 
 COLUMNS = {"poses": re.compile(r'(?:^|[",;\t])\s*x_'), "lengths": re.compile(r'(?:^|[",;\t])\s*L1_')}

@@ -12,14 +12,10 @@ import numpy as np
 from ..errors import InputFileError
 from ..formats.paths import config_file, input_file
 from ..machine.geometry import HexapodGeometry
-from .carto import read_carto
 from .readings import MeasurementSet
 from .runs import joined
 from .tidy_csv import read_tidy
 from .wide_csv import read_wide
-
-LASER_SUFFIXES = (".rtl", ".rtx")
-"""Files of the laser software; each needs its line file beside it."""
 
 
 def read_measurements(
@@ -34,12 +30,11 @@ def read_measurements(
     Parameters
     ----------
     paths : path or sequence of paths
-        ``.rtl`` and ``.rtx`` files, each with a line file of the same name and ``.yaml`` beside it; all others
-        are CSV.
+        CSV files.
     geometry : HexapodGeometry
         The machine that was measured.
     columns : path, optional
-        Columns file that explains the CSV files, or the name of a shipped one; without it they are tidy CSV, one
+        Columns file that explains them, or the name of a shipped one; without it they are tidy CSV, one
         reading a row.
     probe : array_like, shape (3,), optional
         The measured point in ``platform``, m; the tool's tip by default.
@@ -56,19 +51,12 @@ def read_measurements(
         raise InputFileError("measurements", "", "no file is given")
     files = [input_file(path, "readings") for path in paths]
     columns = None if columns is None else config_file(columns, "columns", beside=True)
-    laser = [path for path in files if path.suffix.lower() in LASER_SUFFIXES]
-    tables = [path for path in files if path not in laser]
-    sets = []
     with _kept_in_memory():
-        if laser:
-            sets.append(read_carto([(path, f"{path}.yaml") for path in laser], geometry, probe, in_reach))
-        if tables and columns is None:
-            sets.append(read_tidy(tables, geometry, probe, in_reach))
-        if tables and columns is not None:
-            if probe is not None:
-                raise InputFileError(tables[0], "", "a wide file is of the tool's tip; leave the probe out")
-            sets += [read_wide(path, columns, geometry, in_reach) for path in tables]
-    return joined(sets)
+        if columns is None:
+            return read_tidy(files, geometry, probe, in_reach)
+        if probe is not None:
+            raise InputFileError(files[0], "", "a wide file is of the tool's tip; leave the probe out")
+        return joined([read_wide(path, columns, geometry, in_reach) for path in files])
 
 
 @contextmanager

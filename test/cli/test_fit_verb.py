@@ -547,7 +547,6 @@ WRONG = {
     "columns of another kind": Wrong("w.csv --columns paper", r"format: must be 'hexapod_comp/columns'", "w.csv", WIDE),
     "probe of a wide file": Wrong("w.csv --columns jugglebot_columns --probe-mm 0,0,1", "leave the probe out",
                                   "w.csv", WIDE),
-    "no line file": Wrong("x.rtl", r"x\.rtl\.yaml: cannot be read", "x.rtl", "HEADER::\n"),
     "another machine": Wrong("{measured} --machine jugglebot", r"measured\.csv: line 2: the commanded pose is out of"),
     "no machine": Wrong("{measured} --machine gone", r"gone: there is no such file"),
     "a model for a machine": Wrong("{measured} --machine paper_machine", "format: must be 'hexapod_comp/geometry'"),
@@ -868,5 +867,5 @@ def test_iso230_of_single_passes_says_what_is_missing(hexapod: Program, tmp_path
     rows = [f"l,{way},{x},0,400,linear,{x},um\n" for way in ("forward", "backward") for x in (0, 10, 20)]
     (tmp_path / "once.csv").write_text(TIDY + "".join(rows))
     assert_refused(hexapod("iso230", tmp_path / "once.csv"), "no linear run has two cycles or more")
-    complaint = r"gone\.csv: there is no such file; \.csv, \.rtl, \.rtx files beside it: once\.csv"
+    complaint = r"gone\.csv: there is no such file; \.csv files beside it: once\.csv"
     assert_refused(hexapod("iso230", tmp_path / "gone.csv"), complaint)

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from node_helpers import closed_form_lengths
 from scipy.spatial.transform import Rotation
 from strategies import paper_geometry
-from test_carto import RTL_LINE, rtl
 from test_fuzz_files import CONFIG, GEOMETRIES, models
 from test_fuzz_tables import LENGTHS, POSES, TIDY, column, rows_of, si
 
@@ -49,8 +48,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     (made / "campaign.yaml").write_bytes(CAMPAIGN)
     (made / "budget.yaml").write_bytes((CONFIG / "error_budget.yaml").read_bytes())
     (made / "unit.yaml").write_bytes(GEOMETRIES[1])
-    (made / "a.rtl").write_text(rtl())
-    (made / "a.rtl.yaml").write_text(RTL_LINE)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(made)  # where nonsense is written to
         yield made
@@ -82,8 +79,6 @@ COMMANDS = (
     ("check", "poses.csv", ("--json",)),
     ("check", "model.yaml", ("poses.csv", "--model", "model.yaml")),
     ("iso230", "tidy.csv", ("--targets",)),
-    ("iso230", "a.rtl", ("--json",)),
-    ("iso230", "a.rtl.yaml", ("a.rtl",)),
     ("iso230", "columns.yaml", ("tidy.csv", "--columns", "columns.yaml")),
     ("assess", "poses.csv", ("--machines", "2")),
     ("fit", "tidy.csv", ("--scheme", "lines", "--out", "fitted.yaml")),
@@ -106,13 +101,10 @@ def test_mutated_files(folder: Path, number: int, changes: list) -> None:
     data = mutated(original, changes)
     changed = folder / f"x_{name}"
     changed.write_bytes(data)
-    if name == "a.rtl":
-        (folder / "x_a.rtl.yaml").write_text(RTL_LINE)
-    if name == "a.rtl.yaml":
-        (folder / "x_a.rtl").write_text(rtl())
-    names = {name: str(changed)} if name != "a.rtl.yaml" else {"a.rtl": str(folder / "x_a.rtl")}
-    arguments = [names.get(word, word) for word in rest]  # the others are in the folder where this runs
-    if name not in rest and name != "a.rtl.yaml":
+    arguments = [
+        str(changed) if word == name else word for word in rest
+    ]  # the others are in the folder where this runs
+    if name not in rest:
         arguments.insert(0, str(changed))
     COUNTS["commands"] += 1
     code, out, _ = command(verb, *arguments)

@@ -1,6 +1,6 @@
-"""Mutated measurements: CSV of poses, lengths and readings, wide CSV, the laser's files, LinuxCNC's, tables.
+"""Mutated measurements: CSV of poses, lengths and readings, wide CSV, LinuxCNC's, tables.
 
-Truth: for CSV and text, cells split by hand and read by Decimal (fuzzing.py); for the laser's samples, struct.
+Truth: for CSV and text, cells split by hand and read by Decimal (fuzzing.py).
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import io
 import re
-import struct
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -33,7 +32,6 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from strategies import paper_geometry, random_model
-from test_carto import RATE, RTL_LINE, RTX_LINE, capture, rtl, rtx
 from test_measurement_csv import STRUTS, WIDE, WIDE_COLUMNS
 
 from hexapod_comp.errors import HexapodError
@@ -42,8 +40,6 @@ from hexapod_comp.export.linuxcnc_files import COMP_FILES, HAL_FILE, INI_FILE, r
 from hexapod_comp.export.table import make_table, read_table, write_table
 from hexapod_comp.formats.csv import read_lengths, read_poses
 from hexapod_comp.machine.model import RealMachine
-from hexapod_comp.measurements.carto import load_line, read_carto
-from hexapod_comp.measurements.carto_files import read_rtl, read_rtx
 from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.measurements.tidy_csv import read_tidy
 from hexapod_comp.measurements.wide_csv import read_wide
@@ -248,68 +244,6 @@ def wide_points(section: dict[str, Any], rows: list[dict[str, str]]) -> np.ndarr
     factor = FACTORS["length"][section["unit"]]
     found = np.array([[si(row[name], factor) for name in section["position"]] for row in rows])
     return found + quantity(section, "offset", "length", np.zeros(3))
-
-
-# The laser's files.
-
-SMALL_RTX = rtx(capture(np.zeros_like)[::50], rate=RATE / 50)
-
-
-@given(line=st.booleans(), changes=edits)
-@example(line=False, changes=[])
-@cases(60, 0.04)
-def test_static_laser_files(folder: Path, line: bool, changes: list) -> None:
-    parts = [rtl().encode(), RTL_LINE.encode()]
-    parts[line] = mutated(parts[line], changes)
-    paths = put(folder, "a.rtl", parts[0]), put(folder, "a.yaml", parts[1])
-    try:
-        with reader_of("rtl", *paths):
-            found = read_carto([paths], PAPER)
-            static, about = read_rtl(paths[0]), document(parts[1])
-    except Refused:
-        assert changes
-        return
-    sound(found)
-    text = parts[0].decode("utf-8-sig", "replace") if b"\x00" not in parts[0] else parts[0].decode("latin-1")
-    *_, section = re.split(r"^\s*DEVIATIONS::", text.replace("\r", "\n"), maxsplit=1, flags=re.MULTILINE)
-    section = section.partition("::")[0]
-    listed = re.findall(r"^\s*(\d+)\s+(\d+)\s+(\S+)\s*?$", section, re.MULTILINE)
-    assert [(run, target) for run, target, _, _ in static.rows] == [(int(a), int(b)) for a, b, _ in listed]
-    deviations = [si(value, "1") for _, _, value in listed]
-    same([value for _, _, value, _ in static.rows], deviations)
-    sense = int(about.get("value_sense", 1))
-    sense *= int(about.get("target_sense", 1)) if about["channel"] == "linear" else 1
-    unit = {**FACTORS["length"], **FACTORS["angle"]}[about["unit"]]
-    same(np.sort(found.value), np.sort(sense * np.array(deviations) * float(unit)))
-    finite(static.targets)
-
-
-@given(line=st.booleans(), changes=edits)
-@example(line=False, changes=[])
-@cases(60, 0.04)
-def test_dynamic_laser_files(folder: Path, line: bool, changes: list) -> None:
-    parts = [SMALL_RTX, RTX_LINE.encode()]
-    parts[line] = mutated(parts[line], changes)
-    paths = put(folder, "a.rtx", parts[0]), put(folder, "a.yaml", parts[1])
-    try:
-        with reader_of("rtx", *paths):
-            found, dynamic = read_carto([paths], PAPER), read_rtx(paths[0])
-    except Refused:
-        assert changes
-        return
-    sound(found)
-    start = re.search(rb"^Data:[ \t]*\r?\n", parts[0], re.MULTILINE)
-    assert start
-    count = len(dynamic.samples)
-    assert dynamic.samples.tolist() == list(struct.unpack_from(f"<{count}d", parts[0], start.end()))
-    assert f"{count}" == dynamic.header["Sample no"].strip().lstrip("+0").partition(".")[0]
-    about = load_line(paths[1])
-    assert len(found) <= 10_000
-    # A capture is shown beside its own commanded travel: what is read cannot be further off than the ratio allowed.
-    assert about.capture is not None
-    if about.channel == "linear":
-        travel = abs(about.capture.speed) * (about.capture.end - about.capture.begin)
-        assert abs(found.value[-1]) <= 0.05 * travel + 2e3 * np.abs(dynamic.samples).max() * about.unit
 
 
 # Exports read back.
