@@ -14,14 +14,15 @@ from cffi import FFI
 
 FOLDER = Path("hexapod_comp", "core")  # setup.py runs in the root of the sources
 
-HEADERS = ("hexapod_comp.h",)
+HEADERS = ("hexapod_comp.h", "hexapod_batch.h")
 """What Python calls; the first is the public one, which ``export --c`` copies."""
 
-UNITS = ("hexapod_comp.c",)
-"""Compiled as one unit, in this order."""
+UNITS = ("hexapod_batch.c",)
+"""Compiled as one unit, in this order; it contains ``hexapod_comp.c``."""
 
-FLAGS = ["-std=c99", "-O3", "-ffp-contract=off", "-fno-math-errno"]
-"""The same bits on every machine: products and sums are not contracted, and nothing is reordered."""
+FLAGS = ["-std=c99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
+"""The same bits on every machine: products and sums are not contracted, and nothing is reordered. Nobody asks for errno or
+for floating-point exceptions; without them loops become vector code."""
 
 
 def declarations(header: str) -> str:

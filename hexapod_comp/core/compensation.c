@@ -254,11 +254,10 @@ hc_status hc_command(hc_state *state, const double numbers[7], hc_time time, con
 hc_status hc_command_lengths(hc_state *state, const double nominal[6], hc_time time, hc_answer *answer)
 {
     const hc_model *model = state->model;
+    const judge by = judge_of(&model->limits);
     hc_pose platform = state->last.platform;
-    double unused;
-    const hc_status status = solve_pose(model->base.joints, model->platform.joints, nominal, &model->limits, &platform,
-                                        &unused);
-    return command_platform(state, status, &platform, time, answer);
+    const solution found = solve_pose(model->base.joints, model->platform.joints, nominal, &by, &platform);
+    return command_platform(state, found.status, &platform, time, answer);
 }
 
 void hc_published(hc_state *state, double time)
@@ -267,11 +266,12 @@ void hc_published(hc_state *state, double time)
 }
 
 /* actual_pose_one: the model forwards; lengths and screw rotation are settled in turn */
-static hc_status run_forwards(const hc_state *state, const double commands[6], hc_pose *q, double *condition)
+static solution run_forwards(const hc_state *state, const double commands[6], const double sense[9], hc_pose *q)
 {
     const hc_model *model = state->model;
+    const judge by = judge_of(&model->limits);
     double lengths[6], shifts[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
-    hc_status outcome = HC_NOT_CONVERGED;
+    solution found = {HC_NOT_CONVERGED, 0, NAN};
     int turning = 0, count, i;
     for (i = 0; i < 6; i++) {
         turning = turning || model->struts[i].lead != 0.0;
@@ -286,25 +286,26 @@ static hc_status run_forwards(const hc_state *state, const double commands[6], h
             const double shift = screw_shift(model, q, &now, i);
             change = fmax(change, fabs(shift - shifts[i]));
             shifts[i] = shift;
-            lengths[i] = actual_length(state, i, commands[i], state->last.motion_sense[3 + i], shift);
+            lengths[i] = actual_length(state, i, commands[i], sense[3 + i], shift);
         }
-        if (turning && outcome == HC_OK && change < 1e-15) {
+        if (turning && found.status == HC_OK && change < 1e-15) {
             break;
         }
-        outcome = solve_pose(state->base_joints, state->platform_joints, lengths, &model->limits, q, condition);
-        if (outcome != HC_OK || !turning) {
+        found = solve_pose(state->base_joints, state->platform_joints, lengths, &by, q);
+        if (found.status != HC_OK || !turning) {
             break;
         }
     }
-    return outcome;
+    return found;
 }
 
 hc_status hc_estimate(hc_state *state, const double lengths[6], hc_estimated *estimated)
 {
     hc_pose q = state->estimate, actual;
-    estimated->condition = NAN;
-    estimated->status = run_forwards(state, lengths, &q, &estimated->condition);
-    if (estimated->status == HC_OK) {
+    const solution found = run_forwards(state, lengths, state->last.motion_sense, &q);
+    estimated->status = found.status;
+    estimated->condition = found.condition;
+    if (found.status == HC_OK) {
         state->estimate = q;
         apply_field(&state->model->field, &q, state->last.motion_sense, &actual);
         estimated->tool = compose(&actual, &state->model->tool);

@@ -35,6 +35,18 @@
 #define SMALL_ANGLE (1.0 / 64.0) /* rad */
 #define LEAD_ITERATIONS 20
 
+/* What loops over lanes (lanes.c) call, and a loop of six in it: calls and loops would keep them from becoming vector code. */
+#ifdef __GNUC__
+#define INLINED static inline __attribute__((always_inline))
+#else
+#define INLINED static inline
+#endif
+#if defined(__GNUC__) && !defined(__clang__)
+#define UNROLLED _Pragma("GCC unroll 6")
+#else
+#define UNROLLED
+#endif
+
 typedef struct {
     double x, y, z;
 } vec;
@@ -43,7 +55,7 @@ typedef struct {
     vec row[3];
 } mat;
 
-static inline vec vector(double x, double y, double z)
+INLINED vec vector(double x, double y, double z)
 {
     vec v;
     v.x = x;
@@ -52,12 +64,12 @@ static inline vec vector(double x, double y, double z)
     return v;
 }
 
-static inline vec row_of(const double a[3])
+INLINED vec row_of(const double a[3])
 {
     return vector(a[0], a[1], a[2]);
 }
 
-static inline mat three_rows(const double r[3][3])
+INLINED mat three_rows(const double r[3][3])
 {
     mat m;
     m.row[0] = row_of(r[0]);
@@ -66,49 +78,49 @@ static inline mat three_rows(const double r[3][3])
     return m;
 }
 
-static inline double dot(vec a, vec b)
+INLINED double dot(vec a, vec b)
 {
     return a.x * b.x + a.y * b.y + a.z * b.z;
 }
 
-static inline double norm(vec a)
+INLINED double norm(vec a)
 {
     return sqrt(dot(a, a));
 }
 
-static inline vec cross(vec a, vec b)
+INLINED vec cross(vec a, vec b)
 {
     return vector(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x);
 }
 
-static inline vec add(vec a, vec b)
+INLINED vec add(vec a, vec b)
 {
     return vector(a.x + b.x, a.y + b.y, a.z + b.z);
 }
 
-static inline vec subtract(vec a, vec b)
+INLINED vec subtract(vec a, vec b)
 {
     return vector(a.x - b.x, a.y - b.y, a.z - b.z);
 }
 
-static inline vec scale(double factor, vec a)
+INLINED vec scale(double factor, vec a)
 {
     return vector(factor * a.x, factor * a.y, factor * a.z);
 }
 
 /* k.x a + k.y b + k.z c */
-static inline vec combine(vec k, vec a, vec b, vec c)
+INLINED vec combine(vec k, vec a, vec b, vec c)
 {
     return vector(k.x * a.x + k.y * b.x + k.z * c.x, k.x * a.y + k.y * b.y + k.z * c.y,
                   k.x * a.z + k.y * b.z + k.z * c.z);
 }
 
-static inline vec combine_rows(vec k, const vec rows[3])
+INLINED vec combine_rows(vec k, const vec rows[3])
 {
     return combine(k, rows[0], rows[1], rows[2]);
 }
 
-static inline void store(vec v, double to[3])
+INLINED void store(vec v, double to[3])
 {
     to[0] = v.x;
     to[1] = v.y;

@@ -18,17 +18,18 @@ typedef struct {
     double determinant_upper, determinant_lower;
 } blocks;
 
-static inline vec strut_between(vec b, vec t, vec p, const mat *r)
+INLINED vec strut_between(vec b, vec t, vec p, const mat *r)
 {
     return vector(p.x + r->row[0].x * t.x + r->row[0].y * t.y + r->row[0].z * t.z - b.x,
                   p.y + r->row[1].x * t.x + r->row[1].y * t.y + r->row[1].z * t.z - b.y,
                   p.z + r->row[2].x * t.x + r->row[2].y * t.y + r->row[2].z * t.z - b.z);
 }
 
-static six_struts struts_at(const double base[6][3], const double platform[6][3], vec p, const mat *r)
+INLINED six_struts struts_at(const double base[6][3], const double platform[6][3], vec p, const mat *r)
 {
     six_struts all;
     int i;
+    UNROLLED
     for (i = 0; i < 6; i++) {
         const vec t = row_of(platform[i]);
         all.strut[i] = strut_between(row_of(base[i]), t, p, r);
@@ -38,7 +39,7 @@ static six_struts struts_at(const double base[6][3], const double platform[6][3]
     return all;
 }
 
-static inline double inverse_columns(vec a, vec b, vec c, vec columns[3])
+INLINED double inverse_columns(vec a, vec b, vec c, vec columns[3])
 {
     const vec first = cross(b, c);
     const double determinant = dot(a, first);
@@ -49,12 +50,13 @@ static inline double inverse_columns(vec a, vec b, vec c, vec columns[3])
     return determinant;
 }
 
-static blocks eliminate(const vec s[6], const vec m[6])
+INLINED blocks eliminate(const vec s[6], const vec m[6])
 {
     blocks f;
     vec left[3];
     int k;
     f.determinant_upper = inverse_columns(s[0], s[2], s[4], f.upper);
+    UNROLLED
     for (k = 0; k < 3; k++) {
         const vec row = s[2 * k + 1];
         f.ratio[k] = vector(dot(row, f.upper[0]), dot(row, f.upper[1]), dot(row, f.upper[2]));
@@ -65,7 +67,7 @@ static blocks eliminate(const vec s[6], const vec m[6])
 }
 
 /* Solve with the factors: s_i v + m_i w = f_i. */
-static void substitute(const vec m[6], const blocks *f, const double right[6], vec *v, vec *w)
+INLINED void substitute(const vec m[6], const blocks *f, const double right[6], vec *v, vec *w)
 {
     const vec even = vector(right[0], right[2], right[4]);
     const vec carried = vector(dot(f->ratio[0], even), dot(f->ratio[1], even), dot(f->ratio[2], even));
@@ -77,7 +79,7 @@ static void substitute(const vec m[6], const blocks *f, const double right[6], v
 }
 
 /* _column_square: one column of the inverse, squared, its sign left aside */
-static inline double column_square(const vec m[6], const blocks *f, vec v, vec w, double square)
+INLINED double column_square(const vec m[6], const blocks *f, vec v, vec w, double square)
 {
     const vec rest = combine_rows(vector(dot(m[0], w), dot(m[2], w), dot(m[4], w)), f->upper);
     v = add(v, rest);
@@ -85,7 +87,7 @@ static inline double column_square(const vec m[6], const blocks *f, vec v, vec w
 }
 
 /* Condition number and sign of det J; sign 0 where pivoting is needed. */
-static double block_condition(const six_struts *now, double characteristic_length, double *sign)
+INLINED double block_condition(const six_struts *now, double characteristic_length, double *sign)
 {
     const double square = characteristic_length * characteristic_length;
     const blocks f = eliminate(now->strut, now->moment);
@@ -95,6 +97,7 @@ static double block_condition(const six_struts *now, double characteristic_lengt
     const vec column[3] = {{a[0].x, a[1].x, a[2].x}, {a[0].y, a[1].y, a[2].y}, {a[0].z, a[1].z, a[2].z}};
     double inverse = 0.0, moments = 0.0, condition;
     int k;
+    UNROLLED
     for (k = 0; k < 6; k++) {
         const vec w = k % 2 ? f.lower[k / 2] : combine_rows(column[k / 2], f.lower);
         const vec v = k % 2 ? zero : f.upper[k / 2];
@@ -102,15 +105,14 @@ static double block_condition(const six_struts *now, double characteristic_lengt
         moments += dot(now->moment[k], now->moment[k]) / (l[k] * l[k]);
     }
     condition = sqrt((6.0 + moments / square) * inverse) / 6.0;
-    *sign = f.determinant_upper * f.determinant_lower > 0.0 ? -1.0 : 1.0;
-    if (!(fabs(f.determinant_upper) >= COPLANAR * l[0] * l[2] * l[4] && condition < HUGE_VAL)) {
-        *sign = 0.0;
-    }
+    *sign = f.determinant_upper * f.determinant_lower > 0.0 ? -1.0 : 1.0; /* no branch: lanes.c */
+    *sign = fabs(f.determinant_upper) >= COPLANAR * l[0] * l[2] * l[4] ? *sign : 0.0;
+    *sign = condition < HUGE_VAL ? *sign : 0.0;
     return condition;
 }
 
 /* Squared misfit of six lengths in units of what rounding may leave. */
-static double closure_error(const double now[6], const double wanted[6])
+INLINED double closure_error(const double now[6], const double wanted[6])
 {
     const vec first = row_of(now), second = row_of(now + 3);
     const vec a = subtract(first, row_of(wanted)), b = subtract(second, row_of(wanted + 3));
@@ -255,18 +257,66 @@ static int lengths_possible(const double base[6][3], const double platform[6][3]
     return 1;
 }
 
-/* _closes: a certificate that does not depend on the iteration */
-static int closes(const six_struts *now, const mat *r, const double lengths[6])
+/* What a solution is judged by: that J is well conditioned and of home's sign, the loops close, R is a rotation. It does
+ * not depend on the iteration. */
+typedef struct {
+    double condition, sign, misfit, flaw;
+} certificate;
+
+INLINED certificate certify(const double base[6][3], const double platform[6][3], const double lengths[6], vec p,
+                                  const mat *r, double characteristic_length)
 {
-    return closure_error(now->length, lengths) <= 1.0 && rotation_error(r) <= ROTATION_ROUNDING;
+    const six_struts now = struts_at(base, platform, p, r);
+    certificate c;
+    c.condition = block_condition(&now, characteristic_length, &c.sign);
+    c.misfit = closure_error(now.length, lengths);
+    c.flaw = rotation_error(r);
+    return c;
 }
 
+static int closes(double misfit, double flaw)
+{
+    return misfit <= 1.0 && flaw <= ROTATION_ROUNDING;
+}
+
+/* What keeps a solution: the largest condition number, and home's sign of det J, 0 for any. */
+typedef struct {
+    double characteristic_length, home_sign, condition;
+} judge;
+
+static judge judge_of(const hc_limits *limits)
+{
+    judge by;
+    by.characteristic_length = limits->characteristic_length;
+    by.home_sign = limits->home_sign;
+    by.condition = limits->condition;
+    return by;
+}
+
+static int certified(const certificate *c, double step, const double lengths[6], const judge *by)
+{
+    int i, positive = 1;
+    for (i = 0; i < 6; i++) {
+        positive = positive && lengths[i] > 0.0;
+    }
+    return step < STEP_TOLERANCE && positive && closes(c->misfit, c->flaw) && c->condition <= by->condition
+           && (c->sign * by->home_sign > 0.0 || (by->home_sign == 0.0 && c->sign != 0.0));
+}
+
+/* What came of a forward solution. */
+typedef struct {
+    hc_status status;
+    int iterations;
+    double condition;
+} solution;
+
 /* _newton, with pivoting */
-static hc_status newton(const double base[6][3], const double platform[6][3], const double lengths[6], hc_pose *pose)
+static hc_status newton(const double base[6][3], const double platform[6][3], const double lengths[6], hc_pose *pose,
+                        int *iterations)
 {
     double jacobian[6][6], step[6];
-    int iteration, i, k;
-    for (iteration = 0; iteration < MAX_ITERATIONS; iteration++) {
+    int i, k;
+    for (*iterations = 1; *iterations <= MAX_ITERATIONS; ++*iterations) {
         const six_struts now = struts_of(base, platform, pose);
         double turn, shrink, size;
         for (i = 0; i < 6; i++) {
@@ -292,9 +342,10 @@ static hc_status newton(const double base[6][3], const double platform[6][3], co
             orthonormalise(pose->rotation);
             r = three_rows((const double(*)[3])pose->rotation);
             settled = struts_at(base, platform, row_of(pose->position), &r);
-            return closes(&settled, &r, lengths) ? HC_OK : HC_NOT_CONVERGED;
+            return closes(closure_error(settled.length, lengths), rotation_error(&r)) ? HC_OK : HC_NOT_CONVERGED;
         }
     }
+    *iterations = MAX_ITERATIONS;
     return HC_NOT_CONVERGED;
 }
 
@@ -321,75 +372,83 @@ static int usable(const double lengths[6], const hc_pose *guess)
 }
 
 /* _solve_carefully: with pivoting, and with the reason of a failure */
-static hc_status solve_carefully(const double base[6][3], const double platform[6][3], const double lengths[6],
-                                 const hc_limits *limits, hc_pose *pose, double *condition)
+static solution solve_carefully(const double base[6][3], const double platform[6][3], const double lengths[6],
+                                const judge *by, hc_pose *pose)
 {
     hc_pose trial = *pose;
+    solution found = {HC_OK, 0, NAN};
     six_struts now;
-    hc_status outcome;
     double sign;
-    *condition = NAN;
     if (!usable(lengths, pose)) {
-        return HC_NOT_FINITE;
+        found.status = HC_NOT_FINITE;
+        return found;
     }
     if (!lengths_possible(base, platform, lengths)) {
-        return HC_UNREACHABLE;
+        found.status = HC_UNREACHABLE;
+        return found;
     }
-    orthonormalise(trial.rotation);
-    outcome = newton(base, platform, lengths, &trial);
-    if (outcome != HC_OK) {
-        return outcome;
+    orthonormalise(trial.rotation); /* or what a rounded guess is off stays in a step too small to be followed by another */
+    found.status = newton(base, platform, lengths, &trial, &found.iterations);
+    if (found.status != HC_OK) {
+        return found;
     }
     now = struts_of(base, platform, &trial);
-    *condition = condition_at(base, &trial, &now, limits->characteristic_length, &sign);
-    if (!(*condition <= limits->condition)) {
-        return HC_SINGULAR;
+    found.condition = condition_at(base, &trial, &now, by->characteristic_length, &sign);
+    if (!(found.condition <= by->condition)) {
+        found.status = HC_SINGULAR;
+    } else if (by->home_sign != 0.0 && sign != by->home_sign) {
+        found.status = HC_OTHER_ASSEMBLY;
+    } else {
+        *pose = trial;
     }
-    if (limits->home_sign != 0.0 && sign != limits->home_sign) {
-        return HC_OTHER_ASSEMBLY;
+    return found;
+}
+
+/* One Newton step on the six loop closures; returns its length, m and rad. The rows are multiplied by the struts' lengths,
+ * which spares a division and does not change the step. */
+INLINED double newton_step(const double base[6][3], const double platform[6][3], const double lengths[6], vec *p,
+                                 mat *r)
+{
+    const six_struts now = struts_at(base, platform, *p, r);
+    const blocks f = eliminate(now.strut, now.moment);
+    double misfit[6], ratio, shrink;
+    vec v, w;
+    int i;
+    UNROLLED
+    for (i = 0; i < 6; i++) {
+        misfit[i] = now.length[i] * (lengths[i] - now.length[i]);
     }
-    *pose = trial;
-    return HC_OK;
+    substitute(now.moment, &f, misfit, &v, &w);
+    ratio = MAX_ROTATION_STEP / norm(w);
+    shrink = ratio >= 1.0 ? 1.0 : ratio;
+    *p = add(*p, scale(shrink, v));
+    *r = turned(r, scale(shrink, w));
+    return sqrt(dot(v, v) + dot(w, w));
 }
 
 /* solve_pose_one: the six loop closures by Newton from a guess, which is overwritten only by a solution */
-static hc_status solve_pose(const double base[6][3], const double platform[6][3], const double lengths[6],
-                            const hc_limits *limits, hc_pose *pose, double *condition)
+static solution solve_pose(const double base[6][3], const double platform[6][3], const double lengths[6],
+                           const judge *by, hc_pose *pose)
 {
     vec p = row_of(pose->position);
     mat r = three_rows((const double(*)[3])pose->rotation);
-    double step = HUGE_VAL, sign;
-    six_struts now;
-    int count, i, positive = 1;
-    for (count = 0; step >= STEP_TOLERANCE && count < MAX_ITERATIONS; count++) {
-        double misfit[6], ratio, shrink;
-        blocks f;
-        vec v, w;
-        now = struts_at(base, platform, p, &r);
-        for (i = 0; i < 6; i++) {
-            misfit[i] = now.length[i] * (lengths[i] - now.length[i]);
-        }
-        f = eliminate(now.strut, now.moment);
-        substitute(now.moment, &f, misfit, &v, &w);
-        ratio = MAX_ROTATION_STEP / norm(w);
-        shrink = ratio >= 1.0 ? 1.0 : ratio;
-        step = sqrt(dot(v, v) + dot(w, w));
-        p = add(p, scale(shrink, v));
-        r = turned(&r, scale(shrink, w));
+    solution found = {HC_OK, 0, NAN};
+    certificate c;
+    double step = HUGE_VAL;
+    int i;
+    while (step >= STEP_TOLERANCE && found.iterations < MAX_ITERATIONS) {
+        step = newton_step(base, platform, lengths, &p, &r);
+        found.iterations++;
     }
     r = straightened(&r);
-    now = struts_at(base, platform, p, &r);
-    *condition = block_condition(&now, limits->characteristic_length, &sign);
-    for (i = 0; i < 6; i++) {
-        positive = positive && lengths[i] > 0.0;
+    c = certify(base, platform, lengths, p, &r, by->characteristic_length);
+    if (!certified(&c, step, lengths, by)) {
+        return solve_carefully(base, platform, lengths, by, pose);
     }
-    if (step < STEP_TOLERANCE && positive && closes(&now, &r, lengths) && *condition <= limits->condition
-        && (sign * limits->home_sign > 0.0 || (limits->home_sign == 0.0 && sign != 0.0))) {
-        store(p, pose->position);
-        for (i = 0; i < 3; i++) {
-            store(r.row[i], pose->rotation[i]);
-        }
-        return HC_OK;
+    found.condition = c.condition;
+    store(p, pose->position);
+    for (i = 0; i < 3; i++) {
+        store(r.row[i], pose->rotation[i]);
     }
-    return solve_carefully(base, platform, lengths, limits, pose, condition);
+    return found;
 }

@@ -8,6 +8,7 @@
 typedef struct {
     hc_status status;
     int strut;
+    int other; /* second strut that it is about, -1 for none */
     double value;
 } finding;
 
@@ -16,6 +17,7 @@ static finding found(hc_status status, int strut, double value)
     finding f;
     f.status = status;
     f.strut = strut;
+    f.other = -1;
     f.value = value;
     return f;
 }
@@ -54,51 +56,64 @@ static double segment_distance(const double a[3], const double b[3], const doubl
     return sqrt(square);
 }
 
+/* Platform joints in `base`. */
+static void strut_ends(const double base[6][3], const six_struts *now, double ends[6][3])
+{
+    int i;
+    for (i = 0; i < 6; i++) {
+        store(add(row_of(base[i]), now->strut[i]), ends[i]);
+    }
+}
+
 static finding check_clearance(const double base[6][3], const six_struts *now, const hc_limits *limits)
 {
     double ends[6][3];
     int i, j;
+    strut_ends(base, now, ends);
     for (i = 0; i < 6; i++) {
-        store(add(row_of(base[i]), now->strut[i]), ends[i]);
-    }
-    for (i = 0; i < 6; i++) {
-        double least = HUGE_VAL;
-        int nearest = -1;
+        finding f = found(HC_CLEARANCE, -1, HUGE_VAL);
+        f.other = i;
         for (j = 0; j < i; j++) {
             if (limits->apart[i][j] > 0.0) {
                 const double distance = segment_distance(base[i], ends[i], base[j], ends[j]);
-                if (distance < least || distance != distance) {
-                    least = distance;
-                    nearest = j;
+                if (distance < f.value || distance != distance) {
+                    f.value = distance;
+                    f.strut = j;
                 }
             }
         }
-        if (!(least >= limits->clearance)) {
-            return found(HC_CLEARANCE, nearest, least);
+        if (!(f.value >= limits->clearance)) {
+            return f;
         }
     }
     return found(HC_OK, -1, 0.0);
 }
 
+/* Cosines of a strut's angles to the neutral directions of its joints, at the base and at the platform. */
+static void joint_cosines(const hc_pose *pose, const six_struts *now, const hc_limits *limits, int i, double cosines[2])
+{
+    const vec s = now->strut[i];
+    double at_platform = 0.0;
+    int k;
+    for (k = 0; k < 3; k++) {
+        const double along = pose->rotation[0][k] * s.x + pose->rotation[1][k] * s.y + pose->rotation[2][k] * s.z;
+        at_platform += along * limits->cone_axes[1][i][k];
+    }
+    cosines[0] = dot(s, row_of(limits->cone_axes[0][i])) / now->length[i];
+    cosines[1] = at_platform / now->length[i];
+}
+
 static finding check_joints(const double base[6][3], const hc_pose *pose, const six_struts *now,
                             const hc_limits *limits)
 {
-    int i, k;
+    int i, body;
     for (i = 0; i < 6; i++) {
-        const vec s = now->strut[i];
-        const double length = now->length[i];
-        const double at_base = dot(s, row_of(limits->cone_axes[0][i])) / length;
-        double at_platform = 0.0;
-        for (k = 0; k < 3; k++) {
-            const double along = pose->rotation[0][k] * s.x + pose->rotation[1][k] * s.y + pose->rotation[2][k] * s.z;
-            at_platform += along * limits->cone_axes[1][i][k];
-        }
-        at_platform /= length;
-        if (!(at_base >= limits->cone_cosines[0][i])) {
-            return found(HC_BASE_CONE, i, acos(held(at_base, -1.0, 1.0)));
-        }
-        if (!(at_platform >= limits->cone_cosines[1][i])) {
-            return found(HC_PLATFORM_CONE, i, acos(held(at_platform, -1.0, 1.0)));
+        double cosines[2];
+        joint_cosines(pose, now, limits, i, cosines);
+        for (body = 0; body < 2; body++) {
+            if (!(cosines[body] >= limits->cone_cosines[body][i])) {
+                return found(body ? HC_PLATFORM_CONE : HC_BASE_CONE, i, acos(held(cosines[body], -1.0, 1.0)));
+            }
         }
     }
     return limits->clearance > 0.0 ? check_clearance(base, now, limits) : found(HC_OK, -1, 0.0);

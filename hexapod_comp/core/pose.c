@@ -5,7 +5,7 @@
 #include "core.h"
 
 /* _turned: the Cayley rotation of w times R, exp(w) to second order and exactly orthogonal */
-static mat turned(const mat *r, vec w)
+INLINED mat turned(const mat *r, vec w)
 {
     const double x = 0.5 * w.x, y = 0.5 * w.y, z = 0.5 * w.z;
     const double square = x * x + y * y + z * z;
@@ -19,7 +19,7 @@ static mat turned(const mat *r, vec w)
 }
 
 /* The rotation nearest to a nearly orthonormal matrix: one Newton step. */
-static mat straightened(const mat *r)
+INLINED mat straightened(const mat *r)
 {
     const vec *g = r->row;
     const double g01 = dot(g[0], g[1]), g02 = dot(g[0], g[2]), g12 = dot(g[1], g[2]);
@@ -30,7 +30,7 @@ static mat straightened(const mat *r)
     return out;
 }
 
-static double rotation_error(const mat *r)
+INLINED double rotation_error(const mat *r)
 {
     const vec hand = subtract(cross(r->row[0], r->row[1]), r->row[2]);
     const double first = dot(r->row[0], r->row[0]) - 1.0, second = dot(r->row[1], r->row[1]) - 1.0;
@@ -85,6 +85,31 @@ static hc_pose compose(const hc_pose *a, const hc_pose *b)
         }
     }
     return out;
+}
+
+/* A pose out of arrays: position, rotation matrix by rows. */
+static inline hc_pose pose_of(const double *position, const double *rotation)
+{
+    hc_pose pose;
+    int i, j;
+    for (i = 0; i < 3; i++) {
+        pose.position[i] = position[i];
+        for (j = 0; j < 3; j++) {
+            pose.rotation[i][j] = rotation[3 * i + j];
+        }
+    }
+    return pose;
+}
+
+static inline void write_pose(const hc_pose *pose, double *position, double *rotation)
+{
+    int i, j;
+    for (i = 0; i < 3; i++) {
+        position[i] = pose->position[i];
+        for (j = 0; j < 3; j++) {
+            rotation[3 * i + j] = pose->rotation[i][j];
+        }
+    }
 }
 
 /* R o */

@@ -19,24 +19,29 @@ static double follow(double value, double threshold, double low[9], double sense
     return sense[index];
 }
 
-/* screw_shift: how much longer the command must be for the screw's rotation, m (screw_twist is part of it); `now` are
- * the struts at the pose */
+/* Angle about a strut from the base's cardan axis to the platform's, rad, both seen along the strut. Where it stays within
+ * 90 degrees its sine is the one in LinuxCNC's genhexkins. */
+static double screw_twist(const double base_axis[3], const double platform_axis[3], const hc_pose *pose,
+                          const six_struts *now, int i)
+{
+    const vec s = now->strut[i];
+    const double length = now->length[i];
+    const vec u = vector(s.x / length, s.y / length, s.z / length);
+    const vec b = row_of(base_axis), p = lever(pose, platform_axis);
+    return atan2(dot(b, cross(p, u)), dot(b, p) - dot(b, u) * dot(p, u));
+}
+
+/* How much longer the command must be for the screw's rotation, m: a platform that turns by an angle about the strut turns
+ * the screw in its nut, which advances by lead times angle / 2 pi by itself. `now` are the struts at the pose. */
 static double screw_shift(const hc_model *model, const hc_pose *pose, const six_struts *now, int i)
 {
     const hc_strut *strut = &model->struts[i];
-    vec s, u, b, p;
-    double length, sine, cosine, turns;
+    double twist, turns;
     if (strut->lead == 0.0) {
         return 0.0;
     }
-    s = now->strut[i];
-    length = now->length[i];
-    u = vector(s.x / length, s.y / length, s.z / length);
-    b = row_of(model->base.axes[i]);
-    p = lever(pose, model->platform.axes[i]);
-    sine = dot(b, cross(p, u));
-    cosine = dot(b, p) - dot(b, u) * dot(p, u);
-    turns = (atan2(sine, cosine) - strut->twist_home) / (2.0 * PI);
+    twist = screw_twist(model->base.axes[i], model->platform.axes[i], pose, now, i);
+    turns = (twist - strut->twist_home) / (2.0 * PI);
     return -strut->lead * (turns - floor(turns + 0.5));
 }
 

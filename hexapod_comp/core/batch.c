@@ -1,0 +1,129 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * One pose after the other through the functions of the core, for studies, checks and calibrations.
+ */
+#include "core.h"
+
+void hc_jacobian_many(const double *base, const double *platform, size_t count, const double *positions,
+                      const double *rotations, double *jacobians)
+{
+    const double(*b)[3] = (const double(*)[3])base, (*t)[3] = (const double(*)[3])platform;
+    size_t n;
+    int i;
+    for (n = 0; n < count; n++) {
+        const hc_pose pose = pose_of(positions + 3 * n, rotations + 9 * n);
+        const six_struts now = struts_of(b, t, &pose);
+        for (i = 0; i < 6; i++) {
+            jacobian_row(b[i], pose.position, now.strut[i], jacobians + 36 * n + 6 * (size_t)i);
+        }
+    }
+}
+
+/* Rotations are subtracted before they are multiplied: the smallest motion is off by no more than the poses are. */
+void hc_motions_many(size_t count, const double *positions, const double *rotations, const double *to_positions,
+                     const double *to_rotations, const double *point, const double *axes, double *motions)
+{
+    const vec t = row_of(point);
+    size_t n;
+    int k;
+    for (n = 0; n < count; n++) {
+        const hc_pose from = pose_of(positions + 3 * n, rotations + 9 * n);
+        const hc_pose to = pose_of(to_positions + 3 * n, to_rotations + 9 * n);
+        const mat r = three_rows(from.rotation), s = three_rows(to.rotation);
+        const vec x = subtract(s.row[0], r.row[0]), y = subtract(s.row[1], r.row[1]), z = subtract(s.row[2], r.row[2]);
+        const vec shift = add(subtract(row_of(to.position), row_of(from.position)), vector(dot(x, t), dot(y, t), dot(z, t)));
+        const vec twice = vector(dot(z, r.row[1]) - dot(y, r.row[2]), dot(x, r.row[2]) - dot(z, r.row[0]),
+                                 dot(y, r.row[0]) - dot(x, r.row[1]));
+        const double sine = 0.5 * norm(twice), versine = 0.25 * (dot(x, x) + dot(y, y) + dot(z, z));
+        const double share = sine > 1e-4 || versine > 1.0
+                                 ? 0.5 * atan2(sine, 1.0 - versine) / sine
+                                 : 0.5 + sine * sine / 12.0; /* the series' next term is below 1e-17 */
+        const vec turn_by = scale(share, twice);
+        for (k = 0; k < 3; k++) {
+            const vec along_axis = vector(axes[k], axes[3 + k], axes[6 + k]);
+            motions[(size_t)k * count + n] = dot(along_axis, shift);
+            motions[(size_t)(3 + k) * count + n] = dot(along_axis, turn_by);
+        }
+    }
+}
+
+void hc_screw_twists(const double *base, const double *platform, const double *base_axes, const double *platform_axes,
+                     size_t count, const double *positions, const double *rotations, double *twists)
+{
+    const double(*b)[3] = (const double(*)[3])base, (*t)[3] = (const double(*)[3])platform;
+    size_t n;
+    int i;
+    for (n = 0; n < count; n++) {
+        const hc_pose pose = pose_of(positions + 3 * n, rotations + 9 * n);
+        const six_struts now = struts_of(b, t, &pose);
+        for (i = 0; i < 6; i++) {
+            twists[6 * n + (size_t)i] = screw_twist(base_axes + 3 * i, platform_axes + 3 * i, &pose, &now, i);
+        }
+    }
+}
+
+void hc_strut_errors(const hc_state *state, int strut, double sense, size_t count, const double *commands, double *errors,
+                     double *slopes)
+{
+    const hc_strut *of = &state->model->struts[strut];
+    size_t n;
+    for (n = 0; n < count; n++) {
+        errors[n] = error_at(state->model, strut, commands[n], screw_turn(of, commands[n]), sense, &slopes[n]);
+    }
+}
+
+void hc_strut_commands(const hc_state *state, int strut, double sense, double shift, size_t count, const double *lengths,
+                       double *commands)
+{
+    size_t n;
+    for (n = 0; n < count; n++) {
+        commands[n] = command_for_length(state, strut, lengths[n], sense, shift);
+    }
+}
+
+void hc_follow(double threshold, size_t count, const double *values, double *low, double *sense)
+{
+    double windows[9] = {NAN}, directions[9] = {0.0};
+    size_t n;
+    for (n = 0; n < count; n++) {
+        sense[n] = follow(values[n], threshold, windows, directions, 0);
+        low[n] = windows[0];
+    }
+}
+
+void hc_backwards_many(const hc_state *state, size_t count, const double *positions, const double *rotations,
+                       const double *senses, double *model_positions, double *model_rotations, double *commands, int *solved)
+{
+    size_t n;
+    int i, outside;
+    for (n = 0; n < count; n++) {
+        const hc_pose pose = pose_of(positions + 3 * n, rotations + 9 * n);
+        double low[9], sense[9];
+        hc_pose q;
+        six_struts now;
+        for (i = 0; i < 9; i++) {
+            low[i] = NAN; /* no window yet: the direction is the one given */
+            sense[i] = senses[9 * n + (size_t)i];
+        }
+        solved[n] = run_backwards(state, &pose, low, sense, &q, &now, commands + 6 * n, &outside);
+        write_pose(&q, model_positions + 3 * n, model_rotations + 9 * n);
+    }
+}
+
+void hc_forwards_many(const hc_state *state, size_t count, const double *commands, const double *senses,
+                      double *model_positions, double *model_rotations, double *positions, double *rotations,
+                      int *outcomes, double *conditions)
+{
+    size_t n;
+    for (n = 0; n < count; n++) {
+        hc_pose q = pose_of(model_positions + 3 * n, model_rotations + 9 * n), actual;
+        const solution found_here = run_forwards(state, commands + 6 * n, senses + 9 * n, &q);
+        outcomes[n] = (int)found_here.status;
+        conditions[n] = found_here.condition;
+        if (found_here.status == HC_OK) {
+            apply_field(&state->model->field, &q, senses + 9 * n, &actual);
+            write_pose(&q, model_positions + 3 * n, model_rotations + 9 * n);
+            write_pose(&actual, positions + 3 * n, rotations + 9 * n);
+        }
+    }
+}

@@ -1,0 +1,81 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Six strut drives with a lag, limits of speed and acceleration, steps, stops and backlash, tick by tick.
+ */
+#include "core.h"
+
+#define SETTLED 1e-12 /* m; a reference closer to its command is put onto it: an exponential never arrives */
+#define CONTACT 1e-6  /* m; a motor asked to go beyond its travel counts as stopped within this distance of the stop */
+
+/* Speed at which to approach a command, m/s: distance/lag near it; further off the curve along which half the acceleration
+ * brakes the drive, which meets the straight part with the same slope. The other half is for the speed loop's own lag. */
+static double wanted_speed(const hc_drives *drives, double distance)
+{
+    const double braking = 0.5 * drives->max_acceleration, lag = drives->lag, size = fabs(distance);
+    double speed = size / lag;
+    if (size > braking * lag * lag) {
+        const double short_of = braking * lag;
+        speed = sqrt(2.0 * braking * size - short_of * short_of);
+    }
+    return copysign(fmin(speed, drives->max_speed), distance);
+}
+
+/* Move a reference for one tick towards its target. */
+static void move_reference(const hc_drives *drives, double target, double *position, double *speed)
+{
+    const double tick = drives->tick, lag = drives->lag, most = drives->max_acceleration * tick;
+    const double distance = target - *position;
+    if (lag == 0.0) {
+        *position = target;
+        return;
+    }
+    if (fabs(distance) < SETTLED && fabs(*speed) * lag < SETTLED) {
+        *position = target;
+        *speed = 0.0;
+        return;
+    }
+    *speed += held((wanted_speed(drives, distance) - *speed) * (4.0 * tick / lag), -most, most);
+    *position += tick * *speed;
+}
+
+/* Put a motor onto the step nearest to its reference, and let the nut follow with play. */
+static void place_motor(hc_drives *drives, int i)
+{
+    const double before = drives->motor[i], half = drives->half_play[i], step = drives->step;
+    const double stepped = step > 0.0 ? rint(drives->position[i] / step) * step : drives->position[i];
+    drives->motor[i] = held(stepped, drives->stops[i][0], drives->stops[i][1]);
+    drives->play[i] = held(drives->play[i] + drives->motor[i] - before, -half, half);
+}
+
+void hc_run_drives(hc_drives *drives, const double commands[6], long ticks, double sense[9])
+{
+    int i;
+    for (i = 0; i < 6; i++) {
+        const double low = drives->stops[i][0], high = drives->stops[i][1];
+        const double target = held(commands[i], low, high);
+        int hit = 0;
+        long n;
+        for (n = 0; n < ticks; n++) {
+            if (!drives->stuck[i]) {
+                move_reference(drives, target, &drives->position[i], &drives->speed[i]);
+            }
+            if (drives->position[i] < low || drives->position[i] > high) {
+                hit = 1;
+                drives->position[i] = held(drives->position[i], low, high);
+                drives->speed[i] = 0.0;
+            }
+            place_motor(drives, i);
+        }
+        sense[3 + i] = drives->half_play[i] > 0.0 ? drives->play[i] / drives->half_play[i] : 0.0;
+        drives->stopped[i] = drives->stopped[i] || hit
+                             || (commands[i] != target && fabs(drives->motor[i] - target) <= CONTACT);
+    }
+}
+
+void hc_follow_point(const hc_pose *pose, const double probe[3], double threshold, double low[9], double sense[9])
+{
+    const vec arm = lever(pose, probe);
+    follow(pose->position[0] + arm.x, threshold, low, sense, 0);
+    follow(pose->position[1] + arm.y, threshold, low, sense, 1);
+    follow(pose->position[2] + arm.z, threshold, low, sense, 2);
+}

@@ -1,0 +1,108 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * What is left of each limit along poses, and what limits them. limits.c asks the same and stops at the first limit that is
+ * broken; a test holds the two together.
+ */
+#include "core.h"
+
+static void nearest_struts(const double base[6][3], const six_struts *now, const hc_limits *limits, hc_quantities *found)
+{
+    double ends[6][3];
+    int i, j, k;
+    strut_ends(base, now, ends);
+    for (i = 0; i < 6; i++) {
+        for (j = 0; j < i; j++) {
+            const int pair[2] = {i, j};
+            double distance;
+            if (!(limits->apart[i][j] > 0.0)) {
+                continue;
+            }
+            distance = segment_distance(base[i], ends[i], base[j], ends[j]);
+            for (k = 0; k < 2; k++) {
+                if (distance < found->distances[pair[k]] || distance != distance) {
+                    found->distances[pair[k]] = distance;
+                    found->nearest[pair[k]] = pair[1 - k];
+                }
+            }
+        }
+    }
+}
+
+/* All limited quantities of a pose but its lengths. */
+static void examine(const double base[6][3], const hc_pose *pose, const six_struts *now, const hc_limits *limits,
+                    hc_quantities *found)
+{
+    int i;
+    for (i = 0; i < 6; i++) {
+        double cosines[2];
+        joint_cosines(pose, now, limits, i, cosines);
+        found->cosines[0][i] = cosines[0];
+        found->cosines[1][i] = cosines[1];
+        found->distances[i] = HUGE_VAL;
+        found->nearest[i] = -1.0;
+    }
+    if (limits->clearance > 0.0) {
+        nearest_struts(base, now, limits, found);
+    }
+    found->condition = condition_at(base, pose, now, limits->characteristic_length, &found->sign);
+}
+
+static void examine_nominal(const double base[6][3], const double platform[6][3], const hc_pose *pose,
+                            const hc_limits *limits, hc_quantities *found)
+{
+    const six_struts now = struts_of(base, platform, pose);
+    int i;
+    for (i = 0; i < 6; i++) {
+        found->lengths[i] = now.length[i];
+    }
+    examine(base, pose, &now, limits, found);
+}
+
+void hc_examine(const double *base, const double *platform, const hc_limits *limits, const hc_pose *pose,
+                hc_quantities *found)
+{
+    examine_nominal((const double(*)[3])base, (const double(*)[3])platform, pose, limits, found);
+}
+
+void hc_examine_many(const hc_state *state, size_t count, const double *positions, const double *rotations,
+                     int independent, double *low, double *sense, hc_quantities *found, int *flags)
+{
+    const hc_model *model = state->model;
+    size_t n;
+    int i, outside;
+    for (n = 0; n < count; n++) {
+        const hc_pose pose = pose_of(positions + 3 * n, rotations + 9 * n);
+        hc_quantities *nominal = found + 2 * n, *compensated = found + 2 * n + 1;
+        hc_pose q;
+        six_struts now;
+        for (i = 0; independent && i < 9; i++) {
+            low[i] = NAN;
+            sense[i] = 0.0;
+        }
+        examine_nominal(model->base.joints, model->platform.joints, &pose, &model->limits, nominal);
+        if (!run_backwards(state, &pose, low, sense, &q, &now, compensated->lengths, &outside)) {
+            flags[n] = HC_NOT_CONVERGED;
+            continue;
+        }
+        flags[n] = outside ? HC_OUTSIDE_FIELD : HC_OK;
+        examine(state->base_joints, &q, &now, &model->limits, compensated);
+    }
+}
+
+void hc_check_poses(const double *base, const double *platform, const hc_limits *limits, size_t count,
+                    const double *positions, size_t rotation_count, const double *rotations, signed char *findings,
+                    signed char *struts)
+{
+    const double(*b)[3] = (const double(*)[3])base, (*t)[3] = (const double(*)[3])platform;
+    size_t n;
+    for (n = 0; n < count; n++) {
+        const size_t turned_as = n < rotation_count ? n : rotation_count - 1;
+        const hc_pose pose = pose_of(positions + 3 * n, rotations + 9 * turned_as);
+        const six_struts now = struts_of(b, t, &pose);
+        double condition;
+        const finding f = check_stage(b, &pose, &now, now.length, limits, &condition);
+        findings[n] = (signed char)f.status;
+        struts[2 * n] = (signed char)f.strut;
+        struts[2 * n + 1] = (signed char)f.other;
+    }
+}

@@ -1,0 +1,232 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * Inverse and forward kinematics of many poses, eight at once. The loops over lanes are what compilers turn into vector
+ * instructions; each lane does the arithmetic of a pose alone, operation by operation, so both give the same bits. A lane
+ * that fails a test is solved again with pivoting, which also finds the reason.
+ */
+#include "core.h"
+
+#define LANES 8 /* one register of AVX-512, two of AVX2 */
+
+/* Compiled for each of these, and taken by the processor that the program meets; the arithmetic is IEEE in all of them. */
+#if defined(__GNUC__) && defined(__x86_64__) && defined(__GLIBC__)
+#define WIDE __attribute__((target_clones("avx512f", "avx2", "default")))
+#else
+#define WIDE
+#endif
+
+/* A pose, the lengths sought or found, and how far its solution has come, in each lane. */
+typedef struct {
+    double position[3][LANES];
+    double rotation[9][LANES];
+    double lengths[6][LANES];
+    double step[LANES]; /* of Newton, the last one, m and rad */
+    double count[LANES];
+    double condition[LANES];
+    double sign[LANES];
+    double misfit[LANES];
+    double flaw[LANES];
+} lanes;
+
+INLINED vec lane_position(const lanes *a, int n)
+{
+    return vector(a->position[0][n], a->position[1][n], a->position[2][n]);
+}
+
+INLINED mat lane_rotation(const lanes *a, int n)
+{
+    mat r;
+    r.row[0] = vector(a->rotation[0][n], a->rotation[1][n], a->rotation[2][n]);
+    r.row[1] = vector(a->rotation[3][n], a->rotation[4][n], a->rotation[5][n]);
+    r.row[2] = vector(a->rotation[6][n], a->rotation[7][n], a->rotation[8][n]);
+    return r;
+}
+
+INLINED void set_lane(lanes *a, int n, vec p, const mat *r)
+{
+    a->position[0][n] = p.x;
+    a->position[1][n] = p.y;
+    a->position[2][n] = p.z;
+    a->rotation[0][n] = r->row[0].x;
+    a->rotation[1][n] = r->row[0].y;
+    a->rotation[2][n] = r->row[0].z;
+    a->rotation[3][n] = r->row[1].x;
+    a->rotation[4][n] = r->row[1].y;
+    a->rotation[5][n] = r->row[1].z;
+    a->rotation[6][n] = r->row[2].x;
+    a->rotation[7][n] = r->row[2].y;
+    a->rotation[8][n] = r->row[2].z;
+}
+
+INLINED vec chosen(int first, vec a, vec b)
+{
+    return vector(first ? a.x : b.x, first ? a.y : b.y, first ? a.z : b.z);
+}
+
+WIDE static void measure_lanes(const double base[6][3], const double platform[6][3], lanes *restrict a)
+{
+    int n, i;
+    for (n = 0; n < LANES; n++) {
+        const vec p = lane_position(a, n);
+        const mat r = lane_rotation(a, n);
+        UNROLLED
+        for (i = 0; i < 6; i++) {
+            a->lengths[i][n] = norm(strut_between(row_of(base[i]), row_of(platform[i]), p, &r));
+        }
+    }
+}
+
+/* Take a Newton step in every lane that has not settled. */
+WIDE static void step_lanes(const double base[6][3], const double platform[6][3], lanes *restrict a)
+{
+    int n, i;
+    for (n = 0; n < LANES; n++) {
+        const vec p = lane_position(a, n);
+        const mat r = lane_rotation(a, n);
+        const int moves = a->step[n] >= STEP_TOLERANCE;
+        vec next = p;
+        mat turned_on_to = r;
+        double lengths[6], step;
+        UNROLLED
+        for (i = 0; i < 6; i++) {
+            lengths[i] = a->lengths[i][n];
+        }
+        step = newton_step(base, platform, lengths, &next, &turned_on_to);
+        next = chosen(moves, next, p);
+        turned_on_to.row[0] = chosen(moves, turned_on_to.row[0], r.row[0]);
+        turned_on_to.row[1] = chosen(moves, turned_on_to.row[1], r.row[1]);
+        turned_on_to.row[2] = chosen(moves, turned_on_to.row[2], r.row[2]);
+        set_lane(a, n, next, &turned_on_to);
+        a->step[n] = moves ? step : a->step[n];
+        a->count[n] += moves ? 1.0 : 0.0;
+    }
+}
+
+/* Straighten each lane's rotation and measure what its answer is judged by. */
+WIDE static void certify_lanes(const double base[6][3], const double platform[6][3], double characteristic_length,
+                               lanes *restrict a)
+{
+    int n, i;
+    for (n = 0; n < LANES; n++) {
+        const vec p = lane_position(a, n);
+        mat r = lane_rotation(a, n);
+        double lengths[6];
+        certificate found_here;
+        UNROLLED
+        for (i = 0; i < 6; i++) {
+            lengths[i] = a->lengths[i][n];
+        }
+        r = straightened(&r);
+        found_here = certify(base, platform, lengths, p, &r, characteristic_length);
+        set_lane(a, n, p, &r);
+        a->condition[n] = found_here.condition;
+        a->sign[n] = found_here.sign;
+        a->misfit[n] = found_here.misfit;
+        a->flaw[n] = found_here.flaw;
+    }
+}
+
+static void fill_lane(lanes *a, int n, const double position[3], const double rotation[9])
+{
+    int k;
+    for (k = 0; k < 3; k++) {
+        a->position[k][n] = position[k];
+    }
+    for (k = 0; k < 9; k++) {
+        a->rotation[k][n] = rotation[k];
+    }
+}
+
+void hc_strut_lengths_many(const double *base, const double *platform, size_t count, const double *positions,
+                      const double *rotations, double *lengths)
+{
+    const double(*b)[3] = (const double(*)[3])base, (*t)[3] = (const double(*)[3])platform;
+    lanes a;
+    size_t first;
+    int n, i;
+    for (first = 0; first < count; first += LANES) {
+        const int here = count - first < LANES ? (int)(count - first) : LANES;
+        const double *p = positions + 3 * first, *r = rotations + 9 * first;
+        double *found_here = lengths + 6 * first;
+        for (n = 0; n < LANES; n++) {
+            const int row = n < here ? n : here - 1; /* the last pose once more in what is left of the lanes */
+            fill_lane(&a, n, p + 3 * row, r + 9 * row);
+        }
+        measure_lanes(b, t, &a);
+        for (n = 0; n < here; n++) {
+            for (i = 0; i < 6; i++) {
+                found_here[6 * n + i] = a.lengths[i][n];
+            }
+        }
+    }
+}
+
+/* Whether a lane's pose is the answer; then write it. */
+static int take_lane(const lanes *a, int n, const double lengths[6], const judge *by, double position[3],
+                     double rotation[9])
+{
+    const certificate c = {a->condition[n], a->sign[n], a->misfit[n], a->flaw[n]};
+    int k;
+    if (!certified(&c, a->step[n], lengths, by)) {
+        return 0;
+    }
+    for (k = 0; k < 3; k++) {
+        position[k] = a->position[k][n];
+    }
+    for (k = 0; k < 9; k++) {
+        rotation[k] = a->rotation[k][n];
+    }
+    return 1;
+}
+
+/* Newton in all lanes until none moves. */
+static void settle_lanes(const double base[6][3], const double platform[6][3], lanes *a)
+{
+    int n, moving = 1;
+    while (moving) {
+        step_lanes(base, platform, a);
+        moving = 0;
+        for (n = 0; n < LANES; n++) {
+            moving = moving || (a->step[n] >= STEP_TOLERANCE && a->count[n] < MAX_ITERATIONS);
+        }
+    }
+}
+
+void hc_solve_pose_many(const double *base, const double *platform, size_t count, const double *lengths, double *positions,
+                        double *rotations, double characteristic_length, double home_sign, double largest_condition,
+                        int *outcomes, int *iterations, double *conditions)
+{
+    const double(*b)[3] = (const double(*)[3])base, (*t)[3] = (const double(*)[3])platform;
+    const judge by = {characteristic_length, home_sign, largest_condition};
+    lanes a;
+    size_t first;
+    int n, i;
+    for (first = 0; first < count; first += LANES) {
+        const int here = count - first < LANES ? (int)(count - first) : LANES;
+        for (n = 0; n < LANES; n++) {
+            const size_t row = first + (size_t)(n < here ? n : here - 1);
+            fill_lane(&a, n, positions + 3 * row, rotations + 9 * row);
+            for (i = 0; i < 6; i++) {
+                a.lengths[i][n] = lengths[6 * row + (size_t)i];
+            }
+            a.step[n] = HUGE_VAL;
+            a.count[n] = 0.0;
+        }
+        settle_lanes(b, t, &a);
+        certify_lanes(b, t, characteristic_length, &a);
+        for (n = 0; n < here; n++) {
+            const size_t row = first + (size_t)n;
+            solution found_here = {HC_OK, (int)a.count[n], a.condition[n]};
+            if (!take_lane(&a, n, lengths + 6 * row, &by, positions + 3 * row, rotations + 9 * row)) {
+                hc_pose pose = pose_of(positions + 3 * row, rotations + 9 * row);
+                found_here = solve_carefully(b, t, lengths + 6 * row, &by, &pose);
+                if (found_here.status == HC_OK) {
+                    write_pose(&pose, positions + 3 * row, rotations + 9 * row);
+                }
+            }
+            outcomes[row] = (int)found_here.status;
+            iterations[row] = found_here.iterations;
+            conditions[row] = found_here.condition;
+        }
+    }
+}
