@@ -104,10 +104,11 @@ setup(
             "rosbags>=0.11",
             "viser>=1.0",
             "argcomplete>=3.1",
+            "mujoco-core>=4.0; python_version >= '3.11'",  # the physics without the viewer; has no wheels for 3.10
         ],
         # The site: `make docs`. Formulas become MathML, which needs no script from elsewhere.
         "docs": ["sphinx>=8.1", "myst-nb>=1.1", "furo>=2024.8", "latex2mathml>=3.77"],
-        "bench": ["mujoco>=3.1", "pin>=2.7"],
+        "bench": ["mujoco-core>=4.0; python_version >= '3.11'", "mujoco>=3.1,<4; python_version < '3.11'", "pin>=2.7"],
         # Imported where used. The first four have no rosdep keys, and a clear message says when one is missing.
         "pages": ["plotly>=5.18"],
         "cluster": ["distributed>=2023.12"],

@@ -34,6 +34,27 @@ HARDWARE = (
 )
 """Parameters of ros2_control's JointStateTopicSystem; by the last one commands near the readings are sent too."""
 
+STEEL = 7850.0
+"""Density of what is drawn, kg/m³, in MJCF; a machine file has no masses. A platform of 0.35 m weighs 7 kg."""
+
+SCREW_INERTIA, HINGE_INERTIA = 200.0, 0.01
+"""Armature of a strut's slide, kg, 1.3e-4 kg m² turning on a screw of 5 mm lead; and of a hinge at its foot, kg m².
+
+What weighs little and is driven stiffly needs short steps: the armature makes the slides inert without any weight.
+"""
+
+STIFFNESS, DAMPING = 1e8, 2.8e5
+"""Of a strut's drive: N/m, a steel rod of 20 mm over 0.6 m; N s/m, critical with :data:`SCREW_INERTIA`."""
+
+FASTEST = 1.0
+"""Speed, m/s, to which the damping holds a strut under its drive's largest force, where the machine's limit is higher.
+
+Without a limit of force, a `ctrl` that nobody has set, 0, would throw the platform.
+"""
+
+TIMESTEP, TIED = 1e-3, {"solref": "0.002 1", "solimp": "0.9999 0.9999 0.001"}
+"""MuJoCo's step, s; struts' ends are tied as fast as that allows (two steps), and gravity parts them by 0.1 µm."""
+
 LOOSE = 1e3
 """Limit of effort and speed of joints that no motor moves; readers of URDF want one."""
 
@@ -96,13 +117,20 @@ def urdf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
 
 
 def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) -> str:
-    """Return the machine as MJCF, loops closed: a free platform, each strut's end tied to it, motors on the slides.
+    """Return the machine as MJCF, loops closed: a free platform, each strut's end tied to it, drives on the slides.
 
     Sites ``base_joint_N``, ``strut_end_N`` and ``platform_joint_N`` mark both ends of a strut, ``tool`` and other
-    names the tools. The reference position is home.
+    names the tools. The reference position is home, and so is the keyframe ``home``, whose `ctrl` holds the machine
+    there; a drive's `ctrl` is the length of its strut. Gravity acts along −z of the base.
     """
     root = ET.Element("mujoco", model=geometry.name)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
+    # Damping is integrated implicitly: explicit steps would have to be shorter than what a light body takes to settle.
+    ET.SubElement(root, "option", integrator="implicitfast", timestep=_number(TIMESTEP))
+    default = ET.SubElement(root, "default")
+    # Struts begin and end inside each other's joints and the plate: nothing collides.
+    ET.SubElement(default, "geom", density=_number(STEEL), contype="0", conaffinity="0")
+    ET.SubElement(default, "equality", TIED)
     world = ET.SubElement(root, "worldbody")
     home = geometry.home
     platform = _body(world, "platform", home.position, home.rotation)
@@ -112,11 +140,12 @@ def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
         ET.SubElement(platform, "site", name=f"platform_joint_{n + 1}", pos=_numbers(joint))
     for name, pose in geometry.tools.items():
         _site(platform, name, pose)
-    equality, actuator = ET.Element("equality"), ET.Element("actuator")
-    for n, (name, length) in enumerate(zip(joint_names, strut_lengths(geometry, home), strict=True)):
+    equality, actuator, keyframe = (ET.Element(name) for name in ("equality", "actuator", "keyframe"))
+    lengths, push = strut_lengths(geometry, home), DAMPING * min(geometry.limits.speed, FASTEST)
+    for n, (name, length) in enumerate(zip(joint_names, lengths, strict=True)):
         foot = _body(world, f"{name}_body", geometry.base_joints[n], _foot_frames(geometry)[n])
-        ET.SubElement(foot, "joint", name=f"{name}_foot_1", axis="0 1 0")
-        ET.SubElement(foot, "joint", name=f"{name}_foot_2", axis="1 0 0")
+        for hinge, axis in (("foot_1", "0 1 0"), ("foot_2", "1 0 0")):
+            ET.SubElement(foot, "joint", name=f"{name}_{hinge}", axis=axis, armature=_number(HINGE_INERTIA))
         short = geometry.limits.stroke[n, 0]
         ET.SubElement(
             foot, "geom", type="cylinder", size=f"{STRUT_RADIUS * 1.5}", fromto=f"0 0 0 0 0 {_number(0.5 * short)}"
@@ -125,13 +154,21 @@ def mjcf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
         rod = _body(foot, f"{name}_rod", np.array([0.0, 0.0, length]), np.eye(3))
         reach = _numbers(geometry.limits.stroke[n])
         # MuJoCo adds a joint's position to the place of its body: `ref` makes it the length.
-        ET.SubElement(rod, "joint", name=name, type="slide", axis="0 0 1", ref=_number(length), range=reach)
+        slide = ET.SubElement(rod, "joint", name=name, type="slide", axis="0 0 1", ref=_number(length), range=reach)
+        slide.attrib |= {"armature": _number(SCREW_INERTIA), "damping": _number(DAMPING)}
         ET.SubElement(rod, "geom", type="cylinder", size=f"{STRUT_RADIUS}", fromto=f"0 0 {_number(-0.6 * short)} 0 0 0")
         ET.SubElement(rod, "site", name=f"strut_end_{n + 1}")
         ends = f"strut_end_{n + 1}", f"platform_joint_{n + 1}"
         ET.SubElement(equality, "connect", name=f"{name}_end", site1=ends[0], site2=ends[1])
-        ET.SubElement(actuator, "position", name=name, joint=name, kp="1e5", kv="1e3", ctrlrange=reach)
-    root.extend((equality, actuator))
+        drive = ET.SubElement(actuator, "position", name=name, joint=name, kp=_number(STIFFNESS), ctrlrange=reach)
+        drive.set("forcerange", _numbers([-push, push]))
+    at_home = [
+        _numbers(home.position),
+        _quaternion(home.rotation),
+        *(f"0.0 0.0 {_number(length)}" for length in lengths),
+    ]
+    ET.SubElement(keyframe, "key", name="home", qpos=" ".join(at_home), ctrl=_numbers(lengths))
+    root.extend((equality, actuator, keyframe))
     return _text(root)
 
 
