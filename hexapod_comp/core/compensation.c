@@ -4,7 +4,7 @@
  */
 #include "core.h"
 
-/* command_one: the model backwards for one platform pose */
+/* The model backwards for one platform pose */
 static int run_backwards(const hc_state *state, const hc_pose *platform, double low[9], double sense[9], hc_pose *q,
                          six_struts *now, double commands[6], int *outside)
 {
@@ -44,7 +44,7 @@ static void shrink_ramp(const hc_last *last, hc_last *next, double ramp_rate)
     }
 }
 
-/* elapsed: time since the last command by the stamps and by the receipt, s; -1: not known */
+/* Time since the last command by the stamps and by the receipt, s; -1: not known */
 static hc_time elapsed(const hc_last *last, const hc_last *next)
 {
     hc_time since;
@@ -108,7 +108,7 @@ static finding check_acceleration(const hc_last *last, hc_last *next, double lim
     return worst;
 }
 
-/* check_command: correction, steps, speed and acceleration; `compensated` tells the stage */
+/* Correction, steps, speed and acceleration; `compensated` tells the stage */
 static finding check_command(const hc_last *last, hc_last *next, const hc_limits *limits, int *compensated)
 {
     finding f;
@@ -134,7 +134,7 @@ static finding check_command(const hc_last *last, hc_last *next, const hc_limits
     return f;
 }
 
-/* compensate_one from the platform's pose on: work out the next command; `next` counts only when nothing was found */
+/* Work out the next command; `next` counts only when nothing was found */
 static finding work_out(const hc_state *state, const hc_pose *platform, hc_time time, hc_last *next, hc_answer *answer)
 {
     const hc_model *model = state->model;
@@ -167,7 +167,7 @@ static finding work_out(const hc_state *state, const hc_pose *platform, hc_time 
     next->received = time.received;
     next->published = NAN;
     next->changed = 0;
-    next->resumes = 0;
+    next->resumes = HC_FROM_LAST;
     shrink_ramp(last, next, state->ramp_rate);
     for (i = 0; i < 6; i++) {
         next->correction[i] += next->ramp[i];
@@ -184,7 +184,7 @@ static finding work_out(const hc_state *state, const hc_pose *platform, hc_time 
     return check_stage(state->base_joints, &next->model, &now, next->command, limits, &unused);
 }
 
-/* Compensator._resume: take what measured struts differ from nominal lengths for the correction that they stand at */
+/* Take what measured struts differ from nominal lengths for the correction that they stand at */
 static void take_standing(const hc_state *state, const hc_last *trial, hc_last *last)
 {
     double standing[6];
@@ -214,7 +214,26 @@ static void fill_answer(const hc_last *last, finding f, hc_answer *answer)
     }
 }
 
-/* Compensator.step from the platform's pose on, when there is one */
+/* After a change of tool: what would move a nominal strut is refused, whatever else is wrong with it */
+static finding same_place(const hc_last *last, const hc_last *next, finding f, hc_answer *answer)
+{
+    finding worst = found(HC_TOOL_CHANGED, -1, 0.0);
+    int i;
+    for (i = 0; i < 6; i++) {
+        const double way = next->nominal[i] - last->nominal[i];
+        if (!(fabs(way) <= fabs(worst.value))) {
+            worst.strut = i;
+            worst.value = way;
+        }
+    }
+    if (fabs(worst.value) <= SAME_PLACE) {
+        return f;
+    }
+    answer->compensated = 0;
+    return worst;
+}
+
+/* From the platform's pose on, when there is one */
 static hc_status command_platform(hc_state *state, hc_status status, const hc_pose *platform, hc_time time,
                                   hc_answer *answer)
 {
@@ -224,8 +243,11 @@ static hc_status command_platform(hc_state *state, hc_status status, const hc_po
     answer->compensated = 0;
     answer->outside_field = 0;
     if (status == HC_OK) {
+        answer->platform = *platform;
         f = work_out(state, platform, time, &next, answer);
-        if (state->last.resumes) {
+        if (state->last.resumes == HC_WITH_NEW_TOOL) {
+            f = same_place(&state->last, &next, f, answer);
+        } else if (state->last.resumes == HC_FROM_MEASURED) {
             const hc_last before = state->last;
             take_standing(state, &next, &state->last);
             f = work_out(state, platform, time, &next, answer);
@@ -241,14 +263,20 @@ static hc_status command_platform(hc_state *state, hc_status status, const hc_po
 
 hc_status hc_command(hc_state *state, const double numbers[7], hc_time time, const hc_pose *frame, hc_answer *answer)
 {
-    const hc_model *model = state->model;
-    hc_pose pose, platform;
+    hc_pose pose;
     const hc_status status = read_pose(numbers, &pose);
-    if (status == HC_OK) {
-        const hc_pose in_base = compose(frame ? frame : &model->work, &pose);
-        platform = compose(&in_base, &model->tool_inverse);
+    if (status != HC_OK) {
+        return command_platform(state, status, &state->last.platform, time, answer);
     }
-    return command_platform(state, status, &platform, time, answer);
+    return hc_command_pose(state, &pose, time, frame, answer);
+}
+
+hc_status hc_command_pose(hc_state *state, const hc_pose *pose, hc_time time, const hc_pose *frame, hc_answer *answer)
+{
+    const hc_model *model = state->model;
+    const hc_pose in_base = compose(frame ? frame : &model->work, pose);
+    const hc_pose platform = compose(&in_base, &model->tool_inverse);
+    return command_platform(state, HC_OK, &platform, time, answer);
 }
 
 hc_status hc_command_lengths(hc_state *state, const double nominal[6], hc_time time, hc_answer *answer)
@@ -265,7 +293,7 @@ void hc_published(hc_state *state, double time)
     state->last.published = time;
 }
 
-/* actual_pose_one: the model forwards; lengths and screw rotation are settled in turn */
+/* The model forwards; lengths and screw rotation are settled in turn */
 static solution run_forwards(const hc_state *state, const double commands[6], const double sense[9], hc_pose *q)
 {
     const hc_model *model = state->model;
@@ -324,7 +352,7 @@ static void place_joints(const hc_body *body, double growth, double joints[6][3]
     }
 }
 
-/* RealMachine._growth: by which share a part has grown since 20 degrees */
+/* By which share a part has grown since 20 degrees */
 static double part_growth(const hc_state *state, int part, double expansion)
 {
     const hc_late *late = &state->model->late;
@@ -337,18 +365,20 @@ static double part_growth(const hc_state *state, int part, double expansion)
     return growth;
 }
 
-/* RealMachine: the structure and the struts' growth at the present temperatures */
+/* The structure and the struts' growth at the present temperatures and humidity */
 static void place_machine(hc_state *state)
 {
     int i;
     for (i = 0; i < 6; i++) {
-        state->growth[i] = part_growth(state, i, state->model->struts[i].expansion);
+        const hc_strut *strut = &state->model->struts[i];
+        state->growth[i] = part_growth(state, i, strut->expansion)
+                           + strut->moisture * (state->humidity - REFERENCE_HUMIDITY);
     }
     place_joints(&state->model->base, part_growth(state, 6, state->model->base.expansion), state->base_joints);
     place_joints(&state->model->platform, part_growth(state, 7, state->model->platform.expansion), state->platform_joints);
 }
 
-/* Temperatures.follow and Lag.take */
+/* Followers run first-order lags; a thermometer runs in a straight line from reading to reading. */
 static void follow_late(hc_state *state, int index, double value, double time)
 {
     const hc_late *late = &state->model->late;
@@ -369,8 +399,8 @@ static void follow_late(hc_state *state, int index, double value, double time)
     }
 }
 
-/* Compensator._followed: the lengths whose directions are followed, at the last command; 0 where there are none */
-static int followed(const hc_state *state, double lengths[6])
+/* The values whose directions are followed, at the last command; 0 where there are none. */
+static int followed(const hc_state *state, double values[9])
 {
     hc_last copy = state->last;
     six_struts now;
@@ -384,35 +414,83 @@ static int followed(const hc_state *state, double lengths[6])
     if (!run_backwards(state, &copy.platform, copy.motion_low, copy.motion_sense, &copy.model, &now, commands, &outside)) {
         return 0;
     }
+    store(add(row_of(copy.platform.position), lever(&copy.platform, state->model->field.probe)), values);
     for (i = 0; i < 6; i++) {
-        lengths[i] = now.length[i];
+        values[3 + i] = now.length[i];
     }
     return 1;
 }
 
+/* Take over a state whose model, temperatures or humidity have changed. The model's lengths jump, the struts do not: unless
+ * the windows jump along, that would count as a motion, turn directions round, and a backlash would step. */
+static void renew(hc_state *state, const hc_state *changed)
+{
+    double before[9], after[9];
+    int comparable = followed(state, before), i;
+    *state = *changed;
+    place_machine(state);
+    comparable = followed(state, after) && comparable;
+    for (i = 0; i < 9 && comparable; i++) {
+        state->last.motion_low[i] += after[i] - before[i];
+    }
+    state->last.changed = 1;
+}
+
 hc_status hc_set_temperature(hc_state *state, int index, double value, double time)
 {
-    double before[6], after[6];
-    int comparable, i;
+    hc_state changed = *state;
     if (index < 0 || index > 7 || !(value >= LOWEST_TEMPERATURE && value <= HIGHEST_TEMPERATURE)) {
         return HC_TEMPERATURE;
     }
     if (state->model->late.count && !finite_number(time)) {
         return HC_TEMPERATURE;
     }
-    comparable = followed(state, before);
     if (state->model->late.count) {
-        follow_late(state, index, value, time);
+        follow_late(&changed, index, value, time);
     }
-    state->temperatures[index] = value;
-    place_machine(state);
-    comparable = followed(state, after) && comparable;
-    for (i = 0; i < 6 && comparable; i++) {
-        /* The model's lengths jump, the struts do not: without this the jump would count as a motion. */
-        state->last.motion_low[3 + i] += after[i] - before[i];
-    }
-    state->last.changed = 1;
+    changed.temperatures[index] = value;
+    renew(state, &changed);
     return HC_OK;
+}
+
+hc_status hc_set_humidity(hc_state *state, double value)
+{
+    hc_state changed = *state;
+    if (!(value >= LOWEST_HUMIDITY && value <= 1.0)) {
+        return HC_HUMIDITY;
+    }
+    changed.humidity = value;
+    renew(state, &changed);
+    return HC_OK;
+}
+
+/* All parts are at rest at their temperatures. */
+static void rest(hc_state *state)
+{
+    int i;
+    for (i = 0; i < 8; i++) {
+        state->began[i] = NAN;
+        state->newest[i] = NAN;
+        state->behind[i][0] = 0.0;
+        state->behind[i][1] = 0.0;
+    }
+}
+
+/* The state with another model; where its parts are late in another way, they begin anew. */
+static hc_state with_model(const hc_state *state, const hc_model *model)
+{
+    const hc_late *late = &state->model->late;
+    hc_state changed = *state;
+    int k, same = late->count == model->late.count;
+    for (k = 0; k < late->count && same; k++) {
+        same = late->time_constants[k] == model->late.time_constants[k];
+    }
+    changed.model = model;
+    if (!same) {
+        rest(&changed);
+    }
+    place_machine(&changed);
+    return changed;
 }
 
 static void must_ramp(hc_last *last)
@@ -420,13 +498,12 @@ static void must_ramp(hc_last *last)
     last->changed = last->correction[0] == last->correction[0];
 }
 
-/* Compensator._check_whole: whether the whole correction, without ramp or switch, is allowed at the last command */
-static hc_status check_whole(const hc_state *state)
+hc_status hc_check(const hc_state *state, const hc_model *model, hc_answer *answer)
 {
-    hc_state trial = *state;
-    hc_last unused;
-    hc_answer answer;
+    hc_state trial = with_model(state, model);
+    hc_last next;
     hc_time unknown;
+    finding f;
     int i, home = 0;
     for (i = 0; i < 6; i++) {
         home = home || !finite_number(state->last.nominal[i]);
@@ -441,14 +518,38 @@ static hc_status check_whole(const hc_state *state)
     unknown.received = NAN;
     trial.last.enabled = 1;
     trial.last.changed = 0;
-    return work_out(&trial, home ? &state->model->home : &state->last.platform, unknown, &unused, &answer).status;
+    answer->platform = home ? model->home : state->last.platform;
+    f = work_out(&trial, &answer->platform, unknown, &next, answer);
+    fill_answer(&next, f, answer);
+    return f.status;
+}
+
+hc_status hc_set_model(hc_state *state, const hc_model *model)
+{
+    const hc_state changed = with_model(state, model);
+    hc_answer unused;
+    const hc_status status = hc_check(state, model, &unused);
+    if (status == HC_OK) {
+        renew(state, &changed);
+    }
+    return status;
+}
+
+void hc_set_tool(hc_state *state, const hc_model *model)
+{
+    state->model = model;
+    place_machine(state);
+    if (finite_number(state->last.nominal[0])) {
+        state->last.resumes = HC_WITH_NEW_TOOL;
+    }
 }
 
 hc_status hc_enable(hc_state *state, int enabled)
 {
     const int wanted = enabled != 0;
     if (wanted != state->last.enabled) {
-        const hc_status status = wanted ? check_whole(state) : HC_OK;
+        hc_answer unused;
+        const hc_status status = wanted ? hc_check(state, state->model, &unused) : HC_OK;
         if (status != HC_OK) {
             return status;
         }
@@ -458,7 +559,7 @@ hc_status hc_enable(hc_state *state, int enabled)
     return HC_OK;
 }
 
-/* CommandState.clear: the correction stays, as what the struts stand at */
+/* The correction stays, as what the struts stand at */
 static void forget(hc_state *state)
 {
     hc_last *last = &state->last;
@@ -474,7 +575,7 @@ static void forget(hc_state *state)
         last->smooth_speed[i] = 0.0;
     }
     last->time = NAN;
-    last->resumes = 0;
+    last->resumes = HC_FROM_LAST;
     must_ramp(last);
     state->estimate = state->model->home;
 }
@@ -490,7 +591,7 @@ hc_status hc_reset(hc_state *state, const double measured[6])
     forget(state);
     for (i = 0; measured && i < 6; i++) {
         state->last.command[i] = measured[i];
-        state->last.resumes = 1;
+        state->last.resumes = HC_FROM_MEASURED;
     }
     return HC_OK;
 }
@@ -502,11 +603,9 @@ void hc_init(hc_state *state, const hc_model *model, double ramp_rate)
     state->ramp_rate = ramp_rate;
     for (i = 0; i < 8; i++) {
         state->temperatures[i] = REFERENCE_TEMPERATURE;
-        state->began[i] = NAN;
-        state->newest[i] = NAN;
-        state->behind[i][0] = 0.0;
-        state->behind[i][1] = 0.0;
     }
+    state->humidity = REFERENCE_HUMIDITY;
+    rest(state);
     for (i = 0; i < 6; i++) {
         state->last.correction[i] = NAN;
         state->last.ramp[i] = 0.0;
@@ -545,6 +644,8 @@ const char *hc_reason(hc_status status)
     case HC_UNREACHABLE: return "unreachable";
     case HC_OTHER_ASSEMBLY: return "other_assembly_mode";
     case HC_TEMPERATURE: return "bad_model";
+    case HC_HUMIDITY: return "bad_model";
+    case HC_TOOL_CHANGED: return "tool_changed";
     }
     return "unknown";
 }

@@ -28,6 +28,9 @@
 #define SMOOTHED_OVER 0.02     /* s */
 #define QUATERNION_TOLERANCE 1e-3
 #define REFERENCE_TEMPERATURE 20.0
+#define REFERENCE_HUMIDITY 0.5
+#define LOWEST_HUMIDITY 0.01
+#define SAME_PLACE 1e-5 /* m: nominal lengths that differ by no more are the same place, but for a controller's decimals */
 #define LOWEST_TEMPERATURE (-40.0)
 #define HIGHEST_TEMPERATURE 120.0
 #define FIELD_ITERATIONS 50

@@ -2,15 +2,16 @@
  *
  * Compensation of a hexapod machine tool: tool poses in, compensated strut lengths out.
  *
- * The same arithmetic as hexapod_comp's Compensator in Python, for a servo thread: no allocation, no globals, no
+ * The arithmetic of hexapod_comp, in its Python package and in a servo thread alike: no allocation, no globals, no
  * input or output, no recursion, every loop bounded, nothing needed but <math.h>. The machine and its error model
- * are constants in a generated header, hexapod_model.h; everything that changes lies in a state that you own.
+ * stand in one constant, which `hexapod_comp export --c` writes into hexapod_model.h; all that changes lies in a state
+ * that you own.
  *
  * Units: metres, radians, seconds; temperatures in degrees Celsius. Quaternions are (x, y, z, w). Matrices lie by rows.
  * Frames: `base` does not move, `platform` carries the tool, `work` is where poses are commanded.
  *
  * Compile without contraction of products and sums (gcc: -ffp-contract=off, which -std=c99 implies), or the last
- * digits differ from the Python compensator's.
+ * digits depend on the target.
  */
 #ifndef HEXAPOD_COMP_H
 #define HEXAPOD_COMP_H
@@ -41,8 +42,17 @@ typedef enum {
     HC_SINGULAR,
     HC_UNREACHABLE,
     HC_OTHER_ASSEMBLY,
-    HC_TEMPERATURE
+    HC_TEMPERATURE,
+    HC_HUMIDITY,
+    HC_TOOL_CHANGED
 } hc_status;
+
+/* Where the next command starts: at the last one; at measured struts; or, since the tool has changed, where it must be. */
+typedef enum {
+    HC_FROM_LAST = 0,
+    HC_FROM_MEASURED,
+    HC_WITH_NEW_TOOL
+} hc_start;
 
 /* Position, m, and rotation matrix. */
 typedef struct {
@@ -69,6 +79,7 @@ typedef struct {
     double lead;       /* m per turn, positive for a right-hand screw */
     double twist_home; /* rad */
     double expansion;  /* 1/K */
+    double moisture;   /* growth by relative humidity from 0 to 1 */
     double wave[4][2]; /* m, cosine and sine of the periodic error once, twice, three and four times a turn */
 } hc_strut;
 
@@ -135,25 +146,26 @@ typedef struct {
     double strut_threshold; /* m: the same of a strut */
 } hc_model;
 
-/* All that one command leaves behind. Named as kernels.compensation.State. */
+/* All that one command leaves behind. Recordings hold it under these names: a new meaning needs a new name.
+ * Windows and directions of motion are those of the measured point's x, y, z and of the struts. */
 typedef struct {
-    double motion_low[9];
-    double motion_sense[9];
+    double motion_low[9];   /* lower end of each window, m; NAN before the first value */
+    double motion_sense[9]; /* +1 forward, -1 backward, 0 not known */
     double nominal[6];
     double correction[6];
-    double command[6];
-    double ramp[6];
+    double command[6]; /* after hc_reset to measured struts, where they stand */
+    double ramp[6];    /* the part of the correction that a change has still to take away */
     double time;
-    hc_pose platform;
-    hc_pose model;
+    hc_pose platform; /* pose_platform_in_base commanded */
+    hc_pose model;    /* q with q o E(q) = that pose */
     int enabled;
-    int changed;
-    int resumes;
+    int changed; /* model, temperatures or enabling have, since the last command */
+    hc_start resumes;
     double received;
     double published;
-    double ahead_by_stamp[6];
+    double ahead_by_stamp[6]; /* how far each strut is ahead of the speed limit by the one clock and by the other, m */
     double ahead_by_receipt[6];
-    double smooth_speed[6];
+    double smooth_speed[6]; /* m/s */
 } hc_last;
 
 /* A compensator at work. The caller owns it; two of them know nothing of each other. */
@@ -167,6 +179,7 @@ typedef struct {
     double base_joints[6][3];   /* where the real joints are at these temperatures, m */
     double platform_joints[6][3];
     double growth[6];
+    double humidity; /* 0 to 1 */
     hc_last last;
     hc_pose estimate; /* model pose of the last estimate: where the next one begins */
 } hc_state;
@@ -179,6 +192,7 @@ typedef struct {
     double value;      /* that broke the limit, m, rad, m/s, m/s2 or 1; of HC_EARLY the time to wait, s */
     double condition;  /* number of the nominal pose, NaN where it was not reached */
     int outside_field; /* 1: the field's value was held at the boundary of its box */
+    hc_pose platform;  /* pose_platform_in_base that was asked for */
     double nominal[6];    /* m */
     double correction[6]; /* command - nominal, m */
     double command[6];    /* m */
@@ -205,6 +219,9 @@ typedef struct {
  * machine's work frame). A refused command leaves the state as it was. */
 hc_status hc_command(hc_state *state, const double pose[7], hc_time time, const hc_pose *frame, hc_answer *answer);
 
+/* The same with a pose that is one: position and rotation matrix. */
+hc_status hc_command_pose(hc_state *state, const hc_pose *pose, hc_time time, const hc_pose *frame, hc_answer *answer);
+
 /* Take notice that the last command had gone out at a time, s, on the clock of its receipt. */
 void hc_published(hc_state *state, double time);
 
@@ -215,6 +232,17 @@ hc_status hc_command_lengths(hc_state *state, const double nominal[6], hc_time t
 /* Say where the tool is when the struts read these lengths, m. A refusal leaves the state as it was. */
 hc_status hc_estimate(hc_state *state, const double lengths[6], hc_estimated *estimated);
 
+/* Say what is wrong with all that a model would correct at the last command, before the first one at home: without ramp or
+ * switch. Nothing changes. */
+hc_status hc_check(const hc_state *state, const hc_model *model, hc_answer *answer);
+
+/* Replace the model; corrections ramp from the old one's to the new one's. It stays with the old one, and says why, where
+ * hc_check finds something. */
+hc_status hc_set_model(hc_state *state, const hc_model *model);
+
+/* Take the same machine and model with another tool. Nothing moves: the next command must be where the struts are. */
+void hc_set_tool(hc_state *state, const hc_model *model);
+
 /* Switch compensation on (1) or off (0); corrections ramp. It stays off, with the reason, when what the model would correct
  * at the last command, before the first one at home, breaks a limit. */
 hc_status hc_enable(hc_state *state, int enabled);
@@ -223,6 +251,9 @@ hc_status hc_enable(hc_state *state, int enabled);
  * an unknown index or a value outside -40...120: nothing changes then. `time`, s, on the machine's own clock, is needed where
  * the model has late parts (`late.count`): HC_TEMPERATURE without. These need a reading every few seconds, changed or not. */
 hc_status hc_set_temperature(hc_state *state, int index, double value, double time);
+
+/* Take the air's relative humidity, 0.01 to 1. Its effect on struts that swell ramps in. HC_HUMIDITY outside: nothing changes. */
+hc_status hc_set_humidity(hc_state *state, double value);
 
 /* Forget the last command and all directions of motion. With `measured`, m, the next command starts from where the
  * struts are and ramps; NULL: it may be anywhere. HC_NOT_FINITE for lengths that are not: nothing changes then. */

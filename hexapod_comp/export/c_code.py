@@ -55,6 +55,8 @@ STATUS = (
     "unreachable",
     "other_assembly_mode",
     "temperature",
+    "humidity",
+    "tool_changed",
 )
 """Names of hc_status, in its order."""
 
@@ -185,7 +187,7 @@ def _struts(machine: RealMachine, model: MachineModel) -> str:
     """Return the six struts; the columns of the kernels' table stand in the order of hc_strut."""
     table = machine.strut_arrays[0].copy()
     table[:, GROWTH] = model.struts.expansion  # the core works out the growth from its temperatures
-    rows = [f"{{{_row(row[:WAVES])}, {_values(row[WAVES:].reshape(MOST_HARMONICS, 2))}}}" for row in table]
+    rows = [f"{{{_row(row[:WAVES])}, 0.0, {_values(row[WAVES:].reshape(MOST_HARMONICS, 2))}}}" for row in table]
     return "{\n        " + ",\n        ".join(rows) + "}"
 
 

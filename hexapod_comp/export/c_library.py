@@ -73,6 +73,7 @@ class CState(Structure):
         ("base_joints", c_double * 18),
         ("platform_joints", c_double * 18),
         ("growth", c_double * 6),
+        ("humidity", c_double),
         ("last", CLast),
         ("estimate", CPose),
     )
@@ -88,6 +89,7 @@ class CAnswer(Structure):
         ("value", c_double),
         ("condition", c_double),
         ("outside_field", c_int),
+        ("platform", CPose),
         ("nominal", c_double * 6),
         ("correction", c_double * 6),
         ("command", c_double * 6),

@@ -117,7 +117,7 @@ def test_the_loop_of_the_page_compiles_and_answers(tmp_path):
 
 def test_names_of_refusals_are_the_header_s_in_its_order():
     """The enumeration is counted by hand on both sides."""
-    header = (SOURCES[0] / "hexapod_comp.h").read_text()
+    header = (SOURCES[0] / "hexapod_comp.h").read_text().partition("} hc_status;")[0]
     names = re.findall(r"^    HC_(\w+)", header, re.MULTILINE)
     assert [name.lower() for name in names] == [
         {"other_assembly_mode": "other_assembly"}.get(name, name) for name in STATUS
@@ -183,7 +183,7 @@ class CModel(Structure):
         ("platform", CBody),
         *((name, CPose) for name in ("home", "work", "tool", "tool_inverse")),
         ("limits", CLimits),
-        ("struts", c_double * (6 * PARAMETERS)),
+        ("struts", c_double * (6 * (PARAMETERS + 1))),
         ("map", CMap),
         ("field", CField),
         ("late", CLate),
@@ -211,7 +211,7 @@ def in_c(geometry: HexapodGeometry, model: MachineModel) -> tuple[CModel, list[n
     }.items():
         setattr(made, name, CPose(tuple(pose.position), tuple(pose.rotation.ravel())))
     made.limits.numbers[:] = np.concatenate([np.ravel(part) for part in geometry.limit_numbers])
-    made.struts[:] = table.ravel()
+    made.struts[:] = np.insert(table, GROWTH + 1, 0.0, axis=1).ravel()
     at = [array.ctypes.data for array in kept]
     made.map = CMap(len(knots), *at[:2])
     made.field = CField(
