@@ -3,6 +3,8 @@
 ``--show-args`` lists the arguments. With a real machine: ``simulate:=false geometry:=/path/mine.yaml``.
 """
 
+import os
+import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -10,17 +12,19 @@ from tempfile import NamedTemporaryFile
 from typing import Any
 
 import yaml
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import EnvironmentVariable, LaunchConfiguration
 from launch_ros.actions import Node
 
-from hexapod_comp.export.robot_description import urdf
 from hexapod_comp.formats.paths import config_file
-from hexapod_comp.machine.geometry import load_geometry
 
 FLAG = ["true", "false"]
 RANGES = ["LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT"]
+DESCRIBED = f"{shlex.quote(sys.executable)} -m hexapod_comp.nodes.described"
+"""Starts robot_state_publisher with the URDF that the compensator publishes: of the machine that it runs."""
+
 LOCAL_UNLESS_SET = EnvironmentVariable("ROS_AUTOMATIC_DISCOVERY_RANGE", default_value="LOCALHOST")
 
 
@@ -85,12 +89,21 @@ def _nodes(context: LaunchContext) -> list[Node]:
     if given("simulate") == "true":
         nodes.append(_node("strut_drive", given, [*files, common | truth]))
     if "true" in (given("description"), given("rviz")):
-        geometry = load_geometry(config_file(given("geometry") or "paper.yaml", "geometry"))
-        description = {"robot_description": urdf(geometry), "frame_prefix": prefix, **clock}
-        nodes.append(_helper("robot_state_publisher", given, [description]))
+        nodes.append(_helper("robot_state_publisher", given, [{"frame_prefix": prefix, **clock}], prefix=DESCRIBED))
     if given("rviz") == "true":
-        nodes.append(_helper("rviz2", given, [clock], ["-d", _view(prefix)]))
+        nodes.append(_helper("rviz2", given, [clock], arguments=["-d", _view(prefix)]))
     return nodes
+
+
+def _check_installed(package: str) -> None:
+    """Refuse to start when another package's node is missing: launch would find out with the compensator running."""
+    try:
+        program = Path(get_package_prefix(package), "lib", package, package)
+    except PackageNotFoundError:
+        program = None
+    if program is None or not os.access(program, os.X_OK):
+        name = f"ros-{os.environ.get('ROS_DISTRO', 'jazzy')}-{package.replace('_', '-')}"
+        raise RuntimeError(f"{package} is not installed, so nothing was started: sudo apt install {name}")
 
 
 def _node(executable: str, given: Callable[[str], str], parameters: list) -> Node:
@@ -107,16 +120,17 @@ def _node(executable: str, given: Callable[[str], str], parameters: list) -> Nod
     )
 
 
-def _helper(package: str, given: Callable[[str], str], parameters: list, arguments: list[str] | None = None) -> Node:
+def _helper(package: str, given: Callable[[str], str], parameters: list, **others: Any) -> Node:
     """Return the action that starts another package's node of the same name, beside the machine's."""
+    _check_installed(package)
     return Node(
         package=package,
         executable=package,
         namespace=given("namespace"),
         parameters=parameters,
-        arguments=arguments,
         additional_env={"ROS_AUTOMATIC_DISCOVERY_RANGE": given("discovery_range")},
         output="screen",
+        **others,
     )
 
 

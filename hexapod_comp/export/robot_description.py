@@ -90,10 +90,8 @@ def joint_positions(
     return {name: float(value) for name, value in values.items()}
 
 
-def urdf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) -> str:
+def urdf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES, ros2_control: bool = True) -> str:
     """Return the machine as URDF: links ``base``, ``work``, ``platform``, ``tool``, the struts', the named frames'.
-
-    Its ``ros2_control`` block says what stands below a controller of struts: the compensator's topics.
 
     Parameters
     ----------
@@ -101,6 +99,8 @@ def urdf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
         The nominal machine.
     joint_names : sequence of str, optional
         Names of the struts' slides.
+    ros2_control : bool, optional
+        Add a block for ros2_control, whose hardware are the topics of a compensator with ``command_input: struts``.
     """
     robot = ET.Element("robot", name=geometry.name)
     _link(robot, "base", [_ball(joint) for joint in geometry.base_joints])
@@ -112,7 +112,8 @@ def urdf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) ->
         _fixed(robot, name, pose, "platform")
     for n, name in enumerate(joint_names):
         _strut(robot, geometry, n, name)
-    _control(robot, joint_names)
+    if ros2_control:
+        _control(robot, joint_names)
     return _text(robot)
 
 

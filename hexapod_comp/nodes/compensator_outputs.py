@@ -9,11 +9,11 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Float64MultiArray, String
 from visualization_msgs.msg import MarkerArray
 
 from ..compensation.compensator import Compensator
-from ..export.robot_description import joint_positions
+from ..export.robot_description import joint_positions, urdf
 from ..pose import Pose
 from .command_inputs import STRUTS, nominal_lengths
 from .machine_files import MachineFiles
@@ -22,7 +22,7 @@ from .messages import write_pose
 from .predicted_error import PredictedErrorTopics
 from .runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, ESTIMATE_QOS, EVENT_QOS, STATE_QOS, MachineNode
 from .stamps import nanoseconds_of, period
-from .vital_signs import VitalSigns
+from .vital_signs import LATCHED_QOS, VitalSigns
 from .wire import StrutBytes
 
 
@@ -50,8 +50,14 @@ class CompensatorOutputs:
         self._corrections = node.publish_on(JointState, "strut_corrections", COMMAND_QOS, deadline)
         self._estimates = node.publish_on(PoseStamped, "tool_pose_estimate", ESTIMATE_QOS)
         self._markers = node.create_publisher(MarkerArray, "~/markers", EVENT_QOS)
-        self._joints = node.create_publisher(JointState, "joint_states", EVENT_QOS)
         self._names = options["joint_names"]
+        self._joints: Publisher | None = None
+        self._description: Publisher | None = None
+        if options["publish_description"]:
+            self._joints = node.create_publisher(JointState, "joint_states", EVENT_QOS)
+            self._description = node.create_publisher(String, "robot_description", LATCHED_QOS)
+            below = options["command_input"] == STRUTS
+            self._description.publish(String(data=urdf(compensator.geometry, self._names, ros2_control=below)))
         self._array: Publisher | None = None
         self._nominal: Publisher | None = None
         if options["command_input"] == STRUTS:
@@ -110,7 +116,7 @@ class CompensatorOutputs:
         if self._markers.get_subscription_count():
             correction = self._compensator.correction if corrects else np.zeros(6)
             self._markers.publish(machine_markers(geometry, *pose, correction, self._frame, now))
-        if self._joints.get_subscription_count():
+        if self._joints is not None and self._joints.get_subscription_count():
             positions = joint_positions(geometry, Pose(*pose), self._names)
             message = JointState(name=list(positions), position=list(positions.values()))
             message.header.stamp = now
@@ -125,7 +131,7 @@ class CompensatorOutputs:
         """Destroy the publishers."""
         self._predicted.close()
         self.signs.close()
-        always = self._commands, self._corrections, self._estimates, self._markers, self._joints
-        for publisher in (*always, self._array, self._nominal):
+        always = self._commands, self._corrections, self._estimates, self._markers
+        for publisher in (*always, self._joints, self._description, self._array, self._nominal):
             if publisher is not None:
                 self._node.destroy_publisher(publisher)

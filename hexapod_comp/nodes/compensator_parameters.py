@@ -57,7 +57,10 @@ humidity_rate_limit | {HUMIDITY_RATE} | 0 to 1 1/s | always | a humidity that ju
     refused; 0 = off
 heartbeat_rate | 50.0 | 0 to 1000 Hz | always | heartbeats per second; 0 = none
 marker_rate | 10.0 | 0 to 10 Hz | always | markers and joint states per second; 0 = none
-publish_array | false |  | configure | also publish `strut_commands_array` for ros2_controllers
+publish_array | false |  | configure | also publish `strut_commands_array` for ros2_controllers, in the order of
+    joint_names
+publish_description | true |  | configure | publish the machine for robot_state_publisher and RViz: its URDF on
+    `robot_description`, latched, and all its joints on `joint_states`; false where another node publishes these topics
 """)
 
 TOPICS = """
@@ -78,6 +81,7 @@ out  strut_commands          JointState: compensated strut lengths, m
      ~/stopped               Bool, latched: commands are refused
      ~/heartbeat, ~/validity UInt64, TimeReference: until when the newest command is valid
      joint_states            JointState: all joints of the machine's URDF
+     robot_description       String, latched: that URDF, of the geometry in use
      /diagnostics, ~/markers, ~/journal, ~/files
 ask  ~/enable_compensation   SetBool
      ~/reload_model, ~/reset Trigger

@@ -20,11 +20,13 @@ from rclpy.qos import ReliabilityPolicy
 
 from hexapod_comp.export.robot_description import urdf
 from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.nodes import described
+from hexapod_comp.nodes.compensator import CompensatorNode
 
 VIEWS = CONFIG / "views"
 
 DESCRIPTION = "robot_description"
-"""robot_state_publisher's topic, which our nodes have not."""
+"""Of the compensator; RViz's display of it names no type."""
 
 SHOWS = {"MarkerArray": "MarkerArray", "Pose": "PoseStamped", "RobotModel": "String"}
 """What RViz's displays take."""
@@ -123,6 +125,24 @@ def launch_file(monkeypatch: pytest.MonkeyPatch) -> LaunchFile:
     return LaunchFile(monkeypatch)
 
 
+def install(package: str, prefix: Path) -> None:
+    """Install a node of another package below `prefix`, as ament does: an entry in the index, and a program."""
+    index = prefix / "share" / "ament_index" / "resource_index" / "packages"
+    program = prefix / "lib" / package / package
+    for path in (index / package, program):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    program.chmod(0o755)
+
+
+@pytest.fixture
+def shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Install what shows a machine."""
+    for package in ("robot_state_publisher", "rviz2"):
+        install(package, tmp_path)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+
+
 def parameters(node: dict[str, Any]) -> dict[str, Any]:
     return node["parameters"][-1]
 
@@ -135,6 +155,7 @@ def test_what_is_not_given_stays_at_the_nodes_own_default(launch_file: LaunchFil
         assert node["parameters"] == [str(CONFIG / "fastdds.xml"), {}]
 
 
+@pytest.mark.usefixtures("shown")
 def test_arguments_reach_the_nodes(launch_file: LaunchFile) -> None:
     words = ["geometry:=example_6_6.yaml", "model:=m.yaml", "truth:=t.yaml", "autostart:=false", "use_sim_time:=true"]
     nodes = launch_file.start(*words, "frame_prefix:=left/", "namespace:=left", "rviz:=true")
@@ -143,12 +164,61 @@ def test_arguments_reach_the_nodes(launch_file: LaunchFile) -> None:
     assert parameters(nodes["compensator"]) == {**both, **own}
     assert parameters(nodes["strut_drive"]) == {**both, "truth_file": "t.yaml"}
     assert {node["namespace"] for node in nodes.values()} == {"left"}
-    description = parameters(nodes["robot_state_publisher"])
-    assert description["frame_prefix"] == "left/"
-    assert ET.fromstring(description["robot_description"]).get("name") == "example_6_6"
+    assert parameters(nodes["robot_state_publisher"]) == {"frame_prefix": "left/", "use_sim_time": True}
     assert all(parameters(nodes[name])["use_sim_time"] for name in ("robot_state_publisher", "rviz2"))
 
 
+def test_without_robot_state_publisher_nothing_starts(
+    launch_file: LaunchFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """launch looks for each program when it is its turn: the compensator would run already, and stay."""
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    with pytest.raises(RuntimeError, match=r"nothing was started: sudo apt install ros-[a-z]+-robot-state-publisher"):
+        launch_file.start("description:=true")
+    install("robot_state_publisher", tmp_path)
+    assert "robot_state_publisher" in launch_file.start("description:=true")
+    (tmp_path / "lib" / "robot_state_publisher" / "robot_state_publisher").unlink()
+    with pytest.raises(RuntimeError, match="robot_state_publisher is not installed"):
+        launch_file.start("description:=true")
+
+
+def test_the_description_is_of_the_machine_that_runs(
+    bench: Bench, launch_file: LaunchFile, shown: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The geometry stands in a parameter file alone. Truth: the name and the joints' names that the files hold.
+
+    The program that the launch file puts in front of robot_state_publisher is run up to where it would become that.
+    """
+    names = [f"leg_{n}" for n in range(1, 7)]
+    values = {"geometry_file": "example_6_6.yaml", "joint_names": names}
+    mine = tmp_path / "mine.yaml"
+    mine.write_text(yaml.safe_dump({"/**/compensator": {"ros__parameters": values}}))
+    node = launch_file.start(f"params_file:={mine}", "description:=true")["robot_state_publisher"]
+    assert node["prefix"].endswith(f" -m {described.__name__}")
+    bench.add(CompensatorNode, True, {}, cli_args=["--ros-args", "--params-file", str(mine)])
+    started: list[list[str]] = []
+    monkeypatch.setattr(described.os, "execv", lambda program, words: started.append([program, *words]))
+    with pytest.raises(AssertionError, match="execv"):
+        described.main(["/lib/rsp", "--ros-args", "-r", "__node:=robot_state_publisher"])
+    program, *words, file = started[0]
+    assert (program, words[:2]) == ("/lib/rsp", ["/lib/rsp", "--ros-args"])
+    remapped = ["-r", f"{DESCRIPTION}:=~/{DESCRIPTION}"]  # else two nodes would publish it
+    assert words[-4:] == ["--ros-args", *remapped, "--params-file"]
+    given = yaml.safe_load(Path(file).read_text(encoding="utf-8"))["/**"]["ros__parameters"]
+    Path(file).unlink()
+    robot = ET.fromstring(given[DESCRIPTION])
+    assert robot.get("name") == "example_6_6"
+    assert {joint.get("name") for joint in robot.iter("joint")} >= set(names)
+    assert robot.find("ros2_control") is None  # nobody listens to strut_setpoints
+
+
+def test_the_description_can_be_left_to_another_node(bench: Bench) -> None:
+    """As where ros2_control's joint_state_broadcaster publishes ``joint_states``."""
+    bench.compensator(publish_description=False, command_input="struts")
+    assert not {"/joint_states", f"/{DESCRIPTION}"} & set(topics_of(bench))
+
+
+@pytest.mark.usefixtures("shown")
 def test_rviz_shows_the_machine_with_its_prefix(launch_file: LaunchFile) -> None:
     """RViz's RobotModel puts a slash between prefix and link; topics are relative, and so in RViz's namespace."""
     plain = launch_file.start("rviz:=true")["rviz2"]["arguments"]
