@@ -19,6 +19,18 @@ void hc_jacobian_many(const double *base, const double *platform, size_t count, 
     }
 }
 
+void hc_condition_many(const double *base, const double *platform, size_t count, const double *positions,
+                       const double *rotations, double characteristic_length, double *conditions, double *signs)
+{
+    const double(*b)[3] = (const double(*)[3])base, (*t)[3] = (const double(*)[3])platform;
+    size_t n;
+    for (n = 0; n < count; n++) {
+        const hc_pose pose = pose_of(positions + 3 * n, rotations + 9 * n);
+        const six_struts now = struts_of(b, t, &pose);
+        conditions[n] = condition_at(b, &pose, &now, characteristic_length, &signs[n]);
+    }
+}
+
 /* Rotations are subtracted before they are multiplied: the smallest motion is off by no more than the poses are. */
 void hc_motions_many(size_t count, const double *positions, const double *rotations, const double *to_positions,
                      const double *to_rotations, const double *point, const double *axes, double *motions)

@@ -21,8 +21,8 @@ UNITS = ("hexapod_batch.c",)
 """Compiled as one unit, in this order; it contains ``hexapod_comp.c``."""
 
 FLAGS = ["-std=c99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]
-"""The same bits on every machine: products and sums are not contracted, and nothing is reordered. Nobody asks for errno or
-for floating-point exceptions; without them loops become vector code."""
+"""The same bits on every machine: products and sums are not contracted, and nothing is reordered. Nobody asks for errno
+or for floating-point exceptions; without them loops become vector code."""
 
 
 def declarations(header: str) -> str:

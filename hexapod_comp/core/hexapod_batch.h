@@ -28,6 +28,10 @@ void hc_solve_pose_many(const double *base, const double *platform, size_t count
 void hc_jacobian_many(const double *base, const double *platform, size_t count, const double *positions,
                       const double *rotations, double *jacobians);
 
+/* Condition numbers of the Jacobian, rotations divided by the characteristic length, and signs of det J. */
+void hc_condition_many(const double *base, const double *platform, size_t count, const double *positions,
+                       const double *rotations, double characteristic_length, double *conditions, double *signs);
+
 /* From each pose to another: displacement of a point of the platform, and rotation vector, along the columns of `axes`;
  * 6 x n, m and rad. NaN after exactly half a turn, whose axis could point either way. */
 void hc_motions_many(size_t count, const double *positions, const double *rotations, const double *to_positions,

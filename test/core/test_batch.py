@@ -1,0 +1,177 @@
+"""Batches of the core: against NumPy, SciPy and finite differences, and what is refused where arrays cross."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from strategies import paper_geometry, skewed_geometry
+
+from hexapod_comp.core import batch, ffi, lib
+
+JUDGED = 0.3, 0.0, np.inf
+"""Characteristic length, any assembly mode, any condition number."""
+
+
+def drawn_poses(geometry, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    positions = geometry.home.position + rng.uniform(-0.05, 0.05, (count, 3))
+    turned = Rotation.from_rotvec(rng.uniform(-0.2, 0.2, (count, 3))).as_matrix()
+    return positions, np.ascontiguousarray(turned @ geometry.home.rotation)
+
+
+def joints(geometry) -> tuple[np.ndarray, np.ndarray]:
+    return geometry.base_joints.copy(), geometry.platform_joints.copy()
+
+
+def lengths_at(geometry, positions, rotations) -> np.ndarray:
+    lengths = np.empty((len(positions), 6))
+    batch.strut_lengths(*joints(geometry), positions, rotations, lengths)
+    return lengths
+
+
+def solved(geometry, lengths, positions, rotations, judged=JUDGED):
+    """Outcomes, iterations and conditions; the poses are overwritten."""
+    count = len(lengths)
+    found = np.empty(count, np.intc), np.empty(count, np.intc), np.empty(count)
+    batch.solve_poses(*joints(geometry), lengths, positions, rotations, *judged, *found)
+    return found
+
+
+@pytest.mark.parametrize("geometry", [paper_geometry(), skewed_geometry()], ids=["6-3", "6-6"])
+@pytest.mark.parametrize("count", [1, 7, 8, 21])
+def test_lengths_are_numpy_s_distances(geometry, count):
+    """1e-15 m: the roundings of a sum of four products."""
+    positions, rotations = drawn_poses(geometry, count, 1)
+    base, platform = joints(geometry)
+    expected = np.linalg.norm(positions[:, None] + platform @ np.swapaxes(rotations, 1, 2) - base, axis=2)
+    np.testing.assert_allclose(lengths_at(geometry, positions, rotations), expected, rtol=0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("geometry", [paper_geometry(), skewed_geometry()], ids=["6-3", "6-6"])
+def test_a_pose_among_others_has_the_bits_of_a_pose_alone(geometry):
+    """Eight go through the vector registers at once, whatever their neighbours: one of them has no solution."""
+    positions, rotations = drawn_poses(geometry, 21, 2)
+    lengths = lengths_at(geometry, positions, rotations)
+    lengths[4, 1] = 3.0
+    starts = np.tile(geometry.home.position, (21, 1)), np.tile(geometry.home.rotation, (21, 1, 1))
+    together = [part.copy() for part in starts]
+    outcomes, iterations, conditions = solved(geometry, lengths, *together)
+    assert outcomes[4] == lib.HC_UNREACHABLE
+    assert (np.delete(outcomes, 4) == lib.HC_OK).all()
+    for n in range(21):
+        alone = [part[n : n + 1].copy() for part in starts]
+        found = solved(geometry, lengths[n : n + 1], *alone)
+        assert [part[0] for part in found[:2]] == [outcomes[n], iterations[n]]
+        np.testing.assert_array_equal(found[2], conditions[n : n + 1])
+        np.testing.assert_array_equal(alone[0][0], together[0][n])
+        np.testing.assert_array_equal(alone[1][0], together[1][n])
+
+
+def test_solutions_are_the_poses_that_the_lengths_came_from():
+    """1e-13 m and rad: rounding of the lengths, 1e-16, times a condition of some hundred."""
+    geometry = skewed_geometry()
+    positions, rotations = drawn_poses(geometry, 100, 3)
+    found = np.tile(geometry.home.position, (100, 1)), np.tile(geometry.home.rotation, (100, 1, 1))
+    outcomes, _, _ = solved(geometry, lengths_at(geometry, positions, rotations), *found)
+    assert (outcomes == lib.HC_OK).all()
+    np.testing.assert_allclose(found[0], positions, rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(found[1], rotations, rtol=0.0, atol=1e-13)
+
+
+def test_jacobians_are_differences_of_lengths():
+    """Central differences over 1 µm and 1 µrad leave 1e-12 of curvature and 1e-10 of rounding."""
+    geometry, step = skewed_geometry(), 1e-6
+    positions, rotations = drawn_poses(geometry, 5, 4)
+    matrices = np.empty((5, 6, 6))
+    batch.jacobians(*joints(geometry), positions, rotations, matrices)
+    for k in range(6):
+        ends = []
+        for way in (step, -step):
+            shift, turn = np.zeros(3), np.zeros(3)
+            (shift if k < 3 else turn)[k % 3] = way
+            turned = np.ascontiguousarray(Rotation.from_rotvec(turn).as_matrix() @ rotations)
+            ends.append(lengths_at(geometry, positions + shift, turned))
+        np.testing.assert_allclose(matrices[:, :, k], (ends[0] - ends[1]) / (2.0 * step), rtol=0.0, atol=1e-9)
+
+
+def test_condition_numbers_are_numpy_s():
+    geometry = skewed_geometry()
+    positions, rotations = drawn_poses(geometry, 20, 5)
+    matrices, numbers, signs = np.empty((20, 6, 6)), np.empty(20), np.empty(20)
+    batch.jacobians(*joints(geometry), positions, rotations, matrices)
+    batch.conditions(*joints(geometry), positions, rotations, 0.3, numbers, signs)
+    scaled = matrices / [1.0, 1.0, 1.0, 0.3, 0.3, 0.3]
+    expected = np.linalg.norm(scaled, axis=(1, 2)) * np.linalg.norm(np.linalg.inv(scaled), axis=(1, 2)) / 6.0
+    np.testing.assert_allclose(numbers, expected, rtol=1e-12)
+    np.testing.assert_array_equal(signs, np.sign(np.linalg.det(matrices)))
+
+
+def test_motions_are_scipy_s_rotation_vectors():
+    positions, rotations = drawn_poses(paper_geometry(), 30, 6)
+    turns = np.random.default_rng(7).uniform(-1.5, 1.5, (30, 3))
+    turned = Rotation.from_rotvec(turns).as_matrix() @ rotations
+    found, point = np.empty((6, 30)), np.array([0.01, -0.02, 0.1])
+    batch.motions(positions, rotations, positions + 1e-3, turned, point, np.eye(3), found)
+    np.testing.assert_allclose(found[3:].T, turns, rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(found[:3].T, 1e-3 + (turned - rotations) @ point, rtol=0.0, atol=1e-15)
+
+
+def test_a_window_follows_with_play():
+    """As a nut in its thread: 2 wide, pushed up to 5, the way back shows after 2."""
+    low, sense = batch.follow(np.array([0.0, 5.0, 3.5, 3.0, 2.5, 5.5]), 2.0)
+    assert low.tolist() == [-1.0, 3.0, 3.0, 3.0, 2.5, 3.5]
+    assert sense.tolist() == [0.0, 1.0, 1.0, 1.0, -1.0, 1.0]
+
+
+def test_triangles_close_on_their_circles():
+    """The corners lie on the circles and their distances are the sides: by NumPy, to rounding."""
+    rng = np.random.default_rng(8)
+    axes = Rotation.random(3, random_state=8).as_matrix()
+    circles = np.ascontiguousarray(
+        np.stack([0.3 * rng.normal(size=(3, 3)), 0.4 * axes[:, 0], 0.4 * axes[:, 1]], axis=1)
+    )
+    true = np.array([0.4, 1.9, -2.0])
+    corners = circles[:, 0] + np.cos(true)[:, None] * circles[:, 1] + np.sin(true)[:, None] * circles[:, 2]
+    sides = np.linalg.norm(corners - corners[[1, 2, 0]], axis=1)
+    angles = true + rng.uniform(-0.05, 0.05, (40, 3))
+    points, errors = np.empty((40, 3, 3)), np.empty(40)
+    batch.settle(circles, sides, angles, points, errors)
+    assert errors.max() < 1e-15
+    np.testing.assert_allclose(
+        np.linalg.norm(points - points[:, [1, 2, 0]], axis=2), np.tile(sides, (40, 1)), atol=1e-15
+    )
+    np.testing.assert_allclose(points, np.tile(corners, (40, 1, 1)), atol=1e-13)
+
+
+WRONG = {
+    "shape": lambda a: a[:-1],
+    "type": lambda a: a.astype(np.float32),
+    "layout": lambda a: np.asfortranarray(a),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+@pytest.mark.parametrize("place", range(5))
+def test_what_does_not_fit_is_refused_where_it_crosses(place, wrong):
+    """Nothing is read or written beyond an array: each argument's shape, type and layout is checked."""
+    names = "base", "platform", "positions", "rotations", "lengths"
+    arrays = [np.zeros((6, 3)), np.ones((6, 3)), np.zeros((4, 3)), np.tile(np.eye(3), (4, 1, 1)), np.zeros((4, 6))]
+    arrays[place] = WRONG[wrong](arrays[place])
+    # A batch of another length is one: it is the next array that does not fit.
+    blamed = "rotations" if (names[place], wrong) == ("positions", "shape") else names[place]
+    with pytest.raises(ValueError, match=f"^{blamed}: must be"):
+        batch.strut_lengths(*arrays)
+
+
+def test_a_read_only_result_is_refused():
+    lengths = np.zeros((1, 6))
+    lengths.flags.writeable = False
+    with pytest.raises(ValueError, match="lengths: is read-only"):
+        batch.strut_lengths(np.zeros((6, 3)), np.ones((6, 3)), np.zeros((1, 3)), np.eye(3)[None].copy(), lengths)
+
+
+def test_quantities_lie_as_in_the_header():
+    assert ffi.sizeof("hc_quantities") == batch.QUANTITIES.itemsize
+    for name in batch.QUANTITIES.names:
+        assert ffi.offsetof("hc_quantities", name) == batch.QUANTITIES.fields[name][1]
