@@ -106,15 +106,19 @@ class LinuxcncBridgeNode(MachineNode):
         """Open topics."""
         self.on_parameters(set())
         self._pose_out.header.frame_id = self._options["frame_id"]
+        with self.all_or_nothing():
+            self._open_topics()
+        return super().on_configure(state)
+
+    def _open_topics(self) -> None:
         self._pose_pub = self.publish_on(PoseStamped, "tool_pose_command", COMMAND_QOS, self._options["timeout"])
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
         self.speak_for(self._options["component"])
         self._subscription = self.obey(JointState, "strut_corrections", self._on_correction, self._look_at_publishers)
         topic, count = self._subscription.topic_name, self._subscription.get_publisher_count
         self._source = CommandSource(self, topic, count, self._options["allow_several_publishers"])
-        self._reset = CompensatorReset(self, self._status, self._options)
         self._check = self.every(CHECK_PERIOD, self._check_state)
-        return super().on_configure(state)
+        self._reset = CompensatorReset(self, self._status, self._options)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start to take part."""

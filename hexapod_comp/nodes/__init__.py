@@ -32,7 +32,7 @@ def start(module: str) -> int:
 
 
 def heard_signals() -> list[int]:
-    """Return a list that SIGINT and SIGTERM are added to, from now on, in place of their usual effect.
+    """Return a list that SIGINT, SIGTERM and SIGHUP are added to, from now on, in place of their usual effect.
 
     Not an event: setting one takes its lock, and the signal may have interrupted whoever holds that, a main thread
     about to wait for the event or another signal's handler. Then the process waits for itself for ever.
@@ -43,9 +43,25 @@ def heard_signals() -> list[int]:
 
 
 def _at_the_end(handler: Callable[[int, FrameType | None], object]) -> None:
-    """Let a function handle the signals that end a program, from now on."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, handler)
+    """Let a function handle the signals that end a program, from now on; a hang-up that nohup ignores stays ignored."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number is not signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, handler)
+
+
+def open_streams() -> None:
+    """Open what was closed of stdin, stdout and stderr when the process began: rclpy's executor wants a stderr.
+
+    Else the next file or socket would get its number, and what a library prints.
+    """
+    for number in (0, 1, 2):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
 
 
 def start_compensator() -> int:

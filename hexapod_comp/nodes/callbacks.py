@@ -30,8 +30,8 @@ def numbered(callback: Callable[[Any, int | None], None]) -> Callable[..., None]
 class Alarm:
     """Calls back once, in the executor, a while after it was set; it may be set as often as one likes.
 
-    A timer may not be reset so often: at each reset the EventsExecutor of Jazzy (rclpy 7.1) calls every timer that is
-    due once more, and puts its next call off by a period. On a busy processor a check every 50 ms rested for seconds.
+    A timer may not be reset while a node runs: at each reset the EventsExecutor of Jazzy (rclpy 7.1) calls every timer
+    that is due once more, and puts its next call off by a period: a check every 50 ms rested for seconds.
 
     Parameters
     ----------
@@ -67,9 +67,53 @@ class Alarm:
                 if left > 0.0:
                     self._change.wait(None if left == float("inf") else left)
                 else:
-                    self._due = float("inf")
-                    if self._node.executor is not None:  # that of Jazzy knows no guard conditions
-                        self._node.executor.create_task(self._callback)
+                    executor = self._node.executor  # that of Jazzy knows no guard conditions
+                    self._due = float("inf") if executor is not None else time.monotonic() + 0.1
+                    if executor is not None:
+                        executor.create_task(self._callback)
+
+
+class Ticker:
+    """Calls back, in the executor, at a rate that may change at any time, which neither moves a tick that is due nor
+    touches a timer; a rate that changes a hundred times a second makes it tick no more often than the fastest.
+
+    Parameters
+    ----------
+    node : Node
+        In whose executor.
+    callback : callable
+        What is called.
+    rate : float
+        Hz; 0: never.
+    """
+
+    def __init__(self, node: Node, callback: Callable[[], None], rate: float) -> None:
+        self._callback, self._rate, self._last = callback, 0.0, time.monotonic()
+        self._alarm = Alarm(node, self._tick)
+        self.set_rate(rate)
+
+    def set_rate(self, rate: float) -> None:
+        """Go on at another rate, Hz, counted from the last tick; 0: rest."""
+        if rate != self._rate:
+            self._rate = rate
+            self._wait(time.monotonic())
+
+    def close(self) -> None:
+        """Call back no more."""
+        self._rate = 0.0
+        self._alarm.close()
+
+    def _wait(self, now: float) -> None:
+        self._alarm.set(max(0.0, self._last + 1.0 / self._rate - now) if self._rate else float("inf"))
+
+    def _tick(self) -> None:
+        if not self._rate:
+            return  # it was closed or put to rest while this tick was on its way
+        now = time.monotonic()
+        due = self._last + 1.0 / self._rate
+        self._last = due if now - due < 1.0 / self._rate else now  # in step, but what was missed is not made up for
+        self._wait(now)
+        self._callback()
 
 
 class LateAnswer:

@@ -83,8 +83,13 @@ class CompensatorNode(MachineNode):
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
         self._frames = {ids[name]: pack_pose(pose) for name, pose in geometry.work_frames.items()}
-        self._open_topics(ids)
-        self._journal = JournalTopics(self, self.compensator, self._files.sources, self._options, ids)
+        try:
+            with self.all_or_nothing():
+                self._open_topics(ids)
+                self._journal = JournalTopics(self, self.compensator, self._files.sources, self._options, ids)
+        except Exception:
+            self._compensator = None  # else the end would say goodbye on topics that there are not
+            raise
         what = f"{geometry.name!r} with {self._files.described(self.compensator.model)}"
         self.get_logger().info(f"configured machine {what} in {time.perf_counter() - began:.2f} s")
         return super().on_configure(state)
@@ -146,12 +151,13 @@ class CompensatorNode(MachineNode):
         self._timers_open = [
             self.every(CHECK_PERIOD, self._check_state),
             self.every(ESTIMATE_PERIOD, self._estimate_from_commands),
-            self.at_rate("marker_rate", self._publish_markers),
         ]
+        self._marking = self.at_rate("marker_rate", self._publish_markers)
 
     def _close_topics(self) -> None:
         for timer in self._timers_open:
             self.destroy_timer(timer)
+        self._marking.close()
         self.destroy_subscription(self._subscription)
         services = self._reload, self._operator, self._tools, self._travel
         for part in (*services, self._pacing, self._feedback, self._outputs):
@@ -271,6 +277,7 @@ class CompensatorNode(MachineNode):
         self._status.log_space.look()
         self._look_closer()
         self._tell_problem()
+        self._status.prediction_problem = self._outputs.prediction_problem
         self._reload.look()
         self._travel.look(now)
         self._journal.tick(now)

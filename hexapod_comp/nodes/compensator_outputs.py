@@ -79,6 +79,11 @@ class CompensatorOutputs:
         """Full name of the topic of strut commands."""
         return self._commands.topic_name
 
+    @property
+    def prediction_problem(self) -> str:
+        """Why no error is predicted though somebody listens; empty while all is well."""
+        return self._predicted.problem
+
     def command(self, when: int) -> None:
         """Publish the compensator's command and correction, stamped `when`, ns."""
         self._command_out.write(self._compensator.command, period(self._answered, when), self._fastest)

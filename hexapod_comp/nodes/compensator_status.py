@@ -51,6 +51,8 @@ class CompensatorStatus:
         What was refused.
     frame_id : str
         Of the last command; empty before the first.
+    prediction_problem : str
+        Why no error is predicted though somebody listens; empty while all is well.
     source : CommandSource
         Who commands.
     own_topic : OwnTopic
@@ -58,7 +60,8 @@ class CompensatorStatus:
     measuring : CommandSource
         Who publishes measured struts.
     sensing : dict of str to CommandSource
-        Who publishes temperatures and humidity, by topic.
+        Who publishes temperatures, humidity and the choice of tool, by topic: a second one is not obeyed, and stops
+        nothing.
     thermometers : Thermometers
         Which of them no longer tell.
     command_stamps, reading_stamps : StampGate
@@ -81,7 +84,7 @@ class CompensatorStatus:
         self.commands, self.feedback = Flow(), Flow()
         self.refusals, self.bad_feedback = Refusals(), Refusals()
         self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
-        self.frame_id = ""
+        self.frame_id = self.prediction_problem = ""
         self.following, self.last_known = Following(), LastKnown()
         self.standing = Standing(self.following.commands)
         self.log_space = LogSpace()
@@ -154,6 +157,8 @@ class CompensatorStatus:
         if self.refused_tools.recent(now):
             yield WARN, f"tool refused: {self.refused_tools.last_text}"
         yield from self._lost(now)
+        if self.prediction_problem:
+            yield WARN, self.prediction_problem
         if self.log_space.problem:
             yield WARN, self.log_space.problem
         if self.last_known.waits(now):

@@ -13,6 +13,7 @@ import queue
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from typing import IO, Any
 
@@ -29,6 +30,9 @@ from .stamps import stamp_of
 
 PERIOD = 0.2
 """How often a prediction is asked for and published, s."""
+
+TRY_AGAIN_AFTER = (2.0, 60.0)
+"""A process that failed is started anew after this long, s: the first time, and at most, as the wait doubles."""
 
 
 class PredictionError(HexapodError):
@@ -122,6 +126,11 @@ class PredictedErrorTopics:
         ``frame_id``: of the work frame, along whose axes errors are.
     stamp : callable
         Returns the last command's stamp, ns.
+
+    Attributes
+    ----------
+    problem : str
+        Why nothing is published though somebody listens; empty while all is well.
     """
 
     def __init__(
@@ -135,7 +144,8 @@ class PredictedErrorTopics:
         self._process: PredictionProcess | None = None
         self._source: Source | None = None
         self._asked_for = 0
-        self._failed = False
+        self.problem = ""
+        self._wait, self._again_at = TRY_AGAIN_AFTER[0], 0.0
         self._timer = node.every(PERIOD, self._look)
 
     def close(self) -> None:
@@ -148,21 +158,25 @@ class PredictedErrorTopics:
     def _look(self) -> None:
         """Publish what has been worked out, and ask for the newest pose, while somebody listens."""
         wanted = any(publisher.get_subscription_count() for publisher in self._topics.values())
+        now = time.monotonic()
         if not wanted or self._source is not self._files.sources["model"]:
             self._stop()
-            self._source, self._failed = self._files.sources["model"], False
-        if not wanted or self._failed or not np.isfinite(self._compensator.nominal).all():
+            self._source, self.problem = self._files.sources["model"], ""
+            self._wait, self._again_at = TRY_AGAIN_AFTER[0], 0.0
+        if not wanted or now < self._again_at or not np.isfinite(self._compensator.nominal).all():
             return
         if self._process is None:
             self._process = PredictionProcess(self._files.handed_on())
         try:
             result = self._process.result()
         except PredictionError as error:
-            self._node.warn_of("predicted error", f"no predicted error: {error}")
+            self.problem = f"no predicted error: {error}"
+            self._node.warn_of("predicted error", f"{self.problem}; tried again in {self._wait:g} s")
             self._stop()
-            self._failed = True
+            self._again_at, self._wait = now + self._wait, min(2.0 * self._wait, TRY_AGAIN_AFTER[1])
             return
         if result is not None:
+            self.problem, self._wait = "", TRY_AGAIN_AFTER[0]
             self._publish(result)
         if not self._process.busy:
             self._ask(self._process)

@@ -10,6 +10,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from . import open_streams
 from .middleware import avoid_shared_memory
 
 
@@ -27,6 +28,7 @@ class RosSession:
     """
 
     def __init__(self, name: str, namespace: str = "", **options: Any) -> None:
+        open_streams()
         avoid_shared_memory()
         self._context = rclpy.Context()
         rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)

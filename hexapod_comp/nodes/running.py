@@ -18,7 +18,7 @@ from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 
 from ..errors import LONGEST_TEXT, HexapodError, printable
-from . import heard_signals
+from . import heard_signals, open_streams
 from .arguments import Program
 from .log_relay import LogRelay
 from .memory import give_blocks_back, give_code_back
@@ -67,7 +67,7 @@ def run(
     argv: Sequence[str] | None = None,
     kernels: Callable[[], None] = lambda: None,
 ) -> int:
-    """Run a node until SIGINT or SIGTERM.
+    """Run a node until SIGINT, SIGTERM or SIGHUP.
 
     Signals are only noted, since rclpy's own handling loses the last message and exits non-zero on a
     second Ctrl-C, which ``ros2 launch`` sends.
@@ -92,6 +92,7 @@ def run(
     refusal = program.refusal(arguments)
     if refusal is not None:
         return refusal
+    open_streams()
     give_blocks_back()
     heard = heard_signals()
     with _own_stderr() as stderr:

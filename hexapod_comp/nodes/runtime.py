@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -23,15 +24,12 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from ..errors import CommandError, shorten
-from .callbacks import numbered
+from .callbacks import Ticker, numbered
 from .guarding import CallbackGuard, PlainLogger, Throttle
 from .health import HealthReport, joined
 from .messages import read_message
 from .parameters import Parameter, Parameters
 from .stamps import StampClock
-
-NEVER = 3600.0
-"""Period of a timer that rests, s: it is stopped then."""
 
 COMMAND_QOS = QoSProfile(depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 """Commands: each must arrive. A hundred wait while a busy processor pauses for 0.1 s at 1 kHz, or a cable repeats."""
@@ -102,15 +100,15 @@ class MachineNode(LifecycleNode):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", EVENT_QOS)
         self.speak_for("")
-        self._at_rate: dict[str, Timer] = {}
+        self._tickers: dict[str, Ticker] = {}
         self._options = Parameters(self, table, self._on_parameters)
         self.clock = StampClock(self.simulated_time())
         self._steps_said = 0
         self.wants_autostart = bool(self._options.get("autostart", True))
 
     def _on_parameters(self, names: set[str]) -> None:
-        for name in names & self._at_rate.keys():
-            self._set_rate(name)
+        for name in names & self._tickers.keys():
+            self._tickers[name].set_rate(self._options[name])
         self.on_parameters(names)
 
     def on_parameters(self, names: set[str]) -> None:
@@ -217,6 +215,25 @@ class MachineNode(LifecycleNode):
             step = self.clock.last_step * 1e-9
             self.warn_of("clock", f"the clock was set {'back' if step < 0 else 'forward'} by {abs(step):.3f} s")
 
+    @contextmanager
+    def all_or_nothing(self) -> Iterator[None]:
+        """Close what is opened in this block where it raises, so that the node is as it was before."""
+        kinds: tuple[tuple[str, Callable[[Any], Any]], ...] = (
+            ("timers", self.destroy_timer),
+            ("subscriptions", self.destroy_subscription),
+            ("services", self.destroy_service),
+            ("clients", self.destroy_client),
+            ("publishers", self.destroy_publisher),
+        )
+        before = {kind: list(getattr(self, kind)) for kind, _ in kinds}
+        try:
+            yield
+        except BaseException:
+            for kind, destroy in kinds:
+                for entity in [entity for entity in getattr(self, kind) if entity not in before[kind]]:
+                    destroy(entity)
+            raise
+
     def publish_on(self, message_type: type, topic: str, qos: QoSProfile, deadline: float = 0.0) -> Publisher:
         """Return a publisher; it offers to publish every `deadline` s at least, 0: it offers nothing."""
         qos = copy.copy(qos)
@@ -224,26 +241,17 @@ class MachineNode(LifecycleNode):
         return self.create_publisher(message_type, topic, qos, qos_overriding_options=OVERRIDES)
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
-        """Return a timer on a clock that nobody can set: the node's own stops for as long as it is set back."""
+        """Return a timer on a clock that nobody can set: the node's own stops for as long as it is set back.
+
+        Its period stays, and it is never reset: see :class:`~.callbacks.Alarm`.
+        """
         return self.create_timer(period, callback, clock=self._steady)
 
-    def at_rate(self, name: str, callback: Callable[[], None]) -> Timer:
-        """Return a timer that runs as many times a second as a parameter says, also when that is set anew; 0: none."""
-        self._at_rate[name] = timer = self.every(NEVER, callback)
-        self._set_rate(name)
-        return timer
-
-    def destroy_timer(self, timer: Timer) -> bool:
-        """Destroy a timer."""
-        self._at_rate = {name: other for name, other in self._at_rate.items() if other is not timer}
-        return bool(super().destroy_timer(timer))
-
-    def _set_rate(self, name: str) -> None:
-        timer, rate = self._at_rate[name], self._options[name]
-        timer.cancel()
-        if rate:
-            timer.timer_period_ns = round(1e9 / rate)
-            timer.reset()
+    def at_rate(self, name: str, callback: Callable[[], None]) -> Ticker:
+        """Return what calls back as many times a second as a parameter says, also when that is set anew; 0: never."""
+        guarded = self.guard.around(name, callback)
+        self._tickers[name] = ticker = Ticker(self, guarded, self._options[name])
+        return ticker
 
     def listen_to(
         self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
@@ -304,5 +312,7 @@ class MachineNode(LifecycleNode):
         rclpy leaves those to the garbage collector: a node that somebody still refers to would go on to offer
         services that nobody answers.
         """
+        for ticker in self._tickers.values():
+            ticker.close()
         super().destroy_node()
         self._state_machine.destroy_when_not_in_use()

@@ -73,7 +73,12 @@ class StrutDriveNode(MachineNode):
             self._drive = None
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
-        self._open_topics()
+        try:
+            with self.all_or_nothing():
+                self._open_topics()
+        except Exception:
+            self._drive = None  # else the end would say goodbye on topics that there are not
+            raise
         self._stamps = StampGate("command", self.clock, options["command_validity"], future=False)
         self._no_step, self._log_space = NoStep(geometry), LogSpace()
         self.get_logger().info(f"configured machine {geometry.name!r} with hidden truth {machine.model.name!r}")

@@ -13,9 +13,11 @@ from ..compensation.compensator import Compensator
 from ..errors import CommandError, HexapodError
 from ..machine.frames import BASE, WORK
 from ..machine.geometry import HexapodGeometry
+from .command_source import CommandSource
 from .compensator_status import CompensatorStatus
+from .messages import read_message
 from .parameters import ParameterError
-from .runtime import COMMAND_QOS, MachineNode
+from .runtime import MachineNode
 from .vital_signs import LATCHED_QOS
 
 
@@ -38,7 +40,8 @@ def frame_ids(geometry: HexapodGeometry, options: dict[str, Any]) -> dict[str, s
 class ToolChoice:
     """The tool in use: the parameter ``tool`` and the topic ``select_tool`` choose it, ``~/tool`` says which it is.
 
-    The topic is for controllers: it sets the parameter. Only a machine that stands takes another tool.
+    The topic is for controllers: it sets the parameter. Only one node may publish on it, and only a machine that stands
+    takes another tool.
 
     Parameters
     ----------
@@ -52,7 +55,11 @@ class ToolChoice:
 
     def __init__(self, node: MachineNode, compensator: Compensator, status: CompensatorStatus) -> None:
         self._node, self._compensator, self._status = node, compensator, status
-        self._selected = node.listen_to(String, "select_tool", self._on_message, COMMAND_QOS)
+        self._selected = node.obey(String, "select_tool", self._on_message, self._look_at_publishers)
+        several = bool(node.get_parameter("allow_several_publishers").value)
+        selected = self._selected
+        self._source = CommandSource(node, selected.topic_name, selected.get_publisher_count, several)
+        status.sensing["select_tool"] = self._source
         self._publisher = node.create_publisher(String, "~/tool", LATCHED_QOS)
         node.add_on_set_parameters_callback(self._look)
         node.add_post_set_parameters_callback(self._take)
@@ -62,6 +69,7 @@ class ToolChoice:
         """Take no more tools."""
         self._node.remove_on_set_parameters_callback(self._look)
         self._node.remove_post_set_parameters_callback(self._take)
+        self._status.sensing.pop("select_tool", None)
         self._node.destroy_subscription(self._selected)
         self._node.destroy_publisher(self._publisher)
 
@@ -90,13 +98,31 @@ class ToolChoice:
                 self._node.note("tool", f"tool {name!r}: the next command must be where the struts are")
                 self._publish()
 
-    def _on_message(self, message: String) -> None:
-        result = self._node.set_parameters([Parameter("tool", value=message.data)])[0]
-        if not result.successful:
-            self._status.refused_tools.add("tool", result.reason, time.monotonic())
-            self._node.warn_of("tool", f"select_tool refused: {result.reason}")
-            if not self._status.standing.moving(time.monotonic()):  # commands for the tool it did not get may follow
-                self._compensator.set_tool(self._compensator.geometry.tool_name)
+    def _look_at_publishers(self) -> None:
+        self._source.look(time.monotonic())
+
+    def _on_message(self, data: bytes, number: int | None) -> None:
+        now = time.monotonic()
+        self._source.look(now)  # who has just come may have spoken already
+        self._source.hear(number, now)
+        try:
+            if self._source.problem:
+                raise CommandError(self._source.reason, self._source.problem)
+            self._select(read_message(data, String).data)
+        except CommandError as error:
+            self._status.refused_tools.add(error.reason, str(error), now)
+            self._node.warn_of("tool", f"select_tool refused: {error}")
+
+    def _select(self, name: str) -> None:
+        """Take a tool as the parameter would; where the commander's is refused, its next command must be where the
+        struts are: commands for the tool that it did not get may follow. Whoever else asks in vain stops nothing."""
+        result = self._node.set_parameters([Parameter("tool", value=name)])[0]
+        if result.successful:
+            return
+        commands = set(self._source.names) <= set(self._status.source.names)
+        if commands and not self._status.standing.moving(time.monotonic()):
+            self._compensator.set_tool(self._compensator.geometry.tool_name)
+        raise CommandError("tool", result.reason)
 
     def _publish(self) -> None:
         self._publisher.publish(String(data=self._compensator.geometry.tool_name))

@@ -53,7 +53,7 @@ class VitalSigns:
         self._stopped: bool | None = None
         self._published_at = 0.0
         self.stop(True)
-        self._timer = node.at_rate("heartbeat_rate", self._beats)
+        self._ticker = node.at_rate("heartbeat_rate", self._beats)
 
     def stop(self, stopped: bool) -> None:
         """Say whether the node stops the machine, where that has changed or has not been said for a while."""
@@ -68,7 +68,7 @@ class VitalSigns:
 
     def close(self) -> None:
         """Stop beating."""
-        self._node.destroy_timer(self._timer)
+        self._ticker.close()
         for publisher in (self._heartbeats, self._validities, self._stops):
             self._node.destroy_publisher(publisher)
 

@@ -128,9 +128,9 @@ def test_a_refused_command_is_said_with_its_reason(client, pair):
     ("to_compensator", "to_drive"),
     [
         ((signal.SIGINT, signal.SIGINT), (signal.SIGTERM,)),
-        ((signal.SIGTERM, signal.SIGINT), (signal.SIGINT, signal.SIGINT)),
+        ((signal.SIGHUP, signal.SIGTERM), (signal.SIGINT, signal.SIGINT)),
     ],
-    ids=["double SIGINT, SIGTERM", "SIGTERM and SIGINT, double SIGINT"],
+    ids=["double SIGINT, SIGTERM", "SIGHUP and SIGTERM, double SIGINT"],
 )
 def test_signals_end_both_with_0(client, pair, to_compensator, to_drive):
     """A double SIGINT is what ``ros2 launch`` sends. The last thing said arrives."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+from unittest.mock import MagicMock
 
 import calibration_helpers as small
 import numpy as np
@@ -22,7 +23,8 @@ from hexapod_comp.machine.kinematics import Structure, strut_lengths
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.nodes import predicted_error
-from hexapod_comp.nodes.predicted_error import PredictionProcess, error_message
+from hexapod_comp.nodes.health import WARN
+from hexapod_comp.nodes.predicted_error import PredictedErrorTopics, PredictionError, PredictionProcess, error_message
 from hexapod_comp.pose import Pose
 
 STANDING, ALIGNED = "compensator/predicted_error", "compensator/predicted_error_aligned"
@@ -110,15 +112,53 @@ def test_nothing_is_worked_out_while_nobody_listens(bench, started, tmp_path):
     assert predicted._process is None
 
 
-def test_a_process_that_dies_is_told_once_and_stops_nothing(bench, started, tmp_path):
+def test_a_process_that_dies_is_said_and_started_anew(bench, started, tmp_path, monkeypatch):
+    monkeypatch.setattr(predicted_error, "TRY_AGAIN_AFTER", (0.3, 60.0))
     bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
     bench.ask(small.paper().home)
     listen(bench, STANDING)
     bench.until(lambda: bench.seen[STANDING], "predicted error", STARTED)
     os.kill(started[0]._process.pid, 9)  # type: ignore[union-attr]
-    bench.until(lambda: bench.logged("no predicted error: the process that predicts"), "the complaint")
+    bench.until(lambda: "no predicted error: the process that predicts" in bench.message(), "the warning")
+    assert bench.status().level == WARN
     bench.ask(small.paper().home)
-    assert len(started) == 1
+    before = len(bench.seen[STANDING])
+    bench.until(lambda: len(bench.seen[STANDING]) > before, "predicted errors again", STARTED)
+    assert len(started) == 2
+    bench.until(lambda: "no predicted error" not in bench.message(), "the end of the warning")
+
+
+def test_a_process_that_fails_every_time_is_tried_less_and_less_often(monkeypatch):
+    """Truth: the waits double from 2 s to 60 s; a stand-in for the process fails at once."""
+    began = []
+
+    class Failing:
+        busy = True
+
+        def __init__(self, setup):
+            began.append(now)
+
+        def result(self):
+            raise PredictionError("it cannot")
+
+        def close(self):
+            pass
+
+    node, publisher = MagicMock(), MagicMock()
+    node.create_publisher.return_value = publisher
+    publisher.get_subscription_count.return_value = 1
+    monkeypatch.setattr(predicted_error, "PredictionProcess", Failing)
+    monkeypatch.setattr(predicted_error.time, "monotonic", lambda: now)
+    compensator, files = MagicMock(nominal=np.zeros(6)), MagicMock(sources={"model": object()})
+    topics = PredictedErrorTopics(node, compensator, files, "work", lambda: 0)
+    for tick in range(1000):
+        now = 100.0 + 0.2 * tick
+        topics._look()
+        assert topics.problem == "no predicted error: it cannot"
+    np.testing.assert_allclose(np.diff(began), [2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0], atol=0.21)
+    publisher.get_subscription_count.return_value = 0
+    topics._look()
+    assert topics.problem == ""
 
 
 def test_a_new_model_is_predicted_with(bench, tmp_path):

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from foreign_machines import Machine, with_frames
 from node_helpers import RELIABLE, Bench
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -33,6 +36,14 @@ def machine() -> Machine:
 @pytest.fixture
 def file(machine: Machine, tmp_path: Path) -> str:
     return str(machine.write(tmp_path / "machine.yaml"))
+
+
+@pytest.fixture
+def stranger(bench: Bench) -> Iterator[Node]:
+    """Another node, of another name."""
+    node = rclpy.create_node("stranger", context=bench.context)
+    yield node
+    node.destroy_node()
 
 
 def at_home(machine: Machine, tool: str | None = None, work: str | None = None, shift: float = 0.0) -> Pose:
@@ -124,6 +135,33 @@ def test_a_controller_selects_a_tool_by_a_topic(bench: Bench, machine: Machine, 
     bench.send(at_home(machine, "stub", shift=1e-4), "work")
     bench.until_status(ERROR, "refusing commands: tool_changed")
     bench.ask(at_home(machine, "stub"), "work")
+
+
+def test_a_stranger_who_selects_a_wrong_tool_stops_nothing(bench: Bench, machine: Machine, file: str, stranger) -> None:
+    """He does not command: what he asks for in vain is said, and the controller's next step is taken as ever."""
+    started(bench, file)
+    select = stranger.create_publisher(String, "select_tool", RELIABLE)
+    bench.until(select.get_subscription_count)
+    bench.ask(at_home(machine), "work")
+    select.publish(String(data="drill"))
+    values = bench.until_status(WARN, "tool refused: parameter tool: machine framed has no tool 'drill'")
+    assert values["select_tool_by"] == "/stranger"
+    bench.ask(at_home(machine, shift=1e-4), "work")
+
+
+def test_of_two_who_select_tools_none_is_obeyed(bench: Bench, machine: Machine, file: str, stranger) -> None:
+    started(bench, file)
+    select = bench.witness.create_publisher(String, "select_tool", RELIABLE)
+    other = stranger.create_publisher(String, "select_tool", RELIABLE)
+    bench.until(lambda: select.get_subscription_count() and other.get_subscription_count())
+    bench.ask(at_home(machine), "work")
+    values = bench.until_status(ERROR, "select_tool ignored: several_publishers: several publishers of /select_tool")
+    assert values["select_tool_by"] == "/stranger, /witness"
+    for publisher in (select, other):
+        publisher.publish(String(data="stub"))
+    bench.until(lambda: bench.values().get("refused_tools") == "2")
+    assert bench.values()["tool"] == "tool"
+    bench.ask(at_home(machine, shift=1e-4), "work")
 
 
 def test_the_tool_stays_while_the_machine_moves(bench: Bench, machine: Machine, file: str) -> None:
