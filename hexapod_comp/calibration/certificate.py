@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputFileError
+from ..formats.files import MAX_ARCHIVE_BYTES, read_bytes
 from ..formats.pages import page, picture, shown, table
 from ..formats.paths import input_file, version
 from ..formats.texts import number
@@ -393,10 +393,7 @@ def _files(fit: ModelFit, filed: Filed) -> str:
 
 
 def _sha256(path: Path) -> str:
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise InputFileError(path, "", f"cannot be read: {error.strerror}") from error
+    return hashlib.sha256(read_bytes(path, MAX_ARCHIVE_BYTES)).hexdigest()
 
 
 SIGNATURES = """<table class="text sign"><tbody><tr><th scope=row>evaluated by, date</th><td></td></tr>

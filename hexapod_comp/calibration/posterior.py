@@ -12,18 +12,20 @@ import io
 import json
 import zipfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import HexapodError, InputFileError, ModelError, PoseError
+from ..formats.files import MAX_ARCHIVE_BYTES, MEGABYTE, Opener, parsing, read_bytes
+from ..formats.json import json_content
 from ..formats.outputs import new_file
 from ..formats.paths import input_file
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
-from ..machine.model_file import save_model
+from ..machine.model_file import model_text, save_model, text_sha256
 from ..measurements.readings import KINDS
 from ..pose import Pose
 from .datum import HeldDatum
@@ -35,11 +37,21 @@ VERSION = 1
 
 SUFFIX = ".posterior.npz"
 
-HELD = ("datum_position", "datum_rotation", "datum_part", "datum_given_up")
+HELD = {"datum_position": (3,), "datum_rotation": (3, 3), "datum_part": (6, 6), "datum_given_up": (6,)}
 """Arrays of a held datum."""
 
-MOST_BYTES = 200_000_000
-"""Larger arrays are no fit's: some 5000 parameters."""
+REGION_SHAPES = {
+    "commands": (2,), "box": (2, 3), "platform_box": (2, 3), "work_box": (2, 3), "level": (3, 3), "probe": (3,)
+}  # fmt: skip
+
+LARGEST = 1e6
+"""No number of a fit is larger, SI: what is would overflow where it is squared."""
+
+ROUNDING = 1e-6
+"""By how much a correlation may be larger than one: the covariance is the inverse of what readings and priors know."""
+
+MOST_LISTED = 100
+"""No list of a fit's settings is longer."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +112,8 @@ def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, pa
     if fitted is None or (file.exists() and not file.is_file()):
         save_model(model, path)
         return []
-    beside, content = file.with_name(file.stem + SUFFIX), _content(fitted)
+    unnamed = model_text(replace(model, origin=replace(model.origin, posterior=None)))
+    beside, content = file.with_name(file.stem + SUFFIX), _content(fitted, text_sha256(unnamed))
     with new_file(beside, "wb") as stream:  # first: a model file never names what is not there yet
         stream.write(content)
     posterior = beside.name, hashlib.sha256(content).hexdigest()
@@ -108,10 +121,10 @@ def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, pa
     return [beside]
 
 
-def _content(fitted: FittedParameters) -> bytes:
+def _content(fitted: FittedParameters, model_sha256: str) -> bytes:
     space, stream = fitted.space, io.BytesIO()
     head = {"format": FORMAT, "version": VERSION, "machine": space.geometry.name, "settings": asdict(space.settings)}
-    head["kinds"] = KINDS
+    head |= {"kinds": KINDS, "model_sha256": model_sha256}
     arrays = {name: getattr(fitted, name) for name in ("x", "tolerances", "noise")}
     arrays["covariance"] = fitted.covariance[np.tril_indices(space.size)]  # it is symmetric
     arrays |= {f"region_{name}": value for name, value in vars(space.region).items()}
@@ -126,7 +139,7 @@ def load_posterior(
     model: MachineModel,
     geometry: HexapodGeometry,
     path: str | Path,
-    opener: Callable[[str, int], int] | None = None,
+    opener: Opener | None = None,
 ) -> tuple[FittedParameters | None, str]:
     """Return what a model's fit knows of its parameters, or why that is not known.
 
@@ -149,86 +162,153 @@ def load_posterior(
     name, digest = model.origin.posterior
     try:
         file = input_file(path).with_name(name)
-        content = _read(file, opener)
+        content = read_bytes(file, MAX_ARCHIVE_BYTES, opener)
         if hashlib.sha256(content).hexdigest() != digest:
             return None, f"{name} is not the file that was written with model {model.name!r}"
-        return _parsed(content, file, geometry), ""
+        head, arrays = _unpacked(content, file)
+        if head.get("model_sha256") != model.origin.text_sha256:
+            return None, (
+                f"{name} belongs to another text than that of model {model.name!r}: the model file was altered after "
+                "its fit, or comes from an earlier version; fit again"
+            )
+        return _parsed(head, arrays, file, geometry), ""
     except HexapodError as error:
         return None, str(error)
 
 
-def _read(path: Path, opener: Callable[[str, int], int] | None) -> bytes:
-    try:
-        with open(path, "rb", opener=opener) as stream:
-            content = stream.read(MOST_BYTES + 1)
-    except OSError as error:
-        raise InputFileError(path, "", f"cannot be read: {error.strerror}") from error
-    if len(content) > MOST_BYTES:
-        raise InputFileError(path, "", f"larger than the allowed {MOST_BYTES // 1_000_000} MB")
-    return content
+NOT_ONE = "is no file of a fit's posterior"
 
 
-def _parsed(content: bytes, path: Path, geometry: HexapodGeometry) -> FittedParameters:
+def _unpacked(content: bytes, path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return a file's head and its arrays, all of which are finite."""
+    with parsing(path, NOT_ONE):
+        size = sum(part.file_size for part in zipfile.ZipFile(io.BytesIO(content)).infolist())
+    if size > MAX_ARCHIVE_BYTES:
+        raise InputFileError(path, "", f"unpacks to more than {MAX_ARCHIVE_BYTES // MEGABYTE} MB")
+    with parsing(path, NOT_ONE), np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        arrays = {name: np.asarray(archive[name]) for name in archive.files}
+        head = json_content(str(arrays.pop("head")))
+    if not isinstance(head, dict):
+        raise InputFileError(path, "head", "must be an object", head)
+    for name, array in arrays.items():
+        if name != "labels" and not (array.dtype.kind == "f" and (np.abs(array) <= LARGEST).all()):
+            raise InputFileError(path, name, f"must be finite numbers, up to ±{LARGEST:g}")
+    return head, arrays
+
+
+def _parsed(
+    head: dict[str, Any], arrays: dict[str, np.ndarray], path: Path, geometry: HexapodGeometry
+) -> FittedParameters:
     """Return the parameters of a file's content.
 
     Raises
     ------
     InputFileError
-        It is no such file, of another version or machine, or its parts do not belong together.
+        It is of another version or machine, or its parts do not belong together.
     """
+    known = FORMAT, VERSION, geometry.name
+    found = tuple(head.get(key) for key in ("format", "version", "machine"))
+    if found != known:
+        raise InputFileError(path, "head", f"must be {known}", found)
+
+    def array(name: str, *shape: int) -> np.ndarray:
+        if name not in arrays or arrays[name].shape != shape:
+            given = list(arrays[name].shape) if name in arrays else "none"
+            raise InputFileError(path, name, f"must be an array of shape {shape}", given)
+        return arrays[name]
+
+    region = Region(**{name: array(f"region_{name}", *shape) for name, shape in REGION_SHAPES.items()})
     try:
-        if sum(part.file_size for part in zipfile.ZipFile(io.BytesIO(content)).infolist()) > MOST_BYTES:
-            raise InputFileError(path, "", f"unpacks to more than {MOST_BYTES // 1_000_000} MB")
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            arrays = dict(archive)
-        head = json.loads(str(arrays["head"]))
-        known = FORMAT, VERSION, geometry.name
-        if (head["format"], head["version"], head["machine"]) != known:
-            raise InputFileError(path, "head", f"must be {known}", [head["format"], head["version"], head["machine"]])
-        region = Region(**{entry.name: arrays[f"region_{entry.name}"] for entry in fields(Region)})
-        space = ParameterSpace((geometry, region), _settings(head["settings"]))
-        if tuple(arrays["labels"].tolist()) != space.labels:
-            problem = "are not those of this geometry's parameters; was the geometry changed?"
-            raise InputFileError(path, "labels", problem)
-        covariance = np.zeros((space.size, space.size))
-        covariance[np.tril_indices(space.size)] = arrays["covariance"]
-        covariance += np.tril(covariance, -1).T
-        noise = _noise(arrays["noise"], head.get("kinds"))
-        fitted = FittedParameters(space, arrays["x"], covariance, arrays["tolerances"], noise, _held(arrays))
-    except (KeyError, TypeError, ValueError, zipfile.BadZipFile, ModelError, PoseError) as error:
-        raise InputFileError(path, "", f"is no file of a fit's posterior: {error}") from error
-    shapes = {"x": (space.size,), "covariance": (space.size,) * 2}
-    shapes |= {"tolerances": (len(space.blocks),), "noise": (len(KINDS),)}
-    for name, shape in shapes.items():
-        array = getattr(fitted, name)
-        if array.shape != shape or not np.isfinite(array).all():
-            raise InputFileError(path, name, f"must be finite, of shape {shape}", list(array.shape))
-    return fitted
+        space = ParameterSpace((geometry, region), _settings(path, head.get("settings")))
+    except (ModelError, PoseError) as error:
+        raise InputFileError(path, "head.settings", str(error)) from error
+    labels = arrays.get("labels", np.zeros(0))
+    if tuple(labels.ravel().tolist()) != space.labels:
+        problem = "are not those of this geometry's parameters; was the geometry changed?"
+        raise InputFileError(path, "labels", problem)
+    n = space.size
+    covariance = np.zeros((n, n))
+    covariance[np.tril_indices(n)] = array("covariance", n * (n + 1) // 2)
+    covariance += np.tril(covariance, -1).T
+    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    if (np.diag(covariance) < 0.0).any() or (
+        np.abs(covariance) > (1.0 + 1e-6) * np.outer(deviations, deviations)
+    ).any():
+        raise InputFileError(path, "covariance", "must be a covariance: no correlation is larger than one")
+    tolerances, noise = array("tolerances", len(space.blocks)), _noise(path, arrays, head.get("kinds"))
+    for name, values in (("tolerances", tolerances), ("noise", noise)):
+        if not (values > 0.0).all():
+            raise InputFileError(path, name, "must be above zero", values.min())
+    held = None
+    if any(name in arrays for name in HELD):  # older files have none
+        position, rotation, part, given_up = (array(name, *shape) for name, shape in HELD.items())
+        with parsing(path, "datum", PoseError):
+            held = HeldDatum(Pose(position, rotation), part, given_up)
+    return FittedParameters(space, array("x", n), covariance, tolerances, noise, held)
 
 
-def _noise(factors: np.ndarray, kinds: list[str] | None) -> np.ndarray:
+def _noise(path: Path, arrays: dict[str, np.ndarray], kinds: Any) -> np.ndarray:
     """Return a file's noise factors in the order of :data:`KINDS`; 1 for kinds that it does not know.
 
     Files that do not name the kinds are older, and have the first ones.
     """
-    names = KINDS[: len(factors)] if kinds is None else kinds
-    known = dict(zip(names, factors, strict=True))
-    unknown = [name for name in known if name not in KINDS]
-    if unknown:
-        raise ValueError(f"kinds {unknown} are unknown; allowed are {list(KINDS)}")
+    factors = arrays.get("noise", np.zeros((0, 0)))
+    if factors.ndim != 1:
+        raise InputFileError(path, "noise", "must be a list of numbers", list(factors.shape))
+    names = list(KINDS[: len(factors)]) if kinds is None else kinds
+    if not isinstance(names, list) or len(names) != len(factors) or not all(name in KINDS for name in names):
+        raise InputFileError(path, "head.kinds", f"must name the kind of each noise factor, of {list(KINDS)}", names)
+    known = dict(zip(names, factors.tolist(), strict=True))
     return np.array([known.get(name, 1.0) for name in KINDS])
 
 
-def _held(arrays: dict[str, np.ndarray]) -> HeldDatum | None:
-    """Return the datum of a file's arrays; None: it is older than that."""
-    if not any(name in arrays for name in HELD):
-        return None
-    position, rotation, part, given_up = (arrays[name] for name in HELD)
-    if part.shape != (6, 6) or given_up.shape != (6,) or not (np.isfinite(part).all() and np.isfinite(given_up).all()):
-        raise ValueError("datum_part and datum_given_up must be finite, of shapes (6, 6) and (6,)")
-    return HeldDatum(Pose(position, rotation), part, given_up)
+def _settings(path: Path, given: Any) -> FitSettings:
+    """Return the settings of a file's head, each of the type that it has by default."""
+    if not isinstance(given, dict):
+        raise InputFileError(path, "head.settings", "must be an object", given)
+    for name, value in given.items():
+        if name not in SETTINGS:
+            raise InputFileError(path, f"head.settings.{name}", "is not known to this release", value)
+        allowed, fits = SETTINGS[name]
+        if not fits(value):
+            raise InputFileError(path, f"head.settings.{name}", f"must be {allowed}", value)
+    lists = {name: tuple(tuple(v) if isinstance(v, list) else v for v in value)
+             for name, value in given.items() if isinstance(value, list)}  # fmt: skip
+    return FitSettings(**{**given, **lists})
 
 
-def _settings(given: dict[str, Any]) -> FitSettings:
-    tolerances = tuple((name, value) for name, value in given.pop("tolerances"))
-    return FitSettings(blocks=tuple(given.pop("blocks")), tolerances=tolerances, **given)
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
+
+
+def _is_list(value: Any, fits: Callable[[Any], bool]) -> bool:
+    return isinstance(value, list) and len(value) <= MOST_LISTED and all(map(fits, value))
+
+
+_TEXT = "text", lambda value: isinstance(value, str)
+_NUMBER = "a number", _is_number
+_OR_NULL = "a number or null", lambda value: value is None or _is_number(value)
+_SWITCH = "true or false", lambda value: isinstance(value, bool)
+
+SETTINGS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "blocks": ("a list of names", lambda value: _is_list(value, lambda v: isinstance(v, str))),
+    "shared_platform_joints": _SWITCH,
+    "lead": _OR_NULL,
+    "field_degree": ("a whole number", lambda value: type(value) is int),
+    "strut_expansion": _NUMBER,
+    "base_expansion": _NUMBER,
+    "platform_expansion": _NUMBER,
+    "strut_moisture": _OR_NULL,
+    "thermometer": _TEXT,
+    "time_constants": ("a list of numbers, or null", lambda value: value is None or _is_list(value, _is_number)),
+    "tolerances": (
+        "a list of names and numbers",
+        lambda value: _is_list(
+            value, lambda v: isinstance(v, list) and len(v) == 2 and isinstance(v[0], str) and _is_number(v[1])
+        ),
+    ),
+    "robust": _SWITCH,
+    "scale": _OR_NULL,
+    "alignment": _OR_NULL,
+}
+"""What each of the fit's settings is; a test holds it to :class:`FitSettings`."""

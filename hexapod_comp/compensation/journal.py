@@ -28,8 +28,9 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import HexapodError, InputFileError
-from ..formats.yaml import read_text
+from ..errors import HexapodError, InputFileError, shorten
+from ..formats.files import Opener, read_text
+from ..formats.json import json_content
 from ..machine.frames import BASE, TOOL, WORK
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry, parse_geometry
 from ..machine.model import MachineModel
@@ -78,6 +79,9 @@ REFUSALS_PER_PAGE = 20
 LARGEST_SOURCE = 250_000
 """Longer files are named, not copied, characters: the message is made while commands wait."""
 
+MOST_CHARACTERS = 8_000_000
+"""Longer messages are refused: a page of 50 ms has some 10 kB at 1 kHz, the files in use no more than 1.5 MB."""
+
 CPU_INFO = Path("/proc/cpuinfo")
 
 
@@ -111,10 +115,10 @@ class Source:
         return cls(name, text, hashlib.sha256(text.encode()).hexdigest())
 
     @classmethod
-    def read(cls, path: str | Path, opener: Callable[[str, int], int] | None = None) -> Source:
+    def read(cls, path: str | Path, opener: Opener | None = None) -> Source:
         """Return a file as it is now; what is made of it is made of this text, and never of a later one.
 
-        The opener is that of :func:`~hexapod_comp.formats.yaml.read_text`.
+        The opener is that of :func:`~hexapod_comp.formats.files.read_text`.
         """
         return cls.of(str(path), read_text(path, opener))
 
@@ -393,11 +397,12 @@ def read_sources(text: str) -> dict[str, Source]:
     """
     sources = {}
     try:
-        for key, entry in _content(text)["files"].items():
+        for key, entry in _object(_content(text)["files"], "files").items():
+            entry = _object(entry, f"files.{key}")
             text_or_none = None if entry["text"] is None else str(entry["text"])
             sources[key] = Source(str(entry["name"]), text_or_none, str(entry["sha256"]))
-    except (KeyError, TypeError, AttributeError) as error:
-        raise JournalError(f"not a message with files: {error!r}") from error
+    except KeyError as error:
+        raise JournalError(f"not a message with files: {error} is missing") from error
     for key, source in sources.items():
         if source.text is not None and Source.of("", source.text).sha256 != source.sha256:
             raise JournalError(f"the {key}'s text does not have the hash that stands beside it")
@@ -423,8 +428,10 @@ def read_page(text: str) -> Page:
             refused_more=int(content["refused_more"]),
             snapshot=None if content["snapshot"] is None else _read_snapshot(content["snapshot"]),
         )
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, binascii.Error) as error:
-        raise JournalError(f"not a page of the journal: {error!r}") from error
+    except KeyError as error:
+        raise JournalError(f"not a page of the journal: {error} is missing or unknown") from error
+    except (TypeError, ValueError, AttributeError, OverflowError, binascii.Error) as error:
+        raise JournalError(f"not a page of the journal: {error}") from error
     places = [page.begins, *(entry.after for entry in page.entries), page.begins + len(page.commands)]
     if places != sorted(places):
         raise JournalError("its entries and answers are not in an order that a journal can have")
@@ -433,8 +440,8 @@ def read_page(text: str) -> Page:
 
 def _content(text: str) -> dict[str, Any]:
     try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        content = json_content(text, MOST_CHARACTERS)
+    except ValueError as error:
         raise JournalError(f"not JSON: {error}") from error
     version = content.get("journal") if isinstance(content, dict) else content
     if isinstance(version, int) and version in OLDER:
@@ -442,6 +449,12 @@ def _content(text: str) -> dict[str, Any]:
         raise JournalError(f"is of version {int(version)}, which {OLDER[version]}; {advice}")
     if not isinstance(content, dict) or version not in READABLE:
         raise JournalError(f"must be of version {FORMAT}, not {str(version)[:40]}")
+    return content
+
+
+def _object(content: Any, where: str) -> dict[str, Any]:
+    if not isinstance(content, dict):
+        raise JournalError(f"{where} must be an object (found {shorten(content)})")
     return content
 
 
@@ -467,7 +480,7 @@ ENTRIES: dict[str, dict[str, Callable[[Any], Any]]] = {
 
 
 def _read_entry(content: Any) -> Entry:
-    what = content["what"]
+    what = str(_object(content, "an entry")["what"])
     return Entry(
         int(content["after"]),
         what,
@@ -476,25 +489,29 @@ def _read_entry(content: Any) -> Entry:
 
 
 def _read_snapshot(content: Any) -> Snapshot:
-    temperatures = {str(key): float(value) for key, value in content["state"]["temperatures"].items()}
+    state = _object(_object(content, "snapshot")["state"], "snapshot.state")
+    temperatures = {
+        key: float(value) for key, value in _object(state["temperatures"], "snapshot.state.temperatures").items()
+    }
     arrays = {
-        str(name): np.array([math.nan if v is None else float(v) for v in numbers])
-        for name, numbers in content["state"].items()
+        name: np.array([math.nan if v is None else float(v) for v in numbers])
+        for name, numbers in state.items()
         if name not in BESIDE_NUMBERS
     }
-    lags = {str(name): [float(v) for v in numbers] for name, numbers in content["state"].get("lags", {}).items()}
+    given = _object(state.get("lags", {}), "snapshot.state.lags")
+    lags = {name: [float(v) for v in numbers] for name, numbers in given.items()}
     return Snapshot(
-        state={**arrays, "temperatures": temperatures, "lags": lags, "tool": str(content["state"].get("tool", TOOL))},
-        model=_words(content["model"], "name", "sha256"),
-        geometry=_words(content["geometry"], "name", "sha256"),
-        frames=_words(content["frames"], *ROLES),
-        made_with=_words(content["made_with"]),
+        state={**arrays, "temperatures": temperatures, "lags": lags, "tool": str(state.get("tool", TOOL))},
+        model=_words(content, "model", "name", "sha256"),
+        geometry=_words(content, "geometry", "name", "sha256"),
+        frames=_words(content, "frames", *ROLES),
+        made_with=_words(content, "made_with"),
         joints=tuple(str(name) for name in content.get("joints", STRUT_NAMES)),
     )
 
 
-def _words(content: Any, *required: str) -> dict[str, str]:
-    words = {str(key): str(value) for key, value in content.items()}
-    if missing := [key for key in required if key not in words]:
-        raise KeyError(missing[0])
+def _words(content: dict[str, Any], key: str, *required: str) -> dict[str, str]:
+    words = {name: str(value) for name, value in _object(content[key], f"snapshot.{key}").items()}
+    if missing := [name for name in required if name not in words]:
+        raise KeyError(f"snapshot.{key}.{missing[0]}")
     return words

@@ -23,8 +23,9 @@ import numpy as np
 
 from ..errors import InputFileError
 from ..formats.csv import number_in
+from ..formats.files import read_text
 from ..formats.outputs import write_text
-from ..formats.yaml import UNITS, read_text
+from ..formats.yaml import UNITS
 from ..machine.geometry import STRUT_NAMES
 from .linuxcnc import MOST_POINTS, Genhexkins, ScrewTable
 

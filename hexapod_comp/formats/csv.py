@@ -6,6 +6,7 @@ may have decimal commas, as spreadsheets of many countries write them.
 
 from __future__ import annotations
 
+import codecs
 import csv
 import hashlib
 import io
@@ -24,9 +25,10 @@ import numpy as np
 from ..errors import InputFileError, PoseError
 from ..kernels.pose import QUATERNION_NORM_TOLERANCE
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
+from .files import MAX_CSV_BYTES, open_input, too_large
 from .paths import input_file
 from .texts import DECIMAL_COMMA, MICRO_ERRORS, number_hint, plain_number
-from .yaml import UNITS, spellings
+from .yaml import LARGEST, UNITS, spellings
 
 LABEL_COLUMNS = ("sequence", "name")
 POSITION_COLUMNS = ("x", "y", "z")
@@ -44,9 +46,18 @@ MAX_ROWS = 2_000_000
 MAX_COLUMNS = 1000
 """Wider files are refused: other laboratories' have some dozen columns."""
 
+MAX_CELLS = 40_000_000
+"""Larger tables are refused: each cell takes some 60 bytes."""
+
 MAX_LINE = 1_000_000
 """Longer lines are refused, in characters: a file without line ends would be read into memory whole."""
 
+ENCODINGS = ("utf-8", "utf-16", "windows-1252", "latin-1")
+"""What a file may be written in. Without a word it is UTF-16 where its mark says so, else UTF-8; what is neither is
+read as Windows-1252, of which Latin-1 is a part: only letters of names differ."""
+
+MOST_SKIPPED = 1000
+"""Rows above or below the header that may be skipped."""
 
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 """What may stand between columns; the first of them that is in the header does."""
@@ -97,8 +108,35 @@ class Row:
     label: str
 
 
+@dataclass(frozen=True)
+class Layout:
+    """How a CSV file is written, where its header does not show it.
+
+    Attributes
+    ----------
+    encoding : str
+        One of :data:`ENCODINGS`; empty: detected.
+    above, below : int
+        Rows to skip above the header, empty ones and comments too, and below it: titles, a row of units.
+    """
+
+    encoding: str = ""
+    above: int = 0
+    below: int = 0
+
+
+AS_USUAL = Layout()
+
+
 class Table:
     """A CSV file with its header understood.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    layout : Layout
+        How it is written.
 
     Attributes
     ----------
@@ -106,29 +144,21 @@ class Table:
         The file.
     sha256 : str
         Of the bytes that were read, hexadecimal.
+    notes : list of str
+        What was odd about it.
     header : list of str
         Column names.
     rows : list of (int, list of str)
         Line and cells of each row; all as many as the header's.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, layout: Layout = AS_USUAL) -> None:
         self.path = path
-        numbered, separator, self.sha256 = _read_rows(path)
-        self.header = [name.strip() for name in numbered[0][1]] if numbered else []
-        if len(self.header) > MAX_COLUMNS:
-            problem = f"has {len(self.header)} columns, at most {MAX_COLUMNS} are allowed"
-            raise InputFileError(path, "header", problem)
-        twice = [name for name in self.header if self.header.count(name) > 1]
-        if twice:
-            raise InputFileError(path, "header", "column is given twice", twice[0])
-        self.rows = numbered[1:]
+        content = _read_content(path, layout)
+        self.header, self.rows, self.sha256, self.notes = content.header, content.rows, content.sha256, content.notes
+        separator = content.separator
         if not self.rows:
             raise InputFileError(path, "", "has a header but no rows" if self.header else "has no header")
-        for line, row in self.rows:
-            if len(row) != len(self.header):
-                problem = f"has {len(row)} columns, the header has {len(self.header)}{_other_separator(row, separator)}"
-                raise InputFileError(path, f"line {line}", problem)
         if separator != ",":
             self._point_decimals()
         self._known: set[str] = {name for name in LABEL_COLUMNS if name in self.header}
@@ -256,14 +286,16 @@ def number_in(path: str | Path, where: str, text: str) -> float:
     value = plain_number(text)
     if math.isnan(value):
         raise InputFileError(path, where, f"must be a finite number{number_hint(text)}", text)
+    if abs(value) > LARGEST:
+        raise InputFileError(path, where, f"must be a number within ±{LARGEST:g}", text)
     return value
 
 
 class _Hashed(io.RawIOBase):
-    """The bytes of a file, hashed as they pass: what was read is what is named, also from a pipe."""
+    """The bytes of a file, counted and hashed as they pass: what was read is what is named, also from a pipe."""
 
-    def __init__(self, file: io.FileIO) -> None:
-        self._file = file
+    def __init__(self, file: io.FileIO, path: str | Path, most: int) -> None:
+        self._file, self._path, self._left, self._most = file, path, most, most
         self.sha256 = hashlib.sha256()
 
     def readable(self) -> bool:
@@ -271,39 +303,96 @@ class _Hashed(io.RawIOBase):
 
     def readinto(self, buffer: Any) -> int:
         count = self._file.readinto(buffer) or 0
+        self._left -= count
+        if self._left < 0:
+            raise too_large(self._path, self._most)
         self.sha256.update(memoryview(buffer)[:count])
         return count
 
 
-def _read_rows(path: str | Path) -> tuple[list[tuple[int, list[str]]], str, str]:
-    """Return the rows of a CSV file, less empty ones and comments, with their lines; its separator; its SHA-256."""
-    numbered: list[tuple[int, list[str]]] = []
+class _Content:
+    """The header and rows of a CSV file, less empty ones and comments; its separator and SHA-256."""
+
+    def __init__(self) -> None:
+        self.header: list[str] = []
+        self.rows: list[tuple[int, list[str]]] = []
+        self.separator, self.sha256 = ",", ""
+        self.notes: list[str] = []
+
+    def take_header(self, path: str | Path, cells: list[str]) -> None:
+        """Take the header's cells."""
+        if len(cells) > MAX_COLUMNS:
+            raise InputFileError(path, "header", f"has {len(cells)} columns, at most {MAX_COLUMNS} are allowed")
+        self.header = [name.strip() for name in cells]
+        twice = next((name for name in self.header if name and self.header.count(name) > 1), None)
+        if twice is not None:
+            raise InputFileError(path, "header", "column is given twice", twice)
+
+    def take_row(self, path: str | Path, line: int, cells: list[str]) -> None:
+        """Take a row's cells."""
+        if len(cells) != len(self.header):
+            problem = f"has {len(cells)} columns, the header has {len(self.header)}"
+            raise InputFileError(path, f"line {line}", problem + _other_separator(cells, self.separator))
+        if len(self.rows) >= MAX_ROWS:
+            raise InputFileError(path, "", f"has more than the allowed {MAX_ROWS} rows")
+        if len(self.rows) * len(cells) >= MAX_CELLS:
+            raise InputFileError(path, "", f"has more than the allowed {MAX_CELLS} cells")
+        self.rows.append((line, cells))
+
+
+def _read_content(path: str | Path, layout: Layout) -> _Content:
+    """Return what a CSV file holds; read again as Windows-1252 where it is not UTF-8 and nothing else was said."""
+    with open_input(path, MAX_CSV_BYTES) as file:
+        again = not layout.encoding and file.seekable()
+        start = file.read(2) if again else b""
+        encoding = layout.encoding or ("utf-16" if start in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8")
+        for attempt in (encoding, "windows-1252"):
+            if again:
+                file.seek(0)
+            try:
+                return _decoded(path, file, layout, attempt)
+            except UnicodeDecodeError as error:
+                if attempt != "utf-8" or not again:
+                    problem = f"is not {attempt.upper()} text"
+                    if not layout.encoding:
+                        problem += "; spreadsheets have 'CSV UTF-8' among the formats in which they save"
+                    raise InputFileError(path, "", problem) from error
+    raise AssertionError("Windows-1252 decodes all bytes, or raises")
+
+
+def _decoded(path: str | Path, file: io.FileIO, layout: Layout, encoding: str) -> _Content:
+    """Return what a file of a given encoding holds."""
+    content, source = _Content(), _Hashed(file, path, MAX_CSV_BYTES)
+    options = {"utf-8": ("utf-8-sig", MICRO_ERRORS), "windows-1252": ("cp1252", "replace")}
+    codec, errors = options.get(encoding, (encoding, "strict"))
+    stream = io.TextIOWrapper(io.BufferedReader(source), newline="", encoding=codec, errors=errors)
+    before, lines = 0, None
     try:
-        with open(path, "rb", buffering=0) as file:
-            source = _Hashed(file)
-            buffered = io.BufferedReader(source)
-            stream = io.TextIOWrapper(buffered, newline="", encoding="utf-8-sig", errors=MICRO_ERRORS)
-            before, header, rest = _up_to_header(_bounded_lines(path, stream))
-            separator = next((mark for mark in SEPARATORS if mark in QUOTED.sub("", header)), ",")
-            lines = csv.reader(itertools.chain([header], rest), delimiter=separator, skipinitialspace=True)
-            for row in lines:
-                if row and not row[0].startswith("#"):
-                    numbered.append((before + lines.line_num, row))
-                if len(numbered) > MAX_ROWS:
-                    raise InputFileError(path, "", f"has more than the allowed {MAX_ROWS} rows")
+        before, header, rest = _up_to_header(_bounded_lines(path, stream), layout.above)
+        content.separator = next((mark for mark in SEPARATORS if mark in QUOTED.sub("", header)), ",")
+        lines = csv.reader(itertools.chain([header], rest), delimiter=content.separator, skipinitialspace=True)
+        content.take_header(path, next(lines, []))
+        skipped = 0
+        for row in lines:
+            if skipped < layout.below:
+                skipped += 1
+            elif row and not row[0].startswith("#"):
+                content.take_row(path, before + lines.line_num, row)
     except csv.Error as error:
-        raise InputFileError(path, f"line {before + lines.line_num}", f"is not CSV: {error}") from error
+        line = before + (lines.line_num if lines else 0)
+        raise InputFileError(path, f"line {line}", f"is not CSV: {error}") from error
     except OSError as error:
         raise InputFileError(path, "", f"cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        problem = "is not UTF-8 text; spreadsheets have 'CSV UTF-8' among the formats in which they save"
-        raise InputFileError(path, f"line {len(numbered) + 1} or later", problem) from error
-    return numbered, separator, source.sha256.hexdigest()
+    if encoding == "windows-1252" and not layout.encoding:
+        content.notes = [f"{path}: is not UTF-8; its names were read as Windows-1252"]
+    content.sha256 = source.sha256.hexdigest()
+    return content
 
 
-def _up_to_header(lines: Iterator[str]) -> tuple[int, str, Iterator[str]]:
-    """Return how many lines stand before the first that is neither empty nor a comment, that line, and the rest."""
-    before = 0
+def _up_to_header(lines: Iterator[str], skipped: int) -> tuple[int, str, Iterator[str]]:
+    """Return how many lines stand before the first, below the skipped ones, that is neither empty nor a comment, that
+    line, and the rest."""
+    before = sum(1 for _ in itertools.islice(lines, skipped))
     for line in lines:
         if line.strip() and not line.lstrip().startswith(("#", '"#')):
             return before, line, lines

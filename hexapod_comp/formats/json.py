@@ -15,7 +15,29 @@ import numpy as np
 from ..errors import HexapodError
 from ..pose import Pose
 from .csv import pose_values
+from .files import MAX_FILE_BYTES
 from .texts import CODES
+
+
+def json_content(text: str, most: int = MAX_FILE_BYTES) -> Any:
+    """Return what JSON text from outside holds.
+
+    Raises
+    ------
+    ValueError
+        Not JSON, of more than `most` characters (short lists take twenty times their text), too deep, or with NaN or
+        Infinity, for which JSON has no words.
+    """
+    if len(text) > most:
+        raise ValueError(f"has {len(text)} characters, at most {most} are allowed")
+    try:
+        return json.loads(text, parse_constant=_refuse_constant)
+    except RecursionError as error:
+        raise ValueError("is nested too deep") from error
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no JSON")
 
 
 def json_text(result: Any, indent: int | None = 1) -> str:

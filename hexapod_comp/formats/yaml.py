@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from decimal import Decimal
 from functools import cache
 from itertools import islice
@@ -20,13 +20,15 @@ import numpy as np
 import yaml
 
 from ..errors import InputFileError, shorten
-from .texts import MICRO_ERRORS, number_hint
-
-MAX_FILE_BYTES = 8_000_000
-"""Larger files are refused before they are read: no model comes near it."""
+from .files import read_text
+from .texts import number_hint
 
 MAX_DEPTH = 32
 """Deeper nested YAML is refused: a model needs five levels, and the parser's own stack ends at some thousand."""
+
+MAX_NODES = 200_000
+"""YAML of more values, keys and lists is refused: each takes 10 µs and 600 bytes. A field of 20 × 20 lines along each
+axis, forward and backward, with six polynomials of the fifth order, has 120,000."""
 
 MOST_NEIGHBOURS = 1000
 """Keys looked through for the one that a misspelt key may mean: in a hostile file that would take minutes."""
@@ -45,6 +47,9 @@ UNITS: dict[str, dict[str, float]] = {
     "pressure": {"Pa": 1.0, "hPa": 1e2, "kPa": 1e3},
 }
 """Unit suffixes per kind of quantity, and their size in SI (temperatures stay in degrees Celsius)."""
+
+LARGEST = 1e12
+"""No number of a file is larger, in whatever unit: products of several stay finite."""
 
 MICROS = "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"
 """They look alike, and either may be on a keyboard: both stand for the u of um and urad."""
@@ -105,36 +110,6 @@ for _tag in ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float"):
     _StrictLoader.add_constructor(_tag, _plain_number)
 
 
-def read_text(path: str | Path, opener: Callable[[str, int], int] | None = None) -> str:
-    """Read a UTF-8 text file of bounded size.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-    opener : callable, optional
-        Opens it and may refuse it, as Python's ``open`` takes one; :func:`~hexapod_comp.formats.paths.confined_opener`.
-
-    Raises
-    ------
-    InputFileError
-        Missing, a folder, unreadable, too large, empty or not UTF-8; or refused.
-    """
-    try:
-        with open(path, "rb", opener=opener) as stream:  # bounded, also where the size is not known: pipes, devices
-            content = stream.read(MAX_FILE_BYTES + 1)
-        if len(content) > MAX_FILE_BYTES:
-            raise InputFileError(path, "", f"larger than the allowed {MAX_FILE_BYTES // 1_000_000} MB")
-        text = content.decode("utf-8-sig", MICRO_ERRORS).replace("\r\n", "\n").replace("\r", "\n")
-    except OSError as error:
-        raise InputFileError(path, "", f"cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise InputFileError(path, "", f"is not UTF-8 text (byte {error.start})") from error
-    if not text.strip():
-        raise InputFileError(path, "", "is empty")
-    return text
-
-
 def read_yaml(path: str | Path, file_format: str, version: int) -> Section:
     """Read a YAML file as :func:`parse_yaml` does its text."""
     return parse_yaml(read_text(path), path, file_format, version)
@@ -164,16 +139,7 @@ def parse_yaml(text: str, name: str | Path, file_format: str, version: int) -> S
     InputFileError
         Not YAML, another format or version.
     """
-    try:
-        _refuse_tricks(text)
-        content = yaml.load(text, Loader=_StrictLoader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        problem = getattr(error, "problem", None) or type(error).__name__
-        mark = getattr(error, "problem_mark", None)
-        where = f"line {mark.line + 1}" if mark is not None else ""
-        if mark is not None and "".join(text.split("\n")[mark.line : mark.line + 1]).lstrip(" ").startswith("\t"):
-            problem += "; YAML is indented by spaces, not by tabs"
-        raise InputFileError(name, where, f"is not valid YAML: {problem}") from error
+    content = yaml_content(text, name)
     if not isinstance(content, dict):
         raise InputFileError(name, "", "must hold keys and values at its top level", content)
     section = Section(name, "", content)
@@ -186,19 +152,42 @@ def parse_yaml(text: str, name: str | Path, file_format: str, version: int) -> S
     return section
 
 
-def _refuse_tricks(text: str) -> None:
+def yaml_content(text: str, name: str | Path, most_nodes: int = MAX_NODES) -> Any:
+    """Return what YAML holds: plain values, lists and mappings, not too many and not too deep.
+
+    Raises
+    ------
+    InputFileError
+        Not YAML; with references or tags; a key given twice or no text; too large. Names the line.
+    """
+    try:
+        _refuse_tricks(text, most_nodes)
+        return yaml.load(text, Loader=_StrictLoader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        problem = getattr(error, "problem", None) or type(error).__name__
+        mark = getattr(error, "problem_mark", None)
+        where = f"line {mark.line + 1}" if mark is not None else ""
+        if mark is not None and "".join(text.split("\n")[mark.line : mark.line + 1]).lstrip(" ").startswith("\t"):
+            problem += "; YAML is indented by spaces, not by tabs"
+        raise InputFileError(name, where, f"is not valid YAML: {problem}") from error
+
+
+def _refuse_tricks(text: str, most_nodes: int) -> None:
     """Raise on what lets a short file stand for something else, before anything is made of it.
 
-    Nested references (``*name``) stand for more values than memory holds, nesting overflows the parser's stack
-    and ends the process, a tag (``!!float``) makes the loader read a value as another type.
+    Nested references (``*name``) stand for more values than memory holds, and so do short lists; nesting overflows the
+    parser's stack and ends the process, a tag (``!!float``) makes the loader read a value as another type.
     """
-    depth = 0
+    depth = nodes = 0
     for event in yaml.parse(text, Loader=_StrictLoader):
         if isinstance(event, yaml.AliasEvent):
             raise _complaint(f"reference *{event.anchor} is not understood; write the value out", event)
         if getattr(event, "tag", None) is not None:
             raise _complaint(f"tag {shorten(event.tag)} is not understood; write the plain value", event)
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        nodes += isinstance(event, yaml.NodeEvent)
+        if nodes > most_nodes:
+            raise _complaint(f"holds more than the allowed {most_nodes} values", event)
         if depth > MAX_DEPTH:
             raise _complaint(f"is nested more than {MAX_DEPTH} deep", event)
 
@@ -302,6 +291,8 @@ class Section:
             bad = np.argwhere(~np.isfinite(array))[0]
             index = "".join(f"[{i}]" for i in bad)
             raise self.error(key + index, "must be finite", float(array[tuple(bad)]))
+        if (np.abs(array) > LARGEST).any():
+            raise self.error(key, f"must be numbers within ±{LARGEST:g}", float(array.flat[np.abs(array).argmax()]))
         return array
 
     def quantity_key(self, name: str, dimension: str) -> str | None:

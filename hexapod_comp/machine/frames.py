@@ -43,6 +43,8 @@ def read_named_poses(top: Section, key: str) -> dict[str, Pose]:
     if key not in top:
         return {}
     section = top.section(key)
+    if len(section.left()) > MOST:  # before each is read
+        raise top.error(key, f"must be no more than {MOST}", len(section.left()))
     for name in (BASE, WORK, TOOL):
         if name in section:
             raise section.error(name, f"is what the machine's own {name} frame is called")

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import FrameError, GeometryError, InputFileError, KinematicsError, LimitError, shorten
+from ..formats.files import read_text
 from ..formats.paths import input_file
-from ..formats.yaml import Section, parse_yaml, read_text
+from ..formats.yaml import Section, parse_yaml
 from ..kernels import kinematics as kernels
 from ..kernels.limits import WITHIN, LimitNumbers, check_stage
 from ..pose import Pose

@@ -102,6 +102,8 @@ class ModelOrigin:
         when nobody says.
     datum : Datum or None
         Where the tool is not moved, and by how much that was free to choose; None when nobody says.
+    text_sha256 : str
+        Of the file that the model was read from, less the lines that name the posterior; empty when it was not read.
     """
 
     date: str = ""
@@ -110,6 +112,7 @@ class ModelOrigin:
     note: str = ""
     posterior: tuple[str, str] | None = None
     datum: Datum | None = None
+    text_sha256: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True)

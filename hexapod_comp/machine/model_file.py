@@ -87,8 +87,10 @@ it, and to one rounding (relative 2e-16) elsewhere; what was read from a file is
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
+from dataclasses import replace
 from datetime import date, datetime
 from itertools import product
 from pathlib import Path
@@ -97,9 +99,10 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputFileError, ModelError
+from ..formats.files import read_text
 from ..formats.outputs import write_text
 from ..formats.paths import input_file
-from ..formats.yaml import Section, parse_yaml, read_text
+from ..formats.yaml import Section, parse_yaml
 from ..kernels.struts import MOST_HARMONICS
 from .field import CROSS_AXES, OUTSIDE_POLICIES, GridField, no_field
 from .geometry import HexapodGeometry
@@ -131,6 +134,9 @@ ISO_8601 = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d(\.\d{3}(\d{3})?)?)?(
 """The extended forms that every supported Python reads alike."""
 
 SHA_256 = re.compile(r"[0-9a-f]{64}")
+
+POSTERIOR_LINES = re.compile(r"^posterior:\n(?:[ \t]+.*\n)*", re.MULTILINE)
+"""The block that names a fit's posterior: that file names the hash of all the rest."""
 
 Line = tuple[int, int, int]
 """Key of a field line inside its family: direction, node index along each of the two cross axes."""
@@ -186,7 +192,7 @@ def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineM
     try:
         values = {
             "name": top.text("name"),
-            "origin": _read_origin(top),
+            "origin": replace(_read_origin(top), text_sha256=text_sha256(text)),
             **_read_scalars(top),
             **_read_structure(top),
             **_read_thermal(top),
@@ -201,6 +207,11 @@ def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineM
     except ModelError as error:
         raise InputFileError(name, error.key, error.problem, error.value) from error
     return model
+
+
+def text_sha256(text: str) -> str:
+    """Return the hash of a model file's text less the block that names its posterior, which names this hash."""
+    return hashlib.sha256(POSTERIOR_LINES.sub("", text).encode()).hexdigest()
 
 
 def save_model(model: MachineModel, path: str | Path) -> None:

@@ -21,9 +21,19 @@ import numpy as np
 
 from ..compensation.journal import IDEAL_SOURCE, ROLES, JournalError, Page, Snapshot, Source, read_page, read_sources
 from ..errors import HexapodError, InputFileError, printable
+from ..formats.files import read_text
+from ..formats.yaml import Section, yaml_content
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.model import MachineModel
-from .unpacking import Allowance, UnpackingError, bounded, refuse_overlapping_chunks, refuse_too_much_at_once
+from .unpacking import (
+    MOST_METADATA,
+    MOST_NODES,
+    Allowance,
+    UnpackingError,
+    bounded,
+    refuse_overlapping_chunks,
+    refuse_too_much_at_once,
+)
 
 POSE, STRUTS, TEXT = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState", "std_msgs/msg/String"
 
@@ -39,6 +49,8 @@ COMMANDS = "tool_pose_command"
 
 JOURNAL, FILES = "/journal", "/files"
 """How the topics of a compensator's journal end, after the node's name."""
+
+METADATA = "metadata.yaml"
 
 STORAGE = (".mcap", ".db3")
 
@@ -158,6 +170,7 @@ def read_recording(
     with ExitStack() as stack:
         files, notes = _files(Path(path))
         size = _size(files)
+        _refuse_odd_metadata(path, files)
         stack.enter_context(bounded(Allowance(size)))
         readers = _open(Path(path), files, stack)
         connections = [c for reader in readers for c in reader.connections]
@@ -193,6 +206,8 @@ def _open(path: Path, files: list[Path], stack: ExitStack) -> list[Any]:
         try:
             readers.append(stack.enter_context(rosbag2.Reader(file)))
             refuse_overlapping_chunks(readers[-1])
+        except InputFileError:
+            raise
         except Exception as error:
             raise _unreadable(path, file, "", error) from error
     if not any(reader.message_count for reader in readers):
@@ -201,22 +216,47 @@ def _open(path: Path, files: list[Path], stack: ExitStack) -> list[Any]:
 
 
 def _size(files: list[Path]) -> int:
-    """Return the bytes of a bag's files."""
+    """Return the bytes of a bag's files; refuse those that are no files: opening a FIFO would wait without end."""
     inside = [one for file in files for one in (file.iterdir() if file.is_dir() else [file])]
+    for file in inside:
+        if file.exists() and not (file.is_file() or file.is_dir()):
+            raise InputFileError(file, "", "is not a regular file; a bag holds nothing else")
     return sum(file.stat().st_size for file in inside if file.is_file())
+
+
+def _refuse_odd_metadata(path: str | Path, files: list[Path]) -> None:
+    """Raise where ``metadata.yaml`` is too large, or does not hold what ``rosbags`` and this module take from it."""
+    for folder in files:
+        if not folder.is_dir():
+            continue
+        file = folder / METADATA
+        top = Section(file, "", yaml_content(read_text(file, most=MOST_METADATA), file, MOST_NODES))
+        about = top.section("rosbag2_bagfile_information")
+        for key, kind, what in (("files", list, "a list"), ("custom_data", dict, "a mapping")):
+            given = about.take(key) if key in about else None
+            if given is not None and not isinstance(given, kind):
+                raise about.error(key, f"must be {what}", given)
+        paths = about.take("relative_file_paths")
+        if not isinstance(paths, list) or not all(isinstance(name, str) for name in paths):
+            raise about.error("relative_file_paths", "must be a list of names", paths)
+        for topic in about.sections("topics_with_message_count"):
+            if not 0 <= topic.integer("message_count", 0) < 1 << 63:
+                raise topic.error("message_count", "must be a number of messages")
+            names = topic.section("topic_metadata")
+            names.text("name"), names.text("type")
 
 
 def _files(path: Path) -> tuple[list[Path], list[str]]:
     """Return what is to be opened: the folder, or its single files where ``metadata.yaml`` is missing."""
-    if path.name == "metadata.yaml":
+    if path.name == METADATA:
         path = path.parent
     if not path.exists():
         raise InputFileError(path, "", "there is no such file or folder")
-    if path.is_file():
-        if path.suffix not in STORAGE:
+    if not path.is_dir():
+        if path.suffix not in STORAGE or not path.is_file():
             raise InputFileError(path, "", "must be a bag: a folder with metadata.yaml, a .mcap or a .db3 file")
         return [path], []
-    if (path / "metadata.yaml").is_file():
+    if (path / METADATA).exists():
         return [path], []
     files = sorted(file for file in path.iterdir() if file.suffix in STORAGE)
     if not files:

