@@ -207,9 +207,9 @@ def _parsed(
         It is of another version or machine, or its parts do not belong together.
     """
     known = FORMAT, VERSION, geometry.name
-    found = tuple(head.get(key) for key in ("format", "version", "machine"))
-    if found != known:
-        raise InputFileError(path, "head", f"must be {known}", found)
+    given = tuple(head.get(key) for key in ("format", "version", "machine"))
+    if given != known:
+        raise InputFileError(path, "head", f"must be {known}", given)
 
     def array(name: str, *shape: int) -> np.ndarray:
         if name not in arrays or arrays[name].shape != shape:

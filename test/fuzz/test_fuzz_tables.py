@@ -81,14 +81,18 @@ def rows_of(data: bytes) -> list[dict[str, str]]:
     with decimal commas get points.
     """
     assert b"\0" not in data
-    text = data.decode("utf-8-sig")
+    try:
+        text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("cp1252", "replace")
     top = next(line for line in io.StringIO(text, newline="") if re.match(r'(?!\s*"?#)\s*\S', line))
     bare = re.sub(r'"[^"]*"', "", top)
     separator = next((mark for mark in ",;\t" if mark in bare), ",")
     lines = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True)
     cells = [line for line in lines if line and not line[0].startswith("#")]
     header = [name.strip() for name in cells[0]]
-    assert len(set(header)) == len(header)
+    named = [name for name in header if name]
+    assert len(set(named)) == len(named)
     assert all(len(line) == len(header) for line in cells)
     rows = cells[1:] if separator == "," else with_points(cells[1:])
     return [dict(zip(header, line, strict=True)) for line in rows]
