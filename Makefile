@@ -27,7 +27,7 @@ BESIDE_LINUXCNC = $(MAKE) --no-print-directory VENV=.venv-linuxcnc PYTHON='$(LIN
 # Which versions of Python `make test-all` takes, of those that are here.
 VERSIONS ?= 3.10 3.11 3.12 3.13
 
-.PHONY: help demo test test-all docs constraints test-linuxcnc linuxcnc linuxcnc-rt bench fuzz clean run-linuxcnc-tests ros
+.PHONY: help demo test test-all docs constraints test-linuxcnc linuxcnc linuxcnc-rt bench papers fuzz clean run-linuxcnc-tests ros
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
@@ -37,6 +37,7 @@ help:
 	@echo 'make test-all     the same with every Python found here, each in .venv-3.x; VERSIONS="3.10 3.13" for some'
 	@echo 'make docs    the pages of doc/ as a site with a search and the Python reference, in out/doc'
 	@echo 'make constraints  renew constraints.txt and locked/: versions and hashes of all that is installed'
+	@echo 'make papers  every table and figure of the three papers beside what is computed: out/papers.html'
 	@echo 'make bench   speed beside NumPy, SciPy, MuJoCo, Pinocchio, LinuxCNC and a relay node'
 	@echo 'make fuzz    a nightly run of the fuzzing tests: 100,000 cases and more'
 	@echo 'make linuxcnc       .venv-linuxcnc, to run beside LinuxCNC'
@@ -82,6 +83,9 @@ constraints: $(VENV)/made-in
 
 bench: $(VENV)/with-ros,bench
 	@$(BIN)/python -m benchmarks
+
+papers: $(VENV)/with-ros
+	@$(BIN)/python -m examples.papers
 
 fuzz: $(VENV)/with-ros,test
 	@$(BIN)/python -m benchmarks.fuzz

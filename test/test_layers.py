@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "hexapod_comp"
 ROOMS = (
     "errors", "kernels", "core", "pose", "formats", "machine", "compensation", "measurements", "virtual", "workspace",
-    "calibration", "papers", "export", "replay", "nodes", "linuxcnc", "loop", "cli", "testing", "__main__",
+    "calibration", "export", "replay", "nodes", "linuxcnc", "loop", "cli", "testing", "__main__",
 )  # fmt: skip
 """From the ground up: a room imports from itself and from those before it."""
 

@@ -16,6 +16,9 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from examples.papers import daake
+from examples.papers.mou_king import LINE_Y
+from examples.papers.pictures import configuration_figure
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.lines import fit_lines
 from hexapod_comp.calibration.parameters import FitSettings
@@ -26,9 +29,6 @@ from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.pictures import direction_figure, weights_figure
 from hexapod_comp.measurements.campaign import load_campaign, template
 from hexapod_comp.measurements.readings import MeasurementSet
-from hexapod_comp.papers import daake
-from hexapod_comp.papers.mou_king import LINE_Y
-from hexapod_comp.papers.pictures import configuration_figure
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.instruments import measure
 from hexapod_comp.workspace.overview import overview

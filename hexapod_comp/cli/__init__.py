@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from ..errors import HexapodError
 from ..formats.outputs import inputs_protected
 from ..formats.texts import run_with_plain_streams
-from .parsers import PROGRAM, make_parser
+from .parsers import GONE, PROGRAM, make_parser
 
 NEGATIVE = re.compile(r"-[.\d]")
 """What follows an option and looks like this is its value, not another option."""
@@ -40,6 +40,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: Sequence[str]) -> int:
+    if arguments and arguments[0] in GONE:
+        print(f"{PROGRAM}: error: {arguments[0]} {GONE[arguments[0]]}", file=sys.stderr)
+        return USAGE_ERROR
     parser = make_parser()
     if "_ARGCOMPLETE" in os.environ:
         from .completion import complete

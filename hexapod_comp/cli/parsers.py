@@ -20,6 +20,9 @@ PROGRAM = "hexapod_comp"
 ALIASES = {"simulate": ("measure",)}
 """Old names of verbs, which still work."""
 
+GONE = {"paper": "is `make papers` in the source tree now (python -m examples.papers)"}
+"""Verbs that went, and where to."""
+
 SHAPE = "X,Y,Z[,A,B,C]"
 
 WORDS = "ideal, random or random:SEED"
@@ -443,16 +446,6 @@ def _assess(parser: argparse.ArgumentParser) -> None:
     _json(add)
 
 
-def _paper(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    text = "folder for papers.html and papers.csv; made if it is missing (default out)"
-    add("--out", dest="folder", metavar="FOLDER", default="out", help=text)
-    text = "imperfect machines to draw for each pose of Tables 4 and 5 (default 50)"
-    add("--machines", type=arguments.count, default=50, metavar="N", help=text)
-    add("--seed", type=arguments.seed, default=1, metavar="N", help="of all that is random (default 1)")
-    _json(add)
-
-
 def _classify(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     _machine(add, "positioning_unit.yaml")
@@ -504,6 +497,5 @@ OPTIONS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     "export": _export,
     "assess": _assess,
     "classify": _classify,
-    "paper": _paper,
 }
 """What adds each verb's options."""

@@ -364,22 +364,4 @@ example:
   $ hexapod_comp classify --machine mine.yaml --model model.yaml --tilt-deg 0,5
   $ hexapod_comp classify --tilt-deg 0 --allow-um 50 --out ranking.csv""",
     ),
-    "paper": Verb(
-        "analysis",
-        "the papers' tables and figures, computed beside what they print",
-        """Computes every table and figure of Song, Mou & King, of Mou & King (1998) and of v. Daake, Vetter, Böhm &
-Zirn, and says of each printed number whether it is met, by how much it differs (µm, thousandths of a degree), where it
-is a misprint, and what cannot be met and why. papers.html shows all of it in any browser, offline; papers.csv has a row
-for each number. It takes about half a minute. Exit code: 0 every number that can be met is met, 1 one is not, 2 bad
-input.
-
-example:
-  $ hexapod_comp paper --out out
-  Song, Mou & King: Kinematic Performance Analysis of a Parallel-Chain Hexapod Machine
-  172 met, 91 wrong in print, 62 cannot be met, 1 shown
-  …
-    Table 2: strut lengths of the ideal structure: 60 of 60 met; largest difference 0.4786 µm
-  …
-  page: out/papers.html""",
-    ),
 }

@@ -13,9 +13,11 @@ import pytest
 from helpers import table_lengths
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.papers.misprints import (
+from examples.papers.comparing import table
+from examples.papers.misprints import (
     MENDS,
     MISPRINTS,
+    TOP,
     A,
     B,
     D,
@@ -23,6 +25,7 @@ from hexapod_comp.papers.misprints import (
     cases,
     distances,
     equations_with_2,
+    printed_angles,
     second_equation,
 )
 
@@ -107,3 +110,39 @@ def test_heights_of_the_base_joints_are_lost_on_the_way_to_the_real_structure(se
     (heights,) = (misprint for misprint in MISPRINTS if misprint.name == "Z′_T")
     assert heights.worst()[0] == pytest.approx(10.0, abs=1e-6)  # µm, as the joints were lifted
     assert r"$+\frac12(Z'_{B,2i-1}+Z'_{B,2i})$" in section
+
+
+# The angles of Tables 3 and 5.
+
+TABLE_3 = {5.0: ("4.99998",), 10.0: ("9.99937", "9.99938")}
+"""As printed, by the right angle."""
+
+
+def test_tanh_of_one_rotation_is_a_closed_form():
+    """About one axis the formulas are arctan(tan α): tanh makes tanh(tan α) of it, and a cut series comes not near."""
+    for angle, printed in TABLE_3.items():
+        tangent = np.tan(np.radians(angle))
+        assert f"{np.degrees(np.tanh(tangent)):.5f}" == printed[-1]
+        for cut in (tangent - tangent**3 / 3, tangent - tangent**3 / 3 + tangent**5 / 5):
+            assert f"{np.degrees(cut):.5f}" not in printed
+        for n in range(3):
+            angles = np.zeros(3)
+            angles[n] = angle
+            turned = Rotation.from_euler("YXZ", angles[[1, 0, 2]], degrees=True).as_matrix()
+            found = printed_angles(TOP @ turned.T, np.tanh)
+            assert found[n] == pytest.approx(np.degrees(np.tanh(tangent)), abs=ROUNDING)
+
+
+def test_all_17_angles_of_table_3_to_the_last_digit_and_gamma_goes_into_beta(section: str):
+    printed = [cell for row in table(3) for cell in row[:3]]
+    tanh = np.array([printed_angles(at.top, np.tanh) for at in CASES]).ravel()
+    right = np.array([at.angles for at in CASES]).ravel()
+    assert np.count_nonzero(right) == 17
+    for cell, value, angle in zip(printed, tanh, right, strict=True):
+        assert not angle or f"{value:.6g}" == cell
+    np.testing.assert_allclose([printed_angles(at.top) for at in CASES], right.reshape(10, 3), rtol=0, atol=ROUNDING)
+    # With the right γ in it, row 5 would have 9.99938.
+    assert printed[13] == "9.99937"
+    assert f"{np.degrees(np.tanh(np.tan(np.radians(10.0)))):.5f}" == "9.99938"
+    assert "tanh in place of arctan" in section
+    assert "9.99808°" in section

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
-from pathlib import Path
 
-from ..formats.outputs import write_text
-from ..formats.pages import page, picture
-from ..formats.texts import number
+from hexapod_comp.formats.pages import page, picture
+from hexapod_comp.formats.texts import number
+
 from .comparing import MET, MISSED, OPEN, SHOWN, VERDICTS, WRONG, Exhibit, NumberTable, Paper, Statement
-from .report import difference_text, headline, summary
 
 MARKS = {MET: ("✓", "met"), WRONG: ("≠", "wrong"), OPEN: ("?", "open"), MISSED: ("✗", "missed"), SHOWN: ("·", "shown")}
 """Sign and style of each verdict: told apart without colours too."""
@@ -24,30 +22,10 @@ MEANINGS = {
 }
 
 
-def write_page(path: str | Path, papers: Sequence[Paper], note: str) -> None:
-    """Write the page, all or nothing.
-
-    Parameters
-    ----------
-    path : str or Path
-        HTML file.
-    papers : sequence of Paper
-        What it shows.
-    note : str
-        How it was made: version, seeds.
-
-    Raises
-    ------
-    InputFileError
-        The file cannot be written.
-    """
-    write_text(path, page_text(papers, note))
-
-
 def page_text(papers: Sequence[Paper], note: str) -> str:
-    """Return the page; see :func:`write_page`."""
+    """Return the page; `note` says how it was made."""
     contents = "".join(
-        f'<li><a href="#p{p}">{escape(paper.short)}</a>: {escape(headline(paper))}<ol>'
+        f'<li><a href="#p{p}">{escape(paper.short)}</a>: {escape(paper.headline())}<ol>'
         + "".join(
             f'<li><a href="#p{p}s{s}">{escape(exhibit.title)}</a></li>' for s, exhibit in enumerate(paper.exhibits)
         )
@@ -89,7 +67,7 @@ def _table(table: NumberTable) -> str:
     for r, name in enumerate(table.rows):
         cells = "".join(_cell(table, r, c) for c in range(len(table.columns)))
         rows.append(f"<tr><th scope=row>{escape(name)}</th>{cells}</tr>")
-    caption = escape(summary(table))
+    caption = escape(table.summary())
     return (
         f"<p>{escape(table.note)}</p><p class=caption>{caption}. In each cell: printed, computed, difference Δ.</p>"
         f"<div class=wide tabindex=0><table><thead><tr><th></th>{head}</tr></thead>"
@@ -100,7 +78,7 @@ def _table(table: NumberTable) -> str:
 def _cell(table: NumberTable, r: int, c: int) -> str:
     column, verdict = table.columns[c], table.verdicts[r, c]
     computed = number(float(table.computed[r, c]), column.digits)
-    difference = difference_text(table, r, c)
+    difference = table.difference_text(r, c)
     return (
         f"<td class={MARKS[verdict][1]}><b>{escape(table.printed[r][c])}</b><br>{computed}<br>"
         f"<small>{escape(difference)} {_mark(verdict)}</small></td>"

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .printed import values
+from .comparing import values
 
 A, B, D = 300.0, 572.0, 243.0
 """Side of the platform's triangle, long and short sides of the base, mm; they follow from Table 2."""
@@ -44,24 +44,12 @@ class Case(NamedTuple):
 
 
 class Misprint(NamedTuple):
-    """A misprint.
-
-    Attributes
-    ----------
-    name : str
-        Where it stands.
-    printed, mended : str
-        The part that matters, as printed and as it must be.
-    unit : str
-        Of what is off.
-    off, left : callable
-        How far the printed and the mended form are off at a :class:`Case`.
-    """
+    """A misprint: the part that matters as printed and as it must be, and how far each is off at a :class:`Case`."""
 
     name: str
     printed: str
     mended: str
-    unit: str
+    unit: str  # of what is off
     off: Callable[[Case], float]
     left: Callable[[Case], float]
 
@@ -207,13 +195,24 @@ def heights(at: Case, back: bool) -> float:
     return float(np.abs(heights + (lifted if back else 0.0) - at.top[:, 2]).max() * 1e3)
 
 
-def alpha(at: Case, sign: float) -> float:
-    """Return α' less the pose's α, °; `sign` is that of X'_T3 (Z'_T1 − Z'_T2)."""
-    (x1, x2, x3), (y1, y2, y3), (z1, z2, z3) = at.top.T
-    gamma = np.radians(at.angles[2])
+def printed_angles(top: np.ndarray, inverse: Callable[[float], float] = np.arctan, sign: float = -1.0) -> np.ndarray:
+    """Return α', β', γ' by the paper's formulas, °; γ' comes first and stands in the two others.
+
+    `inverse` is what is computed for arctan; `sign` is that of X'_T3 (Z'_T1 − Z'_T2), printed as 1.
+    """
+    (x1, x2, x3), (y1, y2, y3), (z1, z2, z3) = top.T
+    gamma = inverse((y1 - 2 * y2 + y3) / (S3 * (y1 - y3)))
+    s, c = np.sin(gamma), np.cos(gamma)
     over = -2 * (x1 * (z3 - z2) + x2 * (z1 - z3) + sign * x3 * (z1 - z2))
-    under = A * (y1 - 2 * y2 + y3) * np.sin(gamma) + S3 * A * (y1 - y3) * np.cos(gamma)
-    return float(np.degrees(np.arctan(over / under))) - at.angles[0]
+    alpha = inverse(over / (A * (y1 - 2 * y2 + y3) * s + S3 * A * (y1 - y3) * c))
+    over = -(z1 - 2 * z2 + z3) * c + S3 * (z1 - z3) * s
+    beta = inverse(over / ((x1 - 2 * x2 + x3) * c - S3 * (x1 - x3) * s))
+    return np.degrees([alpha, beta, gamma])
+
+
+def alpha(at: Case, sign: float) -> float:
+    """Return α' less the pose's α, °."""
+    return float((printed_angles(at.top, sign=sign) - at.angles)[0])
 
 
 MISPRINTS = (

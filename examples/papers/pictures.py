@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from ..formats.figures import WITH, WITHOUT
-from ..machine.geometry import HexapodGeometry
-from ..machine.pictures import machine_figure
+from hexapod_comp.formats.figures import WITH, WITHOUT
+from hexapod_comp.machine.geometry import HexapodGeometry
+from hexapod_comp.machine.pictures import machine_figure
 
 BINS = np.arange(-40.5, 41.0, 1.0)
 """Edges of a histogram of changes of length, µm."""
