@@ -35,7 +35,7 @@ from hexapod_comp.loop.processes import NodeProcess, PrivateDomain
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.nodes.client import LISTENER_QOS, TRACK_QOS
 from hexapod_comp.nodes.messages import message_pose, pose_message
-from hexapod_comp.nodes.runtime import COMMAND_QOS, STATE_QOS
+from hexapod_comp.nodes.runtime import COMMAND_QOS, NEWEST_QOS, STATE_QOS
 from hexapod_comp.nodes.warming import warm
 from hexapod_comp.pose import Pose
 
@@ -138,7 +138,7 @@ class Rig:
         node.create_subscription(JointState, "strut_commands", dated(self._on_commands), LISTENER_QOS)
         node.create_subscription(JointState, "strut_corrections", self._on_corrections, LISTENER_QOS)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, LISTENER_QOS)
-        node.create_subscription(PoseStamped, "tool_pose_estimate", self._on_estimate, STATE_QOS)
+        node.create_subscription(PoseStamped, "tool_pose_estimate", self._on_estimate, NEWEST_QOS)
         self._open_wires(node, poses)
         self._set_parameters = node.create_client(SetParameters, "strut_drive/set_parameters")
         self._set_clock = node.create_client(SetParameters, "compensator/set_parameters")

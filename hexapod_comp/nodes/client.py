@@ -19,7 +19,7 @@ from ..pose import Pose
 from .health import status_prefix
 from .messages import StrutReader, message_pose, pose_message
 from .ros_session import RosSession
-from .runtime import COMMAND_QOS, EVENT_QOS, STATE_QOS
+from .runtime import COMMAND_QOS, EVENT_QOS, NEWEST_QOS
 from .stamps import nanoseconds_of
 
 LISTENER_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
@@ -82,7 +82,7 @@ class LoopClient:
         node.create_subscription(JointState, "strut_commands", self._on_command, LISTENER_QOS)
         node.create_subscription(JointState, "strut_corrections", self._on_correction, LISTENER_QOS)
         node.create_subscription(PoseStamped, "tool_pose_true", self._on_true, TRACK_QOS)
-        node.create_subscription(PoseStamped, "tool_pose_estimate", self._on_estimate, STATE_QOS)
+        node.create_subscription(PoseStamped, "tool_pose_estimate", self._on_estimate, NEWEST_QOS)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
         self._enable = node.create_client(SetBool, "compensator/enable_compensation")
 

@@ -20,7 +20,7 @@ from .machine_files import MachineFiles
 from .markers import machine_markers
 from .messages import write_pose
 from .predicted_error import PredictedErrorTopics
-from .runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, ESTIMATE_QOS, EVENT_QOS, STATE_QOS, MachineNode
+from .runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, STATE_QOS, MachineNode
 from .stamps import nanoseconds_of, period
 from .vital_signs import LATCHED_QOS, VitalSigns
 from .wire import StrutBytes
@@ -48,7 +48,7 @@ class CompensatorOutputs:
         deadline = options["command_timeout"]
         self._commands = node.publish_on(JointState, "strut_commands", COMMAND_QOS, deadline)
         self._corrections = node.publish_on(JointState, "strut_corrections", COMMAND_QOS, deadline)
-        self._estimates = node.publish_on(PoseStamped, "tool_pose_estimate", ESTIMATE_QOS)
+        self._estimates = node.publish_on(PoseStamped, "tool_pose_estimate", STATE_QOS)
         self._markers = node.create_publisher(MarkerArray, "~/markers", EVENT_QOS)
         self._names = options["joint_names"]
         self._joints: Publisher | None = None

@@ -20,7 +20,7 @@ from .compensator_status import CompensatorStatus
 from .following import StrokeRange
 from .messages import StrutReader, read_message
 from .plausible import NoJump
-from .runtime import SENSOR_QOS, STATE_QOS, MachineNode
+from .runtime import NEWEST_QOS, SENSOR_QOS, MachineNode
 from .stamps import nanoseconds_of
 
 
@@ -62,7 +62,7 @@ class Feedback:
         self._stamps, self._jumps = status.reading_stamps, NoJump(compensator.geometry)
         self._options, self._thermometers = options, Thermometers(*_temperature_rules(options))
         several = options["allow_several_publishers"]
-        states = node.obey(JointState, "strut_states", self._on_states, look, qos=STATE_QOS)
+        states = node.obey(JointState, "strut_states", self._on_states, look, qos=NEWEST_QOS)
         self._subscriptions = [states]
         self._measuring = CommandSource(node, states.topic_name, states.get_publisher_count, several)
         several = several or options["allow_several_thermometers"]

@@ -24,7 +24,7 @@ from .health import status_prefix
 from .messages import StrutReader, message_pose, read_message
 from .ros_session import RosSession
 from .running import SPIN_PERIOD, keep_discovery_local
-from .runtime import EVENT_QOS, STATE_QOS
+from .runtime import EVENT_QOS, NEWEST_QOS
 from .stamps import nanoseconds_of
 
 QUIET: dict[str, Any] = {
@@ -139,7 +139,7 @@ class Watcher:
             ("tool_pose_true", PoseStamped),
             ("compensator/predicted_error", PoseWithCovarianceStamped),
         ):
-            node.create_subscription(kind, topic, self._keeper(topic), STATE_QOS, raw=True)
+            node.create_subscription(kind, topic, self._keeper(topic), NEWEST_QOS, raw=True)
 
     def view(self) -> View:
         """Return what is known now."""
