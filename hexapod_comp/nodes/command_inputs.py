@@ -96,7 +96,7 @@ class StrutInput(PoseInput):
         raise forward_error(int(solved.outcomes[0]), float(solved.conditions[0]), self._structure.max_condition)
 
 
-def nominal_lengths(compensator: Compensator, measured: np.ndarray, tool: np.ndarray) -> np.ndarray:
+def nominal_lengths(compensator: Compensator, measured: np.ndarray) -> np.ndarray:
     """Return measured struts as a controller of nominal lengths must see them: less what is corrected.
 
     Told the measured ones, it would hold the corrections for a way that it has yet to go, and each time that it starts
@@ -108,8 +108,6 @@ def nominal_lengths(compensator: Compensator, measured: np.ndarray, tool: np.nda
         Its correction counts; before its first command its model's, where it corrects.
     measured : ndarray, shape (6,)
         Strut lengths, m.
-    tool : ndarray, shape (12,)
-        The tool pose estimated from them.
 
     Returns
     -------
@@ -120,6 +118,7 @@ def nominal_lengths(compensator: Compensator, measured: np.ndarray, tool: np.nda
         return measured - compensator.correction
     if not compensator.enabled:
         return measured
+    tool = compensator.estimate(measured)
     pose = Pose(tool[:3], tool[3:].reshape((3, 3)))
     return strut_lengths(compensator.geometry, pose @ compensator.geometry.tool.inverse())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -99,12 +100,17 @@ class CompensatorOutputs:
         """Take the next command as the first: its velocity is zero."""
         self._answered = 0
 
-    def measured(self, struts: np.ndarray, pose: np.ndarray, stamp: Time) -> None:
-        """Publish what follows from a reading of the struts, shape (6,), m, and the tool pose estimated from it."""
+    def measured(
+        self, struts: np.ndarray, pose: np.ndarray, stamp: Time, average: Callable[[np.ndarray], np.ndarray]
+    ) -> None:
+        """Publish what follows from a reading of the struts, shape (6,), m, and the tool pose estimated from it.
+
+        Controllers start from the nominal lengths, and hold them: those of struts at rest are of their average.
+        """
         self.estimate(pose, stamp)
         if self._nominal is not None:
             out, when = self._nominal_out, nanoseconds_of(stamp)
-            out.write(nominal_lengths(self._compensator, struts, pose), period(out.stamp, when), self._fastest)
+            out.write(nominal_lengths(self._compensator, average(struts)), period(out.stamp, when), self._fastest)
             self._nominal.publish(out.stamped(when))
 
     def estimate(self, pose: np.ndarray, stamp: Time) -> None:

@@ -85,8 +85,9 @@ class CompensatorStatus:
         self.refusals, self.bad_feedback = Refusals(), Refusals()
         self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
         self.frame_id = self.prediction_problem = ""
-        self.following, self.last_known = Following(), LastKnown()
+        self.following = Following()
         self.standing = Standing(self.following.commands)
+        self.last_known = LastKnown(average=self.standing.mean)
         self.log_space = LogSpace()
         self.take_parameters()
 

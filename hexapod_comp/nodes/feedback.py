@@ -41,7 +41,8 @@ class Feedback:
     options : dict
         The node's parameters.
     publish : callable
-        Publishes what follows from a reading, given the struts, the pose estimated from them and the reading's stamp.
+        Publishes what follows from a reading, given the struts, the pose estimated from them, the reading's stamp, and
+        what averages the readings of struts at rest.
     look : callable
         Looks again who publishes and whether commands may be obeyed: called when a publisher comes or goes, when a
         second one is heard, and when the struts are found not to follow.
@@ -53,7 +54,7 @@ class Feedback:
         compensator: Compensator,
         status: CompensatorStatus,
         options: dict[str, Any],
-        publish: Callable[[np.ndarray, np.ndarray, Time], None],
+        publish: Callable[[np.ndarray, np.ndarray, Time, Callable[[np.ndarray], np.ndarray]], None],
         look: Callable[[], None],
     ) -> None:
         self._node, self._compensator, self._status = node, compensator, status
@@ -106,7 +107,7 @@ class Feedback:
         self._stamps.accept(stamp, now)
         self._status.feedback.tick(now)
         if self._node.active:
-            self._publish(struts, pose, header.stamp)
+            self._publish(struts, pose, header.stamp, self._status.standing.mean)
 
     def _hear(self, owner: CommandSource, number: int | None, now: float) -> None:
         """Take a reading's sequence number; refuse the reading while it is not clear whose it is."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 
@@ -19,6 +20,13 @@ FOLLOWED_WITHIN = 0.1
 
 STANDS_WITHIN = 50e-6
 """A strut that moves by no more than this in that time stands, m: encoders and servos are never quite still."""
+
+
+AVERAGED_OVER = 0.5
+"""Readings of a machine at rest are averaged over this time, s: ten at least of a slow drive, at 20 Hz."""
+
+NOISE = 2e-6
+"""Readings that differ by no more than this, m, are of one place: encoders read to 0.1 µm, servos hold to 1 µm."""
 
 
 class StrokeRange:
@@ -65,6 +73,11 @@ class Recent:
         """The newest struts, shape (6,), m."""
         return np.frombuffer(self._kept[-1][1])
 
+    @property
+    def at(self) -> float:
+        """When the newest were noted, by the monotonic clock, s."""
+        return self._kept[-1][0]
+
     def note(self, struts: np.ndarray, now: float) -> None:
         """Remember struts, shape (6,), m, at the monotonic time `now`, s."""
         self._kept.append((now, struts.tobytes()))
@@ -72,6 +85,15 @@ class Recent:
     def clear(self) -> None:
         """Forget them all."""
         self._kept.clear()
+
+    def since(self, since: float) -> np.ndarray:
+        """Return what came since a monotonic time, s, newest first, shape (n, 6), m."""
+        rows = []
+        for at, struts in reversed(self._kept):
+            if at < since:
+                break
+            rows.append(struts)
+        return np.frombuffer(b"".join(rows)).reshape((-1, 6))
 
     def range(self, since: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the least and the most since a monotonic time, s, with what was in force then; all of it (6,), m."""
@@ -158,6 +180,14 @@ class Standing:
         """Take a good reading, shape (6,), m, that came at the monotonic time `now`, s."""
         self._readings.note(struts, now)
 
+    def mean(self, newest: np.ndarray) -> np.ndarray:
+        """Return where struts at rest are: the mean of the readings of the last :data:`AVERAGED_OVER`, shape (6,), m.
+
+        While any of them is further than :data:`NOISE` from another it is the newest reading, as it was given.
+        """
+        rows = self._readings.since(self._readings.at - AVERAGED_OVER) if self._readings else newest[None]
+        return rows.mean(axis=0) if (np.ptp(rows, axis=0) <= NOISE).all() else newest
+
     def moving(self, now: float) -> str:
         """Return which strut moves and how far in the last :data:`FOLLOWED_WITHIN`; empty when all stand."""
         for recent, how in ((self._commands, "was told to go"), (self._readings, "went")):
@@ -180,6 +210,9 @@ class LastKnown:
     anywhere_after : float, optional
         For a machine without feedback: when nothing has become known so long after the start, the first command
         may be anywhere, s; 0 = never.
+    average : callable, optional
+        Returns where the struts are when the newest reading is given: the noise of one reading would stay in the place
+        of whoever starts from it.
 
     Attributes
     ----------
@@ -187,8 +220,10 @@ class LastKnown:
         As given; may be set.
     """
 
-    def __init__(self, anywhere_after: float = 0.0) -> None:
-        self.anywhere_after, self._began = anywhere_after, math.inf
+    def __init__(
+        self, anywhere_after: float = 0.0, average: Callable[[np.ndarray], np.ndarray] = lambda newest: newest
+    ) -> None:
+        self.anywhere_after, self._began, self._average = anywhere_after, math.inf, average
         self._measured, self._commanded = np.empty(6), np.empty(6)
         self._measured_at = self._commanded_at = -math.inf
 
@@ -229,7 +264,7 @@ class LastKnown:
             raise CommandError("no_feedback", f"no strut_states yet: where the struts stand is not known{self._hint()}")
         after = self._commanded_at + (-FOLLOWED_WITHIN if fresh else FOLLOWED_WITHIN)
         if self._measured_at > -math.inf and self._measured_at >= after:
-            return self._measured
+            return self._average(self._measured)
         return self._commanded if self._commanded_at > -math.inf else None
 
     def _hint(self) -> str:
