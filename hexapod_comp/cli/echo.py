@@ -18,9 +18,8 @@ def run(args: argparse.Namespace) -> int:
     from ..formats.json import json_text
     from ..nodes import heard_signals
     from ..nodes.echo import DISCOVERY_TIME, Echo, EchoedMessage, published_topics
-    from ..nodes.ros_session import RosSession
+    from ..nodes.ros_session import QUIET, RosSession
     from ..nodes.running import SPIN_PERIOD, keep_discovery_local
-    from ..nodes.watching import QUIET
 
     keep_discovery_local()
     signals = heard_signals()

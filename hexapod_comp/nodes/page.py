@@ -6,8 +6,12 @@ import contextlib
 import io
 import logging
 import socket
+from collections.abc import Callable, Iterator, Mapping
 from html import escape
+from http import HTTPStatus
+from ipaddress import ip_address
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -211,11 +215,63 @@ def _outline(joints: np.ndarray) -> np.ndarray:
     return np.stack([joints, np.roll(joints, -1, axis=0)], axis=1)
 
 
+def same_site(headers: Mapping[str, str], host: str) -> bool:
+    """Return whether a request is of a page that this server may have served.
+
+    A browser can be led here by any page that its user looks at: from another origin, or under a name that is made to
+    mean this address (DNS rebinding). So the name asked for must be an address, this computer's, or the one that the
+    page is served under, and a request from a page must come from one under the same name and port.
+
+    Parameters
+    ----------
+    headers : mapping
+        Of the request.
+    host : str
+        Name or address under which the page is served.
+    """
+    asked = headers.get("Host") or ""
+    try:
+        name = urlsplit(f"//{asked}").hostname or ""
+    except ValueError:  # a bracket that is not closed
+        return False
+    own = {"localhost", host.lower(), socket.gethostname().lower(), f"{socket.gethostname().lower()}.local"}
+    if name not in own:
+        try:
+            ip_address(name)
+        except ValueError:
+            return False
+    origin = headers.get("Origin")
+    return origin is None or origin.lower() in (f"http://{asked}".lower(), f"https://{asked}".lower())
+
+
+@contextlib.contextmanager
+def _own_pages_only(host: str) -> Iterator[None]:
+    """Let a server that websockets starts in this block refuse other sites' requests: viser 1.1 has no way to ask for
+    that, and takes any."""
+    from websockets.asyncio import server
+
+    serve = server.serve
+
+    def guarded(*arguments: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+        def check(connection: Any, request: Any) -> Any:
+            if not same_site(request.headers, host):
+                return connection.respond(HTTPStatus.FORBIDDEN, "this page is served to its own site alone\n")
+            return process_request(connection, request)
+
+        return serve(*arguments, process_request=check, **options)
+
+    server.serve = guarded  # type: ignore[assignment, misc, unused-ignore]
+    try:
+        yield
+    finally:
+        server.serve = serve  # type: ignore[misc, unused-ignore]
+
+
 def _serve(host: str, port: int) -> Any:
     """Return a running server of an empty page.
 
-    viser waits for ever where an address cannot be had, takes another port where one is taken, and lets a visitor ask
-    for a tunnel that makes the page public: none of that here.
+    viser waits for ever where an address cannot be had, takes another port where one is taken, lets a visitor ask
+    for a tunnel that makes the page public, and answers any site's page: none of that here.
     """
     try:
         from viser import ViserServer
@@ -233,7 +289,7 @@ def _serve(host: str, port: int) -> Any:
             """Make nothing public."""
 
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # browsers open connections in vain
-    with contextlib.redirect_stdout(io.StringIO()):  # its greeting
+    with contextlib.redirect_stdout(io.StringIO()), _own_pages_only(host):  # its greeting
         server = PrivateServer(host=host, port=port, verbose=False)
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
     return server

@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
 from std_msgs.msg import String
 
 from ..errors import HexapodError, InputFileError
-from .ros_session import RosSession
+from .ros_session import QUIET, RosSession
 from .running import SPIN_PERIOD
 
 COMPENSATOR = "compensator"
@@ -68,7 +68,7 @@ class BagRecorder:
         self.counts: dict[str, int] = {}
         self._connections: dict[str, Any] = {}
         self._writer, self._store = _open(Path(folder))
-        self._session = RosSession("hexapod_comp_recorder", namespace)
+        self._session = RosSession("hexapod_comp_recorder", namespace, **QUIET)
         for topic, (kind, reliable) in TOPICS.items():
             self._hear(topic, kind, QoSProfile(depth=DEPTH, reliability=_reliability(reliable)))
         for topic in KEPT:

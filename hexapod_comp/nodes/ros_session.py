@@ -8,10 +8,18 @@ from typing import Any
 import rclpy
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from . import open_streams
 from .middleware import avoid_shared_memory
+
+QUIET: dict[str, Any] = {
+    "start_parameter_services": False,
+    "enable_rosout": False,
+    "parameter_overrides": [Parameter("start_type_description_service", value=False)],
+}
+"""Options of a node that publishes nothing and offers nothing."""
 
 
 class RosSession:

@@ -12,7 +12,6 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
@@ -22,17 +21,10 @@ from ..machine.kinematics import solve_pose
 from ..pose import Pose, rotation_angle
 from .health import status_prefix
 from .messages import StrutReader, message_pose, read_message
-from .ros_session import RosSession
+from .ros_session import QUIET, RosSession
 from .running import SPIN_PERIOD, keep_discovery_local
 from .runtime import EVENT_QOS, NEWEST_QOS
 from .stamps import nanoseconds_of
-
-QUIET: dict[str, Any] = {
-    "start_parameter_services": False,
-    "enable_rosout": False,
-    "parameter_overrides": [Parameter("start_type_description_service", value=False)],
-}
-"""Options of a node that publishes nothing and offers nothing."""
 
 STREAM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Best effort, so that nobody waits for a slow witness; deep enough that the latencies are those of all commands."""
@@ -119,7 +111,7 @@ class Watcher:
     geometry : HexapodGeometry
         The machine that is watched.
     node : Node
-        That listens, in the namespace where the machine's nodes are; made with the options :data:`QUIET`.
+        That listens, in the namespace where the machine's nodes are; made with the options :data:`.ros_session.QUIET`.
     """
 
     def __init__(self, geometry: HexapodGeometry, node: Node) -> None:

@@ -25,9 +25,14 @@ from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
 from std_srvs.srv import SetBool, Trigger
 
+from hexapod_comp.formats.paths import config_file
 from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
+from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.nodes.client import LoopClient
+from hexapod_comp.nodes.recorder import BagRecorder
+from hexapod_comp.nodes.ros_session import QUIET, RosSession
 from hexapod_comp.nodes.running import autostart
+from hexapod_comp.nodes.watching import Watcher
 
 PACKAGE = Path(__file__).resolve().parents[2] / "hexapod_comp"
 
@@ -38,7 +43,11 @@ RIGHTS = ("publish", "subscribe", "reply", "request")
 TOOLS = "_ros2cli_*"
 """Names of the nodes that the ``ros2`` tools make; permissions of DDS take patterns (POSIX fnmatch)."""
 
-COMMANDS = {"/tool_pose_command": {"commander", "linuxcnc_bridge"}, "/strut_commands": {"compensator"}}
+COMMANDS = {
+    "/tool_pose_command": {"commander", "linuxcnc_bridge"},
+    "/select_tool": {"commander"},
+    "/strut_commands": {"compensator"},
+}
 """Who alone may move the machine."""
 
 
@@ -137,9 +146,39 @@ def test_the_client_opens_what_the_policy_allows() -> None:
         enclave = read_policy()["commander"]
         assert client.node.get_name() == enclave.node
         found = opened(client.node, enclave.node, "")
+        found["publish"] |= {"/select_tool"}  # for controllers that change tools
         assert found == enclave.allowed
     finally:
         client.close()
+
+
+def test_who_only_listens_may_and_opens_nothing_more(tmp_path: Path) -> None:
+    """``record`` and ``watch``, as they run; of ``echo`` its node, and that every topic of the nodes is there."""
+    policy = read_policy()
+    opens: dict[str, set[str]] = {right: set() for right in RIGHTS}
+
+    def look(node: Node) -> None:
+        for right, names in opened(node, node.get_name(), "").items():
+            opens[right] |= names
+
+    with BagRecorder(tmp_path / "bag") as recorder:
+        look(recorder._session.node)
+    with RosSession("hexapod_comp_watch", **QUIET) as session:
+        Watcher(load_geometry(config_file("paper.yaml")), session.node)
+        look(session.node)
+    with RosSession("hexapod_comp_echo", **QUIET) as session:
+        look(session.node)
+    witness = policy["witness"].allowed
+    assert opens["subscribe"] <= witness["subscribe"]
+    assert {right: opens[right] for right in RIGHTS[:1] + RIGHTS[2:]} == {
+        right: witness[right] for right in RIGHTS[:1] + RIGHTS[2:]
+    }
+    said = {
+        name for name in policy["compensator"].allowed["publish"] if not name.endswith(("_event", "_events", "rosout"))
+    }
+    others = {"/strut_states", "/tool_pose_true", "/tool_pose_command", "/select_tool", "/temperatures", "/humidity"}
+    by_input = {"/strut_setpoints", "/nominal_strut_states"}  # with command_input: struts
+    assert witness["subscribe"] == said | others | by_input
 
 
 LIFECYCLE = ("change_state", "get_state", "get_available_transitions", "get_transition_graph")

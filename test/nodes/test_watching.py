@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from http.client import HTTPConnection
 from pathlib import Path
 
 import matplotlib.image
@@ -21,7 +22,7 @@ from hexapod_comp.cli import main
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.nodes import watching
-from hexapod_comp.nodes.page import WatchPage, strut_colours, strut_ends, words
+from hexapod_comp.nodes.page import WatchPage, same_site, strut_colours, strut_ends, words
 from hexapod_comp.nodes.watching import QUIET, View, Watcher
 from hexapod_comp.pose import Pose
 
@@ -187,6 +188,56 @@ def test_an_address_that_cannot_be_had():
         page.close()
     with pytest.raises(HexapodError, match="cannot serve on no such host"):
         WatchPage(geometry, host="no such host")
+
+
+@pytest.mark.parametrize(
+    ("asked", "origin", "served"),
+    [
+        ("127.0.0.1:8080", None, True),
+        ("localhost:9000", "http://localhost:9000", True),  # through a tunnel
+        ("[::1]:8080", "http://[::1]:8080", True),
+        ("192.168.0.7:8080", "http://192.168.0.7:8080", True),  # with --host 0.0.0.0
+        ("machine.shop:8080", "http://machine.shop:8080", True),  # with --host machine.shop
+        ("127.0.0.1:8080", "http://evil.example", False),
+        ("127.0.0.1:8080", "http://127.0.0.1:3000", False),  # another server on this computer
+        ("127.0.0.1:8080", "null", False),  # a file, or a frame in a sandbox
+        ("evil.example:8080", "http://evil.example:8080", False),  # its name was made to mean 127.0.0.1
+        ("evil.example", None, False),
+        ("", None, False),
+        ("[::1", None, False),
+    ],
+)
+def test_only_the_page_s_own_site_is_served(asked, origin, served):
+    headers = {"Host": asked} | ({} if origin is None else {"Origin": origin})
+    assert same_site(headers, "machine.shop") is served
+
+
+def test_the_server_refuses_what_other_sites_ask_for():
+    """By what a browser sends: for the page itself, and for the connection behind it."""
+    pytest.importorskip("viser", reason="the page needs viser")
+    page = WatchPage(load_geometry("paper.yaml"), port=free_port())
+    upgrade = {
+        "Connection": "Upgrade",
+        "Upgrade": "websocket",
+        "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+        "Sec-WebSocket-Protocol": "viser-v1.1.1",
+    }
+    own = page.address.removeprefix("http://")
+    try:
+        for headers, status in (
+            ({"Host": own}, 200),
+            ({"Host": "evil.example"}, 403),
+            ({"Host": own, "Origin": page.address, **upgrade}, 101),
+            ({"Host": own, "Origin": "http://evil.example", **upgrade}, 403),
+            ({"Host": "evil.example", "Origin": "http://evil.example", **upgrade}, 403),
+        ):
+            connection = HTTPConnection(own, timeout=20.0)
+            connection.request("GET", "/", headers=headers)
+            assert connection.getresponse().status == status, headers
+            connection.close()
+    finally:
+        page.close()
 
 
 def free_port() -> int:
