@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..compensation.compensator import DEFAULT_RAMP_RATE, Compensator
-from ..errors import HexapodError, ModelError, TooEarlyError
+from ..errors import HexapodError, TooEarlyError
 from ..formats.outputs import write_text
 from ..kernels.struts import GROWTH, MOST_HARMONICS, WAVES
 from ..machine.geometry import HexapodGeometry
@@ -24,6 +24,8 @@ from ..machine.model import MachineModel, RealMachine
 from ..machine.temperatures import Temperatures
 from ..machine.trajectory import moves
 from ..pose import Pose, rotation_from_angles, stacked
+from . import carried
+from .carried import refuse_unknown
 
 SOURCES = Path(__file__).parents[1] / "core", Path(__file__).parent / "c"
 """Where the core lies, and what is written around it."""
@@ -121,11 +123,9 @@ def model_header(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[s
     Raises
     ------
     ModelError
-        The struts swell by humidity, of which the C core knows nothing.
+        The model has a term of which the C core knows nothing: struts that swell by humidity.
     """
-    if model.struts.moisture.any():
-        problem = "cannot be carried to C: its core has no humidity. Leave it out, or let the compensator node run it"
-        raise ModelError("struts.moisture", problem, model.struts.moisture.tolist())
+    refuse_unknown(model, carried.C, "the C core")
     machine = RealMachine(geometry, model)
     _, knots, pieces = machine.strut_arrays
     arrays = {"hexapod_knots": knots, "hexapod_pieces": pieces}

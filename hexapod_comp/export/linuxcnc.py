@@ -27,6 +27,7 @@ from ..machine.geometry import STRUT_NAMES
 from ..machine.model import RealMachine
 from ..machine.passes import Passes
 from ..machine.size import rms
+from .carried import AT_20_DEGC, refuse_unknown
 
 MOST_POINTS = 256
 """EMCMOT_COMP_SIZE."""
@@ -126,7 +127,10 @@ def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
     ------
     GeometryError
         The struts' leads differ, or cardan axes come near a right angle: genhexkins cannot have that.
+    ModelError
+        The model has a term that is neither carried nor reported as not carried.
     """
+    refuse_unknown(machine.model, AT_20_DEGC, "LinuxCNC's export")
     geometry, structure = machine.geometry, machine.structure
     lead = float(geometry.screw_lead[0])
     if (geometry.screw_lead != lead).any():

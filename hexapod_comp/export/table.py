@@ -30,6 +30,7 @@ from ..machine.passes import Passes, at
 from ..measurements.readings import attitude_error
 from ..pose import Pose
 from ..virtual.trial import model_commands
+from .carried import AT_20_DEGC, refuse_unknown
 from .worth import DIAGONAL
 
 POSITION = ("x", "y", "z")
@@ -146,12 +147,13 @@ def make_table(
     Raises
     ------
     ModelError
-        Too many nodes.
+        Too many nodes, or a term of the model that is neither carried nor reported as not carried.
     LimitError
         A node is out of the machine's reach.
     OutsideFieldError
         A node is outside the field's box, and the field refuses that.
     """
+    refuse_unknown(model, AT_20_DEGC, "the table")
     nodes = _grid_nodes(box, step)
     shape = tuple(len(n) for n in nodes)
     places = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)

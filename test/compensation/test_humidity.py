@@ -118,6 +118,6 @@ def test_models_carry_it_and_absurd_ones_are_refused() -> None:
 
 def test_export_to_c_refuses_it_before_it_writes(tmp_path: Path) -> None:
     geometry = load_geometry("paper")
-    with pytest.raises(ModelError, match=r"struts\.moisture: cannot be carried to C"):
+    with pytest.raises(ModelError, match=r"struts\.moisture: cannot be exported: the C core does not know it"):
         write_c(tmp_path / "c", geometry, swelling(geometry), ("", ""))
     assert not (tmp_path / "c").exists()

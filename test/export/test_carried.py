@@ -1,0 +1,98 @@
+"""A term that an export does not know is refused. Truth: fields added here, of which no exporter can know anything."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from strategies import paper_geometry, random_model
+
+from hexapod_comp.errors import ModelError
+from hexapod_comp.export.c_code import model_header
+from hexapod_comp.export.carried import AT_20_DEGC, PROVENANCE, C, terms
+from hexapod_comp.export.linuxcnc import make_genhexkins
+from hexapod_comp.export.table import make_table
+from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.machine.struts import StrutErrors
+
+PAPER = paper_geometry()
+BOX = np.array([[-0.02, -0.02, 0.40], [0.02, 0.02, 0.42]])
+
+
+@dataclass(frozen=True)
+class ModelWithSag(MachineModel):
+    sag: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+
+@dataclass(frozen=True)
+class StrutsWithWind(StrutErrors):
+    wind: np.ndarray = field(default_factory=lambda: np.zeros(6))
+
+
+def linuxcnc(model: MachineModel) -> object:
+    return make_genhexkins(RealMachine(PAPER, model), BOX)
+
+
+def table(model: MachineModel) -> object:
+    return make_table(PAPER, model, BOX, 0.02)
+
+
+def c_core(model: MachineModel) -> object:
+    return model_header(PAPER, model, ("", ""))
+
+
+EXPORTERS = pytest.mark.parametrize("export", [linuxcnc, table, c_core])
+
+
+def widened(model: MachineModel, kind: type, **more: Any) -> Any:
+    return kind(**{entry.name: getattr(model, entry.name) for entry in fields(MachineModel)} | more)
+
+
+@EXPORTERS
+def test_an_unknown_term_is_refused_and_zero_passes(export: Callable[[MachineModel], object]):
+    known = random_model(np.random.default_rng(1), "paper")
+    assert export(widened(known, ModelWithSag))
+    with pytest.raises(ModelError, match=r"^sag: cannot be exported: .* does not know it.*\[0\.0, 0\.0, 1e-06\]"):
+        export(widened(known, ModelWithSag, sag=np.array([0.0, 0.0, 1e-6])))
+
+
+@EXPORTERS
+def test_an_unknown_term_of_a_block_is_refused(export: Callable[[MachineModel], object]):
+    assert export(MachineModel("paper", struts=StrutsWithWind()))
+    with pytest.raises(ModelError, match=r"^struts\.wind: .*1e-09"):
+        export(MachineModel("paper", struts=StrutsWithWind(wind=np.full(6, 1e-9))))
+
+
+def test_the_ideal_machine_has_no_terms_and_a_random_one_those_that_it_was_given():
+    assert list(terms(MachineModel("paper", name="other"))) == []
+    given = {name for name, _ in terms(random_model(np.random.default_rng(1), "paper"))}
+    assert {"base_deviation", "struts.offset", "struts.cosine", "field.lines", "base_expansion"} <= given
+    assert given <= C
+
+
+def test_the_lists_hold_todays_terms_and_no_others():
+    """Who adds a field decides here, for each export."""
+    blocks = {
+        "struts": StrutErrors,
+        "field": type(MachineModel("m").field),
+        "late_growth": type(MachineModel("m").late_growth),
+    }
+    today = {
+        name
+        for entry in fields(MachineModel)
+        if entry.name not in PROVENANCE
+        for name in (
+            [f"{entry.name}.{one.name}" for one in fields(blocks[entry.name])] if entry.name in blocks else [entry.name]
+        )
+    }
+    assert today == AT_20_DEGC == C | {"struts.moisture"}
+
+
+def test_humidity_is_reported_by_linuxcnc_and_refused_by_c():
+    model = MachineModel("paper", struts=replace(StrutErrors(), moisture=np.full(6, 1e-5)))
+    assert linuxcnc(model)
+    with pytest.raises(ModelError, match=r"^struts\.moisture: cannot be exported: the C core does not know it"):
+        c_core(model)
