@@ -6,7 +6,9 @@ import argparse
 import contextlib
 import math
 import os
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
@@ -154,6 +156,28 @@ def mention_compiling(kernel: str) -> None:
 
     if not any(cache_folder(numba.config.CACHE_DIR).rglob(f"{kernel}-*.nbi")):
         print("hexapod_comp: compiling, once after an installation; this takes up to a minute", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def ended_in_order() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end this context as Ctrl-C does, so that what was started is ended, with 128 + signal.
+
+    A second one ends the process at once. A hang-up that nohup ignores stays ignored.
+    """
+
+    def leave(caught: int, frame: object) -> None:
+        signal.signal(caught, signal.SIG_DFL)
+        raise SystemExit(128 + caught)
+
+    in_main = threading.current_thread() is threading.main_thread()  # elsewhere Python sets no handlers
+    usual = [one for one in (signal.SIGTERM, signal.SIGHUP) if in_main and signal.getsignal(one) == signal.SIG_DFL]
+    for one in usual:
+        signal.signal(one, leave)
+    try:
+        yield
+    finally:
+        for one in usual:
+            signal.signal(one, signal.SIG_DFL)
 
 
 def progress_bar(total: int, unit: str) -> Any:

@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
         model = calibration.fit.model
     else:
         model = chosen_model(args, geometry, truth)
-    with loop.simulated(args.machine, model, truth) as nodes:
+    with common.ended_in_order(), loop.simulated(args.machine, model, truth) as nodes:
         result = loop.witnessed(geometry, nodes, poses, path, rate, compare=True)
     rows = error_rows(result)
     if args.model in (TRUE, FITTED):

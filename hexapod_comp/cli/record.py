@@ -12,6 +12,7 @@ from . import common
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb; 0 when there is something to be replayed."""
+    from ..errors import InputFileError
     from ..nodes import heard_signals
     from ..nodes.recorder import BagRecorder
 
@@ -23,7 +24,9 @@ def run(args: argparse.Namespace) -> int:
         common.show({"bag": args.folder, "messages": recorder.counts})
     else:
         print("\n".join([f"{count:8d}  {topic}" for topic, count in sorted(recorder.counts.items())]))
-        print(f"written: {args.folder}")
+        print(f"written: {args.folder}" if not recorder.problem else "recording ended early")
+    if recorder.problem:
+        raise InputFileError(args.folder, "", recorder.problem)
     if not recorder.journal:
         common.say_notes(["no compensator was heard: there is nothing to replay"])
     return 0 if recorder.journal else 1

@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     loop.refuse_broken_limits(args.poses, geometry, model, rows, poses)
     started = nullcontext(()) if args.attach else loop.simulated(args.machine, model, truth)
     compare = not (args.attach or args.no_compare)  # nobody switches a real machine's compensation off in passing
-    with started as nodes:
+    with common.ended_in_order(), started as nodes:
         result = loop.witnessed(geometry, nodes, poses, None, rate, compare, args.namespace)
     errors, unanswered = error_rows(result), result.lost + result.refused
     if args.json:

@@ -8,6 +8,7 @@ import json
 import os
 import pty
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -21,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from strategies import paper_geometry, random_field, random_model
 
 from hexapod_comp import cli
-from hexapod_comp.cli import ik
+from hexapod_comp.cli import common, ik
 from hexapod_comp.cli.verbs import VERBS
 from hexapod_comp.compensation.checks import LIMITS, check
 from hexapod_comp.compensation.compensator import Compensator
@@ -698,3 +699,18 @@ def test_assess_refuses_bounds_that_are_none(hexapod, arguments: tuple[str, ...]
     code, out, err = hexapod("assess", *arguments)
     assert (code, out) == (2, "")
     assert f"argument {arguments[0]}" in err
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_signals_end_a_session_in_order(number: signal.Signals) -> None:
+    """What was started inside is ended, as contexts do; 128 + signal, as shells count."""
+    ended = []
+    before = signal.getsignal(number)
+    with pytest.raises(SystemExit) as left, common.ended_in_order():
+        try:
+            os.kill(os.getpid(), number)
+        finally:
+            ended.append(True)
+    assert left.value.code == 128 + number
+    assert ended
+    assert signal.getsignal(number) == before
