@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
@@ -706,11 +707,14 @@ def test_signals_end_a_session_in_order(number: signal.Signals) -> None:
     """What was started inside is ended, as contexts do; 128 + signal, as shells count."""
     ended = []
     before = signal.getsignal(number)
-    with pytest.raises(SystemExit) as left, common.ended_in_order():
-        try:
+
+    def session() -> None:
+        with common.ended_in_order(), contextlib.ExitStack() as started:
+            started.callback(ended.append, True)
             os.kill(os.getpid(), number)
-        finally:
-            ended.append(True)
+
+    with pytest.raises(SystemExit) as left:
+        session()
     assert left.value.code == 128 + number
     assert ended
     assert signal.getsignal(number) == before
