@@ -59,7 +59,7 @@ setup(
     ],
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "core/*.[ch]", "export/c/*"]},
+    package_data={NAME: ["py.typed", "core/*.[ch]", "export/c/*", "export/ros2_control/*"]},
     cffi_modules=["hexapod_comp/core/build.py:ffi"],
     options={"bdist_wheel": {"py_limited_api": "cp310"}},
     data_files=[

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 
 from ..formats.texts import number_hint
 
@@ -117,6 +118,24 @@ def count(text: str, most: int = 10_000_000) -> int:
     if not text.isdecimal() or len(text) > 12 or not 1 <= int(text) <= most:
         raise argparse.ArgumentTypeError(f"must be a whole number from 1 to {most}, not {text!r}")
     return int(text)
+
+
+def rate(text: str) -> int:
+    """Read the rate of a control loop, a whole number of Hz."""
+    return count(text, 10_000)
+
+
+def joint_names(text: str) -> tuple[str, ...]:
+    """Read six different names of joints, in strut order."""
+    names = tuple(text.split(","))
+    if len(set(names)) != 6 or len(names) != 6:
+        raise argparse.ArgumentTypeError(f"needs six different names, in strut order, not {text}")
+    strange = [name for name in names if not re.fullmatch(r"[A-Za-z_][\w/]*", name)]
+    if strange:
+        raise argparse.ArgumentTypeError(
+            f"a name has letters, digits, _ and /, a letter or _ first, not {strange[0]!r}"
+        )
+    return names
 
 
 def port(text: str) -> int:

@@ -30,12 +30,13 @@ def run(args: argparse.Namespace) -> int:
     from ..export.worth import ExportTrial
     from ..machine.model import commanded_box
 
-    wanted = (args.linuxcnc, args.table, args.c_folder, args.urdf, args.mjcf)
+    wanted = (args.linuxcnc, args.table, args.c_folder, args.ros2_control, args.urdf, args.mjcf)
     if all(place is None for place in wanted):
-        raise InputFileError("export", "--linuxcnc, --table, --c, --urdf, --mjcf", "at least one is needed")
+        names = "--linuxcnc, --table, --c, --ros2-control, --urdf, --mjcf"
+        raise InputFileError("export", names, "at least one is needed")
     geometry, model = common.load_machine(args)
     common.mention_compiling("model.actual_pose_one")
-    exact = _descriptions(args, geometry) + ([] if args.c_folder is None else _c(args, geometry, model))
+    exact = _descriptions(args, geometry) + _c(args, geometry, model)
     if args.linuxcnc is None and args.table is None:
         return _show_exact(args, model, exact)
     box = commanded_box(geometry, model) if args.box is None else np.array(args.box)
@@ -64,18 +65,23 @@ def _descriptions(args: argparse.Namespace, geometry: HexapodGeometry) -> list[s
     """Write what robot programs want to know of the machine; return the files."""
     from ..export.robot_description import mjcf, urdf
     from ..formats.outputs import write_text
+    from ..machine.geometry import STRUT_NAMES
 
     written = [(file, form) for file, form in ((args.urdf, urdf), (args.mjcf, mjcf)) if file is not None]
     for file, form in written:
-        write_text(file, form(geometry))
+        write_text(file, form(geometry, args.joint_names or STRUT_NAMES))
     return [file for file, _ in written]
 
 
 def _c(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel) -> list[str]:
-    """Write the C core with this machine's constants; return the files."""
+    """Write the C core with this machine's constants, alone and as a controller of ros2_control; return the files."""
+    if args.c_folder is None and args.ros2_control is None:
+        return []
     from ..compensation.journal import IDEAL_SOURCE, Source
     from ..export.c_code import write_c
+    from ..export.control_package import write_ros2_control
     from ..formats.paths import input_file
+    from ..machine.geometry import STRUT_NAMES
     from ..machine.model_file import IDEAL, model_text
     from ..virtual.named import is_random
 
@@ -86,7 +92,11 @@ def _c(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel)
         source = Source.of(args.model, model_text(model))
     else:
         source = Source.read(input_file(args.model))
-    return [str(file) for file in write_c(args.c_folder, geometry, model, (machine.sha256, source.sha256))]
+    of = (geometry, model, (machine.sha256, source.sha256))
+    files = [] if args.c_folder is None else write_c(args.c_folder, *of)
+    if args.ros2_control is not None:
+        files += write_ros2_control(args.ros2_control, *of, args.rate, args.joint_names or STRUT_NAMES)
+    return [str(file) for file in files]
 
 
 def _show_exact(args: argparse.Namespace, model: MachineModel, written: list[str]) -> int:

@@ -408,6 +408,11 @@ def _export(parser: argparse.ArgumentParser) -> None:
     add("--linuxcnc", metavar="FOLDER", help="folder for LinuxCNC's files; made if it is missing")
     add("--table", type=arguments.csv_file, metavar="FILE.csv", help="CSV file for the trilinear table")
     add("--c", dest="c_folder", metavar="FOLDER", help="folder for the compensator in C with this machine's constants")
+    text = "folder for a ROS 2 package: this machine's compensation as a controller of ros2_control, and configurations"
+    add("--ros2-control", metavar="FOLDER", help=text)
+    add("--rate", type=arguments.rate, default=250, metavar="HZ", help="of ros2_control's loop (default 250)")
+    text = "the struts' joints in URDF, MJCF and ros2_control (default strut_1,…,strut_6)"
+    add("--joint-names", type=arguments.joint_names, metavar="A,B,C,D,E,F", help=text)
     text = "file for the machine as URDF: robot_state_publisher, RViz, ros2_control; needs no model"
     add("--urdf", metavar="FILE.urdf", help=text)
     add("--mjcf", metavar="FILE.xml", help="file for the machine as MuJoCo's MJCF, loops closed; needs no model")

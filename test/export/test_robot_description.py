@@ -14,13 +14,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from foreign_machines import machines, with_frames
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.cli import main
 from hexapod_comp.export.robot_description import joint_positions, mjcf, urdf
-from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import STRUT_NAMES, HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import strut_lengths
 from hexapod_comp.pose import Pose
@@ -211,10 +209,6 @@ def test_export_writes_both_without_a_model(tmp_path: Path, capsys: pytest.Captu
     assert topics["joint_states_topic"] == "nominal_strut_states"  # measured ones would be corrected once more
     for joint in robot.find("ros2_control").findall("joint"):  # JointStateTopicSystem ends at what has no interface
         assert [state.get("name") for state in joint.findall("state_interface")] == ["position", "velocity"]
-    controllers = yaml.safe_load(config_file("ros2_control.yaml").read_text())
-    for name in ("joint_trajectory_controller", "forward_command_controller"):
-        assert name in controllers["controller_manager"]["ros__parameters"]
-        assert controllers[name]["ros__parameters"]["joints"] == list(STRUT_NAMES)
     assert [connect.get("name") for connect in mujoco.find("equality")] == [f"{strut}_end" for strut in STRUT_NAMES]
 
 

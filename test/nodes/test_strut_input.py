@@ -7,6 +7,7 @@ that these lengths belong to.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +16,16 @@ from foreign_machines import machines
 from node_helpers import BEST_EFFORT, HOME, Bench, closed_form_lengths, near
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
 
 from benchmarks.strut_input import difference
+from hexapod_comp.cli import main
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.errors import CommandError, KinematicsError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.nodes.command_inputs import STRUTS, StrutInput
+from hexapod_comp.nodes.compensator import CompensatorNode
 from hexapod_comp.nodes.health import ERROR, OK, WARN
 from hexapod_comp.nodes.parameters import ParameterError
 from hexapod_comp.virtual.named import find_model
@@ -172,3 +176,55 @@ def test_joint_states_show_the_machine_where_its_struts_are(bench: Bench):
     at = [joints[f"platform_{axis}"] for axis in "xyz"]
     np.testing.assert_allclose(at, pose.position, rtol=0, atol=SAME)
     np.testing.assert_allclose([joints[n] for n in STRUT_NAMES], closed_form_lengths(pose), rtol=0, atol=SAME)
+
+
+# ---- before ros2_control ----
+
+
+ASKEW = near(HOME, (0.01, 0.005, 0.0), 1.0)
+"""A pose at which all struts differ."""
+
+
+def started_before(bench: Bench, folder: Path, **others: bool) -> list[Float64MultiArray]:
+    """Start a compensator as doc/ros.md does before ros2_control; return what forward_command_controller is told."""
+    assert main(["export", "--ros2-control", str(folder)]) == 0
+    words = ["--ros-args", "--params-file", str(folder / "config" / "before.yaml")]
+    for name, topic in (
+        ("strut_commands_array", "forward_command_controller/commands"),
+        ("strut_states", "joint_states"),
+    ):
+        words += ["-r", f"{name}:={topic}"]
+    bench.add(CompensatorNode, True, {"enable_compensation": False, **others}, cli_args=words)
+    told: list[Float64MultiArray] = []
+    bench.witness.create_subscription(Float64MultiArray, "forward_command_controller/commands", told.append, 10)
+    return told
+
+
+def broadcast(bench: Bench) -> Callable[[], bool]:
+    """Publish the struts as joint_state_broadcaster does: by name, in its own order, beside other joints."""
+    publisher = bench.witness.create_publisher(JointState, "joint_states", 10)
+    message = setpoints([12.0, *closed_form_lengths(ASKEW)[::-1]], ("spindle", *STRUT_NAMES[::-1]))
+
+    def tell(key: str, value: str) -> bool:
+        message.header.stamp = bench.now()
+        publisher.publish(message)
+        return value in bench.values().get(key, "")
+
+    return tell
+
+
+def test_before_ros2_control_arrays_are_in_joint_order(bench: Bench, tmp_path: Path):
+    """By the configuration that the export writes. Truth: closed-form lengths, all different."""
+    told, tell = started_before(bench, tmp_path), broadcast(bench)
+    bench.until(lambda: tell("pose_estimated_from", "strut_states"), "feedback through joint_states")
+    wanted = closed_form_lengths(ASKEW)
+    assert len(set(wanted.round(6))) == 6
+    bench.until(lambda: tell("pose_estimated_from", "") and (bench.send(ASKEW), told)[1], "an array")
+    np.testing.assert_allclose(told[-1].data, wanted, rtol=0, atol=SAME)
+
+
+def test_before_ros2_control_its_own_joint_states_are_refused(bench: Bench, tmp_path: Path):
+    """What the configuration turns off: with it the node would read what it publishes itself."""
+    started_before(bench, tmp_path, publish_description=True)
+    tell = broadcast(bench)
+    bench.until(lambda: tell("last_bad_feedback", "several publishers"), "the reason")

@@ -1,0 +1,137 @@
+"""ros2_control's package for one machine: a controller around the C core, and configurations of all three wirings.
+
+Within ros2_control the package's own controller compensates, chained below one that plans struts; *below* ros2_control
+the compensator node is its hardware, *before* it the node commands a forward_command_controller.
+"""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+
+from ..errors import InputFileError
+from ..formats.outputs import write_text
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry
+from ..machine.kinematics import strut_lengths
+from ..machine.model import MachineModel
+from .c_code import write_c
+from .robot_description import urdf
+
+TEMPLATES = Path(__file__).parent / "ros2_control"
+"""The package's files; ``@NAME@`` stands for what differs from machine to machine."""
+
+CHAINED = "compensation"
+"""Name of the controller in ``within.yaml``: ahead of the joints that it offers."""
+
+TOLERANCE = 0.75
+"""Of the largest step between two commands: a goal that lags by more is aborted. What the controller then holds, where
+the struts are, must still be within a step of the last command that was not refused."""
+
+LAG = 0.02
+"""Of drives, s, for the speed at which a trajectory comes to the tolerance by lag alone."""
+
+
+def write_ros2_control(
+    folder: str | Path,
+    geometry: HexapodGeometry,
+    model: MachineModel,
+    hashes: tuple[str, str],
+    rate: int,
+    joint_names: Sequence[str] = STRUT_NAMES,
+) -> list[Path]:
+    """Write an ament_cmake package into a folder, which is made if it is missing.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Files of these names in it are replaced.
+    geometry, model, hashes
+        As of :func:`~hexapod_comp.export.c_code.write_c`, whose files are in ``core``.
+    rate : int
+        Of the control loop, Hz.
+    joint_names : sequence of str, optional
+        Of the drives' joints, in strut order.
+
+    Returns
+    -------
+    list of Path
+        The files.
+
+    Raises
+    ------
+    ModelError
+        As of :func:`~hexapod_comp.export.c_code.write_c`.
+    """
+    folder = Path(folder)
+    written = write_c(folder / "core", geometry, model, hashes)
+    values = _values(geometry, model, rate, joint_names)
+    files = {folder / "urdf" / "machine.urdf": drives_urdf(geometry, joint_names)}
+    for template in sorted(TEMPLATES.iterdir()):
+        place = folder / "config" if template.suffix == ".yaml" else folder
+        files[place / template.name] = filled(template.read_text(encoding="utf-8"), values)
+    for path, text in files.items():
+        path.parent.mkdir(exist_ok=True)
+        write_text(path, text)
+    return [*written, *files]
+
+
+def package_name(machine: str) -> str:
+    """Return the package's name, which ROS wants to be lower case letters, digits and underscores, a letter first."""
+    plain = re.sub(r"[^a-z0-9]+", "_", machine.lower()).strip("_")
+    if not plain:
+        raise InputFileError("export", "--ros2-control", f"no package can be named after machine {machine!r}")
+    return ("" if plain[0].isalpha() else "machine_") + plain + "_compensation"
+
+
+def filled(template: str, values: dict[str, str]) -> str:
+    """Return a template with its values."""
+    return re.sub(r"@([A-Z_]+)@", lambda name: values[name[1]], template)
+
+
+def drives_urdf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES) -> str:
+    """Return the machine as URDF with drives that ros2_control simulates, at home: name your own in their place."""
+    robot = ET.fromstring(urdf(geometry, joint_names, ros2_control=False))
+    control = ET.SubElement(robot, "ros2_control", name=geometry.name, type="system")
+    ET.SubElement(ET.SubElement(control, "hardware"), "plugin").text = "mock_components/GenericSystem"
+    for name, length in zip(joint_names, strut_lengths(geometry, geometry.home), strict=True):
+        joint = ET.SubElement(control, "joint", name=name)
+        ET.SubElement(joint, "command_interface", name="position")
+        state = ET.SubElement(joint, "state_interface", name="position")
+        ET.SubElement(state, "param", name="initial_value").text = repr(float(length))
+    ET.indent(robot)
+    return ET.tostring(robot, encoding="unicode") + "\n"
+
+
+def _values(geometry: HexapodGeometry, model: MachineModel, rate: int, joint_names: Sequence[str]) -> dict[str, str]:
+    """Return what stands for each name in a template."""
+    chained = [f"{CHAINED}/{name}" for name in joint_names]
+    plain = {"MACHINE": geometry.name, "MODEL": model.name}
+    return {
+        **{key: re.sub(r"[^\w .,:()+-]", "_", value) for key, value in plain.items()},  # for XML, YAML and comments
+        "PACKAGE": package_name(geometry.name),
+        "RATE": str(rate),
+        "JOINTS": f"[{', '.join(joint_names)}]",
+        "CHAINED": f"[{', '.join(chained)}]",
+        "CONSTRAINTS": _constraints(geometry, rate, joint_names),
+        "CHAINED_CONSTRAINTS": _constraints(geometry, rate, chained),
+    }
+
+
+def _constraints(geometry: HexapodGeometry, rate: int, joints: Sequence[str]) -> str:
+    """Return the lines that end a goal which the struts do not follow, before a hold would be refused."""
+    step, speed = geometry.limits.step, geometry.limits.speed
+    tolerance = TOLERANCE * step
+    fastest = min(speed, step * rate, tolerance / (LAG + 1.0 / rate))
+    lines = [
+        "# A goal ends, and the struts are held where they are, when one is this far from its setpoint, m: below the",
+        f"# machine's step_mm, {step * 1e3:g}. Drives that lag by {LAG * 1e3:g} ms are so far behind at "
+        f"{fastest * 1e3:.3g} mm/s: plan trajectories below",
+        "# that speed, and with velocities: between positions alone the setpoint's speed jumps.",
+        "constraints:",
+        "  goal_time: 1.0                     # s",
+        "  stopped_velocity_tolerance: 0.0    # of the encoders' steps",
+        *(f"  {joint}: {{trajectory: {tolerance:.9g}}}" for joint in joints),
+    ]
+    return "\n".join("    " + line for line in lines)
