@@ -23,12 +23,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from hexapod_comp.export.c_library import CCompensator
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.export.c_code import write_c
-from hexapod_comp.export.c_library import CCompensator
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.model_file import load_model

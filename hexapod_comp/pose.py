@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .core import QUATERNION_NORM_TOLERANCE
+from .core.single import quaternion_of, read_pose, rotation_flaw
 from .errors import PoseError
-from .kernels.pose import QUATERNION_NORM_TOLERANCE, quaternion_of, read_pose, rotation_flaw
 
 LARGEST_ANGLE = 1000.0
 """Larger angles, rad, are refused: nobody turns a tool 159 times, and at 1e16 rounding turns it anywhere."""
@@ -88,7 +89,7 @@ class Pose:
         if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
             raise PoseError(f"quaternion must have norm 1, not {norm:.6g}", quaternion.tolist())
         rotation = np.empty((3, 3))
-        read_pose(0.0, 0.0, 0.0, *quaternion, np.empty(3), rotation)
+        read_pose((0.0, 0.0, 0.0, *quaternion.tolist()), np.empty(3), rotation)
         return Pose(np.asarray(position), rotation)
 
     def angles(self) -> np.ndarray:

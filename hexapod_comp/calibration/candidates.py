@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..core import Status
 from ..errors import GeometryError
-from ..kernels.limits import WITHIN
 from ..machine.field import CROSS_AXES
 from ..machine.geometry import HexapodGeometry
 from ..measurements.campaign_runs import (
@@ -135,7 +135,7 @@ def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
         for name, ends in level if attitude == "level" else tilted:
             points = ends[0] + share[:, None] * (ends[1] - ends[0])
             findings, _ = examiner.findings(points, rotation[None], threads=1)
-            first, last = _longest(findings == WITHIN)
+            first, last = _longest(findings == Status.OK)
             if last - first >= LEAST_SHARE * (SAMPLES - 1):
                 yield f"{name}, {attitude}", points[[first, last]].round(6), rotation
 
@@ -191,7 +191,7 @@ def _sets_of_poses(place: MeasuringBox) -> Iterator[tuple[np.ndarray, np.ndarray
     positions = rng.uniform(place.box[0], place.box[1], (count, 3)).round(6)
     rotations = place.turned(rng.uniform(-place.tilt, place.tilt, (count, 2)).round(6))
     findings, _ = Examiner(place.geometry).findings(positions, rotations)
-    good = np.flatnonzero(findings == WITHIN)[: POSES_A_RUN * POSE_RUNS]
+    good = np.flatnonzero(findings == Status.OK)[: POSES_A_RUN * POSE_RUNS]
     for start in range(0, len(good) - POSES_A_RUN + 1, POSES_A_RUN):
         part = good[start : start + POSES_A_RUN]
         yield positions[part], rotations[part]
@@ -209,7 +209,7 @@ def _circles(place: MeasuringBox) -> Iterator[CampaignRun]:
                 where = ", ".join(f"{value * 1e3:.0f}" for value in centre)
                 name = f"ball_bar, {plane} at {where}, {attitude}"
                 run = circle_run(name, centre, radius, CIRCLE_POINTS, np.eye(3)[list(axes)], rotation)
-                if (examiner.findings(run.positions, rotation[None], threads=1)[0] == WITHIN).all():
+                if (examiner.findings(run.positions, rotation[None], threads=1)[0] == Status.OK).all():
                     yield run
 
 
@@ -229,7 +229,7 @@ def _tilted_at(place: MeasuringBox) -> Iterator[CampaignRun]:
     for share in _shares(True):
         ball = (place.box[0] + share * np.ptp(place.box, axis=0)).round(6)
         positions = np.tile(ball, (TILTS, 1))
-        if (examiner.findings(positions, rotations, threads=1)[0] == WITHIN).all():
+        if (examiner.findings(positions, rotations, threads=1)[0] == Status.OK).all():
             where = ", ".join(f"{value * 1e3:.0f}" for value in ball)
             yield CampaignRun(f"r_test, at {where}", "r_test", positions, rotations)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..kernels.struts import MOST_HARMONICS
+from ..core import MOST_HARMONICS
 from .cell_rows import at_once
 from .estimation import HUBER, MEDIAN_TO_SIGMA, Estimation
 from .linear_problem import LinearProblem, Posterior, solve

@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
+from ..core.batch import strut_errors
 from ..errors import CalibrationError, ModelError
 from ..formats.figures import NOTHING, SIX_COLOURS, WITH, WITHOUT, picture_text
-from ..kernels.struts import smooth_error
 from ..machine.field import COMPONENTS, CROSS_AXES
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths_batch
@@ -192,12 +192,12 @@ def _residual_panel(axes: Axes, fit: ModelFit) -> None:
 
 def _strut_panel(axes: Axes, fit: ModelFit) -> None:
     """Show what each strut does with its commands, offset and backlash aside."""
-    struts = RealMachine(fit.measurements.geometry, fit.model).strut_arrays
+    machine = RealMachine(fit.measurements.geometry, fit.model)
     commands = fit.measurements.stations.commands
     for strut, name in enumerate(STRUT_NAMES):
         at = np.linspace(commands[:, strut].min(), commands[:, strut].max(), 4 * SAMPLES)
-        errors = [smooth_error(c, 0.0, *struts, strut)[0] - fit.model.struts.offset[strut] for c in at]
-        axes.plot(at * 1e3, np.array(errors) * 1e6, lw=0.8, label=name)
+        errors, _ = strut_errors(machine.state.at, strut, at)
+        axes.plot(at * 1e3, (errors - fit.model.struts.offset[strut]) * 1e6, lw=0.8, label=name)
     axes.set(title="strut errors: pitch, screw wave, length map", xlabel="command, mm", ylabel="error, µm")
     axes.legend(ncols=2, fontsize=7)
 

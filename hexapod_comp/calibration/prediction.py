@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..core import Status
 from ..errors import CalibrationError
-from ..kernels.kinematics import OK
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import RealMachine, platform_box
 from ..machine.motion import FOLLOWED
@@ -251,7 +251,7 @@ def _first_order(machine: RealMachine, fitted: FittedParameters | None, stations
     solved = np.zeros(count, dtype=bool)
     for n in range(count):
         arrays = modelled[0][n], modelled[1][n], actual[0][n], actual[1][n]
-        solved[n] = machine.forward(stations.commands[n], stations.sense[n], *arrays)[0] == OK
+        solved[n] = machine.forward(stations.commands[n], stations.sense[n], *arrays)[0] == Status.OK
     displacements = actual[0] - stations.positions + (actual[1] - stations.rotations) @ geometry.tool.position
     values = np.full((count, 6), np.nan)
     values[solved, :3] = displacements[solved] @ geometry.work.rotation

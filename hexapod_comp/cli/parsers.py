@@ -227,12 +227,6 @@ def _replay(parser: argparse.ArgumentParser) -> None:
     add("--model", metavar="FILE", help=f"model file, the name of a shipped one, {WORDS} {own}")
     text = "accept differences up to this, µm (default 0: the same bits)"
     add("--tolerance-um", type=arguments.bound, default=0.0, metavar="UM", help=text)
-    add(
-        "--c",
-        dest="library",
-        metavar="LIBRARY",
-        help="run the C core of an export --c, compiled as a shared library, instead",
-    )
     _pictures(add)
     _table_out(add, "all corrections")
     _json(add)

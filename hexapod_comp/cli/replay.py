@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from . import common
 
@@ -50,7 +49,7 @@ def _replayed(args: argparse.Namespace, recording: Recording) -> tuple[Report, H
     report = Report(recording, None, tolerance=args.tolerance_um * 1e-6)
     with common.progress_bar(len(recording.commands) * (as_it_was + bool(other)), " answers") as bar:
         if as_it_was:
-            report.replayed = replay_recording(recording, files, bar.update, _maker(args, recording))
+            report.replayed = replay_recording(recording, files, bar.update)
             if other is None and not report.replayed.compared:
                 raise InputFileError(args.bag, "", NOTHING)
         if other is not None:
@@ -59,30 +58,6 @@ def _replayed(args: argparse.Namespace, recording: Recording) -> tuple[Report, H
     geometry = files.geometry(recording.first.geometry) if as_it_was or other is None else other[0]
     report.work_frames = geometry.work_frames
     return report, geometry
-
-
-def _maker(args: argparse.Namespace, recording: Recording) -> Callable[[HexapodGeometry, MachineModel], Any]:
-    """Return what makes the compensator: the Python one, or the C core of ``--c``, if it is of the same files."""
-    if args.library is None:
-        from ..compensation.compensator import Compensator
-
-        return Compensator
-    from ..errors import InputFileError
-    from ..export.c_library import CCompensator
-
-    first = recording.first
-    wanted = first.geometry["sha256"], first.model["sha256"]
-
-    def make(geometry: HexapodGeometry, model: MachineModel) -> CCompensator:
-        core = CCompensator(args.library, geometry, model)
-        for what, made_of, used in zip(("geometry", "model"), core.hashes, wanted, strict=True):
-            if made_of != used:
-                raise InputFileError(
-                    args.library, "", f"is made of another {what} file than the recording's (SHA-256 {made_of})"
-                )
-        return core
-
-    return make
 
 
 def _show(args: argparse.Namespace, report: Report) -> None:

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..core import Status
+from ..core.batch import QUANTITIES, examine_poses
 from ..errors import GeometryError, HexapodError, LimitError, NotConvergedError, NotFiniteError, OutsideFieldError
-from ..kernels.checks import OUTSIDE, UNSOLVED, examine_many
-from ..kernels.limits import Quantities
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.limits import REASONS, STAGES
 from ..machine.model import MachineModel, RealMachine
@@ -291,14 +291,14 @@ class _PathCheck:
     ) -> None:
         """Examine tool poses, (n, …), of the rows `owner`; `in_sequence`: after the ones before."""
         quantities, flags = self._examine(*self.geometry.platform_poses(positions, rotations), in_sequence)
-        lengths = quantities.lengths
+        lengths = quantities["lengths"]
         at_rows = share == 1.0
         self.lengths[owner[at_rows]] = lengths[at_rows]
         self.examined += len(owner)
-        self.outside_field[owner[flags == OUTSIDE]] = True
-        solved = flags != UNSOLVED
+        self.outside_field[owner[flags == Status.OUTSIDE_FIELD]] = True
+        solved = flags != Status.NOT_CONVERGED
         with np.errstate(invalid="ignore", over="ignore"):
-            measured = {**self._static(quantities, solved), **self._other(quantities.sign[:, :, None], flags)}
+            measured = {**self._static(quantities, solved), **self._other(quantities["sign"][:, :, None], flags)}
             if in_sequence:
                 changes = np.diff(np.concatenate([self.previous, lengths]), axis=0)
                 measured |= self._changes(changes)
@@ -308,33 +308,17 @@ class _PathCheck:
 
     def _examine(
         self, positions: np.ndarray, rotations: np.ndarray, in_sequence: bool
-    ) -> tuple[Quantities, np.ndarray]:
-        machine, geometry = self.machine, self.geometry
-        quantities = Quantities.empty(len(positions), 2)
-        flags = np.empty(len(positions), np.int64)
-        examine_many(
-            np.ascontiguousarray(positions),
-            np.ascontiguousarray(rotations),
-            not in_sequence,
-            geometry.kernel_joints,
-            geometry.limit_numbers,
-            machine.thresholds,
-            self.motion.low,
-            self.motion.sense,
-            machine.body,
-            machine.strut_arrays,
-            machine.field_arrays,
-            quantities,
-            flags,
-        )
-        for quantity in quantities:
-            quantity[flags == UNSOLVED, 1] = np.nan
+    ) -> tuple[np.ndarray, np.ndarray]:
+        given = np.ascontiguousarray(positions), np.ascontiguousarray(rotations), not in_sequence
+        quantities, flags = examine_poses(self.machine.state.at, *given, self.motion.low, self.motion.sense)
+        for name in QUANTITIES.names or ():
+            quantities[name][flags == Status.NOT_CONVERGED, 1] = np.nan
         return quantities, flags
 
-    def _static(self, quantities: Quantities, solved: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    def _static(self, quantities: np.ndarray, solved: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Return margin and value, (n, 2, k), of the limits of single poses."""
-        limits, correction = self.geometry.limits, np.zeros_like(quantities.lengths)
-        correction[:, 1] = quantities.lengths[:, 1] - quantities.lengths[:, 0]
+        limits, correction = self.geometry.limits, np.zeros_like(quantities["lengths"])
+        correction[:, 1] = quantities["lengths"][:, 1] - quantities["lengths"][:, 0]
         measured = {**limits.margins(quantities), "correction": (limits.correction - np.abs(correction), correction)}
         for margin, _ in measured.values():
             margin[~solved, 1] = np.inf  # said once, as not converged
@@ -357,8 +341,8 @@ class _PathCheck:
         refusing = self.machine.model.field.outside == "refuse"
         never = np.zeros(len(flags), dtype=bool)
         broken = {
-            "not_converged": np.stack([never, flags == UNSOLVED], axis=1)[:, :, None],
-            "outside_field": np.stack([never, (flags == OUTSIDE) & refusing], axis=1)[:, :, None],
+            "not_converged": np.stack([never, flags == Status.NOT_CONVERGED], axis=1)[:, :, None],
+            "outside_field": np.stack([never, (flags == Status.OUTSIDE_FIELD) & refusing], axis=1)[:, :, None],
             "assembly": (sign != self.geometry.home_sign) & ~np.isnan(sign),
         }
         return {name: (np.where(is_so, -1.0, np.inf), sign) for name, is_so in broken.items()}

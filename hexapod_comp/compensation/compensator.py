@@ -13,24 +13,25 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import HexapodError, ModelError, NotConvergedError, NotFiniteError
-from ..kernels import kinematics as kernels
-from ..kernels.compensation import OUTSIDE, compensate_one, compensate_quaternion, estimate_one
-from ..kernels.pose import quaternion_of
+from ..core import Status, Struct, ffi, lib
+from ..core.batch import given
+from ..core.single import backwards, solve_linear
+from ..errors import HexapodError, ModelError, NotConvergedError, NotFiniteError, PoseError
 from ..machine.frames import TOOL
 from ..machine.geometry import HexapodGeometry
-from ..machine.kinematics import forward_error, strut_lengths
-from ..machine.model import MachineModel, RealMachine
+from ..machine.kinematics import forward_error, jacobian
+from ..machine.late import PARTS, Lag
+from ..machine.model import MachineModel, RealMachine, core_model, write_temperatures
 from ..machine.motion import MotionState
 from ..machine.temperatures import HUMIDITY, Temperatures, check_part
 from ..pose import Pose
-from .findings import refuse, refuse_motion
-from .state import TOOL_CHANGED, CommandState, Correction, pack_fixed, pack_pose, read_state
+from .findings import pose_of, refusal
+from .state import PLACES, Correction, named_parts, pack_pose, read_parts
 
 DEFAULT_RAMP_RATE = 1e-3
 """How fast a change of model, temperature or enabling moves a strut, m/s."""
 
-NO_SHIFT = np.concatenate([np.zeros(3), np.eye(3).ravel()])  # as pack_pose, but nothing compiles while modules load
+NO_SHIFT = pack_pose(Pose.identity())
 """Frame of poses that are in ``base`` already."""
 
 
@@ -53,13 +54,24 @@ class Compensator:
 
     Notes
     -----
-    :meth:`step` is the loop's entry: it works on preallocated arrays and returns nothing but what must be
-    sent. :meth:`correct` does the same and gives the full record.
+    What a command leaves behind, and every rule, is the core's: this class holds its ``hc_state`` and says in
+    words what it refuses. :meth:`step` is the loop's entry, :meth:`correct` does the same and gives the full record.
 
     Attributes
     ----------
     geometry : HexapodGeometry
         The machine with the tool in use.
+    model : MachineModel
+        The model in use.
+    command, nominal, correction : ndarray, shape (6,)
+        Of the last command accepted, m; this compensator's own arrays, which the next command changes. NaN before the
+        first; after a reset to measured struts `command` is where they stand.
+    condition : float
+        Condition number of the last nominal pose.
+    outside_field : bool
+        There the field's value was held at the boundary of its box.
+    motion : MotionState
+        Directions of motion after the last command.
     on_change : callable
         Called after each change from outside, with its name and value: ``temperature`` (name, °C, time), ``humidity``
         (fraction, time), ``model``, ``enable`` (bool), ``tool`` (name), ``ramp_rate`` (m/s), ``reset`` (measured struts
@@ -67,57 +79,55 @@ class Compensator:
     """
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel, ramp_rate: float = DEFAULT_RAMP_RATE) -> None:
-        self.geometry = geometry
-        self.temperatures = Temperatures()
-        self.machine = RealMachine(geometry, model)
-        self.condition = math.nan
-        self.outside_field = False
-        self._work = pack_pose(geometry.work)
-        self._last, self._next = CommandState(ramp_rate), CommandState(ramp_rate)
-        self._take_machine(RealMachine(geometry, model))
-        self._model_pose, self._tool_pose = np.empty(12), np.empty(12)
+        self.geometry, self.model = geometry, model
+        self.condition, self.outside_field = math.nan, False
         self.on_change: Callable[[str, Any], None] = lambda what, value: None
-        self._forget()
-
-    @property
-    def command(self) -> np.ndarray:
-        """Strut commands last accepted, m; NaN before the first, the measured struts after a reset."""
-        return self._last.state.command
-
-    @property
-    def nominal(self) -> np.ndarray:
-        """Nominal strut lengths of the last command, m; NaN before the first."""
-        return self._last.state.nominal
-
-    @property
-    def correction(self) -> np.ndarray:
-        """Corrections of the last command, m; NaN before the first."""
-        return self._last.state.correction
+        self._constants, self._state = core_model(geometry, model), Struct("hc_state")
+        self._at, self._answer = self._state.at, ffi.new("hc_answer *")
+        self._time, self._estimated = ffi.new("hc_time *"), ffi.new("hc_estimated *")
+        lib.hc_init(self._at, self._constants.at, ramp_rate)
+        self._told: set[str] = set()
+        self._machine: RealMachine | None = None
+        self._parts = parts = named_parts(self._state)
+        self.command, self.nominal, self.correction = (parts[name] for name in ("command", "nominal", "correction"))
+        self.motion = MotionState(parts["motion_low"], parts["motion_sense"])
+        self._tool_pose = np.frombuffer(ffi.buffer(ffi.addressof(self._estimated.tool)), dtype=float)
 
     @property
     def platform(self) -> Pose:
-        """``pose_platform_in_base`` of the last command; not finite before the first."""
-        return self._last.platform
-
-    @property
-    def motion(self) -> MotionState:
-        """Directions of motion after the last command."""
-        return self._last.motion
-
-    @property
-    def model(self) -> MachineModel:
-        """The model in use."""
-        return self.machine.model
+        """``pose_platform_in_base`` of the last command; home before the first."""
+        return pose_of(self._at.last.platform)
 
     @property
     def ramping(self) -> bool:
         """Whether a change has not been fully taken up yet."""
-        return bool(self._last.state.ramp.any() or self._last.state.changed[0])
+        return bool(self._parts["ramp"].any() or self._at.last.changed)
 
     @property
     def enabled(self) -> bool:
         """Whether it compensates."""
-        return bool(self._last.state.enabled[0])
+        return bool(self._at.last.enabled)
+
+    @property
+    def temperatures(self) -> Temperatures:
+        """Readings in use, and how far late parts are behind them."""
+        view = self._state.view
+        values = {name: float(view["temperatures"][n]) for n, name in enumerate(PARTS) if name in self._told}
+        if HUMIDITY in self._told:
+            values[HUMIDITY] = float(view["humidity"])
+        late, lags = range(self._constants.at.late.count), {}
+        for n, name in enumerate(PARTS):
+            if late and not math.isnan(view["began"][n]):
+                behind = [float(view["behind"][n][k]) for k in late]
+                lags[name] = Lag(float(view["began"][n]), float(view["newest"][n]), behind)
+        return Temperatures(values, lags)
+
+    @property
+    def machine(self) -> RealMachine:
+        """The machine in use, with its model, at the present temperatures."""
+        if self._machine is None:
+            self._machine = RealMachine(self.geometry, self.model, self.temperatures)
+        return self._machine
 
     def set_model(self, model: MachineModel) -> None:
         """Replace the model; the corrections ramp from the old one's to the new one's.
@@ -130,55 +140,12 @@ class Compensator:
             What it would correct at the last command, before the first one at home, breaks a limit: the ramp would
             drag the struts there and be refused on its way. The old model stays.
         """
-        temperatures = self.temperatures
-        if model.late_growth.time_constants != self.model.late_growth.time_constants:
-            temperatures = Temperatures(temperatures.values)  # other lags begin anew, at rest
-        self._check_whole(RealMachine(self.geometry, model, temperatures))
-        self.temperatures = temperatures
-        self._renew(model)
+        constants = core_model(self.geometry, model)
+        if lib.hc_set_model(self._at, constants.at):
+            lib.hc_check(self._at, constants.at, self._answer)
+            raise refusal(self._answer, self.geometry, model)
+        self._constants, self.model, self._machine = constants, model, None
         self.on_change("model", model)
-
-    def _renew(self, model: MachineModel) -> None:
-        """Take a model at the present temperatures."""
-        machine = RealMachine(self.geometry, model, self.temperatures)
-        before, after = self._followed(self.machine), self._followed(machine)
-        if before is not None and after is not None:
-            # The model's lengths jump, the struts do not: without this the jump would count as a motion,
-            # turn directions round, and a backlash would step when they turn back.
-            self.motion.low[:] += after - before
-        self._take_machine(machine)
-        self._last.state.changed[:] = 1.0
-
-    def _check_whole(self, machine: RealMachine) -> None:
-        """Raise when a machine's whole correction, without ramp or switch, breaks a limit at the last command."""
-        trial, tried = CommandState(0.0), CommandState(0.0)
-        home = not np.isfinite(self.nominal).all()
-        platform = self.geometry.home if home else self._last.platform
-        trial.motion.copy_from(self.motion)
-        tool = platform @ self.geometry.tool
-        # By the kernel of :meth:`step`, which is loaded anyway: each costs a node 4 MB.
-        pose, times = (*tool.position, *quaternion_of(tool.rotation)), (math.nan, math.nan)
-        outcome = compensate_quaternion(*pose, *times, NO_SHIFT, pack_fixed(machine), trial.numbers, tried.numbers)
-        refuse(outcome, tried, machine)
-
-    def _followed(self, machine: RealMachine) -> np.ndarray | None:
-        """Return the nine values whose directions are followed, at the last command, under a machine's model.
-
-        None before the first command, and where the model's field cannot be undone: it is refused there.
-        """
-        if not np.isfinite(self.nominal).all():
-            return None
-        platform, motion = self._last.platform, MotionState()
-        motion.copy_from(self.motion)
-        try:
-            _, model_pose, _ = machine.commands_for(platform, motion)
-        except NotConvergedError:
-            return None
-        point = platform.position + platform.rotation @ machine.model.field.probe
-        return np.concatenate([point, strut_lengths(machine.structure, model_pose)])
-
-    def _take_machine(self, machine: RealMachine) -> None:
-        self.machine, self._fixed = machine, pack_fixed(machine)
 
     def set_temperature(self, name: str, value: float, time: float = math.nan) -> None:
         """Take a temperature, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
@@ -192,8 +159,12 @@ class Compensator:
             Unknown name, a value outside the allowed range, or no time where it is needed.
         """
         check_part(name)
-        self._take_reading(name, value, time)
-        self.on_change("temperature", (name, self.temperatures.values[name], time))
+        if lib.hc_set_temperature(self._at, PARTS.index(name), value, time):
+            Temperatures().set(name, value)  # raises for a value out of range, and else it is the time
+            raise ModelError(f"time of the temperature of {name}", "must be finite, s: the model has time constants")
+        self._told.add(name)
+        self._machine = None
+        self.on_change("temperature", (name, float(value), time))
 
     def set_humidity(self, value: float, time: float = math.nan) -> None:
         """Take the air's relative humidity, a fraction, read at a time, s; its effect on struts that swell ramps in.
@@ -203,12 +174,11 @@ class Compensator:
         ModelError
             A value outside the allowed range.
         """
-        self._take_reading(HUMIDITY, value, time)
-        self.on_change("humidity", (self.temperatures.values[HUMIDITY], time))
-
-    def _take_reading(self, name: str, value: float, time: float) -> None:
-        self.temperatures.follow(name, value, time, self.model.late_growth.time_constants)
-        self._renew(self.model)
+        if lib.hc_set_humidity(self._at, value):
+            Temperatures().set(HUMIDITY, value)
+        self._told.add(HUMIDITY)
+        self._machine = None
+        self.on_change("humidity", (float(value), time))
 
     def set_tool(self, name: str) -> None:
         """Take another tool by its name; nothing moves, nothing ramps.
@@ -222,13 +192,12 @@ class Compensator:
             The machine has no such tool; the old one stays.
         """
         self._use(self.geometry.using(tool=name))
-        if np.isfinite(self.nominal).all():
-            self._last.state.resumes[:] = TOOL_CHANGED
         self.on_change("tool", name)
 
     def _use(self, geometry: HexapodGeometry) -> None:
-        self.geometry = geometry
-        self._take_machine(RealMachine(self.geometry, self.model, self.temperatures))
+        constants = core_model(geometry, self.model)
+        lib.hc_set_tool(self._at, constants.at)
+        self.geometry, self._constants, self._machine = geometry, constants, None
 
     def enable(self, enabled: bool) -> None:
         """Switch compensation on or off; the corrections ramp.
@@ -239,10 +208,9 @@ class Compensator:
             As for :meth:`set_model`, when it is switched on.
         """
         if enabled != self.enabled:
-            if enabled:
-                self._check_whole(self.machine)
-            self._last.state.enabled[:] = float(enabled)
-            self._last.must_ramp()
+            if lib.hc_enable(self._at, enabled):
+                lib.hc_check(self._at, self._constants.at, self._answer)
+                raise refusal(self._answer, self.geometry, self.model)
             self.on_change("enable", enabled)
 
     def set_ramp_rate(self, ramp_rate: float) -> None:
@@ -255,8 +223,8 @@ class Compensator:
         """
         if not 0.0 < ramp_rate < math.inf:
             raise HexapodError(f"ramp_rate must be positive and finite, m/s, not {ramp_rate!r}")
-        if ramp_rate != self._last.state.ramp_rate[0]:
-            self._last.state.ramp_rate[:] = ramp_rate
+        if ramp_rate != self._at.ramp_rate:
+            self._at.ramp_rate = ramp_rate
             self.on_change("ramp_rate", ramp_rate)
 
     def reset(self, measured: np.ndarray | None = None) -> None:
@@ -273,23 +241,21 @@ class Compensator:
             most one allowed step away.
         """
         if measured is None:
-            self._forget()
-            self.on_change("reset", None)
-            return
-        measured = np.array(measured, dtype=float)
-        if measured.shape != (6,) or not np.isfinite(measured).all():
-            raise NotFiniteError("measured strut lengths must be six finite numbers, m", measured.tolist())
-        self._forget()
-        self._last.state.command[:], self._last.state.resumes[:] = measured, 1.0
+            lib.hc_reset(self._at, ffi.NULL)
+        else:
+            measured = np.array(measured, dtype=float)
+            if measured.shape != (6,) or lib.hc_reset(self._at, given("measured", measured, 6)):
+                raise NotFiniteError("measured strut lengths must be six finite numbers, m", measured.tolist())
         self.on_change("reset", measured)
 
     def snapshot(self) -> dict[str, Any]:
         """Return what, beside geometry and model, decides the next answer, by name.
 
         ``temperatures``, °C by name, and ``humidity`` among them, ``lags`` of what follows them late, ``tool``, and
-        each field of :class:`~hexapod_comp.kernels.compensation.State`: a list of numbers, matrices by rows.
+        each of :data:`~hexapod_comp.compensation.state.PARTS`: a list of numbers, matrices by rows.
         """
-        return {**self._last.snapshot(), **self.temperatures.snapshot(), "tool": self.geometry.tool_name}
+        parts = {name: np.ravel(part).astype(float).tolist() for name, part in self._parts.items()}
+        return {**parts, **self.temperatures.snapshot(), "tool": self.geometry.tool_name}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Take over a :meth:`snapshot` of a compensator with this geometry and model.
@@ -306,18 +272,17 @@ class Compensator:
             raise ModelError("snapshot.temperatures", "is missing")
         constants = self.model.late_growth.time_constants
         temperatures = Temperatures.restored(snapshot["temperatures"], snapshot.get("lags", {}), len(constants))
-        numbers, geometry = read_state(snapshot), self.geometry.using(tool=snapshot.get("tool", TOOL))
-        self.temperatures = temperatures
+        parts, geometry = read_parts(snapshot), self.geometry.using(tool=snapshot.get("tool", TOOL))
+        lib.hc_init(self._at, self._constants.at, 0.0)
+        write_temperatures(self._state, temperatures)
+        self._told = set(temperatures.values)
         self._use(geometry)
-        self._last.numbers[:] = numbers
-
-    def _forget(self) -> None:
-        home = self.geometry.home
-        self._last.clear()
-        self._model_pose[:3], self._model_pose[3:] = home.position, home.rotation.ravel()
+        for name, part in self._parts.items():
+            if not name.startswith(PLACES) or np.isfinite(parts[name]).all():
+                part[...] = parts[name].reshape(part.shape)  # before the first command there is no place
 
     def step(
-        self, numbers: tuple[float, ...], time: float, frame: np.ndarray | None = None, received: float = math.nan
+        self, numbers: tuple[float, ...], time: float, frame: Struct | None = None, received: float = math.nan
     ) -> np.ndarray:
         """Compensate one commanded tool pose: the loop's entry.
 
@@ -330,7 +295,7 @@ class Compensator:
             matter: for the struts' speed, and for ramps, there no more than 20 ms forwards; so the same commands
             with the same times give the same answers bit for bit, and no jump of a clock can step. NaN: not
             known, then the time of receipt counts.
-        frame : ndarray, shape (12,), optional
+        frame : Struct, optional
             Frame of the commanded pose seen from ``base``, packed by
             :func:`~hexapod_comp.compensation.state.pack_pose`; the geometry's work frame by default.
         received : float, optional
@@ -348,51 +313,22 @@ class Compensator:
             The command is refused and nothing has changed. Of a
             :class:`~hexapod_comp.errors.TooEarlyError` the same command may be tried again later.
         """
-        if self._last.state.resumes[0]:
-            return self._resume(lambda: self._run_numbers(numbers, time, frame, received), numbers)
-        return self._finish(self._run_numbers(numbers, time, frame, received), numbers)
+        if len(numbers) != 7:
+            raise PoseError(f"position and quaternion are seven numbers, not {len(numbers)}", list(numbers))
+        made, answer = self._time, self._answer
+        made.made, made.received = time, received
+        where = ffi.NULL if frame is None else frame.at
+        if lib.hc_command(self._at, numbers, made[0], where, answer):
+            raise refusal(answer, self.geometry, self.model, numbers, self.platform)
+        self.condition, self.outside_field = answer.condition, bool(answer.outside_field)
+        return self.command
 
     def published(self, time: float) -> None:
         """Take notice that the last command had gone out at a time, s, on the clock of its receipt.
 
         The struts' speed is limited between publications: after one that was held up, the next must not come sooner.
         """
-        self._last.state.published[0] = time
-
-    def _run_numbers(self, numbers: tuple[float, ...], time: float, frame: np.ndarray | None, received: float) -> tuple:
-        """Work out the next command from a message's numbers; what it is worth, :meth:`_finish` says."""
-        frame = self._work if frame is None else frame
-        states = self._last.numbers, self._next.numbers
-        return compensate_quaternion(*numbers, time, received, frame, self._fixed, *states)
-
-    def _resume(self, run: Callable[[], tuple], numbers: tuple[float, ...] = ()) -> np.ndarray:
-        """Take the first command after a change of tool, or after a reset to measured struts, from where they stand.
-
-        What they differ from the command's nominal lengths counts as the correction that they stand at, if it
-        could be one; the first command is then the measured struts, and ramps. A trial run finds the nominal
-        lengths.
-        """
-        last = self._last.state
-        if last.resumes[0] == TOOL_CHANGED:
-            refuse_motion(outcome := run(), self._last, self._next, self.geometry)
-            return self._finish(outcome, numbers)
-        before = last.correction.copy(), last.changed.copy()
-        run()
-        standing = last.command - self._next.state.nominal
-        if (np.abs(standing) <= self.geometry.limits.correction).all():
-            last.correction[:], last.changed[:] = standing, 1.0
-        try:
-            return self._finish(run(), numbers)
-        except HexapodError:
-            last.correction[:], last.changed[:] = before
-            raise
-
-    def _finish(self, outcome: tuple, numbers: tuple[float, ...] = ()) -> np.ndarray:
-        """Accept the command under way, or raise what was found."""
-        refuse(outcome, self._next, self.machine, numbers)
-        self._last, self._next = self._next, self._last
-        self.condition, self.outside_field = outcome[-1], outcome[0] == OUTSIDE
-        return self._last.state.command
+        lib.hc_published(self._at, time)
 
     def estimate(self, struts: np.ndarray) -> np.ndarray:
         """Return where the tool is when the struts read `struts`, through the model.
@@ -413,24 +349,16 @@ class Compensator:
         KinematicsError
             There is no such pose; the next estimate starts from the last good one.
         """
-        tool = self.geometry.tool
-        outcome, condition = estimate_one(
-            struts,
-            self._last.numbers,
-            self._fixed,
-            tool.position,
-            tool.rotation,
-            self._model_pose,
-            self._tool_pose,
-        )
-        if outcome != kernels.OK:
-            raise forward_error(outcome, condition, self.geometry.limits.condition)
+        status = lib.hc_estimate(self._at, given("struts", struts, 6), self._estimated)
+        if status:
+            raise forward_error(status, self._estimated.condition, self.geometry.limits.condition)
         return self._tool_pose
 
     @property
     def platform_estimate(self) -> tuple[np.ndarray, np.ndarray]:
         """Position (3,) and rotation (3, 3) of the platform in ``base`` by the last estimate, field left out."""
-        return self._model_pose[:3], self._model_pose[3:].reshape((3, 3))
+        estimate = self._state.view["estimate"]
+        return estimate["position"], estimate["rotation"]
 
     def correct(self, tool_pose: Pose, time: float = math.nan) -> Correction:
         """Compensate one commanded tool pose and return the full record.
@@ -447,28 +375,23 @@ class Compensator:
         LimitError, KinematicsError, OutsideFieldError
             The command is refused and nothing has changed.
         """
-        if self._last.state.resumes[0]:
-            self._resume(lambda: self._run_pose(tool_pose, time))
-        else:
-            self._finish(self._run_pose(tool_pose, time))
+        made = self._time
+        made.made, made.received = time, math.nan
+        if lib.hc_command_pose(self._at, pack_pose(tool_pose).at, made[0], ffi.NULL, self._answer):
+            raise refusal(self._answer, self.geometry, self.model, (), self.platform)
+        self.condition, self.outside_field = self._answer.condition, bool(self._answer.outside_field)
         return self.record(tool_pose)
-
-    def _run_pose(self, tool_pose: Pose, time: float) -> tuple:
-        """Work out the next command from a pose."""
-        pose = tool_pose.position, tool_pose.rotation
-        states = self._last.numbers, self._next.numbers
-        return compensate_one(*pose, time, math.nan, self._work, self._fixed, *states)
 
     def record(self, tool_pose: Pose) -> Correction:
         """Return the record of the command just accepted for `tool_pose`."""
-        platform = self._last.platform
+        platform = self.platform
         box = self.model.valid_box
         outside_box = box is not None and bool((platform.position < box[0]).any() or (platform.position > box[1]).any())
         return Correction(
             tool=self.geometry.tool_name,
             tool_pose=tool_pose,
             platform_pose=platform,
-            model_pose=self._last.model,
+            model_pose=pose_of(self._at.last.model),
             sense=self.motion.sense.copy(),
             temperatures=dict(self.temperatures.values),
             nominal=self.nominal.copy(),
@@ -484,17 +407,17 @@ class Compensator:
 
     def predicted_error(self) -> np.ndarray:
         """Return the tool error that nominal lengths would leave at the last command (see `Correction`)."""
-        matrix, twist = np.empty((6, 6)), self._model_correction() * -1.0
-        platform = self._last.platform
-        kernels.jacobian_one(*self.geometry.kernel_joints, platform.position, platform.rotation, matrix)
-        kernels.solve_six(matrix, twist)
+        platform, twist = self.platform, self._model_correction() * -1.0
+        solve_linear(jacobian(self.geometry, platform), twist)
         lever = platform.rotation @ self.geometry.tool.position
         twist[:3] += np.cross(twist[3:], lever)
         return twist
 
     def _model_correction(self) -> np.ndarray:
         """Return what the model would correct at the last command, ramp and switch left aside."""
-        motion = MotionState()
-        motion.copy_from(self.motion)
-        commands, _, _ = self.machine.commands_for(self._last.platform, motion)
+        platform, commands = self.platform, np.empty(6)
+        low, sense = self.motion.low.copy(), self.motion.sense.copy()
+        given_pose, unused = (platform.position, platform.rotation), (np.empty(3), np.empty((3, 3)))
+        if backwards(self._state, *given_pose, low, sense, *unused, commands) == Status.NOT_CONVERGED:
+            raise NotConvergedError("the error field is too steep to be undone at this pose")
         return commands - self.nominal

@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import core
 from ..errors import HexapodError, InputFileError, shorten
 from ..formats.files import Opener, read_text
 from ..formats.json import json_content
@@ -351,15 +352,11 @@ def _nullified(snapshot: dict[str, Any]) -> dict[str, Any]:
 
 def made_with() -> dict[str, str]:
     """Return the versions and the processor that a result's last bit may depend on."""
-    import numba
-
-    from ..kernels.compiling import cache_folder
-
     return {
-        "kernels": cache_folder(numba.config.CACHE_DIR).name,
+        "core": core.VERSION,
+        "core_sources": core.SOURCES_HASH,
         "python": platform.python_version(),
         "numpy": np.__version__,
-        "numba": numba.__version__,
         "processor": _processor(),
     }
 

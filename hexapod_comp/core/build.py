@@ -14,7 +14,7 @@ from cffi import FFI
 
 FOLDER = Path("hexapod_comp", "core")  # setup.py runs in the root of the sources
 
-HEADERS = ("hexapod_comp.h", "hexapod_batch.h")
+HEADERS = ("hexapod_comp.h", "single.h", "hexapod_batch.h")
 """What Python calls; the first is the public one, which ``export --c`` copies."""
 
 UNITS = ("hexapod_batch.c",)

@@ -145,6 +145,7 @@ static finding work_out(const hc_state *state, const hc_pose *platform, hc_time 
     double unused;
     int i;
     *next = *last;
+    answer->platform = *platform;
     answer->compensated = 0;
     answer->outside_field = 0;
     next->platform = *platform;
@@ -243,7 +244,6 @@ static hc_status command_platform(hc_state *state, hc_status status, const hc_po
     answer->compensated = 0;
     answer->outside_field = 0;
     if (status == HC_OK) {
-        answer->platform = *platform;
         f = work_out(state, platform, time, &next, answer);
         if (state->last.resumes == HC_WITH_NEW_TOOL) {
             f = same_place(&state->last, &next, f, answer);
@@ -518,8 +518,7 @@ hc_status hc_check(const hc_state *state, const hc_model *model, hc_answer *answ
     unknown.received = NAN;
     trial.last.enabled = 1;
     trial.last.changed = 0;
-    answer->platform = home ? model->home : state->last.platform;
-    f = work_out(&trial, &answer->platform, unknown, &next, answer);
+    f = work_out(&trial, home ? &model->home : &state->last.platform, unknown, &next, answer);
     fill_answer(&next, f, answer);
     return f.status;
 }
@@ -618,6 +617,11 @@ void hc_init(hc_state *state, const hc_model *model, double ramp_rate)
     state->last.enabled = 1;
     forget(state);
     place_machine(state);
+}
+
+const char *hc_version(void)
+{
+    return "1";
 }
 
 const char *hc_reason(hc_status status)

@@ -6,6 +6,8 @@
 
 #include "hexapod_batch.h"
 
+#include "single.c"
+
 #include "lanes.c"
 
 #include "batch.c"

@@ -93,7 +93,6 @@ void hc_check_poses(const double *base, const double *platform, const hc_limits 
 typedef struct {
     double inside;      /* the furthest that is allowed, less than 0 where the pose itself is not */
     double outside;     /* the nearest that is not, infinite where there is none */
-    hc_pose platform;   /* there */
     hc_answer refused;  /* what was found there, and the command that was tried */
 } hc_way;
 

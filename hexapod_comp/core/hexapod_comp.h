@@ -259,6 +259,9 @@ hc_status hc_set_humidity(hc_state *state, double value);
  * struts are and ramps; NULL: it may be anywhere. HC_NOT_FINITE for lengths that are not: nothing changes then. */
 hc_status hc_reset(hc_state *state, const double measured[6]);
 
+/* Of the arithmetic: it changes when a bit of an answer does. */
+const char *hc_version(void);
+
 /* The name of a status, as the Python package counts refusals: "stroke", "step", ... */
 const char *hc_reason(hc_status status);
 

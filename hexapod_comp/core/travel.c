@@ -40,7 +40,6 @@ void hc_go(const hc_state *state, const hc_pose *tool, const hc_pose *frame, con
             way->outside = distance;
             fill_answer(&next, f, &answer);
             way->refused = answer;
-            way->platform = platform;
         }
     }
 }

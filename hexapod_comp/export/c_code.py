@@ -7,7 +7,8 @@ the target. Numbers are written with the digits that bring back the very same do
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,52 +16,25 @@ from typing import Any
 import numpy as np
 
 from ..compensation.compensator import DEFAULT_RAMP_RATE, Compensator
+from ..core import Status, dtype_of
 from ..errors import HexapodError, TooEarlyError
 from ..formats.outputs import write_text
-from ..kernels.struts import GROWTH, MOST_HARMONICS, WAVES
+from ..machine.constants import members
 from ..machine.geometry import HexapodGeometry
-from ..machine.late import MOST_TIME_CONSTANTS, PARTS
-from ..machine.model import MachineModel, RealMachine
+from ..machine.model import MachineModel
 from ..machine.temperatures import Temperatures
 from ..machine.trajectory import moves
 from ..pose import Pose, rotation_from_angles, stacked
 from . import carried
 from .carried import refuse_unknown
 
-SOURCES = Path(__file__).parents[1] / "core", Path(__file__).parent / "c"
+CORE, AROUND = Path(__file__).parents[1] / "core", Path(__file__).parent / "c"
 """Where the core lies, and what is written around it."""
 
 PERIOD = 0.004
 """Between two commands of the self-test, s."""
 
 MODEL_FILE, VECTORS_FILE = "hexapod_model.h", "hexapod_vectors.h"
-
-STATUS = (
-    "ok",
-    "stroke_short",
-    "stroke_long",
-    "base_cone",
-    "platform_cone",
-    "clearance",
-    "condition",
-    "assembly",
-    "not_finite",
-    "correction",
-    "step",
-    "speed",
-    "early",
-    "acceleration",
-    "not_converged",
-    "outside_field",
-    "quaternion",
-    "singular",
-    "unreachable",
-    "other_assembly_mode",
-    "temperature",
-    "humidity",
-    "tool_changed",
-)
-"""Names of hc_status, in its order."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +51,7 @@ class Vector:
     time : float
         Of a command, s.
     status : int
-        What the Python compensator said, by its place in :data:`STATUS`.
+        What the Python compensator said, a :class:`~hexapod_comp.core.Status`.
     expected : tuple of six float
         Strut commands, m; of an estimate, position, m, and last row of the rotation matrix.
     """
@@ -106,8 +80,7 @@ def write_c(folder: str | Path, geometry: HexapodGeometry, model: MachineModel, 
     list of Path
         The files.
     """
-    paths = [path for folder in SOURCES for path in sorted(folder.iterdir()) if path.suffix in (".c", ".h", ".comp")]
-    files = {path.name: path.read_text(encoding="utf-8") for path in paths}
+    files = {path.name: path.read_text(encoding="utf-8") for path in sources()}
     files[MODEL_FILE] = model_header(geometry, model, hashes)
     files[VECTORS_FILE] = vectors_header(self_test(geometry, model))
     folder = Path(folder)
@@ -117,20 +90,24 @@ def write_c(folder: str | Path, geometry: HexapodGeometry, model: MachineModel, 
     return [folder / name for name in files]
 
 
+def sources() -> list[Path]:
+    """Return the files that are copied: of the core, what a controller needs, and what is written around it."""
+    unit = (CORE / "hexapod_comp.c").read_text(encoding="utf-8")
+    names = ["hexapod_comp.h", "hexapod_comp.c", *re.findall(r'#include "(.+)"', unit)]
+    return [*(CORE / name for name in names), *(path for path in sorted(AROUND.iterdir()) if path.is_file())]
+
+
 def model_header(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str]) -> str:
     """Return ``hexapod_model.h``: geometry, limits and model as one constant of type hc_model.
 
     Raises
     ------
     ModelError
-        The model has a term of which the C core knows nothing: struts that swell by humidity.
+        The model has a term of which the core knows nothing.
     """
     refuse_unknown(model, carried.C, "the C core")
-    machine = RealMachine(geometry, model)
-    _, knots, pieces = machine.strut_arrays
-    arrays = {"hexapod_knots": knots, "hexapod_pieces": pieces}
-    for axis, nodes, family in zip("xyz", model.field.grid, model.field.lines, strict=True):
-        arrays |= {f"hexapod_nodes_{axis}": nodes, f"hexapod_lines_{axis}": family.swapaxes(3, 4)}
+    arrays: dict[str, np.ndarray] = {}
+    text = _struct(members(geometry, model, hashes), dtype_of("hc_model"), "hexapod", arrays, 1)
     lines = [
         "/* Written by hexapod_comp export --c. Constants of one machine, for hexapod_comp.c; include it once.",
         " * m, rad, 1/K; frames and meanings as in hexapod_comp.h. You may use and ship this file as you like. */",
@@ -140,61 +117,42 @@ def model_header(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[s
         '#include "hexapod_comp.h"',
         "",
         *(_array(name, values) for name, values in arrays.items()),
-        "static const hc_model hexapod_model = {",
-        *(f"    .{name} = {value}," for name, value in _members(geometry, model, machine, hashes)),
-        "};",
+        f"static const hc_model hexapod_model = {text};",
         "",
         "#endif",
     ]
     return "\n".join(lines) + "\n"
 
 
-def _members(
-    geometry: HexapodGeometry, model: MachineModel, machine: RealMachine, hashes: tuple[str, str]
-) -> Iterator[tuple[str, str]]:
-    """Return the members of hc_model and their initialisers."""
-    strings = {"machine": model.machine, "model": model.name, "date": model.origin.date or ""}
-    strings |= {"geometry_sha256": hashes[0], "model_sha256": hashes[1]}
-    yield from ((name, _text(value)) for name, value in strings.items())
-    bodies = zip(("base", "platform"), geometry.kernel_joints, machine.body[2:], strict=True)
-    for name, joints, axes in bodies:
-        deviation, expansion = getattr(model, f"{name}_deviation"), getattr(model, f"{name}_expansion")
-        yield name, _struct({"joints": joints, "deviation": deviation, "axes": axes, "expansion": expansion})
-    tool = geometry.tool
-    poses = {"home": geometry.home, "work": geometry.work, "tool": tool, "tool_inverse": tool.inverse()}
-    for name, pose in poses.items():
-        yield name, _struct({"position": pose.position, "rotation": pose.rotation})
-    yield "limits", _struct(geometry.limit_numbers._asdict())
-    yield "struts", _struts(machine, model)
-    yield "map", _struct({"knot_count": len(machine.strut_arrays[1])}, knots="hexapod_knots", pieces="hexapod_pieces")
-    field = model.field
-    counts = {"node_count": [len(nodes) for nodes in field.grid], "powers": [f.shape[4] for f in field.lines]}
-    pointers = {kind: f"{{{', '.join(f'hexapod_{kind}_{axis}' for axis in 'xyz')}}}" for kind in ("nodes", "lines")}
-    flags = {"refuse_outside": int(field.outside == "refuse")}
-    yield "field", _struct({"probe": field.probe, **counts, **flags}, **pointers)
-    late = model.late_growth
-    count = len(late.time_constants)
-    constants, expansion = np.zeros(MOST_TIME_CONSTANTS), np.zeros((len(PARTS), MOST_TIME_CONSTANTS))
-    constants[:count], expansion[:, :count] = late.time_constants, late.expansion
-    sensors = [late.sensor_of(part) for part in range(len(PARTS))]
-    numbers = {"count": count, "time_constants": constants, "expansion": expansion, "sensors": sensors}
-    yield "late", _struct(numbers)
-    yield "axis_threshold", _number(machine.thresholds[0])
-    yield "strut_threshold", _number(machine.thresholds[1])
+def _struct(values: dict[str, Any], layout: np.dtype, path: str, arrays: dict[str, np.ndarray], depth: int) -> str:
+    """Return the initialiser of a struct; what it points to is put into `arrays` by name."""
+    inner = "    " * depth
+    lines = []
+    for name, value in values.items():
+        text = _initialiser(value, layout[name], f"{path}_{name}", arrays, depth)
+        lines.append(f"{inner}.{name} = {text},\n")
+    return "{\n" + "".join(lines) + "    " * (depth - 1) + "}"
 
 
-def _struts(machine: RealMachine, model: MachineModel) -> str:
-    """Return the six struts; the columns of the kernels' table stand in the order of hc_strut."""
-    table = machine.strut_arrays[0].copy()
-    table[:, GROWTH] = model.struts.expansion  # the core works out the growth from its temperatures
-    rows = [f"{{{_row(row[:WAVES])}, 0.0, {_values(row[WAVES:].reshape(MOST_HARMONICS, 2))}}}" for row in table]
-    return "{\n        " + ",\n        ".join(rows) + "}"
-
-
-def _struct(numbers: dict[str, Any], **others: str) -> str:
-    """Return an initialiser with a line per member."""
-    members = {name: _values(np.asarray(value)) for name, value in numbers.items()} | others
-    return "{\n" + "".join(f"        .{name} = {text},\n" for name, text in members.items()) + "    }"
+def _initialiser(value: Any, kind: np.dtype, path: str, arrays: dict[str, np.ndarray], depth: int) -> str:
+    if isinstance(value, str):
+        return _text(value)
+    if isinstance(value, dict):
+        return _struct(value, kind, path, arrays, depth + 1)
+    if kind.base == np.uintp:
+        if not kind.shape:
+            arrays[path] = value
+            return path
+        return (
+            "{" + ", ".join(_initialiser(v, kind.base, f"{path}_{n}", arrays, depth) for n, v in enumerate(value)) + "}"
+        )
+    if kind.base.names and not isinstance(value, np.ndarray):
+        return "{" + ", ".join(_struct(v, kind.base, path, arrays, depth + 1) for v in value) + "}"
+    if kind.base.names:
+        return _struct({name: value[name] for name in kind.names or ()}, kind, path, arrays, depth + 1)
+    while kind.subdtype:
+        kind = kind.base
+    return _values(np.asarray(value).astype(kind))
 
 
 def _array(name: str, values: np.ndarray) -> str:
@@ -313,12 +271,12 @@ class Recorder:
 
 def status_of(error: HexapodError) -> int:
     """Return the hc_status of what the Python compensator raises."""
-    name = {"bad_model": "temperature"}.get(error.reason, error.reason)
+    name = {"bad_model": "temperature", "other_assembly_mode": "other_assembly"}.get(error.reason, error.reason)
     if isinstance(error, TooEarlyError):
         name = "early"
     if name == "stroke":
         name = "stroke_short" if error.value < error.limit else "stroke_long"  # type: ignore[attr-defined]
-    return STATUS.index(name)
+    return int(Status[name.upper()])
 
 
 def vectors_header(vectors: Sequence[Vector]) -> str:

@@ -23,6 +23,7 @@ C = frozenset(
         *("base_deviation", "platform_deviation", "base_axes_turn", "reversal_threshold"),
         *(f"struts.{name}" for name in ("offset", "pitch", "reference_length", "cosine", "sine", "period", "backlash")),
         *(f"struts.{name}" for name in ("map_knots", "map_values", "map_backlash", "expansion")),
+        "struts.moisture",
         *(f"field.{name}" for name in ("grid", "lines", "probe", "outside", "reversal_threshold")),
         *("base_expansion", "platform_expansion"),
         *(f"late_growth.{name}" for name in ("time_constants", "expansion", "thermometer")),
@@ -30,7 +31,7 @@ C = frozenset(
 )
 """What the C core's constants hold."""
 
-AT_20_DEGC = C | {"struts.moisture"}
+AT_20_DEGC = C
 """What LinuxCNC's files and the table hold, or report as not carried: the field or its tilt, growth, swelling."""
 
 

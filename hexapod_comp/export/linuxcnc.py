@@ -21,8 +21,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.interpolate import make_lsq_spline
 
+from ..core.batch import screw_twists, strut_commands
 from ..errors import GeometryError
-from ..kernels.struts import LEAD, TWIST_HOME, command_for_length, screw_twist
 from ..machine.geometry import STRUT_NAMES
 from ..machine.model import RealMachine
 from ..machine.passes import Passes
@@ -166,10 +166,8 @@ def _side(machine: RealMachine, box: np.ndarray) -> np.ndarray:
         return np.ones(6)
     nodes = _box_nodes(box, 5)
     level = geometry.platform_poses(nodes, np.tile(np.eye(3), (len(nodes), 1, 1)))
-    cosines = np.empty((len(nodes), 6))
-    for row, pose in enumerate(zip(*level, strict=True)):
-        cosines[row] = np.cos([screw_twist(*machine.body, *pose, i) for i in range(6)])
-    side = np.where(np.cos(machine.strut_arrays[0][:, TWIST_HOME]) > 0.0, 1.0, -1.0)
+    cosines = np.cos(screw_twists(machine.body, *(np.ascontiguousarray(part) for part in level)))
+    side = np.where(np.cos(machine.constants.view["struts"]["twist_home"]) > 0.0, 1.0, -1.0)
     nearest = (side * cosines).min(axis=0)
     if nearest.min() < np.sin(FOLD):
         strut = int(nearest.argmin())
@@ -219,12 +217,11 @@ def exact_trims(machine: RealMachine, strut: int, joints: np.ndarray, sense: flo
     genhexkins adds what the screw has turned since its axes were in line; the model counts from home. The
     difference is a constant, and part of the table.
     """
-    table, knots, pieces = machine.strut_arrays
-    twist = table[strut, TWIST_HOME]
+    constants = machine.constants.view["struts"][strut]
+    twist = float(constants["twist_home"])
     since = twist - np.pi * np.round(twist / np.pi)  # what the arcsine makes of it
-    shift = table[strut, LEAD] * since / (2.0 * np.pi)
-    commands = [command_for_length(joint, sense, shift, table, knots, pieces, strut) for joint in joints]
-    return np.array(commands) - joints
+    shift = float(constants["lead"]) * since / (2.0 * np.pi)
+    return strut_commands(machine.state.at, strut, joints, sense, shift) - joints
 
 
 def table_misfit(machine: RealMachine, genhexkins: Genhexkins, box: np.ndarray) -> np.ndarray:

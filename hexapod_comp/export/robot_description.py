@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..kernels.pose import quaternion_of
+from ..core.single import quaternion_of
 from ..machine.frames import BASE
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import strut_lengths

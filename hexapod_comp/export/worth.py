@@ -167,7 +167,7 @@ def _comparison(before: ToolErrors, after: ToolErrors) -> Comparison:
 def _grown(trial: Trial, commands: np.ndarray, driven: ToolErrors, readings: dict[str, float]) -> Size | None:
     """Return how far readings of the sensors move the tool, None where nothing grows by them."""
     grown = RealMachine(trial.machine.geometry, trial.machine.model, Temperatures(readings))
-    if np.array_equal(grown.strut_arrays[0], trial.machine.strut_arrays[0]) and all(
+    if np.array_equal(grown.growth, trial.machine.growth) and all(
         np.array_equal(*joints) for joints in zip(grown.body[:2], trial.machine.body[:2], strict=True)
     ):
         return None

@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
+from ..core import QUATERNION_NORM_TOLERANCE
 from ..errors import InputFileError, PoseError
-from ..kernels.pose import QUATERNION_NORM_TOLERANCE
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
 from .files import MAX_CSV_BYTES, open_input, too_large
 from .paths import input_file

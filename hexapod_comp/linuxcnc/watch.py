@@ -23,10 +23,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..core.single import follow_nine
 from ..errors import HexapodError, KinematicsError
 from ..formats.texts import plain_number
-from ..kernels.drives import follow_point
-from ..kernels.motion import follow
 from ..machine.geometry import load_geometry
 from ..machine.model import RealMachine
 from ..machine.motion import MotionState
@@ -101,11 +100,10 @@ class WatchedMachine:
 
     def _follow(self, struts: np.ndarray, platform: Pose) -> None:
         """Update the directions of motion that the truth's backlash and field depend on."""
-        probe, (axis_threshold, strut_threshold) = self.machine.model.field.probe, self.machine.thresholds
-        low, sense = self._motion.low, self._motion.sense
-        follow_point(platform.position, platform.rotation, probe, axis_threshold, low, sense)
-        for i, length in enumerate(struts):
-            follow(length, strut_threshold, low, sense, 3 + i)
+        model = self.machine.model
+        point = platform.position + platform.rotation @ model.field.probe
+        thresholds = model.field.reversal_threshold, model.reversal_threshold
+        follow_nine(np.concatenate([point, struts]), *thresholds, self._motion.low, self._motion.sense)
 
 
 class MachineComponent:

@@ -13,14 +13,13 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..core import Status, batch
 from ..errors import KinematicsError, OtherAssemblyModeError, SingularError, UnreachableError
-from ..kernels import kinematics as kernels
 from ..kernels.assembly import closed_triangles
-from ..kernels.limits import Quantities, examine
 from ..pose import Pose, rotation_angle
 from .elimination import joint_circles, start_angles
 from .geometry import HexapodGeometry
-from .kinematics import Structure, jacobian, six_lengths, solve_poses
+from .kinematics import Structure, jacobian, six_lengths, solve_one, solve_poses
 
 CLOSURE = 1e-12
 """Largest error of a strut length or of a platform side in a mode, relative to the longest strut."""
@@ -158,16 +157,14 @@ def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose)
     list of str
         One short phrase per objection, with found and allowed values.
     """
-    at = *structure.joints, pose.position, pose.rotation
-    measured, limits = Quantities.empty(1), geometry.limits
-    kernels.strut_lengths_one(*at, measured.lengths[0, 0])
-    examine(*at, geometry.limit_numbers, measured, 0, 0)
+    limits = geometry.limits
+    measured = batch.examine(*structure.joints, geometry.limit_numbers.at, pose.position, pose.rotation)
     broken = {
         name: (int(margin.argmin()), value.ravel()[margin.argmin()])
         for name, (margin, value) in limits.margins(measured).items()
         if not (margin >= 0.0).all()
     }
-    objections = ["det J of the other sign"] if measured.sign[0, 0] != structure.home_sign else []
+    objections = ["det J of the other sign"] if measured["sign"][0, 0] != structure.home_sign else []
     if "condition" in broken:
         objections.append(f"condition number {broken['condition'][1]:.4g} above {limits.condition:.4g}")
     centre, homewards = _home_side(geometry, structure)
@@ -180,7 +177,7 @@ def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose)
             objections.append(f"{body} joint {joint + 1} at {degrees}")
     if "clearance" in broken:
         strut, distance = broken["clearance"]
-        one, other = sorted((strut + 1, int(measured.nearest[0, 0, strut]) + 1))
+        one, other = sorted((strut + 1, int(measured["nearest"][0, 0, strut]) + 1))
         millimetres = f"{distance * 1e3:.1f} mm apart, allowed {limits.clearance * 1e3:.1f} mm"
         objections.append(f"struts {one} and {other} {millimetres}")
     return objections
@@ -380,6 +377,6 @@ def _same(structure: Structure, one: Pose, other: Pose, lengths: np.ndarray) -> 
 def _newton(structure: Structure, lengths: np.ndarray, start: Pose) -> Pose | None:
     """Return the pose that Newton on the six loop closures finds, whatever its sign and condition number."""
     position, rotation = start.position.copy(), start.rotation.copy()
-    anything = structure.characteristic_length, 0.0, math.inf
-    outcome, _, _ = kernels.solve_pose_one(*structure.joints, lengths, position, rotation, *anything)
-    return Pose(position, rotation) if outcome == kernels.OK else None
+    anything = replace(structure, home_sign=0.0, max_condition=math.inf)
+    outcome, _ = solve_one(anything, lengths, position, rotation)
+    return Pose(position, rotation) if outcome == Status.OK else None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ..kernels.struts import screw_twist
+from ..core.batch import screw_twists
 
 if TYPE_CHECKING:
     from .geometry import HexapodGeometry
@@ -103,6 +103,5 @@ def twist_per_lead(geometry: HexapodGeometry, positions: np.ndarray, rotations: 
     across = np.cross(neutral, np.eye(3)[np.abs(neutral).argmin(axis=1)])
     across /= np.linalg.norm(across, axis=1)[:, None]
     machine = (*geometry.kernel_joints, across, across @ geometry.home.rotation)
-    poses = zip(np.ascontiguousarray(positions), np.ascontiguousarray(rotations), strict=True)
-    twists = [screw_twist(*machine, *pose, strut) for pose in poses for strut in range(6)]
+    twists = screw_twists(machine, np.ascontiguousarray(positions), np.ascontiguousarray(rotations))
     return float(np.abs(twists).max() / (2.0 * np.pi))

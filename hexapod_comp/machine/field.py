@@ -9,13 +9,16 @@ dz; a field whose lines carry all six is evaluated by the same code. Families ad
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from ..core import Struct
+from ..core.single import field_at
 from ..errors import ModelError
-from ..kernels.field import field_one
 
 COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")
 """Order of the six error components."""
@@ -106,8 +109,25 @@ class GridField:
         """
         error = np.empty(6)
         position = np.array(position, dtype=float)
-        outside = field_one(position, np.array(sense, dtype=float), *self.grid, *self.lines, error)
-        return error, bool(outside)
+        return error, field_at(self._struct, position, np.array(sense, dtype=float), error)
+
+    @functools.cached_property
+    def _struct(self) -> Struct:
+        return Struct("hc_field", self.members())
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_struct"}
+
+    def members(self) -> dict[str, Any]:
+        """Return what hc_field holds, by name."""
+        return {
+            "probe": self.probe,
+            "node_count": [len(nodes) for nodes in self.grid],
+            "nodes": self.grid,
+            "powers": [family.shape[4] for family in self.lines],
+            "lines": [family.swapaxes(3, 4) for family in self.lines],
+            "refuse_outside": int(self.outside == "refuse"),
+        }
 
 
 def no_field() -> GridField:

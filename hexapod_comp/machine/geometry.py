@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from ..core import Status, Struct, batch
+from ..core.single import check_stage
 from ..errors import FrameError, GeometryError, InputFileError, KinematicsError, LimitError, shorten
 from ..formats.files import read_text
 from ..formats.paths import input_file
 from ..formats.yaml import Section, parse_yaml
-from ..kernels import kinematics as kernels
-from ..kernels.limits import WITHIN, LimitNumbers, check_stage
 from ..pose import Pose
 from .frames import BASE, TOOL, WORK, read_named_poses, read_pose, refuse_names
 from .limits import STRUT_NAMES as STRUT_NAMES
@@ -93,11 +93,11 @@ class HexapodGeometry:
     home_sign: float = field(init=False)
     """Sign of det J at home: the other sign is another assembly mode."""
     kernel_joints: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False)
-    """Private writable copies of the joints for compiled kernels, which would compile twice for read-only ones."""
+    """The joints, as the core takes them: of base and platform."""
     characteristic_length: float = field(init=False)
     """RMS radius of the platform joints about their centroid, m; makes the condition number unit-free."""
-    limit_numbers: LimitNumbers = field(init=False, repr=False)
-    """The limits for compiled kernels."""
+    limit_numbers: Struct = field(init=False, repr=False)
+    """The limits, as the core takes them."""
 
     def __post_init__(self) -> None:
         def put(name: str, value: object) -> None:
@@ -105,7 +105,7 @@ class HexapodGeometry:
 
         put("base_joints", frozen_array(self.base_joints, (6, 3), "base.joints"))
         put("platform_joints", frozen_array(self.platform_joints, (6, 3), "platform.joints"))
-        put("kernel_joints", (self.base_joints.copy(), self.platform_joints.copy()))
+        put("kernel_joints", (self.base_joints, self.platform_joints))
         put("screw_lead", frozen_array(self.screw_lead, (6,), "screw.lead"))
         _refuse_coincident(self.base_joints)
         put("tools", {TOOL: self.tool, **self.tools, self.tool_name: self.tool})
@@ -136,7 +136,7 @@ class HexapodGeometry:
 
     @property
     def kernel_axes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Writable copies of the cardan axes for compiled kernels, zeros where the machine gives none."""
+        """The cardan axes of base and platform, zeros where the machine gives none."""
         missing = np.zeros((6, 3))
         base, platform = self.base_axes, self.platform_axes
         return np.array(missing if base is None else base), np.array(missing if platform is None else platform)
@@ -144,14 +144,15 @@ class HexapodGeometry:
     def _check_home(self, put: Callable[[str, object], None]) -> None:
         """Refuse a home pose that breaks a limit of single poses."""
         pose = (self.home.position, self.home.rotation)
-        lengths = np.empty(6)
-        kernels.strut_lengths_one(*self.kernel_joints, *pose, lengths)
-        put("home_sign", float(kernels.condition_one(*self.kernel_joints, *pose, self.characteristic_length)[1]))
+        rows, lengths, found = (pose[0][None], pose[1][None]), np.empty((1, 6)), (np.empty(1), np.empty(1))
+        batch.strut_lengths(*self.kernel_joints, *rows, lengths)
+        batch.conditions(*self.kernel_joints, *rows, self.characteristic_length, *found)
+        put("home_sign", float(found[1][0]))
         cone_axes, joints = np.array([self.base_cone_axes, self.platform_cone_axes]), self.platform_joints
         # The distance of struts that share a joint cannot be limited.
         apart = (~coincident(joints)).astype(float)
         put("limit_numbers", self.limits.numbers(cone_axes, apart, self.characteristic_length, self.home_sign))
-        refusal = self.refusal(*pose, lengths)
+        refusal = self.refusal(*pose, lengths[0])
         if refusal is not None:
             from .doubts import joint_doubts
 
@@ -166,7 +167,7 @@ class HexapodGeometry:
         """Return why the nominal machine may not stand in a platform pose with its strut lengths, None if it may."""
         outcome = check_stage(*self.kernel_joints, position, rotation, lengths, self.limit_numbers)
         finding, strut, value, _, _ = outcome
-        return None if finding == WITHIN else self.limits.error(finding, strut, 0, value)
+        return None if finding == Status.OK else self.limits.error(finding, strut, 0, value)
 
     def using(self, tool: str | None = None, work: str | None = None) -> HexapodGeometry:
         """Return the same machine with another tool or work frame in use, by name.

@@ -1,6 +1,6 @@
 """Kinematics of the ideal and of the imperfect structure: strut lengths, Jacobian, forward solution.
 
-Checked entry points to :mod:`hexapod_comp.kernels.kinematics`. They take joints, so the same call serves the nominal
+Checked entry points to the core's kinematics. They take joints, so the same call serves the nominal
 structure and the real one.
 """
 
@@ -17,6 +17,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core import MOST_ITERATIONS, Status, batch
 from ..errors import (
     KinematicsError,
     NotConvergedError,
@@ -25,7 +26,6 @@ from ..errors import (
     SingularError,
     UnreachableError,
 )
-from ..kernels import kinematics as kernels
 from ..pose import Pose
 from .geometry import STRUT_NAMES, HexapodGeometry
 
@@ -66,12 +66,12 @@ class Structure:
 
     @property
     def joints(self) -> tuple[np.ndarray, np.ndarray]:
-        """Base and platform joints, as compiled kernels take them."""
+        """Base and platform joints, as the core takes them."""
         return self.base_joints, self.platform_joints
 
     @property
     def solver(self) -> tuple[float, float, float]:
-        """What the forward solution is judged by, as compiled kernels take it."""
+        """What the forward solution is judged by, as the core takes it."""
         return self.characteristic_length, self.home_sign, self.max_condition
 
     @staticmethod
@@ -113,7 +113,7 @@ class ForwardBatch:
     positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
         Platform poses in ``base``, m.
     outcomes : ndarray of int, shape (N,)
-        ``kernels.OK`` or the reason of failure.
+        :class:`~hexapod_comp.core.Status`: ``OK``, or the reason of failure.
     iterations : ndarray of int, shape (N,)
         Newton steps.
     conditions : ndarray, shape (N,)
@@ -129,7 +129,7 @@ class ForwardBatch:
     @property
     def ok(self) -> np.ndarray:
         """Boolean mask of the rows that have a solution."""
-        return self.outcomes == kernels.OK
+        return self.outcomes == Status.OK
 
 
 def strut_lengths(machine: Machine, pose: Pose) -> np.ndarray:
@@ -147,9 +147,9 @@ def strut_lengths(machine: Machine, pose: Pose) -> np.ndarray:
     ndarray, shape (6,)
         |P + R·t_i − b_i|, m.
     """
-    structure, lengths = structure_of(machine), np.empty(6)
-    kernels.strut_lengths_one(*structure.joints, pose.position, pose.rotation, lengths)
-    return lengths
+    lengths = np.empty((1, 6))
+    batch.strut_lengths(*structure_of(machine).joints, pose.position[None], pose.rotation[None], lengths)
+    return lengths[0]
 
 
 def strut_lengths_batch(
@@ -175,7 +175,7 @@ def strut_lengths_batch(
     lengths = np.empty((len(positions), 6))
 
     def run(rows: slice) -> None:
-        kernels.strut_lengths_many(*structure.joints, positions[rows], rotations[rows], lengths[rows])
+        batch.strut_lengths(*structure.joints, positions[rows], rotations[rows], lengths[rows])
 
     over_chunks(run, len(positions), threads)
     if not np.isfinite(lengths).all():
@@ -191,9 +191,7 @@ def jacobian(machine: Machine, pose: Pose) -> np.ndarray:
     ndarray, shape (6, 6)
         Columns 0–2 per metre, 3–5 per radian; row i is (u_i, R·t_i × u_i).
     """
-    structure, matrix = structure_of(machine), np.empty((6, 6))
-    kernels.jacobian_one(*structure.joints, pose.position, pose.rotation, matrix)
-    return matrix
+    return jacobian_batch(structure_of(machine), pose.position[None], pose.rotation[None])[0]
 
 
 def jacobian_batch(structure: Structure, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
@@ -208,7 +206,7 @@ def jacobian_batch(structure: Structure, positions: np.ndarray, rotations: np.nd
     """
     positions, rotations = _batch_poses(positions, rotations)
     matrices = np.empty((len(positions), 6, 6))
-    kernels.jacobian_many(*structure.joints, positions, rotations, matrices)
+    batch.jacobians(*structure.joints, positions, rotations, matrices)
     return matrices
 
 
@@ -219,7 +217,10 @@ def condition_number(machine: Machine, pose: Pose) -> tuple[float, float]:
     length: 1 for an isotropic machine, ∞ at a singular pose.
     """
     structure = structure_of(machine)
-    return kernels.condition_one(*structure.joints, pose.position, pose.rotation, structure.characteristic_length)
+    number, sign = np.empty(1), np.empty(1)
+    given = *structure.joints, pose.position[None], pose.rotation[None], structure.characteristic_length
+    batch.conditions(*given, number, sign)
+    return float(number[0]), float(sign[0])
 
 
 def solve_pose(machine: Machine, lengths: ArrayLike, guess: Pose | None = None) -> Pose:
@@ -251,11 +252,11 @@ def solve_pose(machine: Machine, lengths: ArrayLike, guess: Pose | None = None) 
     structure, lengths = structure_of(machine), six_lengths(lengths)
     guess = structure.home if guess is None else guess
     position, rotation = guess.position.copy(), guess.rotation.copy()
-    outcome, _, condition = _solve_one(structure, lengths, position, rotation)
-    if outcome == kernels.NOT_CONVERGED or (outcome == kernels.SINGULAR and not np.isfinite(condition)):
+    outcome, condition = solve_one(structure, lengths, position, rotation)
+    if outcome == Status.NOT_CONVERGED or (outcome == Status.SINGULAR and not np.isfinite(condition)):
         position, rotation = _closest_pose(structure, lengths, guess)
-        outcome, _, condition = _solve_one(structure, lengths, position, rotation)
-    if outcome != kernels.OK:
+        outcome, condition = solve_one(structure, lengths, position, rotation)
+    if outcome != Status.OK:
         raise forward_error(outcome, condition, structure.max_condition)
     return Pose(position, rotation)
 
@@ -287,17 +288,17 @@ def solve_poses(
     count = len(lengths)
     guesses = _guesses(guess, count)
     positions, rotations = np.empty((count, 3)), np.empty((count, 3, 3))
-    outcomes, iterations = np.empty(count, np.int64), np.empty(count, np.int64)
+    outcomes, iterations = np.empty(count, np.intc), np.empty(count, np.intc)
     conditions = np.empty(count)
 
     def run(rows: slice) -> None:
         positions[rows], rotations[rows] = guesses[0][rows], guesses[1][rows]
         given = lengths[rows], positions[rows], rotations[rows]
         results = outcomes[rows], iterations[rows], conditions[rows]
-        kernels.solve_pose_many(*structure.joints, *given, *structure.solver, *results)
+        batch.solve_poses(*structure.joints, *given, *structure.solver, *results)
 
     over_chunks(run, count, threads)
-    failed = outcomes != kernels.OK
+    failed = outcomes != Status.OK
     positions[failed] = np.nan
     rotations[failed] = np.nan
     return ForwardBatch(positions, rotations, outcomes, iterations, conditions)
@@ -321,10 +322,10 @@ def _guesses(guess: Pose | tuple[np.ndarray, np.ndarray], count: int) -> tuple[n
 
 
 def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = None, first: int = FIRST_SLICE) -> None:
-    """Call `run` on slices that cover ``range(count)``; for kernels without the GIL.
+    """Call `run` on slices that cover ``range(count)``; for functions without the GIL.
 
     The calling thread begins alone. Others help only when it has worked for :data:`ALONE` of processor time and what
-    is left would take it as long again, so that no batch is slower for the help, whatever its kernel costs. It goes on
+    is left would take it as long again, so that no batch is slower for the help, whatever its rows cost. It goes on
     to take slices as they do, and waits only for those that others have begun.
 
     Parameters
@@ -370,24 +371,28 @@ def _share(slices: list[slice], run: Callable[[slice], None], workers: int) -> N
 
 
 def forward_error(outcome: int, condition: float, max_condition: float) -> KinematicsError:
-    """Return the error that belongs to a kernel's outcome other than OK."""
-    if outcome == kernels.NOT_FINITE:
+    """Return the error that belongs to an outcome of the core other than OK."""
+    if outcome == Status.NOT_FINITE:
         return NotFiniteError("strut lengths and guess must be finite, lengths above 0")
-    if outcome == kernels.UNREACHABLE:
+    if outcome == Status.UNREACHABLE:
         return UnreachableError("no pose has these strut lengths: two struts cannot meet their joints")
-    if outcome == kernels.SINGULAR:
+    if outcome == Status.SINGULAR:
         problem = f"the machine is singular there: condition number {condition:.4g}, allowed {max_condition:.4g}"
         return SingularError(problem, condition, max_condition)
-    if outcome == kernels.OTHER_ASSEMBLY:
+    if outcome == Status.OTHER_ASSEMBLY:
         return OtherAssemblyModeError("the pose found from this guess belongs to another assembly mode")
-    problem = f"Newton did not settle within {kernels.MAX_ITERATIONS} steps; give a guess nearer to the pose"
-    return NotConvergedError(problem, limit=kernels.MAX_ITERATIONS)
+    problem = f"Newton did not settle within {MOST_ITERATIONS} steps; give a guess nearer to the pose"
+    return NotConvergedError(problem, limit=MOST_ITERATIONS)
 
 
-def _solve_one(
+def solve_one(
     structure: Structure, lengths: np.ndarray, position: np.ndarray, rotation: np.ndarray
-) -> tuple[int, int, float]:
-    return kernels.solve_pose_one(*structure.joints, lengths, position, rotation, *structure.solver)
+) -> tuple[int, float]:
+    """Solve from a guess, which a solution overwrites; return (outcome, condition number)."""
+    outcome, steps, condition = np.empty(1, np.intc), np.empty(1, np.intc), np.empty(1)
+    given = lengths[None], position[None], rotation[None]
+    batch.solve_poses(*structure.joints, *given, *structure.solver, outcome, steps, condition)
+    return int(outcome[0]), float(condition[0])
 
 
 def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tuple[np.ndarray, np.ndarray]:
@@ -412,9 +417,10 @@ def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tup
         return guess.position + x[:3], rotation
 
     def misfit(x: np.ndarray) -> np.ndarray:
-        trial = np.empty(6)
-        kernels.strut_lengths_one(*structure.joints, *pose_at(x), trial)
-        return trial - lengths
+        trial = np.empty((1, 6))
+        position, rotation = pose_at(x)
+        batch.strut_lengths(*structure.joints, position[None], np.ascontiguousarray(rotation)[None], trial)
+        return trial[0] - lengths
 
     first = misfit(np.zeros(6))
     if not np.isfinite(first @ first):

@@ -7,24 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..core import Status as Found
+from ..core import Struct
 from ..errors import GeometryError, KinematicsError, LimitError, NotFiniteError, TooEarlyError
-from ..kernels.limits import (
-    ACCELERATION,
-    ASSEMBLY,
-    BASE_CONE,
-    CLEARANCE,
-    CONDITION,
-    CORRECTION,
-    EARLY,
-    NOT_FINITE,
-    PLATFORM_CONE,
-    SPEED,
-    STEP,
-    STROKE_LONG,
-    STROKE_SHORT,
-    LimitNumbers,
-    Quantities,
-)
 
 STRUT_NAMES = tuple(f"strut_{i}" for i in range(1, 7))
 """Names of the six struts, in order, as they stand in messages."""
@@ -74,7 +59,7 @@ class Limits:
         Smallest distance between the axes of two struts, m; 0: not limited. Struts that share a joint do not count.
     acceleration : float, optional
         Largest strut acceleration, m/s²; 0: not limited. Of the speed smoothed over
-        :data:`~hexapod_comp.kernels.compensation.SMOOTHED_OVER`.
+        the core's SMOOTHED_OVER, 20 ms.
     """
 
     stroke: np.ndarray
@@ -111,87 +96,88 @@ class Limits:
 
     def numbers(
         self, cone_axes: np.ndarray, apart: np.ndarray, characteristic_length: float, home_sign: float
-    ) -> LimitNumbers:
-        """Return the limits as compiled code takes them; the arguments are the machine's, see there."""
-        return LimitNumbers(
-            stroke=self.stroke.copy(),
-            cone_axes=cone_axes,
-            cone_cosines=self.cone_cosines,
-            apart=apart,
-            condition=float(self.condition),
-            correction=float(self.correction),
-            step=float(self.step),
-            clearance=float(self.clearance),
-            characteristic_length=characteristic_length,
-            home_sign=home_sign,
-            speed=float(self.speed),
-            acceleration=float(self.acceleration),
-        )
+    ) -> Struct:
+        """Return the limits as the core takes them, hc_limits; the arguments are the machine's."""
+        values = {
+            "stroke": self.stroke,
+            "cone_axes": cone_axes,
+            "cone_cosines": self.cone_cosines,
+            "apart": apart,
+            "condition": float(self.condition),
+            "correction": float(self.correction),
+            "step": float(self.step),
+            "clearance": float(self.clearance),
+            "characteristic_length": characteristic_length,
+            "home_sign": home_sign,
+            "speed": float(self.speed),
+            "acceleration": float(self.acceleration),
+        }
+        return Struct("hc_limits", values)
 
-    def margins(self, quantities: Quantities) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    def margins(self, quantities: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Return what is left of each limit of single poses, and the values, by the limit's name.
 
         Parameters
         ----------
-        found : Quantities
+        quantities : ndarray of :data:`~hexapod_comp.core.batch.QUANTITIES`, shape (N, S)
             Of N poses in S stages.
 
         Returns
         -------
         dict of str to (ndarray, ndarray)
             Margins and values, shape (N, S, 6), (N, S, 1) for the condition number: m, rad. A margin is negative,
-            or NaN, exactly where :func:`~hexapod_comp.kernels.limits.check_stage` refuses. Without ``clearance``
+            or NaN, exactly where :func:`~hexapod_comp.core.single.check_stage` refuses. Without ``clearance``
             where it is not limited.
         """
-        angles, condition = np.arccos(np.clip(quantities.cosines, -1.0, 1.0)), quantities.condition[..., None]
+        angles, condition = np.arccos(np.clip(quantities["cosines"], -1.0, 1.0)), quantities["condition"][..., None]
         cones = np.array([self.base_cone, self.platform_cone]) - angles
         # An angle rounds where its cosine does not: the cosine says on which side of its limit it is.
-        cones = np.where(quantities.cosines >= self.cone_cosines, np.maximum(cones, 0.0), np.minimum(cones, -TINY))
-        stroke = np.minimum(quantities.lengths - self.stroke[:, 0], self.stroke[:, 1] - quantities.lengths)
+        cones = np.where(quantities["cosines"] >= self.cone_cosines, np.maximum(cones, 0.0), np.minimum(cones, -TINY))
+        stroke = np.minimum(quantities["lengths"] - self.stroke[:, 0], self.stroke[:, 1] - quantities["lengths"])
         margins = {
-            "stroke": (stroke, quantities.lengths),
+            "stroke": (stroke, quantities["lengths"]),
             "base_cone": (cones[..., 0, :], angles[..., 0, :]),
             "platform_cone": (cones[..., 1, :], angles[..., 1, :]),
             "condition": (self.condition - condition, condition),
         }
         if self.clearance:
-            margins["clearance"] = (quantities.distances - self.clearance, quantities.distances)
+            margins["clearance"] = (quantities["distances"] - self.clearance, quantities["distances"])
         return margins
 
     def error(self, code: int, strut: int, stage: int, value: float) -> LimitError | KinematicsError:
         """Return the error for a finding: which limit, which strut, found and allowed value with units."""
-        if code in (SPEED, EARLY, ACCELERATION):
+        if code in (Found.SPEED, Found.EARLY, Found.ACCELERATION):
             return self._motion_error(code, strut, value)
         which = STAGES[stage]
-        if code == NOT_FINITE:
+        if code == Found.NOT_FINITE:
             return NotFiniteError(f"the {which} values at this pose are not finite")
         name = STRUT_NAMES[strut] if strut >= 0 else ""
         low, high = self.stroke[strut]
-        cone = (self.base_cone if code == BASE_CONE else self.platform_cone)[strut]
+        cone = (self.base_cone if code == Found.BASE_CONE else self.platform_cone)[strut]
         stroke = (
             low if value < low else high,
             f"{name}: {which} length {value * 1e3:.4f} mm is outside the stroke {low * 1e3:.3f}…{high * 1e3:.3f} mm",
         )
         allowed, text = {
-            STROKE_SHORT: stroke,
-            STROKE_LONG: stroke,
-            BASE_CONE: (cone, _cone_text(name, which, "base", value, cone)),
-            PLATFORM_CONE: (cone, _cone_text(name, which, "platform", value, cone)),
-            CLEARANCE: (
+            Found.STROKE_SHORT: stroke,
+            Found.STROKE_LONG: stroke,
+            Found.BASE_CONE: (cone, _cone_text(name, which, "base", value, cone)),
+            Found.PLATFORM_CONE: (cone, _cone_text(name, which, "platform", value, cone)),
+            Found.CLEARANCE: (
                 self.clearance,
                 f"{name}: {value * 1e3:.3f} mm from the nearest other strut ({which}), "
                 f"allowed {self.clearance * 1e3:g} mm",
             ),
-            CONDITION: (
+            Found.CONDITION: (
                 self.condition,
                 f"condition number {value:.4g} of the {which} pose is above {self.condition:g}: near a singularity",
             ),
-            ASSEMBLY: (0.0, f"the {which} pose belongs to another assembly mode than home"),
-            CORRECTION: (
+            Found.ASSEMBLY: (0.0, f"the {which} pose belongs to another assembly mode than home"),
+            Found.CORRECTION: (
                 self.correction,
                 f"{name}: correction {value * 1e6:.3f} µm is larger than ±{self.correction * 1e6:g} µm",
             ),
-            STEP: (
+            Found.STEP: (
                 self.step,
                 f"{name}: the {which} length would change by {value * 1e3:.4f} mm in one command, "
                 f"allowed {self.step * 1e3:g} mm",
@@ -202,10 +188,10 @@ class Limits:
     def _motion_error(self, code: int, strut: int, value: float) -> LimitError:
         """Return the error for a motion that is too fast; `value` is m/s, m/s², or s too early."""
         name = STRUT_NAMES[strut]
-        if code == EARLY:
+        if code == Found.EARLY:
             text = f"{name} cannot be there yet: {value * 1e3:.3g} ms too early for {self.speed * 1e3:g} mm/s"
             return TooEarlyError(text, value, self.speed, strut)
-        quantity, unit = ("speed", "mm/s") if code == SPEED else ("acceleration", "mm/s²")
+        quantity, unit = ("speed", "mm/s") if code == Found.SPEED else ("acceleration", "mm/s²")
         allowed = getattr(self, quantity)
         text = f"{name}: {quantity} {value * 1e3:.4g} {unit} by the stamps, allowed {allowed * 1e3:g} {unit}"
         return LimitError(REASONS[code], text, value, allowed, strut, "compensated")

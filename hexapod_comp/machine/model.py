@@ -13,10 +13,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core import Status, Struct, batch, lib
+from ..core.single import backwards
 from ..errors import ModelError, NotConvergedError
-from ..kernels import kinematics as kernels
-from ..kernels.model import actual_pose_many, actual_pose_one, command_one
 from ..pose import Pose
+from .constants import members
 from .field import GridField, no_field
 from .geometry import HexapodGeometry
 from .kinematics import Structure, forward_error, over_chunks
@@ -221,44 +222,28 @@ class RealMachine:
     def __init__(
         self, geometry: HexapodGeometry, model: MachineModel, temperatures: Temperatures | None = None
     ) -> None:
-        if model.machine != geometry.name:
-            problem = f"the model is for machine {model.machine!r}, the geometry is {geometry.name!r}"
-            raise ModelError("machine", problem)
         self.geometry, self.model = geometry, model
         self.temperatures = temperatures or Temperatures()
-        base, platform = geometry.kernel_joints
-        expansions = (*model.struts.expansion.tolist(), model.base_expansion, model.platform_expansion)
-        *growth, of_base, of_platform = (self._growth(n, expansion) for n, expansion in enumerate(expansions))
-        swelling = model.struts.moisture * self.temperatures.above_reference(HUMIDITY)
-        self.structure = structure = Structure.of(geometry).moved(
-            _displacement(base, model.base_deviation, of_base),
-            _displacement(platform, model.platform_deviation, of_platform),
-        )
-        base_axes, platform_axes = geometry.kernel_axes
-        if model.base_axes_turn.any():
-            turn = np.eye(3)
-            kernels.rotate(turn, *model.base_axes_turn.tolist())
-            base_axes = base_axes @ turn.T
-        self.body = (*structure.joints, base_axes, platform_axes)
-        self.solver = structure.solver
-        self.strut_arrays = (
-            model.struts.parameter_table(geometry, growth + swelling),
-            model.struts.map_knots.copy(),
-            model.struts.spline_coefficients(),
-        )
-        self.thresholds = np.array([model.field.reversal_threshold, model.reversal_threshold])
-        self.field_arrays = (model.field.probe, *model.field.grid, *model.field.lines)
+        self.constants, self.state = core_model(geometry, model), Struct("hc_state")
+        lib.hc_init(self.state.at, self.constants.at, 0.0)
+        write_temperatures(self.state, self.temperatures)
+        lib.hc_place(self.state.at)
+        placed = self.state.view["base_joints"].copy(), self.state.view["platform_joints"].copy()
+        self.structure = Structure(*placed, *Structure.of(geometry).solver, geometry.home)
 
-    def _growth(self, part: int, expansion: float) -> float:
-        """Return by which share a part has grown since 20 °C."""
-        late_growth = self.model.late_growth
-        sensor = PARTS[late_growth.sensor_of(part)]
-        growth = expansion * self.temperatures.above_reference(sensor)
-        lag = self.temperatures.lags.get(sensor)
-        if lag is not None:
-            for late_expansion, behind in zip(late_growth.expansion[part].tolist(), lag.behind, strict=True):
-                growth += late_expansion * behind
-        return growth
+    def __reduce__(self) -> tuple:
+        return RealMachine, (self.geometry, self.model, self.temperatures)
+
+    @property
+    def body(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Real joints of base and platform, and their cardan axes, shape (6, 3) each."""
+        base, platform = (self.constants.view[name]["axes"] for name in ("base", "platform"))
+        return (*self.structure.joints, base, platform)
+
+    @property
+    def growth(self) -> np.ndarray:
+        """By which share each strut has grown since 20 °C and 50 % of humidity, shape (6,)."""
+        return self.state.view["growth"]
 
     def commands_for(self, target: Pose, motion: MotionState | None = None) -> tuple[np.ndarray, Pose, bool]:
         """Return the strut commands that really bring the platform to a pose (backward run).
@@ -286,22 +271,11 @@ class RealMachine:
         """
         motion, commands = MotionState() if motion is None else motion, np.empty(6)
         position, rotation = np.empty(3), np.empty((3, 3))
-        solved, outside = command_one(
-            target.position,
-            target.rotation,
-            self.thresholds,
-            motion.low,
-            motion.sense,
-            self.body,
-            self.strut_arrays,
-            self.field_arrays,
-            position,
-            rotation,
-            commands,
-        )
-        if not solved:
+        given = target.position, target.rotation, motion.low, motion.sense
+        status = backwards(self.state, *given, position, rotation, commands)
+        if status == Status.NOT_CONVERGED:
             raise NotConvergedError("the error field is too steep to be undone at this pose")
-        return commands, Pose(position, rotation), bool(outside)
+        return commands, Pose(position, rotation), status == Status.OUTSIDE_FIELD
 
     def pose_for(
         self, commands: ArrayLike, sense: np.ndarray | None = None, guess: Pose | None = None
@@ -331,7 +305,7 @@ class RealMachine:
         sense = MotionState().sense if sense is None else sense
         position, rotation = guess.position.copy(), guess.rotation.copy()
         actual_position, actual_rotation = np.empty(3), np.empty((3, 3))
-        outcome, _, condition, _ = self.forward(
+        outcome, condition = self.forward(
             np.ascontiguousarray(commands, dtype=float),
             np.ascontiguousarray(sense, dtype=float),
             position,
@@ -339,41 +313,62 @@ class RealMachine:
             actual_position,
             actual_rotation,
         )
-        if outcome != kernels.OK:
+        if outcome != Status.OK:
             raise forward_error(outcome, condition, self.structure.max_condition)
         return Pose(actual_position, actual_rotation), Pose(position, rotation)
 
-    def forward(self, commands, sense, position, rotation, actual_position, actual_rotation):
-        """Run :func:`actual_pose_one` on preallocated arrays: the loop's entry, without checks."""
-        return actual_pose_one(
-            commands,
-            sense,
-            self.body,
-            self.strut_arrays,
-            self.field_arrays,
-            self.solver,
-            position,
-            rotation,
-            actual_position,
-            actual_rotation,
-        )
+    def forward(
+        self,
+        commands: np.ndarray,
+        sense: np.ndarray,
+        position: np.ndarray,
+        rotation: np.ndarray,
+        actual_position: np.ndarray,
+        actual_rotation: np.ndarray,
+    ) -> tuple[int, float]:
+        """Run the model forwards on arrays of the caller; return (outcome, condition number).
 
-    def forward_many(
-        self, commands, senses, positions, rotations, actual_positions, actual_rotations, outcomes, conditions
-    ):
-        """Run :func:`actual_pose_many` on preallocated arrays, by several threads where that helps; without checks."""
+        The model pose is the guess, and the solution where the outcome is OK; only then is the actual pose written.
+        """
+        outcome, condition = np.empty(1, np.intc), np.empty(1)
+        guess, actual = (position[None], rotation[None]), (actual_position[None], actual_rotation[None])
+        batch.forwards(self.state.at, commands[None], sense[None], *guess, *actual, outcome, condition)
+        return int(outcome[0]), float(condition[0])
+
+    def forward_many(self, *arrays: np.ndarray) -> None:
+        """Run :func:`~hexapod_comp.core.batch.forwards` by several threads where that helps."""
 
         def run(rows: slice) -> None:
-            given = commands[rows], senses[rows], self.body, self.strut_arrays, self.field_arrays, self.solver
-            poses = positions[rows], rotations[rows], actual_positions[rows], actual_rotations[rows]
-            actual_pose_many(*given, *poses, outcomes[rows], conditions[rows])
+            batch.forwards(self.state.at, *(array[rows] for array in arrays))
 
-        over_chunks(run, len(commands))
+        over_chunks(run, len(arrays[0]))
 
 
-def _displacement(nominal: np.ndarray, deviation: np.ndarray, growth: float) -> np.ndarray:
-    """Return real minus nominal joints of a body that grows about its origin, shape (6, 3), m."""
-    return deviation + growth * (nominal + deviation)
+def core_model(geometry: HexapodGeometry, model: MachineModel) -> Struct:
+    """Return a machine and its model for the core, ``hc_model``.
+
+    Raises
+    ------
+    ModelError
+        The model belongs to another machine.
+    """
+    if model.machine != geometry.name:
+        problem = f"the model is for machine {model.machine!r}, the geometry is {geometry.name!r}"
+        raise ModelError("machine", problem)
+    return Struct("hc_model", members(geometry, model))
+
+
+def write_temperatures(state: Struct, temperatures: Temperatures) -> None:
+    """Write readings and lags into an ``hc_state``; it must be placed then."""
+    view = state.view
+    view["temperatures"] = [temperatures.at(name) for name in PARTS]
+    view["humidity"] = temperatures.at(HUMIDITY)
+    for index, name in enumerate(PARTS):
+        lag = temperatures.lags.get(name)
+        if lag is not None:
+            view["began"][index] = 0.0 if math.isnan(lag.began) else lag.began  # late parts count from then on
+            view["newest"][index] = lag.newest
+            view["behind"][index][: len(lag.behind)] = lag.behind
 
 
 class MachinesByTemperature:

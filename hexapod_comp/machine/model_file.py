@@ -98,12 +98,12 @@ from typing import Any
 
 import numpy as np
 
+from ..core import MOST_HARMONICS
 from ..errors import InputFileError, ModelError
 from ..formats.files import read_text
 from ..formats.outputs import write_text
 from ..formats.paths import input_file
 from ..formats.yaml import Section, parse_yaml
-from ..kernels.struts import MOST_HARMONICS
 from .field import CROSS_AXES, OUTSIDE_POLICIES, GridField, no_field
 from .geometry import HexapodGeometry
 from .late import PARTS, LateGrowth

@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from ..core.batch import follow
 from ..formats.figures import WITH, WITHOUT
-from ..kernels.motion import follow
 from ..pose import Pose
 from .geometry import HexapodGeometry
 
@@ -142,15 +142,14 @@ def direction_figure() -> Figure:
     threshold = 2.0
     there = np.concatenate([np.linspace(0.0, 12.0, 60), np.full(60, 12.0), np.linspace(12.0, 3.0, 60)])
     values = there + 0.3 * np.random.default_rng(1).standard_normal(len(there))
-    low, sense = np.full(1, np.nan), np.zeros(1)
-    followed = np.array([(follow(value, threshold, low, sense, 0), low[0]) for value in values])
+    low, sense = follow(values, threshold)
     figure = Figure(figsize=(7, 4), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
-    number, window = np.arange(len(values)), followed[:, 1]
+    number, window = np.arange(len(values)), low
     upper.fill_between(number, window, window + threshold, color=WITH, alpha=0.25, label="window")
     upper.plot(values, color="black", lw=0.8, label="value, with noise")
     upper.set(ylabel="µm")
     upper.legend()
-    lower.step(number, followed[:, 0], where="post", color=WITHOUT)
+    lower.step(number, sense, where="post", color=WITHOUT)
     lower.set(xlabel="command", ylabel="direction", yticks=[-1, 0, 1])
     return figure

@@ -12,26 +12,13 @@ the cardan joints force on the screw since home, and growth g, by heat and by hu
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..core import MOST_HARMONICS
+from ..core.batch import screw_twists
 from ..errors import ModelError
-from ..kernels.struts import (
-    BACKLASH,
-    GROWTH,
-    HARMONICS,
-    LEAD,
-    MOST_HARMONICS,
-    OFFSET,
-    PARAMETERS,
-    PITCH,
-    REFERENCE,
-    TWIST_HOME,
-    WAVENUMBER,
-    WAVES,
-    screw_twist,
-)
 from .geometry import HexapodGeometry
 
 if TYPE_CHECKING:
@@ -178,26 +165,30 @@ class StrutErrors:
         lengths, backlash = np.split(np.transpose(self._spline().c, (2, 1, 0)), 2)
         return np.ascontiguousarray(np.concatenate([lengths, backlash], axis=2))
 
-    def parameter_table(self, geometry: HexapodGeometry, growth: np.ndarray) -> np.ndarray:
-        """Return the kernels' table, shape (6, PARAMETERS), for a growth (6,) of the struts."""
-        table = np.zeros((6, PARAMETERS))
-        table[:, OFFSET], table[:, PITCH], table[:, REFERENCE] = self.offset, self.pitch, self.reference_length
-        table[:, WAVENUMBER] = 2.0 * np.pi / self.period
-        table[:, HARMONICS] = (((self.cosine != 0.0) | (self.sine != 0.0)) * self.harmonics).max(axis=1)
-        amplitudes = np.stack([self.cosine, self.sine], axis=2).reshape(6, -1)
-        table[:, WAVES : WAVES + amplitudes.shape[1]] = amplitudes
-        table[:, BACKLASH] = self.backlash
-        table[:, LEAD] = geometry.screw_lead
-        table[:, TWIST_HOME] = home_twists(geometry)
-        table[:, GROWTH] = growth
-        return table
+    def members(self, geometry: HexapodGeometry) -> list[dict[str, Any]]:
+        """Return what hc_strut holds of each strut, by name."""
+        count = (((self.cosine != 0.0) | (self.sine != 0.0)) * self.harmonics).max(axis=1)
+        wave = np.zeros((6, MOST_HARMONICS, 2))
+        wave[:, : self.cosine.shape[1]] = np.stack([self.cosine, self.sine], axis=2)
+        columns = {
+            "offset": self.offset,
+            "pitch": self.pitch,
+            "reference": self.reference_length,
+            "wavenumber": 2.0 * np.pi / self.period,
+            "harmonics": count.astype(float),
+            "backlash": self.backlash,
+            "lead": geometry.screw_lead,
+            "twist_home": home_twists(geometry),
+            "expansion": self.expansion,
+            "moisture": self.moisture,
+            "wave": wave,
+        }
+        return [{name: column[i] for name, column in columns.items()} for i in range(6)]
 
 
 def home_twists(geometry: HexapodGeometry) -> np.ndarray:
     """Return the screw rotation of each strut at home, rad, shape (6,): the zero of the correction."""
     if not geometry.screw_lead.any():
         return np.zeros(6)
-    position, rotation = geometry.home.position, geometry.home.rotation
-    base, platform = geometry.kernel_joints
-    axes = geometry.kernel_axes
-    return np.array([screw_twist(base, platform, *axes, position, rotation, i) for i in range(6)])
+    body = *geometry.kernel_joints, *geometry.kernel_axes
+    return screw_twists(body, geometry.home.position[None], geometry.home.rotation[None])[0]

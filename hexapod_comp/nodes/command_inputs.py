@@ -13,8 +13,8 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
 
 from ..compensation.compensator import Compensator
+from ..core.single import quaternion_of
 from ..errors import HexapodError
-from ..kernels.pose import quaternion_of
 from ..machine.kinematics import Structure, forward_error, solve_poses, strut_lengths
 from ..pose import Pose
 from .messages import StrutReader, read_message

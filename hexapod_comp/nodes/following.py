@@ -9,7 +9,6 @@ from collections.abc import Callable
 import numpy as np
 
 from ..errors import CommandError, LimitError
-from ..kernels.struts import within
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 
 KEPT = 512
@@ -152,7 +151,7 @@ class Following:
         """Compare measured struts, shape (6,), m; the reading was made at the monotonic time `made`, s."""
         if self.problem or not (self.commands and self.limit):
             return
-        if within(measured, self.commands.last, self.limit):  # as they nearly always are
+        if np.abs(measured - self.commands.last).max() <= self.limit:  # as they nearly always are
             return
         low, high = self.commands.range(made - FOLLOWED_WITHIN)
         off = np.maximum(low - measured, measured - high)

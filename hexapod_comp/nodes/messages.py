@@ -10,9 +10,8 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
+from ..core.single import quaternion_of, write_lengths
 from ..errors import CommandError
-from ..kernels.pose import quaternion_of
-from ..kernels.struts import write_lengths
 from ..machine.geometry import STRUT_NAMES
 from ..pose import Pose
 

@@ -17,8 +17,8 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
+from ..core.single import write_lengths
 from ..errors import CommandError
-from ..kernels.struts import write_lengths
 from ..machine.geometry import STRUT_NAMES
 from .messages import LARGEST_MESSAGE, StrutMessage, pose_numbers, read_message
 from .stamps import nanoseconds_of, stamp_of

@@ -11,8 +11,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from ..core import MOST_HARMONICS
 from ..errors import ModelError
-from ..kernels.struts import MOST_HARMONICS
 from ..machine.field import CROSS_AXES, GridField, no_field
 from ..machine.geometry import HexapodGeometry, first_of_same
 from ..machine.kinematics import Structure, strut_lengths

@@ -194,7 +194,7 @@ class StrutDrive:
 
     def _locate(self, lengths: np.ndarray, model_pose: tuple[np.ndarray, np.ndarray]) -> None:
         """Find the true pose for motor positions, starting from, and updating, a model pose."""
-        self._outcome, _, self._condition, _ = self.machine.forward(
+        self._outcome, self._condition = self.machine.forward(
             lengths, self._motion.sense, *model_pose, *self._true_pose
         )
 

@@ -12,12 +12,11 @@ from itertools import groupby
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..core import Status
+from ..core.batch import backwards
 from ..errors import ModelError, NotConvergedError
-from ..kernels.kinematics import OK
-from ..kernels.model import command_one
 from ..machine.kinematics import forward_error
 from ..machine.model import MachineModel, RealMachine
-from ..machine.motion import FOLLOWED
 from ..machine.passes import Passes, Poses, at
 from ..machine.temperatures import Temperatures
 from ..measurements.readings import attitude_error
@@ -141,12 +140,12 @@ def drive(
     commands, senses = np.ascontiguousarray(commands, dtype=float), np.ascontiguousarray(senses, dtype=float)
     modelled = np.array(starts[0], order="C"), np.array(starts[1], order="C")
     actual = np.empty_like(modelled[0]), np.empty_like(modelled[1])
-    outcomes, conditions = np.empty(len(commands), np.int64), np.empty(len(commands))
+    outcomes, conditions = np.empty(len(commands), np.intc), np.empty(len(commands))
     arrays, done = (commands, senses, *modelled, *actual, outcomes, conditions), 0
     for machine, alike in groupby(machines):
         rows = slice(done, done + len(list(alike)))
         machine.forward_many(*(each[rows] for each in arrays))
-        failed = np.flatnonzero(outcomes[rows] != OK)
+        failed = np.flatnonzero(outcomes[rows] != Status.OK)
         if len(failed):
             row = done + int(failed[0])
             error = forward_error(outcomes[row], conditions[row], machine.structure.max_condition)
@@ -171,15 +170,16 @@ def model_commands(
     """
     positions, rotations = np.ascontiguousarray(targets[0]), np.ascontiguousarray(targets[1])
     commands, modelled = np.empty((len(positions), 6)), (np.empty_like(positions), np.empty_like(rotations))
-    low, sense = np.empty(FOLLOWED), np.empty(FOLLOWED)
-    for n, machine in enumerate(machines):
-        low[:], sense[:] = np.nan, senses[n]  # no window yet: the direction is the one given
-        given = positions[n], rotations[n], machine.thresholds, low, sense
-        arrays = machine.body, machine.strut_arrays, machine.field_arrays
-        solved, _ = command_one(*given, *arrays, modelled[0][n], modelled[1][n], commands[n])
-        if not solved:
-            where = at(positions[n]) if name_of is None else name_of(n)
-            raise NotConvergedError(f"{where}: the error field is too steep to be undone at this pose")
+    solved, done = np.empty(len(positions), np.intc), 0
+    arrays = positions, rotations, np.ascontiguousarray(senses, dtype=float), *modelled, commands, solved
+    for machine, alike in groupby(machines):
+        rows = slice(done, done + len(list(alike)))
+        backwards(machine.state.at, *(array[rows] for array in arrays))
+        done = rows.stop
+    if not solved.all():
+        n = int(solved.argmin())
+        where = at(positions[n]) if name_of is None else name_of(n)
+        raise NotConvergedError(f"{where}: the error field is too steep to be undone at this pose")
     return commands, modelled
 
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
+from ..core import Status
 from ..errors import GeometryError
-from ..kernels.limits import WITHIN
 from ..machine.geometry import HexapodGeometry
 from .reach import FINDINGS, Examiner, Reach, home_orientation, reach
 
@@ -92,7 +92,7 @@ def machine_box(geometry: HexapodGeometry, cells: int = CELLS) -> ReachedBox:
     level, home = np.eye(3), home_orientation(geometry)
     tip = geometry.tool_pose(geometry.home).position
     finding, _ = Examiner(geometry).findings(tip[None], level[None])
-    return largest_box(reach(geometry, level if finding[0] == WITHIN else home, cells))
+    return largest_box(reach(geometry, level if finding[0] == Status.OK else home, cells))
 
 
 def _home_piece(reached: Reach) -> np.ndarray:
@@ -161,13 +161,13 @@ def _moved(box: np.ndarray, axis: int, side: int, way: float) -> np.ndarray:
 
 def _fits(examiner: Examiner, rotation: np.ndarray, box: np.ndarray) -> bool:
     findings, _ = examiner.findings(_points(box), rotation[None])
-    return bool((findings == WITHIN).all())
+    return bool((findings == Status.OK).all())
 
 
 def _cause(examiner: Examiner, rotation: np.ndarray, box: np.ndarray) -> str:
     """Return what most of the points of a box that are not within break, with the struts concerned."""
     findings, struts = examiner.findings(_points(box), rotation[None])
-    out = findings[findings != WITHIN]
+    out = findings[findings != Status.OK]
     code = int(np.bincount(out).argmax())
     concerned = np.unique(struts[findings == code])
     names = ", ".join(str(strut + 1) for strut in concerned if strut >= 0)

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..core import batch
 from ..errors import KinematicsError
-from ..kernels import kinematics as kernels
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import ForwardBatch, Structure, jacobian_batch, over_chunks, solve_poses, strut_lengths
 from .sources import BASE_JOINT, LENGTH, TOOL, SingleErrors
@@ -263,7 +263,7 @@ def _exact(
             (base if part == BASE_JOINT else platform)[struts] = vector
         after = solve_poses(structure.moved(base, platform), commanded, before, threads=1)
         motions = np.empty((6, len(lengths)))
-        kernels.motions_many(*before, after.positions, after.rotations, geometry.tool.position, axes, motions)
+        batch.motions(*before, after.positions, after.rotations, geometry.tool.position, axes, motions)
         yield motions
 
 
@@ -318,7 +318,7 @@ def _way(method: str) -> Callable[..., Iterator[np.ndarray]]:
 def _nominal(structure: Structure, positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, ForwardBatch]:
     """Return the nominal lengths (N, 6), and the poses that they give: certified, NaN where they cannot be."""
     lengths = np.empty((len(positions), 6))
-    kernels.strut_lengths_many(*structure.joints, positions, rotations, lengths)
+    batch.strut_lengths(*structure.joints, positions, rotations, lengths)
     return lengths, solve_poses(structure, lengths, (positions, rotations), threads=1)
 
 
@@ -356,7 +356,7 @@ def _sizes(vectors: np.ndarray) -> np.ndarray:
 
 
 def _poses(positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return poses as the kernels take them: contiguous, a single rotation (3, 3) for all of them spread.
+    """Return poses as the core takes them: contiguous, a single rotation (3, 3) for all of them spread.
 
     Raises
     ------

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from ..core import Status
 from ..formats.texts import aligned, number
-from ..kernels.limits import WITHIN
 from ..machine.doubts import doubts, twist_per_lead
 from ..machine.frames import BASE
 from ..machine.geometry import HexapodGeometry
@@ -102,7 +102,7 @@ def _tilts(geometry: HexapodGeometry) -> np.ndarray:
             sets = [way * angles if a == axis else np.zeros(1) for a in range(3)]
             turned = orientations(geometry, [values.tolist() for values in sets])
             findings, _ = examiner.findings(np.tile(tip, (len(turned), 1)), turned)
-            out = np.flatnonzero(findings != WITHIN)
+            out = np.flatnonzero(findings != Status.OK)
             tilts[axis, side] = way * angles[out[0] - 1 if len(out) else -1]
     return tilts
 

@@ -15,8 +15,9 @@ from functools import cached_property
 import numpy as np
 from scipy import ndimage
 
+from ..core import Status
+from ..core.batch import check_poses
 from ..errors import GeometryError
-from ..kernels.limits import STROKE_LONG, WITHIN, check_poses
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import over_chunks
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
@@ -32,7 +33,7 @@ FINDINGS = (
     "assembly mode",
     "not a finite number",
 )
-"""What limits a pose, in words; the index is the code in :mod:`..kernels.limits`."""
+"""What limits a pose, in words; the index is its :class:`~hexapod_comp.core.Status`."""
 
 SEARCH_CELLS = (24, 48, 96)
 """Cells along the longest edge with which the reach is looked for, one after the other until it is found."""
@@ -82,9 +83,9 @@ class Examiner:
         def run(rows: slice) -> None:
             turned = rotations if len(rotations) == 1 else rotations[rows]
             platform = self.geometry.platform_poses(positions[rows], turned)
-            poses = [np.ascontiguousarray(part) for part in platform]
-            results = findings[rows], struts[rows]
-            check_poses(*self.geometry.kernel_joints, *poses, self.geometry.limit_numbers, *results)
+            places, turns = (np.ascontiguousarray(part) for part in platform)
+            given = *self.geometry.kernel_joints, self.geometry.limit_numbers.at, places, turns
+            check_poses(*given, findings[rows], struts[rows])
 
         over_chunks(run, len(positions), threads)
         return findings, struts
@@ -106,7 +107,7 @@ class Examiner:
         for _ in range(HALVINGS):
             middle = 0.5 * (inside + outside)
             at_middle, who = self.findings(middle, rotations)
-            beyond = at_middle != WITHIN
+            beyond = at_middle != Status.OK
             inside[~beyond], outside[beyond] = middle[~beyond], middle[beyond]
             findings[beyond], struts[beyond] = at_middle[beyond], who[beyond]
         return inside, findings, struts
@@ -164,7 +165,7 @@ class Reach:
     @property
     def within(self) -> np.ndarray:
         """Grid points within all limits, bool, shape (X, Y, Z)."""
-        return self.findings == WITHIN
+        return self.findings == Status.OK
 
     @property
     def spacing(self) -> float:
@@ -202,7 +203,7 @@ class Reach:
         points = self.points()
         centroid = points.mean(axis=0)
         finding, _ = Examiner(self.geometry).findings(centroid[None], self.rotation[None])
-        if finding[0] == WITHIN:
+        if finding[0] == Status.OK:
             return centroid
         depth = ndimage.distance_transform_edt(self.within)
         deepest = np.unravel_index(depth.argmax(), depth.shape)
@@ -286,9 +287,9 @@ def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: 
     outermost = possible_box(geometry, rotation)
     while True:
         axes, findings = _grid(examiner, rotation, box, cells)
-        grown = _grown(box, findings == WITHIN, outermost)
+        grown = _grown(box, findings == Status.OK, outermost)
         if np.array_equal(grown, box):
-            if not (findings == WITHIN).any():
+            if not (findings == Status.OK).any():
                 raise GeometryError("cells", "are too coarse: the grid misses the small workspace; take more", cells)
             boundary = _crossings(examiner, rotation, axes, findings)
             return Reach(geometry, rotation, axes, findings, boundary)
@@ -322,7 +323,7 @@ def possible_box(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
     centres, longest = -struts @ geometry.work.rotation, geometry.limits.stroke[:, 1:]
     box = np.array([(centres - longest).max(axis=0), (centres + longest).min(axis=0)])
     if not (box[0] < box[1]).all():
-        raise _empty(rotation, f"{FINDINGS[STROKE_LONG]}: no point is near enough to all base joints")
+        raise _empty(rotation, f"{FINDINGS[Status.STROKE_LONG]}: no point is near enough to all base joints")
     return box
 
 
@@ -331,7 +332,7 @@ def _search(examiner: Examiner, rotation: np.ndarray) -> np.ndarray:
     possible = possible_box(examiner.geometry, rotation)
     for cells in SEARCH_CELLS:
         axes, findings = _grid(examiner, rotation, possible, cells)
-        where = np.argwhere(findings == WITHIN)
+        where = np.argwhere(findings == Status.OK)
         if len(where):
             step = axes[0][1] - axes[0][0]
             low = np.array([axis[i] for axis, i in zip(axes, where.min(axis=0), strict=True)])
@@ -371,7 +372,7 @@ def _crossings(
     examiner: Examiner, rotation: np.ndarray, axes: tuple[np.ndarray, ...], findings: np.ndarray
 ) -> Boundary:
     """Bisect every edge of the grid that has one end within reach."""
-    within = findings == WITHIN
+    within = findings == Status.OK
     inside, outside, axis, outward = [], [], [], []
     for k in range(3):
         before = np.take(within, np.arange(len(axes[k]) - 1), k)

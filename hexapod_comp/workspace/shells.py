@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..core import Status
 from ..errors import GeometryError
-from ..kernels.limits import WITHIN
 from ..machine.geometry import HexapodGeometry
 from .reach import Examiner, Reach, poses_at
 
@@ -152,7 +152,7 @@ def _cast(
     shares = np.linspace(0.0, farthest, SAMPLES)
     samples = origin + shares[:, None] * directions[:, None]
     at_samples, _ = examiner.findings(samples.reshape(-1, 3), reach.rotation[None])
-    within = (at_samples == WITHIN).reshape(len(directions), SAMPLES)
+    within = (at_samples == Status.OK).reshape(len(directions), SAMPLES)
     within[:, 0] = True
     exits = within.argmin(axis=1)
     ray = np.arange(len(directions))

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..compensation.findings import refuse
-from ..compensation.state import CommandState, pack_fixed, pack_pose
+from ..compensation.findings import refusal
+from ..compensation.state import pack_pose
+from ..core import Status, Struct
+from ..core.batch import go
 from ..errors import HexapodError
 from ..formats.texts import aligned, number
-from ..kernels.travel import travel_one
 from ..machine.model import RealMachine
 from ..pose import Pose
 
@@ -103,13 +104,13 @@ def travel(
 
 
 class _Outset:
-    """Where a machine's tool starts from, packed for the kernel."""
+    """Where a machine's tool starts from, as the core takes it."""
 
     def __init__(self, machine: RealMachine, tool_pose: Pose, frame: Pose, compensates: bool) -> None:
-        self._machine, self._tool = machine, tool_pose
-        self._judging = pack_pose(frame), pack_fixed(machine), machine.model.field.outside == "refuse"
-        self._last, self._next = CommandState(0.0), CommandState(0.0)
-        self._last.state.enabled[:] = float(compensates)
+        self._machine = machine
+        self._frame, self._start, self._state = pack_pose(frame), pack_pose(tool_pose), Struct("hc_state")
+        self._state.copy_from(machine.state)
+        self._state.view["last"]["enabled"] = compensates
         _, beta, _ = tool_pose.angles()
         # R = Ry(β)·Rx(α)·Rz(γ): α turns about x as Ry(β) leaves it, β about y, γ about the tool's own z.
         axes = np.array([[math.cos(beta), 0.0, -math.sin(beta)], [0.0, 1.0, 0.0], tool_pose.rotation[:, 2]])
@@ -119,18 +120,16 @@ class _Outset:
         """Return how far the tool may go; raise what is wrong with where it starts."""
         index = COORDINATES.index(coordinate)
         turns, axis = index >= 3, sign * self._axes[index]
-        vectors = (np.zeros(3), axis) if turns else (axis, np.zeros(3))
+        shift, turn = (np.zeros(3), axis) if turns else (axis, np.zeros(3))
         stroke = float(self._machine.geometry.limits.stroke.max())
-        steps = (TURN_STEP, LONGEST_TURN) if turns else (stroke / STEPS, 4.0 * stroke)
-        pose, states = (self._tool.position, self._tool.rotation), (self._last.numbers, self._next.numbers)
-        inside, outside, refused = travel_one(*pose, *vectors, *steps, *self._judging, *states)
-        try:
-            refuse(refused, self._next, self._machine)
-        except HexapodError as error:
-            if outside == 0.0:
-                raise
-            return Travel(coordinate, sign, inside, error)
-        return Travel(coordinate, sign, inside, None)
+        step, longest = (TURN_STEP, LONGEST_TURN) if turns else (stroke / STEPS, 4.0 * stroke)
+        way = go(self._state.at, self._start.at, self._frame.at, shift, turn, step, longest)
+        if way.refused.status == Status.OK:
+            return Travel(coordinate, sign, way.inside, None)
+        error = refusal(way.refused, self._machine.geometry, self._machine.model)
+        if way.outside == 0.0:
+            raise error
+        return Travel(coordinate, sign, way.inside, error)
 
 
 def travel_text(ways: Sequence[Travel]) -> str:

@@ -16,8 +16,8 @@ import pytest
 from strategies import paper_geometry, random_model
 
 from benchmarks.smooth_imperfections import with_wavy_field
+from hexapod_comp.core import batch
 from hexapod_comp.errors import ModelError
-from hexapod_comp.kernels.struts import smooth_error
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.virtual.imperfections import with_length_map
 
@@ -35,8 +35,8 @@ FORWARD, BACKWARD = np.ones(3), -np.ones(3)
 
 def strut_errors(model: MachineModel) -> np.ndarray:
     """Return what the machine's struts do with :data:`COMMANDS`, shape (6, n), m."""
-    arrays = RealMachine(PAPER, model).strut_arrays
-    return np.array([[smooth_error(c, 0.0, *arrays, strut)[0] for c in COMMANDS] for strut in range(6)])
+    machine = RealMachine(PAPER, model)
+    return np.array([batch.strut_errors(machine.state.at, strut, COMMANDS)[0] for strut in range(6)])
 
 
 def field_errors(model: MachineModel, points: np.ndarray, sense: np.ndarray = FORWARD) -> np.ndarray:

@@ -21,8 +21,8 @@ from strategies import (
 
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.compensation.state import Correction, pack_pose
+from hexapod_comp.core import LONGEST_RAMP_STEP
 from hexapod_comp.errors import HexapodError, LimitError, ModelError, NotFiniteError, OutsideFieldError
-from hexapod_comp.kernels.compensation import LONGEST_RAMP_STEP
 from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.geometry import HexapodGeometry, Limits
 from hexapod_comp.machine.model import MachineModel

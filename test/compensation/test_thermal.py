@@ -17,7 +17,6 @@ from scipy.signal import lfilter
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.compensation.thermal import DEFAULT_TIME_CONSTANT, Plausibility, TemperatureFilter, Thermometers
 from hexapod_comp.errors import ModelError
-from hexapod_comp.kernels.struts import GROWTH
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.late import LateGrowth
 from hexapod_comp.machine.model import MachineModel
@@ -257,9 +256,9 @@ def test_a_compensator_follows_late_and_a_restored_one_goes_on_bit_for_bit():
     for second in range(401, 701):
         for compensator in (one, other):
             compensator.set_temperature("base", 23.0, float(second))
-    growth = one.machine.strut_arrays[0][:, GROWTH]
+    growth = one.machine.growth
     np.testing.assert_allclose(growth, 12e-6 * 3.0 * -math.expm1(-1.0), rtol=1e-12)
-    assert growth.tobytes() == other.machine.strut_arrays[0][:, GROWTH].tobytes()
+    assert growth.tobytes() == other.machine.growth.tobytes()
     assert one.snapshot()["lags"] == other.snapshot()["lags"]
 
 
@@ -277,6 +276,6 @@ def test_lags_begin_anew_with_a_model_of_other_time_constants():
     compensator.set_temperature("base", 22.0, 60.0)
     compensator.set_model(replace(model, late_growth=replace(model.late_growth, time_constants=(900.0,))))
     assert compensator.snapshot()["lags"] == {}
-    np.testing.assert_allclose(compensator.machine.strut_arrays[0][:, GROWTH], 24e-6)  # at rest
+    np.testing.assert_allclose(compensator.machine.growth, 24e-6)  # at rest
     with pytest.raises(ModelError, match=r"snapshot\.lags\.base"):
         compensator.restore(compensator.snapshot() | {"lags": {"base": [0.0, 1.0]}})

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hexapod_comp.core import Status, batch
 from hexapod_comp.errors import KinematicsError, NotFiniteError, OtherAssemblyModeError, SingularError, UnreachableError
-from hexapod_comp.kernels import kinematics as kernels
 from hexapod_comp.machine.assembly import (
     _sought_poses,
     assembly_modes,
@@ -98,12 +98,12 @@ def multi_start(structure: Structure, lengths: np.ndarray, seed: int, count: int
     """All poses that Newton reaches from thousands of random ones."""
     positions = np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 3)) * lengths.max()
     rotations = Rotation.random(count, random_state=seed).as_matrix()
-    outcomes, iterations = np.empty(count, np.int64), np.empty(count, np.int64)
+    outcomes, iterations = np.empty(count, np.intc), np.empty(count, np.intc)
     joints = structure.base_joints, structure.platform_joints
     state = (np.tile(lengths, (count, 1)), positions, rotations, 0.2, 0.0, np.inf)
-    kernels.solve_pose_many(*joints, *state, outcomes, iterations, np.empty(count))
+    batch.solve_poses(*joints, *state, outcomes, iterations, np.empty(count))
     found: list[Pose] = []
-    rows = np.hstack([positions, rotations.reshape(-1, 9)])[outcomes == kernels.OK]
+    rows = np.hstack([positions, rotations.reshape(-1, 9)])[outcomes == Status.OK]
     while len(rows):
         found.append(Pose(rows[0, :3], rows[0, 3:].reshape(3, 3)))
         rows = rows[np.abs(rows - rows[0]).max(axis=1) > 1e-6]
@@ -152,7 +152,7 @@ def test_real_structure_is_continued_from_the_pairs(geometry, structure, deviati
         assert miss(pose, modes) < REGULAR
         assert miss(pose, [working_mode(geometry, real, lengths)]) < REGULAR
         for mode in modes:
-            np.testing.assert_allclose(distances(real, mode), lengths, rtol=0, atol=5e-13)  # kernels' closure
+            np.testing.assert_allclose(distances(real, mode), lengths, rtol=0, atol=5e-13)  # the core's closure
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -20,6 +20,8 @@ from helpers import (
 from scipy.spatial.transform import Rotation
 from strategies import paper_geometry
 
+from hexapod_comp.core import Status, batch
+from hexapod_comp.core.single import rotate
 from hexapod_comp.errors import (
     KinematicsError,
     NotFiniteError,
@@ -28,7 +30,6 @@ from hexapod_comp.errors import (
     SingularError,
     UnreachableError,
 )
-from hexapod_comp.kernels import kinematics as kernels
 from hexapod_comp.machine import kinematics
 from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.kinematics import (
@@ -36,6 +37,7 @@ from hexapod_comp.machine.kinematics import (
     condition_number,
     jacobian,
     jacobian_batch,
+    solve_one,
     solve_pose,
     solve_poses,
     strut_lengths,
@@ -56,20 +58,11 @@ POSES = 100_000
 machines = pytest.mark.parametrize("machine", MACHINES.values(), ids=MACHINES.keys())
 
 
-def solve_in_kernel(
+def solve_in_core(
     structure: Structure, lengths: np.ndarray, position: np.ndarray, rotation: np.ndarray
-) -> tuple[int, int, float]:
-    """Call the compiled solver; `position` and `rotation` are the guess and receive the answer."""
-    return kernels.solve_pose_one(
-        structure.base_joints,
-        structure.platform_joints,
-        lengths,
-        position,
-        rotation,
-        structure.characteristic_length,
-        structure.home_sign,
-        structure.max_condition,
-    )
+) -> tuple[int, float]:
+    """Call the core's solver; `position` and `rotation` are the guess and receive the answer."""
+    return solve_one(structure, lengths, position, rotation)
 
 
 # --- the paper's tables ------------------------------------------------------------------------------------
@@ -202,14 +195,14 @@ def test_motions_between_poses_against_rotations_by_their_vectors(angle: float, 
     swing, axis = np.cross(vectors, arms) / angle, vectors / angle
     carried = shifts + np.sin(angle) * swing + 2.0 * np.sin(0.5 * angle) ** 2 * np.cross(axis, swing)
     turned = Rotation.from_rotvec(vectors).as_matrix() @ rotations
-    kernels.motions_many(positions, rotations, positions + shifts, turned, point, axes.as_matrix(), motions)
+    batch.motions(positions, rotations, positions + shifts, turned, point, axes.as_matrix(), motions)
     np.testing.assert_allclose(motions[:3].T, axes.inv().apply(carried), rtol=0.0, atol=tolerance)
     np.testing.assert_allclose(motions[3:].T, axes.inv().apply(vectors), rtol=0.0, atol=tolerance)
 
 
 def test_the_motion_by_half_a_turn_has_no_axis() -> None:
     half, motions = np.diag([1.0, -1.0, -1.0])[None], np.empty((6, 1))
-    kernels.motions_many(np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 3)), half, np.zeros(3), np.eye(3), motions)
+    batch.motions(np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 3)), half, np.zeros(3), np.eye(3), motions)
     np.testing.assert_array_equal(motions[:, 0], [1.0, 1.0, 1.0, np.nan, np.nan, np.nan])
 
 
@@ -231,7 +224,7 @@ def test_condition_number_and_sign_against_linear_algebra(machine: HexapodGeomet
 def test_solver_reports_the_condition_number_at_its_answer() -> None:
     """The same quantity by two ways; both round, so to 1e-12."""
     pose = table_poses()[4]
-    _, _, condition = solve_in_kernel(IDEAL, strut_lengths(IDEAL, pose), HOME.position.copy(), HOME.rotation.copy())
+    _, condition = solve_in_core(IDEAL, strut_lengths(IDEAL, pose), HOME.position.copy(), HOME.rotation.copy())
     assert condition == pytest.approx(condition_number(IDEAL, pose)[0], rel=1e-12)
 
 
@@ -250,10 +243,10 @@ def test_batch_equals_single_bit_for_bit(machine: HexapodGeometry, count: int) -
     batch = solve_poses(structure, lengths, machine.home)
     for n in range(count):
         position, rotation = machine.home.position.copy(), machine.home.rotation.copy()
-        outcome, iterations, condition = solve_in_kernel(structure, lengths[n], position, rotation)
-        assert (outcome, iterations) == (batch.outcomes[n], batch.iterations[n])
+        outcome, condition = solve_in_core(structure, lengths[n], position, rotation)
+        assert outcome == batch.outcomes[n]
         assert condition == batch.conditions[n] or (np.isnan(condition) and np.isnan(batch.conditions[n]))
-        if outcome == kernels.OK:
+        if outcome == Status.OK:
             assert (position == batch.positions[n]).all()
             assert (rotation == batch.rotations[n]).all()
         else:
@@ -388,12 +381,10 @@ def seen_half_done(count: int) -> bool:
     """Solve `count` poses in one kernel call on a thread, and look on from here."""
     lengths = np.tile(strut_lengths(IDEAL, table_poses()[4]), (count, 1))
     positions, rotations = np.tile(HOME.position, (count, 1)), np.tile(HOME.rotation, (count, 1, 1))
-    outcomes, iterations = np.full(count, -1), np.empty(count, np.int64)
+    outcomes, iterations = np.full(count, -1, np.intc), np.empty(count, np.intc)
     call = (IDEAL.base_joints, IDEAL.platform_joints, lengths, positions, rotations)
     limits = (IDEAL.characteristic_length, IDEAL.home_sign, IDEAL.max_condition)
-    worker = threading.Thread(
-        target=kernels.solve_pose_many, args=(*call, *limits, outcomes, iterations, np.empty(count))
-    )
+    worker = threading.Thread(target=batch.solve_poses, args=(*call, *limits, outcomes, iterations, np.empty(count)))
     worker.start()
     seen = False
     while worker.is_alive() and not seen:
@@ -446,7 +437,7 @@ def test_rotate_is_the_exponential(size: float) -> None:
     vector = size * np.array([0.6, -0.48, 0.64])
     rotation = Rotation.from_rotvec([0.1, 0.2, -0.3]).as_matrix()
     expected = Rotation.from_rotvec(vector).as_matrix() @ rotation
-    kernels.rotate(rotation, *vector)
+    rotate(rotation, *vector)
     np.testing.assert_allclose(rotation, expected, atol=4e-16)
 
 
@@ -516,16 +507,16 @@ def test_batch_of_poses_names_the_row_that_is_not_finite() -> None:
 
 
 UNTOUCHED = {
-    "nan length": (kernels.NOT_FINITE, lambda lengths, p, r: lengths.__setitem__(2, np.nan)),
-    "infinite length": (kernels.NOT_FINITE, lambda lengths, p, r: lengths.__setitem__(0, np.inf)),
-    "negative length": (kernels.NOT_FINITE, lambda lengths, p, r: lengths.__setitem__(5, -0.5)),
-    "zero length": (kernels.NOT_FINITE, lambda lengths, p, r: lengths.__setitem__(5, 0.0)),
-    "nan guess": (kernels.NOT_FINITE, lambda lengths, p, r: p.__setitem__(1, np.nan)),
-    "infinite guess": (kernels.NOT_FINITE, lambda lengths, p, r: r.__setitem__((2, 2), np.inf)),
-    "unreachable": (kernels.UNREACHABLE, lambda lengths, p, r: lengths.__setitem__(1, 3.0)),
-    "mirrored guess": (kernels.OTHER_ASSEMBLY, lambda lengths, p, r: p.__setitem__(2, -0.4)),
-    "no rotation": (kernels.NOT_CONVERGED, lambda lengths, p, r: r.__imul__(0.9)),
-    "left-handed": (kernels.NOT_CONVERGED, lambda lengths, p, r: r[:, 2].__imul__(-1.0)),
+    "nan length": (Status.NOT_FINITE, lambda lengths, p, r: lengths.__setitem__(2, np.nan)),
+    "infinite length": (Status.NOT_FINITE, lambda lengths, p, r: lengths.__setitem__(0, np.inf)),
+    "negative length": (Status.NOT_FINITE, lambda lengths, p, r: lengths.__setitem__(5, -0.5)),
+    "zero length": (Status.NOT_FINITE, lambda lengths, p, r: lengths.__setitem__(5, 0.0)),
+    "nan guess": (Status.NOT_FINITE, lambda lengths, p, r: p.__setitem__(1, np.nan)),
+    "infinite guess": (Status.NOT_FINITE, lambda lengths, p, r: r.__setitem__((2, 2), np.inf)),
+    "unreachable": (Status.UNREACHABLE, lambda lengths, p, r: lengths.__setitem__(1, 3.0)),
+    "mirrored guess": (Status.OTHER_ASSEMBLY, lambda lengths, p, r: p.__setitem__(2, -0.4)),
+    "no rotation": (Status.NOT_CONVERGED, lambda lengths, p, r: r.__imul__(0.9)),
+    "left-handed": (Status.NOT_CONVERGED, lambda lengths, p, r: r[:, 2].__imul__(-1.0)),
 }
 
 
@@ -536,7 +527,7 @@ def test_failure_leaves_the_guess_untouched(outcome: int, spoil) -> None:
     position, rotation = HOME.position.copy(), HOME.rotation.copy()
     spoil(lengths, position, rotation)
     before = position.copy(), rotation.copy()
-    found, _, _ = solve_in_kernel(IDEAL, lengths, position, rotation)
+    found, _ = solve_in_core(IDEAL, lengths, position, rotation)
     assert found == outcome
     np.testing.assert_array_equal(position, before[0])
     np.testing.assert_array_equal(rotation, before[1])
@@ -545,8 +536,8 @@ def test_failure_leaves_the_guess_untouched(outcome: int, spoil) -> None:
 def test_singular_answer_leaves_the_guess_untouched() -> None:
     singular = Pose.from_angles(HOME.position, np.deg2rad([0.0, 0.0, 88.0]))
     position, rotation = singular.position.copy(), singular.rotation.copy()
-    outcome, _, condition = solve_in_kernel(IDEAL, strut_lengths(IDEAL, singular), position, rotation)
-    assert outcome == kernels.SINGULAR
+    outcome, condition = solve_in_core(IDEAL, strut_lengths(IDEAL, singular), position, rotation)
+    assert outcome == Status.SINGULAR
     assert condition > IDEAL.max_condition
     assert (position == singular.position).all()
     assert (rotation == singular.rotation).all()

@@ -10,7 +10,6 @@ from calibration_helpers import paper
 from scipy.integrate import solve_ivp
 
 from hexapod_comp.errors import InputFileError, KinematicsError, ModelError
-from hexapod_comp.kernels.struts import GROWTH
 from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
 from hexapod_comp.machine.late import PARTS, LateGrowth, late
 from hexapod_comp.machine.model import MachineModel, MachinesByTemperature, ModelOrigin, RealMachine
@@ -80,11 +79,11 @@ def test_a_machine_grows_by_one_thermometer_and_what_is_behind_it():
     behind = np.zeros((8, 2))
     behind[6] = -1.0, -1.5
     warm = machines.at(np.array([99.0] * 6 + [22.0, 50.0]), behind)
-    assert warm.strut_arrays[0][2, GROWTH] == pytest.approx(10.5e-6)
+    assert warm.growth[2] == pytest.approx(10.5e-6)
     nominal = paper().kernel_joints[0]
     np.testing.assert_allclose(warm.structure.base_joints - nominal, -11.5e-6 * nominal, atol=1e-15)
     own = RealMachine(paper(), warming_model(thermometer=""), Temperatures({"strut_3": 24.0, "base": 22.0}))
-    assert own.strut_arrays[0][2, GROWTH] == pytest.approx(44e-6)  # its own reading; at rest
+    assert own.growth[2] == pytest.approx(44e-6)  # its own reading; at rest
 
 
 def test_stations_driven_together_go_where_each_goes_alone():

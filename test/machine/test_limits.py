@@ -20,8 +20,9 @@ from strategies import fixed, paper_geometry, random_model, random_pose, seeds, 
 
 from hexapod_comp.compensation.checks import check
 from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.core import Status, Struct, batch
+from hexapod_comp.core.single import check_stage
 from hexapod_comp.errors import HexapodError, LimitError
-from hexapod_comp.kernels import limits as codes
 from hexapod_comp.machine.assembly import mode_objections
 from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.kinematics import Structure, strut_lengths
@@ -319,7 +320,7 @@ MACHINES = {
 }
 
 
-def first_broken(limits: Limits, numbers: codes.LimitNumbers, found: codes.Quantities) -> set[tuple[str, int]]:
+def first_broken(limits: Limits, numbers: Struct, found: np.ndarray) -> set[tuple[str, int]]:
     """Return, of all limits that the full examination finds broken, what a check in the documented order meets first.
 
     Reason and strut; two struts for a clearance, which concerns both; nothing for a pose within the limits.
@@ -336,20 +337,19 @@ def first_broken(limits: Limits, numbers: codes.LimitNumbers, found: codes.Quant
         return {("clearance", int(i)) for i in np.flatnonzero(broken["clearance"])}
     if broken["condition"][0]:
         return {("condition", -1)}
-    return {("assembly", -1)} if found.sign[0, 0] != numbers.home_sign else set()
+    return {("assembly", -1)} if found["sign"][0, 0] != numbers.view["home_sign"] else set()
 
 
 def hold_together(machine: HexapodGeometry, limits: Limits, pose: Pose, lengths: np.ndarray) -> str:
     """Fail unless both ways of asking say the same of a pose of the nominal machine; return what they say."""
-    given = machine.limit_numbers
-    numbers = limits.numbers(given.cone_axes, given.apart, given.characteristic_length, given.home_sign)
+    given = machine.limit_numbers.view
+    numbers = limits.numbers(*(given[name] for name in ("cone_axes", "apart", "characteristic_length", "home_sign")))
     at = *machine.kernel_joints, pose.position, pose.rotation
-    found = codes.Quantities.empty(1)
-    found.lengths[0, 0] = lengths
-    codes.examine(*at, numbers, found, 0, 0)
-    finding, strut, _, other, _ = codes.check_stage(*at, lengths, numbers)
+    found = batch.examine(*machine.kernel_joints, numbers.at, pose.position, pose.rotation)
+    found["lengths"][0, 0] = lengths
+    finding, strut, _, other, _ = check_stage(*at, lengths, numbers)
     expected = first_broken(limits, numbers, found)
-    if finding == codes.WITHIN:
+    if finding == Status.OK:
         assert expected == set()
     else:
         assert (REASONS[finding], strut) in expected
@@ -357,15 +357,17 @@ def hold_together(machine: HexapodGeometry, limits: Limits, pose: Pose, lengths:
     return REASONS[finding]
 
 
-def at_the_edge(limits: Limits, lengths: np.ndarray, found: codes.Quantities) -> list[Limits]:
+def at_the_edge(limits: Limits, lengths: np.ndarray, found: np.ndarray) -> list[Limits]:
     """Return limits at the very quantities of a pose, and some steps of floating point beside them."""
-    angles = np.arccos(np.clip(found.cosines[0, 0], -1.0, 1.0))
+    angles = np.arccos(np.clip(found["cosines"][0, 0], -1.0, 1.0))
     values: list[tuple[str, tuple, float]] = []
     for i in range(6):
         values += [("stroke", (i, side), lengths[i]) for side in range(2)]
         values += [(f"{body}_cone", (i,), angles[side, i]) for side, body in enumerate(("base", "platform"))]
-    values += [("condition", (), found.condition[0, 0])]
-    values += [("clearance", (), least) for least in found.distances[0, 0] if limits.clearance and np.isfinite(least)]
+    values += [("condition", (), found["condition"][0, 0])]
+    values += [
+        ("clearance", (), least) for least in found["distances"][0, 0] if limits.clearance and np.isfinite(least)
+    ]
     every = []
     for name, place, value in values:
         for steps in (-1000, -30, -1, 0, 1, 30, 1000):  # a cosine near 1 resolves some 100 steps of its angle
@@ -387,9 +389,10 @@ def test_both_ways_of_asking_agree_to_the_last_bit(name: str) -> None:
     wide = replace(WIDE, clearance=1e-6 if machine.limits.clearance else 0.0)
     for _ in range(5):
         pose = random_pose(rng, machine.home, 0.06, 25.0)
-        lengths, found = strut_lengths(Structure.of(machine), pose), codes.Quantities.empty(1)
-        given = machine.limit_numbers._replace(clearance=wide.clearance)
-        codes.examine(*machine.kernel_joints, pose.position, pose.rotation, given, found, 0, 0)
+        lengths, given = strut_lengths(Structure.of(machine), pose), Struct("hc_limits")
+        given.copy_from(machine.limit_numbers)
+        given.view["clearance"] = wide.clearance
+        found = batch.examine(*machine.kernel_joints, given.at, pose.position, pose.rotation)
         verdicts = [hold_together(machine, limits, pose, lengths) for limits in at_the_edge(wide, lengths, found)]
         assert set(verdicts) >= {"", "stroke", "base_cone", "platform_cone", "condition"}
 

@@ -21,8 +21,8 @@ from strategies import (
     skewed_geometry,
 )
 
+from hexapod_comp.core.single import follow_nine
 from hexapod_comp.errors import ModelError, NotConvergedError, NotFiniteError, UnreachableError
-from hexapod_comp.kernels.motion import follow
 from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.kinematics import Structure, solve_pose
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -298,6 +298,14 @@ def test_bad_models_are_refused(bad, message):
 # Directions of motion.
 
 THRESHOLD = 2e-6
+
+
+def follow(value, threshold, low, sense, index):
+    """Take one of the nine values, and none of the others; return its direction."""
+    values = np.full(9, np.nan)
+    values[index] = value
+    follow_nine(values, threshold, threshold, low, sense)
+    return sense[index]
 
 
 class Follower:

@@ -12,8 +12,9 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 from strategies import fixed, paper_geometry, random_pose, random_struts, seeds, skewed_geometry
 
+from hexapod_comp.core.batch import screw_twists, strut_commands
+from hexapod_comp.core.single import actual_length
 from hexapod_comp.errors import ModelError
-from hexapod_comp.kernels.struts import HARMONICS, actual_length, command_for_length, screw_twist
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.motion import MotionState
 from hexapod_comp.machine.struts import STEEPEST_ERROR, StrutErrors
@@ -24,14 +25,19 @@ PAPER = paper_geometry()
 COMMANDS = np.linspace(0.35, 0.65, 61)
 
 
-def arrays(struts, growth=0.0):
-    """Return what the kernels read, for a machine whose screws cannot turn."""
-    table = struts.parameter_table(PAPER, np.full(6, growth))
-    return table, struts.map_knots.copy(), struts.spline_coefficients()
+def machine_of(struts, growth=0.0):
+    """Return a machine whose screws cannot turn, and whose struts have grown."""
+    machine = RealMachine(PAPER, MachineModel("paper", struts=struts))
+    machine.growth[:] = growth
+    return machine
 
 
 def length(struts, command, sense=0.0, strut=0, growth=0.0, shift=0.0):
-    return actual_length(command, sense, shift, *arrays(struts, growth), strut)
+    return actual_length(machine_of(struts, growth).state, strut, command, sense, shift)
+
+
+def command_for_length(machine, strut, wanted, sense=0.0, shift=0.0):
+    return strut_commands(machine.state.at, strut, np.array([wanted]), sense, shift)[0]
 
 
 def on_strut_4(value):
@@ -104,7 +110,7 @@ def test_growth_comes_from_the_temperature_above_20_degrees():
     """Truth: L·(1 + a·(T − T_ref)) (DESIGN): 12 ppm/K · 15 K of 0.5 m are 90 µm, on strut 2 alone."""
     model = MachineModel("paper", struts=StrutErrors(expansion=np.full(6, 12e-6)))
     machine = RealMachine(PAPER, model, Temperatures({"strut_2": 35.0}))
-    lengths = [actual_length(0.5, 0.0, 0.0, *machine.strut_arrays, i) for i in range(6)]
+    lengths = [actual_length(machine.state, i, 0.5) for i in range(6)]
     np.testing.assert_allclose(np.array(lengths) - 0.5, np.where(np.arange(6) == 1, 90e-6, 0.0), atol=2e-16)
 
 
@@ -158,12 +164,12 @@ def test_length_map_of_few_knots(count):
 def test_command_and_length_undo_each_other(seed, command, sense, shift):
     """Truth: the inverse of a function. Tolerance: three roundings of half a metre."""
     struts = random_struts(np.random.default_rng(seed))
-    read = arrays(struts, growth=3e-4)
+    machine = machine_of(struts, growth=3e-4)
     for strut in range(6):
-        real = actual_length(command, sense, shift, *read, strut)
-        assert command_for_length(real, sense, shift, *read, strut) == pytest.approx(command, abs=4e-16)
-        back = command_for_length(command, sense, shift, *read, strut)
-        assert actual_length(back, sense, shift, *read, strut) == pytest.approx(command, abs=4e-16)
+        real = actual_length(machine.state, strut, command, sense, shift)
+        assert command_for_length(machine, strut, real, sense, shift) == pytest.approx(command, abs=4e-16)
+        back = command_for_length(machine, strut, command, sense, shift)
+        assert actual_length(machine.state, strut, back, sense, shift) == pytest.approx(command, abs=4e-16)
 
 
 @fixed
@@ -178,9 +184,9 @@ def test_undone_also_where_the_error_is_as_steep_as_allowed(period, offset, phas
         sine=np.full(6, amplitude * np.sin(phase)),
         period=np.full(6, period),
     )
-    read = arrays(struts)
-    command = command_for_length(at, 0.0, 0.0, *read, 0)
-    assert actual_length(command, 0.0, 0.0, *read, 0) == pytest.approx(at, abs=1e-15)
+    machine = machine_of(struts)
+    command = command_for_length(machine, 0, at)
+    assert actual_length(machine.state, 0, command) == pytest.approx(at, abs=1e-15)
 
 
 # What no strut can be.
@@ -214,10 +220,10 @@ def test_refused(bad, message):
 
 
 def test_harmonics_that_no_strut_has_are_left_out():
-    """The kernels work for those that a model has; and a model is the same however it was written."""
+    """The core works for those that a model has; and a model is the same however it was written."""
     struts = StrutErrors(cosine=on_strut_4(3e-6)[:, None] * [1.0, 0.0, 0.0], sine=np.zeros((6, 3)))
     assert struts.cosine.shape == struts.sine.shape == (6, 1)
-    np.testing.assert_array_equal(arrays(struts)[0][:, HARMONICS], on_strut_4(1.0))
+    np.testing.assert_array_equal(machine_of(struts).constants.view["struts"]["harmonics"], on_strut_4(1.0))
 
 
 # Rotation of the screws.
@@ -257,7 +263,7 @@ def test_sine_of_the_twist_is_genhexkins(seed):
     axes = rng.normal(size=(2, 6, 3))
     axes /= np.linalg.norm(axes, axis=2)[:, :, None]
     for i, strut in enumerate(struts_at(geometry, pose)):
-        twist = screw_twist(*geometry.kernel_joints, *axes, pose.position, pose.rotation, i)
+        twist = screw_twists((*geometry.kernel_joints, *axes), pose.position[None], pose.rotation[None])[0, i]
         truth = genhexkins_correction(2.0 * np.pi, axes[0, i], axes[1, i], strut, pose.rotation)
         assert np.sin(twist) == pytest.approx(np.sin(truth), abs=1e-11)
 
@@ -316,7 +322,7 @@ def test_sign_and_size_by_hand():
     base[0], platform[0] = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
     axes = np.tile([1.0, 0.0, 0.0], (6, 1))
     turned = Rotation.from_rotvec([0.0, 0.0, np.deg2rad(10.0)]).as_matrix()
-    twist = screw_twist(base, platform, axes, axes.copy(), np.array([0.0, 0.0, 0.4]), turned, 0)
+    twist = screw_twists((base, platform, axes, axes), np.array([[0.0, 0.0, 0.4]]), turned[None])[0, 0]
     assert np.rad2deg(twist) == pytest.approx(10.0, abs=1e-12)
 
 

@@ -10,8 +10,9 @@ import pytest
 from helpers import segment_distance
 from strategies import PAPER_FILE, paper_geometry
 
+from hexapod_comp.core import Status
+from hexapod_comp.core.single import segment_distance as closest
 from hexapod_comp.errors import GeometryError, PoseError
-from hexapod_comp.kernels import limits as codes
 from hexapod_comp.machine import kinematics
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.pose import Pose
@@ -83,12 +84,12 @@ def quantities(geometry: HexapodGeometry, tip: np.ndarray, rotation: np.ndarray)
         if np.linalg.norm(geometry.platform_joints[i] - geometry.platform_joints[j]) > 1e-6
     ]
     return {
-        codes.STROKE_SHORT: lengths - limits.stroke[:, 0],
-        codes.STROKE_LONG: limits.stroke[:, 1] - lengths,
-        codes.BASE_CONE: limits.base_cone - at_base,
-        codes.PLATFORM_CONE: limits.platform_cone - at_platform,
-        codes.CLEARANCE: np.array(apart) - limits.clearance,
-        codes.CONDITION: np.array([limits.condition - condition]),
+        Status.STROKE_SHORT: lengths - limits.stroke[:, 0],
+        Status.STROKE_LONG: limits.stroke[:, 1] - lengths,
+        Status.BASE_CONE: limits.base_cone - at_base,
+        Status.PLATFORM_CONE: limits.platform_cone - at_platform,
+        Status.CLEARANCE: np.array(apart) - limits.clearance,
+        Status.CONDITION: np.array([limits.condition - condition]),
     }
 
 
@@ -104,7 +105,7 @@ def test_how_low_and_how_high_the_unit_goes():
     end = np.array([[0.0, 0.0, 0.10], [0.0, 0.0, 0.30]])
     points, findings, _ = Examiner(unit()).boundary(start, end, LEVEL)
     np.testing.assert_allclose(points[:, 2], [low, high], atol=1e-6)
-    assert findings.tolist() == [codes.STROKE_SHORT, codes.STROKE_LONG]
+    assert findings.tolist() == [Status.STROKE_SHORT, Status.STROKE_LONG]
 
 
 @pytest.mark.parametrize(
@@ -121,8 +122,8 @@ def test_how_low_and_how_high_the_unit_goes():
 def test_distance_of_two_segments(first, second, distance):
     """Truth: read off the coordinates."""
     first, second = np.array(first, dtype=float), np.array(second, dtype=float)
-    assert codes.segment_distance(*first, *second) == pytest.approx(distance, abs=1e-15)
-    assert codes.segment_distance(*second[::-1], *first) == pytest.approx(distance, abs=1e-15)
+    assert closest(*first, *second) == pytest.approx(distance, abs=1e-15)
+    assert closest(*second[::-1], *first) == pytest.approx(distance, abs=1e-15)
 
 
 def test_distance_of_random_segments():
@@ -132,7 +133,7 @@ def test_distance_of_random_segments():
         if n % 3 == 0:
             along, aside = rng.normal(), 10.0 ** rng.uniform(-17.0, -3.0)
             corners[3] = corners[2] + along * (corners[1] - corners[0]) + aside * corners[3]
-        assert codes.segment_distance(*corners) == pytest.approx(segment_distance(*corners), abs=1e-9)
+        assert closest(*corners) == pytest.approx(segment_distance(*corners), abs=1e-9)
 
 
 def test_clearance_stops_the_closest_pair():
@@ -147,10 +148,10 @@ def test_clearance_stops_the_closest_pair():
         if pair not in ((0, 1), (2, 3), (4, 5))  # these share a joint of the platform
     }
     least = min(apart.values())
-    for shift, finding in ((1e-6, codes.CLEARANCE), (-1e-6, codes.WITHIN)):
+    for shift, finding in ((1e-6, Status.CLEARANCE), (-1e-6, Status.OK)):
         found, struts = Examiner(limited(geometry, clearance=least + shift)).findings(tip[None], turned[None])
         assert found[0] == finding
-        if finding == codes.CLEARANCE:
+        if finding == Status.CLEARANCE:
             assert apart[tuple(struts[0].tolist())] == pytest.approx(least, abs=2e-6)
 
 
@@ -158,7 +159,7 @@ def test_struts_that_share_a_joint_may_meet_there():
     """Truth: on the paper's machine struts meet in pairs, at distance 0; other pairs are 100 mm apart and more."""
     paper = paper_geometry()
     found, _ = Examiner(limited(paper, clearance=0.05)).findings(paper.home.position[None], LEVEL[None])
-    assert found[0] == codes.WITHIN
+    assert found[0] == Status.OK
 
 
 def test_poses_of_their_own_orientation(monkeypatch):
@@ -200,8 +201,8 @@ def test_work_and_tool_frames_only_rename_poses():
     [
         pytest.param(lambda: (unit(), LEVEL), {1, 2, 3}, id="unit"),
         pytest.param(lambda: (unit(), tilted(unit(), 6, -3, 4)), {1, 2, 3}, id="unit tilted"),
-        pytest.param(lambda: (limited(paper_geometry(), clearance=0.2), LEVEL), {codes.CLEARANCE}, id="clearance"),
-        pytest.param(lambda: (limited(paper_geometry(), condition=1.6), LEVEL), {codes.CONDITION}, id="condition"),
+        pytest.param(lambda: (limited(paper_geometry(), clearance=0.2), LEVEL), {Status.CLEARANCE}, id="clearance"),
+        pytest.param(lambda: (limited(paper_geometry(), condition=1.6), LEVEL), {Status.CONDITION}, id="condition"),
     ],
 )
 def test_at_the_boundary_the_named_limit_is_reached_and_no_other_broken(make, limiting):
@@ -245,7 +246,7 @@ class Ball(Examiner):
 
     def findings(self, positions, rotations, threads=None):
         far = np.linalg.norm(positions[:, None] - self.centres, axis=2).min(axis=1) > 0.08
-        return np.where(far, codes.STROKE_LONG, 0).astype(np.int8), np.full((len(far), 2), -1, np.int8)
+        return np.where(far, Status.STROKE_LONG, 0).astype(np.int8), np.full((len(far), 2), -1, np.int8)
 
 
 def ball_reach(*centres: tuple[float, float, float]) -> Reach:
@@ -263,7 +264,7 @@ def test_volume_and_box_of_a_ball():
     assert found.parts == 1
     regions = found.regions()
     assert set(regions) == {"top", "bottom", *(f"side {k}…{k + 60}°" for k in range(0, 360, 60))}
-    assert all(shares == {FINDINGS[codes.STROKE_LONG]: 1.0} for shares in regions.values())
+    assert all(shares == {FINDINGS[Status.STROKE_LONG]: 1.0} for shares in regions.values())
 
 
 def test_a_reach_in_two_parts():
@@ -304,7 +305,7 @@ def test_the_grid_holds_the_whole_reach(name):
     assert (box[0] <= found.box[0]).all()
     assert (found.box[1] <= box[1]).all()
     tips = np.random.default_rng(6).uniform(box[0] - 0.05, box[1] + 0.05, (50_000, 3))
-    inside = Examiner(geometry).findings(tips, found.rotation[None])[0] == codes.WITHIN
+    inside = Examiner(geometry).findings(tips, found.rotation[None])[0] == Status.OK
     margin = found.spacing
     assert inside.any()
     assert (tips[inside] > found.box[0] - margin).all()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from test_reach import LEVEL, UNIT_FILE, tilted, unit
 
+from hexapod_comp.core import Status
 from hexapod_comp.errors import GeometryError
-from hexapod_comp.kernels import limits as codes
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.workspace.reach import Examiner, Reach, reach
 from hexapod_comp.workspace.shells import Shell, mesh_volume, shell
@@ -22,7 +22,7 @@ def small_shell() -> Shell:
 
 
 def within(found: Shell, points: np.ndarray) -> np.ndarray:
-    return Examiner(found.geometry).findings(points.reshape(-1, 3), found.rotation[None])[0] == codes.WITHIN
+    return Examiner(found.geometry).findings(points.reshape(-1, 3), found.rotation[None])[0] == Status.OK
 
 
 def test_a_shell_is_the_boundary():

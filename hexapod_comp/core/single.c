@@ -1,0 +1,143 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * See single.h.
+ */
+#include "core.h"
+#include "single.h"
+
+double hc_rotation_flaw(const double *r)
+{
+    const vec x = row_of(r), y = row_of(r + 3), z = row_of(r + 6);
+    double flaw = 0.0;
+    int i, j;
+    for (i = 0; i < 3; i++) {
+        for (j = 0; j <= i; j++) {
+            const double product = r[i] * r[j] + r[3 + i] * r[3 + j] + r[6 + i] * r[6 + j];
+            const double part = fabs(product - (i == j ? 1.0 : 0.0));
+            if (!(part <= flaw)) {
+                flaw = part;
+            }
+        }
+    }
+    return dot(cross(x, y), z) < 0.0 ? HUGE_VAL : flaw;
+}
+
+hc_status hc_read_pose(const double numbers[7], double *position, double *rotation)
+{
+    hc_pose pose;
+    const hc_status status = read_pose(numbers, &pose);
+    if (status == HC_OK) {
+        write_pose(&pose, position, rotation);
+    }
+    return status;
+}
+
+/* From its largest component. */
+void hc_quaternion(const double *rotation, double q[4])
+{
+    const double(*r)[3] = (const double(*)[3])rotation;
+    const double trace = r[0][0] + r[1][1] + r[2][2];
+    double largest = trace, root;
+    int i = 3, j, k, n;
+    for (n = 0; n < 3; n++) {
+        if (r[n][n] > largest) {
+            i = n;
+            largest = r[n][n];
+        }
+    }
+    if (i == 3) {
+        root = 2.0 * sqrt(1.0 + trace);
+        q[0] = (r[2][1] - r[1][2]) / root;
+        q[1] = (r[0][2] - r[2][0]) / root;
+        q[2] = (r[1][0] - r[0][1]) / root;
+        q[3] = 0.25 * root;
+        return;
+    }
+    j = (i + 1) % 3;
+    k = (i + 2) % 3;
+    root = 2.0 * sqrt(1.0 + r[i][i] - r[j][j] - r[k][k]);
+    q[i] = 0.25 * root;
+    q[j] = (r[j][i] + r[i][j]) / root;
+    q[k] = (r[k][i] + r[i][k]) / root;
+    q[3] = (r[k][j] - r[j][k]) / root;
+}
+
+void hc_rotate(double *rotation, double x, double y, double z)
+{
+    rotate((double(*)[3])rotation, x, y, z);
+}
+
+void hc_orthonormalise(double *rotation)
+{
+    orthonormalise((double(*)[3])rotation);
+}
+
+double hc_solve_linear(double *matrix, double *right)
+{
+    return solve_six((double(*)[6])matrix, right);
+}
+
+hc_status hc_check_stage(const double *base, const double *platform, const double *position, const double *rotation,
+                         const double *lengths, const hc_limits *limits, int struts[2], double *value, double *condition)
+{
+    const double(*b)[3] = (const double(*)[3])base;
+    const hc_pose pose = pose_of(position, rotation);
+    const six_struts now = struts_of(b, (const double(*)[3])platform, &pose);
+    const finding f = check_stage(b, &pose, &now, lengths, limits, condition);
+    struts[0] = f.strut;
+    struts[1] = f.other;
+    *value = f.value;
+    return f.status;
+}
+
+double hc_segment_distance(const double a[3], const double b[3], const double c[3], const double d[3])
+{
+    return segment_distance(a, b, c, d);
+}
+
+void hc_follow_nine(const double *values, double axis_threshold, double strut_threshold, double *low, double *sense)
+{
+    int i;
+    for (i = 0; i < 9; i++) {
+        follow(values[i], i < 3 ? axis_threshold : strut_threshold, low, sense, i);
+    }
+}
+
+int hc_field_at(const hc_field *field, const double *point, const double *sense, double *error)
+{
+    return field_at(field, row_of(point), sense, error);
+}
+
+double hc_actual_length(const hc_state *state, int strut, double command, double sense, double shift)
+{
+    return actual_length(state, strut, command, sense, shift);
+}
+
+void hc_write_lengths(const double *lengths, double period, double fastest, double *position, double *velocity)
+{
+    int i;
+    for (i = 0; i < 6 && period > 0.0; i++) {
+        period = fmax(period, fabs(lengths[i] - position[i]) / fastest);
+    }
+    for (i = 0; i < 6; i++) {
+        velocity[i] = period > 0.0 ? (lengths[i] - position[i]) / period : 0.0;
+        position[i] = lengths[i];
+    }
+}
+
+void hc_place(hc_state *state)
+{
+    place_machine(state);
+}
+
+hc_status hc_backwards(const hc_state *state, const double *position, const double *rotation, double *low, double *sense,
+                       double *model_position, double *model_rotation, double *commands)
+{
+    const hc_pose target = pose_of(position, rotation);
+    hc_pose q;
+    six_struts now;
+    int outside = 0;
+    const int solved = run_backwards(state, &target, low, sense, &q, &now, commands, &outside);
+    write_pose(&q, model_position, model_rotation);
+    return !solved ? HC_NOT_CONVERGED : outside ? HC_OUTSIDE_FIELD : HC_OK;
+}
