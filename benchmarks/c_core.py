@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from hexapod_comp.export.c_library import CCompensator
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.compensation.compensator import Compensator

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -88,11 +88,4 @@ def test_the_lists_hold_todays_terms_and_no_others():
             [f"{entry.name}.{one.name}" for one in fields(blocks[entry.name])] if entry.name in blocks else [entry.name]
         )
     }
-    assert today == AT_20_DEGC == C | {"struts.moisture"}
-
-
-def test_humidity_is_reported_by_linuxcnc_and_refused_by_c():
-    model = MachineModel("paper", struts=replace(StrutErrors(), moisture=np.full(6, 1e-5)))
-    assert linuxcnc(model)
-    with pytest.raises(ModelError, match=r"^struts\.moisture: cannot be exported: the C core does not know it"):
-        c_core(model)
+    assert today == AT_20_DEGC == C
