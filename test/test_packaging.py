@@ -25,9 +25,9 @@ from hexapod_comp.formats.paths import config_file, shipped_names
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "hexapod_comp"
-FOLDERS = ("hexapod_comp", "config", "launch", "resource")
-MADE = ("__pycache__", ".hypothesis", "out", "*.egg-info", "build", "install", "log")
-FILES = ("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "LICENSE", "README.md")
+FOLDERS = ("hexapod_comp", "config", "environment", "launch", "resource", "tools")
+MADE = ("__pycache__", ".hypothesis", "out", "*.egg-info", "build", "dist", "install", "log", "*.so")
+FILES = ("package.xml", "colcon.pkg", "setup.py", "setup.cfg", "pyproject.toml", "LICENSE", "README.md")
 
 # Import name → key in rosdep's python.yaml and name on PyPI, where the three differ. ROS packages are
 # imported under their own name, which is also their key.
@@ -62,7 +62,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = workspace / "src" / "hexapod_comp"
     source.mkdir(parents=True)
     for name in FOLDERS:
-        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns(*MADE))
     for name in FILES:
         shutil.copy2(ROOT / name, source / name)
     (source / "config" / "own").mkdir(exist_ok=True)
@@ -137,7 +137,7 @@ def test_the_source_archive_carries_all_that_its_checks_need(wheel: Path):
     assert needed <= held
 
 
-VERSIONS = ("3.10", "3.11", "3.12", "3.13")
+VERSIONS = ("3.10", "3.11", "3.12", "3.13", "3.14")
 
 
 def _environment(version: str) -> dict[str, str]:
@@ -164,7 +164,8 @@ def test_constraints_pin_all_that_make_installs(version: str, monkeypatch: pytes
     pinned = _pins(ROOT / "constraints.txt", version)
     setup = _setup_arguments()
     wanted = [Requirement(line) for line in (*setup["install_requires"], *setup["extras_require"]["ros"])]
-    wanted += [Requirement(line) for extra in ("test", "docs") for line in setup["extras_require"][extra]]
+    extras = ("test", "docs", "compiler", "wheel")
+    wanted += [Requirement(line) for extra in extras for line in setup["extras_require"][extra]]
     here = _environment(version)
     for requirement in wanted:
         if requirement.marker is not None and not requirement.marker.evaluate(here):
@@ -176,8 +177,9 @@ def test_constraints_pin_all_that_make_installs(version: str, monkeypatch: pytes
 def test_locked_files_are_the_constraints_with_hashes(version: str):
     """Nothing is left out or has two versions; setuptools, which then builds this package, is there."""
     locked = {path.stem: _pins(path, version) for path in sorted((ROOT / "locked").glob("*.txt"))}
-    assert set(locked) == {"docs", "ros", "test"}
-    assert "setuptools" in locked["ros"]
+    assert set(locked) == {"compiler", "docs", "ros", "test", "wheel"}
+    assert {"setuptools", "cffi"} <= set(locked["ros"])
+    assert set(locked["compiler"]) == {"ziglang"}
     assert {pin for pins in locked.values() for pin in pins.items()} == set(
         _pins(ROOT / "constraints.txt", version).items()
     )

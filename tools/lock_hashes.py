@@ -1,7 +1,7 @@
 """Write locked/*.txt: every package of constraints.txt with the SHA-256 of each file that make may install of it.
 
-Run by ``make constraints``, with Python 3.11 or newer and uv beside it. A file of ``ros`` comes first, and ``test`` and
-``docs`` hold what they add to it, so that pip takes them together.
+Run by ``make constraints``, with Python 3.11 or newer and uv beside it. A file of ``ros`` comes first, and the
+others hold what they add to it, so that pip takes them together.
 """
 
 from __future__ import annotations
@@ -17,11 +17,17 @@ import tomllib
 
 ROOT = Path(__file__).resolve().parents[1]
 
-FILES = {"ros": ["ros"], "test": ["ros", "test"], "docs": ["ros", "docs"]}
+FILES = {
+    "ros": ["ros"],
+    "test": ["ros", "test"],
+    "docs": ["ros", "docs"],
+    "compiler": ["ros", "compiler"],
+    "wheel": ["ros", "wheel"],
+}
 """What each file holds: the package's own requirements, and these extras."""
 
 WHEEL = re.compile(
-    r"-(?:cp3(?:10|11|12|13)-cp3\d+|cp3\d+-abi3|(?:py2\.)?py3\d*(?:\.py2)?-none|cp3\d+-none)-(\S+)\.whl$"
+    r"-(?:cp3(?:10|11|12|13|14)-cp3\d+|cp3\d+-abi3|(?:py2\.)?py3\d*(?:\.py2)?-none|cp3\d+-none)-(\S+)\.whl$"
 )
 """Interpreters of make's environments, without the free-threaded ones; the rest of a name says the platform."""
 

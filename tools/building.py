@@ -1,0 +1,97 @@
+"""How the core is compiled: which C compiler, and what pip fetches where there is none.
+
+setup.py takes its build command from here. pip and other frontends call the hooks of PEP 517 (pyproject.toml names this
+file): setuptools' own, which ask for the compiler of PyPI's package ``ziglang`` on a machine without one.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+import shlex
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from setuptools import build_meta
+from setuptools.build_meta import *  # noqa: F403 (the hooks that stay as they are)
+from setuptools.command.build_ext import build_ext
+
+PROBE = "#include <math.h>\n#include <stdint.h>\ndouble probe(double x) { return sin(x) + (double)INT64_MAX; }\n"
+
+ZIG = [sys.executable, "-m", "ziglang", "cc", "-target", f"{platform.machine()}-linux-gnu.2.17"]
+"""For any processor of this kind, and for glibc from 2012 on: without a target zig takes this very processor."""
+
+NO_COMPILER = """no C compiler compiles and links a shared library here, and hexapod_comp builds its core with one.
+  Debian, Ubuntu: apt-get install gcc libc6-dev; Fedora: dnf install gcc; without root: pip install ziglang.
+  CC=... names another one."""
+
+
+def works(command: list[str]) -> bool:
+    """Tell whether a command compiles C with the standard library and links it as a shared library."""
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(folder, "probe.c")
+        source.write_text(PROBE, encoding="ascii")
+        made = [*command, "-shared", "-fPIC", str(source), "-lm", "-o", str(Path(folder, "probe.so"))]
+        try:
+            return subprocess.run(made, capture_output=True, timeout=300, check=False).returncode == 0
+        except OSError:
+            return False
+
+
+def installed_compiler() -> list[str] | None:
+    """Return the machine's C compiler: CC's, else the one that Python was built with, else any."""
+    if os.environ.get("CC"):
+        return shlex.split(os.environ["CC"])  # named on purpose: its own messages tell what is wrong with it
+    candidates = [shlex.split(sysconfig.get_config_var("CC") or "cc"), ["cc"], ["gcc"], ["clang"]]
+    return next((command for command in candidates if works(command)), None)
+
+
+class BuildCore(build_ext):
+    """Compile the extension with the compiler that is there, and without Python's own headers (core/stable_abi)."""
+
+    def build_extensions(self) -> None:
+        """Compile and link; no flag of the Python that runs this is taken over: its compiler may be another one."""
+        compiler = installed_compiler()
+        if compiler is None and importlib.util.find_spec("ziglang"):
+            compiler = ZIG
+        if compiler is None:
+            sys.exit(f"setup.py: {NO_COMPILER}")
+        self.announce(f"compiling the core with {shlex.join(compiler)}", level=2)
+        self.compiler.set_executables(
+            compiler=compiler, compiler_so=[*compiler, "-fPIC", "-DNDEBUG"], linker_so=[*compiler, "-shared"]
+        )
+        for extension in self.extensions:
+            extension.include_dirs.insert(0, str(Path("hexapod_comp", "core", "stable_abi")))
+            extension.define_macros.append(("Py_LIMITED_API", "0x030a0000"))
+            extension.extra_compile_args.append("-Werror=implicit-function-declaration")
+        with tempfile.TemporaryDirectory() as folder:
+            for name in ("ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR"):  # else 100 MB would stay in ~/.cache
+                os.environ.setdefault(name, folder)
+            super().build_extensions()
+
+
+def compiler_from_pypi() -> list[str]:
+    """Return what a build needs besides where this machine has no compiler."""
+    return [] if installed_compiler() else ["ziglang"]
+
+
+def get_requires_for_build_wheel(config_settings: Any = None) -> list[str]:
+    """Return setuptools' requirements and, where none is here, a compiler."""
+    return [*build_meta.get_requires_for_build_wheel(config_settings), *compiler_from_pypi()]
+
+
+def get_requires_for_build_editable(config_settings: Any = None) -> list[str]:
+    """Return setuptools' requirements and, where none is here, a compiler."""
+    return [*build_meta.get_requires_for_build_editable(config_settings), *compiler_from_pypi()]
+
+
+if __name__ == "__main__":  # make asks
+    if "--zig" in sys.argv:
+        print(shlex.join(ZIG))
+        sys.exit()
+    sys.exit(0 if installed_compiler() else f"make: {NO_COMPILER}")
