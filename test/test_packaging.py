@@ -293,6 +293,16 @@ def test_every_dependency_is_a_key_of_rosdep_or_a_package_of_jazzy():
     assert {dependency.name for dependency in package.build_depends} == {"g++-static", "python3-cffi"}
 
 
+def test_the_changelog_is_what_catkins_tools_read():
+    """Their grammar (REP 132): one section a version, underlined at full length, only the newest named Forthcoming."""
+    text = (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8")
+    sections = re.findall(r"^(\S.*)\n(-+)$", text, re.MULTILINE)
+    assert all(len(line) == len(name) for name, line in sections)
+    names = [name for name, _ in sections]
+    assert all(re.fullmatch(r"\d+\.\d+\.\d+ \(\d{4}-\d\d-\d\d\)", name) for name in names if name != "Forthcoming")
+    assert "Forthcoming" not in names[1:]
+
+
 def test_citation_and_changelog_name_the_version():
     assert re.search(rf"^version: {_version()}$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
     assert re.search(rf"^{_version()} \(", (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8"), re.MULTILINE)
