@@ -37,9 +37,9 @@ PYTHON3 = ("cffi", "hypothesis", "matplotlib", "numba", "numpy", "packaging", "p
 ROSDEP_KEYS = {name: f"python3-{name}" for name in PYTHON3}
 PYPI_NAMES = {"yaml": "pyyaml"}
 # setuptools runs setup.py wherever that is read, mpl_toolkits comes with matplotlib and llvmlite with Numba, apsw
-# and lz4 with rosbags, hal and linuxcnc with LinuxCNC, benchmarks are the source tree's; the others are optional
-# extras, what only `pytest -n` needs, and benchmark tools.
-COMING_WITH = {"setuptools", "mpl_toolkits", "llvmlite", "apsw", "lz4", "hal", "linuxcnc", "benchmarks"}
+# and lz4 with rosbags, websockets with viser, hal and linuxcnc with LinuxCNC, benchmarks are the source tree's; the
+# others are optional extras, what only `pytest -n` needs, and benchmark tools.
+COMING_WITH = {"setuptools", "mpl_toolkits", "llvmlite", "apsw", "lz4", "websockets", "hal", "linuxcnc", "benchmarks"}
 EXEMPT = COMING_WITH | {"xdist", "argcomplete", "plotly", "distributed", "rosbags", "mujoco", "pinocchio", "viser"}
 WITHOUT_ROS = """
 import importlib, sys
@@ -495,7 +495,7 @@ def _rosdep_key(name: str) -> str:
 def _imports(folder: Path) -> set[str]:
     """Return the third-party top-level names that the Python files of a folder import, anywhere in them."""
     folders = ("test", "tools")
-    own = {"hexapod_comp", "data", *(path.stem for name in folders for path in (ROOT / name).rglob("*.py"))}
+    own = {"hexapod_comp", "data", "examples", *(path.stem for name in folders for path in (ROOT / name).rglob("*.py"))}
     names = {name for path in folder.rglob("*.py") for name in _imported_names(ast.parse(path.read_bytes()))}
     return names - own - EXEMPT - set(sys.stdlib_module_names)
 
