@@ -29,19 +29,6 @@ def pytest_configure() -> None:
     NODE_FIXTURES.update(OWN_NODE_FIXTURES)
 
 
-def pytest_collection_finish(session: pytest.Session) -> None:
-    """Compile what nodes need before the first test with one: on a busy machine that outlasts a test's time limit."""
-    if session.config.option.collectonly or not any(_has_nodes(item) for item in session.items):
-        return
-    from hexapod_comp.nodes.warming import warm
-
-    warm()
-
-
-def _has_nodes(item: pytest.Item) -> bool:
-    return not OWN_NODE_FIXTURES.isdisjoint(getattr(item, "fixturenames", ()))
-
-
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
     """Keep a file's tests in one process, as ``--dist loadfile`` does, but those of the zoo machine by machine.

@@ -36,7 +36,6 @@ from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.nodes.client import LISTENER_QOS, TRACK_QOS
 from hexapod_comp.nodes.messages import message_pose, pose_message
 from hexapod_comp.nodes.runtime import COMMAND_QOS, NEWEST_QOS, STATE_QOS
-from hexapod_comp.nodes.warming import warm
 from hexapod_comp.pose import Pose
 
 from .controller import Controller, Mode
@@ -94,7 +93,6 @@ class Rig:
     # ---- coming and going ----
 
     def __enter__(self) -> Rig:
-        warm()
         self.folder = Path(tempfile.mkdtemp(prefix="hexapod_comp_faults_"))
         self.model = Path(shutil.copy(config_file(MODEL), self.folder / "model.yaml"))
         self._geometry_file = shutil.copy(config_file(GEOMETRY), self.folder / "geometry.yaml")

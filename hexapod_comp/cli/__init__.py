@@ -58,7 +58,7 @@ def _run(arguments: Sequence[str]) -> int:
         with inputs_protected(args):
             return int(importlib.import_module(f".{args.verb}", __name__).run(args))
     except (HexapodError, ImportError) as error:
-        if isinstance(error, ImportError) and error.name != "numba":
+        if isinstance(error, ImportError) and error.name != "hexapod_comp.core._core":
             raise
         print(f"{PROGRAM}: error: {error}", file=sys.stderr)
     except MemoryError as error:

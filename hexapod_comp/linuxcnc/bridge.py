@@ -30,7 +30,6 @@ from ..nodes.messages import StrutMessage, StrutReader
 from ..nodes.running import keep_discovery_local, run
 from ..nodes.runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, STATE_QOS, MachineNode
 from ..nodes.stamps import StampClock, StampGate, nanoseconds_of, stamp_of
-from ..nodes.warming import warm_messages
 from .bridge_status import BridgeStatus
 from .guard import CorrectionGuard, GuardStatus
 from .hal import COUNTS, METRES, HalComponent, pose_from_axes
@@ -297,7 +296,7 @@ class LinuxcncBridgeNode(MachineNode):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; the entry of the executable ``linuxcnc_bridge``."""
     keep_discovery_local()
-    return run(LinuxcncBridgeNode, PROGRAM, argv, warm_messages)
+    return run(LinuxcncBridgeNode, PROGRAM, argv)
 
 
 if __name__ == "__main__":

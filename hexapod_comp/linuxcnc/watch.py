@@ -160,7 +160,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except HexapodError as error:
         print(f"cannot start: {error}", file=sys.stderr)
         return 1
-    shown.cycle()  # compiles the kernels before LinuxCNC goes on; until then a signal ends the process at once
+    shown.cycle()  # the pins hold values before LinuxCNC goes on
     heard = heard_signals()
     shown.component.ready()
     period, due = 1.0 / options.rate, time.monotonic()

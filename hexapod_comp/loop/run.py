@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -76,10 +75,6 @@ def simulated(machine: str, model: MachineModel, truth: MachineModel) -> Iterato
     model, truth : MachineModel
         What the compensator runs, and the hidden errors of the machine; both reach the nodes as files.
     """
-    from ..nodes.warming import warm
-
-    print("preparing; the first run on a machine compiles its kernels, which takes up to a minute", file=sys.stderr)
-    warm()
     geometry_file = str(config_file(machine, "geometry", beside=True).resolve())
     with tempfile.TemporaryDirectory(prefix="hexapod_comp_") as folder:
         model_file, truth_file = (f"{folder}/{name}.yaml" for name in ("model", "truth"))

@@ -11,7 +11,7 @@ from types import FrameType
 
 
 def start(module: str) -> int:
-    """Run a program's module; without Numba it ends with one line that says where to get that.
+    """Run a program's module; without the compiled core it ends with one line that says how to build it.
 
     A signal while the module is loaded ends the process at once: there is nothing yet to put in order.
 
@@ -24,7 +24,7 @@ def start(module: str) -> int:
     try:
         main = importlib.import_module(module).main
     except ImportError as error:
-        if error.name != "numba":
+        if error.name != "hexapod_comp.core._core":
             raise
         print(f"cannot start: {error}", file=sys.stderr)
         return 1

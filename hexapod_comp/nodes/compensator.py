@@ -35,7 +35,6 @@ from .runtime import ACKNOWLEDGED_WITHIN, MachineNode
 from .stamps import stamp_of
 from .tools import ToolChoice, frame_ids
 from .travel import TravelReports
-from .warming import warm_compensator, warm_up
 
 CHECK_PERIOD = 0.05
 """How often the node looks whether its state has changed, s."""
@@ -73,7 +72,6 @@ class CompensatorNode(MachineNode):
         try:
             geometry = self._files.geometry()
             self._compensator = Compensator(geometry, self._files.model(geometry), self._options["ramp_rate"])
-            warm_up(self._compensator)
             self._compensator.enable(self._options["enable_compensation"])
             self._compensator.set_tool(self._options["tool"])
             ids = frame_ids(geometry, self._options)
@@ -297,7 +295,7 @@ class CompensatorNode(MachineNode):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; the entry of the executable ``compensator``."""
     keep_discovery_local()
-    return run(CompensatorNode, PROGRAM, argv, warm_compensator)
+    return run(CompensatorNode, PROGRAM, argv)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import faulthandler
 import functools
 import gc
@@ -21,15 +22,15 @@ from ..errors import LONGEST_TEXT, HexapodError, printable
 from . import heard_signals, open_streams
 from .arguments import Program
 from .log_relay import LogRelay
-from .memory import give_blocks_back, give_code_back
 from .middleware import avoid_shared_memory
 from .runtime import MachineNode
-from .starting import Starting
-from .warming import Warming
 
 SPIN_PERIOD = 0.1
 """Longest wait of one spin, s: how soon a signal is noticed (EventsExecutor.spin itself never returns)."""
 
+
+M_MMAP_THRESHOLD, LARGEST_KEPT = -3, 1 << 20
+"""Parameter of glibc's ``mallopt``; blocks from this size on, byte, go back to the system when they are freed."""
 
 ENDED_WITHIN = 4.0
 """What the end of a process may take from its signal on, s; usually it is a fraction of a second."""
@@ -65,7 +66,6 @@ def run(
     make_node: Callable[[], MachineNode],
     program: Program,
     argv: Sequence[str] | None = None,
-    kernels: Callable[[], None] = lambda: None,
 ) -> int:
     """Run a node until SIGINT, SIGTERM or SIGHUP.
 
@@ -80,8 +80,6 @@ def run(
         What its arguments may be.
     argv : sequence of str, optional
         Arguments after the program's name; those of this process by default.
-    kernels : callable
-        Runs every kernel that the node uses, so that none compiles later.
 
     Returns
     -------
@@ -97,7 +95,7 @@ def run(
     heard = heard_signals()
     with _own_stderr() as stderr:
         with LogRelay():
-            code = _run_until(heard, make_node, kernels, arguments, stderr)
+            code = _run_until(heard, make_node, arguments, stderr)
         if argv is None:
             # Python's own end waits for threads of DDS, which now and then never end, though all has been closed.
             for stream in filter(None, (sys.stdout, sys.stderr)):  # None: it was closed from the beginning
@@ -107,6 +105,15 @@ def run(
         faulthandler.cancel_dump_traceback_later()
         signal.setitimer(signal.ITIMER_REAL, 0.0)
     return code
+
+
+def give_blocks_back() -> None:
+    """Let large blocks go back to the system as soon as they are freed, where the C library is glibc.
+
+    Left alone, its threshold grows with the largest block that was ever freed, and long messages leave holes.
+    """
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, LARGEST_KEPT)
 
 
 def _own_stderr() -> TextIO:
@@ -120,7 +127,6 @@ def _own_stderr() -> TextIO:
 def _run_until(
     heard: Sequence[int],
     make_node: Callable[[], MachineNode],
-    kernels: Callable[[], None],
     arguments: list[str],
     stderr: TextIO,
 ) -> int:
@@ -129,31 +135,25 @@ def _run_until(
     except (rclpy.exceptions.ROSInterruptException, RuntimeError, ValueError) as error:
         print(printable(f"cannot start ROS: {error}", LONGEST_TEXT), file=sys.stderr)
         return 1
-    warming = Warming(kernels)
     try:
         node = make_node()
     except HexapodError as error:
         print(f"cannot start: {error}", file=sys.stderr)
-        warming.give_up()
         rclpy.try_shutdown()
         return 1
     node.get_logger().info(discovery())
-    starting = Starting(node, warming)
     executor = EventsExecutor()
     executor.add_node(node)
     spin = node.guard.around("spinning", functools.partial(executor.spin_once, timeout_sec=SPIN_PERIOD))
     with ExitStack() as ending:  # the last is called first
-        for end in (rclpy.try_shutdown, node.destroy_node, executor.shutdown, node.say_goodbye, starting.close):
+        for end in (rclpy.try_shutdown, node.destroy_node, executor.shutdown, node.say_goodbye):
             ending.callback(end)
         ending.callback(_end_within, ENDED_WITHIN, stderr)
-        while not (heard or starting.look()) and rclpy.ok():
-            spin()
         if node.wants_autostart and node.unconfigured and not autostart(node, heard):
             return 1
         # What is loaded by now stays; the collector need not look at it again while the machine moves.
         gc.collect()
         gc.freeze()
-        give_code_back()
         while not heard and rclpy.ok():
             spin()
     return 0

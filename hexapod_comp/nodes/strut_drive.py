@@ -32,7 +32,6 @@ from .running import keep_discovery_local, run
 from .runtime import ACKNOWLEDGED_WITHIN, STATE_QOS, MachineNode
 from .stamps import StampGate, nanoseconds_of
 from .strut_drive_parameters import PARAMETERS, PROGRAM
-from .warming import warm_drive
 
 LONGEST_PAUSE = 0.25
 """After a longer pause (a stopped process), the machine has moved on by no more than this, s."""
@@ -256,7 +255,7 @@ class StrutDriveNode(MachineNode):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; the entry of the executable ``strut_drive``."""
     keep_discovery_local()
-    return run(StrutDriveNode, PROGRAM, argv, warm_drive)
+    return run(StrutDriveNode, PROGRAM, argv)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ LONGEST = 200
 class TravelReports:
     """``~/travel`` while somebody subscribes, and ``~/get_travel`` of a configured compensator.
 
-    It is worked out in a thread of its own, by kernels that leave Python to the commands.
+    It is worked out in a thread of its own, by the core, which leaves Python to the commands.
 
     Parameters
     ----------
