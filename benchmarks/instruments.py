@@ -130,7 +130,7 @@ def one_machine(number: int, seed: int) -> Judged:
 
     level, tilted = ((error(None, tilt), error(fit.model, tilt)) for tilt in (0.0, TILT))
     expected = (fit.level.low, fit.level.high) if fit.level else (np.nan, np.nan)
-    return Judged(level, tilted, expected, fit.unseen_errors)
+    return Judged(level, tilted, expected, tuple(error.name for error in fit.unseen_errors))
 
 
 def shown(case: InstrumentCase, machines: list[Judged]) -> tuple[str, bool]:

@@ -20,7 +20,19 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from foreign_machines import MM, UM, Errors, Machine, aligned_rms, commands, goes_to, machines, rotation, tool_errors
+from foreign_machines import (
+    MM,
+    UM,
+    Errors,
+    Frame,
+    Machine,
+    aligned_rms,
+    commands,
+    goes_to,
+    machines,
+    rotation,
+    tool_errors,
+)
 from helpers import quick_pictures
 from scipy.spatial.transform import Rotation
 
@@ -262,12 +274,17 @@ def test_the_truth_lies_within_every_published_deviation(
     assert (z < 2.0).mean() > 0.75
 
 
-def test_the_valid_box_is_of_platform_positions_in_base(animal: Animal) -> None:
-    """The file's own words. Eight corners of the measured box say how far the platform went; home is in."""
-    platforms = animal.machine.platforms(corners(animal.machine.box))
-    box = np.array(yaml.safe_load(Path(animal.model).read_text())["valid_box_mm"]) * MM
-    np.testing.assert_allclose(box, [platforms.min(axis=0), platforms.max(axis=0)], atol=1e-9)
-    assert ((box[0] < animal.machine.home) & (animal.machine.home < box[1])).all()
+def test_the_model_holds_in_the_box_that_was_measured(animal: Animal) -> None:
+    """The file's own words, in its frame: the laser followed the tool's tip, and home is in."""
+    region = yaml.safe_load(Path(animal.model).read_text())["region"]
+    machine, box = animal.machine, np.array(region["box_mm"]) * MM
+    np.testing.assert_allclose(box, machine.box, atol=1e-9)
+    np.testing.assert_allclose(np.array(region.get("point_mm", [0.0] * 3)) * MM, machine.tool.position, atol=1e-12)
+    position, angles = (region.get(key, [0.0] * 3) for key in ("position_mm", "rotation_deg"))
+    frame = Frame(tuple(np.array(position) * MM), tuple(angles))
+    np.testing.assert_allclose(frame.position, machine.work.position, atol=1e-12)
+    np.testing.assert_allclose(frame.matrix, machine.work.matrix, atol=1e-12)
+    assert ((box[0] < machine.middle) & (machine.middle < box[1])).all()
 
 
 def test_what_it_is_worth_is_judged_where_the_machine_was_measured(animal: Animal) -> None:
@@ -412,11 +429,7 @@ def test_exports_read_back(animal: Animal) -> None:
     found = animal.tells("export", "--model", animal.model, "--linuxcnc", cnc, "--table", path, "--step-mm", 1000)
     assert found["frame"] == "work"
     box = np.array(found["box_mm"]) * MM
-    platforms = animal.machine.platforms(corners(box))
-    valid = np.array(yaml.safe_load(Path(animal.model).read_text())["valid_box_mm"]) * MM
-    assert (platforms > valid[0] - UM).all()
-    assert (platforms < valid[1] + UM).all()
-    assert (np.ptp(box, axis=0) > 0.5 * np.array(animal.machine.half)).all(), "a box that is of use"
+    np.testing.assert_allclose(box, animal.machine.box, atol=1e-9)
     for check in found["checks"]:
         assert check["level"]["after_rms_um"] < 0.5 * check["level"]["before_rms_um"]
 

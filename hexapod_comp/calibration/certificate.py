@@ -217,7 +217,7 @@ def _before_after(name: str, error: ToolError) -> Iterator[tuple[str, ...]]:
     expanded = number(COVERAGE * error.high * 1e6, 2)
     yield f"{name}: displacement", number(error.before * 1e6, 2), number(error.after * 1e6, 3), between, expanded, "µm"
     sizes = (number(error.rotation_before * 1e6, 1), number(error.rotation_after * 1e6, 2))
-    between, expanded = "roll was not read", ""
+    between, expanded = "roll is not shown", ""
     if error.rotation_low is not None and error.rotation_high is not None:
         between = f"{number(error.rotation_low * 1e6, 2)} … {number(error.rotation_high * 1e6, 2)}"
         expanded = number(COVERAGE * error.rotation_high * 1e6, 1)
@@ -353,7 +353,7 @@ def _pictures(fit: ModelFit) -> Iterator[str]:
     from .pictures import before_after_figure, residuals_by_run_figure
 
     yield "<h2>Pictures</h2>"
-    if fit.model.valid_box is not None:
+    if fit.model.region is not None:
         text = "Error in space before compensation, and what is expected after it, at three heights of the measured box"
         yield picture(text, before_after_figure(fit))
     text = "What the fit leaves of each reading, over its stated standard uncertainty; the band is ± U (k = 2)"
@@ -379,7 +379,7 @@ def _hidden(fit: ModelFit) -> str:
     seen = fit.observability
     text = f"{seen.structure_rank} of {seen.structure_size} parameters of the structure are seen by these readings."
     if fit.unseen_errors:
-        text += f" Errors that leave no trace in them: {', '.join(fit.unseen_errors)}."
+        text += f" Errors that they do not show: {', '.join(map(str, fit.unseen_errors))}."
     return f"<h2>What the readings do not show</h2><p>{shown(text, 2000)}</p><p>{_lines(fit.held.report())}</p>"
 
 

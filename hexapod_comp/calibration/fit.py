@@ -20,7 +20,7 @@ from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
 from .estimation import HUBER, OUTLIER, Estimation, Solution, iterate
 from .lead import ScrewLead, look_for_lead
 from .linear_problem import LinearProblem, Posterior, physical_covariance
-from .observability import Allowed, Observability, ToolError, observe, without_trace
+from .observability import Allowed, Observability, ToolError, UnseenError, observe, without_trace
 from .parameters import WAVES, FitSettings, ParameterSpace
 from .residuals import Residuals
 from .selection import Decision, select
@@ -107,8 +107,8 @@ class ModelFit:
         χ² and held-out error of each kind of channel.
     observability : Observability
         What the data determine.
-    unseen_errors : tuple of str
-        Machine errors that the readings cannot show (:data:`~.observability.MACHINE_ERRORS`).
+    unseen_errors : tuple of UnseenError
+        Machine errors that the readings do not show (:data:`~.observability.MACHINE_ERRORS`).
     verdict : Verdict
         What the model promises, and what is wrong.
     outliers : tuple of Outlier
@@ -132,7 +132,7 @@ class ModelFit:
     decisions: tuple[Decision, ...]
     channels: tuple[ChannelFit, ...]
     observability: Observability
-    unseen_errors: tuple[str, ...]
+    unseen_errors: tuple[UnseenError, ...]
     verdict: Verdict
     outliers: tuple[Outlier, ...]
     notes: tuple[str, ...]
@@ -238,8 +238,8 @@ def _fit(measurements: MeasurementSet, begun: _Begun, progress: Callable[[str], 
     noise = {KINDS.index(c.kind): c.estimated for c in channels}
     verdict = judge(estimation, solution, allowed, with_all, settings, noise, progress)
     no_trace = unseen_errors(measurements, settings)
-    if any(name.startswith("roll") for name in no_trace):
-        verdict = verdict.without_rotation()
+    if rolls := [str(error) for error in no_trace if error.name.startswith("roll")]:
+        verdict = verdict.without_rotation("; ".join(rolls))
     as_solved = _named(space, solution, measurements, channels, len(decisions), verdict.level)
     unseen = unseen_part(estimation, solution.posterior.tolerances[0], solution.posterior.noise, datum)
     model, held = hold(measurements.geometry, as_solved, datum, unseen)
@@ -250,7 +250,7 @@ def _fit(measurements: MeasurementSet, begun: _Begun, progress: Callable[[str], 
         solution=solution,
         decisions=tuple(decisions),
         channels=channels,
-        observability=observe(space, solution.problem, solution.posterior),
+        observability=observe(space, solution.problem, solution.posterior, measurements.tilt()),
         unseen_errors=no_trace,
         verdict=verdict,
         outliers=tuple(_outliers(estimation, solution)),
@@ -357,8 +357,8 @@ def _way(space: ParameterSpace, solution: Solution, everything: ParameterSpace, 
     return way
 
 
-def unseen_errors(measurements: MeasurementSet, settings: FitSettings) -> tuple[str, ...]:
-    """Return the machine errors that the readings cannot show, whatever blocks are allowed in a fit.
+def unseen_errors(measurements: MeasurementSet, settings: FitSettings) -> tuple[UnseenError, ...]:
+    """Return the machine errors that the readings do not show, whatever blocks are allowed in a fit.
 
     Parameters
     ----------

@@ -12,6 +12,7 @@ from ..errors import CalibrationError
 from ..machine.field import COMPONENTS, CROSS_AXES
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import MachineModel, RealMachine
+from ..machine.region import Region
 from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..measurements.readings import AXES, CHANNELS, KINDS, LEAST_TRAVEL, MeasurementSet
 from ..virtual.instruments import station_errors
@@ -212,9 +213,6 @@ def datum_of(measurements: MeasurementSet, grid: Sequence[np.ndarray]) -> tuple[
     return datum, [f"home lies outside the box along {', '.join(beyond)}: lines are zero at the end next to it"]
 
 
-def valid_box_of(measurements: MeasurementSet, grid: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the platform positions that the grid covers, shape (2, 3), m in ``base``."""
-    on_lines = [run.base_axis is not None for run in measurements.runs]
-    first = measurements.station[np.array(on_lines)[measurements.run]][0]
-    lever = measurements.stations.rotations[first] @ measurements.probe
-    return np.array([[nodes[0] for nodes in grid], [nodes[-1] for nodes in grid]]) - lever
+def region_of(measurements: MeasurementSet, grid: Sequence[np.ndarray]) -> Region:
+    """Return the places of the measured point that the grid covers."""
+    return Region(np.array([[nodes[0] for nodes in grid], [nodes[-1] for nodes in grid]]), measurements.probe)

@@ -59,7 +59,7 @@ from .grid_readings import (
     grid_readings,
     line_name,
     nearest_nodes,
-    valid_box_of,
+    region_of,
 )
 
 OrderRule = Literal["adjusted-r2", "aicc"] | int
@@ -201,7 +201,7 @@ def fit_lines(
         machine=measurements.geometry.name,
         name=name or f"lines, {'5-D' if (readings.component >= 3).any() else '1-D'}",
         field=field,
-        valid_box=valid_box_of(measurements, grid),
+        region=region_of(measurements, grid),
         origin=ModelOrigin(date or calendar.today().isoformat(), measurements.files, None, _origin_note(order)),
     )
     notes = list(dict.fromkeys((*measurements.notes, *notes)))

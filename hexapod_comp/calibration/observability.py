@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,9 @@ SEEN = 1.0
 
 WEAK = 5.0
 """Observable directions below so many standard deviations are called weak."""
+
+NOT_READ = 1e-6
+"""An error that changes the readings by less, standard deviations, changes none: rounding."""
 
 UNSEEN_SHARE = 0.5
 """A parameter is called unobservable when more than this share of it lies in directions nobody sees."""
@@ -93,6 +97,8 @@ class Observability:
         Strength, in standard deviations, and main parameters of directions that are only just seen.
     unseen : tuple of str
         Structure parameters that the data do not see.
+    tilt : float
+        Furthest that the tool was tilted from level in the readings, rad.
     """
 
     blocks: tuple[BlockSight, ...]
@@ -104,9 +110,10 @@ class Observability:
     indices: dict[str, float]
     weak: tuple[tuple[float, str], ...]
     unseen: tuple[str, ...]
+    tilt: float
 
 
-def observe(space: ParameterSpace, problem: LinearProblem, posterior: Posterior) -> Observability:
+def observe(space: ParameterSpace, problem: LinearProblem, posterior: Posterior, tilt: float = 0.0) -> Observability:
     """Return what a linear problem's data determine.
 
     Parameters
@@ -117,6 +124,8 @@ def observe(space: ParameterSpace, problem: LinearProblem, posterior: Posterior)
         The data's derivatives.
     posterior : Posterior
         Tolerances, noise and covariance, all blocks in use.
+    tilt : float
+        Furthest that the tool was tilted from level, rad.
     """
     spread = space.spread(posterior.tolerances)
     information = spread[:, None] * np.tensordot(posterior.noise**-2, problem.normal, 1) * spread
@@ -136,6 +145,7 @@ def observe(space: ParameterSpace, problem: LinearProblem, posterior: Posterior)
         indices=_indices(seen, len(problem.target)),
         weak=tuple(_weak(space, singular, vectors)),
         unseen=tuple(label for label, is_hidden in zip(structure.labels, hidden, strict=True) if is_hidden),
+        tilt=tilt,
     )
 
 
@@ -181,8 +191,29 @@ def _weak(space: ParameterSpace, singular: np.ndarray, vectors: np.ndarray) -> l
     return weak
 
 
-def without_trace(estimation: Estimation) -> tuple[str, ...]:
-    """Return the machine errors that leave no trace in the readings; none when their space has no field.
+class UnseenError(NamedTuple):
+    """An error of a machine that its readings do not show: name, and by how much it changes them.
+
+    The change is the root sum of squares over all readings, free of what instruments do not know, of an error of the
+    field's tolerance, in standard deviations of the stated noise.
+    """
+
+    name: str
+    trace: float
+
+    @property
+    def reason(self) -> str:
+        """Why it is not seen."""
+        if self.trace <= NOT_READ:
+            return "no reading shows it"
+        return f"below the noise: it changes all readings together by {self.trace:.2g} σ, seen from {SEEN:g} on"
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.reason})"
+
+
+def without_trace(estimation: Estimation) -> tuple[UnseenError, ...]:
+    """Return the machine errors that readings do not show above their noise; none when their space has no field.
 
     Parameters
     ----------
@@ -208,7 +239,7 @@ def without_trace(estimation: Estimation) -> tuple[str, ...]:
     if not seen:
         return ()
     traces = np.linalg.norm(estimation.free_of_unknowns(np.stack([*seen.values()], axis=1)), axis=0)
-    return tuple(name for name, trace in zip(seen, traces, strict=True) if trace <= SEEN)
+    return tuple(UnseenError(name, float(t)) for name, t in zip(seen, traces, strict=True) if t <= SEEN)
 
 
 @dataclass(frozen=True)
@@ -227,7 +258,9 @@ class ToolError:
     rotation_before, rotation_after : float
         The same of the rotation, rad.
     rotation_low, rotation_high : float or None
-        None where nothing read how the tool rolls: the priors alone would say it.
+        None where the readings do not show how the tool rolls: the priors alone would say it.
+    rotation_unknown : str
+        Why they are None.
     """
 
     before: float
@@ -238,6 +271,7 @@ class ToolError:
     rotation_after: float
     rotation_low: float | None
     rotation_high: float | None
+    rotation_unknown: str = ""
 
 
 Allowed = tuple[ParameterSpace, np.ndarray, np.ndarray]

@@ -18,6 +18,7 @@ from ..machine.geometry import STRUT_NAMES, HexapodGeometry, first_of_same
 from ..machine.kinematics import Structure, strut_lengths
 from ..machine.late import PARTS, LateGrowth
 from ..machine.model import MachineModel
+from ..machine.region import Region
 from ..machine.struts import StrutErrors
 from ..machine.temperatures import REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE
 from ..measurements.readings import AXES, MeasurementSet, Stations, spans
@@ -141,7 +142,7 @@ class FitSettings:
 
 
 @dataclass(frozen=True)
-class Region:
+class Extent:
     """What was measured, as far as parameters depend on it: all that is left of readings once they are fitted.
 
     Attributes
@@ -150,10 +151,8 @@ class Region:
         Lowest and highest strut command, m.
     box : ndarray, shape (2, 3)
         Lowest and highest commanded place of the measured point, m in ``base``: where the field is.
-    platform_box : ndarray, shape (2, 3)
-        The same of the platform's positions, m in ``base``: where the model holds.
     work_box : ndarray, shape (2, 3)
-        The same of the measured point, m in the work frame, in which campaigns are boxes.
+        The same, m in the work frame, in which campaigns are boxes: where the model holds.
     level : ndarray, shape (3, 3)
         Attitude of the platform, in ``base``, with a level tool (:meth:`MeasurementSet.level`).
     probe : ndarray, shape (3,)
@@ -162,21 +161,19 @@ class Region:
 
     commands: np.ndarray
     box: np.ndarray
-    platform_box: np.ndarray
     work_box: np.ndarray
     level: np.ndarray
     probe: np.ndarray
 
     @staticmethod
-    def of(measurements: MeasurementSet) -> Region:
+    def of(measurements: MeasurementSet) -> Extent:
         """Return where a set was measured."""
         commands, points, work = measurements.stations.commands, measurements.points(), measurements.geometry.work
         _check_commands(measurements.geometry, commands)
         in_work = (points - work.position) @ work.rotation
-        return Region(
+        return Extent(
             commands=np.array([commands.min(), commands.max()]),
             box=np.array([points.min(axis=0), points.max(axis=0)]),
-            platform_box=measurements.platform_box(),
             work_box=np.array([in_work.min(axis=0), in_work.max(axis=0)]),
             level=measurements.level(),
             probe=measurements.probe,
@@ -213,14 +210,14 @@ class ParameterSpace:
 
     Parameters
     ----------
-    measurements : MeasurementSet or (HexapodGeometry, Region)
+    measurements : MeasurementSet or (HexapodGeometry, Extent)
         Tells which commands the length map, and which box the field must cover.
     settings : FitSettings
         Which blocks.
 
     Attributes
     ----------
-    region : Region
+    region : Extent
         What was measured; its boxes, ``level`` and ``probe`` are here too.
     blocks : tuple of Block
         In the order of the vector.
@@ -236,10 +233,10 @@ class ParameterSpace:
         The field's basis.
     """
 
-    def __init__(self, measurements: MeasurementSet | tuple[HexapodGeometry, Region], settings: FitSettings) -> None:
+    def __init__(self, measurements: MeasurementSet | tuple[HexapodGeometry, Extent], settings: FitSettings) -> None:
         if isinstance(measurements, MeasurementSet):
             settings = as_warmed(settings, measurements.stations)
-            measurements = measurements.geometry, Region.of(measurements)
+            measurements = measurements.geometry, Extent.of(measurements)
         self.geometry, self.region = geometry, region = measurements
         self.settings = settings
         self.home_lengths = strut_lengths(Structure.of(geometry), geometry.home)
@@ -247,7 +244,7 @@ class ParameterSpace:
         self.periods = _periods(geometry, settings.lead)
         knots = map_knots(*region.commands)
         self.knots = {"map": knots, "backlash map": wear_knots(knots)}
-        self.box, self.platform_box, self.work_box = region.box, region.platform_box, region.work_box
+        self.box, self.work_box = region.box, region.work_box
         self.level, self.probe = region.level, region.probe
         self.field = SmoothField(self.box, settings.field_degree)
         self.blocks = tuple(self._make_blocks())
@@ -258,6 +255,11 @@ class ParameterSpace:
         """Return points (n, 3) of the work frame in ``base``, m."""
         work = self.geometry.work
         return work.position + in_work @ work.rotation.T
+
+    @property
+    def measured(self) -> Region | None:
+        """Where a model of these parameters holds; None where no box was measured."""
+        return Region(self.work_box, self.probe, self.geometry.work) if spans(self.work_box) else None
 
     def _make_blocks(self) -> list[Block]:
         names = [name for name in BLOCKS if self._has(name)]
@@ -410,7 +412,7 @@ class ParameterSpace:
             base_expansion=float(expansion[6]),
             platform_expansion=float(expansion[7]),
             late_growth=self._late_growth(x, bool(expansion.any())),
-            valid_box=self.platform_box if spans(self.platform_box) else None,
+            region=self.measured,
         )
 
     @property

@@ -87,7 +87,7 @@ def strut_error_figure(
     CalibrationError
         No model, or one without a box: nobody knows how far the line goes.
     """
-    if not models or any(model.valid_box is None for model in models.values()):
+    if not models or any(model.measured is None for model in models.values()):
         raise CalibrationError("picture of strut errors", "needs models, each with the box in which it holds")
     box = commanded_box(geometry, next(iter(models.values())))
     middle = box.mean(axis=0)
@@ -240,7 +240,7 @@ def _maps(fit: ModelFit) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     CalibrationError
         The readings span no box.
     """
-    if fit.model.valid_box is None:
+    if fit.model.region is None:
         raise CalibrationError("picture of the error in space", "needs readings that span a box")
     low, high = fit.space.work_box
     x, y = (np.linspace(low[a], high[a], MAP_NODES) for a in range(2))
@@ -344,7 +344,7 @@ def predicted_error_figure(machine: RealMachine, fitted: FittedParameters | None
     poses = machine.geometry.platform_poses(points, np.tile(np.eye(3), (len(points), 1, 1)))
     aligned = ErrorPredictor(machine, fitted).predict(poses)[1]
     if aligned is None:
-        raise ModelError("valid_box", "holds too few poses that the machine takes")
+        raise ModelError("region", "holds too few poses that the machine takes")
     figure = Figure(figsize=(11, 7), layout="constrained")
     panels = figure.subplots(2, 3, sharex=True, sharey=True)
     for n, axes in enumerate(panels.ravel()):

@@ -11,7 +11,7 @@ from ..measurements.readings import DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
 from .estimation import Estimation
 from .fit import unseen_errors
 from .linear_problem import physical_covariance, solve
-from .observability import Observability, ToolError, expected_error, observe
+from .observability import Observability, ToolError, UnseenError, expected_error, observe
 from .parameters import FitSettings, ParameterSpace
 from .promise import Scatter, Unexplained
 from .verdict import TILT
@@ -29,8 +29,8 @@ class Plan:
         The parameters to be fitted.
     observability : Observability
         What the readings will determine.
-    unseen_errors : tuple of str
-        Machine errors that they cannot show.
+    unseen_errors : tuple of UnseenError
+        Machine errors that they will not show.
     level, tilted : ToolError or None
         The tool error to expect after a fit, the machine's repeatability included; `before` is that of machines within
         the tolerances.
@@ -41,7 +41,7 @@ class Plan:
     measurements: MeasurementSet
     space: ParameterSpace
     observability: Observability
-    unseen_errors: tuple[str, ...]
+    unseen_errors: tuple[UnseenError, ...]
     level: ToolError | None
     tilted: ToolError | None
     stops: float
@@ -71,7 +71,7 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
     return Plan(
         measurements=measurements,
         space=space,
-        observability=observe(space, problem, posterior),
+        observability=observe(space, problem, posterior, measurements.tilt()),
         unseen_errors=unseen_errors(measurements, settings),
         level=level,
         tilted=tilted,

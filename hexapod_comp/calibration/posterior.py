@@ -30,7 +30,7 @@ from ..measurements.readings import KINDS
 from ..pose import Pose
 from .datum import HeldDatum
 from .fit import ModelFit
-from .parameters import FitSettings, ParameterSpace, Region
+from .parameters import Extent, FitSettings, ParameterSpace
 
 FORMAT = "hexapod_comp/posterior"
 VERSION = 1
@@ -41,7 +41,7 @@ HELD = {"datum_position": (3,), "datum_rotation": (3, 3), "datum_part": (6, 6), 
 """Arrays of a held datum."""
 
 REGION_SHAPES = {
-    "commands": (2,), "box": (2, 3), "platform_box": (2, 3), "work_box": (2, 3), "level": (3, 3), "probe": (3,)
+    "commands": (2,), "box": (2, 3), "work_box": (2, 3), "level": (3, 3), "probe": (3,)
 }  # fmt: skip
 
 LARGEST = 1e6
@@ -217,7 +217,7 @@ def _parsed(
             raise InputFileError(path, name, f"must be an array of shape {shape}", given)
         return arrays[name]
 
-    region = Region(**{name: array(f"region_{name}", *shape) for name, shape in REGION_SHAPES.items()})
+    region = Extent(**{name: array(f"region_{name}", *shape) for name, shape in REGION_SHAPES.items()})
     try:
         space = ParameterSpace((geometry, region), _settings(path, head.get("settings")))
     except (ModelError, PoseError) as error:

@@ -14,7 +14,7 @@ import numpy as np
 from ..core import Status
 from ..errors import CalibrationError
 from ..machine.kinematics import Structure, strut_lengths_batch
-from ..machine.model import RealMachine, platform_box
+from ..machine.model import RealMachine
 from ..machine.motion import FOLLOWED
 from ..machine.passes import Poses
 from ..machine.temperatures import HUMIDITY, Temperatures
@@ -175,12 +175,11 @@ class ErrorPredictor:
         """Return the motion of the whole machine that is no error once the datum is set."""
         geometry, fitted = self._machine.geometry, self._fitted
         level = geometry.work.rotation @ geometry.tool.rotation.T if fitted is None else fitted.space.level
-        box = platform_box(self._machine.model, level)
-        if box is None:
+        region = self._machine.model.measured
+        if region is None:
             return None
-        nodes = [np.linspace(low, high, 3) for low, high in box.T]
-        positions = np.stack(np.meshgrid(*nodes), axis=-1).reshape(-1, 3)
-        poses = positions, np.tile(level, (len(positions), 1, 1))
+        places = np.stack(np.meshgrid(*(np.linspace(low, high, 3) for low, high in region.box.T)), axis=-1)
+        poses = region.poses(places.reshape(-1, 3), level)
         errors = self._errors(poses)
         reached = np.isfinite(errors.values).all(axis=1)
         if reached.sum() < 3:

@@ -13,7 +13,7 @@ from ..measurements.campaign import Campaign, template
 from ..measurements.campaign_runs import CampaignRun
 from .candidates import MeasuringBox, candidates
 from .gains import Aim, Selection, seen_by
-from .parameters import FitSettings, ParameterSpace, Region
+from .parameters import Extent, FitSettings, ParameterSpace
 
 RUNS_AT_ONCE = 40
 """Candidates that are laid out together: bounds the memory."""
@@ -176,7 +176,7 @@ class Proposal:
         return taken
 
 
-def region(place: MeasuringBox, runs: Sequence[CampaignRun]) -> Region:
+def region(place: MeasuringBox, runs: Sequence[CampaignRun]) -> Extent:
     """Return the region that runs of a box cover, as far as parameters depend on it."""
     geometry = place.geometry
     positions, rotations = (np.concatenate([getattr(run, name) for run in runs]) for name in ("positions", "rotations"))
@@ -184,10 +184,9 @@ def region(place: MeasuringBox, runs: Sequence[CampaignRun]) -> Region:
     corners = np.stack(np.meshgrid(*place.box.T, indexing="ij"), axis=-1).reshape(-1, 3)
     platform, level = geometry.platform_poses(corners, place.level[None])
     points = platform + level @ geometry.tool.position
-    return Region(
+    return Extent(
         commands=np.array([lengths.min(), lengths.max()]),
         box=np.array([points.min(axis=0), points.max(axis=0)]),
-        platform_box=np.array([platform.min(axis=0), platform.max(axis=0)]),
         work_box=place.box,
         level=level[0],
         probe=np.asarray(geometry.tool.position),

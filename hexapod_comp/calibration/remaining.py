@@ -13,8 +13,9 @@ import numpy as np
 
 from ..errors import InputFileError
 from ..formats.texts import aligned, number
-from ..machine.model import RealMachine, commanded_box
+from ..machine.model import RealMachine, commanded_box, measured_region
 from ..machine.passes import Poses
+from ..machine.region import region_json, region_text
 from ..measurements.campaign import Campaign, template
 from ..measurements.readings import CHANNELS, DEFAULT_UNCERTAINTY, MeasurementSet
 from ..workspace.combining import NORMAL, covariance_factor, monte_carlo, root_sum_of_squares
@@ -139,8 +140,8 @@ def remaining(
     """
     space, predictor = fitted.space, ErrorPredictor(machine, fitted)
     rng = np.random.default_rng(SEED)
-    low, high = space.platform_box
-    in_box = rng.uniform(low, high, (POINTS, 3)), np.tile(space.level, (POINTS, 1, 1))
+    region = measured_region(machine.model)
+    in_box = region.poses(rng.uniform(region.box[0], region.box[1], (POINTS, 3)), space.level)
     factor = covariance_factor(fitted.covariance)
     left, effects = [], []
     for where, poses in (("measured box, level tool", in_box), (name, workspace)):
@@ -248,8 +249,8 @@ def remaining_text(result: Remaining) -> str:
     geometry, model = result.machine.geometry, result.machine.model
     head = (
         f"machine {geometry.name}, model {model.name!r}: what is left of the tool's error after compensation, by the "
-        f"covariance of the fit's {result.parameters} parameters.\nThe datum is aligned over the measured box. Where "
-        "nothing was measured, only what the fit's parameters describe counts."
+        f"covariance of the fit's {result.parameters} parameters.\n{region_text(model.measured, geometry)}\nThe datum "
+        "is aligned over that box. Where nothing was measured, only what the fit's parameters describe counts."
     )
     titles = ["where", "poses", "RMS µm", "worst pose µm", "there, tool in work: x, y, z mm"]
     titles += ["95 % of machines below µm", "rotation µrad", "datum as it stands, RMS µm"]
@@ -309,6 +310,7 @@ def remaining_json(result: Remaining) -> dict[str, Any]:
         "model": result.machine.model.name,
         "parameters": result.parameters,
         "frame": "work",
+        "measured_box": region_json(result.machine.model.measured, result.machine.geometry),
         "left": [
             {
                 "where": part.where,

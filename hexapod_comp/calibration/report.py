@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 
+import numpy as np
+
 from ..formats.texts import aligned, number
-from ..measurements.readings import ANGULAR_KINDS, CHANNELS
+from ..measurements.readings import ANGULAR_KINDS, CHANNELS, SAME_ATTITUDE
 from .estimation import SETTLED
 from .fit import ChannelFit, ModelFit, Outlier
 from .lead import ScrewLead
-from .observability import BlockSight, Observability, ToolError
+from .observability import BlockSight, Observability, ToolError, UnseenError
 from .plan import Plan
+from .verdict import TILT
 from .warming import warming_json, warming_text
 
 MOST_LISTED, MOST_OF_RUN = 10, 3
@@ -79,7 +82,13 @@ def _expected(level: ToolError | None, tilted: ToolError | None, seen: Observabi
 def tilt_doubt(tilted: ToolError | None, seen: Observability) -> Iterator[str]:
     """Yield why a model is not to be trusted with a tilted tool, if it is not."""
     if tilted is not None and seen.structure_rank < seen.structure_size and tilted.after > TRUST * tilted.before:
-        yield "The readings do not show what tilting does: do not trust this model with a tilted tool."
+        share = 100.0 * tilted.after / tilted.before
+        tilt = f"taken at tilts of up to {np.degrees(seen.tilt):.1f}°" if seen.tilt > SAME_ATTITUDE else "all level"
+        yield (
+            f"Do not trust this model with a tilted tool: tilted by {np.degrees(TILT):g}°, {share:.0f} % of the error "
+            f"stays ({100.0 * TRUST:g} % allowed). The readings, {tilt}, show {seen.structure_rank} of "
+            f"{seen.structure_size} parameters of the structure above their noise."
+        )
 
 
 def tool_error_text(error: ToolError) -> str:
@@ -103,7 +112,7 @@ def stops_text(stops: float) -> str:
 def rotation_interval(error: ToolError) -> str:
     """Return the interval of a tool's rotation in µrad, or that there is none."""
     if error.rotation_low is None or error.rotation_high is None:
-        return " by the priors, for nothing read its roll"
+        return f" by the priors: {error.rotation_unknown}"
     return f" ({error.rotation_low * 1e6:.2f}…{error.rotation_high * 1e6:.2f})"
 
 
@@ -145,7 +154,7 @@ def _decision_table(fit: ModelFit) -> str:
     return head + "\n" + aligned(header, rows)
 
 
-def observability_text(seen: Observability, unseen_errors: tuple[str, ...]) -> str:
+def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ...]) -> str:
     """Return what the data determine: block by block, rank, indices, weak and unseen directions."""
     header = ("block", "parameters", "determined", "tolerance", "median error", "")
     lines = [aligned(header, [_sight_row(b) for b in seen.blocks])]
@@ -159,7 +168,11 @@ def observability_text(seen: Observability, unseen_errors: tuple[str, ...]) -> s
     if seen.unseen:
         lines.append("not seen (left near nominal): " + ", ".join(seen.unseen))
     if unseen_errors:
-        lines.append("machine errors that leave no trace in these readings: " + ", ".join(unseen_errors))
+        by_reason: dict[str, list[str]] = {}
+        for error in unseen_errors:
+            by_reason.setdefault(error.reason, []).append(error.name)
+        listed = "; ".join(f"{', '.join(names)} ({reason})" for reason, names in by_reason.items())
+        lines.append(f"machine errors that the readings do not show: {listed}")
     return "\n".join(lines)
 
 
@@ -243,20 +256,24 @@ def _unit(kind: str) -> str:
 
 
 def _expected_json(
-    level: ToolError | None, tilted: ToolError | None, seen: Observability, unseen_errors: tuple[str, ...]
+    level: ToolError | None, tilted: ToolError | None, seen: Observability, unseen_errors: tuple[UnseenError, ...]
 ) -> dict:
     """Return what a fit and a plan for one both say."""
 
     def error(tool: ToolError | None) -> dict | None:
         if tool is None:
             return None
-        return {f"{name}_{'rad' if 'rotation' in name else 'm'}": value for name, value in vars(tool).items()}
+        values = vars(tool).copy()
+        unknown = values.pop("rotation_unknown")
+        in_si = {f"{name}_{'rad' if 'rotation' in name else 'm'}": value for name, value in values.items()}
+        return in_si | {"rotation_unknown": unknown or None}
 
     return {
         "expected_tool_error": error(level),
         "expected_tool_error_tilted": error(tilted),
         "observability": {**vars(seen), "blocks": [vars(block) for block in seen.blocks]},
-        "unseen_errors": unseen_errors,
+        "unseen_errors": [error.name for error in unseen_errors],
+        "unseen_errors_traces": [error.trace for error in unseen_errors],
     }
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..measurements.readings import ANGULAR_KINDS, DEFAULT_UNCERTAINTY, KINDS, MeasurementSet, attitude_error
+from ..measurements.readings import ANGULAR_KINDS, DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
 from .estimation import SETTLED, Estimation, Solution
 from .linear_problem import physical_covariance
 from .misfit import ChiSquare, chi_squares, held_by_priors, stated_scale, unexplained
@@ -58,10 +58,10 @@ class Verdict:
     doubts: tuple[str, ...]
     remarks: tuple[str, ...]
 
-    def without_rotation(self) -> Verdict:
+    def without_rotation(self, why: str) -> Verdict:
         """Return the same with no interval for the tool's rotation, of which the priors alone would speak."""
         level, tilted = (
-            None if error is None else replace(error, rotation_low=None, rotation_high=None)
+            None if error is None else replace(error, rotation_low=None, rotation_high=None, rotation_unknown=why)
             for error in (self.level, self.tilted)
         )
         return replace(self, level=level, tilted=tilted)
@@ -117,8 +117,7 @@ NOT_TILTED = "a field was needed, and measured with a level tool alone: nothing 
 
 def _is_level_only(measurements: MeasurementSet, space: ParameterSpace) -> bool:
     """Return whether a field is needed that was measured with a level tool alone: it says nothing of a tilted one."""
-    turned = np.linalg.norm(attitude_error(measurements.stations.rotations, space.level), axis=1)
-    return space.block("field displacement") is not None and turned.max() < 0.5 * TILT
+    return space.block("field displacement") is not None and measurements.tilt() < 0.5 * TILT
 
 
 def _unstated(m: MeasurementSet) -> str:

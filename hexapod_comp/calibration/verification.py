@@ -233,13 +233,14 @@ def _tool(
     """Return how far a change moves the tool in the measured box, RMS, as it stands and with the datum aligned, m."""
     if candidate.change is None:
         return None
-    space = fitted.space
-    low, high = space.platform_box
-    places = np.random.default_rng(SEED).uniform(low, high, (POSES, 3))
+    space, region = fitted.space, model.measured
+    if region is None:  # no box in which a datum could be aligned
+        return None
+    places = np.random.default_rng(SEED).uniform(region.box[0], region.box[1], (POSES, 3))
     predictor = ErrorPredictor(RealMachine(space.geometry, model), fitted)
     try:
-        _, *slopes, _ = predictor.slopes((places, np.tile(space.level, (POSES, 1, 1))))
-    except CalibrationError:  # no box in which a datum could be aligned
+        _, *slopes, _ = predictor.slopes(region.poses(places, space.level))
+    except CalibrationError:  # hardly a pose of the box can be reached
         return None
     mean = explained(check, fitted, candidate.change, candidate.scale).mean
     moved = [np.linalg.norm(part[:, :3] @ mean, axis=1) for part in slopes]

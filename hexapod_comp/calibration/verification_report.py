@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ..formats.texts import aligned, number
+from ..machine.region import region_json, region_text
 from .changes import DATUM, FAMILIES, READING, STRUT, TEMPERATURE
 from .update import Update
 from .verification import NAMED, UNDECIDED, VALID, Candidate, Verification
@@ -27,7 +28,8 @@ def verification_report(result: Verification) -> str:
     m = result.measurements
     parts = [
         f"machine {m.geometry.name}, model {result.model.name!r}: {len(m)} check readings of {len(np.unique(m.run))} "
-        f"runs, {result.independent} numbers without what the instruments leave open",
+        f"runs, {result.independent} numbers without what the instruments leave open\n"
+        f"{region_text(result.model.measured, m.geometry)}",
         "\n".join(_verdict(result)),
     ]
     if result.doubts:
@@ -44,10 +46,10 @@ def verification_report(result: Verification) -> str:
 
 def _outside(result: Verification) -> str:
     """Return how many places lie outside the box that the model was fitted in; empty if none does."""
-    box, positions = result.model.valid_box, result.measurements.stations.positions
-    if box is None:
+    region, stations = result.model.measured, result.measurements.stations
+    if region is None:
         return ""
-    beyond = ((positions < box[0] - SLACK) | (positions > box[1] + SLACK)).any(axis=1)
+    beyond = ~region.contains(stations.positions, stations.rotations, SLACK)
     if not beyond.any():
         return ""
     return f"{beyond.sum()} of {len(beyond)} places lie outside the box in which the model was fitted"
@@ -149,6 +151,7 @@ def verification_json(result: Verification) -> dict:
         "machine": result.measurements.geometry.name,
         "model": result.model.name,
         "verdict": result.verdict,
+        "measured_box": region_json(result.model.measured, result.measurements.geometry),
         "readings": len(result.measurements),
         "independent": result.independent,
         "chi_square": result.chi_square,

@@ -72,7 +72,7 @@ def _report(
         if len(result.breaches) > MOST_BREACHES:
             lines.append(f"… and {len(result.breaches) - MOST_BREACHES} more; --json prints all")
     lines += ["", "smallest margin per limit:", _smallest_table(geometry.limits, rows, result)]
-    lines += ["", *_notes(rows, result, ideal), _verdict(rows, result)]
+    lines += ["", *_notes(geometry, model, rows, result), _verdict(rows, result)]
     return "\n".join(lines)
 
 
@@ -195,8 +195,10 @@ def _smallest_table(limits: Limits, rows: list[Row], result: CheckResult) -> str
     return texts.aligned(header, body)
 
 
-def _notes(rows: list[Row], result: CheckResult, ideal: bool) -> list[str]:
+def _notes(geometry: HexapodGeometry, model: MachineModel, rows: list[Row], result: CheckResult) -> list[str]:
     """Return what a reader should know that is no broken limit."""
+    from ..machine.region import region_text
+
     notes = []
     if result.unchecked_moves.any():
         skipped = int(result.unchecked_moves.sum())
@@ -208,9 +210,11 @@ def _notes(rows: list[Row], result: CheckResult, ideal: bool) -> list[str]:
         (result.outside_box, "outside the box in which the model was measured"),
         (result.outside_field, "outside the error field, whose value at the boundary is held there"),
     ):
-        if outside.any() and not ideal:
+        if outside.any():
             first = rows[int(outside.argmax())]
             notes.append(f"note: {problem}: {int(outside.sum())} of {len(rows)}, first {common.where(first)}")
+    if result.outside_box.any():
+        notes.append(f"  {region_text(model.measured, geometry)}")
     return notes
 
 
@@ -222,6 +226,8 @@ def _verdict(rows: list[Row], result: CheckResult) -> str:
 
 
 def _as_json(geometry: HexapodGeometry, model: MachineModel, rows: list[Row], result: CheckResult) -> dict[str, Any]:
+    from ..machine.region import region_json
+
     return {
         "machine": geometry.name,
         "model": model.name,
@@ -230,6 +236,7 @@ def _as_json(geometry: HexapodGeometry, model: MachineModel, rows: list[Row], re
         "rate_hz": result.rate,
         "within_limits": result.ok,
         "poses_examined": result.examined,
+        "measured_box": region_json(model.measured, geometry),
         "broken": [_breach_json(rows, breach) for breach in result.breaches],
         "smallest_margins": _smallest(geometry.limits, rows, result),
         "rows": [_row_values(row, n, result) for n, row in enumerate(rows)],

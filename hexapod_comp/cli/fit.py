@@ -124,10 +124,11 @@ def _write(args: argparse.Namespace, result: _Result, measured: MeasurementSet, 
     from ..calibration.lines_report import worth_json, worth_text
     from ..calibration.posterior import save_with_posterior
     from ..formats.outputs import write_text
+    from ..machine.region import region_json
     from ..measurements.standards import judge, standards_json, standards_text
 
     judged = judge(measured)
-    parts = [result.text]
+    parts = [result.text, _region(result, measured) + "\n"]
     parts += [standards_text(judged) + "\n"] if judged else []
     parts += [worth_text(worth) + "\n"] if worth else []
     text = "\n".join(parts)
@@ -137,6 +138,7 @@ def _write(args: argparse.Namespace, result: _Result, measured: MeasurementSet, 
     if args.json:
         more = {"standards": standards_json(judged), "worth": worth_json(worth) if worth else None}
         files = {"written": args.out, "written_beside": beside}
+        more["measured_box"] = region_json(result.model.measured, measured.geometry)
         common.show({**result.content(), **more, "misfit": result.misfit, **files})
     else:
         print(f"{text}\nmodel: {args.out}")
@@ -148,6 +150,13 @@ def _write(args: argparse.Namespace, result: _Result, measured: MeasurementSet, 
             _write_certificate(args, result, result.fit, beside, text)
         common.mention(args, f"certificate: {args.certificate}")
     common.save_pictures(args, result.pictures)
+
+
+def _region(result: _Result, measured: MeasurementSet) -> str:
+    """Return where the model was measured."""
+    from ..machine.region import region_text
+
+    return region_text(result.model.measured, measured.geometry)
 
 
 def _details(args: argparse.Namespace) -> Details | None:
@@ -241,7 +250,7 @@ def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSett
         from ..calibration.pictures import fit_figure, left_error_figure, predicted_error_figure, strut_error_figure
 
         made = {"fit.png": fit_figure(fit)}
-        if fit.model.valid_box is not None:
+        if fit.model.region is not None:
             made["left.png"] = left_error_figure(fit)
             machine = RealMachine(measured.geometry, fit.model)
             made["predicted_error.png"] = predicted_error_figure(machine, fitted)

@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     if args.model != "ideal":
         platforms = geometry.platform_poses(positions, rotations)
         predicted = _Predicted.of(RealMachine(geometry, model), args.model, platforms)
-        _mention_outside(int(result.outside_box.sum()), len(rows))
+        _mention_outside(geometry, model, int(result.outside_box.sum()), len(rows))
     _show(args, geometry, model, rows, result, predicted)
     common.say_notes(f"{common.where(rows[breach.row])}: {breach.error}" for breach in result.breaches[:MOST_NOTES])
     if len(result.breaches) > MOST_NOTES:
@@ -143,12 +143,14 @@ def _parts(predicted: PredictedError | None) -> tuple[np.ndarray | None, np.ndar
     return (None, None) if predicted is None else (predicted.values, predicted.deviations)
 
 
-def _mention_outside(outside: int, count: int) -> None:
+def _mention_outside(geometry: HexapodGeometry, model: MachineModel, outside: int, count: int) -> None:
     """Say on stderr that predictions go beyond what was measured."""
+    from ..machine.region import region_text
+
     if outside:
         poses = "the pose lies" if count == 1 else f"{outside} of {count} poses lie"
-        text = f"{poses} outside the box for which the model was measured; the predicted error there is extrapolated"
-        print(f"hexapod_comp: note: {text}", file=sys.stderr)
+        text = f"{poses} outside the box in which the model was measured; the predicted error there is extrapolated"
+        print(f"hexapod_comp: note: {text} ({region_text(model.measured, geometry)})", file=sys.stderr)
 
 
 def _show(

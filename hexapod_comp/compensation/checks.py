@@ -18,6 +18,7 @@ from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.limits import REASONS, STAGES
 from ..machine.model import MachineModel, RealMachine
 from ..machine.motion import MotionState
+from ..machine.passes import Poses
 from ..machine.trajectory import moves
 from ..pose import Pose, stacked
 
@@ -174,7 +175,7 @@ def check(
         run.check_moves(positions, rotations, progress)
     else:
         run.check_rows(positions, rotations, mode == "stream", progress)
-    return run.result(mode, geometry.platform_poses(positions, rotations)[0])
+    return run.result(mode, geometry.platform_poses(positions, rotations))
 
 
 @dataclass
@@ -347,17 +348,15 @@ class _PathCheck:
         }
         return {name: (np.where(is_so, -1.0, np.inf), sign) for name, is_so in broken.items()}
 
-    def result(self, mode: str, platform_positions: np.ndarray) -> CheckResult:
+    def result(self, mode: str, platforms: Poses) -> CheckResult:
         """Return what was found."""
         breaches = [
             Breach(row, share, self._error(name, strut, stage, value))
             for name, worst in self.worst.items()
             for (row, strut), (_, value, stage, share) in worst.broken.items()
         ]
-        box = self.machine.model.valid_box
-        outside = np.zeros(self.count, dtype=bool)
-        if box is not None:
-            outside = ((platform_positions < box[0]) | (platform_positions > box[1])).any(axis=1)
+        region = self.machine.model.measured
+        outside = np.zeros(self.count, dtype=bool) if region is None else ~region.contains(*platforms)
         summaries = {name: self.worst[name] for name in self.limits}
         return CheckResult(
             mode=mode,

@@ -384,13 +384,10 @@ class Compensator:
 
     def record(self, tool_pose: Pose) -> Correction:
         """Return the record of the command just accepted for `tool_pose`."""
-        platform = self.platform
-        box = self.model.valid_box
-        outside_box = box is not None and bool((platform.position < box[0]).any() or (platform.position > box[1]).any())
         return Correction(
             tool=self.geometry.tool_name,
             tool_pose=tool_pose,
-            platform_pose=platform,
+            platform_pose=self.platform,
             model_pose=pose_of(self._at.last.model),
             sense=self.motion.sense.copy(),
             temperatures=dict(self.temperatures.values),
@@ -402,8 +399,16 @@ class Compensator:
             enabled=self.enabled,
             ramping=self.ramping,
             outside_field=self.outside_field,
-            outside_box=outside_box,
+            outside_box=self.outside_box,
         )
+
+    @property
+    def outside_box(self) -> bool:
+        """Whether the last command is outside the region in which the model was measured."""
+        platform, region = self.platform, self.model.measured
+        if region is None or not np.isfinite(platform.position).all():
+            return False
+        return not region.contains(platform.position, platform.rotation)
 
     def predicted_error(self) -> np.ndarray:
         """Return the tool error that nominal lengths would leave at the last command (see `Correction`)."""

@@ -80,7 +80,7 @@ class Correction:
     outside_field : bool
         The field's value was held at the boundary of its box.
     outside_box : bool
-        The platform is outside the box for which the model was measured.
+        The command is outside the region in which the model was measured.
     """
 
     tool: str

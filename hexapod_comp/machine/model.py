@@ -23,6 +23,7 @@ from .geometry import HexapodGeometry
 from .kinematics import Structure, forward_error, over_chunks
 from .late import AT_ONCE, PARTS, Lag, LateGrowth, late
 from .motion import MotionState
+from .region import Region
 from .rows import changed_rows
 from .struts import StrutErrors
 from .temperatures import HUMIDITY, Temperatures
@@ -141,8 +142,8 @@ class MachineModel:
     reversal_threshold : float
         How far a strut must come back before its direction counts as reversed, m: above the noise of the
         commands, and as far below the backlash as that allows. The field has a threshold of its own.
-    valid_box : ndarray, shape (2, 3) or None
-        Lowest and highest platform position for which the model was measured, m in ``base``; None: anywhere.
+    region : Region or None
+        Where the model was measured; None: not known.
     origin : ModelOrigin
         Provenance.
 
@@ -163,7 +164,7 @@ class MachineModel:
     platform_expansion: float = 0.0
     late_growth: LateGrowth = AT_ONCE
     reversal_threshold: float = 0.2e-6
-    valid_box: np.ndarray | None = None
+    region: Region | None = None
     origin: ModelOrigin = ModelOrigin()
 
     def __post_init__(self) -> None:
@@ -186,19 +187,15 @@ class MachineModel:
         for name in ("base_expansion", "platform_expansion"):
             if not math.isfinite(getattr(self, name)):
                 raise ModelError(f"thermal.{name}", "must be finite, 1/K", getattr(self, name))
-        if self.valid_box is not None:
-            object.__setattr__(self, "valid_box", _checked_box(self.valid_box))
         if not (math.isfinite(self.reversal_threshold) and self.reversal_threshold >= 0.0):
             raise ModelError("reversal_threshold", "must be finite and not negative, m", self.reversal_threshold)
 
-
-def _checked_box(valid_box: np.ndarray) -> np.ndarray:
-    """Return a private read-only copy of a box that has an inside."""
-    box = np.array(valid_box, dtype=float)
-    if box.shape != (2, 3) or not (np.isfinite(box).all() and (box[0] < box[1]).all()):
-        raise ModelError("valid_box", "must be its lowest and its highest corner, m", box.tolist())
-    box.flags.writeable = False
-    return box
+    @property
+    def measured(self) -> Region | None:
+        """Where the model was measured, or else where its field is; None where nothing tells."""
+        if self.region is None and any(family.shape[4] for family in self.field.lines):
+            return Region(self.field.box, self.field.probe)
+        return self.region
 
 
 class RealMachine:
@@ -417,35 +414,26 @@ class MachinesByTemperature:
         return [machines[n] for n in number.tolist()]
 
 
-def platform_box(model: MachineModel, level: np.ndarray) -> np.ndarray | None:
-    """Return the box of platform positions in ``base`` for which a model was measured, shape (2, 3), m, or None.
-
-    It is the model's valid box, or where its field's box of measured points lets the platform be at the attitude
-    `level`, shape (3, 3).
-    """
-    if model.valid_box is None and any(family.shape[4] for family in model.field.lines):
-        return model.field.box - level @ model.field.probe
-    return model.valid_box
-
-
 def commanded_box(geometry: HexapodGeometry, model: MachineModel) -> np.ndarray:
     """Return the box of level tool positions in ``work`` for which a model was measured, shape (2, 3), m.
-
-    It is the model's valid box of platform positions, or where its field's box of measured points lets the
-    platform be. With a work frame that is turned it is the largest box of the work frame, alike in proportions to
-    the one around it, that fits inside: poses outside were not measured.
 
     Raises
     ------
     ModelError
-        The model has neither.
+        The model does not tell.
     """
-    level = geometry.work.rotation @ geometry.tool.rotation.T  # of the platform, when the tool is level
-    box = platform_box(model, level)
-    if box is None:
-        raise ModelError("valid_box", "the model has neither a valid box nor a field; give a box of tool positions")
-    centre, half = geometry.tool_pose(Pose(box.mean(axis=0), level)).position, 0.5 * np.ptp(box, axis=0)
-    turned = np.abs(geometry.work.rotation)
-    around = turned.T @ half
-    inside = around * (half / (turned @ around)).min()
-    return np.array([centre - inside, centre + inside])
+    return measured_region(model).commanded(geometry)
+
+
+def measured_region(model: MachineModel) -> Region:
+    """Return where a model was measured.
+
+    Raises
+    ------
+    ModelError
+        The model does not tell.
+    """
+    region = model.measured
+    if region is None:
+        raise ModelError("region", "the model tells of no box in which it was measured; give a box of tool positions")
+    return region

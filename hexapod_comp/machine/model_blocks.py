@@ -12,6 +12,7 @@ import yaml
 from ..formats.yaml import UNITS, in_si
 from .field import COMPONENTS, GridField, no_field
 from .model import Datum, MachineModel
+from .region import Region
 from .struts import WAVE_PARTS, StrutErrors
 
 DIRECTIONS = ("forward", "backward")
@@ -92,6 +93,14 @@ def datum_block(datum: Datum) -> dict[str, Any]:
     """Return where the tool is not moved."""
     position, angles = written(datum.position, "length", "mm"), written(datum.angles, "angle", "deg")
     return {"position_mm": position, "rotation_deg": angles, "held": datum.held}
+
+
+def region_block(region: Region) -> dict[str, Any]:
+    """Return where a model was measured; what is zero is left out."""
+    block = {"box_mm": written(region.box, "length", "mm")}
+    parts = {"point_mm": ("length", region.point), "position_mm": ("length", region.frame.position)}
+    parts["rotation_deg"] = "angle", region.frame.angles()
+    return block | {key: written(v, kind, key[key.index("_") + 1 :]) for key, (kind, v) in parts.items() if v.any()}
 
 
 def structure_block(model: MachineModel) -> dict[str, Any]:

@@ -13,7 +13,12 @@ all six or a list of six. Everything marked optional may be left out and is then
     sources:                          # every file that it was fitted to; [] for none
     - file: laser_x.csv
       sha256: 64 lower-case hexadecimal digits
-    valid_box_mm: [[-200, -200, 350], [200, 200, 550]]  # optional: lowest, highest platform position, base
+    region:                           # optional: where it was measured; by default where its field is
+      box_mm: [[-200, -200, 350], [200, 200, 550]]  # lowest, highest place of the measured point
+      point_mm: [0, 0, 0]             # optional: that point, in platform; its origin
+      position_mm: [0, 0, 0]          # optional: origin and axes of the box in base, as α, β, γ
+      rotation_deg: [0, 0, 0]
+                                      # in place of it, `valid_box_mm`: lowest, highest platform position in base
     held_out_residual_um: 4.2         # optional: RMS tool error left on data not used for the fit
     note: one line for people         # optional
     posterior:                        # optional: how well the fit knows its parameters, in a file beside this one
@@ -104,6 +109,7 @@ from ..formats.files import read_text
 from ..formats.outputs import write_text
 from ..formats.paths import input_file
 from ..formats.yaml import Section, parse_yaml
+from ..pose import Pose
 from .field import CROSS_AXES, OUTSIDE_POLICIES, GridField, no_field
 from .geometry import HexapodGeometry
 from .late import PARTS, LateGrowth
@@ -117,11 +123,13 @@ from .model_blocks import (
     block_text,
     datum_block,
     field_block,
+    region_block,
     structure_block,
     struts_block,
     thermal_block,
     written,
 )
+from .region import Region
 from .struts import WAVE_PARTS, StrutErrors
 
 MODEL_FORMAT = "hexapod_comp/model"
@@ -240,8 +248,8 @@ def model_text(model: MachineModel) -> str:
     content: dict[str, Any] = {"format": MODEL_FORMAT, "version": MODEL_VERSION, "closed": True}
     content |= {"machine": model.machine, "name": model.name, "date": model.origin.date}
     content["sources"] = [{"file": name, "sha256": digest} for name, digest in model.origin.sources]
-    if model.valid_box is not None:
-        content["valid_box_mm"] = written(model.valid_box, "length", "mm")
+    if model.region is not None:
+        content["region"] = region_block(model.region)
     if model.origin.held_out_residual is not None:
         content["held_out_residual_um"] = written(model.origin.held_out_residual, "length", "um")
     if model.origin.note:
@@ -336,10 +344,22 @@ def _check_hash(key: str, name: str, digest: object) -> None:
 
 
 def _read_scalars(top: Section) -> dict[str, Any]:
-    """Return valid box and reversal threshold, where given."""
+    """Return region and reversal threshold, where given."""
     values: dict[str, Any] = {}
     if top.quantity_key("valid_box", "length"):
-        values["valid_box"] = top.quantity("valid_box", "length", (2, 3))
+        box = top.quantity("valid_box", "length", (2, 3))
+        try:
+            values["region"] = Region(box)
+        except ModelError as error:
+            raise top.error("valid_box", error.problem, error.value) from error
+        if "region" in top:
+            raise top.error("region", "stands beside valid_box: only one can be true")
+    if "region" in top:
+        section, zero = top.section("region"), np.zeros(3)
+        box, point = section.quantity("box", "length", (2, 3)), section.quantity("point", "length", (3,), zero)
+        frame = section.quantity("position", "length", (3,), zero), section.quantity("rotation", "angle", (3,), zero)
+        section.finish()
+        values["region"] = Region(box, point, Pose.from_angles(*frame))
     if top.quantity_key("reversal_threshold", "length"):
         values["reversal_threshold"] = float(top.quantity("reversal_threshold", "length"))
     return values

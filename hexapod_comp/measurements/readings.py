@@ -358,22 +358,13 @@ class MeasurementSet:
             return parallel
         return rotations[away.argmin()]
 
+    def tilt(self) -> float:
+        """Return how far the tool was tilted or turned at most, from :meth:`level`, rad."""
+        return float(np.linalg.norm(attitude_error(self.stations.rotations, self.level()), axis=1).max())
+
     def tool_box(self) -> np.ndarray:
         """Return the lowest and highest commanded tool position, shape (2, 3), m in ``work``."""
         positions, _ = self.geometry.tool_poses(self.stations.positions, self.stations.rotations)
-        return np.array([positions.min(axis=0), positions.max(axis=0)])
-
-    def platform_box(self) -> np.ndarray:
-        """Return the lowest and highest commanded platform position, shape (2, 3), m in ``base``.
-
-        Of the stations that are level, where these span a box: with a long tool, tilted ones reach further, but
-        not with a level tool. Otherwise of all stations.
-        """
-        positions = self.stations.positions
-        turned = np.linalg.norm(attitude_error(self.stations.rotations, self.level()), axis=1)
-        of_level = positions[turned <= SAME_ATTITUDE]
-        if len(of_level) and spans(of_level):
-            positions = of_level
         return np.array([positions.min(axis=0), positions.max(axis=0)])
 
     def along(self) -> np.ndarray:

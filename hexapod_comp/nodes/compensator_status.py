@@ -168,6 +168,8 @@ class CompensatorStatus:
             yield OK, "waiting for the first command"
         if compensator.condition > NEAR_SINGULAR * compensator.geometry.limits.condition:
             yield WARN, "running, near a singularity"
+        if compensator.outside_box:
+            yield WARN, "running, outside the box in which the model was measured"
         if compensator.ramping:
             yield OK, "running, a change is ramping in"
         yield OK, "running" if self.fed(now) else "running, pose estimated from own commands"
@@ -194,6 +196,7 @@ class CompensatorStatus:
     def values(self, compensator: Compensator, fresh_start: bool, now: float) -> dict[str, str]:
         """Return everything else as key and value; before the first command nothing is corrected."""
         correction = 0.0 if fresh_start else float(np.abs(compensator.correction).max())
+        region = compensator.model.measured
         values = {
             "model": compensator.model.name,
             "tool": compensator.geometry.tool_name,
@@ -210,6 +213,8 @@ class CompensatorStatus:
             "largest_correction_m": f"{correction:.9f}",
             "condition_number": f"{compensator.condition:.3f}",
             "outside_field": str(compensator.outside_field).lower(),
+            "outside_box": str(compensator.outside_box).lower(),
+            "measured_box": "not known" if region is None else region.text(compensator.geometry),
             "last_refusal": self.refusals.last_text,
             "last_bad_feedback": self.bad_feedback.last_text,
             "bad_feedback": str(sum(self.bad_feedback.counts.values())),

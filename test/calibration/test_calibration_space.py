@@ -241,7 +241,8 @@ def test_model_says_what_the_vector_says(readings: MeasurementSet):
     for name in ("offset", "pitch", "reference_length", "cosine", "sine", "period", "backlash"):
         np.testing.assert_allclose(getattr(model.struts, name), getattr(truth.struts, name), atol=1e-15)
     assert model.machine == truth.machine
-    np.testing.assert_allclose(model.valid_box, small.BOX, atol=1e-12)
+    assert model.region is not None
+    np.testing.assert_allclose(model.region.box, small.BOX, atol=1e-12)
 
 
 @pytest.mark.parametrize(

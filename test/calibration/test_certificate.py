@@ -16,6 +16,7 @@ from calibration_helpers import FEW, campaign, measured, virtual_machine
 from hexapod_comp.calibration import certificate, pictures
 from hexapod_comp.calibration.certificate import Details, Filed, certificate_text, left_out, load_details
 from hexapod_comp.calibration.fit import ModelFit, fit_model
+from hexapod_comp.calibration.observability import UnseenError
 from hexapod_comp.calibration.report import fit_report
 from hexapod_comp.calibration.sensitivity import predict
 from hexapod_comp.errors import InputFileError
@@ -82,11 +83,11 @@ def test_it_promises_what_the_report_promises(fit: ModelFit, filed: Filed) -> No
     assert shown == pytest.approx(wanted, abs=0.0051)
     assert unit == "µm"
     rotation = rows["level tool: rotation"]
-    assert rotation[2:] == ["roll was not read", "", "µrad"], "a linear laser alone promises nothing of it"
+    assert rotation[2:] == ["roll is not shown", "", "µrad"], "a linear laser alone promises nothing of it"
     known = replace(level, rotation_low=1e-6, rotation_high=3e-6)
     rows = cells(certificate_text(replace(fit, verdict=replace(fit.verdict, level=known)), filed))
     assert [row[3:] for row in rows if row[0] == "level tool: rotation"] == [["1.00 … 3.00", "6.0", "µrad"]]
-    assert "do not trust this model with a tilted tool" in certificate_text(fit, filed), "as the report says it"
+    assert "Do not trust this model with a tilted tool" in certificate_text(fit, filed), "as the report says it"
 
 
 @pytest.mark.usefixtures("unpictured")
@@ -116,7 +117,7 @@ def test_strangers_names_are_text(fit: ModelFit, filed: Filed) -> None:
     runs = tuple(replace(run, name=HOSTILE + run.name) for run in m.runs)
     sources = tuple(FileLine(HOSTILE, 1) for _ in m.sources)
     hostile = replace(m, runs=runs, sources=sources, files=((HOSTILE, HOSTILE),))
-    stranger = replace(fit, measurements=hostile, notes=(HOSTILE,), unseen_errors=(HOSTILE,))
+    stranger = replace(fit, measurements=hostile, notes=(HOSTILE,), unseen_errors=(UnseenError(HOSTILE, 0.0),))
     details = Details({"customer": HOSTILE}, (HOSTILE,), (HOSTILE,))
     page = Reader(certificate_text(stranger, replace(filed, model=HOSTILE, report=HOSTILE), details))
     assert {"script", "link", "iframe", "object", "form"}.isdisjoint(page.tags)

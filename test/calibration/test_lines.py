@@ -18,6 +18,7 @@ from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import Structure, jacobian
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.model_file import load_model, save_model
+from hexapod_comp.machine.region import Region
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import BACKWARD, CHANNELS, FORWARD, MeasurementSet, Reading
 from hexapod_comp.measurements.runs import assemble
@@ -101,7 +102,7 @@ def test_a_machine_of_the_papers_form_is_found_again(quiet, linear_truth, order)
     for found, true in zip(fit.model.field.lines, linear_truth.model.field.lines, strict=True):
         assert found == pytest.approx(true, abs=1e-12)
     assert all(nodes == pytest.approx(true) for nodes, true in zip(fit.model.field.grid, GRID, strict=True))
-    assert fit.model.valid_box == pytest.approx(BOX)
+    assert fit.model.region.box == pytest.approx(BOX)
     assert len([note for note in fit.notes if "too few points" in note]) == (order == 4)
 
 
@@ -390,7 +391,8 @@ def test_a_probe_off_the_platform(geometry, real):
     truth = RealMachine(tool, real.model)
     fit = fit_lines(measure(template(campaign, tool), campaign, truth, 0))
     assert fit.model.field.probe == pytest.approx([0.0, 0.0, 0.1])
-    assert fit.model.valid_box == pytest.approx(BOX)
+    assert fit.model.region.box == pytest.approx(campaign.box)
+    assert fit.model.region.point == pytest.approx(np.array([0.0, 0.0, 0.1]))
     assert reduction(paper_metric(truth, fit.model, campaign.box)) > 0.7
 
 
@@ -440,7 +442,7 @@ def test_strut_errors_of_a_lifted_machine(geometry):
     family[:, :, :, 2] = 10e-6
     empty = np.zeros((2, 2, 2, 6, 0))
     nodes = tuple(BOX[:, axis] for axis in range(3))
-    model = MachineModel(geometry.name, field=GridField(nodes, (family, empty, empty)), valid_box=BOX)
+    model = MachineModel(geometry.name, field=GridField(nodes, (family, empty, empty)), region=Region(BOX))
     found = strut_length_errors(geometry, model, np.array([-0.1, 0.15]), 0.05, 0.45)
     for n, x in enumerate((-0.1, 0.15)):
         column = jacobian(Structure.of(geometry), Pose([x, 0.05, 0.45], np.eye(3)))[:, 2]

@@ -6,6 +6,7 @@ from functools import cache
 import calibration_helpers as small
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import gmean
 
 from hexapod_comp.calibration.cell_rows import CellRows
@@ -14,18 +15,21 @@ from hexapod_comp.calibration.linear_problem import LinearProblem, Posterior, so
 from hexapod_comp.calibration.observability import (
     MACHINE_ERRORS,
     Observability,
+    ToolError,
     box_stations,
     expected_error,
     observe,
     without_trace,
 )
-from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
+from hexapod_comp.calibration.parameters import TOLERANCES, FitSettings, ParameterSpace
 from hexapod_comp.calibration.plan import plan
+from hexapod_comp.calibration.report import tilt_doubt
 from hexapod_comp.calibration.sensitivity import predict
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.measurements.campaign import load_campaign, template
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
+from hexapod_comp.pose import Pose
 
 SQUARENESS = ("squareness xy", "squareness xz", "squareness yz")
 TWISTS = ("twist dx ~ y z", "twist dy ~ x z", "twist dz ~ x y")
@@ -100,13 +104,51 @@ def test_tilted_poses_see_more():
 def test_machine_errors_that_leave_no_trace(instrument: str, diagonals: int, unseen: set[str]):
     """By hand: a shear or a bilinear twist is constant along its own line and linear across, which zeros and beam
     slopes swallow; on a body diagonal it is not. Roll needs a roll channel."""
-    assert set(without_trace(read(instrument, diagonals, FIELD))) == unseen
+    errors = without_trace(read(instrument, diagonals, FIELD))
+    assert {error.name for error in errors} == unseen
 
 
 def test_errors_are_unseen_however_few_terms_the_field_has():
     """A field of degree 2 has no term for a twist that involves the short z axis: it is no less unseen."""
     small_field = replace(FIELD, field_degree=2)
-    assert set(without_trace(read("5-D", 0, small_field))) == {*SQUARENESS, *TWISTS, *ROLLS}
+    errors = without_trace(read("5-D", 0, small_field))
+    assert {error.name for error in errors} == {*SQUARENESS, *TWISTS, *ROLLS}
+    assert {error.reason for error in errors} == {"no reading shows it"}
+
+
+@pytest.mark.parametrize("poses", [54, 216])
+def test_what_is_below_the_noise_was_read(poses: int) -> None:
+    """Attitudes at random places, of 1 mrad; a roll of the field's tolerance turns about x by up to that at the faces.
+
+    So all of them together change by tolerance/noise · √(Σu²) standard deviations.
+    """
+    turns = Rotation.from_rotvec(np.radians(8.0) * np.random.default_rng(4).uniform(-1.0, 1.0, (poses, 3))).as_matrix()
+    places = np.random.default_rng(3).uniform(*small.BOX, (poses, 3))
+    readings = small.scattered(small.paper(), [Pose(p, turn) for p, turn in zip(places, turns, strict=True)])
+    assert np.degrees(readings.tilt()) == pytest.approx(np.degrees(Rotation.from_matrix(turns).magnitude()).max())
+    readings = replace(readings, uncertainty=np.full(len(readings), 1e-3))
+    estimation = Estimation(readings, ParameterSpace(readings, FIELD))
+    found = {error.name: error for error in without_trace(estimation)}
+    field, low, high = estimation.space.field, *estimation.space.box[:, 0]
+    u = 2.0 * (places[:, 0] - low) / (high - low) - 1.0
+    largest = TOLERANCES["field rotation"] * field.prior[field.terms.index("x1")]
+    wanted = largest / 1e-3 * np.sqrt((u**2).sum())
+    assert found["roll of x"].trace == pytest.approx(wanted, rel=1e-6)
+    assert found["roll of x"].reason.startswith(f"below the noise: it changes all readings together by {wanted:.2g} σ")
+
+
+def test_the_warning_for_tilted_tools_says_what_was_read() -> None:
+    """Level lines against tilted poses that are not enough: neither may say of the other what is true of itself."""
+    stays = ToolError(100e-6, 20e-6, 1e-6, 30e-6, 1e-4, 2e-5, None, None)
+    for poses, said in ((0, "The readings, all level, show 14 of 33"), (2, "taken at tilts of up to 8.0°, show")):
+        plan = template(small.campaign("5-D", 0, poses=poses, tilt=np.radians(8.0)), small.paper())
+        space, problem = problem_of(plan, STRUCTURE)
+        posterior = solve(space, problem, space.start_tolerances(), ONES, 0)
+        seen = observe(space, problem, posterior, np.radians(8.0) if poses else plan.tilt())
+        (text,) = tilt_doubt(stays, seen)
+        assert said in text
+        assert "tilted by 10°, 20 % of the error stays (10 % allowed)" in text
+    assert not list(tilt_doubt(replace(stays, after=9e-6), seen))
 
 
 def readings_of(instrument: str, diagonals: int, model: MachineModel) -> Estimation:

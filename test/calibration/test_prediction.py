@@ -94,7 +94,8 @@ def test_errors_spread_as_those_of_machines_that_are_drawn(name: str, tmp_path: 
         np.testing.assert_allclose(ours, theirs, atol=0.11)  # 1/√1500, four times
 
     assert aligned is not None
-    told = np.stack(np.meshgrid(*(np.linspace(*side, 3) for side in space.platform_box.T)), -1).reshape(-1, 3)
+    told = np.stack(np.meshgrid(*(np.linspace(*side, 3) for side in space.work_box.T)), -1).reshape(-1, 3)
+    told = np.array(machine.work.position) + told @ machine.work.matrix.T - machine.level() @ space.probe
     level = np.tile(machine.level(), (len(told), 1, 1))
     reference = machine.tips(told, level), motions(machine, space, drawn[:1000], (told, level))
     sets = aligned_by_kabsch(*reference, machine.tips(positions, rotations), spread[:1000])

@@ -35,6 +35,7 @@ from hexapod_comp.calibration.verification_report import verification_json, veri
 from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.datum import tool_move
 from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.machine.region import Region
 from hexapod_comp.measurements.readings import CHANNELS, FORWARD, MeasurementSet
 from hexapod_comp.virtual.instruments import compensated, measure
 
@@ -234,7 +235,7 @@ def test_readings_of_an_unchanged_machine_taken_for_something_else_are_recognise
 
 def test_places_outside_the_fitted_box_are_counted() -> None:
     readings = check(fitted().truth)
-    model = replace(fitted().model, valid_box=np.array([[-1.0, -1.0, 2.0], [1.0, 1.0, 3.0]]))
+    model = replace(fitted().model, region=Region(np.array([[-1.0, -1.0, 2.0], [1.0, 1.0, 3.0]])))
     stations = len(readings.stations.positions)
     report = verification_report(verify_model(model, fitted().known, readings))
     assert f"{stations} of {stations} places lie outside the box" in report

@@ -142,7 +142,7 @@ def test_fit_reports_all_its_sections(done: Calibration) -> None:
         "expected tool error at random points of the measured box",
         "level tool: ",
         "tilted 10°: ",
-        "do not trust this model with a tilted tool",
+        "Do not trust this model with a tilted tool",
         "residuals; held out",
         "blocks; gain",
         "structure parameters are observable",
@@ -185,8 +185,8 @@ def test_model_file_says_where_it_comes_from(done: Calibration) -> None:
     assert model.origin.sources == (("measured.csv", hashlib.sha256(done.measured.read_bytes()).hexdigest()),)
     assert re.fullmatch(r"\d{4}-\d\d-\d\d", model.origin.date)
     assert "scheme joint, 1000 readings" in model.origin.note
-    assert model.valid_box is not None
-    np.testing.assert_allclose(model.valid_box, BOX, atol=1e-12)
+    assert model.region is not None
+    np.testing.assert_allclose(model.region.box, BOX, atol=1e-12)
     residual = model.origin.held_out_residual
     assert residual is not None
     assert 0.5e-6 < residual < 5e-6  # cells of two readings of 1 µm, and the shipped machine's field of 3 µm
@@ -695,7 +695,7 @@ def test_plan_says_what_will_be_determined(hexapod: Program, five: Path) -> None
     assert "machine paper: 3976 readings of 25 runs at 500 stations, 57 parameters" in out
     assert "14 of 33 structure parameters are observable; of all 57 parameters " in out
     assert re.search(r"level tool: +[\d.]+ → [\d.]+ µm RMS", out)
-    assert "do not trust this model with a tilted tool" in out
+    assert "Do not trust this model with a tilted tool" in out
     assert "machine errors that leave no trace in these readings: roll of x, roll of y, roll of z\n" in out
 
 

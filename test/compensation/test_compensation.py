@@ -26,6 +26,7 @@ from hexapod_comp.errors import HexapodError, LimitError, ModelError, NotFiniteE
 from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.geometry import HexapodGeometry, Limits
 from hexapod_comp.machine.model import MachineModel
+from hexapod_comp.machine.region import Region
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.pose import Pose
 
@@ -242,7 +243,7 @@ def test_temperatures_in_closed_form() -> None:
 
 def boxed(outside: str) -> MachineModel:
     field = random_field(np.random.default_rng(12), outside=outside)
-    return MachineModel("paper", field=field, valid_box=np.array([[-0.1, -0.1, 0.35], [0.1, 0.1, 0.5]]))
+    return MachineModel("paper", field=field, region=Region(np.array([[-0.1, -0.1, 0.35], [0.1, 0.1, 0.5]])))
 
 
 def test_outside_the_field_is_held_and_said_or_refused() -> None:

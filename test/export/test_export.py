@@ -36,6 +36,7 @@ from hexapod_comp.machine.model import MachineModel, RealMachine, commanded_box
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.motion import MotionState
 from hexapod_comp.machine.passes import Passes
+from hexapod_comp.machine.region import Region
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.pose import Pose
 
@@ -448,7 +449,7 @@ def test_verb_tells_when_an_export_makes_it_worse(tmp_path: Path, monkeypatch: p
     ("arguments", "error"),
     [
         ((), "at least one is needed"),
-        (("--linuxcnc", "x"), "neither a valid box nor a field"),
+        (("--linuxcnc", "x"), "tells of no box in which it was measured"),
         (("--linuxcnc", "/nonexistent/folder/x", "--box=-9,-9,390,9,9,410"), "cannot be made"),
         (("--table", "/nonexistent/x.csv", "--box=-9,-9,390,9,9,410"), "cannot be written"),
         (("--linuxcnc", "x", "--box=-900,-9,390,9,9,410"), "outside the stroke"),
@@ -472,6 +473,6 @@ def test_verb_refuses_options(argument: str, capsys: pytest.CaptureFixture[str])
 def test_box_comes_from_the_model_and_follows_the_frames() -> None:
     geometry, model = paper_geometry(), paper_machine()
     np.testing.assert_allclose(commanded_box(geometry, model), PAPER_BOX, atol=1e-12)
-    valid = replace(model, valid_box=SMALL_BOX)
+    valid = replace(model, region=Region(SMALL_BOX))
     shifted = replace(geometry, work=Pose([0.1, 0.0, 0.3], np.eye(3)), tool=Pose([0.0, 0.0, -0.05], np.eye(3)))
     np.testing.assert_allclose(commanded_box(shifted, valid), SMALL_BOX - [0.1, 0.0, 0.35], atol=1e-12)

@@ -22,7 +22,9 @@ from hexapod_comp.errors import HexapodError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, ModelOrigin
 from hexapod_comp.machine.model_file import load_model, save_model
+from hexapod_comp.machine.region import Region
 from hexapod_comp.measurements.campaign import load_campaign
+from hexapod_comp.pose import Pose
 from hexapod_comp.workspace.sources import load_budget
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
@@ -179,7 +181,15 @@ def models(folder: Path) -> list[bytes]:
     small = type(full.field)((grid, grid, grid + 0.5), lines, [0.01, 0.0, -0.1])  # type: ignore[arg-type]
     box = np.array([[-0.2, -0.2, 0.3], [0.2, 0.2, 0.6]])
     values = {name: getattr(full, name) for name in ("base_deviation", "platform_deviation", "struts")}
-    model = MachineModel("paper", "full", origin=origin, field=small, valid_box=box, base_expansion=11e-6, **values)
+    model = MachineModel(
+        "paper",
+        "full",
+        origin=origin,
+        field=small,
+        region=Region(box, np.array([0.01, 0.0, -0.1]), Pose([0.1, 0.0, 0.2], np.eye(3))),
+        base_expansion=11e-6,
+        **values,
+    )
     save_model(model, folder / "full.yaml")
     by_hand = """format: hexapod_comp/model
 version: 1
@@ -217,8 +227,11 @@ def same_model(found: MachineModel, tree: dict[str, Any]) -> None:
     assert found.origin.date.replace("T", " ")[:10] == tree["date"][:10]
     assert found.origin.sources == tuple((s["file"], s["sha256"]) for s in tree["sources"])
     same(found.reversal_threshold, quantity(tree, "reversal_threshold", "length", 0.2e-6))
-    if found.valid_box is not None:
-        same(found.valid_box, quantity(tree, "valid_box", "length"))
+    if found.region is not None:
+        region = tree["region"]
+        for name, value in (("box", found.region.box), ("point", found.region.point)):
+            same(value, quantity(region, name, "length", 0.0))
+        same(found.region.frame.position, quantity(region, "position", "length", 0.0))
     if found.origin.held_out_residual is not None:
         same(found.origin.held_out_residual, quantity(tree, "held_out_residual", "length"))
     for name in ("base_deviation", "platform_deviation"):

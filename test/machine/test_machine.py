@@ -285,9 +285,6 @@ def test_temperatures_not_heard_of_are_20_degrees():
         ({"reversal_threshold": -1e-6}, "reversal_threshold.*-1e-06"),
         ({"reversal_threshold": math.nan}, "reversal_threshold.*nan"),
         ({"base_expansion": math.inf}, "thermal.base_expansion.*inf"),
-        ({"valid_box": np.zeros((2, 2))}, "valid_box.*lowest.*highest"),
-        ({"valid_box": [[0, 0, 1], [1, 1, 0]]}, r"valid_box.*\[1.0, 1.0, 0.0\]"),
-        ({"valid_box": [[0, 0, 0], [1, 1, np.nan]]}, "valid_box.*nan"),
     ],
 )
 def test_bad_models_are_refused(bad, message):

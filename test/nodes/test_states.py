@@ -181,6 +181,24 @@ def test_singular_pose_near(bench, tmp_path):
     bench.until_status(ERROR, "refusing commands")
 
 
+def test_outside_the_measured_box(bench, tmp_path):
+    """Measured 5 mm around home: 6 mm beside it the node goes on, and says where it was measured."""
+    x, y, z = (1e3 * HOME.position).tolist()
+    box = [[x - 5.0, y - 5.0, z - 5.0], [x + 5.0, y + 5.0, z + 5.0]]
+    bench.compensator(model_file=model_file(tmp_path, region={"box_mm": box}), command_timeout=0.0)
+    bench.ask(HOME)
+    assert bench.until_status(OK, "running")["outside_box"] == "false"
+    assert bench.ask(near(HOME, (0.001, 0.0, 0.0)))
+    for step in range(2, 7):
+        bench.ask(near(HOME, (0.001 * step, 0.0, 0.0)))
+    values = bench.until_status(WARN, "running, outside the box in which the model was measured")
+    assert values["outside_box"] == "true"
+    assert "sides 10 × 10 × 10 mm" in values["measured_box"]
+    for step in range(5, -1, -1):
+        bench.ask(near(HOME, (0.001 * step, 0.0, 0.0)))
+    bench.until_status(OK, "running")
+
+
 def test_overload_keeps_the_newest_and_counts_the_others(bench):
     """105 commands before the node gets to work, and a queue of a hundred: five are counted, none comes late."""
     bench.compensator(command_timeout=0.0)

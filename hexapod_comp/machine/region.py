@@ -1,0 +1,107 @@
+"""Where a model was measured: one box, for the promise, the certificate, exports, pictures, checks and the compensator.
+
+It is a box of places of one point of the platform, the one that instruments measured: how the tool was turned there
+does not matter, so that readings that are added can only make it larger.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError
+from ..pose import Pose
+from .geometry import HexapodGeometry
+
+ON_THE_FACE = 1e-9
+"""A place that is further outside, m, is outside: files keep a picometre."""
+
+PARALLEL = 1e-9
+"""Directions whose components differ by less are parallel."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """A box of places of a point of the platform.
+
+    Attributes
+    ----------
+    box : ndarray, shape (2, 3)
+        Lowest and highest place, m along the axes of `frame`.
+    point : ndarray, shape (3,)
+        The point in ``platform``, m: by default its origin.
+    frame : Pose
+        Of the box in ``base``: the work frame in which was measured, by default ``base`` itself.
+
+    Raises
+    ------
+    ModelError
+        A box without an inside, or a point that is not finite.
+    """
+
+    box: np.ndarray
+    point: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    frame: Pose = field(default_factory=Pose.identity)
+
+    def __post_init__(self) -> None:
+        box, point = np.array(self.box, dtype=float), np.array(self.point, dtype=float)
+        if box.shape != (2, 3) or not (np.isfinite(box).all() and (box[0] < box[1]).all()):
+            raise ModelError("region.box", "must be its lowest and its highest corner, m", box.tolist())
+        if point.shape != (3,) or not np.isfinite(point).all():
+            raise ModelError("region.point", "must be a finite place in platform, m", point.tolist())
+        for name, array in (("box", box), ("point", point)):
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    def contains(self, positions: np.ndarray, rotations: np.ndarray, slack: float = ON_THE_FACE) -> np.ndarray:
+        """Return whether the point is in the box, or out of it by no more than `slack`, m, at platform poses, (N,).
+
+        Parameters
+        ----------
+        positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
+            ``pose_platform_in_base``, m.
+        """
+        places = (positions + rotations @ self.point - self.frame.position) @ self.frame.rotation
+        return ((places >= self.box[0] - slack) & (places <= self.box[1] + slack)).all(axis=-1)
+
+    def poses(self, places: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return ``pose_platform_in_base`` of one rotation (3, 3) with the point at places (N, 3), m, of the frame."""
+        in_base = self.frame.position + places @ self.frame.rotation.T
+        return in_base - rotation @ self.point, np.tile(rotation, (len(places), 1, 1))
+
+    def commanded(self, geometry: HexapodGeometry) -> np.ndarray:
+        """Return the box of level tool positions in ``work`` for which the point is inside, shape (2, 3), m.
+
+        In a work frame that is turned against `frame` it is the largest box of the work frame, alike in proportions to
+        the one around it, that fits inside.
+        """
+        level = geometry.work.rotation @ geometry.tool.rotation.T  # of the platform, when the tool is level
+        beside = level @ (geometry.tool.position - self.point)  # the tool's tip from the point, in base
+        middle = self.frame.position + self.frame.rotation @ self.box.mean(axis=0)
+        centre = geometry.work.rotation.T @ (middle + beside - geometry.work.position)
+        half, turned = 0.5 * np.ptp(self.box, axis=0), np.abs(geometry.work.rotation.T @ self.frame.rotation)
+        turned[turned < PARALLEL] = 0.0
+        around = turned @ half
+        inside = around * (half / (turned.T @ around)).min()
+        return np.array([centre - inside, centre + inside])
+
+    def text(self, geometry: HexapodGeometry) -> str:
+        """Return the box for people: of level tool positions in ``work``."""
+        box = self.commanded(geometry).round(9) * 1e3
+        low, high = (", ".join(f"{v:g}" for v in corner) for corner in box)
+        sides = " × ".join(f"{side:.4g}" for side in np.ptp(box, axis=0))
+        return f"tool positions in work ({low})…({high}) mm, sides {sides} mm"
+
+
+def region_text(region: Region | None, geometry: HexapodGeometry) -> str:
+    """Return where a model was measured, for people; of models that do not tell, too."""
+    return "measured box: none" if region is None else f"measured box: {region.text(geometry)}"
+
+
+def region_json(region: Region | None, geometry: HexapodGeometry) -> dict[str, Any] | None:
+    """Return where a model was measured as plain numbers; units are in the keys."""
+    if region is None:
+        return None
+    return {"tool_in_work_m": region.commanded(geometry), "measured_point_in_platform_m": region.point}
