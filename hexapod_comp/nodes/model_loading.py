@@ -25,7 +25,9 @@ from ..formats.paths import confined_file, confined_opener
 from ..machine.field import GridField
 from ..machine.late import LateGrowth
 from ..machine.model import Datum, MachineModel, ModelOrigin
+from ..machine.region import Region
 from ..machine.struts import StrutErrors
+from ..pose import Pose
 
 LOADED_WITHIN = 30.0
 """A file that takes longer to read is given up, s; the shipped ones take one second, nearly all of it imports."""
@@ -65,6 +67,8 @@ def model_of(text: str) -> MachineModel:
     data["struts"] = StrutErrors(**data["struts"])
     data["field"] = GridField(**{**field, "grid": tuple(field["grid"]), "lines": tuple(field["lines"])})
     data["origin"] = ModelOrigin(**origin)
+    if (region := data["region"]) is not None:
+        data["region"] = Region(**{**region, "frame": Pose(**region["frame"])})
     return MachineModel(**data)
 
 

@@ -696,7 +696,9 @@ def test_plan_says_what_will_be_determined(hexapod: Program, five: Path) -> None
     assert "14 of 33 structure parameters are observable; of all 57 parameters " in out
     assert re.search(r"level tool: +[\d.]+ → [\d.]+ µm RMS", out)
     assert "Do not trust this model with a tilted tool" in out
-    assert "machine errors that leave no trace in these readings: roll of x, roll of y, roll of z\n" in out
+    assert (
+        "machine errors that the readings do not show: roll of x, roll of y, roll of z (no reading shows it)\n" in out
+    )
 
 
 def test_plan_as_json(hexapod: Program, done: Calibration) -> None:
