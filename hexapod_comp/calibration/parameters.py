@@ -259,7 +259,7 @@ class ParameterSpace:
     @property
     def measured(self) -> Region | None:
         """Where a model of these parameters holds; None where no box was measured."""
-        return Region(self.work_box, self.probe, self.geometry.work) if spans(self.work_box) else None
+        return Region.of(self.work_box, self.probe, self.geometry.work) if spans(self.work_box) else None
 
     def _make_blocks(self) -> list[Block]:
         names = [name for name in BLOCKS if self._has(name)]

@@ -98,8 +98,8 @@ def datum_block(datum: Datum) -> dict[str, Any]:
 def region_block(region: Region) -> dict[str, Any]:
     """Return where a model was measured; what is zero is left out."""
     block = {"box_mm": written(region.box, "length", "mm")}
-    parts = {"point_mm": ("length", region.point), "position_mm": ("length", region.frame.position)}
-    parts["rotation_deg"] = "angle", region.frame.angles()
+    parts = {"point_mm": ("length", region.point), "position_mm": ("length", region.position)}
+    parts["rotation_deg"] = "angle", region.angles
     return block | {key: written(v, kind, key[key.index("_") + 1 :]) for key, (kind, v) in parts.items() if v.any()}
 
 

@@ -109,7 +109,6 @@ from ..formats.files import read_text
 from ..formats.outputs import write_text
 from ..formats.paths import input_file
 from ..formats.yaml import Section, parse_yaml
-from ..pose import Pose
 from .field import CROSS_AXES, OUTSIDE_POLICIES, GridField, no_field
 from .geometry import HexapodGeometry
 from .late import PARTS, LateGrowth
@@ -357,9 +356,11 @@ def _read_scalars(top: Section) -> dict[str, Any]:
     if "region" in top:
         section, zero = top.section("region"), np.zeros(3)
         box, point = section.quantity("box", "length", (2, 3)), section.quantity("point", "length", (3,), zero)
-        frame = section.quantity("position", "length", (3,), zero), section.quantity("rotation", "angle", (3,), zero)
+        position, angles = (
+            section.quantity(*key, (3,), zero) for key in (("position", "length"), ("rotation", "angle"))
+        )
         section.finish()
-        values["region"] = Region(box, point, Pose.from_angles(*frame))
+        values["region"] = Region(box, point, position, angles)
     if top.quantity_key("reversal_threshold", "length"):
         values["reversal_threshold"] = float(top.quantity("reversal_threshold", "length"))
     return values

@@ -7,6 +7,7 @@ does not matter, so that readings that are added can only make it larger.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -32,26 +33,40 @@ class Region:
         Lowest and highest place, m along the axes of `frame`.
     point : ndarray, shape (3,)
         The point in ``platform``, m: by default its origin.
-    frame : Pose
-        Of the box in ``base``: the work frame in which was measured, by default ``base`` itself.
+    position, angles : ndarray, shape (3,)
+        Of the box's frame in ``base``, m and α, β, γ in rad: the work frame in which was measured, by default ``base``.
 
     Raises
     ------
     ModelError
-        A box without an inside, or a point that is not finite.
+        A box without an inside, or places that are not finite.
     """
 
     box: np.ndarray
     point: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    frame: Pose = field(default_factory=Pose.identity)
+    position: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    angles: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    @staticmethod
+    def of(box: np.ndarray, point: np.ndarray, frame: Pose) -> Region:
+        """Return a box of places of a point in a frame, given as its pose in ``base``."""
+        return Region(box, point, frame.position, frame.angles())
+
+    @cached_property
+    def frame(self) -> Pose:
+        """Of the box in ``base``."""
+        return Pose.from_angles(self.position, self.angles)
 
     def __post_init__(self) -> None:
-        box, point = np.array(self.box, dtype=float), np.array(self.point, dtype=float)
+        box = np.array(self.box, dtype=float)
         if box.shape != (2, 3) or not (np.isfinite(box).all() and (box[0] < box[1]).all()):
             raise ModelError("region.box", "must be its lowest and its highest corner, m", box.tolist())
-        if point.shape != (3,) or not np.isfinite(point).all():
-            raise ModelError("region.point", "must be a finite place in platform, m", point.tolist())
-        for name, array in (("box", box), ("point", point)):
+        box.flags.writeable = False
+        object.__setattr__(self, "box", box)
+        for name in ("point", "position", "angles"):
+            array = np.array(getattr(self, name), dtype=float)
+            if array.shape != (3,) or not np.isfinite(array).all():
+                raise ModelError(f"region.{name}", "must be three finite numbers", array.tolist())
             array.flags.writeable = False
             object.__setattr__(self, name, array)
 

@@ -27,7 +27,6 @@ from ..machine.late import LateGrowth
 from ..machine.model import Datum, MachineModel, ModelOrigin
 from ..machine.region import Region
 from ..machine.struts import StrutErrors
-from ..pose import Pose
 
 LOADED_WITHIN = 30.0
 """A file that takes longer to read is given up, s; the shipped ones take one second, nearly all of it imports."""
@@ -67,8 +66,7 @@ def model_of(text: str) -> MachineModel:
     data["struts"] = StrutErrors(**data["struts"])
     data["field"] = GridField(**{**field, "grid": tuple(field["grid"]), "lines": tuple(field["lines"])})
     data["origin"] = ModelOrigin(**origin)
-    if (region := data["region"]) is not None:
-        data["region"] = Region(**{**region, "frame": Pose(**region["frame"])})
+    data["region"] = None if data["region"] is None else Region(**data["region"])
     return MachineModel(**data)
 
 

@@ -24,7 +24,6 @@ from hexapod_comp.machine.model import MachineModel, ModelOrigin
 from hexapod_comp.machine.model_file import load_model, save_model
 from hexapod_comp.machine.region import Region
 from hexapod_comp.measurements.campaign import load_campaign
-from hexapod_comp.pose import Pose
 from hexapod_comp.workspace.sources import load_budget
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
@@ -186,7 +185,7 @@ def models(folder: Path) -> list[bytes]:
         "full",
         origin=origin,
         field=small,
-        region=Region(box, np.array([0.01, 0.0, -0.1]), Pose([0.1, 0.0, 0.2], np.eye(3))),
+        region=Region(box, np.array([0.01, 0.0, -0.1]), np.array([0.1, 0.0, 0.2]), np.array([0.1, -0.2, 0.3])),
         base_expansion=11e-6,
         **values,
     )
@@ -231,7 +230,7 @@ def same_model(found: MachineModel, tree: dict[str, Any]) -> None:
         region = tree["region"]
         for name, value in (("box", found.region.box), ("point", found.region.point)):
             same(value, quantity(region, name, "length", 0.0))
-        same(found.region.frame.position, quantity(region, "position", "length", 0.0))
+        same(found.region.position, quantity(region, "position", "length", 0.0))
     if found.origin.held_out_residual is not None:
         same(found.origin.held_out_residual, quantity(tree, "held_out_residual", "length"))
     for name in ("base_deviation", "platform_deviation"):

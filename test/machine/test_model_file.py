@@ -19,7 +19,6 @@ from hexapod_comp.machine.model import MachineModel, ModelOrigin
 from hexapod_comp.machine.model_file import load_model, model_text, parse_model, save_model
 from hexapod_comp.machine.region import Region
 from hexapod_comp.machine.struts import StrutErrors
-from hexapod_comp.pose import Pose
 
 PAPER, SKEWED = paper_geometry(), skewed_geometry()
 DIGEST = "0123456789abcdef" * 4
@@ -101,7 +100,7 @@ def there_and_back(model, folder, geometry):
 def random_region(rng):
     """A box of a point of the platform, in a frame whose angles are what a file keeps."""
     box = np.sort(rng.uniform(-1.0, 1.0, (2, 3)), axis=0)
-    return Region(box, rng.uniform(-0.1, 0.1, 3), Pose(rng.uniform(-1.0, 1.0, 3), np.eye(3)))
+    return Region(box, rng.uniform(-0.1, 0.1, 3), *rng.uniform(-1.0, 1.0, (2, 3)))
 
 
 # There and back.
@@ -229,8 +228,8 @@ def test_a_file_written_by_hand(tmp_path):
     assert_equal(model.origin, ModelOrigin("2026-01-31", (("laser.csv", DIGEST),), 4.2e-6), relative=3e-16)
     np.testing.assert_array_equal(model.region.box, [[-0.2, -0.2, 0.35], [0.2, 0.2, 0.55]])
     assert not model.region.point.any()
-    assert not model.region.frame.position.any()
-    np.testing.assert_array_equal(model.region.frame.rotation, np.eye(3))
+    assert not model.region.position.any()
+    assert not model.region.angles.any()
     assert model.reversal_threshold == 3e-6
     np.testing.assert_array_equal(model.base_deviation[[0, 5]], [[1e-6, 2e-6, 3e-6], [-4e-6, 5.5e-6, 0]])
     assert not model.platform_deviation.any()
