@@ -30,7 +30,7 @@ BESIDE_LINUXCNC = $(MAKE) --no-print-directory VENV=.venv-linuxcnc PYTHON='$(LIN
 # Which versions of Python `make test-all` takes, of those that are here.
 VERSIONS ?= 3.10 3.11 3.12 3.13 3.14
 
-.PHONY: help demo test test-all docs wheel constraints test-linuxcnc linuxcnc linuxcnc-rt bench papers fuzz clean run-linuxcnc-tests ros
+.PHONY: help demo test test-all docs wheel constraints test-linuxcnc linuxcnc linuxcnc-rt bench papers fuzz fuzz-core clean run-linuxcnc-tests ros
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
@@ -44,6 +44,7 @@ help:
 	@echo 'make papers  every table and figure of the three papers beside what is computed: out/papers.html'
 	@echo 'make bench   speed beside NumPy, SciPy, MuJoCo, Pinocchio, LinuxCNC and a relay node'
 	@echo 'make fuzz    a nightly run of the fuzzing tests: 100,000 cases and more'
+	@echo 'make fuzz-core    any bytes for the C core, half an hour; needs clang'
 	@echo 'make linuxcnc       .venv-linuxcnc, to run beside LinuxCNC'
 	@echo 'make linuxcnc-rt MODEL=mine.yaml  the compensator as a realtime component of LinuxCNC (MACHINE=paper)'
 	@echo 'make test-linuxcnc  the tests with a real LinuxCNC; root installs the package first'
@@ -109,6 +110,9 @@ papers: $(VENV)/with-ros $(CORE)
 
 fuzz: $(VENV)/with-ros,test $(CORE)
 	@$(BIN)/python -m benchmarks.fuzz
+
+fuzz-core: $(VENV)/with-ros
+	@$(BIN)/python -m benchmarks.fuzz_core
 
 linuxcnc:
 	@$(BESIDE_LINUXCNC) ros

@@ -44,7 +44,7 @@ static void place_motor(hc_drives *drives, int i)
     const double before = drives->motor[i], half = drives->half_play[i], step = drives->step;
     const double stepped = step > 0.0 ? rint(drives->position[i] / step) * step : drives->position[i];
     drives->motor[i] = held(stepped, drives->stops[i][0], drives->stops[i][1]);
-    drives->play[i] = held(drives->play[i] + drives->motor[i] - before, -half, half);
+    drives->play[i] = half > 0.0 ? held(drives->play[i] + drives->motor[i] - before, -half, half) : 0.0;
 }
 
 void hc_run_drives(hc_drives *drives, const double commands[6], long ticks, double sense[9])

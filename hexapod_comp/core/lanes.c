@@ -9,10 +9,12 @@
 #define LANES 8 /* one register of AVX-512, two of AVX2 */
 
 /* Compiled for each of these, and taken by the processor that the program meets; the arithmetic is IEEE in all of them. */
+#ifndef WIDE
 #if defined(__GNUC__) && defined(__x86_64__) && defined(__GLIBC__)
 #define WIDE __attribute__((target_clones("avx512f", "avx2", "default")))
 #else
 #define WIDE
+#endif
 #endif
 
 /* A pose, the lengths sought or found, and how far its solution has come, in each lane. */
