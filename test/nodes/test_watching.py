@@ -23,7 +23,8 @@ from hexapod_comp.errors import HexapodError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.nodes import watching
 from hexapod_comp.nodes.page import WatchPage, same_site, strut_colours, strut_ends, words
-from hexapod_comp.nodes.watching import QUIET, View, Watcher
+from hexapod_comp.nodes.ros_session import QUIET
+from hexapod_comp.nodes.watching import View, Watcher
 from hexapod_comp.pose import Pose
 
 OFFSETS = np.array([-100.0, -50.0, 0.0, 50.0, 100.0, 200.0])
