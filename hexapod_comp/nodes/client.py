@@ -43,10 +43,14 @@ class Sent:
         How many commands the compensator had refused before, as it says itself.
     command, correction : ndarray, shape (6,)
         The answer, m.
+    too_old : str
+        How many of the refused ones had waited for too long.
     """
 
     sent_at: float
     refused: str
+    too_old: str
+    message: PoseStamped
     answered_at: float = float("nan")
     command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))
     correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))
@@ -193,28 +197,46 @@ class LoopClient:
     def _send(self, message: PoseStamped) -> Sent:
         stamp = self.node.get_clock().now()
         message.header.stamp = stamp.to_msg()
-        entry = self.sent[stamp.nanoseconds] = Sent(time.monotonic(), self._refused())
+        entry = self.sent[stamp.nanoseconds] = Sent(time.monotonic(), self._refused(), self._too_old(), message)
         self._publisher.publish(message)
         return entry
 
-    def wait_for_answer(self, entry: Sent, timeout: float = ANSWER_TIMEOUT) -> None:
-        """Wait until command and correction have come back.
+    def wait_for_answer(self, entry: Sent, timeout: float = ANSWER_TIMEOUT) -> Sent:
+        """Wait until command and correction have come back; return the record that was answered.
+
+        A pose that a busy computer handed over too late is sent again, with a new stamp: the machine waits where it is,
+        and the next pose on a path would be too far from there.
 
         Raises
         ------
         NoAnswerError
-            The command was lost, or refused, with the compensator's reason.
+            The command was lost, or refused, with the compensator's reason and what it says is to be done.
         """
         end = entry.sent_at + timeout
         while not _answered(entry):
             if self._refused() != entry.refused:
-                raise NoAnswerError(f"a command was refused: {self.diagnostics['last_refusal']}")
+                if time.monotonic() < end and self._only_too_old(entry):
+                    entry = self._send(entry.message)
+                    continue
+                raise NoAnswerError(f"a command was refused: {self._refusal()}")
             if time.monotonic() > end:
                 raise NoAnswerError(f"no answer to a command within {timeout:g} s")
             self._spin_once(0.01)
+        return entry
 
     def _refused(self) -> str:
         return self.diagnostics.get("refused", "0")
+
+    def _too_old(self) -> str:
+        return self.diagnostics.get("refused.stamp_past", "0")
+
+    def _only_too_old(self, entry: Sent) -> bool:
+        """Return whether all that was refused since a command had waited for too long."""
+        return int(self._refused()) - int(entry.refused) == int(self._too_old()) - int(entry.too_old)
+
+    def _refusal(self) -> str:
+        advice = self.diagnostics.get("what_to_do", "")
+        return self.diagnostics["last_refusal"] + (f"; {advice}" if advice else "")
 
     def stream(self, path: Path, each: Callable[[int], None] | None = None) -> list[Sent]:
         """Send a path at its rate and return the records; :attr:`track` then holds where the tool went.
@@ -242,13 +264,13 @@ class LoopClient:
             while (left := due - time.monotonic()) > 0.0:
                 self._spin_once(left)
             if entries:
-                self.wait_for_answer(entries[-1])
+                entries[-1] = self.wait_for_answer(entries[-1])
             entries.append(self._send(message))
             self._streamed = len(entries)
             if each is not None:
                 each(index)
             due = max(due + 1.0 / path.rate, time.monotonic() - 1.0 / path.rate)
-        self.wait_for_answer(entries[-1])
+        entries[-1] = self.wait_for_answer(entries[-1])
         self._streamed = None
         return entries
 
@@ -256,8 +278,7 @@ class LoopClient:
         """Send one pose again and again, as a controller at standstill does, until a condition holds."""
         end = time.monotonic() + timeout
         while True:
-            entry = self.send(pose)
-            self.wait_for_answer(entry)
+            entry = self.wait_for_answer(self.send(pose))
             next_due = entry.sent_at + 1.0 / rate
             while (left := next_due - time.monotonic()) > 0.0:
                 self._spin_once(left)

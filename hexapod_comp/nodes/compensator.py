@@ -22,7 +22,7 @@ from .command_inputs import command_input
 from .command_source import CommandSource, OwnTopic
 from .compensator_outputs import CompensatorOutputs
 from .compensator_parameters import PARAMETERS, PROGRAM
-from .compensator_status import CompensatorStatus
+from .compensator_status import ADVICE, OTHERWISE, CompensatorStatus
 from .feedback import Feedback
 from .health import WARN, seconds
 from .journal import JournalTopics
@@ -198,7 +198,7 @@ class CompensatorNode(MachineNode):
             self._fresh_start = False
             self._look_closer()
         self._stamps.accept(stamp, now)
-        self._status.answered(self.compensator.command, frame_id, now)
+        self._status.answered(self.compensator.command, frame_id, when, now)
         self._unestimated = when
         return 0.0
 
@@ -267,7 +267,7 @@ class CompensatorNode(MachineNode):
         self._journal.refused(stamp, error.reason, str(error))
         self._status.refusals.add(error.reason, str(error), now)
         self._outputs.signs.stop(True)
-        self.warn_of(error.reason, f"command refused ({error.reason}): {error}")
+        self.warn_of(error.reason, f"command refused ({error.reason}): {error}; {ADVICE.get(error.reason, OTHERWISE)}")
 
     def _check_state(self) -> None:
         self._look_at_publishers()

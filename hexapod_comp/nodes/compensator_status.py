@@ -21,6 +21,25 @@ NEAR_SINGULAR = 0.9
 """From this share of the largest allowed condition number on, diagnostics warn."""
 
 
+ADVICE = {
+    "stamp_past": "send the pose again with a new stamp; never skip one that was not answered",
+    "stamp_future": "set the clocks, or send a zero stamp, which means now",
+    "stamp_order": "stamp commands in the order in which they are sent",
+    "step": "go on from the last answered command (last_answered), in steps that the limit allows",
+    "speed": "plan slower, and stamp each pose with the time for which it was computed, not that of sending",
+    "acceleration": "plan more gently, and stamp each pose with the time for which it was computed",
+    "tool_changed": "send where the struts are with the tool in use; the refusal says where that is",
+    "no_feedback": "wait for strut_states; a machine without feedback needs start_without_feedback_after",
+    "following_error": "find out why the struts do not follow, then call ~/reset while the machine stands",
+    "several_publishers": "leave one publisher on the topic",
+    "unknown_publisher": "leave one publisher on the topic, whose node's name can be read",
+}
+"""What the sender of a refused command is to do, by reason."""
+
+OTHERWISE = "mend what the refusal names, and go on from the last answered command (last_answered)"
+"""The same for all other reasons: a limit, a frame, a message that cannot be read."""
+
+
 class Guard(Protocol):
     """Something that stops the machine while it has a problem."""
 
@@ -51,6 +70,8 @@ class CompensatorStatus:
         What was refused.
     frame_id : str
         Of the last command; empty before the first.
+    last_answered : int
+        Stamp of the last answered command, ns; 0 before the first.
     prediction_problem : str
         Why no error is predicted though somebody listens; empty while all is well.
     source : CommandSource
@@ -85,6 +106,7 @@ class CompensatorStatus:
         self.refusals, self.bad_feedback = Refusals(), Refusals()
         self.failed_reloads, self.refused_resets, self.refused_tools = Refusals(), Refusals(), Refusals()
         self.frame_id = self.prediction_problem = ""
+        self.last_answered = 0
         self.following = Following()
         self.standing = Standing(self.following.commands)
         self.last_known = LastKnown(average=self.standing.mean)
@@ -99,11 +121,18 @@ class CompensatorStatus:
         self.following.limit = options["following_error_limit"]
         self.last_known.anywhere_after = options["start_without_feedback_after"]
 
-    def answered(self, command: np.ndarray, frame_id: str, now: float) -> None:
-        """Take notice of a strut command, m, that answered a pose in a frame at the monotonic time `now`, s."""
+    def answered(self, command: np.ndarray, frame_id: str, stamp: int, now: float) -> None:
+        """Take notice of a strut command, m, stamped in ns, that answered a pose in a frame at a monotonic time, s."""
+        self.last_answered = stamp
         self.following.note(command, now)
         self.commands.tick(now)
         self.frame_id = frame_id
+
+    def advice(self) -> str:
+        """Return what the sender of commands is to do: about what stops the machine, or else about the last refusal."""
+        guard = self.problem()
+        reason = guard.reason if guard is not None else self.refusals.last_reason
+        return ADVICE.get(reason, OTHERWISE) if reason else ""
 
     def watch(self, source: CommandSource, own_topic: OwnTopic, pacing: Pacing) -> None:
         """Take the guards of the topics of a configured node, and what lets its commands wait."""
@@ -216,6 +245,8 @@ class CompensatorStatus:
             "outside_box": str(compensator.outside_box).lower(),
             "measured_box": "not known" if region is None else region.text(compensator.geometry),
             "last_refusal": self.refusals.last_text,
+            "what_to_do": self.advice(),
+            "last_answered": f"{self.last_answered // 10**9}.{self.last_answered % 10**9:09d}",
             "last_bad_feedback": self.bad_feedback.last_text,
             "bad_feedback": str(sum(self.bad_feedback.counts.values())),
             "failed_reloads": str(sum(self.failed_reloads.counts.values())),

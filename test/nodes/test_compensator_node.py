@@ -242,7 +242,7 @@ BAD = {
         "old, allowed 0.5 s",
     ),
     "future stamp": (set_stamp(5.0), "stamp_future", "in the future, allowed 0.5 s"),
-    "earlier than the last": (set_stamp(-0.2), "stamp_order", "earlier than the last"),
+    "earlier than the last": (set_stamp(-0.2), "stamp_order", "earlier than the one before"),
     "out of reach": (set_position(z=2.0), "stroke", "outside the stroke 330.000…880.000 mm"),
     "base joint plane": (set_position(z=0.0), "stroke", "outside the stroke"),
     "too large a step": (set_position(z=0.41), "step", "in one command, allowed 2 mm"),
@@ -529,8 +529,13 @@ def test_first_command_is_at_most_one_step_from_the_measured_struts(bench):
     measured = near(HOME, (0.0, 0.0, 0.05))
     bench.estimate(bench.feed(closed_form_lengths(measured)))
     bench.send(near(measured, (0.0, 0.0, 0.005)))
-    assert "allowed 2 mm" in bench.until_status(ERROR, "refusing commands: step")["last_refusal"]
-    bench.ask(near(measured, (0.0, 0.0, 0.001)))
+    values = bench.until_status(ERROR, "refusing commands: step")
+    assert "allowed 2 mm" in values["last_refusal"]
+    assert values["what_to_do"].startswith("go on from the last answered command")
+    assert values["last_answered"] == "0.000000000"
+    answer = bench.ask(near(measured, (0.0, 0.0, 0.001)))
+    stamp = answer.command.header.stamp
+    bench.until(lambda: bench.values()["last_answered"] == f"{stamp.sec}.{stamp.nanosec:09d}", "the stamp")
     assert len(bench.seen["strut_commands"]) == 1
 
 
