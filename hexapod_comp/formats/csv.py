@@ -332,7 +332,11 @@ class _Content:
         """Take a row's cells."""
         if len(cells) != len(self.header):
             problem = f"has {len(cells)} columns, the header has {len(self.header)}"
-            raise InputFileError(path, f"line {line}", problem + _other_separator(cells, self.separator))
+            if len(self.header) == 1:
+                hint = "; is that the header? A columns file skips titles above it: table: rows_above_header"
+            else:
+                hint = _other_separator(cells, self.separator)
+            raise InputFileError(path, f"line {line}", problem + hint)
         if len(self.rows) >= MAX_ROWS:
             raise InputFileError(path, "", f"has more than the allowed {MAX_ROWS} rows")
         if len(self.rows) * len(cells) >= MAX_CELLS:

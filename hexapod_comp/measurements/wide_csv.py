@@ -1,9 +1,13 @@
 """Wide CSV files of other laboratories: one pose a row, in columns that a small YAML file explains.
 
-A columns file (format ``hexapod_comp/columns``, see config/jugglebot_columns.yaml)::
+A columns file (format ``hexapod_comp/columns``, see config/jugglebot_columns.yaml, examples/tracker)::
 
     format: hexapod_comp/columns
     version: 1
+    table:                          # optional: how the file is written, where that does not show
+      encoding: latin-1             # or utf-8, utf-16, windows-1252; detected without it
+      rows_above_header: 5          # to skip: titles; empty lines and comments count too
+      rows_below_header: 1          # to skip: a row of units
     run: poses                      # optional; the CSV file's name otherwise
     order: sequence                 # rows in the order of measuring: directions follow from it; or unknown (default)
     commanded:                      # pose of the tool in the work frame; without this section it is the nominal
@@ -11,12 +15,29 @@ A columns file (format ``hexapod_comp/columns``, see config/jugglebot_columns.ya
       unit: mm
       offset_mm: [0, 0, 565]        # optional, added to the position
       quaternion: [qx, qy, qz, qw]  # or angles: [alpha, beta, gamma] with angle_unit; neither: level
+                                    # or, instead of all that, poses in a file of their own beside this one:
+      file: commanded.csv           # as every pose file (x_mm, …), a row for each row measured, in the same order,
+      name: Point ID                # or found by what stands in this column, as its `name` or `sequence`
     measured:                       # likewise; without quaternion or angles only positions were measured
       position: [mx, my, mz]
       unit: mm
       quaternion: [mqx, mqy, mqz, mqw]
       position_uncertainty_um: 200  # optional standard deviations
       attitude_uncertainty_mrad: 1
+      position_uncertainty:         # or one for each row:
+        columns: [U95]              # for x, y and z alike; or three columns
+        unit: mm
+        coverage_factor: 2          # what the file gives, in standard deviations of one axis: 2 or 1.96 for 95 % of an
+                                    # axis, 2.80 for a sphere that holds 95 % of the points
+    temperature:                    # optional, in each row; 20 °C without it
+      unit: degC
+      everywhere: T air             # the air, and the machine unless a part (strut_1, …, base, platform) has its own
+    humidity:                       # optional: for struts that swell
+      column: rH
+      unit: percent
+    time:                           # optional: as Python's strptime reads the columns, joined by a space;
+      columns: [Date, Time]         # or one column of numbers, and unit: s in place of format
+      format: "%d.%m.%Y %H:%M:%S"
     struts:                         # optional: what the machine was told, or its encoders read
       readings: [l1, l2, l3, l4, l5, l6]
       length_per_unit_mm: [75.7, 71.2, 72.3, 70.8, 70.6, 71.3]
@@ -29,27 +50,57 @@ have had their say in six numbers. A fit finds strut offsets anyway; this only s
 
 from __future__ import annotations
 
+import difflib
+import re
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import InputFileError, PoseError
-from ..formats.csv import Table
-from ..formats.yaml import Section, read_yaml
+from ..formats.csv import AS_USUAL, ENCODINGS, MOST_SKIPPED, Layout, Table, read_pose_arrays
+from ..formats.yaml import MOST_NEIGHBOURS, Section, read_yaml
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, solve_poses, strut_lengths_batch
+from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
 from ..pose import Pose
 from .readings import AXES, FROM_PREVIOUS, UNKNOWN, FileLine, MeasurementSet, Reading, attitude_error
 from .runs import assemble
+from .tidy_rows import LATEST
 
 COLUMNS_FORMAT = "hexapod_comp/columns"
 COLUMNS_VERSION = 1
 
 ORDERS = {"sequence": FROM_PREVIOUS, "unknown": UNKNOWN}
 
+EVERYWHERE = "everywhere"
+
+COVERAGE_FACTORS = (0.5, 10.0)
+"""Smallest and largest; an interval of 99.99 % is 3.9 standard deviations wide on each side."""
+
+WITH_DATE = re.compile("%[djcxsDF]")
+"""What makes a format of times tell the days apart."""
+
 ZEROS = ("home", "given", "measured")
 """Where the lengths at reading zero come from."""
+
+
+@dataclass(frozen=True)
+class UncertaintyColumns:
+    """Where uncertainties stand.
+
+    Attributes
+    ----------
+    columns : tuple of str
+        One for all axes, or three.
+    unit : float
+        Size of their unit in SI, divided by the coverage factor: what makes standard deviations of them.
+    """
+
+    columns: tuple[str, ...]
+    unit: float
 
 
 @dataclass(frozen=True)
@@ -68,8 +119,8 @@ class PoseColumns:
         Columns of a quaternion (x, y, z, w) or of the paper's three angles; empty when there are none.
     angle_unit : float
         Size of the angles' unit, rad.
-    uncertainty : tuple of float
-        Standard deviations of position (m) and attitude (rad), NaN when not known.
+    uncertainty : tuple of float or UncertaintyColumns
+        Standard deviations of position (m) and attitude (rad), NaN when not known; or where each row's stand.
     """
 
     position: tuple[str, ...]
@@ -77,7 +128,48 @@ class PoseColumns:
     offset: np.ndarray
     turn: tuple[str, ...]
     angle_unit: float
-    uncertainty: tuple[float, float]
+    uncertainty: tuple[float | UncertaintyColumns, float | UncertaintyColumns]
+
+
+@dataclass(frozen=True)
+class PoseFile:
+    """Commanded poses in a file of their own.
+
+    Attributes
+    ----------
+    path : Path
+        Beside the columns file.
+    name : str
+        Column of the measured file that names the pose; empty: row by row.
+    """
+
+    path: Path
+    name: str
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Where temperatures, humidity and time of each row stand.
+
+    Attributes
+    ----------
+    temperatures : dict of str to str
+        Columns by part; ``everywhere`` for all that have none.
+    humidity : (str, float) or None
+        Column, and the size of its unit.
+    times : tuple of str
+        Columns, joined by a space where there are several; empty when there are none.
+    time_format : str
+        As ``strptime`` has it; empty: numbers.
+    time_unit : float
+        Size of the numbers' unit, s.
+    """
+
+    temperatures: dict[str, str]
+    humidity: tuple[str, float] | None
+    times: tuple[str, ...]
+    time_format: str
+    time_unit: float
 
 
 @dataclass(frozen=True)
@@ -106,10 +198,12 @@ class StrutColumns:
 class Columns:
     """What the columns of a wide file mean; the parts are as in the file, None where left out."""
 
+    layout: Layout
     run: str
     order: int
-    commanded: PoseColumns | None
+    commanded: PoseColumns | PoseFile | None
     measured: PoseColumns
+    surroundings: Surroundings
     struts: StrutColumns | None
 
 
@@ -123,10 +217,12 @@ def load_columns(path: str | Path) -> Columns:
     """
     top = read_yaml(path, COLUMNS_FORMAT, COLUMNS_VERSION)
     columns = Columns(
+        layout=_layout(top),
         run=top.text("run") if "run" in top else "",
         order=ORDERS[top.choice("order", tuple(ORDERS), "unknown")],
-        commanded=_pose_columns(top.section("commanded")) if "commanded" in top else None,
+        commanded=_commanded(top.section("commanded"), Path(path)) if "commanded" in top else None,
         measured=_pose_columns(top.section("measured")),
+        surroundings=_surroundings(top),
         struts=_strut_columns(top.section("struts")) if "struts" in top else None,
     )
     if columns.commanded is None and columns.struts is None:
@@ -137,12 +233,82 @@ def load_columns(path: str | Path) -> Columns:
     return columns
 
 
-def _names(section: Section, key: str, count: int) -> tuple[str, ...]:
-    """Take so many column names."""
+def _names(section: Section, key: str, count: int | None) -> tuple[str, ...]:
+    """Take so many column names, None: any number of them."""
     names = section.take(key)
-    if not isinstance(names, list) or len(names) != count or not all(isinstance(n, str) and n for n in names):
-        raise section.error(key, f"must be a list of {count} column names", names)
+    well = isinstance(names, list) and names and all(isinstance(n, str) and n for n in names)
+    if not well or len(names) != (count or len(names)):
+        raise section.error(key, f"must be a list of {f'{count} ' if count else ''}column names", names)
     return tuple(names)
+
+
+def _layout(top: Section) -> Layout:
+    if "table" not in top:
+        return AS_USUAL
+    section = top.section("table")
+    encoding = section.choice("encoding", ENCODINGS) if "encoding" in section else ""
+    rows = []
+    for key in ("rows_above_header", "rows_below_header"):
+        rows.append(section.integer(key, 0))
+        if not 0 <= rows[-1] <= MOST_SKIPPED:
+            raise section.error(key, f"must be 0…{MOST_SKIPPED}", rows[-1])
+    section.finish()
+    return Layout(encoding, *rows)
+
+
+def _commanded(section: Section, path: Path) -> PoseColumns | PoseFile:
+    if "file" not in section:
+        return _pose_columns(section)
+    name = section.text("file")
+    if Path(name).name != name:
+        raise section.error("file", "must be a file's name, beside the columns file", name)
+    poses = PoseFile(path.with_name(name), section.text("name") if "name" in section else "")
+    section.finish()
+    return poses
+
+
+def _surroundings(top: Section) -> Surroundings:
+    temperatures: dict[str, str] = {}
+    humidity = None
+    times, time_format, time_unit = (), "", 1.0  # type: tuple[str, ...], str, float
+    if "temperature" in top:
+        section = top.section("temperature")
+        section.unit("unit", "temperature")
+        for part in (EVERYWHERE, *Temperatures.NAMES):
+            if part in section:
+                temperatures[part] = section.text(part)
+        section.finish()
+        if not temperatures:
+            raise section.error(EVERYWHERE, "is missing, and so is every part")
+    if "humidity" in top:
+        section = top.section("humidity")
+        humidity = section.text("column"), section.unit("unit", "ratio")
+        section.finish()
+    if "time" in top:
+        section = top.section("time")
+        if "format" in section:
+            times, time_format = _names(section, "columns", None), section.text("format")
+        else:
+            times, time_unit = _names(section, "columns", 1), section.unit("unit", "time")
+        section.finish()
+    return Surroundings(temperatures, humidity, times, time_format, time_unit)
+
+
+def _uncertainty(section: Section, name: str, dimension: str) -> float | UncertaintyColumns:
+    """Take one standard deviation for all rows, or where each row's stand; NaN where there is neither."""
+    if name not in section:
+        return float(section.quantity(name, dimension, default=np.nan))
+    part = section.section(name)
+    columns = _names(part, "columns", None)
+    if len(columns) not in (1, 3):
+        raise part.error("columns", "must be one column for all axes, or three", list(columns))
+    unit = part.unit("unit", dimension)
+    factor = float(part.array("coverage_factor"))
+    low, high = COVERAGE_FACTORS
+    if not low <= factor <= high:
+        raise part.error("coverage_factor", f"must be {low:g}…{high:g}; 1 where the column is a deviation", factor)
+    part.finish()
+    return UncertaintyColumns(columns, unit / factor)
 
 
 def _pose_columns(section: Section) -> PoseColumns:
@@ -160,8 +326,8 @@ def _pose_columns(section: Section) -> PoseColumns:
         turn=turn,
         angle_unit=angle_unit,
         uncertainty=(
-            float(section.quantity("position_uncertainty", "length", default=np.nan)),
-            float(section.quantity("attitude_uncertainty", "angle", default=np.nan)),
+            _uncertainty(section, "position_uncertainty", "length"),
+            _uncertainty(section, "attitude_uncertainty", "angle"),
         ),
     )
     section.finish()
@@ -214,18 +380,24 @@ def read_wide(
     InputFileError
         Naming file, line and column.
     """
-    columns, table = load_columns(columns_path), Table(path)
+    columns = load_columns(columns_path)
+    table = Table(path, columns.layout)
     used: set[str] = set()
     measured = _read_poses(table, columns.measured, used)
     notes: list[str] = []
     commands = None if columns.struts is None else _lengths(table, columns.struts, measured, geometry, used, notes)
-    if columns.commanded is not None:
+    if isinstance(columns.commanded, PoseFile):
+        commanded = _poses_of_file(table, columns.commanded, used)
+    elif columns.commanded is not None:
         commanded = _read_poses(table, columns.commanded, used)
     else:
         commanded = _nominal_poses(table, geometry, np.asarray(commands))
-    unused = [name for name in table.header if name not in used]
+    conditions = _conditions(table, columns.surroundings, used)
+    deviations = [_deviations(table, given, used) for given in columns.measured.uncertainty]
+    unused = [name for name in table.header if name and name not in used]
+    notes += table.notes
     notes += [f"{path}: columns not used: {', '.join(unused)}"] if unused else []
-    readings = _readings(table, columns, commanded, measured, commands)
+    readings = _readings(table, columns, commanded, measured, commands, deviations, conditions)
     return assemble(geometry, readings, None, [(Path(path).name, table.sha256)], notes, in_reach)
 
 
@@ -251,6 +423,95 @@ def _read_poses(table: Table, columns: PoseColumns, used: set[str]) -> _Poses:
             where = f"line {line}, columns {', '.join(columns.turn)}"
             raise InputFileError(table.path, where, str(error)) from error
     return _Poses(positions, rotations)
+
+
+def _poses_of_file(table: Table, file: PoseFile, used: set[str]) -> _Poses:
+    """Return the commanded pose of each row from a file of poses."""
+    labels, positions, rotations = read_pose_arrays(file.path)
+    if not file.name:
+        if len(labels) != len(table.rows):
+            problem = f"has {len(table.rows)} rows, and {file.path.name} {len(labels)} poses; without commanded.name"
+            raise InputFileError(table.path, "", f"{problem} they go row by row")
+        return _Poses(positions, rotations)
+    used.add(file.name)
+    rows = {one.label: n for n, one in enumerate(labels)}
+    if len(rows) != len(labels):
+        raise InputFileError(file.path, "", "has a name twice; commanded.name finds poses by their names")
+    numbers = []
+    for (line, _), name in zip(table.rows, table.texts(file.name), strict=True):
+        if name not in rows:
+            near = difflib.get_close_matches(name, list(rows)[:MOST_NEIGHBOURS], 1)
+            problem = f"has no pose in {file.path.name}" + (f"; did you mean {near[0]!r}?" if near else "")
+            raise InputFileError(table.path, f"line {line}, column {file.name}", problem, name)
+        numbers.append(rows[name])
+    return _Poses(positions[numbers], rotations[numbers])
+
+
+def _deviations(table: Table, given: float | UncertaintyColumns, used: set[str]) -> np.ndarray:
+    """Return a standard deviation for each row and axis, shape (rows, 3)."""
+    if not isinstance(given, UncertaintyColumns):
+        return np.full((len(table.rows), 3), given)
+    values = _read_numbers(table, given.columns, given.unit, used)
+    if not (values > 0.0).all():
+        row, column = np.argwhere(values <= 0.0)[0]
+        where = f"line {table.rows[row][0]}, column {given.columns[column]}"
+        raise InputFileError(table.path, where, "an uncertainty must be above zero", float(values[row, column]))
+    return np.broadcast_to(values, (len(values), 3))
+
+
+class _Conditions(NamedTuple):
+    """Of each row: temperatures (rows, 8), °C; time, s, and relative humidity, NaN where not known."""
+
+    temperatures: np.ndarray
+    times: np.ndarray
+    humidities: np.ndarray
+
+
+def _conditions(table: Table, columns: Surroundings, used: set[str]) -> _Conditions:
+    count = len(table.rows)
+
+    def read(name: str | None, unit: float, otherwise: np.ndarray, low: float, high: float, allowed: str) -> np.ndarray:
+        if name is None:
+            return otherwise
+        values = _read_numbers(table, (name,), unit, used)[:, 0]
+        wrong = ~((values >= low) & (values <= high))
+        if wrong.any():
+            line, cells = table.rows[int(wrong.argmax())]
+            problem = f"must be within {allowed}"
+            raise InputFileError(table.path, f"line {line}, column {name}", problem, cells[table.header.index(name)])
+        return values
+
+    named, (low, high) = columns.temperatures, TEMPERATURE_RANGE
+    bounds = low, high, f"{low:g}…{high:g} °C"
+    everywhere = read(named.get(EVERYWHERE), 1.0, np.full(count, REFERENCE_TEMPERATURE), *bounds)
+    parts = [read(named.get(part), 1.0, everywhere, *bounds) for part in Temperatures.NAMES]
+    unknown = np.full(count, np.nan)
+    damp, size = columns.humidity or (None, 1.0)
+    humidities = read(damp, size, unknown, 0.0, 1.0, "0…100 %")
+    if columns.time_format:
+        times = _clock_times(table, columns, used)
+    else:
+        name = columns.times[0] if columns.times else None
+        times = read(name, columns.time_unit, unknown, -LATEST, LATEST, f"±{LATEST:g} s")
+    return _Conditions(np.stack(parts, axis=1), times, humidities)
+
+
+def _clock_times(table: Table, columns: Surroundings, used: set[str]) -> np.ndarray:
+    """Return times that are written as dates and clocks, s; without a zone they are taken for UTC."""
+    used.update(columns.times)
+    texts = [" ".join(parts) for parts in zip(*(table.texts(name) for name in columns.times), strict=True)]
+    names, times = ", ".join(columns.times), np.empty(len(texts))
+    for n, ((line, _), text) in enumerate(zip(table.rows, texts, strict=True)):
+        try:
+            moment = datetime.strptime(text, columns.time_format)
+        except (ValueError, re.error) as error:
+            problem = f"is not written as time.format says, {columns.time_format!r}"
+            raise InputFileError(table.path, f"line {line}, column {names}", problem, text) from error
+        times[n] = (moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)).timestamp()
+        if n and times[n] < times[n - 1] and not WITH_DATE.search(columns.time_format):
+            problem = "is earlier than the row before; over midnight the date is needed too: columns: [date, time]"
+            raise InputFileError(table.path, f"line {line}, column {names}", problem, text)
+    return times
 
 
 def _lengths(
@@ -290,21 +551,27 @@ def _nominal_poses(table: Table, geometry: HexapodGeometry, lengths: np.ndarray)
 
 
 def _readings(
-    table: Table, columns: Columns, commanded: _Poses, measured: _Poses, commands: np.ndarray | None
+    table: Table,
+    columns: Columns,
+    commanded: _Poses,
+    measured: _Poses,
+    commands: np.ndarray | None,
+    deviations: list[np.ndarray],
+    conditions: _Conditions,
 ) -> list[Reading]:
     """Return position and attitude readings of every row."""
-    errors = [("position", measured.positions - commanded.positions, columns.measured.uncertainty[0])]
+    errors = [("position", measured.positions - commanded.positions, deviations[0])]
     if columns.measured.turn:
-        turned = attitude_error(measured.rotations, commanded.rotations)
-        errors.append(("attitude", turned, columns.measured.uncertainty[1]))
+        errors.append(("attitude", attitude_error(measured.rotations, commanded.rotations), deviations[1]))
     run = columns.run or Path(table.path).stem
     readings = []
     for n, (line, _) in enumerate(table.rows):
         pose = Pose(commanded.positions[n], commanded.rotations[n])
         lengths = None if commands is None else tuple(commands[n].tolist())
-        for kind, values, uncertainty in errors:
-            for axis, value in zip(AXES, values[n].tolist(), strict=True):
+        temperatures, source = tuple(conditions.temperatures[n].tolist()), FileLine(str(table.path), line)
+        state = temperatures, lengths, source, float(conditions.times[n])
+        for kind, values, spreads in errors:
+            for axis, value, spread in zip(AXES, values[n].tolist(), spreads[n].tolist(), strict=True):
                 place = (run, 1, columns.order, pose, f"{kind}_{axis}")
-                source = FileLine(str(table.path), line)
-                readings.append(Reading(*place, value, uncertainty, commands=lengths, source=source))
+                readings.append(Reading(*place, value, spread, *state, humidity=float(conditions.humidities[n])))
     return readings

@@ -871,3 +871,15 @@ def test_iso230_of_single_passes_says_what_is_missing(hexapod: Program, tmp_path
     assert_refused(hexapod("iso230", tmp_path / "once.csv"), "no linear run has two cycles or more")
     complaint = r"gone\.csv: there is no such file; \.csv files beside it: once\.csv"
     assert_refused(hexapod("iso230", tmp_path / "gone.csv"), complaint)
+
+
+def test_a_trackers_export_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The example's readings were drawn with deviations of U95 / 2.80: then χ² is about its freedom, within 3 σ."""
+    folder = Path(__file__).resolve().parents[2] / "examples" / "tracker"
+    command = ["fit", str(folder / "points.csv"), "--columns", str(folder / "columns.yaml"), "--blocks", "structure"]
+    assert cli.main([*command, "--out", str(tmp_path / "model.yaml"), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    (channel,) = result["channels"]
+    assert channel["readings"] == 180
+    assert channel["chi_square"] == pytest.approx(1.0, abs=0.35)
+    assert any("columns not used: Luftdruck" in note for note in result["notes"])

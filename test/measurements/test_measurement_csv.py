@@ -405,6 +405,89 @@ def test_bad_wide_files(tmp_path: Path, case: str) -> None:
         wide(tmp_path, columns)
 
 
+EXPORT = """Prüfer: Müller
+name;cx;cy;cz;mx;my;mz;U;T;T base;rH;Date;Time
+-;mm;mm;mm;mm;mm;mm;mm;°C;°C;%;;
+A;0;0;400;0,01;0;400;0,028;21,5;22,5;40;04.03.2026;23:59:50
+B;10;0;400;10;0;400,02;0,056;21,6;22,6;41;05.03.2026;00:00:10
+""".encode("latin-1")
+EXPORT_COLUMNS = """format: hexapod_comp/columns
+version: 1
+table: {rows_above_header: 1, rows_below_header: 1}
+commanded: {position: [cx, cy, cz], unit: mm}
+measured:
+  position: [mx, my, mz]
+  unit: mm
+  position_uncertainty: {columns: [U], unit: mm, coverage_factor: 2.8}
+temperature: {unit: degC, everywhere: T, base: T base}
+humidity: {column: rH, unit: percent}
+time: {columns: [Date, Time], format: "%d.%m.%Y %H:%M:%S"}
+"""
+
+
+def export(folder: Path, columns: str = EXPORT_COLUMNS, content: bytes = EXPORT) -> MeasurementSet:
+    (folder / "e.csv").write_bytes(content)
+    (folder / "c.yaml").write_text(columns)
+    return read_wide(folder / "e.csv", folder / "c.yaml", paper_geometry())
+
+
+def test_a_trackers_export(tmp_path: Path) -> None:
+    """U of 28 and 56 µm with k = 2.8 are 10 and 20 µm; 20 s lie between the rows, over midnight."""
+    found = export(tmp_path)
+    np.testing.assert_allclose(found.value, [10e-6, 0, 0, 0, 0, 20e-6], atol=1e-15)
+    np.testing.assert_allclose(found.uncertainty, [*[10e-6] * 3, *[20e-6] * 3], rtol=1e-12)
+    stations = found.stations
+    np.testing.assert_allclose(stations.temperatures[found.station[0]], [*[21.5] * 6, 22.5, 21.5])
+    np.testing.assert_allclose(stations.temperatures[found.station[3]], [*[21.6] * 6, 22.6, 21.6])
+    assert stations.times[found.station[3]] - stations.times[found.station[0]] == 20.0
+    assert stations.times[found.station[0]] == 1772668790.0, "`date -u -d '2026-03-04 23:59:50' +%s`"
+    assert stations.humidity[found.station[3]] == pytest.approx(0.41)
+    assert [note for note in found.notes if "Windows-1252" in note]
+    own = EXPORT_COLUMNS.replace(
+        "columns: [U], unit: mm, coverage_factor: 2.8", "columns: [T, rH, U], unit: um, coverage_factor: 1"
+    )
+    np.testing.assert_allclose(export(tmp_path, own).uncertainty[:3], [21.5e-6, 40e-6, 0.028e-6], rtol=1e-12)
+
+
+def test_commanded_poses_in_a_file_of_their_own(tmp_path: Path) -> None:
+    """By name in any order; or row by row."""
+    (tmp_path / "poses.csv").write_text("name,x_mm,y_mm,z_mm\nB,10,0,400\nspare,0,0,0\nA,0,0,399\n")
+    named = EXPORT_COLUMNS.replace("{position: [cx, cy, cz], unit: mm}", "{file: poses.csv, name: name}")
+    np.testing.assert_allclose(export(tmp_path, named).value, [10e-6, 0, 1e-3, 0, 0, 20e-6], atol=1e-15)
+    with pytest.raises(InputFileError, match=r"e\.csv: has 2 rows, and poses\.csv 3 poses"):
+        export(tmp_path, named.replace(", name: name", ""))
+    with pytest.raises(InputFileError, match=r"line 5, column name: has no pose in poses\.csv .*'C'"):
+        export(tmp_path, named, EXPORT.replace(b"\nB;", b"\nC;"))
+    with pytest.raises(InputFileError, match=r"commanded\.file: must be a file's name, beside"):
+        export(tmp_path, named.replace("poses.csv", "../poses.csv"))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ("coverage_factor: 2.8", "coverage_factor: 0", r"coverage_factor: must be 0\.5…10; 1 where .* is a deviation"),
+        (", coverage_factor: 2.8", "", "coverage_factor: is missing"),
+        ("columns: [U]", "columns: [U, U]", "must be one column for all axes, or three"),
+        ("columns: [U]", "columns: []", "must be a list of column names"),
+        ("everywhere: T, base", "bass", "'bass' is not|bass: is not a known key|everywhere: is missing"),
+        ("unit: degC", "unit: degF", r"temperature\.unit: must be one of degC"),
+        ("everywhere: T,", "everywhere: rH, platform: cz,", r"line 4, column cz: must be within -40…120 °C .*'400'"),
+        ("column: rH", "column: cz", "column cz: must be within 0…100 %"),
+        ("%H:%M:%S", "%H:%M", r"line 4, column Date, Time: is not written as time\.format says"),
+        ('[Date, Time], format: "%d.%m.%Y %H:%M:%S"', '[Time], format: "%H:%M:%S"', "over midnight the date is needed"),
+        ('format: "%d.%m.%Y %H:%M:%S"', "unit: s", r"time\.columns: must be a list of 1 column names"),
+        ("rows_above_header: 1", "rows_above_header: -1", r"rows_above_header: must be 0…1000"),
+        ("rows_above_header: 1", "encoding: utf-7", "encoding: must be one of utf-8, utf-16, windows-1252, latin-1"),
+        ("rows_above_header: 1", "rows_above_header: 0", "the header has 1; is that the header.*rows_above_header"),
+        ("columns: [U]", "columns: [cy]", "line 4, column cy: an uncertainty must be above zero"),
+    ],
+)
+def test_exports_that_are_not_as_their_columns_say(tmp_path: Path, before: str, after: str, said: str) -> None:
+    assert before in EXPORT_COLUMNS
+    with pytest.raises(InputFileError, match=said):
+        export(tmp_path, EXPORT_COLUMNS.replace(before, after))
+
+
 def test_no_unit_quaternion_in_a_wide_file(tmp_path: Path) -> None:
     with pytest.raises(InputFileError, match=r"w\.csv: line 2, columns qx, qy, qz, qw: .*norm 1"):
         wide(tmp_path, WIDE_COLUMNS, "0,0,0,0,0,0,1,0,16,0,0,0,2,25.4,0,300,x\n")
