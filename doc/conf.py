@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+from html import escape
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -76,6 +77,48 @@ def block_math(writer: HTML5Translator, node: nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
+MANY = 6
+"""Columns of prose from which on the cells of a row stand below each other on any screen."""
+
+PROSE = 45
+"""Characters of a cell that make its table one to be read, not one of numbers."""
+
+
+LONG = re.compile(r"_msgs/|\S{30}")
+
+
+def label_cells(_app: Sphinx, tree: nodes.document, _name: str) -> None:
+    """Give the cells of tables of prose their column's name: where the screen is narrow they stand below each other.
+
+    Long names of types and tests may break behind an underscore, a slash or a colon.
+    """
+    for table in tree.findall(nodes.table):
+        entries = list(table.findall(nodes.entry))
+        if max((len(entry.astext()) for entry in entries), default=0) < PROSE:
+            continue
+        columns = max(len(list(row.findall(nodes.entry))) for row in table.findall(nodes.row))
+        table["classes"].append("prose" if columns < MANY else "cards")
+        head = next(iter(table.findall(nodes.thead)), None)
+        names = [entry.astext() for entry in head.findall(nodes.entry)] if head else []
+        for row in (row for body in table.findall(nodes.tbody) for row in body.findall(nodes.row)):
+            for entry, name in zip(row.findall(nodes.entry), names, strict=False):
+                entry["label"] = name
+        for text in [text for text in table.findall(nodes.Text) if LONG.search(text)]:
+            parts = [nodes.Text(part) for part in re.split(r"(?<=[_/:])(?=\w)", text)]
+            breaks = [nodes.raw("", "<wbr>", format="html") for _ in parts[1:]]
+            text.parent.replace(
+                text, [node for pair in zip(parts, [*breaks, nodes.Text("")], strict=True) for node in pair]
+            )
+
+
+def labelled_cell(writer: HTML5Translator, entry: nodes.entry) -> None:
+    """Write a cell of a table with its label, which the style sheet shows."""
+    HTML5Translator.visit_entry(writer, entry)
+    if entry.get("label"):
+        opened = next(n for n in reversed(range(len(writer.body))) if writer.body[n].startswith(("<td", "<th")))
+        writer.body[opened] = writer.body[opened].replace("<td", f'<td data-label="{escape(entry["label"])}"', 1)
+
+
 def keep_bars(_app: Sphinx, _what: str, _name: str, _thing: object, _options: object, lines: list[str]) -> None:
     """Keep |x| in a docstring what it is there, a magnitude; reStructuredText would look for a substitution."""
     lines[:] = [re.sub(r"(``.*?``)|\|", lambda match: match[1] or r"\|", line) for line in lines]
@@ -86,3 +129,5 @@ def setup(app: Sphinx) -> None:
     if convert:
         app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))
     app.connect("autodoc-process-docstring", keep_bars)
+    app.connect("doctree-resolved", label_cells)
+    app.add_node(nodes.entry, override=True, html=(labelled_cell, HTML5Translator.depart_entry))

@@ -401,7 +401,7 @@ SIGNATURES = """<table class="text sign"><tbody><tr><th scope=row>evaluated by, 
 
 STYLE = """
  th[scope=row], th:first-child { text-align: left }
- th[scope=row] { white-space: normal; overflow-wrap: anywhere; max-width: 28em }
+ th[scope=row] { white-space: normal; overflow-wrap: break-word; max-width: 28em }
  .warning { border: 3px solid #a01515; padding: 8px 12px; max-width: none; white-space: pre-line }
  .text td:nth-child(2) { min-width: 22em } .sign { margin-top: 48px } .sign td { min-width: 22em; height: 40px }
  .hashes td:last-child { font-family: monospace; word-break: break-all; min-width: 0 }

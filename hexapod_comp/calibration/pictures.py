@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -191,14 +192,21 @@ def _residual_panel(axes: Axes, fit: ModelFit) -> None:
 
 
 def _strut_panel(axes: Axes, fit: ModelFit) -> None:
-    """Show what each strut does with its commands, offset and backlash aside."""
-    machine = RealMachine(fit.measurements.geometry, fit.model)
+    """Show what each strut does with its commands, offset and backlash aside.
+
+    The screws' waves, closer than a picture shows and on top of each other, are numbers beside the names.
+    """
+    struts = fit.model.struts
+    even = replace(struts, cosine=np.zeros_like(struts.cosine), sine=np.zeros_like(struts.sine))
+    machine = RealMachine(fit.measurements.geometry, replace(fit.model, struts=even))
+    waves = np.hypot(struts.cosine, struts.sine).max(axis=1)
     commands = fit.measurements.stations.commands
     for strut, name in enumerate(STRUT_NAMES):
         at = np.linspace(commands[:, strut].min(), commands[:, strut].max(), 4 * SAMPLES)
         errors, _ = strut_errors(machine.state.at, strut, at)
-        axes.plot(at * 1e3, (errors - fit.model.struts.offset[strut]) * 1e6, lw=0.8, label=name)
-    axes.set(title="strut errors: pitch, screw wave, length map", xlabel="command, mm", ylabel="error, µm")
+        label = f"{name}, wave ±{waves[strut] * 1e6:.1f} µm" if waves.any() else name
+        axes.plot(at * 1e3, (errors - struts.offset[strut]) * 1e6, lw=1.2, color=SIX_COLOURS[strut], label=label)
+    axes.set(title="strut errors: pitch and length map", xlabel="command, mm", ylabel="error, µm")
     axes.legend(ncols=2, fontsize=7)
 
 

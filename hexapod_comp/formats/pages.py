@@ -19,6 +19,9 @@ RESOLUTION = 110
 LONGEST_CELL = 300
 """Of a text in a table; longer ones end in …"""
 
+MANY = 4
+"""Columns from which on a narrow screen shows the cells of a row below each other."""
+
 STYLE = """
  body { font: 16px/1.45 sans-serif; margin: 0; color: #1b1b1b; background: #fff }
  main { max-width: 1180px; margin: 0 auto; padding: 12px 16px 48px }
@@ -32,6 +35,13 @@ STYLE = """
  .text td:first-child, .text th:first-child { min-width: 0 }
  figure { margin: 16px 0 } img { max-width: 100%; height: auto } figcaption { font-size: 14px; color: #444 }
  th[scope=row] { background: #fafafa }
+ @media screen and (max-width: 700px) {
+  table.rows, .rows tbody, .rows tr, .rows th, .rows td { display: block; border: 0; text-align: left }
+  .rows th, .rows td { white-space: normal; max-width: none }
+  .rows thead { display: none } .rows tr { border: 1px solid #c8c8c8; margin-bottom: 8px }
+  .rows td:not([data-label=""])::before { content: attr(data-label) ": "; color: #444 }
+  .rows td:empty { display: none }
+ }
 """
 """What all pages look like; a page adds its own."""
 
@@ -66,10 +76,12 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]], style: str = 
     head = "".join(f"<th scope=col>{shown(name)}</th>" for name in header)
     lines = []
     for first, *rest in rows:
-        cells = "".join(f"<td>{shown(cell)}</td>" for cell in rest)
+        names = [*header[1:], *[""] * len(rest)]
+        cells = "".join(f'<td data-label="{shown(n)}">{shown(cell)}</td>' for n, cell in zip(names, rest, strict=False))
         lines.append(f"<tr><th scope=row>{shown(first)}</th>{cells}</tr>")
     top = f"<thead><tr>{head}</tr></thead>" if any(header) else ""
-    opening = f"<table class={style}>" if style else "<table>"
+    styles = " ".join(filter(None, (style, "rows" if len(header) >= MANY else "")))
+    opening = f'<table class="{styles}">' if styles else "<table>"
     return f"<div class=wide tabindex=0>{opening}{top}<tbody>{''.join(lines)}</tbody></table></div>"
 
 
