@@ -3,7 +3,7 @@
 The same commands, a small circle that turns and comes back, go through compensators that differ by one block; they
 take turns, and a block's cost is what it adds to a command, and to an estimate of the pose from strut readings, of
 the ideal machine: all called from Python, processor time of the thread, the least of the rounds, since others on
-the machine can only add. What the ideal machine's command is made of is timed part by part.
+the machine can only add. What the ideal machine's command is made of is timed part by part, each with its call.
 
 Run ``python -m benchmarks.blocks`` (``--json`` for programs).
 """
@@ -18,15 +18,13 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
-import numba
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.core import ffi, lib
+from hexapod_comp.core.batch import given, written
 from hexapod_comp.formats.paths import config_file
-from hexapod_comp.kernels import kinematics as kernels
-from hexapod_comp.kernels.limits import check_stage
-from hexapod_comp.kernels.pose import read_pose
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.model_file import load_model
@@ -129,7 +127,7 @@ def measure(rounds: int) -> list[Block]:
     """Return every block's cost."""
     geometry = load_geometry(config_file("paper.yaml"))
     told, everybody = commands(geometry), compensators(geometry)
-    for compensator in everybody.values():  # compiles
+    for compensator in everybody.values():  # the first command is another one
         one_round(compensator, told)
     times = np.array([[one_round(c, told) for c in everybody.values()] for _ in range(rounds)])
     least = times.min(axis=0)
@@ -139,24 +137,6 @@ def measure(rounds: int) -> list[Block]:
 
 
 # --- parts -------------------------------------------------------------------------------------------------
-
-
-def repeated(kernel: Callable, *arguments: object) -> Callable[[], float]:
-    """Return a function that calls a kernel many times from compiled code and tells what a call takes, µs."""
-
-    @numba.njit
-    def many(count, given):
-        for _ in range(count):
-            kernel(*given)
-
-    many(1, arguments)
-
-    def run() -> float:
-        began = time.thread_time()
-        many(INNER, arguments)
-        return (time.thread_time() - began) / INNER * 1e6
-
-    return run
 
 
 def from_python(call: Callable[[], object]) -> Callable[[], float]:
@@ -177,14 +157,23 @@ def parts(rounds: int) -> list[Part]:
     geometry = load_geometry(config_file("paper.yaml"))
     spaced = dataclasses.replace(geometry, limits=dataclasses.replace(geometry.limits, clearance=0.1))
     home, lengths = geometry.home, np.empty(6)
-    nominal = (*geometry.kernel_joints, home.position.copy(), home.rotation.copy(), lengths)
+    joints = [given("joints", part, 6, 3) for part in geometry.kernel_joints]
+    position, rotation = home.position.copy(), home.rotation.copy()
+    pose = written("position", position, 3), written("rotation", rotation, 3, 3)
+    found = written("lengths", lengths, 6)
+    out = ffi.new("int[2]"), ffi.new("double *"), ffi.new("double *")
+    numbers = ffi.new("double[7]", [*home.position.tolist(), 0.0, 0.0, 0.0, 1.0])
     compensator = Compensator(geometry, load_model(config_file("paper_machine.yaml"), geometry))
     compensator.step(commands(geometry)[0], 0.0)
+    limits, spaced_limits = geometry.limit_numbers.at, spaced.limit_numbers.at
     runs = {
-        "quaternion to rotation": repeated(read_pose, *[0.0] * 6, 1.0, np.empty(3), np.empty((3, 3))),
-        "nominal strut lengths": repeated(kernels.strut_lengths_one, *nominal),
-        "limits, each of two stages": repeated(check_stage, *nominal, geometry.limit_numbers),
-        "the same with a clearance": repeated(check_stage, *nominal, spaced.limit_numbers),
+        "a call into the core": from_python(lambda: lib.hc_version()),
+        "quaternion to rotation": from_python(lambda: lib.hc_read_pose(numbers, *pose)),
+        "nominal strut lengths, of eight": from_python(lambda: lib.hc_strut_lengths_many(*joints, 1, *pose, found)),
+        "limits, each of two stages": from_python(lambda: lib.hc_check_stage(*joints, *pose, found, limits, *out)),
+        "the same with a clearance": from_python(
+            lambda: lib.hc_check_stage(*joints, *pose, found, spaced_limits, *out)
+        ),
         "a temperature reading": from_python(lambda: compensator.set_temperature("strut_1", 20.5)),
     }
     return [Part(name, min(run() for _ in range(rounds))) for name, run in runs.items()]

@@ -1,7 +1,7 @@
 """Classification of single errors: every pose of a workspace × every single error, exact, and who else could do it.
 
 The effect of 48 single errors (lengths of six struts, their screws' pitch, 18 coordinates of base joints, 18
-of platform joints) at random poses about home, solved by our compiled kernels, by the iteration of v. Daake et al.
+of platform joints) at random poses about home, solved by our core, by the iteration of v. Daake et al.
 (Python, 0.01 mm a step, as the paper has it) and by a batch Newton in NumPy. The slow ones get a few of the
 same poses, and their time counts per effect.
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.kernels import kinematics as kernels
-from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
+from hexapod_comp.core import Status, batch
+from hexapod_comp.machine.kinematics import Structure, solve_one, strut_lengths_batch
 
 from . import cannot_run
 from .genhexkins import Genhexkins, NotHere, emc_poses, si_poses
@@ -24,9 +24,6 @@ from .poses import make_poses
 
 YAWS = np.arange(0.0, 86.0, 5.0)
 """Where convergence is looked at, degrees."""
-
-OUTCOMES = ("solved", "NOT_FINITE", "NOT_CONVERGED", "SINGULAR", "UNREACHABLE", "OTHER_ASSEMBLY")
-"""Names of the kernels' outcomes."""
 
 
 @dataclass(frozen=True)
@@ -77,11 +74,11 @@ def _ours(structure: Structure, lengths: np.ndarray, positions: np.ndarray, rota
     """Solve with the kernel from one guess each."""
     count = len(lengths)
     positions, rotations = positions.copy(), np.ascontiguousarray(rotations)
-    outcomes, iterations, conditions = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
+    outcomes, iterations, conditions = np.empty(count, np.intc), np.empty(count, np.intc), np.empty(count)
     limits = structure.characteristic_length, structure.home_sign, structure.max_condition
     problem = structure.base_joints, structure.platform_joints, lengths, positions, rotations
-    kernels.solve_pose_many(*problem, *limits, outcomes, iterations, conditions)
-    return _Answers(outcomes == kernels.OK, positions, rotations)
+    batch.solve_poses(*problem, *limits, outcomes, iterations, conditions)
+    return _Answers(outcomes == Status.OK, positions, rotations)
 
 
 def _theirs(module: Genhexkins, lengths: np.ndarray, positions: np.ndarray, rotations: np.ndarray) -> _Answers:
@@ -186,12 +183,14 @@ def _sprung(module: Genhexkins, title: str, structure: Structure, lengths: np.nd
     position = make_poses(1).home.position.copy()
     codes, poses = module.solved(lengths, emc_poses(position[None], rotation[None]))
     rotation = np.ascontiguousarray(rotation)
-    limits = structure.characteristic_length, structure.home_sign, structure.max_condition
-    joints = structure.base_joints, structure.platform_joints
-    outcome, _, _ = kernels.solve_pose_one(*joints, lengths[0], position, rotation, *limits)
+    outcome, _ = solve_one(structure, lengths[0], position, rotation)
     kept = np.isfinite(position).all() and np.isfinite(rotation).all()
     theirs = f"returns {codes[0]}, pose {'finite' if np.isfinite(poses).all() else 'NaN'}"
-    return Trap(title, f"{OUTCOMES[outcome]}, pose {'finite' if kept else 'NaN'}", theirs)
+    return Trap(
+        title,
+        f"{'solved' if outcome == Status.OK else Status(outcome).name}, pose {'finite' if kept else 'NaN'}",
+        theirs,
+    )
 
 
 def report(rows: list[Convergence], worth: Honesty, caught: list[Trap]) -> str:

@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.kernels import kinematics as kernels
 from hexapod_comp.machine.kinematics import Structure
 
+from .peers import STEP_TOLERANCE
 from .poses import NEAR, WIDE, Contender, Poses, joined
 
 NAME = "LinuxCNC genhexkins"
@@ -34,7 +34,7 @@ CRITERION = 1e-9
 """Its own default: it ends when every strut was right to this, mm, before the last step. Its steps shrink by a constant
 factor each, so its answers are about as good as this; ours converges quadratically."""
 
-LOOSE_CRITERION = kernels.STEP_TOLERANCE / MM
+LOOSE_CRITERION = STEP_TOLERANCE / MM
 """What ours calls a last step, 1e-8 m, mm: genhexkins is quicker with it, and its answers are worse."""
 
 ANY_ERROR = 1e9

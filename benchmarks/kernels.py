@@ -13,10 +13,11 @@ import statistics
 import sys
 import time
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
-from hexapod_comp.kernels import kinematics as kernels
+from hexapod_comp.core import batch, lib
 from hexapod_comp.machine.kinematics import solve_pose, solve_poses, strut_lengths, strut_lengths_batch
 from hexapod_comp.pose import Pose
 
@@ -54,16 +55,23 @@ class Result:
 # --- ours --------------------------------------------------------------------------------------------------
 
 
+def _pointers(row: int, *arrays: np.ndarray) -> list[Any]:
+    """Return what the core takes of one row of each array: checked before the clock runs."""
+    parts = [array[row : row + 1] for array in arrays]
+    return [batch.written("row", part, *part.shape, kind=part.dtype) for part in parts]
+
+
 def our_inverse(poses: Poses) -> list[Contender]:
     """Kernel and checked call, one by one."""
     joints = poses.structure.base_joints, poses.structure.platform_joints
     as_poses = [Pose(p, r) for p, r in zip(poses.positions, poses.rotations, strict=True)]
     count, lengths = len(as_poses), np.empty((len(as_poses), 6))
-    rows = list(zip(poses.positions, poses.rotations, lengths, strict=True))
+    given = [batch.given("joints", part, 6, 3) for part in joints]
+    rows = [(*_pointers(n, poses.positions, poses.rotations), *_pointers(n, lengths)) for n in range(count)]
 
     def kernel() -> None:
-        for position, rotation, found in rows:
-            kernels.strut_lengths_one(*joints, position, rotation, found)
+        for row in rows:
+            lib.hc_strut_lengths_many(*given, 1, *row)
 
     def checked() -> np.ndarray:
         return np.array([strut_lengths(poses.structure, pose) for pose in as_poses])
@@ -81,7 +89,7 @@ def our_inverse_batch(poses: Poses) -> list[Contender]:
     lengths = np.empty((count, 6))
 
     def kernel() -> None:
-        kernels.strut_lengths_many(*joints, poses.positions, poses.rotations, lengths)
+        batch.strut_lengths(*joints, poses.positions, poses.rotations, lengths)
 
     def checked() -> np.ndarray:
         return strut_lengths_batch(poses.structure, poses.positions, poses.rotations, threads=1)
@@ -98,12 +106,15 @@ def our_forward(task: str, poses: Poses) -> list[Contender]:
     joints = structure.base_joints, structure.platform_joints
     limits = structure.characteristic_length, structure.home_sign, structure.max_condition
     positions, rotations = np.empty((count, 3)), np.empty((count, 3, 3))
-    rows = list(zip(poses.lengths, positions, rotations, strict=True))
+    outcomes, iterations, conditions = np.empty(count, np.intc), np.empty(count, np.intc), np.empty(count)
+    given = [batch.given("joints", part, 6, 3) for part in joints]
+    rows = [_pointers(n, poses.lengths, positions, rotations) for n in range(count)]
+    results = [_pointers(n, outcomes, iterations, conditions) for n in range(count)]
 
     def kernel() -> None:
         positions[:], rotations[:] = home.position, home.rotation
-        for lengths, position, rotation in rows:
-            kernels.solve_pose_one(*joints, lengths, position, rotation, *limits)
+        for row, result in zip(rows, results, strict=True):
+            lib.hc_solve_pose_many(*given, 1, *row, *limits, *result)
 
     def checked() -> np.ndarray:
         found = [solve_pose(structure, lengths, home) for lengths in poses.lengths]
@@ -120,12 +131,12 @@ def our_forward_batch(task: str, poses: Poses) -> list[Contender]:
     structure, home, count = poses.structure, poses.home, len(poses.positions)
     limits = structure.characteristic_length, structure.home_sign, structure.max_condition
     positions, rotations = np.empty((count, 3)), np.empty((count, 3, 3))
-    outcomes, iterations, conditions = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
+    outcomes, iterations, conditions = np.empty(count, np.intc), np.empty(count, np.intc), np.empty(count)
 
     def kernel() -> None:
         positions[:], rotations[:] = home.position, home.rotation
         problem = structure.base_joints, structure.platform_joints, poses.lengths, positions, rotations
-        kernels.solve_pose_many(*problem, *limits, outcomes, iterations, conditions)
+        batch.solve_poses(*problem, *limits, outcomes, iterations, conditions)
 
     def checked() -> np.ndarray:
         found = solve_poses(structure, poses.lengths, home, threads=1)

@@ -4,8 +4,7 @@
 
 A mutant is a copy of the sources with one operator, ``not``, number, returned value or statement changed, drawn at
 random from all such places. The tests that concern its file run until one fails: it is killed, also when they run out
-of time. Mutants of kernels run as plain Python first, without the tests that need compiled code, since compiling takes
-a minute; one that survives so is compiled. ``--only`` repeats mutants by their numbers, as after a new test.
+of time. ``--only`` repeats mutants by their numbers, as after a new test.
 Exits 1 when fewer than 95 % are killed. What it does is explained in doc/benchmarks.md.
 """
 
@@ -26,7 +25,6 @@ from pathlib import Path
 
 # What all tests import, loaded once: each mutant has a fork of this process.
 import hypothesis  # noqa: F401
-import numba
 import pytest
 import scipy.optimize
 import scipy.spatial.transform  # noqa: F401
@@ -35,28 +33,20 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "hexapod_comp"
 FOLDER = ROOT / "out" / "mutants"
 CORE = ("pose.py", "calibration/linear_problem.py", "calibration/sensitivity.py", "calibration/selection.py")
-CORE += ("machine/*.py", "compensation/*.py", "kernels/*.py")
-NOT_CORE = {"pictures.py", "compiling.py"}
+CORE += ("machine/*.py", "compensation/*.py")
+NOT_CORE = {"pictures.py"}
 
 TESTS = {
     "pose.py": ["test_pose.py", "nodes/test_conversions.py", "machine"],
     "machine": ["machine", "compensation", "virtual/test_simulation.py"],
     "compensation": ["compensation", "machine/test_limits.py", "replay", "virtual/test_simulation.py"],
-    "kernels": [
-        "machine/test_kinematics.py",
-        "machine",
-        "nodes/test_conversions.py",
-        "compensation",
-        "virtual",
-        "kernels",
-    ],
     "calibration": ["calibration/test_sensitivity.py", "calibration/test_fit.py", "calibration/test_observability.py"],
 }
 """Where a room's tests are, from near to far; before them run those whose file has the mutated module's name."""
 
 BAR = 0.95
-SHORT, LIMIT = 0.2, 20.0
-"""Processor time, s: of a test without a mutant to be worth running as plain Python, and of any test with one."""
+LIMIT = 20.0
+"""Processor time of a test with a mutant, s."""
 
 FAILURES = ("FAILED", "ERROR")
 """How the lines of pytest's summary begin that name a test."""
@@ -148,12 +138,10 @@ class ProcessorTime:
 
 
 class Copy:
-    """A copy of sources and tests with one mutant at a time; its compiled kernels stay for the next run."""
+    """A copy of sources and tests with one mutant at a time."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.left_out: list[str] = []
-        self.cache = "compiled"
         for path in ROOT.iterdir():
             if path.is_dir() and path.name[0] != "." and path.name not in ("out", "build", "install", "log"):
                 shutil.rmtree(folder / path.name, ignore_errors=True)
@@ -161,39 +149,29 @@ class Copy:
             elif path.is_file():
                 shutil.copy2(path, folder)
 
-    def leave_out(self) -> None:
-        """Leave out the tests of kernels that fail as plain Python without a mutant, or take long."""
-        lines = self._run(TESTS["kernels"], False, SHORT, "--tb=no").splitlines()
-        self.left_out = [f"--deselect={line.split()[1]}" for line in lines if line.startswith(FAILURES)]
-        print(f"kernels as plain Python, {len(self.left_out)} tests left out: {lines[-1]}", flush=True)
-
-    def failure(self, tests: list[str], compiled: bool) -> str:
+    def failure(self, tests: list[str]) -> str:
         """Return what failed first, or "" where nothing does."""
-        lines = self._run(tests, compiled, LIMIT, "-x", "--tb=no", *([] if compiled else self.left_out)).splitlines()
+        lines = self._run(tests, LIMIT, "-x", "--tb=no").splitlines()
         failed = [line for line in lines if line.startswith(FAILURES)]
         last = lines[-1] if lines else "no output"
         return failed[0] if failed else "" if " passed" in last and "error" not in last else last
 
-    def _run(self, tests: list[str], compiled: bool, limit: float, *options: str) -> str:
+    def _run(self, tests: list[str], limit: float, *options: str) -> str:
         """Return what pytest prints in a process of its own, which has the libraries but nothing of the project."""
         arguments = ["-q", "-p", "no:cacheprovider", "-o", "timeout=0", *options]
         arguments += dict.fromkeys(f"test/{test}" for test in tests)
         with tempfile.TemporaryFile("w+") as output:
-            child = get_context("fork").Process(
-                target=self._in_child, args=(arguments, compiled, limit, output.fileno())
-            )
+            child = get_context("fork").Process(target=self._in_child, args=(arguments, limit, output.fileno()))
             child.start()
             child.join()
             output.seek(0)
             return output.read()
 
-    def _in_child(self, arguments: list[str], compiled: bool, limit: float, output: int) -> None:
+    def _in_child(self, arguments: list[str], limit: float, output: int) -> None:
         os.dup2(output, 1)
         os.dup2(output, 2)
         os.chdir(self.folder)
-        numba.config.DISABLE_JIT = not compiled
-        numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = str(self.folder / self.cache)
-        os.environ |= {"PYTHONPATH": str(self.folder), "NUMBA_DISABLE_JIT": "0" if compiled else "1"}
+        os.environ["PYTHONPATH"] = str(self.folder)
         sys.path.insert(0, str(self.folder))
         code = pytest.main(arguments, plugins=[ProcessorTime(limit)])
         sys.stdout.flush()
@@ -206,12 +184,10 @@ class Copy:
         room = path.relative_to(PACKAGE).parts[0]
         own = [str(test.relative_to(ROOT / "test")) for test in (ROOT / "test").rglob(f"test_{path.stem}.py")]
         parts = [[test] for test in dict.fromkeys(own + TESTS[room])]
-        compiled = [False, True] if room == "kernels" else [True]
-        self.cache = "compiled-mutant" if room == "kernels" else "compiled"
         setattr(node, field, value)
         try:
             place.write_text(ast.unparse(ast.fix_missing_locations(tree)), encoding="utf-8")
-            return next(filter(None, (self.failure(part, way) for way in compiled for part in parts)), "")
+            return next(filter(None, map(self.failure, parts)), "")
         finally:
             setattr(node, field, was)
             shutil.copy2(path, place)
@@ -233,8 +209,6 @@ def main() -> int:
     survived = 0
     FOLDER.mkdir(parents=True, exist_ok=True)
     copy = Copy(FOLDER)
-    if any(path.parent.name == "kernels" for _, (path, _) in chosen):
-        copy.leave_out()
     for number, (path, mutant) in chosen:
         began, what = time.monotonic(), describe(path, mutant)
         by = copy.killed_by(path, trees[path], mutant)

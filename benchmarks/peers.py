@@ -6,10 +6,12 @@ import numpy as np
 from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.kernels import kinematics as kernels
 from hexapod_comp.machine.kinematics import Structure
 
 from .poses import WIDE, Contender, Poses, joined
+
+STEP_TOLERANCE = 1e-8
+"""Where the core's Newton stops, m and rad: the others get the same criterion."""
 
 # --- NumPy and SciPy ---------------------------------------------------------------------------------------
 
@@ -43,7 +45,7 @@ def numpy_newton(poses: Poses, wanted: np.ndarray) -> np.ndarray:
         step = np.linalg.solve(matrix, (wanted - lengths)[..., None])[..., 0]
         position += step[..., :3]
         rotation = Rotation.from_rotvec(step[..., 3:]).as_matrix() @ rotation
-        if np.abs(step).max() < kernels.STEP_TOLERANCE:
+        if np.abs(step).max() < STEP_TOLERANCE:
             break
     return np.concatenate([position, rotation.reshape(*wanted.shape[:-1], 9)], axis=-1)
 

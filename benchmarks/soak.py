@@ -295,12 +295,11 @@ def report(found: Soak) -> list[str]:
     for index, node in enumerate(NODES):
         slope, error = found.growth(index)
         collections = [note["seconds"] for note in found.notes[node] if note["kind"] == "gc"]
-        compiled = [note["name"] for note in found.notes[node] if note["kind"] == "compile"]
         lines.append(
             f"{node}: {found.memory[-1][1 + index] * 1e-6:.1f} MB, "
             f"{slope:+.2f} ± {2 * error:.2f} MB/h after warming up; "
             f"{len(collections)} garbage collections, longest {max(collections, default=0.0) * 1e6:.0f} µs; "
-            f"compiled {len(compiled)}; waited {found.waited[node]:.2f} s for a processor"
+            f"waited {found.waited[node]:.2f} s for a processor"
         )
     lines.append("longest latencies, ms, and how long each process waited for a processor in the second around them:")
     for gap in found.worst:

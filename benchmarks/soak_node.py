@@ -13,17 +13,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-from numba.core import event
-
 
 class Notes:
-    """Writes collections of the garbage collector and compilations of Numba, with CLOCK_MONOTONIC, as JSON lines."""
+    """Writes collections of the garbage collector, with CLOCK_MONOTONIC, as JSON lines."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("w", encoding="utf-8", buffering=1)
         self._began = 0.0
         gc.callbacks.append(self._on_collection)
-        event.register("numba:compile", _Compilations(self))
 
     def write(self, **values: Any) -> None:
         """Write one line."""
@@ -35,21 +32,6 @@ class Notes:
             return
         now = time.monotonic()
         self.write(kind="gc", at=now, seconds=now - self._began, generation=info["generation"])
-
-
-class _Compilations(event.Listener):
-    """Tells notes of what Numba compiles."""
-
-    def __init__(self, notes: Notes) -> None:
-        self._notes = notes
-
-    def on_start(self, event: event.Event) -> None:
-        """Note who is compiled: from here on the loop would stand."""
-        name = event.data["dispatcher"].py_func.__qualname__
-        self._notes.write(kind="compile", at=time.monotonic(), name=name)
-
-    def on_end(self, event: event.Event) -> None:
-        """Nothing: the start says it all."""
 
 
 def main() -> int:

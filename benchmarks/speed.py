@@ -24,7 +24,7 @@ from .speed_picture import speed_picture
 from .speed_text import page
 
 DOC = Path(__file__).resolve().parents[1] / "doc"
-PACKAGES = ("numpy", "scipy", "numba", "mujoco", "mujoco-core", "pin", "ros-jazzy-rclpy")
+PACKAGES = ("numpy", "scipy", "mujoco", "mujoco-core", "pin", "ros-jazzy-rclpy")
 
 
 @dataclass

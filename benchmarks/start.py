@@ -1,4 +1,4 @@
-"""How long the nodes take until they are ready, with a warm cache of compiled kernels.
+"""How long the nodes take until they are ready.
 
 Usage: python -m benchmarks.start [--starts 5]; exits 1 when the median is above the bar.
 """

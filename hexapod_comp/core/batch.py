@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from . import ffi, lib
+from . import Struct, ffi, lib
 
 QUANTITIES = np.dtype(
     [
@@ -414,3 +414,25 @@ def settle(circles: np.ndarray, sides: np.ndarray, angles: np.ndarray, points: n
         written("points", points, count, 3, 3),
         written("errors", errors, count),
     )
+
+
+def run_drives(drives: Struct, commands: np.ndarray, ticks: int, sense: np.ndarray) -> None:
+    """Run six drives, ``hc_drives``, for some ticks towards commands, m, (6,); write the struts' part of `sense`, (9,).
+
+    What ``stopped`` already says stays. A drive brakes for its stops as for any command; what still runs into one (a
+    jump, a command turned round too late) is stopped there dead.
+    """
+    lib.hc_run_drives(drives.at, given("commands", commands, 6), ticks, written("sense", sense, 9))
+
+
+def follow_point(
+    position: np.ndarray,
+    rotation: np.ndarray,
+    probe: np.ndarray,
+    threshold: float,
+    low: np.ndarray,
+    sense: np.ndarray,
+) -> None:
+    """Follow the measured point of a platform pose along the three axes, see :mod:`hexapod_comp.machine.motion`."""
+    motion = written("low", low, 9), written("sense", sense, 9)
+    lib.hc_follow_point(pose_of(position, rotation), given("probe", probe, 3), threshold, *motion)

@@ -1,6 +1,6 @@
 """Forward kinematics without a guess: every assembly mode of a 6-3 machine, and the pick of the working one.
 
-:mod:`hexapod_comp.machine.elimination` finds where to look, :mod:`hexapod_comp.kernels.assembly` closes the
+:mod:`hexapod_comp.machine.elimination` finds where to look, :mod:`hexapod_comp.machine.triangles` closes the
 loops from there; this module makes poses of the triangles, continues them to real structures, and picks. The modes
 of other machines, of which there may be forty, are sought by Newton from some thousand poses all around.
 """
@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from ..core import Status, batch
 from ..errors import KinematicsError, OtherAssemblyModeError, SingularError, UnreachableError
-from ..kernels.assembly import closed_triangles
 from ..pose import Pose, rotation_angle
 from .elimination import joint_circles, start_angles
 from .geometry import HexapodGeometry
 from .kinematics import Structure, jacobian, six_lengths, solve_one, solve_poses
+from .triangles import closed_triangles
 
 CLOSURE = 1e-12
 """Largest error of a strut length or of a platform side in a mode, relative to the longest strut."""

@@ -11,7 +11,7 @@ of given sides. So three angles meet three distances, |T_i − T_j| = a_ij (doc/
   roots z = e^{iφ1}, those of a machine that can be put together lie on |z| = 1.
 
 N is sampled, not expanded: a Fourier transform gives its coefficients, a companion matrix its roots. They
-only start the search (:mod:`hexapod_comp.kernels.assembly`); so a root that rounding has pushed off the
+only start the search (:mod:`hexapod_comp.machine.triangles`); so a root that rounding has pushed off the
 circle (double roots: singular poses) is not lost. The elimination is done about each of the three joints in
 turn, so that a root that is badly conditioned in one angle is found through another.
 

@@ -12,9 +12,9 @@ from collections import deque
 
 import numpy as np
 
+from ..core import Status, Struct
+from ..core.batch import follow_point, run_drives
 from ..errors import CommandError, ModelError
-from ..kernels import kinematics as kernels
-from ..kernels.drives import follow_point, run_struts
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import forward_error
 from ..machine.model import RealMachine
@@ -70,20 +70,28 @@ class StrutDrive:
     def _set_up_struts(self) -> None:
         p = self.parameters
         self._commands = np.array(p.initial_lengths)
-        self._stops = np.array(p.stops)
-        self._position = self._commands.copy()
-        self._speed = np.zeros(6)
-        self._motor = to_step(self._commands, p.step)
-        self._half_play = 0.5 * self.machine.model.struts.largest_backlash
-        self._play = np.zeros(6)
-        self._stuck, self._stopped = np.zeros(6, bool), np.zeros(6, bool)
+        at_rest = {
+            "tick": self._tick,
+            "lag": p.lag,
+            "max_speed": p.max_speed,
+            "max_acceleration": p.max_acceleration,
+            "step": p.step,
+            "stops": p.stops,
+            "half_play": 0.5 * self.machine.model.struts.largest_backlash,
+            "position": self._commands,
+            "motor": to_step(self._commands, p.step),
+        }
+        self._drives = Struct("hc_drives", at_rest)
+        drives = self._drives.view
+        self._position, self._speed, self._motor = drives["position"], drives["speed"], drives["motor"]
+        self._play, self._stuck, self._stopped = drives["play"], drives["stuck"], drives["stopped"]
 
     def _set_up_pose(self, geometry: HexapodGeometry) -> None:
         self._motion = MotionState()
         self._model_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
         self._true_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
         self._commanded_pose = geometry.home.position.copy(), geometry.home.rotation.copy()
-        self._outcome, self._condition = kernels.OK, math.nan
+        self._outcome, self._condition = Status.OK, math.nan
         work = geometry.work.inverse()
         self._work = work.position, work.rotation
         self._tool = geometry.tool.position, geometry.tool.rotation
@@ -117,7 +125,7 @@ class StrutDrive:
     @property
     def stopped(self) -> np.ndarray:
         """Which motors the last advance found at a stop, asked or knocked to go on; bool, shape (6,)."""
-        return self._stopped.copy()
+        return self._stopped != 0
 
     def set_command(self, lengths: np.ndarray) -> None:
         """Take six strut commands; lengths beyond a stop are taken, and reported by :attr:`stopped`.
@@ -171,25 +179,7 @@ class StrutDrive:
 
     def _run(self, ticks: int) -> None:
         """Run the drives for some ticks, then find where that puts the platform."""
-        p = self.parameters
-        run_struts(
-            ticks,
-            self._tick,
-            p.lag,
-            p.max_speed,
-            p.max_acceleration,
-            p.step,
-            self._commands,
-            self._stops,
-            self._stuck,
-            self._half_play,
-            self._position,
-            self._speed,
-            self._motor,
-            self._play,
-            self._stopped,
-            self._motion.sense,
-        )
+        run_drives(self._drives, self._commands, ticks, self._motion.sense)
         self._locate(self._motor, self._model_pose)
 
     def _locate(self, lengths: np.ndarray, model_pose: tuple[np.ndarray, np.ndarray]) -> None:
@@ -206,7 +196,7 @@ class StrutDrive:
         direction.
         """
         self._locate(self._commands, self._commanded_pose)
-        if self._outcome == kernels.OK:
+        if self._outcome == Status.OK:
             model, motion = self.machine.model, self._motion
             threshold, probe = model.field.reversal_threshold, model.field.probe
             follow_point(*self._commanded_pose, probe, threshold, motion.low, motion.sense)
@@ -291,5 +281,5 @@ class StrutDrive:
         return Pose(origin + axes @ (position + rotation @ offset) + noise, axes @ rotation @ turn)
 
     def _refuse_impossible(self) -> None:
-        if self._outcome != kernels.OK:
+        if self._outcome != Status.OK:
             raise forward_error(self._outcome, self._condition, self.machine.structure.max_condition)

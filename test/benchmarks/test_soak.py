@@ -1,7 +1,7 @@
 """Five seconds of what ``python -m benchmarks.soak`` does for half an hour, and that its account is right.
 
 No latency is judged here: other jobs decide it on a shared machine. What is judged holds on any: a command
-without an answer has been counted, and nothing is compiled or hoarded while the machine moves.
+without an answer has been counted, and nothing is hoarded while the machine moves.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from benchmarks.soak import BINS, NODES, Soak, soak
+from benchmarks.soak import BINS, Soak, soak
 
 SECONDS = 5.0
 
@@ -23,7 +23,6 @@ def test_five_seconds_at_1_khz():
     assert found.lost <= counted
     assert found.heartbeats > 10.0 * SECONDS  # of 50 a second
     assert found.histogram.sum() == found.commands - found.lost
-    assert [note["name"] for node in NODES for note in found.notes[node] if note["kind"] == "compile"] == []
     memory = np.array(found.memory)[:, 1:]
     assert (memory[-1] - memory[len(memory) // 2]).max() < 1e6, "an hour of that would be more than 1.4 GB"
 

@@ -1,6 +1,6 @@
 """Forward kinematics is never wrong silently: whatever it is given, its answer holds or it raises.
 
-Every answer is judged by NumPy's linear algebra on the joints, not by the kernels. Hypothesis runs
+Every answer is judged by NumPy's linear algebra on the joints, not by the core. Hypothesis runs
 derandomised, so that a red test is red for everybody.
 """
 
@@ -15,10 +15,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import fixed, paper_geometry, seeds
 
+from hexapod_comp.core import Status
 from hexapod_comp.errors import KinematicsError, NotFiniteError, OtherAssemblyModeError
-from hexapod_comp.kernels import kinematics as kernels
 from hexapod_comp.machine.geometry import HexapodGeometry
-from hexapod_comp.machine.kinematics import Structure, solve_pose, solve_poses, strut_lengths, strut_lengths_batch
+from hexapod_comp.machine.kinematics import (
+    Structure,
+    solve_one,
+    solve_pose,
+    solve_poses,
+    strut_lengths,
+    strut_lengths_batch,
+)
 from hexapod_comp.pose import Pose
 
 MACHINES = [paper_geometry(), general_machine(), three_two_one_machine()]
@@ -113,23 +120,14 @@ def test_any_guess(machine: HexapodGeometry, guess: Pose) -> None:
 
 @fixed
 @given(machines, st.lists(any_float, min_size=18, max_size=18))
-def test_anything_at_all_in_the_kernel(machine: HexapodGeometry, numbers: list[float]) -> None:
-    """No check stands before the kernel here: lengths, position and rotation are any 18 floats."""
+def test_anything_at_all_in_the_core(machine: HexapodGeometry, numbers: list[float]) -> None:
+    """No check stands before the core here: lengths, position and rotation are any 18 floats."""
     structure = Structure.of(machine)
     lengths, position, rotation = np.split(np.array(numbers), [6, 9])
     rotation = rotation.reshape(3, 3)
     before = position.copy(), rotation.copy()
-    outcome, _, _ = kernels.solve_pose_one(
-        structure.base_joints,
-        structure.platform_joints,
-        lengths,
-        position,
-        rotation,
-        structure.characteristic_length,
-        structure.home_sign,
-        structure.max_condition,
-    )
-    if outcome == kernels.OK:
+    outcome, _ = solve_one(structure, lengths, position, rotation)
+    if outcome == Status.OK:
         judge(machine, structure, lengths, Pose(position, rotation))
     else:
         np.testing.assert_array_equal(position, before[0])
@@ -187,7 +185,7 @@ def test_the_target_itself_between_100000_pairs_in_the_box() -> None:
         found = solve_poses(structure, lengths, pose_in_box(machine, 10_000 + group), threads=1)
         assert np.abs(found.positions - positions)[found.ok].max() <= 1e-12
         assert np.abs(found.rotations - rotations)[found.ok].max() <= 1e-12
-        assert np.isin(found.outcomes, (kernels.OK, kernels.OTHER_ASSEMBLY)).all()
+        assert np.isin(found.outcomes, (Status.OK, Status.OTHER_ASSEMBLY)).all()
         answers += int(found.ok.sum())
     assert answers >= 99_900
 
