@@ -511,6 +511,9 @@ hc_status hc_check(const hc_state *state, const hc_model *model, hc_answer *answ
         trial.last.correction[i] = NAN;
         trial.last.command[i] = NAN;
         trial.last.ramp[i] = 0.0;
+        trial.last.ahead_by_stamp[i] = 0.0;
+        trial.last.ahead_by_receipt[i] = 0.0;
+        trial.last.smooth_speed[i] = 0.0; /* that the struts move now is no acceleration of the correction's */
     }
     trial.last.time = NAN;
     trial.last.received = NAN;

@@ -135,6 +135,17 @@ def test_a_constant_acceleration_passes_as_what_it_is():
             compensator.step(at(rise_of(0.05 * period)), 2.0 * period)
 
 
+def test_compensation_is_switched_on_and_a_model_is_taken_while_struts_move():
+    """What they move with is no acceleration of the correction; the C core had refused both."""
+    compensator = ideal(acceleration=2.0)
+    for n in range(40):
+        compensator.step(at(rise_of(0.5 * 1.9 * (1e-3 * n) ** 2)), 1e-3 * n)
+    compensator.enable(False)
+    compensator.enable(True)
+    compensator.set_model(compensator.model)
+    assert compensator.enabled
+
+
 def test_without_times_there_is_no_speed():
     """Single poses in Python: only a step is too far."""
     compensator = ideal()
