@@ -171,6 +171,19 @@ def angles_from_rotation(rotation: np.ndarray) -> np.ndarray:
     return np.stack([alpha, beta, gamma], axis=-1)
 
 
+def roll_pitch_yaw(rotation: np.ndarray) -> np.ndarray:
+    """Return URDF's angles about fixed axes, R = Rz(yaw)·Ry(pitch)·Rx(roll); radians, shape (3,).
+
+    At a pitch of ±90° only yaw ± roll is determined; yaw is then whatever rounding leaves, and roll fits it.
+    """
+    r = np.asarray(rotation, dtype=float)
+    yaw = math.atan2(r[1, 0], r[0, 0])
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    pitch = math.atan2(-r[2, 0], cosine * r[0, 0] + sine * r[1, 0])
+    roll = math.atan2(sine * r[0, 2] - cosine * r[1, 2], cosine * r[1, 1] - sine * r[0, 1])
+    return np.array([roll, pitch, yaw])
+
+
 def rotation_angle(rotation: np.ndarray) -> float:
     """Return the angle of a rotation matrix, radians in [0, π]."""
     *vector, scalar = quaternion_of(rotation)

@@ -11,7 +11,14 @@ from scipy.spatial.transform import Rotation
 from strategies import fixed
 
 from hexapod_comp.errors import PoseError
-from hexapod_comp.pose import Pose, angles_from_rotation, best_motion, rotation_angle, rotation_from_angles
+from hexapod_comp.pose import (
+    Pose,
+    angles_from_rotation,
+    best_motion,
+    roll_pitch_yaw,
+    rotation_angle,
+    rotation_from_angles,
+)
 
 turns = st.floats(-np.pi, np.pi)
 tilts = st.floats(-1.5, 1.5)
@@ -202,3 +209,12 @@ def test_the_best_motion_takes_points_back_to_where_they_came_from(seed):
 def test_points_in_a_line_have_no_best_motion(count):
     line = np.linspace(0.0, 1.0, count)[:, None] * [0.1, 0.2, -0.3] + [1.0, 2.0, 3.0]
     assert best_motion(line + 1e-4, line) is None
+
+
+@pytest.mark.parametrize("pitch", [0.3, -1.2, 0.5 * np.pi, -0.5 * np.pi])
+def test_roll_pitch_yaw_give_the_rotation_back(pitch: float) -> None:
+    """Truth: SciPy's rotation from angles about fixed axes; at a pitch of 90° too, where they are not unique."""
+    for roll, yaw in ((0.0, 0.0), (0.4, -2.5), (-3.0, 1.1)):
+        rotation = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
+        again = Rotation.from_euler("xyz", roll_pitch_yaw(rotation)).as_matrix()
+        np.testing.assert_allclose(again, rotation, atol=1e-15)

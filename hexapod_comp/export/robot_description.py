@@ -17,7 +17,7 @@ from ..core.single import quaternion_of
 from ..machine.frames import BASE
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import strut_lengths
-from ..pose import Pose
+from ..pose import Pose, roll_pitch_yaw
 
 PLATFORM_JOINTS = ("platform_x", "platform_y", "platform_z", "platform_beta", "platform_alpha", "platform_gamma")
 """In their order from base to platform: R = Ry(β)·Rx(α)·Rz(γ) (Song et al., T_BASE^TOP)."""
@@ -278,10 +278,7 @@ def _joint(
 ) -> None:
     joint = ET.SubElement(robot, "joint", name=name, type=kind)
     if at is not None:
-        from scipy.spatial.transform import Rotation  # 27 MB that a node, which only wants the joints, does without
-
-        angles = Rotation.from_matrix(at.rotation).as_euler("xyz")  # roll, pitch, yaw about fixed axes
-        ET.SubElement(joint, "origin", xyz=_numbers(at.position), rpy=_numbers(angles))
+        ET.SubElement(joint, "origin", xyz=_numbers(at.position), rpy=_numbers(roll_pitch_yaw(at.rotation)))
     for role, link in zip(("parent", "child"), links, strict=True):
         ET.SubElement(joint, role, link=link)
     if axis is not None:
