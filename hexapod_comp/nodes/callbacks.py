@@ -68,6 +68,8 @@ class Alarm:
                     self._change.wait(None if left == float("inf") else left)
                 else:
                     executor = self._node.executor  # that of Jazzy knows no guard conditions
+                    if executor is not None and self._node not in executor.get_nodes():
+                        executor = None
                     self._due = float("inf") if executor is not None else time.monotonic() + 0.1
                     if executor is not None:
                         executor.create_task(self._callback)

@@ -25,10 +25,10 @@ IN_FLIGHT = 0.5
 """For this long after a step of the clock, s, messages that were stamped before it may still arrive."""
 
 EARLY = 2_000_000
-"""No message is younger than its sender's youngest by more than this, ns."""
+"""No message is from the future by more than this, ns, or than its sender's messages are, where it stamps ahead."""
 
-LEAST_RISES = 1e6
-"""How fast the age of a sender's youngest message is forgotten, ns/s: clocks drift apart by a tenth of that."""
+LEAD_SHRINKS = 1e6
+"""How fast it is forgotten how far a sender stamps ahead, ns/s: clocks drift apart by a tenth of that."""
 
 RUN, RUN_LASTS = 3, 0.02
 """This many messages that are in order among themselves and arrive over this time, s, were not overtaken: their
@@ -137,10 +137,10 @@ class StampGate:
     """Lets one sender's messages pass by their stamps: none too old or from the future, none overtaken.
 
     Sender and node may share a clock that is set, back or forward, while messages are on their way. Then a stamp may
-    be one of the old setting or of the new one, unless that would make the message younger than its sender's ever are:
-    messages come late, but none comes before it was sent. It is the one that follows closest on the last message's. So
-    a step of the clock shuts nothing out, and lets no overtaken message pass. A sender whose clock is set while the
-    node's is not shows itself by a run of messages in order.
+    be one of the old setting or of the new one, unless that would put the message into the future, further than its
+    sender stamps ahead: messages come late, but none comes before it was sent. It is the one that follows closest on
+    the last message's. So a step of the clock shuts nothing out, and lets no overtaken message pass. A sender whose
+    clock is set while the node's is not shows itself by a run of messages in order.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ class StampGate:
         self._shift = self._checked_shift = clock.shift
         self._run, self._run_since, self._run_made = 0, 0.0, 0
         self._then = -float("inf")
-        self._least: int | None = None  # the youngest age of the sender's messages, ns
+        self._lead = 0  # how far the sender stamps ahead, ns
 
     def check(self, stamp: int, now: float) -> float:
         """Check a stamp, ns, at the monotonic time `now`, s; return how old it is, s, 0 where it may be any age.
@@ -205,7 +205,7 @@ class StampGate:
         if not stamp:
             return
         elapsed = min(max(0.0, now - self._then), FORGET_ORDER_AFTER)
-        self._least = self._age if self._least is None else min(self._age, self._least + round(LEAST_RISES * elapsed))
+        self._lead = max(-self._age, self._lead - round(LEAD_SHRINKS * elapsed), 0)
         self._shift, self._then = self._checked_shift, now
         self._made = stamp - self._shift
         if self._capped:
@@ -213,7 +213,7 @@ class StampGate:
 
     def forget(self) -> None:
         """Forget the order: the next stamp may be any."""
-        self._then, self._least, self._run = -float("inf"), None, 0
+        self._then, self._lead, self._run = -float("inf"), 0, 0
 
     def _read_by(self, stamp: int, ordered: bool) -> None:
         """Find out by which setting of the clock a stamp was made, and how old it is then, ns."""
@@ -225,7 +225,7 @@ class StampGate:
             self._checked_shift = own
             return
         ages = {age - clock.shift + shift: shift for shift in {clock.shift, own, *before}}
-        possible = {age: shift for age, shift in ages.items() if age >= (self._least or 0) - EARLY}
+        possible = {age: shift for age, shift in ages.items() if age >= -self._lead - EARLY}
         self._age = min(possible, default=max(ages))
         # The stamp that follows closest on the last one's: what waited while the node stood still comes in turn.
         made = sorted((stamp - shift, shift) for shift in possible.values() or ages.values())

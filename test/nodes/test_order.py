@@ -84,7 +84,7 @@ def test_a_strut_that_is_away_for_one_reading_is_said(bench):
         bench.feed(answer.lengths + off * (np.arange(6) == 3), later=0.03 * n)
         bench.barrier()
     bench.until_status(ERROR, "refusing commands: following_error: strut_4")
-    assert bench.status().message.endswith("bad feedback: following_error")
+    assert "bad feedback: following_error" in bench.status().message  # behind it, on a busy computer, what is late
     assert "strut_4" in bench.values()["last_bad_feedback"]
 
 

@@ -159,6 +159,20 @@ def test_a_step_while_the_node_stands_still_splits_what_waits_where_it_was_made(
         gate.accept(stamp, clock.now)
 
 
+@pytest.mark.parametrize("step", [-3600.0, -0.3, 0.3, 3600.0])
+def test_a_command_that_is_faster_than_the_only_one_before_is_read_by_the_new_setting(step):
+    """The first was on its way for 20 ms on a busy computer, the next for 1 ms, and the clock was set between."""
+    clock = TestClock()
+    gate = StampGate("command", clock.watch, 0.5)
+    for late in (20 * MS, MS):
+        stamp = clock.system()
+        clock.steady += late
+        assert gate.check(stamp, clock.now) == pytest.approx(late * 1e-9)
+        gate.accept(stamp, clock.now)
+        clock.ahead += round(step * SECOND)
+        clock.steady += 50 * MS
+
+
 def test_a_step_in_a_pause_counts_too_and_slewing_and_a_slow_read_do_not():
     clock = TestClock()
     for _ in range(3000):  # an hour at NTP's largest rate, 500 ppm

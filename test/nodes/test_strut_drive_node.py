@@ -415,14 +415,14 @@ def test_misspelt_parameter_is_warned_of(bench):
 
 
 def test_quality_of_service(bench):
-    """Commands reliable, in a queue of a hundred; states best effort, the newest only."""
+    """Commands in a queue of a hundred; states the newest only; all reliable, so that default subscribers hear them."""
     node = bench.drive(**EXACT)
     ends = {end.topic_name: end.qos_profile for end in (*node.publishers, *node.subscriptions)}
     for name in ("strut_commands", "strut_states", "tool_pose_true"):
         qos = ends[f"/{name}"]
         commanded = name == "strut_commands"
         assert (qos.depth, qos.history) == (100 if commanded else 1, HistoryPolicy.KEEP_LAST), name
-        assert qos.reliability == (ReliabilityPolicy.RELIABLE if commanded else ReliabilityPolicy.BEST_EFFORT), name
+        assert qos.reliability == ReliabilityPolicy.RELIABLE, name
     assert ends["/diagnostics"].reliability == ReliabilityPolicy.RELIABLE
 
 
