@@ -30,7 +30,8 @@ BESIDE_LINUXCNC = $(MAKE) --no-print-directory VENV=.venv-linuxcnc PYTHON='$(LIN
 # Which versions of Python `make test-all` takes, of those that are here.
 VERSIONS ?= 3.10 3.11 3.12 3.13 3.14
 
-.PHONY: help demo test test-all docs wheel constraints test-linuxcnc linuxcnc linuxcnc-rt bench papers fuzz fuzz-core clean run-linuxcnc-tests ros
+.PHONY: help demo test test-all test-docs docs wheel constraints test-linuxcnc linuxcnc linuxcnc-rt bench papers fuzz fuzz-core clean \
+    run-linuxcnc-tests ros
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
 
@@ -38,6 +39,7 @@ help:
 	@echo 'make demo    measure, fit and run a machine with hidden errors; figures, out/demo.png'
 	@echo 'make test    ruff, mypy and the tests, in three processes for two cores'
 	@echo 'make test-all     the same with every Python found here, each in .venv-3.x; VERSIONS="3.10 3.13" for some'
+	@echo 'make test-docs    run the sessions of the pages, minutes, and hold their output to what is shown'
 	@echo 'make docs    the pages of doc/ as a site with a search and the Python reference, in out/doc'
 	@echo 'make wheel   source archive and one wheel for all these Pythons (manylinux2014), in dist/'
 	@echo 'make constraints  renew constraints.txt and locked/: versions and hashes of all that is installed'
@@ -73,6 +75,10 @@ test-all:
 	    then passed="$$passed $$version"; else failed="$$failed $$version"; fi; done; \
 	    echo "make: tests passed with Python:$${passed:- none}; failed:$${failed:- none}"; \
 	    [ -n "$$passed" ] && [ -z "$$failed" ]; }
+
+# make test holds every command of the pages to what exists; this runs those whose output is shown.
+test-docs: $(VENV)/with-ros,test $(CORE)
+	LONG_TESTS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest test/test_doc_commands.py -k sessions
 
 # All anew each time: the notebooks run, and a page of a module that went would stay.
 docs: $(VENV)/with-ros,docs $(CORE)

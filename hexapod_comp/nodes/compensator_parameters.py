@@ -71,6 +71,7 @@ in   tool_pose_command       PoseStamped: commanded tool pose, frame_id a work f
      temperatures            Temperature: °C; frame_id names strut_1 to strut_6, base or platform
      humidity                RelativeHumidity: 0 to 1; for struts that swell
 out  strut_commands          JointState: compensated strut lengths, m
+     strut_commands_array    Float64MultiArray: the commands in joint order, with publish_array
      strut_corrections       JointState: command − nominal, m
      nominal_strut_states    JointState: with strut_setpoints, measured struts less the corrections, m
      tool_pose_estimate      PoseStamped: from measured struts, in base

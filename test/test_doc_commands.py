@@ -1,0 +1,315 @@
+"""Every command in a block of README.md and doc/ is one that exists, and those that print what a page shows are run.
+
+Each line of a shell block goes to a check of its program: our own verbs to the parser, ROS's tools to the tables of
+parameters, topics and services, ``make`` and benchmarks to their files. What is another's program stands in
+:data:`OTHERS`. Sessions, which are blocks with ``$`` and output, are run in their page's order with ``LONG_TESTS=1``
+(``make test-docs``): each line shown must come out, its numbers within two of their last digit or 2 %.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import yaml
+from launch_stand_in import LaunchFile
+from node_helpers import HOME, Bench
+
+from hexapod_comp.cli.parsers import make_parser
+from hexapod_comp.formats.paths import config_file
+from hexapod_comp.linuxcnc import parameters as linuxcnc_bridge
+from hexapod_comp.nodes import compensator_parameters, strut_drive_parameters
+from hexapod_comp.nodes.health import ERROR
+from hexapod_comp.nodes.parameters import Taken
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "doc").glob("*.md"))]
+
+BLOCK = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
+
+NODES = {part.PROGRAM.name: part for part in (compensator_parameters, strut_drive_parameters, linuxcnc_bridge)}
+
+OTHERS = {"apt-get", "cc", "cd", "colcon", "cp", "eval", "export", "linuxcnc", "pip", "python3", "rosdep", "source"}
+OTHERS |= {"sudo", "touch", "venv/bin/pip", "venv/bin/python", "./selftest"}
+"""Programs of others, and the shell's own words: of these a page's reader sees at once when one is wrong."""
+
+OURS_ELSEWHERE = {"/compensation/status": "the controller of export --ros2-control"}
+"""Topics that our nodes do not have."""
+
+
+class Command(NamedTuple):
+    """A line of a block, in words, and where it stands."""
+
+    place: str
+    words: list[str]
+
+
+def blocks(page: Path) -> Iterator[tuple[int, str]]:
+    """Yield the shell blocks of a page with their lines' number: those of commands, and those of sessions."""
+    text = page.read_text(encoding="utf-8")
+    for block in BLOCK.finditer(text):
+        if block[2] in ("", "sh"):
+            line = text.count("\n", 0, block.start()) + 2
+            yield line, re.sub(rf"^{block[1]}", "", block[3], flags=re.MULTILINE)
+
+
+OURS = {"hexapod_comp", "ros2", "make", "python", *NODES}
+
+
+def commands() -> list[Command]:
+    """Return the commands of all blocks that begin with one, in sessions those after ``$``; comments are cut."""
+    found = []
+    for page in PAGES:
+        for line, text in blocks(page):
+            joined = re.sub(r"\\\n *", " ", text)  # its lines count as one
+            session = joined.startswith("$ ")
+            first = joined.removeprefix("$ ").lstrip("#").split()
+            if not session and not (first and first[0] in OURS | OTHERS) and "\nros2 " not in joined:
+                continue
+            for number, row in enumerate(joined.splitlines()):
+                if (session and not row.startswith("$ ")) or not row.strip() or row.startswith("#"):
+                    continue
+                plain = re.sub(r" +#.*", "", row.removeprefix("$ "))
+                for part in re.split(r" && | &(?= |$)", plain):
+                    words = shlex.split(part)
+                    while words and "=" in words[0]:
+                        words = words[1:]
+                    if words:
+                        found.append(Command(f"{page.relative_to(ROOT)}:{line + number}", words))
+    return found
+
+
+COMMANDS = commands()
+
+
+def test_all_programs_are_known() -> None:
+    assert not [c for c in COMMANDS if c.words[0] not in OURS | OTHERS]
+
+
+def of(*program: str) -> Any:
+    """Return the commands of a program, as parameters of a test."""
+    rows = [c for c in COMMANDS if c.words[: len(program)] == list(program)]
+    assert rows
+    return pytest.mark.parametrize("command", rows, ids=lambda c: f"{c.place} {' '.join(c.words)[:60]}")
+
+
+@of("hexapod_comp")
+def test_our_verbs_and_options_are_there(command: Command) -> None:
+    make_parser().parse_args(command.words[1:])
+
+
+@of("python", "-m")
+def test_benchmarks_are_there(command: Command) -> None:
+    module, *options = command.words[2:]
+    source = importlib.util.find_spec(module)
+    assert source is not None
+    assert source.origin is not None
+    text = Path(source.origin).read_text(encoding="utf-8")
+    assert all(f'"{word}"' in text for word in options if word.startswith("--")), options
+
+
+@of("make")
+def test_targets_are_in_the_makefile(command: Command) -> None:
+    target, *variables = command.words[1:]
+    text = (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert re.search(rf"^{re.escape(target)}:", text, re.MULTILINE)
+    assert all(re.search(rf"\b{word.partition('=')[0]}\b", text) for word in variables)
+
+
+@of("ros2")
+def test_what_is_asked_of_ros_exists(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    kind, verb, *words = command.words[1:]
+    check: Callable[..., None] = globals()[f"check_{kind}"]
+    if kind == "launch":
+        check(monkeypatch, words)
+    else:
+        check(verb, words)
+
+
+def check_launch(monkeypatch: pytest.MonkeyPatch, words: list[str]) -> None:
+    assert words.pop(0) == "machine.launch.py"
+    assert {word.partition(":=")[0] for word in words} <= set(LaunchFile(monkeypatch).defaults)
+
+
+def check_run(package: str, words: list[str]) -> None:
+    if package == "hexapod_comp":
+        check_node(words)
+
+
+@pytest.mark.parametrize("command", [c for c in COMMANDS if c.words[0] in NODES], ids=lambda c: c.place)
+def test_nodes_are_started_with_parameters_that_they_have(command: Command) -> None:
+    check_node(command.words)
+
+
+def check_node(words: list[str]) -> None:
+    node = NODES[words[0]]
+    table = {parameter.name: parameter for parameter in node.PARAMETERS}
+    topics = topics_of(words[0])
+    for option, word in pairwise(words):
+        if option == "-p":
+            name, _, value = word.partition(":=")
+            table[name].checked(yaml.safe_load(value))
+        elif option == "-r":
+            assert f"/{word.partition(':=')[0]}" in topics, word
+
+
+def topics_of(name: str) -> dict[str, str]:
+    """Return topics and services of a node with their types' names, from its help."""
+    found = {}
+    for line in NODES[name].TOPICS.splitlines():
+        names, _, kind = re.sub(r"^(in|out|ask)?\s+", "", line).partition("  ")
+        for topic in names.split(", "):
+            found["/" + topic.strip().replace("~", name).lstrip("/")] = kind.strip()
+    return found
+
+
+def check_topic(verb: str, words: list[str]) -> None:
+    topic = next(word for word in words if word.startswith("/"))
+    known = {name for node in NODES for name in topics_of(node)}
+    assert topic in known | set(OURS_ELSEWHERE)
+    assert verb in ("echo", "hz", "delay", "pub")
+
+
+def check_service(verb: str, words: list[str]) -> None:
+    name, kind = words[:2]
+    assert verb == "call"
+    node, service = name.strip("/").split("/")
+    listed = NODES[node].TOPICS
+    assert re.search(rf"~/{service}\b", listed), name
+    assert kind.rpartition("/")[2] in listed
+
+
+def check_param(verb: str, words: list[str]) -> None:
+    table = {parameter.name: parameter for parameter in NODES[words[0].strip("/")].PARAMETERS}
+    if verb == "set":
+        table[words[1]].checked(yaml.safe_load(words[2]))
+        assert table[words[1]].taken in (Taken.ALWAYS, Taken.RELOAD)
+    elif verb == "describe":
+        assert words[1] in table
+
+
+def check_lifecycle(verb: str, words: list[str]) -> None:
+    assert (verb, words[0].strip("/") in NODES) == ("set", True)
+    assert words[1] in ("configure", "activate", "deactivate", "cleanup")
+
+
+def check_security(verb: str, words: list[str]) -> None:
+    policy = next(word for word in words if word.endswith("policy.xml"))
+    assert (ROOT / "config" / policy.partition("/config/")[2]).is_file()
+
+
+def check_pkg(verb: str, words: list[str]) -> None:
+    assert verb == "prefix"
+
+
+# ---- what the pages say of a running machine ----
+
+
+def test_the_fault_of_the_first_commands_stops_the_machine_at_home(bench: Bench) -> None:
+    """doc/ros.md: the tool is held at home, a fault is set that the page says will stop it, and it is reset."""
+    rows = [c.words for c in COMMANDS if c.place.startswith("doc/ros.md") and c.words[:3] == ["ros2", "param", "set"]]
+    name, value = next(words[4:] for words in rows if words[3] == "/strut_drive")
+    bench.machine()
+    bench.speak("tool_pose_command")
+
+    def held() -> bool:
+        bench.send(HOME)
+        return bool(bench.seen["strut_commands"])
+
+    bench.until(held, "commands")
+    bench.fault(name.removeprefix("fault_"), yaml.safe_load(value))
+    bench.until(lambda: (bench.send(HOME), "following_error" in bench.message())[1], "the stop that the page promises")
+    assert bench.status().level == ERROR
+    bench.until(lambda: bench.trigger("reset").success, "a reset")
+    bench.until(lambda: (bench.send(HOME), "following_error" not in bench.message())[1], "the end of the stop")
+
+
+# ---- sessions ----
+
+LONG = pytest.mark.skipif(not os.environ.get("LONG_TESTS"), reason="minutes: make test-docs runs it (LONG_TESTS=1)")
+
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]\d+)?")
+
+
+def sessions(page: Path) -> list[tuple[str, list[str], list[str]]]:
+    """Return a page's sessions: where each command stands, its words, and what is shown of its output."""
+    found: list[tuple[str, list[str], list[str]]] = []
+    for line, text in blocks(page):
+        if not text.startswith("$ hexapod_comp"):
+            continue
+        for number, row in enumerate(text.splitlines()):
+            if row.startswith("$ "):
+                words = shlex.split(re.sub(r"\s+#.*", "", row.removeprefix("$ ")))
+                found.append((f"{page.relative_to(ROOT)}:{line + number}", words, []))
+            elif row.strip() not in ("", "…"):
+                found[-1][2].append(row)
+    return found
+
+
+def same(shown: str, printed: str) -> bool:
+    """Return whether a line shown is the line printed, up to ``…`` and to its numbers' last digits."""
+    if len(shown.split("…")) > 1:
+        return all(NUMBER.sub("0", part).strip() in NUMBER.sub("0", printed) for part in shown.split("…"))
+    texts = [" ".join(NUMBER.sub("0", line).split()) for line in (shown, printed)]
+    numbers = [NUMBER.findall(line) for line in (shown, printed)]
+    return texts[0] == texts[1] and all(close(a, b) for a, b in zip(*numbers, strict=True))
+
+
+def close(shown: str, printed: str) -> bool:
+    digits = len(shown.partition(".")[2]) if "e" not in shown else 0
+    a, b = float(shown), float(printed)
+    return abs(a - b) <= max(2.0 * 10.0**-digits, 0.02 * abs(a)) if digits else abs(a - b) <= max(1.0, 0.02 * abs(a))
+
+
+def prepare(page: Path, folder: Path) -> None:
+    """Write what a page takes for granted: the reader's machine, and campaigns that the page prints."""
+    shutil.copy(config_file("example_6_6.yaml"), folder / "mine.yaml")
+    for block in BLOCK.finditer(page.read_text(encoding="utf-8")):
+        if name := re.search(r"^format: hexapod_comp/campaign +# (\w+\.yaml)$", block[3], re.MULTILINE):
+            (folder / name[1]).write_text(block[3], encoding="utf-8")
+
+
+def run_session(page: Path, folder: Path, wanted: Callable[[list[str]], bool] = lambda words: True) -> list[str]:
+    """Run a page's sessions in their order in a folder; return what is shown and did not come out."""
+    prepare(page, folder)
+    wrong = []
+    for place, words, shown in sessions(page):
+        if not wanted(words):
+            continue
+        program = [sys.executable, "-m", "hexapod_comp", *words[1:]]
+        ran = subprocess.run(program, cwd=folder, capture_output=True, text=True, encoding="utf-8")
+        printed = (ran.stdout + ran.stderr).splitlines()
+        for line in shown:
+            if not any(same(line, other) for other in printed):
+                wrong.append(f"{place}: {line}")
+    return wrong
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the readings and the model that doc/calibration.md begins with: pages go on from there."""
+    folder = tmp_path_factory.mktemp("pages")
+    page = "doc/calibration.md"
+    rows = [c.words for c in COMMANDS if c.place.startswith(page) and c.words[0] == "hexapod_comp"]
+    for verb in ("simulate", "fit"):
+        words = next(words for words in rows if words[1] == verb)
+        subprocess.run([sys.executable, "-m", *words], cwd=folder, capture_output=True, check=True)
+    return folder
+
+
+@LONG
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("page", [page for page in PAGES if sessions(page)], ids=lambda page: page.name)
+def test_sessions_print_what_their_page_shows(page: Path, calibrated: Path, tmp_path: Path) -> None:
+    shutil.copytree(calibrated, tmp_path, dirs_exist_ok=True)
+    assert not (wrong := run_session(page, tmp_path)), "\n".join(wrong)
