@@ -200,10 +200,10 @@ export HAS_HAL
 
 define NEXT
 
-The program is $(CURDIR)/$(BIN)/hexapod_comp, and doc/install.md tells other ways to it. Next, for example:
-  . $(BIN)/activate                                    # this shell finds hexapod_comp now
-  hexapod_comp show example_6_6.yaml                   # a machine as config/example_6_6.yaml describes it, key by key
-  hexapod_comp plan campaign.yaml --machine paper.yaml # what a measuring campaign will show
+The program is $(CURDIR)/$(BIN)/hexapod_comp; other ways to it: doc/install.md. Next, for example:
+  . $(BIN)/activate                                            # this shell finds hexapod_comp now
+  hexapod_comp show example_6_6.yaml                           # a machine as config/example_6_6.yaml describes it
+  hexapod_comp ik --model paper_machine.yaml --pose 50,20,420  # struts, corrections and errors at a pose, mm
 endef
 export NEXT
 

@@ -49,6 +49,8 @@ setup(
     long_description_content_type="text/markdown",
     license=stated("license"),
     license_files=["LICENSE"],
+    url=stated("url"),
+    author=stated("author"),
     maintainer=stated("maintainer"),
     maintainer_email="" if MAINTAINER is None else MAINTAINER.get("email", ""),
     keywords="hexapod, Stewart platform, machine tool, calibration, error compensation, ROS 2, LinuxCNC",

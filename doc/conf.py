@@ -1,11 +1,13 @@
 """The pages of this folder as a site: ``make docs``, or rosdoc2, which finds this file where ROS packages keep it.
 
-rosdoc2 runs it from a copy of this folder, says itself what project and version are, and has neither notebooks nor
-MathML: there the notebooks show what is written, not what is computed, and formulas are MathJax's.
+rosdoc2 runs it from a copy of this folder, some versions before they have said what project and version are, and has
+neither notebooks nor MathML nor NumPy: there the notebooks show what is written, not what is computed, formulas are
+MathJax's, and the Python reference is left out.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import sys
@@ -15,6 +17,7 @@ from xml.etree import ElementTree
 
 from docutils import nodes
 from sphinx.application import Sphinx
+from sphinx.directives.code import CodeBlock
 from sphinx.writers.html5 import HTML5Translator
 
 try:
@@ -23,21 +26,26 @@ except ImportError:
     convert = None
 
 ROOT = Path(__file__).resolve().parents[1]
+project = "hexapod_comp"
+author = copyright = "The hexapod_comp maintainers"
 if (ROOT / "package.xml").is_file():
     # Where the package is not installed, and for the notebooks, which run in processes of their own.
     sys.path.insert(0, str(ROOT))
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    project = "hexapod_comp"
-    author = "The hexapod_comp maintainers"
-    copyright = author
     release = version = ElementTree.parse(ROOT / "package.xml").findtext("version") or ""
+else:
+    release = version = globals().get("release", "")
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
-exclude_patterns = ["_build", "templates"]
+NOTEBOOKS = importlib.util.find_spec("myst_nb") is not None
+REFERENCE = importlib.util.find_spec("numpy") is not None
+
+extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+extensions.insert(0, "myst_nb" if NOTEBOOKS else "myst_parser")
+exclude_patterns = ["_build", "**/templates", "templates", *([] if REFERENCE else ["**/api.md", "api.md"])]
 templates_path = ["templates"]
 
 html_theme = "furo"
-html_title = f"hexapod_comp {release}"
+html_title = f"hexapod_comp {release}".strip()
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 if convert:
@@ -63,6 +71,10 @@ napoleon_use_ivar = True
 napoleon_use_rtype = False
 default_role = "literal"  # `size` in a docstring is an argument's name
 suppress_warnings = ["ref.python"]  # napoleon looks attributes up by their name alone, which two classes may share
+if not REFERENCE:
+    suppress_warnings += ["toc.excluded", "toc.not_readable"]  # the reference
+if not (ROOT / "package.xml").is_file():
+    suppress_warnings.append("myst.xref_missing")  # files beside doc/, which the copy has not
 
 
 def inline_math(writer: HTML5Translator, node: nodes.math) -> None:
@@ -124,8 +136,16 @@ def keep_bars(_app: Sphinx, _what: str, _name: str, _thing: object, _options: ob
     lines[:] = [re.sub(r"(``.*?``)|\|", lambda match: match[1] or r"\|", line) for line in lines]
 
 
+class CodeCell(CodeBlock):
+    """A notebook's cell where there are no notebooks: its code, without a run."""
+
+    option_spec = CodeBlock.option_spec | {"tags": lambda text: text}
+
+
 def setup(app: Sphinx) -> None:
     """Let formulas be written as MathML, and docstrings be read as they are meant."""
+    if not NOTEBOOKS:
+        app.add_directive("code-cell", CodeCell)
     if convert:
         app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))
     app.connect("autodoc-process-docstring", keep_bars)

@@ -29,7 +29,7 @@ Lengths are shown in mm, corrections in µm, angles in degrees. A pose is the to
 x, y, z and the angles α, β, γ with R = Ry(β)·Rx(α)·Rz(γ). A machine or model is a file, or the name of a
 shipped one (paper, paper_machine, …)."""
 
-EPILOG = """Verbs, options and files complete in the shell: pip install hexapod_comp[completion], then
+EPILOG = """Verbs, options and files complete in the shell: pip install argcomplete, then
 eval "$(register-python-argcomplete hexapod_comp)"."""
 
 VERBS = {
@@ -165,7 +165,7 @@ example:
         """Serves a page on this computer alone, unless --host says otherwise: the machine in 3-D, its struts coloured
 by correction, the tool's error (µm, µrad) as predicted and as left, what compensator and drive say of themselves,
 refusals, strut lengths (mm), and latencies (ms). It only listens in this ROS domain: nothing on the page moves or
-changes anything. It ends at Ctrl-C. It needs viser: pip install hexapod_comp[watch].
+changes anything. It ends at Ctrl-C. It needs viser: pip install viser.
 
 example:
   $ hexapod_comp watch --machine mine.yaml

@@ -146,7 +146,8 @@ def _client(namespace: str) -> LoopClient:
         from ..nodes.client import LoopClient
     except ImportError as error:
         raise HexapodError(
-            f"ROS 2 is needed for this ({error}); install hexapod_comp[ros], or source a ROS 2 installation"
+            f"ROS 2 is needed for this ({error}): source a ROS 2 installation, or where there is none run "
+            "`pip install '.[ros]'` in the source tree (doc/install.md)"
         ) from error
     return LoopClient(namespace=namespace)
 

@@ -276,7 +276,7 @@ def _serve(host: str, port: int) -> Any:
     try:
         from viser import ViserServer
     except ImportError as error:
-        text = "watching needs viser, which is not installed: pip install hexapod_comp[watch]"
+        text = "watching needs viser, which is not installed: pip install viser"
         raise HexapodError(text) from error
     try:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET

@@ -274,7 +274,7 @@ def _open(folder: Path) -> tuple[Any, Any]:
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise HexapodError("recording needs rosbags, which is not installed: pip install hexapod_comp[bags]") from error
+        raise HexapodError("recording needs rosbags, which is not installed: pip install rosbags") from error
     if folder.exists():
         raise InputFileError(folder, "", "is there already; a recording makes a folder of its own")
     try:

@@ -192,7 +192,7 @@ def _rosbags() -> Any:
         from rosbags import rosbag2, typesys
     except ImportError as error:
         raise HexapodError(
-            f"reading bags needs rosbags ({error}): pip install hexapod_comp[bags], "
+            f"reading bags needs rosbags ({error}): pip install rosbags, "
             "or on a ROS machine the rosdep key python3-rosbags-pip"
         ) from error
     return rosbag2, typesys

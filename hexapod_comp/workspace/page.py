@@ -142,7 +142,7 @@ def _plotly_script() -> str:
     try:
         from plotly.offline import get_plotlyjs  # type: ignore[import-not-found, import-untyped, unused-ignore]
     except ImportError as error:
-        raise HexapodError("the interactive page needs plotly: pip install hexapod_comp[pages]") from error
+        raise HexapodError("the interactive page needs plotly: pip install plotly") from error
     return get_plotlyjs().replace("</script", "<\\/script")
 
 

@@ -148,7 +148,7 @@ def _on_cluster(parts: Iterable[Part], scheduler: str) -> Iterator[Extremes]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise HexapodError("a cluster needs Dask: pip install hexapod_comp[cluster]") from error
+        raise HexapodError("a cluster needs Dask: pip install distributed") from error
     try:
         client: Any = Client(scheduler, timeout=WAIT, set_as_default=False)
     except (OSError, ValueError) as error:

@@ -218,7 +218,7 @@ def test_pictures_are_pictures(done: Done) -> None:
         assert len(content) > 10_000
 
 
-@pytest.mark.skipif(not PAGE, reason="plotly is not installed: pip install hexapod_comp[pages]")
+@pytest.mark.skipif(not PAGE, reason="plotly is not installed: pip install plotly")
 def test_the_page_is_one_whole_file(done: Done) -> None:
     page = (done.folder / "page.html").read_text(encoding="utf-8")
     assert page.startswith("<!DOCTYPE html>")
@@ -232,7 +232,7 @@ def test_without_plotly_the_rest_is_there(tmp_path: Path, monkeypatch: pytest.Mo
     out = ("--out", tmp_path / "ranking.csv", "--pictures", tmp_path)
     code, out, _ = classify(*out, "--cells", 4, "--tilt-deg", 0)
     assert code == 0
-    assert "no page: the interactive page needs plotly: pip install hexapod_comp[pages]" in out
+    assert "no page: the interactive page needs plotly: pip install plotly" in out
     assert {path.name for path in tmp_path.iterdir()} == TABLE
 
 

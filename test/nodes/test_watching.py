@@ -172,7 +172,7 @@ def test_colours_of_corrections():
 def test_without_viser_the_verb_says_what_to_install(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["watch"]) == 2
-    assert "pip install hexapod_comp[watch]" in capsys.readouterr().err
+    assert "pip install viser" in capsys.readouterr().err
 
 
 def test_an_address_that_cannot_be_had():

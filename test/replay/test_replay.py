@@ -753,7 +753,7 @@ def test_bag_of_sqlite_without_its_tables(tmp_path):
 def test_without_rosbags_the_error_says_how_to_get_it(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "rosbags", None)
     (tmp_path / "run.mcap").touch()
-    with pytest.raises(HexapodError, match=r"pip install hexapod_comp\[bags\].*python3-rosbags-pip"):
+    with pytest.raises(HexapodError, match=r"pip install rosbags.*python3-rosbags-pip"):
         read_recording(tmp_path / "run.mcap")
 
 

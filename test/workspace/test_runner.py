@@ -105,7 +105,7 @@ def test_an_interruption_ends_the_processes(small: list[Reach], errors: SingleEr
 @pytest.fixture(scope="module")
 def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Address of a cluster of two workers in this process, spoken to over TCP like any other."""
-    distributed = pytest.importorskip("distributed", reason="Dask is not installed: pip install hexapod_comp[cluster]")
+    distributed = pytest.importorskip("distributed", reason="Dask is not installed: pip install distributed")
     folder = str(tmp_path_factory.mktemp("dask"))
     options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None, "local_directory": folder}
     with distributed.LocalCluster(processes=False, protocol="tcp://", host="127.0.0.1", **options) as cluster:
@@ -123,13 +123,13 @@ def test_on_a_cluster(small: list[Reach], errors: SingleErrors, whole: Extremes,
 
 def test_a_cluster_without_dask(small: list[Reach], errors: SingleErrors, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(HexapodError, match=r"needs Dask: pip install hexapod_comp\[cluster\]"):
+    with pytest.raises(HexapodError, match=r"needs Dask: pip install distributed"):
         survey(small, errors, scheduler="tcp://127.0.0.1:8786")
 
 
 def test_no_scheduler_answers(small: list[Reach], errors: SingleErrors, monkeypatch: pytest.MonkeyPatch) -> None:
     """Port 1 of this machine, where nothing listens; after one second instead of ten."""
-    distributed = pytest.importorskip("distributed", reason="Dask is not installed: pip install hexapod_comp[cluster]")
+    distributed = pytest.importorskip("distributed", reason="Dask is not installed: pip install distributed")
 
     def impatient(address: str, **options: object) -> object:
         return client(address, **{**options, "timeout": "1s"})

@@ -199,7 +199,7 @@ def test_the_largest_page_that_is_allowed_is_below_its_limit(tmp_path):
 
 def test_without_plotly_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
-    with pytest.raises(HexapodError, match=r"pip install hexapod_comp\[pages\]"):
+    with pytest.raises(HexapodError, match=r"pip install plotly"):
         page_text(unit(), page_data())
 
 
