@@ -361,10 +361,14 @@ def _fit_line(
     u = _parameter(group.point[:, axis], along)
     values = _without_run_zeros(group, u, ways)
     place, number = _places(group.point[:, axis])
+    beside = np.unique(group.node[:, CROSS_AXES[axis]], axis=0, return_inverse=True)[1].ravel()
     means = {}
     for way in ways:
         rows = group.direction == way
-        means[way] = _averaged(values[rows], number[rows], len(place))
+        means[way] = (
+            _averaged(values[rows], number[rows], len(place)),
+            _spread(values[rows], number[rows], beside[rows]),
+        )
     if group.sloping.any():
         means = _straightened(means, _parameter(place, along))
     fits = []
@@ -407,14 +411,22 @@ def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> n
     return group.value - unknown @ solution[smooth.shape[1] :]
 
 
-def _averaged(values: np.ndarray, number: np.ndarray, places: int) -> tuple[np.ndarray, float]:
-    """Return the mean reading at each place, NaN where there is none, and the spread of one about it."""
+def _averaged(values: np.ndarray, number: np.ndarray, places: int) -> np.ndarray:
+    """Return the mean reading at each place, NaN where there is none."""
     count = np.bincount(number, minlength=places)
     total = np.bincount(number, weights=values, minlength=places)
-    mean = np.where(count, total / np.maximum(count, 1), np.nan)
-    freedom = len(values) - int((count > 0).sum())
-    spread = ((values - mean[number]) ** 2).sum()
-    return mean, float(np.sqrt(spread / freedom)) if freedom else float("nan")
+    return np.where(count, total / np.maximum(count, 1), np.nan)
+
+
+def _spread(values: np.ndarray, number: np.ndarray, line: np.ndarray) -> float:
+    """Return the standard deviation of readings about their mean at a place of one line; NaN where none is repeated.
+
+    Lines that share a polynomial differ by what it leaves of the machine: that is no repeatability of anything.
+    """
+    repeats = np.unique(np.stack([line, number]), axis=1, return_inverse=True)[1].ravel()
+    freedom = len(values) - (int(repeats.max()) + 1)
+    left = values - _averaged(values, repeats, int(repeats.max()) + 1)[repeats]
+    return float(np.sqrt((left**2).sum() / freedom)) if freedom else float("nan")
 
 
 def _straightened(means: dict[int, tuple[np.ndarray, float]], u: np.ndarray) -> dict[int, tuple[np.ndarray, float]]:

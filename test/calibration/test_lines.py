@@ -8,7 +8,7 @@ from foreign_machines import machines
 from scipy.stats import linregress
 
 from hexapod_comp.calibration.evaluation import PaperMetric, held_out, paper_metric, worth
-from hexapod_comp.calibration.lines import LinesFit, fit_lines
+from hexapod_comp.calibration.lines import LinesFit, _kind, fit_lines
 from hexapod_comp.calibration.lines_report import report
 from hexapod_comp.calibration.pictures import fitted_lines_figure, strut_error_figure, strut_length_errors
 from hexapod_comp.errors import CalibrationError
@@ -179,6 +179,20 @@ def test_cycles_are_averaged_and_their_spread_is_told(geometry, linear_truth):
 
 def test_without_cycles_there_is_no_spread(quiet):
     assert all(np.isnan(line.repeat_std) for line in fit_lines(quiet).lines)
+
+
+def test_lines_that_share_a_polynomial_are_no_repeats_of_each_other(geometry, five, real, real_fit):
+    """Parallel lines of a machine that twists differ by 10 µrad; each was read twice, with the campaign's noise.
+
+    Truth: the noise that was drawn, known to 1/√(2n) of some hundred repeats of a kind; and none where all was read once.
+    """
+    for kind, noise in (("straightness", LASER.noise[1]), ("rotation", LASER.noise[2])):
+        shared = [line for line in real_fit.lines if len(line.nodes) > 1 and _kind(line) == kind]
+        assert shared
+        assert np.sqrt(np.mean([line.repeat_std**2 for line in shared])) == pytest.approx(noise, rel=0.15)
+    assert real_fit.misfit == ""
+    once = fit_lines(measure(five, replace(QUIET, instrument="5-D"), real, 0))
+    assert all(np.isnan(line.repeat_std) for line in once.lines)
 
 
 def test_zeros_and_beam_slopes_change_nothing(five, real):
