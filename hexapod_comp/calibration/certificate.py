@@ -379,7 +379,7 @@ def _hidden(fit: ModelFit) -> str:
     seen = fit.observability
     text = f"{seen.structure_rank} of {seen.structure_size} parameters of the structure are seen by these readings."
     if fit.unseen_errors:
-        text += f" Errors that they do not show: {', '.join(map(str, fit.unseen_errors))}."
+        text += f" Errors that they do not show: {listed(fit.unseen_errors)}."
     return f"<h2>What the readings do not show</h2><p>{shown(text, 2000)}</p><p>{_lines(fit.held.report())}</p>"
 
 

@@ -20,7 +20,7 @@ from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
 from .estimation import HUBER, OUTLIER, Estimation, Solution, iterate
 from .lead import ScrewLead, look_for_lead
 from .linear_problem import LinearProblem, Posterior, physical_covariance
-from .observability import Allowed, Observability, ToolError, UnseenError, observe, without_trace
+from .observability import Allowed, Observability, ToolError, UnseenError, listed, observe, without_trace
 from .parameters import WAVES, FitSettings, ParameterSpace
 from .residuals import Residuals
 from .selection import Decision, select
@@ -238,8 +238,8 @@ def _fit(measurements: MeasurementSet, begun: _Begun, progress: Callable[[str], 
     noise = {KINDS.index(c.kind): c.estimated for c in channels}
     verdict = judge(estimation, solution, allowed, with_all, settings, noise, progress)
     no_trace = unseen_errors(measurements, settings)
-    if rolls := [str(error) for error in no_trace if error.name.startswith("roll")]:
-        verdict = verdict.without_rotation("; ".join(rolls))
+    if rolls := [error for error in no_trace if error.name.startswith("roll")]:
+        verdict = verdict.without_rotation(listed(rolls))
     as_solved = _named(space, solution, measurements, channels, len(decisions), verdict.level)
     unseen = unseen_part(estimation, solution.posterior.tolerances[0], solution.posterior.noise, datum)
     model, held = hold(measurements.geometry, as_solved, datum, unseen)

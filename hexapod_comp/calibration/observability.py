@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -208,8 +209,13 @@ class UnseenError(NamedTuple):
             return "no reading shows it"
         return f"below the noise: it changes all readings together by {self.trace:.2g} σ, seen from {SEEN:g} on"
 
-    def __str__(self) -> str:
-        return f"{self.name} ({self.reason})"
+
+def listed(errors: Iterable[UnseenError]) -> str:
+    """Return errors in words, those together that are not seen for the same reason."""
+    by_reason: dict[str, list[str]] = {}
+    for error in errors:
+        by_reason.setdefault(error.reason, []).append(error.name)
+    return "; ".join(f"{', '.join(names)} ({reason})" for reason, names in by_reason.items())
 
 
 def without_trace(estimation: Estimation) -> tuple[UnseenError, ...]:

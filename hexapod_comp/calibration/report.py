@@ -12,7 +12,7 @@ from ..measurements.readings import ANGULAR_KINDS, CHANNELS, SAME_ATTITUDE
 from .estimation import SETTLED
 from .fit import ChannelFit, ModelFit, Outlier
 from .lead import ScrewLead
-from .observability import BlockSight, Observability, ToolError, UnseenError
+from .observability import BlockSight, Observability, ToolError, UnseenError, listed
 from .plan import Plan
 from .verdict import TILT
 from .warming import warming_json, warming_text
@@ -168,11 +168,7 @@ def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ..
     if seen.unseen:
         lines.append("not seen (left near nominal): " + ", ".join(seen.unseen))
     if unseen_errors:
-        by_reason: dict[str, list[str]] = {}
-        for error in unseen_errors:
-            by_reason.setdefault(error.reason, []).append(error.name)
-        listed = "; ".join(f"{', '.join(names)} ({reason})" for reason, names in by_reason.items())
-        lines.append(f"machine errors that the readings do not show: {listed}")
+        lines.append(f"machine errors that the readings do not show: {listed(unseen_errors)}")
     return "\n".join(lines)
 
 

@@ -184,7 +184,7 @@ def test_without_cycles_there_is_no_spread(quiet):
 def test_lines_that_share_a_polynomial_are_no_repeats_of_each_other(geometry, five, real, real_fit):
     """Parallel lines of a machine that twists differ by 10 µrad; each was read twice, with the campaign's noise.
 
-    Truth: the noise that was drawn, known to 1/√(2n) of some hundred repeats of a kind; and none where all was read once.
+    Truth: the noise that was drawn, known to 1/√(2n) of some hundred repeats of a kind. Read once, nothing is a repeat.
     """
     for kind, noise in (("straightness", LASER.noise[1]), ("rotation", LASER.noise[2])):
         shared = [line for line in real_fit.lines if len(line.nodes) > 1 and _kind(line) == kind]
