@@ -35,7 +35,7 @@ from ..measurements.standards import (
 from ..workspace.overview import corners
 from .cells import Cells
 from .fit import ModelFit
-from .observability import ToolError
+from .observability import ToolError, listed
 from .report import tilt_doubt
 
 FORMAT, VERSION = "hexapod_comp/certificate", 1
