@@ -6,6 +6,7 @@ differences along it, whatever they will read; the evidence of each change then 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,8 +26,8 @@ USUAL = 12
 LEAST, MOST = 6, 60
 """As few tell next to nothing; as many are better laid out as a campaign."""
 
-CHANNELS_READ = ("linear", "rotation_x", "rotation_y", "rotation_z")
-"""What is read, on lines along the axes pitch and yaw, on diagonals the displacement."""
+READ_BY = {"linear": ("linear",), "rotation": ("rotation_x", "rotation_y", "rotation_z")}
+"""What each instrument reads: on lines along the axes pitch and yaw, there and on diagonals the displacement."""
 
 CRASH, WARMTH = 20e-6, 12e-6
 """Changes that are to be named: of each strut by itself, m, and growth of all struts, m/m: steel by a kelvin."""
@@ -53,8 +54,10 @@ class _Choice:
         return np.concatenate(rows)
 
 
-def propose_check(fitted: FittedParameters, readings: int = USUAL) -> MeasurementSet:
-    """Return the check readings to take with a laser for displacement, pitch and yaw: values are not a number.
+def propose_check(
+    fitted: FittedParameters, readings: int = USUAL, instruments: Sequence[str] = tuple(READ_BY)
+) -> MeasurementSet:
+    """Return the check readings to take with a laser: values are not a number.
 
     A crash of any strut and growth of all are to be told from all else that may have happened.
 
@@ -64,16 +67,23 @@ def propose_check(fitted: FittedParameters, readings: int = USUAL) -> Measuremen
         What the fit knows.
     readings : int
         How many.
+    instruments : sequence of str
+        What there is to measure with, of :data:`READ_BY`.
 
     Raises
     ------
     CalibrationError
-        A fit without a box, or a number of readings that is none.
+        A fit without a box, a number of readings that is none, or an unknown instrument.
     """
+    for name in instruments:
+        if name not in READ_BY:
+            raise CalibrationError("instruments", f"must be of {', '.join(READ_BY)}, not {name!r}")
     if not LEAST <= readings <= MOST:
         raise CalibrationError("readings", f"must be {LEAST}…{MOST}, not {readings}")
     wide = widened(fitted)
-    laid_out, groups = _laid_out(wide)
+    laid_out, groups = _laid_out(
+        wide, [channel for name in READ_BY if name in instruments for channel in READ_BY[name]]
+    )
     weighing = _Weighing(wide, laid_out, possible_changes(wide.space, tuple(b.name for b in fitted.space.blocks)))
     choice, value, left = _Choice(), -np.inf, readings
     while left > 0:
@@ -102,7 +112,7 @@ def _moves(choice: _Choice, groups: list[tuple[int, ...]]) -> list[tuple[_Choice
     return moves
 
 
-def _laid_out(fitted: FittedParameters) -> tuple[MeasurementSet, list[tuple[int, ...]]]:
+def _laid_out(fitted: FittedParameters, channels: Sequence[str]) -> tuple[MeasurementSet, list[tuple[int, ...]]]:
     """Return what could be read in the measured box, and the readings of each zero: both ends, then the middle."""
     space = fitted.space
     box, side = space.work_box, float(np.ptp(space.work_box, axis=0).min())
@@ -110,7 +120,7 @@ def _laid_out(fitted: FittedParameters) -> tuple[MeasurementSet, list[tuple[int,
         raise CalibrationError("fit", "has measured no box in which check readings could be laid out")
     level = space.geometry.work.rotation.T @ space.level @ space.geometry.tool.rotation
     grid = template(Campaign(box, side, 0.5 * side, "5-D", 4, level=level), space.geometry)
-    read = np.isin(grid.channel, [CHANNELS.index(name) for name in CHANNELS_READ]) & (grid.direction == FORWARD)
+    read = np.isin(grid.channel, [CHANNELS.index(name) for name in channels]) & (grid.direction == FORWARD)
     along, chosen = grid.along(), []
     for key in np.unique(np.stack([grid.run, grid.channel], axis=1)[read], axis=0):
         members = np.flatnonzero(read & (grid.run == key[0]) & (grid.channel == key[1]))

@@ -20,6 +20,9 @@ from .warming import warming_json, warming_text
 MOST_LISTED, MOST_OF_RUN = 10, 3
 """Runs with outliers, and outliers of a run, beyond these are counted, not listed."""
 
+GROSS = 50.0
+"""Standard deviations beyond which a reading is taken for mistyped: no instrument's own errors are as large."""
+
 MOST_RUNS = 5
 """Runs that are listed as met worst."""
 
@@ -30,6 +33,7 @@ TRUST = 0.1
 def fit_report(fit: ModelFit) -> str:
     """Return the report of a fit, for people: what is left, what was found, what the readings could not show."""
     parts = [
+        *_gross_errors(fit),
         *_doubts(fit),
         _headline(fit),
         *_expected(fit.level, fit.tilted, fit.observability),
@@ -193,6 +197,14 @@ def _outliers(fit: ModelFit) -> Iterator[str]:
     if len(runs) > MOST_LISTED:
         lines.append(f"  and {sum(runs.values()) - sum(n for _, n in runs.most_common(MOST_LISTED))} in other runs")
     yield "\n".join(lines)
+
+
+def _gross_errors(fit: ModelFit) -> Iterator[str]:
+    """Yield the reading that is worst, before anything else, where it looks mistyped."""
+    gross = sorted((o for o in fit.outliers if abs(o.sigmas) >= GROSS), key=lambda o: -abs(o.sigmas))
+    if gross:
+        more = f"; {len(gross) - 1} more beyond {GROSS:g} σ below" if len(gross) > 1 else ""
+        yield f"CHECK THIS READING, which looks mistyped: {_outlier_line(gross[0])}{more}"
 
 
 def _outlier_line(o: Outlier) -> str:

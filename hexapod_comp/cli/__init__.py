@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from ..errors import HexapodError
 from ..formats.outputs import inputs_protected
 from ..formats.texts import run_with_plain_streams
-from .parsers import GONE, PROGRAM, make_parser
+from .parsers import GONE, PROGRAM, make_parser, unknown_verb
 
 NEGATIVE = re.compile(r"-[.\d]")
 """What follows an option and looks like this is its value, not another option."""
@@ -48,6 +48,11 @@ def _run(arguments: Sequence[str]) -> int:
         from .completion import complete
 
         complete(parser)
+    if arguments and not arguments[0].startswith("-") and (near := unknown_verb(arguments[0])) is not None:
+        print(
+            f"{PROGRAM}: error: there is no verb {arguments[0]!r}{near}; {PROGRAM} --help lists them", file=sys.stderr
+        )
+        return USAGE_ERROR
     try:
         args = parser.parse_args(_with_negative_values(arguments))
     except SystemExit as leaving:  # argparse has printed help or what is wrong

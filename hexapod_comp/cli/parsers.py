@@ -8,6 +8,7 @@ units in the keys.
 from __future__ import annotations
 
 import argparse
+import difflib
 from collections.abc import Callable
 from itertools import groupby
 from typing import Any, NoReturn
@@ -29,10 +30,34 @@ WORDS = "ideal, random or random:SEED"
 """Models that are no files."""
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says which option was meant."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        options = [option for option in self._option_string_actions if option.startswith("--")]
+        names = [] if self._subparsers is not None else [one.partition("=")[0] for one in args if one.startswith("--")]
+        for name in names:
+            if name == "--":
+                break
+            if not any(option.startswith(name) for option in options):
+                near = difflib.get_close_matches(name, options, 1)
+                self.error(f"there is no option {name}" + (f"; did you mean {near[0]}?" if near else ""))
+        return super().parse_known_args(args, namespace)
+
+
+def unknown_verb(name: str) -> str | None:
+    """Return None for a verb, else which one may have been meant, to follow a complaint."""
+    names = [*VERBS, *(alias for aliases in ALIASES.values() for alias in aliases)]
+    if name in names:
+        return None
+    near = difflib.get_close_matches(name, names, 1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser; it leaves the verb as ``verb``, and the name under which it was called as ``called``."""
     raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(PROGRAM, description=DESCRIPTION, epilog=EPILOG, formatter_class=raw)
+    parser = _Parser(PROGRAM, description=DESCRIPTION, epilog=EPILOG, formatter_class=raw)
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and leave")
     hint = "VERB --help gives its options, units and an example"
     subparsers = parser.add_subparsers(
@@ -348,6 +373,8 @@ def _verify(parser: argparse.ArgumentParser) -> None:
     _compensated(add)
     add("--propose", metavar="FILE", help="instead: write which readings to take, a tidy CSV file without values")
     add("--readings", type=int, metavar="N", help="how many of them (default 12)")
+    text = "what there is to take them with: linear, rotation (default both, as a 5-D laser)"
+    add("--instruments", metavar="A,B", help=text)
     _json(add)
 
 

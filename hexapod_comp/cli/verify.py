@@ -37,20 +37,25 @@ def _refuse_what_does_not_fit(args: argparse.Namespace) -> None:
         raise CommandError("FILE", "check readings are missing; --propose FILE says which to take")
     if args.propose is not None and (args.files or args.compensated):
         raise CommandError("--propose", "says which readings to take: measured files and --compensated come after that")
-    if args.readings is not None and args.propose is None:
-        raise CommandError("--readings", "needs --propose")
+    for name in ("readings", "instruments"):
+        if getattr(args, name) is not None and args.propose is None:
+            raise CommandError(f"--{name}", "needs --propose")
 
 
 def _propose(args: argparse.Namespace) -> int:
     """Write the check readings to take."""
-    from ..calibration.check_plan import USUAL, propose_check
+    from ..calibration.check_plan import READ_BY, USUAL, propose_check
     from ..calibration.settling import described
     from ..measurements.writing import write_measurements
 
     _, fitted = _known(args, args.model)
     common.mention_compiling("model.actual_pose_one")
     with common.stage("choosing readings"):
-        readings = propose_check(fitted, USUAL if args.readings is None else args.readings)
+        readings = propose_check(
+            fitted,
+            USUAL if args.readings is None else args.readings,
+            tuple(READ_BY) if args.instruments is None else args.instruments.split(","),
+        )
     write_measurements(readings, args.propose)
     runs = [described(readings, (readings.run == run).nonzero()[0]) for run in dict.fromkeys(readings.run.tolist())]
     if args.json:

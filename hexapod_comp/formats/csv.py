@@ -27,7 +27,7 @@ from ..errors import InputFileError, PoseError
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
 from .files import MAX_CSV_BYTES, open_input, too_large
 from .paths import input_file
-from .texts import DECIMAL_COMMA, MICRO_ERRORS, number_hint, plain_number
+from .texts import DECIMAL_COMMA, MICRO_ERRORS, THOUSANDS, number_hint, plain_number
 from .yaml import LARGEST, UNITS, spellings
 
 LABEL_COLUMNS = ("sequence", "name")
@@ -64,9 +64,6 @@ SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 
 QUOTED = re.compile(r'"[^"]*"')
 """What stands in quotes separates nothing."""
-
-THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
-"""A number whose comma may be a decimal one, or stand between thousands."""
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """A spreadsheet takes a cell that begins so for a formula, and runs it."""

@@ -24,6 +24,12 @@ SUFFIXES = {"poses": (".csv",), "lengths": (".csv",), "readings": (".csv",)}
 COLUMNS = {"poses": re.compile(r'(?:^|[",;\t])\s*x_'), "lengths": re.compile(r'(?:^|[",;\t])\s*L1_')}
 """What stands in the header of CSV files of a kind."""
 
+NUMBERS = re.compile(r"[-+.\d]+(,[-+.\d]+)+")
+"""What was meant to be read as it stands, not a file's name."""
+
+TYPED = {"poses": "--pose", "lengths": "--lengths"}
+"""Options that take what files of a kind hold."""
+
 MOST_LISTED = 12
 """Names in a message about a file that is missing."""
 
@@ -227,6 +233,8 @@ def version() -> str:
 def _no_such_file(name: str, kind: str, beside: bool) -> str:
     """Say that `name` is neither a file nor shipped, and which of its kind there are: beside it, and shipped."""
     own = os.path.expanduser(name)
+    if NUMBERS.fullmatch(name) and kind in TYPED:
+        return f"there is no such file; numbers go with an option: {TYPED[kind]} {name}"
     folder = os.path.dirname(own)
     if folder and not os.path.isdir(folder):
         return "there is no such file, nor its folder"

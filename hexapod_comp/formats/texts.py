@@ -39,9 +39,16 @@ DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
 """A number as much of the world writes it."""
 
 
+THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
+"""A number whose comma may be a decimal one, or stand between thousands."""
+
+
 def number_hint(text: str) -> str:
     """Return what keeps a text from being a number, to follow a complaint, where that is plain to see."""
     text = text.strip()
+    if THOUSANDS.fullmatch(text):
+        meant = f"{text.replace(',', '.')} or {text.replace(',', '')}"
+        return f"; its comma may be a decimal one or stand between thousands: write {meant}"
     if DECIMAL_COMMA.fullmatch(text):
         return f", with a decimal point: {text.replace(',', '.')}"
     return ", without semicolons" if ";" in text else ""

@@ -210,8 +210,10 @@ class Section:
         if not isinstance(content, dict):
             raise InputFileError(path, key, "must be a mapping of keys to values", content)
         self._left = dict(content)
+        self._known: set[str] = set()
 
     def __contains__(self, key: str) -> bool:
+        self._known.add(key)
         return key in self._left
 
     def where(self, key: str) -> str:
@@ -222,8 +224,16 @@ class Section:
         """Return (not raise) an error about `key`."""
         return InputFileError(self.path, self.where(key), problem, value)
 
+    def _meant(self, name: str, dimension: str) -> str:
+        """Return which key may mean a quantity, to follow the complaint that it is missing."""
+        wanted = [f"{name}_{unit}" for unit in UNITS[dimension]]
+        left = list(islice(self._left, MOST_NEIGHBOURS))
+        near = [key for one in wanted for key in difflib.get_close_matches(one, left, 1, 0.8)]
+        return f"; did you mean it by {near[0]!r}?" if near else ""
+
     def take(self, key: str) -> Any:
         """Take a required value of any kind."""
+        self._known.add(key)
         if key not in self._left:
             near = difflib.get_close_matches(key, islice(self._left, MOST_NEIGHBOURS), 1)
             raise self.error(key, "is missing" + (f"; did you mean it by {near[0]!r}?" if near else ""))
@@ -254,6 +264,7 @@ class Section:
 
     def integer(self, key: str, default: int) -> int:
         """Take an optional whole number."""
+        self._known.add(key)
         value = self._left.pop(key, default)
         if type(value) is not int:
             raise self.error(key, "must be a whole number", value)
@@ -297,6 +308,7 @@ class Section:
 
     def quantity_key(self, name: str, dimension: str) -> str | None:
         """Return the key that carries `name` with a unit of `dimension`, or None when there is none."""
+        self._known.update(f"{name}_{unit}" for unit in UNITS[dimension])
         keys = [f"{name}_{unit}" for unit in spellings(dimension) if f"{name}_{unit}" in self._left]
         if name in self._left:
             units = ", ".join(f"{name}_{unit}" for unit in UNITS[dimension])
@@ -330,7 +342,7 @@ class Section:
             if default is not None:
                 return np.array(default, dtype=float)
             units = ", ".join(f"{name}_{unit}" for unit in UNITS[dimension])
-            raise self.error(name, f"is missing; write one of {units}")
+            raise self.error(name, f"is missing; write one of {units}{self._meant(name, dimension)}")
         return in_si(self.array(key, shape), spellings(dimension)[key[len(name) + 1 :]])
 
     def per_strut(self, name: str, dimension: str, default: float | None = None) -> np.ndarray:
@@ -356,7 +368,9 @@ class Section:
         """Raise if keys are left that nobody asked for: a misspelt key must not be lost in silence."""
         if self._left:
             key = next(iter(self._left))
-            raise self.error(key, "is not a known key here", self._left[key])
+            near = difflib.get_close_matches(key, sorted(self._known), 1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise self.error(key, f"is not a known key here{hint}", self._left[key])
 
 
 def in_si(values: Any, factor: float) -> Any:

@@ -7,7 +7,7 @@ them. Struts are numbered 1..6 in the file's order and named ``strut_1`` … ``s
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,9 @@ from ..pose import Pose
 from .frames import BASE, TOOL, WORK, read_named_poses, read_pose, refuse_names
 from .limits import STRUT_NAMES as STRUT_NAMES
 from .limits import Limits, frozen_array
+
+JOINTS_TIMES = {25.4: "in inches", 1.0 / 25.4: "in mm, not inches", 10.0: "in cm", 1e3: "in m", 1e-3: "in mm, not m"}
+"""Factors by which joints in a wrong unit are too small, and what the number would be right as."""
 
 GEOMETRY_FORMAT = "hexapod_comp/geometry"
 GEOMETRY_VERSION = 1
@@ -157,9 +160,23 @@ class HexapodGeometry:
             from .doubts import joint_doubts
 
             platform = self.home.position + self.platform_joints @ self.home.rotation.T
-            raise GeometryError(
-                "home", "; ".join([f"breaks a limit: {refusal}", *joint_doubts(self.base_joints, platform)])
-            )
+            doubts = [*self._unit_doubts(), *joint_doubts(self.base_joints, platform)]
+            raise GeometryError("home", "; ".join([f"breaks a limit: {refusal}", *doubts]))
+
+    def _unit_doubts(self) -> Iterator[str]:
+        """Yield that the joints' unit may be wrong, where home would be a good pose of joints in another unit."""
+        fitting = []
+        for factor, what in JOINTS_TIMES.items():
+            base, platform = (np.ascontiguousarray(joints * factor) for joints in self.kernel_joints)
+            rows, lengths = (self.home.position[None], self.home.rotation[None]), np.empty((1, 6))
+            found = np.empty(1), np.empty(1)
+            batch.strut_lengths(base, platform, *rows, lengths)
+            batch.conditions(base, platform, *rows, factor * self.characteristic_length, *found)
+            low, high = self.limits.stroke.T
+            if (lengths >= low).all() and (lengths <= high).all() and found[0][0] <= self.limits.condition:
+                fitting.append(what)
+        if fitting:
+            yield f"do the units fit? With the joints {' or '.join(fitting)}, home is within stroke and condition"
 
     def refusal(
         self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray

@@ -183,8 +183,9 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
     """
     path = input_file(path, "campaign")
     top = read_yaml(path, CAMPAIGN_FORMAT, CAMPAIGN_VERSION)
-    box, level, cell, step = _read_grid(top, own_box, "runs" in top)
     instrument = top.choice("instrument", (*INSTRUMENTS, "none"), "none")
+    diagonals = top.integer("diagonals", 0)
+    box, level, cell, step = _read_grid(top, own_box, instrument != "none" or diagonals != 0)
     try:
         campaign = Campaign(
             box=box,
@@ -192,7 +193,7 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
             step=step,
             level=level,
             instrument=None if instrument == "none" else instrument,
-            diagonals=top.integer("diagonals", 0),
+            diagonals=diagonals,
             cycles=top.integer("cycles", 1),
             poses=top.integer("poses", 0),
             tilt=float(top.quantity("tilt", "angle", default=0.0)),
@@ -210,14 +211,14 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
     return campaign
 
 
-def _read_grid(top: Section, own_box: OwnBox | None, has_runs: bool) -> tuple[np.ndarray, np.ndarray, float, float]:
+def _read_grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Return the box, m, the tool's attitude in it, and the distances of lines and of readings, m.
 
-    A campaign that lists its runs needs no distances.
+    A campaign without lines of its own, of scattered poses or of runs that it lists, needs no distances.
     """
     if own_box is None or top.quantity_key("box", "length") is not None:
         box, level, cells = top.quantity("box", "length", (2, 3)), np.eye(3), None
-        if has_runs:
+        if not with_lines:
             cells = float(np.ptp(box, axis=0).min())
     else:
         box, level = own_box()

@@ -174,7 +174,7 @@ def test_version_is_the_packages(hexapod) -> None:
     assert hexapod("--version") == (0, f"hexapod_comp {version.group(1)}\n", "")
 
 
-@pytest.mark.parametrize("arguments", [(), ("nonsense",), ("ik", "--pose", "1,2"), ("check",), ("fk", "--guess", "x")])
+@pytest.mark.parametrize("arguments", [(), ("ik", "--pose", "1,2"), ("check",), ("fk", "--guess", "x")])
 def test_usage_errors_exit_2(hexapod, arguments: tuple[str, ...]) -> None:
     code, out, err = hexapod(*arguments)
     assert (code, out) == (2, "")
@@ -718,3 +718,20 @@ def test_signals_end_a_session_in_order(number: signal.Signals) -> None:
     assert left.value.code == 128 + number
     assert ended
     assert signal.getsignal(number) == before
+
+
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        ("nonsense", "there is no verb 'nonsense'; hexapod_comp --help lists them"),
+        ("fti measured.csv", "there is no verb 'fti'; did you mean fit?"),
+        ("verfy model.yaml", "there is no verb 'verfy'; did you mean verify?"),
+        ("fit measured.csv --colums c.yaml --out m.yaml", "there is no option --colums; did you mean --columns?"),
+        ("check poses.csv --machin=mine.yaml --modle=a", "there is no option --modle; did you mean --model?"),
+        ("fk 1,2,3,4,5,6", "numbers go with an option: --lengths 1,2,3,4,5,6"),
+        ("verify m.yaml r.csv --instruments linear", "needs --propose"),
+    ],
+)
+def test_verbs_and_options_typed_wrong(typed: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(typed.split()) == 2
+    assert said in capsys.readouterr().err

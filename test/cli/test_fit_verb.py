@@ -518,7 +518,7 @@ WRONG = {
     "a folder": Wrong(".", r"\.: is a folder"),
     "empty": Wrong("e.csv", r"e\.csv: has no header", "e.csv"),
     "header only": Wrong("h.csv", r"h\.csv: has a header but no rows", "h.csv", TIDY),
-    "not text": Wrong("b.csv", r"b\.csv: header: column run is missing", "b.csv", "\xff\xfe\n\xff"),
+    "not text": Wrong("b.csv", r"b\.csv: has a header but no rows", "b.csv", "\xff\xfe,\n1,2\n"),
     "nan": Wrong("n.csv", r"n\.csv: line 2, column value: .*'nan'", "n.csv",
                  TIDY + "l,forward,0,0,400,linear,nan,um\n"),
     "unit": Wrong("u.csv", r"u\.csv: line 2, column unit: .*'furlong'", "u.csv",
@@ -527,13 +527,13 @@ WRONG = {
                           TIDY + LINE.format(x=0) + LINE.format(x=900)),
     "too few": Wrong("f.csv", r"11 readings .* leave 10 numbers for the structure's 33", "f.csv",
                      TIDY + "".join(LINE.format(x=10 * n) for n in range(11))),
-    "endless": Wrong("v.csv", r"v\.csv: line 2: value must be within ±10 m: .*\(found 1e\+302\)", "v.csv",
+    "endless": Wrong("v.csv", r"v\.csv: line 2, column value: must be a number within .*'1e308'", "v.csv",
                      TIDY + "l,forward,0,0,400,linear,1e308,um\n" + LINE.format(x=9)),
     "turns": Wrong("v.csv", r"v\.csv: line 2: value must be within ±10 rad", "v.csv",
                    TIDY + "l,forward,0,0,400,rotation_x,11,rad\n" + LINE.format(x=9)),
     "below any instrument": Wrong("v.csv", r"v\.csv: line 2: uncertainty must be 1e-12…10 m", "v.csv",
                                   TIDY.replace("unit", "unit,uncertainty") + "l,forward,0,0,400,linear,1,um,1e-300\n"),
-    "no certainty": Wrong("v.csv", r"v\.csv: line 2: uncertainty must be 1e-12…10 m", "v.csv",
+    "no certainty": Wrong("v.csv", r"v\.csv: line 2, column uncertainty: must be a number within", "v.csv",
                           TIDY.replace("unit", "unit,uncertainty") + "l,forward,0,0,400,linear,1,um,1e300\n"),
     "the same file twice": Wrong("{measured} {measured}", "is the same file as"),
     "unknown block": Wrong("{measured} --blocks pitch,colour", r"blocks: must be of structure, .*'colour'"),
@@ -883,3 +883,17 @@ def test_a_trackers_export_from_the_command_line(tmp_path: Path, capsys: pytest.
     assert channel["readings"] == 180
     assert channel["chi_square"] == pytest.approx(1.0, abs=0.35)
     assert any("columns not used: Luftdruck" in note for note in result["notes"])
+
+
+def test_a_mistyped_coordinate_stands_on_the_first_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """306 for 30.6: with file and line, before all else."""
+    folder = Path(__file__).resolve().parents[2] / "examples" / "tracker"
+    content = (folder / "points.csv").read_bytes()
+    wrong = re.sub(rb"(?m)^P07;[-0-9]+,", b"P07;306,", content)
+    assert wrong != content
+    path = tmp_path / "points.csv"
+    path.write_bytes(wrong)
+    columns = ["--columns", str(folder / "columns.yaml"), "--blocks", "structure", "--out", str(tmp_path / "m.yaml")]
+    cli.main(["fit", str(path), *columns])
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.startswith(f"CHECK THIS READING, which looks mistyped: {path}: line 13: position_x is ")

@@ -272,5 +272,5 @@ def test_key_paths_of_nested_lists():
 def test_what_nobody_asked_for_is_an_error():
     left = section(known=1, unknwon=2)
     left.take("known")
-    with pytest.raises(InputFileError, match=r"unknwon: is not a known key here \(found 2\)"):
+    with pytest.raises(InputFileError, match=r"unknwon: is not a known key here; did you mean 'known'\? \(found 2\)"):
         left.finish()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import os
+import re
 import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -272,3 +273,52 @@ def test_an_encoding_that_is_named_is_meant(tmp_path: Path) -> None:
     path.write_bytes("name,x_mm,y_mm,z_mm\nMeßpunkt,1,2,400\n".encode("latin-1"))
     with pytest.raises(InputFileError, match=r"poses\.csv: is not UTF-8 text$"):
         Table(path, Layout(encoding="utf-8"))
+
+
+# What was typed wrong is understood.
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ("correction_um: 1000", "correction_um: 2,000", r"its comma may be .* between thousands: write 2\.000 or 2000"),
+        ("correction_um: 1000", "correction_um: 2,5", r"must be a number, with a decimal point: 2\.5"),
+        ("step_mm", "stepp_mm", r"step: is missing; write one of step_m, .*; did you mean it by 'stepp_mm'\?"),
+        ("clearance_mm", "clearence_mm", r"clearence_mm: is not a known key here; did you mean 'clearance_mm'\?"),
+    ],
+)
+def test_a_geometrys_key_or_number_typed_wrong(tmp_path: Path, before: str, after: str, said: str) -> None:
+    text = (CONFIG / "example_6_6.yaml").read_text(encoding="utf-8")
+    text = re.sub(r"correction_um: *[\d.]+", "correction_um: 1000", text)
+    assert before in text
+    path = tmp_path / "mine.yaml"
+    path.write_text(text.replace(before, after), encoding="utf-8")
+    with pytest.raises(InputFileError, match=said):
+        load_geometry(path)
+
+
+def test_a_drawing_in_inches_under_joints_mm(tmp_path: Path) -> None:
+    """Its numbers are 25.4 times too small; and that is asked, not only what the wrong machine breaks."""
+    tree = yaml.safe_load((CONFIG / "example_6_6.yaml").read_text(encoding="utf-8"))
+    for body in ("base", "platform"):
+        tree[body]["joints_mm"] = (np.array(tree[body]["joints_mm"]) / 25.4).round(4).tolist()
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump(tree))
+    with pytest.raises(InputFileError, match=r"do the units fit\? With the joints in inches"):
+        load_geometry(path)
+
+
+def test_poses_and_lengths_given_as_files() -> None:
+    for read, option in ((read_lengths, "--lengths"), (read_poses, "--pose")):
+        with pytest.raises(InputFileError, match=f"numbers go with an option: {option} 1100,-2,3"):
+            read("1100,-2,3")
+
+
+def test_a_campaign_of_scattered_poses_needs_no_grid(tmp_path: Path) -> None:
+    path = tmp_path / "tracker.yaml"
+    text = "format: hexapod_comp/campaign\nversion: 1\nbox_mm: [[-50, -50, 400], [50, 50, 450]]\n"
+    path.write_text(text + "poses: 60\n")
+    assert load_campaign(path).poses == 60
+    path.write_text(text + "instrument: 5-D\n")
+    with pytest.raises(InputFileError, match="cell: is missing"):
+        load_campaign(path)
