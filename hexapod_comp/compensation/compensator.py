@@ -86,7 +86,7 @@ class Compensator:
         self._at, self._answer = self._state.at, ffi.new("hc_answer *")
         self._time, self._estimated = ffi.new("hc_time *"), ffi.new("hc_estimated *")
         lib.hc_init(self._at, self._constants.at, ramp_rate)
-        self._told: set[str] = set()
+        self._sensed: set[str] = set()
         self._machine: RealMachine | None = None
         self._parts = parts = named_parts(self._state)
         self.command, self.nominal, self.correction = (parts[name] for name in ("command", "nominal", "correction"))
@@ -112,8 +112,8 @@ class Compensator:
     def temperatures(self) -> Temperatures:
         """Readings in use, and how far late parts are behind them."""
         view = self._state.view
-        values = {name: float(view["temperatures"][n]) for n, name in enumerate(PARTS) if name in self._told}
-        if HUMIDITY in self._told:
+        values = {name: float(view["temperatures"][n]) for n, name in enumerate(PARTS) if name in self._sensed}
+        if HUMIDITY in self._sensed:
             values[HUMIDITY] = float(view["humidity"])
         late, lags = range(self._constants.at.late.count), {}
         for n, name in enumerate(PARTS):
@@ -162,7 +162,7 @@ class Compensator:
         if lib.hc_set_temperature(self._at, PARTS.index(name), value, time):
             Temperatures().set(name, value)  # raises for a value out of range, and else it is the time
             raise ModelError(f"time of the temperature of {name}", "must be finite, s: the model has time constants")
-        self._told.add(name)
+        self._sensed.add(name)
         self._machine = None
         self.on_change("temperature", (name, float(value), time))
 
@@ -176,7 +176,7 @@ class Compensator:
         """
         if lib.hc_set_humidity(self._at, value):
             Temperatures().set(HUMIDITY, value)
-        self._told.add(HUMIDITY)
+        self._sensed.add(HUMIDITY)
         self._machine = None
         self.on_change("humidity", (float(value), time))
 
@@ -275,7 +275,7 @@ class Compensator:
         parts, geometry = read_parts(snapshot), self.geometry.using(tool=snapshot.get("tool", TOOL))
         lib.hc_init(self._at, self._constants.at, 0.0)
         write_temperatures(self._state, temperatures)
-        self._told = set(temperatures.values)
+        self._sensed = set(temperatures.values)
         self._use(geometry)
         for name, part in self._parts.items():
             if not name.startswith(PLACES) or np.isfinite(parts[name]).all():

@@ -112,6 +112,6 @@ def backwards(
     Returns OK, NOT_CONVERGED, or OUTSIDE_FIELD where the field is held at the boundary of its box.
     """
     motion = written("low", low, 9), written("sense", sense, 9)
-    found = written("model_position", model_position, 3), written("model_rotation", model_rotation, 3, 3)
+    model = written("model_position", model_position, 3), written("model_rotation", model_rotation, 3, 3)
     pose: tuple[Any, Any] = given("position", position, 3), given("rotation", rotation, 3, 3)
-    return lib.hc_backwards(state.at, *pose, *motion, *found, written("commands", commands, 6))
+    return lib.hc_backwards(state.at, *pose, *motion, *model, written("commands", commands, 6))

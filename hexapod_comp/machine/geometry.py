@@ -147,10 +147,10 @@ class HexapodGeometry:
     def _check_home(self, put: Callable[[str, object], None]) -> None:
         """Refuse a home pose that breaks a limit of single poses."""
         pose = (self.home.position, self.home.rotation)
-        rows, lengths, found = (pose[0][None], pose[1][None]), np.empty((1, 6)), (np.empty(1), np.empty(1))
+        rows, lengths, judged = (pose[0][None], pose[1][None]), np.empty((1, 6)), (np.empty(1), np.empty(1))
         batch.strut_lengths(*self.kernel_joints, *rows, lengths)
-        batch.conditions(*self.kernel_joints, *rows, self.characteristic_length, *found)
-        put("home_sign", float(found[1][0]))
+        batch.conditions(*self.kernel_joints, *rows, self.characteristic_length, *judged)
+        put("home_sign", float(judged[1][0]))
         cone_axes, joints = np.array([self.base_cone_axes, self.platform_cone_axes]), self.platform_joints
         # The distance of struts that share a joint cannot be limited.
         apart = (~coincident(joints)).astype(float)

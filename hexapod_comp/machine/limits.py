@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..core import Status as Found
-from ..core import Struct
+from ..core import Status, Struct
 from ..errors import GeometryError, KinematicsError, LimitError, NotFiniteError, TooEarlyError
 
 STRUT_NAMES = tuple(f"strut_{i}" for i in range(1, 7))
@@ -146,38 +145,38 @@ class Limits:
 
     def error(self, code: int, strut: int, stage: int, value: float) -> LimitError | KinematicsError:
         """Return the error for a finding: which limit, which strut, found and allowed value with units."""
-        if code in (Found.SPEED, Found.EARLY, Found.ACCELERATION):
+        if code in (Status.SPEED, Status.EARLY, Status.ACCELERATION):
             return self._motion_error(code, strut, value)
         which = STAGES[stage]
-        if code == Found.NOT_FINITE:
+        if code == Status.NOT_FINITE:
             return NotFiniteError(f"the {which} values at this pose are not finite")
         name = STRUT_NAMES[strut] if strut >= 0 else ""
         low, high = self.stroke[strut]
-        cone = (self.base_cone if code == Found.BASE_CONE else self.platform_cone)[strut]
+        cone = (self.base_cone if code == Status.BASE_CONE else self.platform_cone)[strut]
         stroke = (
             low if value < low else high,
             f"{name}: {which} length {value * 1e3:.4f} mm is outside the stroke {low * 1e3:.3f}…{high * 1e3:.3f} mm",
         )
         allowed, text = {
-            Found.STROKE_SHORT: stroke,
-            Found.STROKE_LONG: stroke,
-            Found.BASE_CONE: (cone, _cone_text(name, which, "base", value, cone)),
-            Found.PLATFORM_CONE: (cone, _cone_text(name, which, "platform", value, cone)),
-            Found.CLEARANCE: (
+            Status.STROKE_SHORT: stroke,
+            Status.STROKE_LONG: stroke,
+            Status.BASE_CONE: (cone, _cone_text(name, which, "base", value, cone)),
+            Status.PLATFORM_CONE: (cone, _cone_text(name, which, "platform", value, cone)),
+            Status.CLEARANCE: (
                 self.clearance,
                 f"{name}: {value * 1e3:.3f} mm from the nearest other strut ({which}), "
                 f"allowed {self.clearance * 1e3:g} mm",
             ),
-            Found.CONDITION: (
+            Status.CONDITION: (
                 self.condition,
                 f"condition number {value:.4g} of the {which} pose is above {self.condition:g}: near a singularity",
             ),
-            Found.ASSEMBLY: (0.0, f"the {which} pose belongs to another assembly mode than home"),
-            Found.CORRECTION: (
+            Status.ASSEMBLY: (0.0, f"the {which} pose belongs to another assembly mode than home"),
+            Status.CORRECTION: (
                 self.correction,
                 f"{name}: correction {value * 1e6:.3f} µm is larger than ±{self.correction * 1e6:g} µm",
             ),
-            Found.STEP: (
+            Status.STEP: (
                 self.step,
                 f"{name}: the {which} length would change by {value * 1e3:.4f} mm in one command, "
                 f"allowed {self.step * 1e3:g} mm",
@@ -188,10 +187,10 @@ class Limits:
     def _motion_error(self, code: int, strut: int, value: float) -> LimitError:
         """Return the error for a motion that is too fast; `value` is m/s, m/s², or s too early."""
         name = STRUT_NAMES[strut]
-        if code == Found.EARLY:
+        if code == Status.EARLY:
             text = f"{name} cannot be there yet: {value * 1e3:.3g} ms too early for {self.speed * 1e3:g} mm/s"
             return TooEarlyError(text, value, self.speed, strut)
-        quantity, unit = ("speed", "mm/s") if code == Found.SPEED else ("acceleration", "mm/s²")
+        quantity, unit = ("speed", "mm/s") if code == Status.SPEED else ("acceleration", "mm/s²")
         allowed = getattr(self, quantity)
         text = f"{name}: {quantity} {value * 1e3:.4g} {unit} by the stamps, allowed {allowed * 1e3:g} {unit}"
         return LimitError(REASONS[code], text, value, allowed, strut, "compensated")
