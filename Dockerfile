@@ -8,11 +8,7 @@ RUN apt-get update \
     && rosdep install -y --from-paths src --ignore-src --dependency-types exec \
     && apt-get install -y --no-install-recommends python3-venv ros-jazzy-robot-state-publisher \
     && rm -rf /var/lib/apt/lists/*
-# Ubuntu 24.04 packages no Numba.
-RUN python3 -m venv --system-site-packages venv \
-    && touch venv/COLCON_IGNORE \
-    && venv/bin/pip install --no-cache-dir numba \
-    && . /opt/ros/jazzy/setup.sh \
-    && venv/bin/python "$(command -v colcon)" build --packages-select hexapod_comp
+RUN . /opt/ros/jazzy/setup.sh \
+    && colcon build --packages-select hexapod_comp
 STOPSIGNAL SIGINT
 CMD ["bash", "-c", ". install/setup.bash && exec ros2 launch hexapod_comp machine.launch.py model:=paper_machine.yaml"]

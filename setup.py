@@ -83,7 +83,6 @@ setup(
     install_requires=[
         "numpy>=1.26",
         "scipy>=1.11",
-        "numba>=0.58",
         "cffi>=1.16",
         "PyYAML>=6.0",
         "matplotlib>=3.6",

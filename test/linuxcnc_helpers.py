@@ -26,7 +26,6 @@ from typing import Any
 
 import numpy as np
 
-from hexapod_comp.kernels.compiling import cache_folder
 from hexapod_comp.linuxcnc.hal import HalError, load_module
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -111,7 +110,6 @@ def environment(home: Path) -> dict[str, str]:
         "PATH": "/usr/local/bin:/usr/bin:/bin:/usr/sbin:/sbin",
         "PYTHONPATH": str(ROOT),
         "PYTHONDONTWRITEBYTECODE": "1",
-        "NUMBA_CACHE_DIR": str(home / "kernels"),
         "ROS_LOG_DIR": str(home / "ros"),
         "OPENBLAS_NUM_THREADS": "1",
         "OMP_NUM_THREADS": "1",
@@ -127,13 +125,10 @@ def give(path: Path) -> None:
 
 
 def make_folder() -> Path:
-    """Make a folder for one LinuxCNC; the home in it has the compiled kernels, so that nothing compiles twice."""
+    """Make a folder for one LinuxCNC, with a home in it."""
     folder = Path(tempfile.mkdtemp(prefix="hexapod_linuxcnc_", dir="/tmp"))
     home = folder / "home"
     (home / "ros").mkdir(parents=True)
-    kernels = cache_folder(os.environ.get("NUMBA_CACHE_DIR", ""))
-    if kernels.is_dir():
-        shutil.copytree(kernels, home / "kernels" / kernels.name)
     return folder
 
 

@@ -23,7 +23,7 @@ from hexapod_comp.pose import Pose
 PAPER_FILE = Path(__file__).resolve().parents[1] / "config" / "paper.yaml"
 
 fixed = settings(derandomize=True, deadline=None, database=None, max_examples=50)
-"""Decorator for property tests: same examples every time; no deadline, since kernels may still compile."""
+"""Decorator for property tests: same examples every time; no deadline: a busy machine fails nothing."""
 
 UNEVEN_GRID = (
     np.array([-0.2, -0.05, 0.02, 0.2]),

@@ -33,13 +33,13 @@ FILES = ("package.xml", "colcon.pkg", "setup.py", "setup.cfg", "pyproject.toml",
 
 # Import name → key in rosdep's python.yaml and name on PyPI, where the three differ. ROS packages are
 # imported under their own name, which is also their key.
-PYTHON3 = ("cffi", "hypothesis", "matplotlib", "numba", "numpy", "packaging", "pytest", "scipy", "tqdm", "yaml")
+PYTHON3 = ("cffi", "hypothesis", "matplotlib", "numpy", "packaging", "pytest", "scipy", "tqdm", "yaml")
 ROSDEP_KEYS = {name: f"python3-{name}" for name in PYTHON3}
 PYPI_NAMES = {"yaml": "pyyaml"}
-# setuptools runs setup.py wherever that is read, mpl_toolkits comes with matplotlib and llvmlite with Numba, apsw
+# setuptools runs setup.py wherever that is read, mpl_toolkits comes with matplotlib , apsw
 # and lz4 with rosbags, websockets with viser, hal and linuxcnc with LinuxCNC, benchmarks are the source tree's; the
 # others are optional extras, what only `pytest -n` needs, and benchmark tools.
-COMING_WITH = {"setuptools", "mpl_toolkits", "llvmlite", "apsw", "lz4", "websockets", "hal", "linuxcnc", "benchmarks"}
+COMING_WITH = {"setuptools", "mpl_toolkits", "apsw", "lz4", "websockets", "hal", "linuxcnc", "benchmarks"}
 EXEMPT = COMING_WITH | {"xdist", "argcomplete", "plotly", "distributed", "rosbags", "mujoco", "pinocchio", "viser"}
 WITHOUT_ROS = """
 import importlib, sys
@@ -247,8 +247,7 @@ def test_a_build_without_a_compiler_says_what_to_install(tmp_path: Path):
 
 
 # From ros/rosdistro, rosdep/base.yaml and rosdep/python.yaml at 8468e88 (2026-08-22): what
-# `rosdep resolve --os ubuntu:noble` answers for our keys. python3-numba resolves there too, to a package that
-# noble has not.
+# `rosdep resolve --os ubuntu:noble` answers for our keys.
 NOBLE = {
     "g++-static": "g++",
     "python3-argcomplete": "python3-argcomplete",
@@ -287,7 +286,6 @@ def test_every_dependency_is_a_key_of_rosdep_or_a_package_of_jazzy():
     """Read as rosdep, colcon and bloom do, and without conditions: every distribution gets the same."""
     package = importlib.import_module("catkin_pkg.package").parse_package(ROOT / "package.xml")
     named = [*package.buildtool_depends, *package.build_depends, *package.exec_depends, *package.test_depends]
-    named = [dependency for dependency in named if dependency.name != "python3-numba"]
     assert {dependency.name for dependency in named} <= set(NOBLE) | JAZZY
     assert {dependency.condition for dependency in named} == {None}
     assert {dependency.name for dependency in package.build_depends} == {"g++-static", "python3-cffi"}
@@ -409,50 +407,40 @@ def test_package_xml_lists_what_the_source_imports():
     assert {key for key in listed if key.startswith("python3-")} <= needed
 
 
-@pytest.mark.filterwarnings("ignore:.*parse_:DeprecationWarning")  # catkin_pkg under a newer pyparsing
-@pytest.mark.parametrize(
-    ("distribution", "packaged"),
-    [("humble", True), ("jazzy", False), ("kilted", False), ("lyrical", True), ("", True)],
-)
-def test_rosdep_is_asked_for_numba_only_where_ubuntu_packages_it(distribution: str, packaged: bool):
-    """Ubuntu 24.04, the system of Jazzy and Kilted, has no python3-numba: rosdep install would end there."""
-    package = importlib.import_module("catkin_pkg.package").parse_package(ROOT / "package.xml")
-    package.evaluate_conditions({"ROS_DISTRO": distribution})  # as rosdep, colcon and bloom do
-    kept = {dependency.name for dependency in package.exec_depends if dependency.evaluated_condition}
-    assert ("python3-numba" in kept) is packaged
-    assert {"python3-numpy", "rclpy"} <= kept
+NO_CORE = "import sys; sys.modules['hexapod_comp.core._core'] = None\n"
+"""What makes a script find no compiled core."""
 
 
-def _without_numba(words: tuple[str, ...], folder: Path) -> subprocess.CompletedProcess[str]:
-    (folder / "numba.py").write_text("raise ImportError(\"No module named 'numba'\")\n")
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT), *sys.path])}
-    return subprocess.run([sys.executable, *words], env=environment, capture_output=True, text=True, check=False)
+def _run_script(script: str, *words: str) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+    words = (sys.executable, "-c", script, *words)
+    return subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
 
 
 @pytest.mark.parametrize(
     "program", ["hexapod_comp", "compensator", "strut_drive", "linuxcnc_bridge", "linuxcnc_machine"]
 )
-def test_missing_numba_is_said_in_one_line_that_tells_where_to_get_it(
-    program: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_core_that_was_not_built_is_named_in_one_line_that_tells_how(program: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(ROOT)
     lines = [line.split(" = ") for line in _setup_arguments()["entry_points"]["console_scripts"]]
     module, function = dict(lines)[program].split(":")  # started as the script that pip writes does
-    script = f"import sys; from {module} import {function}; sys.exit({function}())"
+    script = f"{NO_CORE}from {module} import {function}; sys.exit({function}())"
     words = ("ik", "--pose", "0,0,400") if program == "hexapod_comp" else ()
-    run = _without_numba(("-c", script, *words), tmp_path)
+    run = _run_script(script, *words)
     assert run.returncode in (1, 2)
     assert run.stdout == ""
     line = run.stderr.removesuffix("\n")
     assert "\n" not in line
-    assert "No module named 'numba'" in line
-    assert "pip install numba" in line
+    assert "hexapod_comp's core does not load" in line
+    assert "pip install --editable ." in line
 
 
-def test_who_only_imports_a_node_without_numba_goes_on(tmp_path: Path):
-    script = "try:\n    import hexapod_comp.nodes.compensator\nexcept ImportError as error:\n    print(error.name)"
-    run = _without_numba(("-c", script), tmp_path)
-    assert (run.returncode, run.stdout) == (0, "numba\n"), run.stderr
+def test_who_only_imports_a_node_without_a_core_goes_on():
+    script = (
+        f"{NO_CORE}try:\n    import hexapod_comp.nodes.compensator\nexcept ImportError as error:\n    print(error.name)"
+    )
+    run = _run_script(script)
+    assert (run.returncode, run.stdout) == (0, "hexapod_comp.core._core\n"), run.stderr
 
 
 def test_package_xml_lists_what_the_tests_import():

@@ -47,7 +47,6 @@ def run(args: argparse.Namespace) -> int:
         wave_period=args.wave_period_mm * 1e-3,
         shared_platform_joints=not args.separate_platform_joints,
     )
-    common.mention_compiling("model.actual_pose_one")
     names = [common.where(row) for row in rows]
     with common.progress_bar(args.machines, " machines") as bar:
         result = assess(geometry, poses, bounds, args.seed, args.machines, names, bar.update)

@@ -46,7 +46,6 @@ def run(args: argparse.Namespace) -> int:
         rows, positions, rotations = read_pose_arrays(args.poses)
     geometry, model = common.load_machine(args)
     mode = "stream" if args.stream else "moves"
-    common.mention_compiling("checks.examine_many")
     with common.progress_bar(len(rows), " poses") as bar:
         result = check(geometry, model, (positions, rotations), mode, args.rate_hz, bar.update)
     common.write_table(args, (_row_values(rows[n], n, result) for n in range(len(rows))))

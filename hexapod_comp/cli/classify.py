@@ -48,7 +48,6 @@ def run(args: argparse.Namespace) -> int:
     if args.model is not None:
         return _after_calibration(args, geometry)
     budget = _budget(args.budget, geometry)
-    common.mention_compiling("kinematics.solve_pose_many")
     turned = orientations(geometry, (args.tilt_deg, args.tilt_deg, (0.0,)))
     reached = reaches(geometry, turned, args.cells)
     names = _names(args.tilt_deg)
@@ -97,7 +96,6 @@ def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry) -> i
     fitted, unknown = load_posterior(model, geometry, args.model)
     if fitted is None:
         raise CommandError("model", f"it is not known what {args.model} leaves: {unknown}")
-    common.mention_compiling("model.actual_pose_one")
     tilts = args.tilt_deg
     reached = reaches(geometry, orientations(geometry, (tilts, tilts, (0.0,))), args.cells)
     poses, machine = random_poses(reached, COMBINED_POSES, args.seed), RealMachine(geometry, model)

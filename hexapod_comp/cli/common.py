@@ -140,24 +140,6 @@ def save_pictures(args: argparse.Namespace, pictures: Callable[[], Mapping[str, 
         mention(args, f"picture: {path}")
 
 
-def mention_compiling(kernel: str) -> None:
-    """Say on a terminal that the first run after an installation takes longer.
-
-    Parameters
-    ----------
-    kernel : str
-        ``module.function`` of the kernel that is about to be used.
-    """
-    if not sys.stderr.isatty():
-        return
-    import numba
-
-    from ..kernels.compiling import cache_folder
-
-    if not any(cache_folder(numba.config.CACHE_DIR).rglob(f"{kernel}-*.nbi")):
-        print("hexapod_comp: compiling, once after an installation; this takes up to a minute", file=sys.stderr)
-
-
 @contextlib.contextmanager
 def ended_in_order() -> Iterator[None]:
     """Let SIGTERM and SIGHUP end this context as Ctrl-C does, so that what was started is ended, with 128 + signal.

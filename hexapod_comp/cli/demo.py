@@ -60,7 +60,6 @@ def _calibration(args: argparse.Namespace, geometry: HexapodGeometry, truth: Mac
     """Measure and fit the machine, and say what came of it before the loop starts."""
     from ..loop.story import calibrate, calibration_text
 
-    common.mention_compiling("model.actual_pose_one")
     with common.stage_line() as say:
         calibration = calibrate(geometry, truth, place, args.seed, say)
     if not args.json:

@@ -35,7 +35,6 @@ def run(args: argparse.Namespace) -> int:
         names = "--linuxcnc, --table, --c, --ros2-control, --urdf, --mjcf"
         raise InputFileError("export", names, "at least one is needed")
     geometry, model = common.load_machine(args)
-    common.mention_compiling("model.actual_pose_one")
     exact = _descriptions(args, geometry) + _c(args, geometry, model)
     if args.linuxcnc is None and args.table is None:
         return _show_exact(args, model, exact)

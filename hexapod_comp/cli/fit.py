@@ -95,7 +95,6 @@ def run(args: argparse.Namespace) -> int:
     settings = fit_settings(args)
     with common.stage("reading measurements"):
         measured = read_measurements(args.files, geometry, args.columns, args.probe_mm)
-    common.mention_compiling("model.actual_pose_one")
     try:
         result = _joint(args, measured, settings) if args.scheme == "joint" else _lines(args, measured)
     except CalibrationError:

@@ -30,7 +30,6 @@ def run(args: argparse.Namespace) -> int:
     with common.stage(f"reading {args.lengths_file}"):
         rows, lengths = _read(args)
     geometry, model = common.load_machine(args)
-    common.mention_compiling("kinematics.solve_pose_many")
     _mention_search(args, geometry, len(rows))
     if args.all_modes:
         _all_modes(args, geometry, lengths[0])

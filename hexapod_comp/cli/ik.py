@@ -34,7 +34,6 @@ def run(args: argparse.Namespace) -> int:
     with common.stage(f"reading {args.poses}"):
         rows, positions, rotations = _given_pose(args) or read_pose_arrays(args.poses)
     geometry, model = common.load_machine(args)
-    common.mention_compiling("checks.examine_many")
     with common.progress_bar(len(rows), " poses") as bar:
         result = check(geometry, model, (positions, rotations), "poses", progress=bar.update)
     _refuse_lengthless(result, rows)

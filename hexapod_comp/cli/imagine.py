@@ -50,7 +50,6 @@ def run(args: argparse.Namespace) -> int:
     box, error_of_tool = None, None
     try:
         box, attitude, _ = machine_box(geometry)
-        common.mention_compiling("model.actual_pose_one")
         error_of_tool = held_out(RealMachine(geometry, model), None, box, level=attitude)
     except GeometryError as error:
         common.say_notes([f"what the tool does is not shown: {error}"])

@@ -41,7 +41,6 @@ def _judge(args: argparse.Namespace, geometry: HexapodGeometry) -> int:
     from ..measurements.campaign import template
 
     campaign = _campaign(args, geometry)
-    common.mention_compiling("model.actual_pose_one")
     with common.stage_line() as say:
         say("laying out the readings")
         measured = template(campaign, geometry, args.seed, args.campaign)
@@ -61,7 +60,6 @@ def _propose(args: argparse.Namespace, geometry: HexapodGeometry) -> int:
 
     goal = _goal(args)
     base = _campaign(args, geometry)
-    common.mention_compiling("model.actual_pose_one")
     place = MeasuringBox(geometry, base.box, base.level, goal.tilt)
     with common.stage_line() as say:
         result = propose(place, goal, fit_settings(args), base, say)

@@ -14,7 +14,6 @@ def run(args: argparse.Namespace) -> int:
     from ..workspace.pictures import overview_figure
 
     geometry = load_geometry(args.machine)
-    common.mention_compiling("limits.check_poses")
     with common.stage_line() as say:
         say("reach and largest box")
         seen = overview(geometry)

@@ -33,7 +33,6 @@ def run(args: argparse.Namespace) -> int:
     if args.warm_up is not None:
         warm_up, expansion = load_warm_up(args.warm_up, args.seed)
         campaign, truth = warm_up.campaign(campaign), growing(truth, expansion)
-    common.mention_compiling("model.actual_pose_one")
     plan = template(campaign, geometry, args.seed, args.campaign)
     running, machine = None if args.model == "ideal" else model, RealMachine(geometry, truth)
     with common.progress_bar(len(plan.stations), " stations") as bar:

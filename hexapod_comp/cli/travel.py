@@ -24,7 +24,6 @@ def run(args: argparse.Namespace) -> int:
     else:
         _, positions, rotations = common.one_row(args.pose)
         pose = Pose(positions[0], rotations[0])
-    common.mention_compiling("travel.travel_one")
     ways = travel(RealMachine(geometry, model), pose)
     if args.json:
         machine = {"machine": geometry.name, "model": model.name, **common.frames(geometry)}

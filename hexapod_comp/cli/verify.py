@@ -49,7 +49,6 @@ def _propose(args: argparse.Namespace) -> int:
     from ..measurements.writing import write_measurements
 
     _, fitted = _known(args, args.model)
-    common.mention_compiling("model.actual_pose_one")
     with common.stage("choosing readings"):
         readings = propose_check(
             fitted,
@@ -98,7 +97,6 @@ def checked(args: argparse.Namespace, path: str) -> Checked:
         probe = fitted.space.probe  # as the fit was told
     with common.stage("reading measurements"):
         measured = read_measurements(args.files, geometry, args.columns, probe)
-    common.mention_compiling("model.actual_pose_one")
     if args.compensated:
         measured = compensated(measured, model)
     with common.stage("weighing what may have happened"):

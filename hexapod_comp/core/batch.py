@@ -155,7 +155,7 @@ def motions(
     to_rotations: np.ndarray,
     point: np.ndarray,
     axes: np.ndarray,
-    found: np.ndarray,
+    moved: np.ndarray,
 ) -> None:
     """Write the motion from each pose to another, shape (6, N): displacement of a point, m, and rotation vector, rad.
 
@@ -167,7 +167,7 @@ def motions(
         In ``platform``, m.
     axes : ndarray, shape (3, 3)
         Its columns are the axes, in ``base``, along which the motions are written.
-    found : ndarray, shape (6, N)
+    moved : ndarray, shape (6, N)
         NaN after exactly half a turn, whose axis could point either way.
     """
     poses, count = _poses(positions, rotations), len(positions)
@@ -177,7 +177,7 @@ def motions(
         given("to_rotations", to_rotations, count, 3, 3),
         given("point", point, 3),
         given("axes", axes, 3, 3),
-        written("found", found, 6, count),
+        written("moved", moved, 6, count),
     )
 
 
@@ -306,10 +306,10 @@ def examine(
     base: np.ndarray, platform: np.ndarray, limits: Any, position: np.ndarray, rotation: np.ndarray
 ) -> np.ndarray:
     """Return the limited quantities of one pose, shape (1, 1) of :data:`QUANTITIES`; `limits`: ``hc_limits *``."""
-    found = np.empty((1, 1), QUANTITIES)
-    into = ffi.from_buffer("hc_quantities *", found)
+    quantities = np.empty((1, 1), QUANTITIES)
+    into = ffi.from_buffer("hc_quantities *", quantities)
     lib.hc_examine(*_joints(base, platform), limits, pose_of(position, rotation), into)
-    return found
+    return quantities
 
 
 def examine_poses(
@@ -341,11 +341,11 @@ def examine_poses(
         HC_OK, HC_NOT_CONVERGED: no command was found, HC_OUTSIDE_FIELD: the field's value was held at the boundary.
     """
     poses = _poses(positions, rotations)
-    found, flags = np.empty((poses[0], 2), QUANTITIES), np.empty(poses[0], np.intc)
+    quantities, flags = np.empty((poses[0], 2), QUANTITIES), np.empty(poses[0], np.intc)
     motion = written("low", low, 9), written("sense", sense, 9)
-    into = ffi.from_buffer("hc_quantities[]", found), written("flags", flags, poses[0], kind=np.intc)
+    into = ffi.from_buffer("hc_quantities[]", quantities), written("flags", flags, poses[0], kind=np.intc)
     lib.hc_examine_many(state, *poses, independent, *motion, *into)
-    return found, flags
+    return quantities, flags
 
 
 def check_poses(

@@ -1,6 +1,6 @@
 """Waves as imperfections: are they as large, as long and as smooth as asked, and nothing else?
 
-What is looked at is what the machine does with them (its kernels' strut error, its field's values), not the
+What is looked at is what the machine does with them (the core's strut error, its field's values), not the
 arrays that were drawn. A sum of plane waves of one length λ obeys f'' = −(2π/λ)²·f on a strut and Helmholtz'
 equation ∇²f = −(2π/λ)²·f in space; a sum of several lengths has its spectrum between the shortest and the
 longest. Neither needs the phases, directions or sizes that were drawn.

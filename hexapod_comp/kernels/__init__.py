@@ -1,1 +1,0 @@
-"""Everything compiled, and nothing else: arrays and numbers in, arrays and numbers out."""
