@@ -212,6 +212,17 @@ def test_the_stable_abi_is_what_pythons_own_header_declares(tmp_path: Path):
     assert done.returncode == 0, done.stderr
 
 
+def test_the_stable_abi_has_what_older_versions_of_cffi_ask_for(tmp_path: Path):
+    """cffi 1.16, of Ubuntu 24.04, generates ``PyInt_FromLong`` unless told that this is Python 3, and calls memset."""
+    source = tmp_path / "cffi_1_16.c"
+    text = '#include <Python.h>\n#if PY_MAJOR_VERSION < 3\n#error "Python 2"\n#endif\n'
+    source.write_text(text + "void clear(char *a) { memset(a, 0, 1); }\n")
+    folder = ROOT / "hexapod_comp" / "core" / "stable_abi"
+    command = [*building.installed_compiler(), f"-I{folder}", "-Werror", "-fsyntax-only", str(source)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.fixture
 def no_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Take every command away: PATH leads to an empty folder, and no variable names a compiler."""

@@ -10,9 +10,11 @@
 #include <alloca.h> /* as Python's header does, and cffi counts on */
 #include <assert.h>
 #include <stddef.h>
+#include <string.h>
 #include <sys/types.h>
 
 #ifndef Py_PYTHON_H
+#define PY_MAJOR_VERSION 3 /* asked by cffi up to 1.16 */
 typedef ssize_t Py_ssize_t;
 typedef struct _object PyObject;
 typedef struct _ts PyThreadState;
