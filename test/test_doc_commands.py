@@ -252,12 +252,12 @@ def sessions(page: Path) -> list[tuple[str, list[str], list[str]]]:
 
 
 def same(shown: str, printed: str) -> bool:
-    """Return whether a line shown is the line printed, up to ``…`` and to its numbers' last digits."""
-    if len(shown.split("…")) > 1:
-        return all(NUMBER.sub("0", part).strip() in NUMBER.sub("0", printed) for part in shown.split("…"))
-    texts = [" ".join(NUMBER.sub("0", line).split()) for line in (shown, printed)]
-    numbers = [NUMBER.findall(line) for line in (shown, printed)]
-    return texts[0] == texts[1] and all(close(a, b) for a, b in zip(*numbers, strict=True))
+    """Return whether a line shown is the line printed, up to its numbers' last digits; ``…`` is anything."""
+    begins, *rest = shown.split("…")
+    texts = [" ".join(NUMBER.sub("0", line).split()) for line in (begins, printed)]
+    numbers = [NUMBER.findall(line) for line in (begins, printed)]
+    alike = texts[1].startswith(texts[0]) if rest else texts[0] == texts[1]
+    return alike and all(close(a, b) for a, b in zip(*numbers, strict=not rest))
 
 
 def close(shown: str, printed: str) -> bool:

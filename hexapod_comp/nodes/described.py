@@ -23,7 +23,7 @@ from .vital_signs import LATCHED_QOS
 
 TOPIC = "robot_description"
 
-SAID_AFTER = 5.0
+WARN_AFTER = 5.0
 """Without a URDF for this long the log says what is missing, s."""
 
 
@@ -40,7 +40,7 @@ def wait_for_description(arguments: Sequence[str]) -> str:
     heard: list[String] = []
     node.create_subscription(String, TOPIC, heard.append, LATCHED_QOS)
     missing = f"no URDF yet: waiting for a compensator to publish {node.resolve_topic_name(TOPIC)}"
-    waiting = node.create_timer(SAID_AFTER, lambda: node.get_logger().warning(missing))
+    waiting = node.create_timer(WARN_AFTER, lambda: node.get_logger().warning(missing))
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
     try:

@@ -40,7 +40,7 @@ const std::vector<std::string> PARTS = {
 
 // Why references are not answered, beside the core's refusals.
 enum Guard { NONE, NO_REFERENCES, NO_FEEDBACK, STALE, FOLLOWING_ERROR };
-constexpr std::array<const char *, 5> SAID = {
+constexpr std::array<const char *, 5> GUARD_TEXTS = {
   "compensating", "no references", "no feedback: a strut's state is not finite",
   "stale: commands move, the struts' states do not; activate the controller anew to go on",
   "following_error: the struts are not where they were sent; activate the controller anew to go on"};
@@ -207,9 +207,9 @@ private:
   void command(double now)
   {
     hc_answer answer;
-    said_ = hc_command_lengths(&state_, reference_interfaces_.data(), {now, UNKNOWN}, &answer);
-    if (said_ != HC_OK) {  // the struts are held at the last command
-      refused_[said_ == HC_STROKE_SHORT ? HC_STROKE_LONG : said_.load()]++;
+    last_status_ = hc_command_lengths(&state_, reference_interfaces_.data(), {now, UNKNOWN}, &answer);
+    if (last_status_ != HC_OK) {  // the struts are held at the last command
+      refused_[last_status_ == HC_STROKE_SHORT ? HC_STROKE_LONG : last_status_.load()]++;
       return;
     }
     std::copy(answer.command, answer.command + 6, command_.begin());
@@ -220,14 +220,14 @@ private:
   void publish_status()
   {
     enable_ = get_node()->get_parameter("enable_compensation").as_bool();
-    const int guard = guard_, said = said_;
-    const bool refused = guard == NONE && said != HC_OK;
+    const int guard = guard_, status = last_status_;
+    const bool refused = guard == NONE && status != HC_OK;
     DiagnosticStatus message;
     message.name = std::string(get_node()->get_name()) + ": state";
     message.hardware_id = hc_machine()->machine;
     message.level = refused || guard > NO_REFERENCES ? DiagnosticStatus::ERROR :
       guard == NO_REFERENCES ? DiagnosticStatus::WARN : DiagnosticStatus::OK;
-    message.message = refused ? std::string("refused: ") + hc_reason(static_cast<hc_status>(said)) : SAID[guard];
+    message.message = refused ? std::string("refused: ") + hc_reason(static_cast<hc_status>(status)) : GUARD_TEXTS[guard];
     const auto add = [&message](const std::string & key, const std::string & value) {
         message.values.emplace_back();
         message.values.back().key = key;
@@ -258,7 +258,7 @@ private:
   // Between the control loop and the executor's thread:
   std::array<std::atomic<double>, 8> degrees_{};
   std::atomic<bool> enable_{true}, enabled_{true};
-  std::atomic<int> guard_{NO_REFERENCES}, said_{HC_OK};
+  std::atomic<int> guard_{NO_REFERENCES}, last_status_{HC_OK};
   std::array<std::atomic<uint64_t>, MOST_STATUSES> refused_{};
   std::atomic<uint64_t> commands_{0}, refused_temperatures_{0}, unwritten_{0}, calls_{0};
   std::atomic<double> longest_{0.0}, spent_{0.0};
