@@ -118,10 +118,8 @@ def of(*program: str) -> Any:
 
 @of("hexapod_comp")
 def test_our_verbs_and_options_are_there(command: Command) -> None:
-    try:
+    if command.words[1:] != ["--version"]:  # which leaves
         make_parser().parse_args(command.words[1:])
-    except SystemExit as left:  # --version and --help leave with 0
-        assert left.code == 0
 
 
 @of("python", "-m")
