@@ -103,7 +103,7 @@ class MachineNode(LifecycleNode):
         self._tickers: dict[str, Ticker] = {}
         self._options = Parameters(self, table, self._on_parameters)
         self.clock = StampClock(self.simulated_time())
-        self._steps_said = 0
+        self._steps_logged = 0
         self.wants_autostart = bool(self._options.get("autostart", True))
 
     def _on_parameters(self, names: set[str]) -> None:
@@ -210,8 +210,8 @@ class MachineNode(LifecycleNode):
         """Find out whether the clock was set, also while no messages come, and say so."""
         self.clock.read()
         steps = self.clock.set_back + self.clock.set_forward
-        if steps != self._steps_said:
-            self._steps_said = steps
+        if steps != self._steps_logged:
+            self._steps_logged = steps
             step = self.clock.last_step * 1e-9
             self.warn_of("clock", f"the clock was set {'back' if step < 0 else 'forward'} by {abs(step):.3f} s")
 
