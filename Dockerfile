@@ -5,8 +5,8 @@ WORKDIR /ws
 COPY . src/hexapod_comp
 RUN apt-get update \
     && rosdep update \
-    && rosdep install -y --from-paths src --ignore-src --dependency-types exec \
-    && apt-get install -y --no-install-recommends python3-venv ros-jazzy-robot-state-publisher \
+    && rosdep install -y --from-paths src --ignore-src --dependency-types build --dependency-types exec \
+    && apt-get install -y --no-install-recommends ros-jazzy-robot-state-publisher \
     && rm -rf /var/lib/apt/lists/*
 RUN . /opt/ros/jazzy/setup.sh \
     && colcon build --packages-select hexapod_comp
