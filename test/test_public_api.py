@@ -74,7 +74,7 @@ def test_the_version_is_the_packages():
 
 @pytest.mark.parametrize("command", ["import hexapod_comp", "from hexapod_comp.cli import main; main(['--help'])"])
 def test_the_door_opens_without_numpy(command: str):
-    """NumPy, SciPy and Numba take a second of processor time; the rest of --help a tenth."""
+    """NumPy and SciPy take a second of processor time; the rest of --help a tenth."""
     heavy = "{'numpy', 'scipy', 'yaml', 'matplotlib', 'rclpy'}"
     code = f"import sys; {command}; sys.exit(str(sorted({heavy} & set(sys.modules))))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
