@@ -141,11 +141,24 @@ class Compensator:
             drag the struts there and be refused on its way. The old model stays.
         """
         constants = core_model(self.geometry, model)
-        if lib.hc_set_model(self._at, constants.at):
-            lib.hc_check(self._at, constants.at, self._answer)
-            raise refusal(self._answer, self.geometry, model)
+        self._check(constants, model)
+        lib.hc_set_model(self._at, constants.at)
         self._constants, self.model, self._machine = constants, model, None
         self.on_change("model", model)
+
+    def check(self) -> None:
+        """Raise what is wrong with all that the model would correct at the last command, before the first one at home.
+
+        Raises
+        ------
+        LimitError, KinematicsError, OutsideFieldError
+            As for :meth:`set_model`.
+        """
+        self._check(self._constants, self.model)
+
+    def _check(self, constants: Struct, model: MachineModel) -> None:
+        if lib.hc_check(self._at, constants.at, self._answer):
+            raise refusal(self._answer, self.geometry, model)
 
     def set_temperature(self, name: str, value: float, time: float = math.nan) -> None:
         """Take a temperature, °C, of a strut, ``base`` or ``platform``; its effect ramps in.
@@ -208,9 +221,9 @@ class Compensator:
             As for :meth:`set_model`, when it is switched on.
         """
         if enabled != self.enabled:
-            if lib.hc_enable(self._at, enabled):
-                lib.hc_check(self._at, self._constants.at, self._answer)
-                raise refusal(self._answer, self.geometry, self.model)
+            if enabled:
+                self.check()
+            lib.hc_enable(self._at, enabled)
             self.on_change("enable", enabled)
 
     def set_ramp_rate(self, ramp_rate: float) -> None:

@@ -67,11 +67,12 @@ class CompensatorNode(MachineNode):
     # ---- lifecycle ----
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Load geometry and model, compile, open topics."""
+        """Load geometry and model, open topics."""
         began = time.perf_counter()
         try:
             geometry = self._files.geometry()
             self._compensator = Compensator(geometry, self._files.model(geometry), self._options["ramp_rate"])
+            self._compensator.check()
             self._compensator.enable(self._options["enable_compensation"])
             self._compensator.set_tool(self._options["tool"])
             ids = frame_ids(geometry, self._options)
