@@ -31,6 +31,10 @@ FORCED = "WRITTEN BY FORCE: this model is not to be trusted"
 ADVICE = "Do units, lead, geometry and the instrument's uncertainty fit?"
 
 
+OF_THE_MODEL = ("correction", "assembly", "not_converged")
+"""Limits that a model breaks by itself; others, such as the stroke's end, a measured pose may be next to."""
+
+
 def fit_settings(args: argparse.Namespace) -> FitSettings:
     """Return what the options say about a fit of scheme joint.
 
@@ -100,6 +104,8 @@ def run(args: argparse.Namespace) -> int:
     except CalibrationError:
         common.say_notes(measured.notes)  # they may say why
         raise
+    if beyond := beyond_limits(measured, result.model):
+        result = replace(result, misfit="; ".join(filter(None, (result.misfit, beyond))))
     if result.misfit and not args.force:
         _refuse(args, result)
         return 1
@@ -107,6 +113,26 @@ def run(args: argparse.Namespace) -> int:
         worth = _worth(truth, result, measured)
     _write(args, result, measured, worth)
     return 0
+
+
+def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
+    """Return which poses, of those measured, the compensator would refuse with a model; empty if none."""
+    import numpy as np
+
+    from ..compensation.checks import check
+    from ..formats.texts import number
+
+    geometry, stations = measured.geometry, measured.stations
+    places = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(12)
+    chosen = np.unique(places, axis=0, return_index=True)[1]
+    poses = geometry.tool_poses(stations.positions[chosen], stations.rotations[chosen])
+    breaches = [b for b in check(geometry, model, poses, "poses").breaches if b.limit in OF_THE_MODEL]
+    if not breaches:
+        return ""
+    at = ", ".join(number(1e3 * v, 1) for v in poses[0][breaches[0].row])
+    count = len({breach.row for breach in breaches})
+    problem = f"with it the compensator would refuse {count} of the {len(chosen)} poses that were measured"
+    return f"{problem}, first at {at} mm, tool in work: {breaches[0].error}"
 
 
 def _refuse(args: argparse.Namespace, result: _Result) -> None:

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calibration_helpers import paper, scattered
 from helpers import quick_pictures
 
 from hexapod_comp import cli
@@ -26,11 +27,15 @@ from hexapod_comp.calibration.linear_problem import physical_covariance
 from hexapod_comp.calibration.observability import expected_error
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.posterior import load_posterior
+from hexapod_comp.cli.fit import beyond_limits
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.measurements.files import read_measurements
 from hexapod_comp.measurements.readings import MeasurementSet
+from hexapod_comp.pose import Pose
 
 CAMPAIGN = """format: hexapod_comp/campaign
 version: 1
@@ -897,3 +902,18 @@ def test_a_mistyped_coordinate_stands_on_the_first_line(tmp_path: Path, capsys: 
     cli.main(["fit", str(path), *columns])
     first = capsys.readouterr().out.splitlines()[0]
     assert first.startswith(f"CHECK THIS READING, which looks mistyped: {path}: line 13: position_x is ")
+
+
+def test_a_model_that_the_compensator_would_refuse_is_named_before_it_is_written() -> None:
+    """All struts too long by 1.5 times what may be corrected, and by a tenth of that."""
+    poses = [Pose(np.array([x, 0.0, 0.42]), np.eye(3)) for x in (-0.1, 0.0, 0.1)]
+    measured = scattered(paper(), poses)
+    limit = paper().limits.correction
+    for offset, said in ((0.1 * limit, False), (1.5 * limit, True)):
+        model = MachineModel("paper", struts=StrutErrors(offset=np.full(6, offset)))
+        text = beyond_limits(measured, model)
+        assert bool(text) == said
+    assert text.startswith(
+        "with it the compensator would refuse 3 of the 3 poses that were measured, first at -100.0, 0.0"
+    )
+    assert "correction" in text
