@@ -7,8 +7,9 @@ length − nominal strut length.
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -114,7 +115,7 @@ class ModelOrigin:
     note: str = ""
     posterior: tuple[str, str] | None = None
     datum: Datum | None = None
-    text_sha256: str = field(default="", compare=False)
+    text_sha256: str = dataclasses.field(default="", compare=False)
 
 
 @dataclass(frozen=True)
@@ -155,11 +156,11 @@ class MachineModel:
 
     machine: str
     name: str = "ideal"
-    base_deviation: np.ndarray = field(default_factory=lambda: np.zeros((6, 3)))
-    platform_deviation: np.ndarray = field(default_factory=lambda: np.zeros((6, 3)))
-    base_axes_turn: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    struts: StrutErrors = field(default_factory=StrutErrors)
-    field: GridField = field(default_factory=no_field)
+    base_deviation: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((6, 3)))
+    platform_deviation: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((6, 3)))
+    base_axes_turn: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
+    struts: StrutErrors = dataclasses.field(default_factory=StrutErrors)
+    field: GridField = dataclasses.field(default_factory=no_field)
     base_expansion: float = 0.0
     platform_expansion: float = 0.0
     late_growth: LateGrowth = AT_ONCE

@@ -559,3 +559,10 @@ def test_the_ideal_model_has_no_file(tmp_path, monkeypatch):
     assert not any(block.any() for block in (model.base_deviation, model.platform_deviation, model.struts.offset))
     with pytest.raises(InputFileError):  # a path means the file
         load_model(tmp_path / "ideal", SKEWED)
+
+
+def test_the_models_field_hides_nothing():
+    """`MachineModel.field` is a GridField: in the class, `field` of dataclasses must not be meant by that name too."""
+    from hexapod_comp.machine import model
+
+    assert not hasattr(model, "field")
