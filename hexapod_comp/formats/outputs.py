@@ -22,7 +22,6 @@ READ = (
     "details",
     "files",
     "lengths_file",
-    "library",
     "machine",
     "model",
     "poses",
@@ -35,7 +34,7 @@ READ = (
 WRITTEN = ("certificate", "mjcf", "out", "propose", "report", "table", "urdf")
 """Arguments that name files to write."""
 
-FOLDERS = ("c_folder", "folder", "linuxcnc", "pictures")
+FOLDERS = ("c_folder", "folder", "linuxcnc", "pictures", "ros2_control")
 """Arguments that name folders to write into; they are made."""
 
 _protected: dict[tuple[int, int], str] = {}

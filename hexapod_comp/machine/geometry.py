@@ -169,11 +169,11 @@ class HexapodGeometry:
         for factor, what in JOINTS_TIMES.items():
             base, platform = (np.ascontiguousarray(joints * factor) for joints in self.kernel_joints)
             rows, lengths = (self.home.position[None], self.home.rotation[None]), np.empty((1, 6))
-            found = np.empty(1), np.empty(1)
+            conditions = np.empty(1), np.empty(1)
             batch.strut_lengths(base, platform, *rows, lengths)
-            batch.conditions(base, platform, *rows, factor * self.characteristic_length, *found)
+            batch.conditions(base, platform, *rows, factor * self.characteristic_length, *conditions)
             low, high = self.limits.stroke.T
-            if (lengths >= low).all() and (lengths <= high).all() and found[0][0] <= self.limits.condition:
+            if (lengths >= low).all() and (lengths <= high).all() and conditions[0][0] <= self.limits.condition:
                 fitting.append(what)
         if fitting:
             yield f"do the units fit? With the joints {' or '.join(fitting)}, home is within stroke and condition"

@@ -17,7 +17,7 @@ from hexapod_comp.formats import outputs
 
 ROOT = Path(__file__).resolve().parents[2]
 WORDS = {"name", "namespace", "blocks", "instruments", "order", "scheme", "method", "scheduler", "thermometer", "host"}
-WORDS |= {"tool", "work"}
+WORDS |= {"tool", "work", "topic"}
 """Options whose text is no file's name."""
 
 

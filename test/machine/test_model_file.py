@@ -78,6 +78,8 @@ def assert_equal(one, other, relative=0.0):
     assert type(one) is type(other)
     if is_dataclass(one):
         for entry in fields(one):
+            if not entry.compare:  # where it was read from, such as a file's hash
+                continue
             assert_equal(getattr(one, entry.name), getattr(other, entry.name), relative)
     elif isinstance(one, tuple):
         assert len(one) == len(other)
@@ -390,7 +392,7 @@ LAST_LINE = "  - {axis: z, at: [1, 1], direction: both, dx_um: []}\n"
         ("dz_um: [1, 2, 3]", "dz_mm: [0, 60]", ["field.lines_z.dz", "±50 mm", "unit", "0.06"]),
         ("dz_um: [1, 2, 3]", "dz_mm: [80, 0, -40]", ["field.lines_z.dz", "±50 mm", "0.08"]),
         ("rx_urad: [7]", "rx_rad: [-0.2]", ["field.lines_z.rx", "±100 mrad", "0.2"]),
-        ("dz_um: [1, 2, 3]", "dz_um: [1.0e+300, 1.0e+300]", ["field.lines_z.dz", "±50 mm"]),
+        ("dz_um: [1, 2, 3]", "dz_um: [1.0e+300, 1.0e+300]", ["field.lines[0].dz_um", "within ±1e+12"]),
         ("[10, 20, 30, 40, 50, 60]", "[10, 200000, 0, 0, 0, 0]", ["struts.offset", "±100 mm", "unit", "0.2"]),
         ("expansion_ppm_per_K: 11.7", "expansion_ppm_per_K: 11700", ["struts.expansion", "±1000 ppm per K", "0.0117"]),
         (LAST_LINE, "", ["field.lines", "the forward line along z at [1, 1] is missing"]),
