@@ -315,7 +315,7 @@ def test_episodes_are_the_same_for_the_same_seed_and_all_kinds_come_equally_ofte
     firsts = [faults[0][1] for faults in drawn(5)]
     assert sorted(firsts) == sorted([*KINDS] * 2)
     assert 5 < sum(len(faults) == 2 for faults in drawn(5)) < 2 * len(KINDS)
-    assert set(VISIBLE) == set(KINDS)
+    assert set(VISIBLE) >= set(KINDS)  # benchmarks.network adds its own, where a test has imported it
 
 
 class Chosen:
