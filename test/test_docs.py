@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from hexapod_comp.cli import main
+from hexapod_comp.measurements.readings import ANGULAR_KINDS, DEFAULT_UNCERTAINTY
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("doc/**/*.md")])
@@ -43,6 +44,13 @@ def test_the_site_shows_every_page():
     listed = set(re.findall(r"^[\w/]+$", index, re.MULTILINE))
     pages = {str(page.relative_to(ROOT / "doc").with_suffix("")) for page in ROOT.glob("doc/**/*.md")}
     assert listed == pages - {"index"}
+
+
+def test_each_key_of_a_campaigns_noise_is_documented_with_its_default():
+    text = (ROOT / "doc" / "calibration.md").read_text(encoding="utf-8")
+    for kind, sigma in DEFAULT_UNCERTAINTY.items():
+        unit = "rad" if kind in ANGULAR_KINDS else "m"
+        assert re.search(rf"^\| `{kind}_u{unit}` \|.+\| {sigma * 1e6:g} µ{unit} \|$", text, re.MULTILINE), kind
 
 
 def test_the_code_that_the_theory_names_is_there():

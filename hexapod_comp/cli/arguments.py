@@ -10,6 +10,11 @@ from ..formats.texts import number_hint
 
 POSE_HELP = "mm and degrees: x,y,z or x,y,z,alpha,beta,gamma"
 
+LINE_HELP = "mm and degrees: x,y,z of its start, x,y,z of its end, and the tool's alpha,beta,gamma (default 0,0,0)"
+
+DIRECTIONS = ("forward", "backward")
+"""In which every axis and every strut last moved."""
+
 POSE_OPTIONS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
 """A pose number by number: the options of ik."""
 
@@ -52,6 +57,17 @@ def lengths(text: str) -> tuple[float, ...]:
     if len(values) != 6:
         raise argparse.ArgumentTypeError(f"needs six lengths in mm, not {len(values)}")
     return tuple(v * 1e-3 for v in values)
+
+
+def line(text: str) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+    """Read two points in mm and, perhaps, the tool's angles in degrees; return the points, m, and the angles, rad."""
+    values = numbers(text)
+    if len(values) not in (6, 9):
+        raise argparse.ArgumentTypeError(f"needs six or nine numbers ({LINE_HELP}), not {len(values)}")
+    start, end = (tuple(v * 1e-3 for v in values[n : n + 3]) for n in (0, 3))
+    if start == end:
+        raise argparse.ArgumentTypeError(f"must end elsewhere than it starts, not {text}")
+    return start, end, tuple(map(math.radians, values[6:] or (0.0, 0.0, 0.0)))
 
 
 def box(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:

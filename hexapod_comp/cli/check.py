@@ -48,6 +48,8 @@ def run(args: argparse.Namespace) -> int:
     mode = "stream" if args.stream else "moves"
     with common.progress_bar(len(rows), " poses") as bar:
         result = check(geometry, model, (positions, rotations), mode, args.rate_hz, bar.update)
+    if not args.json:
+        common.mention_default(args, geometry)
     common.write_table(args, (_row_values(rows[n], n, result) for n in range(len(rows))))
     common.show(_as_json(geometry, model, rows, result) if args.json else _report(args, geometry, model, rows, result))
     return 0 if result.ok else 1

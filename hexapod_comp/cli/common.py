@@ -37,6 +37,12 @@ def load_machine(args: argparse.Namespace) -> tuple[HexapodGeometry, MachineMode
     return geometry, find_model(getattr(args, "model", "ideal"), geometry)
 
 
+def mention_default(args: argparse.Namespace, geometry: HexapodGeometry) -> None:
+    """Say on stderr that the default machine was taken, where nobody named one."""
+    if not getattr(args, "machine_given", False):
+        say_notes([f"no --machine was given: this is machine {geometry.name}, the default"])
+
+
 def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campaign:
     """Return the campaign that the options name; one without a box gets the largest that the machine reaches."""
     from ..measurements.campaign import load_campaign

@@ -79,13 +79,20 @@ def _poses(
         {"sequence": row.label, **pose_values(geometry.tool_pose(pose))} for row, pose in zip(rows, poses, strict=True)
     ]
     common.write_table(args, table)
+    direction = args.direction or "midway"
     if args.json:
-        common.show({"machine": geometry.name, "model": model.name, **common.frames(geometry), "rows": table})
-    elif args.out is None and args.lengths is None:
+        content: dict[str, Any] = {"machine": geometry.name, "model": model.name, **common.frames(geometry)}
+        content |= {"direction": direction} if args.model != "ideal" else {}
+        common.show({**content, "rows": table})
+        return
+    if args.lengths is None:
+        common.mention_default(args, geometry)
+    if args.out is None and args.lengths is None:
         common.show(common.csv_text(table))
     elif args.out is None:
         header = list(table[0])[1:]
         title = f"{common.machine_title(geometry, model)}: pose of {common.whose(geometry)}"
+        title += f", all axes and struts moved {direction}" if args.direction else ""
         common.show(f"{title}\n{texts.aligned(header, [[texts.number(table[0][name], 6) for name in header]])}")
 
 
@@ -103,12 +110,13 @@ def _solve(
     from ..machine.assembly import working_mode
     from ..machine.kinematics import Structure, solve_pose, solve_poses
     from ..machine.model import RealMachine
+    from ..machine.motion import DIRECTIONS, FOLLOWED
     from ..pose import Pose
 
     machine = RealMachine(geometry, model)
     commands = args.model != "ideal" or bool(geometry.screw_lead.any())  # rather than lengths
     structure = machine.structure if commands else Structure.of(geometry)
-    guess = _guess(args, geometry)
+    guess, senses = _guess(args, geometry), np.full(FOLLOWED, DIRECTIONS[args.direction or "midway"])
     batch = None if args.cold else solve_poses(structure, lengths, guess)
     poses = []
     bar = common.progress_bar(len(rows), " rows")
@@ -121,8 +129,8 @@ def _solve(
                 pose = Pose(batch.positions[n], batch.rotations[n])
             else:
                 pose = solve_pose(structure, lengths[n], guess)
-            if commands:  # struts and field come on top; directions of motion are not known
-                pose = machine.pose_for(lengths[n], np.zeros(9), pose)[0]
+            if commands:  # struts and field come on top
+                pose = machine.pose_for(lengths[n], senses, pose)[0]
         except KinematicsError as error:
             problem = f"{common.where(row)}: {error}" if row.line else str(error)
             raise KinematicsError(problem, error.value, error.limit) from error

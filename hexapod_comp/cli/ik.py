@@ -24,51 +24,159 @@ if TYPE_CHECKING:
 MOST_NOTES = 10
 """Broken limits named on stderr."""
 
+MOST_STEPS = 100_000
+"""Poses on a line, each way."""
+
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
     from ..compensation.checks import check
-    from ..formats.csv import read_pose_arrays
     from ..machine.model import RealMachine
 
-    with common.stage(f"reading {args.poses}"):
-        rows, positions, rotations = _given_pose(args) or read_pose_arrays(args.poses)
+    _refuse_several(args)
     geometry, model = common.load_machine(args)
-    with common.progress_bar(len(rows), " poses") as bar:
-        result = check(geometry, model, (positions, rotations), "poses", progress=bar.update)
-    _refuse_lengthless(result, rows)
+    targets = _targets(args, geometry)
+    with common.progress_bar(len(targets.rows), " poses") as bar:
+        given = targets.positions, targets.rotations
+        result = check(geometry, model, given, "poses", progress=bar.update, senses=targets.senses)
+    _refuse_lengthless(result, targets)
     predicted = None
     if args.model != "ideal":
-        platforms = geometry.platform_poses(positions, rotations)
-        predicted = _Predicted.of(RealMachine(geometry, model), args.model, platforms)
-        _mention_outside(geometry, model, int(result.outside_box.sum()), len(rows))
-    _show(args, geometry, model, rows, result, predicted)
-    common.say_notes(f"{common.where(rows[breach.row])}: {breach.error}" for breach in result.breaches[:MOST_NOTES])
+        platforms = geometry.platform_poses(*given)
+        predicted = _Predicted.of(RealMachine(geometry, model), args.model, platforms, targets.senses)
+        _mention_outside(geometry, model, int(result.outside_box.sum()), len(targets.rows))
+    _show(args, geometry, model, targets, result, predicted)
+    common.say_notes(f"{targets.where(breach.row)}: {breach.error}" for breach in result.breaches[:MOST_NOTES])
     if len(result.breaches) > MOST_NOTES:
         common.say_notes([f"{len(result.breaches) - MOST_NOTES} more limits are broken; see check"])
     return 0
 
 
-def _given_pose(args: argparse.Namespace) -> tuple[list[Row], np.ndarray, np.ndarray] | None:
-    """Return the pose given by options, None when a file is; refuse both and neither."""
+@dataclass(frozen=True)
+class _Targets:
+    """Tool poses, each with its directions of motion.
+
+    Attributes
+    ----------
+    rows : list of Row
+        Where each comes from.
+    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
+        ``pose_tool_in_work``, m.
+    senses : ndarray, shape (N, 9)
+        Of axes and struts.
+    directions : list of str
+        What they are called.
+    along : ndarray, shape (N,), or None
+        Way from the start of a line, m.
+    """
+
+    rows: list[Row]
+    positions: np.ndarray
+    rotations: np.ndarray
+    senses: np.ndarray
+    directions: list[str]
+    along: np.ndarray | None = None
+
+    def where(self, n: int) -> str:
+        """Say which pose one is, for messages."""
+        if self.along is None:
+            return common.where(self.rows[n])
+        return f"{texts.number(float(self.along[n]) * 1e3, 3)} mm along the line, {self.directions[n]}"
+
+    def columns(self, n: int) -> dict[str, Any]:
+        """Return what a row of the output says of where a pose of a line is."""
+        from ..formats.csv import pose_values
+        from ..pose import Pose
+
+        if self.along is None:
+            return {}
+        pose = Pose(self.positions[n], self.rotations[n])
+        return {"along_mm": float(self.along[n]) * 1e3, **pose_values(pose)}
+
+
+def _refuse_several(args: argparse.Namespace) -> None:
+    """Raise unless poses are given in exactly one way."""
     from ..errors import CommandError
 
-    single = [getattr(args, name) for name in arguments.POSE_OPTIONS]
-    ways = [args.poses is not None, args.pose is not None, any(value is not None for value in single)]
-    if sum(ways) != 1:
-        problem = "give a CSV file of poses, or --pose, or --x-mm --y-mm --z-mm; exactly one of the three"
+    by_number = any(getattr(args, name) is not None for name in arguments.POSE_OPTIONS)
+    if (args.poses is not None) + (args.pose is not None) + (args.line is not None) + by_number != 1:
+        problem = "give a CSV file of poses, or --pose, or --x-mm --y-mm --z-mm, or --line; exactly one of the four"
         raise CommandError("usage", problem)
-    if args.poses is not None:
-        return None
+    if args.line is not None and args.direction is not None:
+        raise CommandError("usage", "--line gives both directions; --direction goes with poses")
+
+
+def _targets(args: argparse.Namespace, geometry: HexapodGeometry) -> _Targets:
+    """Return the poses that the options give or name, each with its direction."""
+    import numpy as np
+
+    from ..formats.csv import read_pose_arrays
+    from ..machine.motion import DIRECTIONS, FOLLOWED
+
+    if args.line is not None:
+        start, end, angles = args.line
+        return _line(geometry, start, end, angles, args.step_mm * 1e-3)
+    with common.stage(f"reading {args.poses}"):
+        rows, positions, rotations = _given_pose(args) if args.poses is None else read_pose_arrays(args.poses)
+    direction = args.direction or "midway"
+    senses = np.full((len(rows), FOLLOWED), DIRECTIONS[direction])
+    return _Targets(rows, positions, rotations, senses, [direction] * len(rows))
+
+
+def _line(
+    geometry: HexapodGeometry,
+    start: tuple[float, ...],
+    end: tuple[float, ...],
+    angles: tuple[float, ...],
+    step: float,
+) -> _Targets:
+    """Return the poses along a straight line of the tool, forward and then, in the same order, backward.
+
+    Each axis and each strut has the direction of its own motion; one that stands still has none.
+    """
+    import numpy as np
+
+    from ..errors import CommandError
+    from ..formats.csv import Row
+    from ..machine.passes import Passes
+    from ..pose import rotation_from_angles
+
+    way = np.array(end) - np.array(start)
+    length = float(np.linalg.norm(way))
+    if length > step * MOST_STEPS:
+        least = f"{length / MOST_STEPS * 1e3:g} or more on a line of {length * 1e3:g} mm"
+        problem = f"--step-mm: must be {least}, not {step * 1e3:g}"
+        raise CommandError("usage", problem)
+    whole = int(length / step * (1.0 + 1e-9))
+    along = step * np.arange(whole + 1)
+    along = np.append(along, length) if length - along[-1] > 1e-6 * step else np.append(along[:-1], length)
+    positions = np.array(start) + along[:, None] * (way / length)
+    rotations = np.tile(rotation_from_angles(np.array([angles])), (len(along), 1, 1))
+    senses = Passes.of_tool(geometry, positions, rotations, np.tile(way / length, (len(along), 1))).both_ways().senses()
+    return _Targets(
+        [Row(0, str(n + 1)) for n in range(2 * len(along))],
+        np.tile(positions, (2, 1)),
+        np.tile(rotations, (2, 1, 1)),
+        senses,
+        ["forward"] * len(along) + ["backward"] * len(along),
+        np.tile(along, 2),
+    )
+
+
+def _given_pose(args: argparse.Namespace) -> tuple[list[Row], np.ndarray, np.ndarray]:
+    """Return the pose given by options."""
+    from ..errors import CommandError
+
     if args.pose is not None:
         return common.one_row(args.pose)
+    single = [getattr(args, name) for name in arguments.POSE_OPTIONS]
     missing = [name for name, value in zip(arguments.POSE_OPTIONS[:3], single, strict=False) if value is None]
     if missing:
         raise CommandError("usage", f"--{missing[0].replace('_', '-')} is missing")
     return common.one_row(arguments.pose(",".join(repr(value or 0.0) for value in single)))
 
 
-def _refuse_lengthless(result: CheckResult, rows: list[Row]) -> None:
+def _refuse_lengthless(result: CheckResult, targets: _Targets) -> None:
     """Raise where there are no commands to give: the model cannot be undone at a pose."""
     import numpy as np
 
@@ -79,8 +187,8 @@ def _refuse_lengthless(result: CheckResult, rows: list[Row]) -> None:
     row = int((~np.isfinite(result.lengths)).any(axis=(1, 2)).argmax())
     for breach in result.breaches:
         if breach.row == row and isinstance(breach.error, NotConvergedError):
-            raise NotConvergedError(f"{common.where(rows[row])}: {breach.error}")
-    raise NotFiniteError(f"{common.where(rows[row])}: strut lengths are not finite")
+            raise NotConvergedError(f"{targets.where(row)}: {breach.error}")
+    raise NotFiniteError(f"{targets.where(row)}: strut lengths are not finite")
 
 
 @dataclass(frozen=True)
@@ -93,13 +201,13 @@ class _Predicted:
     unseen: int  # ways of the whole machine to shift and turn that readings did not show
 
     @staticmethod
-    def of(machine: RealMachine, model_file: str, poses: Poses) -> _Predicted:
+    def of(machine: RealMachine, model_file: str, poses: Poses, senses: np.ndarray) -> _Predicted:
         """Predict for platform poses; what the model file says of its fit is read."""
         from ..calibration.posterior import load_posterior
         from ..calibration.prediction import ErrorPredictor
 
         fitted, unknown = load_posterior(machine.model, machine.geometry, model_file)
-        standing, aligned = ErrorPredictor(machine, fitted).predict(poses)
+        standing, aligned = ErrorPredictor(machine, fitted).predict(poses, senses)
         held = None if fitted is None else fitted.held
         return _Predicted(standing, aligned, unknown, 0 if held is None else held.held)
 
@@ -116,7 +224,7 @@ class _Predicted:
                 columns[key] = None if values is None else float(values[row, n]) * 1e6
         return columns
 
-    def text(self) -> str:
+    def text(self, direction: str) -> str:
         """Return the first pose's errors as a table for people."""
         from ..calibration.prediction import COMPONENTS
 
@@ -127,7 +235,8 @@ class _Predicted:
         title = (
             "predicted error of the tool without compensation, actual − commanded, along and about the axes of work;\n"
         )
-        title += "direction of motion not known: midway; ± is one standard deviation"
+        title += "direction of motion not known: midway" if direction == "midway" else _moved(direction)
+        title += "; ± is one standard deviation"
         title += f", not known: {self.unknown}" if self.unknown else " of the fit"
         if self.unseen:
             title += (
@@ -135,6 +244,10 @@ class _Predicted:
             )
             title += "the error as it stands is zero at the\nheld datum, and ± has the tolerance of the structure"
         return f"{title}\n{texts.aligned(header, body)}\n"
+
+
+def _moved(direction: str) -> str:
+    return f"all axes and struts moved {direction}"
 
 
 def _parts(predicted: PredictedError | None) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -156,7 +269,7 @@ def _show(
     args: argparse.Namespace,
     geometry: HexapodGeometry,
     model: MachineModel,
-    rows: list[Row],
+    targets: _Targets,
     result: CheckResult,
     predicted: _Predicted | None,
 ) -> None:
@@ -164,8 +277,8 @@ def _show(
 
     Also an ideal machine's commands are not its lengths where screws turn with the joints.
     """
-    with_model = predicted is not None or bool(geometry.screw_lead.any())
-    table = [_columns(row, lengths, with_model) for row, lengths in zip(rows, result.lengths, strict=True)]
+    with_model = predicted is not None or targets.along is not None or bool(geometry.screw_lead.any())
+    table = [_columns(targets, n, result.lengths[n], with_model) for n in range(len(targets.rows))]
     if predicted is not None:
         table = [{**columns, **predicted.columns(n)} for n, columns in enumerate(table)]
     common.write_table(args, table)
@@ -174,17 +287,25 @@ def _show(
         if predicted is not None:
             content |= {"error_frame": geometry.work_name, "error_sd_not_known": predicted.unknown or None}
         common.show({**content, "rows": table})
-    elif args.out is None:
-        one = args.poses is None
-        common.show(_one_pose(geometry, model, result.lengths[0], predicted) if one else common.csv_text(table))
+        return
+    one = args.poses is None and args.line is None
+    if args.out is not None or not one:
+        common.mention_default(args, geometry)
+    if args.out is None:
+        direction = targets.directions[0]
+        common.show(
+            _one_pose(geometry, model, result.lengths[0], predicted, direction) if one else common.csv_text(table)
+        )
 
 
-def _columns(row: Row, lengths: np.ndarray, with_model: bool) -> dict[str, Any]:
-    """Return one row of the output: label, commands and, with a model, nominal lengths and corrections."""
+def _columns(targets: _Targets, n: int, lengths: np.ndarray, with_model: bool) -> dict[str, Any]:
+    """Return one row of the output: label, commands and, with a model, direction, nominal lengths and corrections."""
     from ..formats.csv import LENGTH_COLUMNS, length_values
 
     nominal, command = lengths
-    columns: dict[str, Any] = {"sequence": row.label, **length_values(command if with_model else nominal)}
+    columns: dict[str, Any] = {"sequence": targets.rows[n].label}
+    columns |= {"direction": targets.directions[n]} if with_model else {}
+    columns |= {**targets.columns(n), **length_values(command if with_model else nominal)}
     if with_model:
         columns |= {f"nominal_{name}": value for name, value in length_values(nominal).items()}
         corrections = (command - nominal) * 1e6
@@ -194,7 +315,9 @@ def _columns(row: Row, lengths: np.ndarray, with_model: bool) -> dict[str, Any]:
     return columns
 
 
-def _one_pose(geometry: HexapodGeometry, model: MachineModel, lengths: np.ndarray, predicted: _Predicted | None) -> str:
+def _one_pose(
+    geometry: HexapodGeometry, model: MachineModel, lengths: np.ndarray, predicted: _Predicted | None, direction: str
+) -> str:
     """Return one pose's lengths, and with a model the error that they take out, as tables for people."""
     from ..machine.geometry import STRUT_NAMES
 
@@ -209,4 +332,6 @@ def _one_pose(geometry: HexapodGeometry, model: MachineModel, lengths: np.ndarra
         for i, name in enumerate(STRUT_NAMES)
     ]
     title = common.machine_title(geometry, model) + f": strut lengths for a pose of {common.whose(geometry)}"
-    return f"{title}\n{texts.aligned(header, body)}\n" + (f"\n{predicted.text()}" if predicted is not None else "")
+    title += "" if direction == "midway" else f", {_moved(direction)}"
+    errors = f"\n{predicted.text(direction)}" if predicted is not None else ""
+    return f"{title}\n{texts.aligned(header, body)}\n{errors}"

@@ -26,6 +26,8 @@ GONE = {"paper": "is `make papers` in the source tree now (python -m examples.pa
 
 SHAPE = "X,Y,Z[,A,B,C]"
 
+LINE_SHAPE = "X,Y,Z,X,Y,Z[,A,B,C]"
+
 WORDS = "ideal, random or random:SEED"
 """Models that are no files."""
 
@@ -101,9 +103,16 @@ Add = Callable[..., Any]
 """``add_argument`` of a parser."""
 
 
+class _Given(argparse.Action):
+    """Store a machine, and that it was given."""
+
+    def __call__(self, _: object, namespace: argparse.Namespace, value: Any, __: str | None = None) -> None:
+        namespace.machine, namespace.machine_given = value, True
+
+
 def _machine(add: Add, default: str = "paper.yaml") -> None:
     text = f"geometry file, or the name of a shipped one (default {default})"
-    add("--machine", metavar="FILE", default=default, help=text)
+    add("--machine", metavar="FILE", action=_Given, default=default, help=text)
 
 
 def _machine_and_model(add: Add) -> None:
@@ -116,6 +125,11 @@ def _machine_model_frames(add: Add) -> None:
     _machine_and_model(add)
     add("--tool", metavar="NAME", help="one of the geometry file's `tools` (default: its `tool`)")
     add("--work", metavar="NAME", help="the poses' frame: one of its `work_frames`, or base (default: its `work`)")
+
+
+def _direction(add: Add) -> None:
+    text = "the direction in which every axis and every strut last moved (default: not known, midway between both)"
+    add("--direction", choices=arguments.DIRECTIONS, help=text)
 
 
 def _json(add: Add) -> None:
@@ -150,6 +164,11 @@ def _ik(parser: argparse.ArgumentParser) -> None:
         unit = "mm" if name.endswith("mm") else "degrees"
         text = f"the pose number by number, {unit}"
         add(f"--{name.replace('_', '-')}", type=arguments.finite, metavar="NUMBER", help=text)
+    text = f"both ways along a straight line of the tool, {arguments.LINE_HELP}"
+    add("--line", type=arguments.line, metavar=LINE_SHAPE, help=text)
+    text = "distance of the poses on that line (default 5)"
+    add("--step-mm", type=arguments.above_zero, default=5.0, metavar="MM", help=text)
+    _direction(add)
     _machine_model_frames(add)
     _table_out(add, "the lengths")
     _json(add)
@@ -163,6 +182,7 @@ def _fk(parser: argparse.ArgumentParser) -> None:
     start("--guess", type=arguments.pose, metavar=SHAPE, help=f"{arguments.POSE_HELP}; default home")
     start("--cold", action="store_true", help="no guess: pick the working assembly mode")
     start("--all-modes", action="store_true", help="list every assembly mode of the nominal machine")
+    _direction(add)
     _machine_model_frames(add)
     _table_out(add, "the poses")
     _json(add)

@@ -56,8 +56,12 @@ example:
         """A file's columns are x_mm, y_mm, z_mm, optionally alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw)
 and sequence or name; other units by their suffix (_m, _um, _in, _rad). CSV in gives CSV out, L1_mm … L6_mm,
 which fk reads. With --model, L1_mm … L6_mm are the lengths to command, nominal_L1_mm … and
-correction_L1_um … (command − nominal) follow. Directions of motion are not known here: a backlash counts
-half either way. Lengths are given for any pose; limits that it breaks are named on stderr (see check).
+correction_L1_um … (command − nominal) follow. By default no direction of motion is known: commands are midway
+between both, and a backlash adds nothing. With --direction forward every axis and every strut is taken to have moved
+in its positive direction last (struts: longer), with backward in its negative one; the output says which.
+With --line the tool passes a straight line both ways, and each strut moves as that line has it: a row for every
+--step-mm and for the end, from start to end, all forward (towards the end), then all backward. Lengths are given for
+any pose; limits that it breaks are named on stderr (see check).
 
 example:
   $ hexapod_comp ik --pose 0,0,400,5,0,0
@@ -69,14 +73,16 @@ example:
   strut_4  509.191843
   strut_5  499.282327
   strut_6  498.955256
-  $ hexapod_comp ik config/table1.csv --model paper_machine --out lengths.csv""",
+  $ hexapod_comp ik config/table1.csv --model paper_machine --out lengths.csv
+  $ hexapod_comp ik --line=-200,0,450,200,0,450 --step-mm 5 --model paper_machine --out line.csv""",
     ),
     "fk": Verb(
         "kinematics",
         "tool pose (mm, degrees) for six strut lengths (mm) or a CSV file",
         """A file's columns are L1_mm … L6_mm (or _m, _um, _in), optionally sequence or name; CSV in gives CSV
 out, which ik and check read. With --model the lengths are commands, and the pose is where the real machine
-goes. Newton starts at home, or at --guess; --cold needs no guess: it finds every pose with these lengths
+goes, midway between both directions of motion or, with --direction, in the one in which axes and struts moved last
+(see ik). Newton starts at home, or at --guess; --cold needs no guess: it finds every pose with these lengths
 and picks the one in which the machine can work. Of a 6-3 machine these are all; of others those that Newton
 finds from 4000 starts all around.
 

@@ -138,6 +138,7 @@ def check(
     mode: str = "moves",
     rate: float = 250.0,
     progress: Callable[[int], object] = lambda rows: None,
+    senses: np.ndarray | None = None,
 ) -> CheckResult:
     """Check tool poses against all limits of a machine.
 
@@ -152,11 +153,14 @@ def check(
     mode : str
         ``moves``: the poses are targets, joined by :func:`hexapod_comp.machine.trajectory.moves`, and the whole path
         is checked. ``stream``: they are consecutive commands, checked for step and speed. ``poses``: each is
-        checked by itself, with directions of motion unknown.
+        checked by itself, with the directions of motion `senses`.
     rate : float
         Commands per second, Hz.
     progress : callable, optional
         Called with the number of rows just done.
+    senses : ndarray, shape (N, 9), optional
+        Directions of motion as in :class:`~hexapod_comp.machine.motion.MotionState`, for the mode ``poses``; by
+        default not known. The other modes follow the motion.
 
     Raises
     ------
@@ -169,12 +173,14 @@ def check(
         raise GeometryError("--rate-hz", f"must lie in {RATES[0]:g}…{RATES[1]:g} Hz", rate)
     if mode not in MODES:
         raise GeometryError("mode", f"must be one of {', '.join(MODES)}", mode)
+    if senses is not None and mode != "poses":
+        raise GeometryError("senses", "are followed, not given, in this mode", mode)
     positions, rotations = stacked(poses)
     run = _PathCheck(geometry, model, len(positions), rate)
     if mode == "moves":
         run.check_moves(positions, rotations, progress)
     else:
-        run.check_rows(positions, rotations, mode == "stream", progress)
+        run.check_rows(positions, rotations, mode == "stream", progress, senses)
     return run.result(mode, geometry.platform_poses(positions, rotations))
 
 
@@ -245,13 +251,24 @@ class _PathCheck:
         self.previous: np.ndarray = np.full((1, 2, 6), np.nan)
 
     def check_rows(
-        self, positions: np.ndarray, rotations: np.ndarray, stream: bool, progress: Callable[[int], object]
+        self,
+        positions: np.ndarray,
+        rotations: np.ndarray,
+        stream: bool,
+        progress: Callable[[int], object],
+        senses: np.ndarray | None = None,
     ) -> None:
-        """Check the rows themselves, as consecutive commands or each for itself."""
+        """Check the rows themselves, as consecutive commands or each for itself, then with given senses (N, 9)."""
         for start in range(0, self.count, CHUNK):
-            owner = np.arange(start, min(start + CHUNK, self.count))
-            self.take(positions[owner], rotations[owner], owner, np.ones(len(owner)), stream)
-            progress(len(owner))
+            rows = np.arange(start, min(start + CHUNK, self.count))
+            alike = [rows]
+            if senses is not None:
+                alike = np.split(rows, np.flatnonzero(np.diff(senses[rows], axis=0).any(axis=1)) + 1)
+            for owner in alike:
+                if senses is not None:
+                    self.motion.sense[:] = senses[owner[0]]
+                self.take(positions[owner], rotations[owner], owner, np.ones(len(owner)), stream)
+            progress(len(rows))
 
     def check_moves(self, positions: np.ndarray, rotations: np.ndarray, progress: Callable[[int], object]) -> None:
         """Check the rows, then the moves between those that are within their limits."""

@@ -329,7 +329,7 @@ def examine_poses(
     positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
         ``pose_platform_in_base``, m.
     independent : bool
-        Forget the motion before each pose.
+        Forget the motion before each pose: its directions are the given ones.
     low, sense : ndarray, shape (9,)
         The motion state; updated.
 

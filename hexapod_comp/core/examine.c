@@ -77,7 +77,6 @@ void hc_examine_many(const hc_state *state, size_t count, const double *position
         six_struts now;
         for (i = 0; independent && i < 9; i++) {
             low[i] = NAN;
-            sense[i] = 0.0;
         }
         examine_nominal(model->base.joints, model->platform.joints, &pose, &model->limits, nominal);
         if (!run_backwards(state, &pose, low, sense, &q, &now, compensated->lengths, &outside)) {

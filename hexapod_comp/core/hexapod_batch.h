@@ -77,8 +77,8 @@ typedef struct {
 void hc_examine(const double *base, const double *platform, const hc_limits *limits, const hc_pose *pose,
                 hc_quantities *found);
 
-/* n x 2 quantities, nominal and compensated, of poses that follow each other or are `independent`; `low` and `sense` (9)
- * are the motion, updated. Of `flags`, HC_NOT_CONVERGED says that the second is not written, HC_OUTSIDE_FIELD that the
+/* n x 2 quantities, nominal and compensated, of poses that follow each other or are `independent`, each with the
+ * directions given; `low` and `sense` (9) are the motion, updated. Of `flags`, HC_NOT_CONVERGED says that the second is not written, HC_OUTSIDE_FIELD that the
  * field's value was held at the boundary. */
 void hc_examine_many(const hc_state *state, size_t count, const double *positions, const double *rotations,
                      int independent, double *low, double *sense, hc_quantities *found, int *flags);

@@ -37,6 +37,9 @@ QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
 LENGTH_COLUMNS = tuple(f"L{i}" for i in range(1, 7))
 NOMINAL_COLUMNS = tuple(f"nominal_L{i}" for i in range(1, 7))
 CORRECTION_COLUMNS = tuple(f"correction_L{i}" for i in range(1, 7))
+ALONG_COLUMNS = ("along", *POSITION_COLUMNS)
+"""What ``ik --line`` says of where a pose is, besides its angles."""
+
 PREDICTED_ERRORS = tuple(f"{error}_{{}}{known}" for error in ("error", "error_aligned") for known in ("", "_sd"))
 """What ``ik --model`` says of the tool's error, each for x, y, z and rx, ry, rz."""
 
@@ -517,7 +520,8 @@ def _rotations_from_quaternions(path: str | Path, rows: list[Row], quaternions: 
 def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
     """Read strut lengths from a CSV file (or ``-``) with the columns ``L1_mm`` … ``L6_mm`` (or ``_m``, …).
 
-    The columns ``nominal_L…``, ``correction_L…`` and ``error_…`` that ``ik --model`` adds are known and passed over.
+    The columns that ``ik --model`` and ``ik --line`` add are known and passed over: ``nominal_L…``, ``correction_L…``,
+    ``error_…``, ``direction``, ``along`` and the pose.
 
     Returns
     -------
@@ -536,9 +540,11 @@ def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
     shifts, turns = (
         tuple(n.format(axis) for n in PREDICTED_ERRORS for axis in axes) for axes in ("xyz", ("rx", "ry", "rz"))
     )
-    for group in (NOMINAL_COLUMNS, CORRECTION_COLUMNS, shifts):
+    for group in (NOMINAL_COLUMNS, CORRECTION_COLUMNS, shifts, ALONG_COLUMNS):
         table.columns(group, "length")
-    table.columns(turns, "angle")
+    for group in (turns, ANGLE_COLUMNS):
+        table.columns(group, "angle")
+    table.columns(("direction",), None)
     table.refuse_unknown()
     return table.labels(), lengths
 

@@ -14,6 +14,10 @@ FOLLOWED = 9
 """Three axes of the measured point, then six struts."""
 
 
+DIRECTIONS = {"forward": 1.0, "midway": 0.0, "backward": -1.0}
+"""The sense of all axes and all struts that were approached in one direction; midway: not known."""
+
+
 class MotionState:
     """Windows and directions of motion of the nine followed values.
 

@@ -30,7 +30,10 @@ from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.errors import GeometryError, HexapodError
 from hexapod_comp.formats.csv import read_lengths, read_poses
 from hexapod_comp.machine.field import GridField
-from hexapod_comp.machine.model import MachineModel
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
+from hexapod_comp.machine.model_file import load_model, model_text
+from hexapod_comp.machine.motion import MotionState
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.pose import Pose
 
@@ -40,6 +43,8 @@ PAPER = paper_geometry()
 IDEAL = MachineModel("paper")
 MACHINES = ("example_6_6.yaml", "jugglebot.yaml", "paper.yaml", "positioning_unit.yaml")
 POSE_HEADER = "name,x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg"
+
+DEFAULT_NOTE = "hexapod_comp: note: no --machine was given: this is machine paper, the default\n"
 
 Run = tuple[int, str, str]
 
@@ -185,7 +190,13 @@ def test_usage_errors_exit_2(hexapod, arguments: tuple[str, ...]) -> None:
     ("arguments", "complaint"),
     [
         (("ik",), "give a CSV file of poses, or --pose"),
-        (("ik", TABLE_1, "--pose", "0,0,400"), "exactly one of the three"),
+        (("ik", TABLE_1, "--pose", "0,0,400"), "exactly one of the four"),
+        (("ik", "--line", "0,0,400,9,0,400", "--pose", "0,0,400"), "exactly one of the four"),
+        (
+            ("ik", "--line", "0,0,400,9,0,400", "--step-mm", "1e-9"),
+            "--step-mm: must be 9e-05 or more on a line of 9 mm",
+        ),
+        (("ik", "--line", "0,0,400,9,0,400", "--direction", "forward"), "--line gives both directions"),
         (("ik", "--x-mm", "1", "--z-mm", "400"), "--y-mm is missing"),
         (("ik", "nowhere.csv"), "nowhere.csv: there is no such file"),
         (("ik", TABLE_1, "--model", "paper"), "format: must be 'hexapod_comp/model'"),
@@ -229,7 +240,7 @@ def test_control_c_and_a_closed_pipe(hexapod, monkeypatch: pytest.MonkeyPatch) -
 def test_a_closed_pipe_is_quiet(tmp_path: Path) -> None:
     """``hexapod_comp ik long.csv | head -1`` in two real processes."""
     path = file_of(tmp_path, [(n, 0, 0, 400, 0, 0, 0) for n in range(5000)])
-    command = f"{sys.executable} -m hexapod_comp ik {path} | head -1"
+    command = f"{sys.executable} -m hexapod_comp ik {path} --machine paper | head -1"
     done = subprocess.run(["sh", "-c", command], cwd=ROOT, capture_output=True, text=True, timeout=100)
     assert done.stdout == "sequence,L1_mm,L2_mm,L3_mm,L4_mm,L5_mm,L6_mm\n"
     assert done.stderr == ""
@@ -243,7 +254,7 @@ def test_the_example_in_the_help_is_real(hexapod, monkeypatch: pytest.MonkeyPatc
     first = lines[0].split()
     assert first[:2] == ["$", "hexapod_comp"]
     code, out, err = hexapod(*first[2:])
-    assert (code, err) == (0, "")
+    assert (code, err) == (0, DEFAULT_NOTE if verb == "check" else "")
     shown = [line[2:] for line in lines[1:] if line.strip(" …") and not line.startswith("  $")]
     assert shown
     produced = out.splitlines()
@@ -257,7 +268,7 @@ def test_the_example_in_the_help_is_real(hexapod, monkeypatch: pytest.MonkeyPatc
 def test_table_1_gives_table_2_at_the_printed_digits(hexapod) -> None:
     """000, Tables 1 and 2."""
     code, out, err = hexapod("ik", TABLE_1)
-    assert (code, err) == (0, "")
+    assert (code, err) == (0, DEFAULT_NOTE)
     rows = parsed(out)
     assert [row["sequence"] for row in rows] == [str(n) for n in range(1, 11)]
     ours = [[f"{float(row[f'L{i}_mm']):.3f}" for i in range(1, 7)] for row in rows]
@@ -269,8 +280,8 @@ def test_table_1_gives_table_2_at_the_printed_digits(hexapod) -> None:
 def test_ik_then_fk_is_where_it_started(hexapod, tmp_path: Path, model: str, start: tuple[str, ...]) -> None:
     """CSV carries 1e-9 mm and degrees; the pose moves by less than ten times the lengths' rounding."""
     lengths, poses = str(tmp_path / "lengths.csv"), str(tmp_path / "poses.csv")
-    assert hexapod("ik", TABLE_1, "--model", model, "--out", lengths) == (0, "", "")
-    assert hexapod("fk", lengths, "--model", model, *start, "--out", poses) == (0, "", "")
+    assert hexapod("ik", TABLE_1, "--model", model, "--out", lengths) == (0, "", DEFAULT_NOTE)
+    assert hexapod("fk", lengths, "--model", model, *start, "--out", poses) == (0, "", DEFAULT_NOTE)
     rows, found = read_poses(poses)
     assert [row.label for row in rows] == [str(n) for n in range(1, 11)]
     for pose, wanted in zip(found, table_poses(), strict=True):
@@ -282,7 +293,7 @@ def test_ik_then_fk_is_where_it_started(hexapod, tmp_path: Path, model: str, sta
 def test_poses_and_lengths_from_a_pipe() -> None:
     command = f"{sys.executable} -m hexapod_comp ik {TABLE_1} | {sys.executable} -m hexapod_comp fk -"
     done = subprocess.run(["sh", "-c", command], cwd=ROOT, capture_output=True, text=True, timeout=100)
-    assert done.stderr == ""
+    assert done.stderr == 2 * DEFAULT_NOTE
     assert parsed(done.stdout)[4]["beta_deg"] == "10.000000000"
 
 
@@ -313,6 +324,101 @@ def test_ik_with_a_model_prints_commands_and_corrections(hexapod) -> None:
     table = hexapod("ik", "--pose", "1,2,410,3,4,5", "--model", "paper_machine")[1]
     assert table.splitlines()[1].split() == ["strut", "nominal_mm", "command_mm", "correction_um"]
     assert code == 0
+
+
+@pytest.mark.parametrize(
+    ("given", "problem"),
+    [
+        (("--line", "0,0,400,9,0"), "argument --line: needs six or nine numbers (mm and degrees: "),
+        (("--line", "0,0,400,0,0,400"), "argument --line: must end elsewhere than it starts"),
+        ((TABLE_1, "--direction", "up"), "argument --direction: invalid choice: 'up'"),
+    ],
+)
+def test_a_line_or_direction_that_is_none_is_refused(hexapod, given: tuple[str, ...], problem: str) -> None:
+    code, out, err = hexapod("ik", *given)
+    assert (code, out) == (2, "")
+    assert problem in err
+
+
+def only_backlash(folder: Path, lost: list[float], machine: str = "paper") -> str:
+    """A model with a backlash, µm, and nothing else."""
+    path = folder / "backlash.yaml"
+    struts, origin = StrutErrors(backlash=np.array(lost) * 1e-6), ModelOrigin("2026-01-31")
+    path.write_text(model_text(MachineModel(machine, "lost motion", struts=struts, origin=origin)))
+    return str(path)
+
+
+def test_forward_and_backward_differ_by_the_backlash_and_midway_is_between(hexapod, tmp_path: Path) -> None:
+    """A backlash is what a command must go further after a reversal: forward − backward = b, by definition."""
+    lost = [1.0, 2.0, 3.0, 4.0, 5.0, 8.0]
+    given = ("ik", "--pose", "70,-30,420,3,-2,5", "--model", only_backlash(tmp_path, lost))
+    found = {}
+    for direction in ("forward", "backward", "midway"):
+        told = () if direction == "midway" else ("--direction", direction)
+        content = json.loads(hexapod(*given, *told, "--json")[1])
+        (row,) = content["rows"]
+        assert row["direction"] == direction
+        found[direction] = np.array([row[f"L{i}_mm"] for i in range(1, 7)]) * 1e3
+        if told:  # fk, moved the same way, finds the pose again; its text and that of ik say which way
+            lengths = ",".join(repr(float(length) * 1e-3) for length in found[direction])
+            back = ("fk", "--lengths", lengths, *given[3:], *told)
+            (pose,) = json.loads(hexapod(*back, "--json")[1])["rows"]
+            assert [pose[name] for name in POSE_HEADER.split(",")[1:]] == pytest.approx(
+                [70, -30, 420, 3, -2, 5], abs=1e-9
+            )
+            for verb in (given, back):
+                assert f"all axes and struts moved {direction}" in hexapod(*verb, *told)[1].splitlines()[0]
+    assert found["forward"] - found["backward"] == pytest.approx(lost, abs=1e-6)
+    assert (found["forward"] + found["backward"]) / 2 == pytest.approx(found["midway"], abs=1e-6)
+
+
+@pytest.mark.parametrize("machine", ["paper", "example_6_6"])
+def test_a_line_has_both_ways_of_every_strut(hexapod, tmp_path: Path, machine: str) -> None:
+    """Commands differ by +b where the nominal length, by finite differences, rises on the way, by −b where it falls."""
+    geometry = load_geometry(f"{machine}.yaml")
+    x, y, z = geometry.tool_pose(geometry.home).position * 1e3
+    lost, out = [1.0, 2.0, 3.0, 4.0, 5.0, 8.0], tmp_path / "line.csv"
+    model = only_backlash(tmp_path, lost, geometry.name)
+    line = f"{x - 20},{y - 5},{z + 1},{x + 21},{y + 3},{z + 2},1,2,3"
+    given = ("ik", "--machine", machine, "--model", model, "--line", line, "--step-mm", "4", "--out", str(out))
+    assert hexapod(*given) == (0, "", "")
+    rows = parsed(out.read_text())
+    half = len(rows) // 2
+    assert [row["direction"] for row in rows] == ["forward"] * half + ["backward"] * half
+    assert half == 12  # 41.79 mm: eleven poses 4 mm apart, and the end
+    places = np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in rows])
+    np.testing.assert_allclose(places[[0, half - 1]], np.array(line.split(",")[:6], float).reshape(2, 3), atol=1e-8)
+    np.testing.assert_allclose(places[:half], places[half:], atol=0)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(places[:half], axis=0), axis=1)[:-1], 4.0, atol=1e-8)
+    nominal, corrections = (
+        np.array([[float(row[name.format(i)]) for i in range(1, 7)] for row in rows])
+        for name in ("nominal_L{}_mm", "correction_L{}_um")
+    )
+    rates = np.diff(nominal[:half], axis=0)
+    steady = np.sign(rates[1:]) == np.sign(rates[:-1])  # no turning point between a row's neighbours
+    assert steady.mean() > 0.8
+    assert (rates > 0.0).any()
+    assert (rates < 0.0).any()
+    both = (corrections[:half] - corrections[half:])[1:-1]
+    np.testing.assert_allclose(both[steady], (np.sign(rates[1:]) * lost)[steady], atol=1e-5)
+    assert len(read_lengths(str(out))[1]) == 2 * half  # fk reads it
+
+
+def test_a_line_is_what_the_compensator_commands_on_the_way(hexapod) -> None:
+    """The compensator follows the motion from pose to pose; with all errors of the model, a field that reverses too."""
+    line, step = ((-30.0, 20.0, 410.0), (30.0, 10.0, 415.0)), "10"
+    given = ("ik", "--line", ",".join(map(str, sum(line, ()))), "--step-mm", step, "--model", "paper_machine", "--json")
+    rows = json.loads(hexapod(*given)[1])["rows"]
+    machine = RealMachine(PAPER, load_model("paper_machine.yaml", PAPER))
+    half = len(rows) // 2
+    for way in (rows[:half], rows[half:][::-1]):
+        motion = MotionState()
+        for n, row in enumerate(way):
+            position = [row[f"{axis}_mm"] * 1e-3 for axis in "xyz"]
+            target = PAPER.platform_pose(Pose(np.array(position), np.eye(3)))
+            commands = machine.commands_for(target, motion)[0]
+            if n:  # at the first nothing has moved yet
+                assert [row[f"L{i}_mm"] for i in range(1, 7)] == pytest.approx(commands * 1e3, abs=1e-9)
 
 
 def test_ik_predicts_the_error_without_compensation_in_the_work_frame(hexapod, tmp_path: Path) -> None:
@@ -604,7 +710,7 @@ def test_check_long_streams_in_pieces() -> None:
 def test_check_writes_all_margins(hexapod, tmp_path: Path) -> None:
     out = tmp_path / "margins.csv"
     code, text, err = hexapod("check", TABLE_1, "--model", "paper_machine", "--out", str(out))
-    assert (code, err) == (0, "")
+    assert (code, err) == (0, DEFAULT_NOTE)
     assert text.endswith("all within limits\n")
     rows = parsed(out.read_text())
     assert len(rows) == 10

@@ -187,7 +187,7 @@ def run(command: str, **options: object) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("verb", ["--help", "ik poses.csv"])
+@pytest.mark.parametrize("verb", ["--help", "ik poses.csv --machine paper"])
 @pytest.mark.parametrize(("to", "code"), [("> /dev/full", 2), ("| true", 141), (">&-", 0)])
 def test_an_output_that_nobody_takes_is_no_traceback(verb, to, code, tmp_path):
     """Before: tracebacks from `print`, and "Exception ignored" with exit code 120 from the end of Python."""
