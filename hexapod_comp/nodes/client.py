@@ -164,7 +164,7 @@ class LoopClient:
             and self.node.count_publishers("strut_commands") > 0
             and self._estimate is not None
             and self._enable.service_is_ready()
-            and "commands" in self.diagnostics  # a node that still compiles has none
+            and "commands" in self.diagnostics  # a node that is not configured yet has none
         )
 
     def _counts(self) -> tuple[int, int]:
