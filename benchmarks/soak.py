@@ -4,7 +4,7 @@ Compensator and simulated drive run as processes of their own, the drive's readi
 and the tool goes round a circle. Their stderr goes into a pipe that nobody reads, as when a terminal was stopped
 with Ctrl-S. Latency is from just before a command is published to its strut commands' arrival here. For the longest
 ones the system says how long each process had been waiting for a processor in the second around
-it (/proc/PID/task/*/schedstat), and the nodes say what Python's garbage collector and Numba did.
+it (/proc/PID/task/*/schedstat), and the nodes say what Python's garbage collector did.
 
 Usage: python -m benchmarks.soak [--minutes 30] [--rate-hz 1000] [--json]
 """

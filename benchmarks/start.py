@@ -13,10 +13,10 @@ import numpy as np
 
 from hexapod_comp.loop.processes import NodeProcess, PrivateDomain
 
-BAR = 3.0
+BAR = 1.0
 """Longest start allowed, s."""
 
-GIVE_UP = 180.0
+GIVE_UP = 60.0
 
 
 def seconds_until_ready(name: str) -> float:

@@ -39,10 +39,10 @@ HUGE = 10_000_000
 GROWTH = 20
 """A node may have grown by so much when all is over, MB: the log's and diagnostics' share of a long life."""
 
-PEAK, COPIES = 250, 60
+PEAK, COPIES = 200, 60
 """No node may ever have more than this, MB, or than it began with and six copies of the longest message: the
 middleware's, rclpy's, the one that is looked at, and others that wait; 55 is the most in 200,000 messages. A node
-begins with 140 to 180, and with more where it has compiled."""
+begins with some 80."""
 
 TOPICS = {
     "compensator": ("tool_pose_command", "strut_states", "temperatures", "humidity"),
