@@ -81,6 +81,10 @@ class Struct:
             raise TypeError(f"{self.name} points to memory of this process")
         return _rebuilt, (self.name, self.view.tobytes())
 
+    def keep(self, other: Struct) -> None:
+        """Hold what C has made this struct point to, in place of what was held: as long as this lives, so does that."""
+        self._kept[:] = [other]
+
     def copy_from(self, other: Struct) -> None:
         """Take over another one, with what it points to."""
         self.view[...] = other.view

@@ -224,6 +224,7 @@ class RealMachine:
         self.temperatures = temperatures or Temperatures()
         self.constants, self.state = core_model(geometry, model), Struct("hc_state")
         lib.hc_init(self.state.at, self.constants.at, 0.0)
+        self.state.keep(self.constants)
         write_temperatures(self.state, self.temperatures)
         lib.hc_place(self.state.at)
         placed = self.state.view["base_joints"].copy(), self.state.view["platform_joints"].copy()
