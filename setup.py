@@ -134,8 +134,8 @@ setup(
         "pytest11": [f"{NAME}.testing = {NAME}.testing"],
         "console_scripts": [
             f"hexapod_comp = {NAME}.cli:main",
-            f"compensator = {NAME}.nodes:start_compensator",
-            f"strut_drive = {NAME}.nodes:start_strut_drive",
+            f"compensator = {NAME}.ros:start_compensator",
+            f"strut_drive = {NAME}.ros:start_strut_drive",
             f"linuxcnc_bridge = {NAME}.linuxcnc:start_bridge",
             f"linuxcnc_machine = {NAME}.linuxcnc:start_machine",
             f"hal_sweep = {NAME}.linuxcnc.hal_sweep:main",

@@ -28,10 +28,10 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
 from hexapod_comp.loop.processes import PrivateDomain
-from hexapod_comp.nodes.messages import pose_message
-from hexapod_comp.nodes.runtime import COMMAND_QOS
-from hexapod_comp.nodes.stamps import nanoseconds_of
 from hexapod_comp.pose import Pose
+from hexapod_comp.ros.messages import pose_message
+from hexapod_comp.ros.runtime import COMMAND_QOS
+from hexapod_comp.ros.stamps import nanoseconds_of
 
 RATES = (250.0, 500.0, 1000.0, 0.0)
 """Commands per second; 0 is flat out: the next one leaves when the last was answered."""
@@ -199,7 +199,7 @@ def measure(bouts: int, rounds: int, seconds: float, floor: bool = False) -> lis
     """Run everything and return one row per rate; `floor`: against the relay that does not even look at messages."""
     with ExitStack() as stack:
         stack.enter_context(PrivateDomain())
-        stack.enter_context(process("hexapod_comp.nodes.compensator", OURS, "marker_rate:=0.0", BLIND, MODEL))
+        stack.enter_context(process("hexapod_comp.ros.compensator", OURS, "marker_rate:=0.0", BLIND, MODEL))
         stack.enter_context(process("benchmarks.relay", RELAY, f"serialized:={str(floor).lower()}"))
         context = rclpy.Context()
         rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)

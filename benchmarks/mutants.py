@@ -37,7 +37,7 @@ CORE += ("machine/*.py", "compensation/*.py")
 NOT_CORE = {"pictures.py"}
 
 TESTS = {
-    "pose.py": ["test_pose.py", "nodes/test_conversions.py", "machine"],
+    "pose.py": ["test_pose.py", "ros/test_conversions.py", "machine"],
     "machine": ["machine", "compensation", "virtual/test_simulation.py"],
     "compensation": ["compensation", "machine/test_limits.py", "replay", "virtual/test_simulation.py"],
     "calibration": ["calibration/test_sensitivity.py", "calibration/test_fit.py", "calibration/test_observability.py"],

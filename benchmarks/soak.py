@@ -34,11 +34,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import UInt64
 
 from hexapod_comp.loop.processes import PrivateDomain, waited_for_processor
-from hexapod_comp.nodes.messages import pose_message
-from hexapod_comp.nodes.running import SPIN_PERIOD
-from hexapod_comp.nodes.runtime import COMMAND_QOS, EVENT_QOS
-from hexapod_comp.nodes.stamps import nanoseconds_of
 from hexapod_comp.pose import Pose
+from hexapod_comp.ros.messages import pose_message
+from hexapod_comp.ros.running import SPIN_PERIOD
+from hexapod_comp.ros.runtime import COMMAND_QOS, EVENT_QOS
+from hexapod_comp.ros.stamps import nanoseconds_of
 
 NODES = ("compensator", "strut_drive")
 

@@ -38,7 +38,7 @@ def main() -> int:
     """Run the node until SIGTERM."""
     events, name, *arguments = sys.argv[1:]
     Notes(Path(events))
-    module = importlib.import_module(f"hexapod_comp.nodes.{name}")
+    module = importlib.import_module(f"hexapod_comp.ros.{name}")
     return module.main(arguments)
 
 

@@ -22,7 +22,7 @@ from hexapod_comp.formats.paths import config_file
 
 FLAG = ["true", "false"]
 RANGES = ["LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT"]
-DESCRIBED = f"{shlex.quote(sys.executable)} -m hexapod_comp.nodes.described"
+DESCRIBED = f"{shlex.quote(sys.executable)} -m hexapod_comp.ros.described"
 """Starts robot_state_publisher with the URDF that the compensator publishes: of the machine that it runs."""
 
 LOCAL_UNLESS_SET = EnvironmentVariable("ROS_AUTOMATIC_DISCOVERY_RANGE", default_value="LOCALHOST")

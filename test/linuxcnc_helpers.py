@@ -324,7 +324,7 @@ class Linuxcnc:
         given = {"model_file": model, "start_without_feedback_after": 0.5, **parameters}
         words = [f"{name}:={value}" for name, value in given.items()]
         options = [word for text in words for word in ("-p", text)]
-        command = [sys.executable, "-m", "hexapod_comp.nodes.compensator", "--ros-args", *options]
+        command = [sys.executable, "-m", "hexapod_comp.ros.compensator", "--ros-args", *options]
         process = self.start_process(command, f"compensator_{self._started}.log")
         self.newest_compensator = process
         until(lambda: ": ready" in process.text() or not process.running(), "compensator", START_WITHIN, process.text)

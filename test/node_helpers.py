@@ -8,8 +8,8 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.nodes.compensator import CompensatorNode
 from hexapod_comp.pose import Pose
+from hexapod_comp.ros.compensator import CompensatorNode
 from hexapod_comp.testing.bench import BEST_EFFORT, RELIABLE, SENT, TRANSITIONS, Answer
 from hexapod_comp.testing.bench import Bench as BareBench
 

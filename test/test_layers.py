@@ -11,12 +11,12 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "hexapod_comp"
 ROOMS = (
     "errors", "core", "pose", "formats", "machine", "compensation", "measurements", "virtual", "workspace",
-    "calibration", "export", "replay", "nodes", "linuxcnc", "loop", "cli", "testing", "__main__",
+    "calibration", "export", "replay", "ros", "nodes", "linuxcnc", "loop", "cli", "testing", "__main__",
 )  # fmt: skip
 """From the ground up: a room imports from itself and from those before it."""
 
 MODULES = sorted(PACKAGE.rglob("*.py"))
-ROS_ROOMS = ("nodes", "linuxcnc", "testing")
+ROS_ROOMS = ("ros", "linuxcnc", "testing")
 PICTURE_MODULES = ("pictures", "page", "figures")
 PICTURE_LIBRARIES = {"matplotlib", "mpl_toolkits", "plotly", "viser"}
 
@@ -58,3 +58,12 @@ def test_no_two_classes_share_a_name():
             if isinstance(node, ast.ClassDef):
                 places.setdefault(node.name, []).append(f"{path.relative_to(PACKAGE)}:{node.lineno}")
     assert {name: found for name, found in places.items() if len(found) > 1} == {}
+
+
+def test_the_old_name_of_the_ros_room_finds_its_modules():
+    from hexapod_comp.nodes import start
+    from hexapod_comp.nodes.messages import message_pose
+    from hexapod_comp.ros import start as same
+
+    assert start is same
+    assert callable(message_pose)

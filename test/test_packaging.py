@@ -401,7 +401,7 @@ def test_the_core_imports_without_ros():
     modules = ["hexapod_comp"]
     for path in sorted(PACKAGE.rglob("*.py")):
         dotted = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-        if path.name != "__init__.py" and path.parent.name not in ("nodes", "linuxcnc", "testing"):
+        if path.name != "__init__.py" and path.parent.name not in ("ros", "linuxcnc", "testing"):
             modules.append(dotted)
     blocked = ",".join(sorted({"rclpy", "launch", "launch_ros", *_ros_dependencies()}))
     run = subprocess.run(
@@ -448,7 +448,7 @@ def test_a_core_that_was_not_built_is_named_in_one_line_that_tells_how(program: 
 
 def test_who_only_imports_a_node_without_a_core_goes_on():
     script = (
-        f"{NO_CORE}try:\n    import hexapod_comp.nodes.compensator\nexcept ImportError as error:\n    print(error.name)"
+        f"{NO_CORE}try:\n    import hexapod_comp.ros.compensator\nexcept ImportError as error:\n    print(error.name)"
     )
     run = _run_script(script)
     assert (run.returncode, run.stdout) == (0, "hexapod_comp.core._core\n"), run.stderr

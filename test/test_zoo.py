@@ -499,7 +499,7 @@ def test_run_and_replay(animal: Animal, bench: Any, monkeypatch: pytest.MonkeyPa
     from node_recorder import Recorder
     from replay_helpers import write_bag
 
-    from hexapod_comp.nodes.client import LoopClient
+    from hexapod_comp.ros.client import LoopClient
 
     # Nodes and client share one interpreter: on a busy computer an answer may take more than its second.
     monkeypatch.setattr(LoopClient.wait_for_answer, "__defaults__", (20.0,))

@@ -10,7 +10,7 @@ import numpy as np
 
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.machine.kinematics import Structure, strut_lengths
-from hexapod_comp.nodes.messages import message_pose
+from hexapod_comp.ros.messages import message_pose
 
 from . import wire
 from .fault import SILENT, Fault, Meaning

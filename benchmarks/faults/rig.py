@@ -33,10 +33,10 @@ from std_srvs.srv import Trigger
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.loop.processes import NodeProcess, PrivateDomain
 from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.nodes.client import LISTENER_QOS, TRACK_QOS
-from hexapod_comp.nodes.messages import message_pose, pose_message
-from hexapod_comp.nodes.runtime import COMMAND_QOS, NEWEST_QOS, STATE_QOS
 from hexapod_comp.pose import Pose
+from hexapod_comp.ros.client import LISTENER_QOS, TRACK_QOS
+from hexapod_comp.ros.messages import message_pose, pose_message
+from hexapod_comp.ros.runtime import COMMAND_QOS, NEWEST_QOS, STATE_QOS
 
 from .controller import Controller, Mode
 from .logdisk import LogDisk
@@ -370,7 +370,7 @@ class Rig:
 def dated(callback: Callable[[Any, float], None]) -> Callable[..., None]:
     """Return a callback for rclpy that hands on a message and when its publisher sent it, s on the system's clock.
 
-    As :func:`hexapod_comp.nodes.callbacks.numbered`: rclpy asks the signature, and its executors differ.
+    As :func:`hexapod_comp.ros.callbacks.numbered`: rclpy asks the signature, and its executors differ.
     """
 
     def called(*arguments: Any) -> None:

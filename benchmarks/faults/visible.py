@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from hexapod_comp.nodes import compensator, strut_drive
+from hexapod_comp.ros import compensator, strut_drive
 
 from .record import Happened, Record, Told
 

@@ -13,8 +13,8 @@ from . import common
 def run(args: argparse.Namespace) -> int:
     """Run the verb; 0 when there is something to be replayed."""
     from ..errors import InputFileError
-    from ..nodes import heard_signals
-    from ..nodes.recorder import BagRecorder
+    from ..ros import heard_signals
+    from ..ros.recorder import BagRecorder
 
     heard, end = heard_signals(), time.monotonic() + (args.seconds or math.inf)
     with BagRecorder(args.folder, args.namespace) as recorder, common.progress_bar(0, " messages") as bar:

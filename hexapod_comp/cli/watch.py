@@ -9,9 +9,9 @@ import sys
 def run(args: argparse.Namespace) -> int:
     """Run the verb until Ctrl-C."""
     from ..machine.geometry import load_geometry
-    from ..nodes import heard_signals
-    from ..nodes.page import WatchPage
-    from ..nodes.watching import watch
+    from ..ros import heard_signals
+    from ..ros.page import WatchPage
+    from ..ros.watching import watch
 
     geometry = load_geometry(args.machine)
     page = WatchPage(geometry, args.host, args.port)

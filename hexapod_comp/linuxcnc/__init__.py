@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..nodes import start
+from ..ros import start
 
 
 def start_bridge() -> int:

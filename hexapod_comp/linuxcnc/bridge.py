@@ -24,12 +24,12 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 
 from ..errors import CommandError
-from ..nodes.command_source import CommandSource
-from ..nodes.health import OK
-from ..nodes.messages import StrutMessage, StrutReader
-from ..nodes.running import keep_discovery_local, run
-from ..nodes.runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, STATE_QOS, MachineNode
-from ..nodes.stamps import StampClock, StampGate, nanoseconds_of, stamp_of
+from ..ros.command_source import CommandSource
+from ..ros.health import OK
+from ..ros.messages import StrutMessage, StrutReader
+from ..ros.running import keep_discovery_local, run
+from ..ros.runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, STATE_QOS, MachineNode
+from ..ros.stamps import StampClock, StampGate, nanoseconds_of, stamp_of
 from .bridge_status import BridgeStatus
 from .guard import CorrectionGuard, GuardStatus
 from .hal import COUNTS, METRES, HalComponent, pose_from_axes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ..nodes.health import ERROR, OK, WARN, Flow, Refusals, seconds
+from ..ros.health import ERROR, OK, WARN, Flow, Refusals, seconds
 from .guard import CorrectionGuard, GuardStatus
 
 TEXTS = {

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ..nodes.arguments import Program
-from ..nodes.parameters import read_table
+from ..ros.arguments import Program
+from ..ros.parameters import read_table
 from .hal import pins
 
 PARAMETERS = read_table("""

@@ -10,8 +10,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from ..nodes.health import ERROR, status_prefix
-from ..nodes.runtime import EVENT_QOS, MachineNode
+from ..ros.health import ERROR, status_prefix
+from ..ros.runtime import EVENT_QOS, MachineNode
 from .bridge_status import BridgeStatus
 
 RESET_AFTER = 0.15

@@ -8,8 +8,8 @@ from typing import Any
 
 from std_msgs.msg import Bool, UInt64
 
-from ..nodes.runtime import EVENT_QOS, MachineNode
-from ..nodes.vital_signs import LATCHED_QOS
+from ..ros.runtime import EVENT_QOS, MachineNode
+from ..ros.vital_signs import LATCHED_QOS
 
 
 class StopInput:

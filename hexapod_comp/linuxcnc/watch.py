@@ -29,8 +29,8 @@ from ..formats.texts import plain_number
 from ..machine.geometry import load_geometry
 from ..machine.model import RealMachine
 from ..machine.motion import MotionState
-from ..nodes import heard_signals
 from ..pose import Pose
+from ..ros import heard_signals
 from ..virtual.named import find_model
 from .hal import METRES, HalComponent, pins, quaternion_from_axes
 

@@ -13,8 +13,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 
-from ..nodes.children import end_with_parent
-from ..nodes.middleware import avoid_shared_memory
+from ..ros.children import end_with_parent
+from ..ros.middleware import avoid_shared_memory
 
 # DDS derives its UDP ports from the domain: 7400 + 250 · domain + offset. Offsets 0 and 1 are multicast,
 # participants take 10, 11, 12, …; nobody uses 2 to 9, and domains above 101 reach into the ephemeral ports.
@@ -112,7 +112,7 @@ class NodeProcess:
         handle, path = tempfile.mkstemp(prefix=f"hexapod_comp_{module}_", suffix=".log")
         self.log = Path(path)
         arguments = ros_arguments(parameters, remaps)
-        command = [*wrapper, sys.executable, "-m", f"hexapod_comp.nodes.{module}", *arguments]
+        command = [*wrapper, sys.executable, "-m", f"hexapod_comp.ros.{module}", *arguments]
         with os.fdopen(handle, "wb") as log:
             self._process = subprocess.Popen(
                 command,

@@ -29,7 +29,7 @@ from .records import PoseRecord, SessionResult
 from .report import ALIGNED, ErrorRow, busy_text
 
 if TYPE_CHECKING:
-    from ..nodes.client import LoopClient
+    from ..ros.client import LoopClient
 
 RATES = (1.0, 1000.0)
 """Commands per second that make sense over DDS from Python, Hz."""
@@ -143,7 +143,7 @@ def _progress():
 def _client(namespace: str) -> LoopClient:
     """Return a client of the nodes, with a clear word where there is no ROS."""
     try:
-        from ..nodes.client import LoopClient
+        from ..ros.client import LoopClient
     except ImportError as error:
         raise HexapodError(
             f"ROS 2 is needed for this ({error}): source a ROS 2 installation, or where there is none run "

@@ -18,7 +18,7 @@ from .processes import NodeProcess, PrivateDomain, waited_for_processor
 from .records import Answering, PathRecord, PoseRecord, SessionResult, Track
 
 if TYPE_CHECKING:
-    from ..nodes.client import LoopClient, Sent
+    from ..ros.client import LoopClient, Sent
 
 CONNECT_TIMEOUT = 60.0
 """Longest wait for both nodes, s: they start in under three seconds, on a busy computer in twenty."""

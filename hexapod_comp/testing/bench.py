@@ -36,12 +36,12 @@ from visualization_msgs.msg import MarkerArray
 from ..formats.paths import config_file
 from ..machine.geometry import STRUT_NAMES, load_geometry
 from ..machine.model_file import save_model
-from ..nodes.compensator import CompensatorNode
-from ..nodes.health import status_prefix
-from ..nodes.messages import message_pose, pose_message
-from ..nodes.running import autostart
-from ..nodes.strut_drive import StrutDriveNode
 from ..pose import Pose
+from ..ros.compensator import CompensatorNode
+from ..ros.health import status_prefix
+from ..ros.messages import message_pose, pose_message
+from ..ros.running import autostart
+from ..ros.strut_drive import StrutDriveNode
 from ..virtual.named import find_model, is_random
 
 if TYPE_CHECKING:

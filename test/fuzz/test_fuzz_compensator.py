@@ -39,8 +39,8 @@ from std_srvs.srv import Trigger
 from strategies import paper_geometry
 
 from hexapod_comp.machine.geometry import STRUT_NAMES
-from hexapod_comp.nodes.compensator import CompensatorNode
 from hexapod_comp.pose import Pose
+from hexapod_comp.ros.compensator import CompensatorNode
 
 LIMITS = paper_geometry().limits
 

@@ -31,7 +31,7 @@ from sensor_msgs.msg import JointState
 from strategies import paper_geometry
 
 from hexapod_comp.machine.geometry import STRUT_NAMES
-from hexapod_comp.nodes.strut_drive import StrutDriveNode
+from hexapod_comp.ros.strut_drive import StrutDriveNode
 
 LIMITS = paper_geometry().limits
 

@@ -28,7 +28,7 @@ from std_srvs.srv import Trigger
 
 from hexapod_comp.loop.processes import NodeProcess
 from hexapod_comp.machine.geometry import STRUT_NAMES
-from hexapod_comp.nodes.messages import pose_message
+from hexapod_comp.ros.messages import pose_message
 
 MESSAGES = max(600, NIGHTLY)
 """To each of the nodes."""

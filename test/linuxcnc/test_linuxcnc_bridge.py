@@ -30,10 +30,10 @@ from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
 from hexapod_comp.linuxcnc.guard import LONGEST_STEP, GuardStatus
 from hexapod_comp.linuxcnc.hal import HalComponent, HalError, load_module, pins, quaternion_from_axes
 from hexapod_comp.machine.geometry import STRUT_NAMES
-from hexapod_comp.nodes.health import ERROR, OK, WARN
-from hexapod_comp.nodes.parameters import ParameterError
-from hexapod_comp.nodes.running import autostart
 from hexapod_comp.pose import Pose
+from hexapod_comp.ros.health import ERROR, OK, WARN
+from hexapod_comp.ros.parameters import ParameterError
+from hexapod_comp.ros.running import autostart
 
 NODE = "linuxcnc_bridge"
 

@@ -21,10 +21,10 @@ from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.trajectory import Path, move
-from hexapod_comp.nodes import health
-from hexapod_comp.nodes.health import ERROR, OK
-from hexapod_comp.nodes.messages import message_pose
 from hexapod_comp.pose import Pose
+from hexapod_comp.ros import health
+from hexapod_comp.ros.health import ERROR, OK
+from hexapod_comp.ros.messages import message_pose
 from hexapod_comp.virtual.machine import DriveParameters, StrutDrive
 
 STEP = 0.1e-6

@@ -20,11 +20,11 @@ from sensor_msgs.msg import JointState
 from hexapod_comp.errors import NoAnswerError, printable
 from hexapod_comp.loop.processes import NodeProcess
 from hexapod_comp.loop.session import connect
-from hexapod_comp.nodes.arguments import outside_ros
-from hexapod_comp.nodes.client import LISTENER_QOS, LoopClient, Sent
-from hexapod_comp.nodes.compensator_parameters import PROGRAM as COMPENSATOR
-from hexapod_comp.nodes.middleware import PROFILE_VARIABLES, avoid_shared_memory
 from hexapod_comp.pose import Pose
+from hexapod_comp.ros.arguments import outside_ros
+from hexapod_comp.ros.client import LISTENER_QOS, LoopClient, Sent
+from hexapod_comp.ros.compensator_parameters import PROGRAM as COMPENSATOR
+from hexapod_comp.ros.middleware import PROFILE_VARIABLES, avoid_shared_memory
 
 STOP_WITHIN = 2.0
 """From the signal to the end of the process, s."""
@@ -87,7 +87,7 @@ def assert_ends_well(node: NodeProcess, *signals: signal.Signals) -> None:
 
 def run_both(*arguments: str) -> list[tuple[int, str]]:
     """Run both nodes at once, as a user would, and return exit code and stderr of each when they have ended."""
-    modules = [f"hexapod_comp.nodes.{name}" for name in ("compensator", "strut_drive")]
+    modules = [f"hexapod_comp.ros.{name}" for name in ("compensator", "strut_drive")]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     started = [subprocess.Popen([sys.executable, "-m", module, *arguments], **pipes) for module in modules]
     try:
@@ -234,8 +234,8 @@ def test_bad_start_ends_with_1_and_a_clear_word(isolated_ros, arguments, texts):
 
 
 PROGRAMS = {
-    "compensator": ("nodes.compensator", "model_file  [ideal]", "tool_pose_command"),
-    "strut_drive": ("nodes.strut_drive", "truth_file  [paper_machine.yaml]", "strut_commands"),
+    "compensator": ("ros.compensator", "model_file  [ideal]", "tool_pose_command"),
+    "strut_drive": ("ros.strut_drive", "truth_file  [paper_machine.yaml]", "strut_commands"),
     "linuxcnc_bridge": ("linuxcnc.bridge", "units  [mm]", "strut_corrections"),
 }
 """Executables: module, and texts of their help."""

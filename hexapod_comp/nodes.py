@@ -1,0 +1,7 @@
+"""The old name of :mod:`hexapod_comp.ros`, for one version: its modules are found under this name too."""
+
+from __future__ import annotations
+
+from .ros import __path__, heard_signals, open_streams, start
+
+__all__ = ["__path__", "heard_signals", "open_streams", "start"]

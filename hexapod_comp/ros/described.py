@@ -1,0 +1,73 @@
+"""Start a program with the URDF that the compensator publishes: ``python -m hexapod_comp.ros.described PROGRAM ...``.
+
+robot_state_publisher takes the URDF as a parameter when it starts. Which geometry and joint names the compensator uses
+may stand in any of its parameter files, so the compensator alone knows its URDF. This program waits for it, writes it
+into a parameter file, and then becomes the program that it was asked to start, with that file as its last argument. The
+topic stays the compensator's: what that program publishes of the URDF goes to a topic below its own name.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from tempfile import NamedTemporaryFile
+
+import rclpy
+import yaml
+from rclpy.executors import SingleThreadedExecutor
+from std_msgs.msg import String
+
+from .middleware import avoid_shared_memory
+from .vital_signs import LATCHED_QOS
+
+TOPIC = "robot_description"
+
+WARN_AFTER = 5.0
+"""Without a URDF for this long the log says what is missing, s."""
+
+
+SIGNALS_SEEN_WITHIN = 0.2
+"""rclpy waits in C: Python handles a signal when the wait ends, s."""
+
+
+def wait_for_description(arguments: Sequence[str]) -> str:
+    """Return the URDF on ``robot_description``, for a program's ROS arguments: namespace, remappings, enclave."""
+    avoid_shared_memory()
+    context = rclpy.Context()
+    rclpy.init(args=list(arguments), context=context)
+    node = rclpy.create_node("description_listener", context=context, start_parameter_services=False)
+    heard: list[String] = []
+    node.create_subscription(String, TOPIC, heard.append, LATCHED_QOS)
+    missing = f"no URDF yet: waiting for a compensator to publish {node.resolve_topic_name(TOPIC)}"
+    waiting = node.create_timer(WARN_AFTER, lambda: node.get_logger().warning(missing))
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    try:
+        while not heard:
+            executor.spin_once(timeout_sec=SIGNALS_SEEN_WITHIN)
+    finally:
+        node.destroy_timer(waiting)
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
+    return heard[0].data
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Become the program that the arguments name, once the URDF is known."""
+    program, *arguments = sys.argv[1:] if argv is None else argv
+    try:
+        text = wait_for_description([program, *arguments])
+    except KeyboardInterrupt:
+        return 0
+    parameters = {"/**": {"ros__parameters": {TOPIC: text}}}
+    with NamedTemporaryFile("w", prefix="description_", suffix=".yaml", delete=False, encoding="utf-8") as file:
+        yaml.safe_dump(parameters, file)
+    own_topic = ["-r", f"{TOPIC}:=~/{TOPIC}"]  # the topic itself stays the compensator's
+    os.execv(program, [program, *arguments, "--ros-args", *own_topic, "--params-file", file.name])
+    raise AssertionError("execv does not return")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

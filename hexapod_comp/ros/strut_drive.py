@@ -1,0 +1,262 @@
+"""The simulated strut-drive node: strut commands in, encoder readings and the true tool pose out.
+
+It stands for the six drives and the machine on them: :class:`~hexapod_comp.virtual.machine.StrutDrive` with a
+hidden truth. Run it with ``ros2 run hexapod_comp strut_drive`` or
+``python -m hexapod_comp.ros.strut_drive``.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from sensor_msgs.msg import JointState
+
+from ..errors import CommandError, HexapodError, KinematicsError
+from ..formats.paths import config_file
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry, load_geometry
+from ..machine.model import MachineModel, RealMachine
+from ..virtual.machine import DriveParameters, Faults, StrutDrive
+from ..virtual.named import RANDOM, find_model, is_word
+from .command_source import CommandSource
+from .health import ERROR, OK, WARN, Flow, Refusals, joined, seconds
+from .log_space import LogSpace
+from .messages import StrutMessage, StrutReader, write_pose
+from .order import NoStep
+from .running import keep_discovery_local, run
+from .runtime import ACKNOWLEDGED_WITHIN, STATE_QOS, MachineNode
+from .stamps import StampGate, nanoseconds_of
+from .strut_drive_parameters import PARAMETERS, PROGRAM
+
+LONGEST_PAUSE = 0.25
+"""After a longer pause (a stopped process), the machine has moved on by no more than this, s."""
+
+CHECK_PERIOD = 0.05
+
+
+class StrutDriveNode(MachineNode):
+    """Lifecycle node around one :class:`StrutDrive`; arguments are those of ``rclpy`` nodes."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("strut_drive", PARAMETERS, **options)
+        self._refusals, self._commands = Refusals(), Flow()
+        self._drive: StrutDrive | None = None
+
+    @property
+    def drive(self) -> StrutDrive:
+        """The simulated machine of a configured node."""
+        if self._drive is None:
+            raise CommandError("not_configured", "the node is not configured")
+        return self._drive
+
+    # ---- lifecycle ----
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Build the machine and open topics."""
+        options, names = self._options, self._options["joint_names"]
+        self._reader, self._states_out, self._true_out = StrutReader(names), StrutMessage(names=names), PoseStamped()
+        self._true_out.header.frame_id = options["base_frame"]
+        try:
+            geometry = load_geometry(config_file(options["geometry_file"], "geometry"))
+            machine = RealMachine(geometry, self._truth(geometry))
+            self._drive = StrutDrive(machine, self._drive_parameters(), options["noise_seed"])
+            self.drive.faults = self._faults()
+            self.drive.advance(1.0 / options["rate"])
+            self._tool_in_base()
+        except HexapodError as error:
+            self._drive = None
+            self.get_logger().error(f"cannot configure: {error}")
+            return TransitionCallbackReturn.FAILURE
+        try:
+            with self.all_or_nothing():
+                self._open_topics()
+        except Exception:
+            self._drive = None  # else the end would say goodbye on topics that there are not
+            raise
+        self._stamps = StampGate("command", self.clock, options["command_validity"], future=False)
+        self._no_step, self._log_space = NoStep(geometry), LogSpace()
+        self.get_logger().info(f"configured machine {geometry.name!r} with hidden truth {machine.model.name!r}")
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Start to move, from where the struts stand, and to measure."""
+        self._no_step.start(self.drive.motor_lengths())
+        self._last_run = time.monotonic()
+        self._active = True
+        self.get_logger().info("ready")
+        return super().on_activate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close topics and forget the machine."""
+        self._active = False
+        for timer in self._own_timers:
+            self.destroy_timer(timer)
+        self.destroy_subscription(self._subscription)
+        for publisher in (self._states_pub, self._true_pub):
+            self.destroy_publisher(publisher)
+        self._drive = None
+        return super().on_cleanup(state)
+
+    def say_goodbye(self) -> None:
+        """Publish a last status and wait until it has arrived."""
+        if self._drive is None:
+            return
+        self._active = False
+        self._check_state()
+        self._diagnostics_pub.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+
+    def _truth(self, geometry: HexapodGeometry) -> MachineModel:
+        name = self._options["truth_file"]
+        if name == RANDOM:
+            name = f"{RANDOM}:{self._options['truth_seed']}"
+        return find_model(name if is_word(name) else config_file(name, "model"), geometry)
+
+    def _drive_parameters(self) -> DriveParameters:
+        names = ("step", "lag", "max_acceleration", "encoder_resolution", "encoder_noise", "tracker_noise")
+        values = {name: self._options[name] for name in names}
+        return DriveParameters(max_speed=self._options["max_speed"] or None, **values)
+
+    def _open_topics(self) -> None:
+        self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
+        self._true_pub = self.publish_on(PoseStamped, "tool_pose_true", STATE_QOS)
+        self.speak_for(self.drive.machine.geometry.name)
+        self._subscription = self.obey(JointState, "strut_commands", self._on_commands, self._look_at_publishers)
+        topic, count = self._subscription.topic_name, self._subscription.get_publisher_count
+        self._source = CommandSource(self, topic, count, self._options["allow_several_publishers"])
+        self._own_timers = [
+            self.every(1.0 / self._options["rate"], self._run),
+            self.every(CHECK_PERIOD, self._check_state),
+        ]
+
+    # ---- faults ----
+
+    def on_parameters(self, names: set[str]) -> None:
+        """Take what has been set while the node runs; a knock only where it has been asked for anew."""
+        if self._drive is not None:
+            self._stamps.max_age = self._options["command_validity"]
+            faults = self._faults()
+            self._drive.faults = faults if "fault_jump" in names else replace(faults, jump=None)
+
+    def _faults(self) -> Faults:
+        def index(number: int) -> int | None:
+            return number - 1 if number else None
+
+        options, jump = self._options, self._options["fault_jump"]
+        return Faults(
+            stuck=index(options["fault_stuck_strut"]),
+            encoder_lost=index(options["fault_encoder_lost"]),
+            feedback_delay=options["fault_feedback_delay"],
+            feedback_drop=options["fault_feedback_drop"],
+            jump=(options["fault_jump_strut"] - 1, jump) if jump else None,
+        )
+
+    # ---- the machine ----
+
+    def _look_at_publishers(self) -> None:
+        self._source.look(time.monotonic())
+
+    def _on_commands(self, data: bytes, number: int | None) -> None:
+        if not self._active:
+            return
+        now = time.monotonic()
+        self._source.hear(number, now)
+        try:
+            if self._source.problem:
+                raise CommandError(self._source.reason, self._source.problem)
+            self._obey_commands(data, now)
+        except HexapodError as error:
+            self._refusals.add(error.reason, str(error), now)
+            self.warn_of(error.reason, f"command refused ({error.reason}): {error}")
+            return
+        self._commands.tick(now)
+
+    def _obey_commands(self, data: bytes, now: float) -> None:
+        """Take commands that are six lengths, in order, and no step from the last ones."""
+        stamp, lengths = nanoseconds_of(self._reader.take(data).header.stamp), self._reader.lengths
+        self._stamps.check(stamp, now)
+        self._no_step.check(lengths, now)
+        self.drive.set_command(lengths)
+        self._stamps.accept(stamp, now)
+        self._no_step.passed(lengths, now)
+
+    def _run(self) -> None:
+        if not self._active:
+            return
+        now = time.monotonic()
+        self.drive.advance(min(now - self._last_run, LONGEST_PAUSE))
+        self._last_run = now
+        stamp = self.get_clock().now().to_msg()
+        if self.drive.feedback_arrived:
+            out = self._states_out
+            out.position[:] = self.drive.encoder_lengths()
+            out.velocity[:] = self.drive.encoder_speeds()
+            out.message.header.stamp = stamp
+            self._states_pub.publish(out.message)
+        try:
+            self._tool_in_base()
+        except KinematicsError as error:
+            self.warn_of("true pose", f"the machine cannot stand where its struts are: {error}")
+            return
+        self._true_out.header.stamp = stamp
+        self._true_pub.publish(self._true_out)
+
+    def _tool_in_base(self) -> None:
+        """Fill the message of the true tool pose, as the tracker reads it, in ``base``."""
+        pose = self.drive.machine.geometry.work @ self.drive.tracker_pose()
+        write_pose(self._true_out, pose.position, pose.rotation)
+
+    # ---- state ----
+
+    def _findings(self, now: float) -> Iterator[tuple[bytes, str]]:
+        """Yield what there is to say, worst first."""
+        stopped = [name for name, at_stop in zip(STRUT_NAMES, self.drive.stopped, strict=True) if at_stop]
+        if stopped:
+            yield ERROR, f"at the travel stop: {', '.join(stopped)}"
+        if self._source.problem:
+            yield ERROR, f"refusing commands: {self._source.reason}: {self._source.problem}"
+        if reasons := self._refusals.reasons(now, self._source.reason if self._source.problem else ""):
+            yield ERROR, f"refusing commands: {reasons}"
+        missing = self._source.sequence.missing(now)
+        if self._commands.count and 0.0 < self._options["command_timeout"] < self._commands.age(now):
+            yield WARN, "no new command"
+        elif missing:
+            yield WARN, "running, commands are being missed"
+        if self._log_space.problem:
+            yield WARN, self._log_space.problem
+        yield OK, "running" if self._commands.count else "waiting for the first command"
+
+    def _check_state(self) -> None:
+        self._look_at_publishers()
+        self._log_space.look()
+        now = time.monotonic()
+        level, text = joined(self._findings(now)) if self._active else (WARN, "not active")
+        self.tell(level, text, lambda: self._values(now))
+
+    def _values(self, now: float) -> dict[str, str]:
+        return {
+            "commanded_by": ", ".join(self._source.names),
+            "commands": str(self._commands.count),
+            "commands_missed": str(self._source.sequence.missed),
+            "command_rate_hz": f"{self._commands.rate(now):.1f}",
+            "command_age_s": seconds(self._commands.age(now)),
+            "clock_set_back": str(self.clock.set_back),
+            "clock_set_forward": str(self.clock.set_forward),
+            "senders_clock_set_back": str(self._stamps.sender_set_back),
+            "last_refusal": self._refusals.last_text,
+            **self._refusals.values(),
+        }
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node; the entry of the executable ``strut_drive``."""
+    keep_discovery_local()
+    return run(StrutDriveNode, PROGRAM, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,97 @@
+"""Messages that must not be obeyed although each by itself is good: overtaken ones, and steps that nobody sends."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from node_helpers import CONFIG, HOME, Bench, closed_form_lengths, near
+from rclpy.duration import Duration
+from rclpy.time import Time
+from sensor_msgs.msg import JointState
+
+from hexapod_comp.errors import LimitError
+from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
+from hexapod_comp.ros.health import ERROR, WARN
+from hexapod_comp.ros.log_space import LogSpace
+from hexapod_comp.ros.order import NoStep
+
+
+@pytest.mark.parametrize(
+    ("step", "pause", "passes"), [(2.9e-3, 0.004, True), (3.1e-3, 0.004, False), (0.03, 0.2, True)]
+)
+def test_steps_beyond_the_limits_of_step_and_speed_are_refused(step, pause, passes):
+    """The paper's machine allows 2 mm per command and 250 mm/s: 3 mm after 4 ms, 52 mm after 0.2 s."""
+    guard = NoStep(load_geometry(CONFIG / "paper.yaml"))
+    lengths = closed_form_lengths(HOME)
+    guard.check(lengths + 1.0, 0.0)  # nothing is known yet
+    guard.passed(lengths, 1.0)
+    wanted = lengths + step * (np.arange(6) == 4)
+    if passes:
+        guard.check(wanted, 1.0 + pause)
+        return
+    with pytest.raises(LimitError, match=r"strut_5 would step by 3\.1 mm, allowed 3 mm") as caught:
+        guard.check(wanted, 1.0 + pause)
+    assert caught.value.reason == "step"
+
+
+def test_nan_and_huge_steps_are_refused():
+    guard = NoStep(load_geometry(CONFIG / "paper.yaml"))
+    lengths = closed_form_lengths(HOME)
+    guard.passed(lengths, 1.0)
+    for value in (np.nan, np.inf, 1e300):
+        with pytest.raises(LimitError, match="strut_3"):
+            guard.check(np.where(np.arange(6) == 2, value, lengths), 1.004)
+
+
+def strut_message(bench: Bench, lengths: np.ndarray, before: JointState | None = None) -> JointState:
+    """Return a message stamped now, or 50 ms before another: however long that took, it has been overtaken."""
+    message = JointState(name=list(STRUT_NAMES), position=lengths.tolist(), velocity=[0.0] * 6)
+    message.header.stamp = bench.now()
+    if before is not None:
+        message.header.stamp = (Time.from_msg(before.header.stamp) - Duration(seconds=0.05)).to_msg()
+    return message
+
+
+def test_the_drive_refuses_overtaken_commands_and_steps(bench):
+    """Its parameter rate is low, so that nothing else happens; what it obeys last stays in force."""
+    bench.drive(rate=50.0)
+    good = closed_form_lengths(HOME)
+    first = strut_message(bench, good)
+    bench.publish("strut_commands", first)  # both wait in the node's queue, so it reads them without a pause
+    bench.publish("strut_commands", strut_message(bench, good + 1e-4, first))
+    bench.until_status(ERROR, "refusing commands: stamp_order", "strut_drive")
+    bench.publish("strut_commands", strut_message(bench, np.where(np.arange(6) == 1, 1e30, good)))
+    bench.until_status(ERROR, "refusing commands: step", "strut_drive")
+    drive = bench.nodes[0].drive
+    np.testing.assert_array_equal(drive.commands, good)
+
+
+def test_the_compensator_does_not_use_overtaken_readings(bench):
+    bench.compensator()
+    lengths = closed_form_lengths(HOME)
+    first = bench.feed(lengths)
+    bench.barrier()
+    bench.publish("strut_states", strut_message(bench, closed_form_lengths(near(HOME, (1e-3, 0.0, 0.0))), first))
+    bench.until_status(ERROR, "bad feedback: stamp_order")
+    assert len(bench.seen["tool_pose_estimate"]) == 1
+
+
+def test_a_strut_that_is_away_for_one_reading_is_said(bench):
+    """One reading 3 mm off among good ones, between two looks of the diagnostics: the limit is 2 mm."""
+    bench.compensator()
+    answer = bench.ask(HOME)
+    for n, off in enumerate((0.0, 3e-3, 0.0)):  # 30 ms apart: a strut may move by 17 mm
+        bench.feed(answer.lengths + off * (np.arange(6) == 3), later=0.03 * n)
+        bench.barrier()
+    bench.until_status(ERROR, "refusing commands: following_error: strut_4")
+    assert "bad feedback: following_error" in bench.status().message  # behind it, on a busy computer, what is late
+    assert "strut_4" in bench.values()["last_bad_feedback"]
+
+
+@pytest.mark.parametrize("node", ["compensator", "strut_drive"])
+def test_a_full_log_disk_is_said_beside_everything_else(bench, monkeypatch, node):
+    monkeypatch.setattr(LogSpace, "look", lambda space: setattr(space, "problem", "log disk full: /var/log"))
+    made = bench.compensator() if node == "compensator" else bench.drive()
+    bench.until(lambda: bench.status(node), "a status")
+    assert bench.status(made.get_name()).message.endswith("log disk full: /var/log")
+    assert bench.status(node).level == WARN

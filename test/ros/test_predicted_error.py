@@ -1,0 +1,185 @@
+"""The topics of the predicted error: what they say, in which frame, how well it is known, and that nobody pays unasked.
+
+What should be said comes from the machine's own forward run; the spread from the calibration's tests.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from unittest.mock import MagicMock
+
+import calibration_helpers as small
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from node_helpers import RELIABLE, Bench
+from scipy.spatial.transform import Rotation
+
+from hexapod_comp.machine.kinematics import Structure, strut_lengths
+from hexapod_comp.machine.model import RealMachine
+from hexapod_comp.machine.model_file import load_model
+from hexapod_comp.pose import Pose
+from hexapod_comp.ros import predicted_error
+from hexapod_comp.ros.health import WARN
+from hexapod_comp.ros.predicted_error import PredictedErrorTopics, PredictionError, PredictionProcess, error_message
+
+STANDING, ALIGNED = "compensator/predicted_error", "compensator/predicted_error_aligned"
+UM = 1e-6
+STARTED = 60.0
+"""The process imports for a second on a free processor, s."""
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> list[PredictionProcess]:
+    """Return the processes that nodes start."""
+    found: list[PredictionProcess] = []
+    real = predicted_error.PredictionProcess
+    monkeypatch.setattr(predicted_error, "PredictionProcess", lambda setup: found.append(real(setup)) or found[-1])
+    return found
+
+
+def listen(bench: Bench, *topics: str) -> None:
+    for topic in topics:
+        bench.witness.create_subscription(PoseWithCovarianceStamped, topic, bench.seen[topic].append, RELIABLE)
+
+
+def test_the_topics_say_what_the_machine_would_do_and_how_well_that_is_known(bench, tmp_path):
+    """All struts too long by d lift a level platform at home by d·L/h, and nothing turns: a closed form.
+
+    Of the covariance: known struts and joints of 2 µm make the tool known to about as much; the datum takes most.
+    """
+    bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
+    geometry = small.paper()
+    answer = bench.ask(geometry.home)
+    listen(bench, STANDING, ALIGNED)
+    bench.until(lambda: bench.seen[STANDING] and bench.seen[ALIGNED], "predicted errors", STARTED)
+    standing, aligned = bench.seen[STANDING][0], bench.seen[ALIGNED][0]
+    for message in (standing, aligned):
+        assert message.header.frame_id == "work"
+        assert message.header.stamp == answer.command.header.stamp
+        covariance = np.array(message.pose.covariance).reshape(6, 6)
+        assert (np.linalg.eigvalsh(covariance / 1e-12) > -1e-6).all()
+    lengths = strut_lengths(Structure.of(geometry), geometry.home)
+    lift = 30 * UM * lengths[0] / geometry.home.position[2]
+    position, orientation = standing.pose.pose.position, standing.pose.pose.orientation
+    # second order: 37 µm squared over half a metre
+    np.testing.assert_allclose([position.x, position.y, position.z], [0.0, 0.0, lift], atol=5e-9)
+    np.testing.assert_allclose([orientation.x, orientation.y, orientation.z, orientation.w], [0, 0, 0, 1], atol=1e-8)
+    sigma, left = (np.sqrt(np.diag(np.array(m.pose.covariance).reshape(6, 6))[:3]) for m in (standing, aligned))
+    assert ((sigma > 0.5 * UM) & (sigma < 10 * UM)).all()
+    assert (left < 0.5 * sigma).all()
+
+
+def test_without_a_fit_the_covariance_is_nan_never_zero(bench):
+    """Of the shipped virtual machine nobody says how well it is known; a command in another pose, from a turn on."""
+    bench.compensator(model_file="paper_machine.yaml", ramp_rate=1.0)
+    pose = small.paper().home @ Pose.from_angles([0.0, 0.0, 0.0005], [0.001, 0.0, 0.0])
+    bench.ask(pose)
+    listen(bench, STANDING)
+    bench.until(lambda: bench.seen[STANDING], "predicted error", STARTED)
+    message = bench.seen[STANDING][0]
+    assert all(math.isnan(value) for value in message.pose.covariance)
+    machine = RealMachine(small.paper(), load_model("paper_machine", small.paper()))
+    went, _ = machine.pose_for(strut_lengths(Structure.of(small.paper()), pose), guess=pose)
+    p, q = message.pose.pose.position, message.pose.pose.orientation
+    np.testing.assert_allclose([p.x, p.y, p.z], went.position - pose.position, atol=1e-12)
+    turn = Rotation.from_matrix(went.rotation @ pose.rotation.T).as_quat()
+    np.testing.assert_allclose([q.x, q.y, q.z, q.w], turn, atol=1e-12)
+
+
+def test_nothing_is_worked_out_while_nobody_listens(bench, started, tmp_path):
+    """No process at all, until somebody subscribes; and it goes when they leave."""
+    node = bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
+    bench.ask(small.paper().home)
+    looks = []
+    predicted = node._outputs._predicted
+    node.create_timer(0.05, lambda: looks.append(None))
+    bench.until(lambda: len(looks) > 10, "half a second")
+    assert not started
+    subscription = bench.witness.create_subscription(
+        PoseWithCovarianceStamped, STANDING, bench.seen[STANDING].append, RELIABLE
+    )
+    bench.until(lambda: bench.seen[STANDING], "predicted error", STARTED)
+    assert len(started) == 1
+    process = started[0]._process
+    assert process is not None
+    bench.witness.destroy_subscription(subscription)
+    bench.until(lambda: process.poll() is not None, "the end of the process")
+    assert predicted._process is None
+
+
+def test_a_process_that_dies_is_said_and_started_anew(bench, started, tmp_path, monkeypatch):
+    monkeypatch.setattr(predicted_error, "TRY_AGAIN_AFTER", (0.3, 60.0))
+    bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
+    bench.ask(small.paper().home)
+    listen(bench, STANDING)
+    bench.until(lambda: bench.seen[STANDING], "predicted error", STARTED)
+    os.kill(started[0]._process.pid, 9)  # type: ignore[union-attr]
+    bench.until(lambda: "no predicted error: the process that predicts" in bench.message(), "the warning")
+    assert bench.status().level == WARN
+    bench.ask(small.paper().home)
+    before = len(bench.seen[STANDING])
+    bench.until(lambda: len(bench.seen[STANDING]) > before, "predicted errors again", STARTED)
+    assert len(started) == 2
+    bench.until(lambda: "no predicted error" not in bench.message(), "the end of the warning")
+
+
+def test_a_process_that_fails_every_time_is_tried_less_and_less_often(monkeypatch):
+    """Truth: the waits double from 2 s to 60 s; a stand-in for the process fails at once."""
+    began = []
+
+    class Failing:
+        busy = True
+
+        def __init__(self, setup):
+            began.append(now)
+
+        def result(self):
+            raise PredictionError("it cannot")
+
+        def close(self):
+            pass
+
+    node, publisher = MagicMock(), MagicMock()
+    node.create_publisher.return_value = publisher
+    publisher.get_subscription_count.return_value = 1
+    monkeypatch.setattr(predicted_error, "PredictionProcess", Failing)
+    monkeypatch.setattr(predicted_error.time, "monotonic", lambda: now)
+    compensator, files = MagicMock(nominal=np.zeros(6)), MagicMock(sources={"model": object()})
+    topics = PredictedErrorTopics(node, compensator, files, "work", lambda: 0)
+    for tick in range(1000):
+        now = 100.0 + 0.2 * tick
+        topics._look()
+        assert topics.problem == "no predicted error: it cannot"
+    np.testing.assert_allclose(np.diff(began), [2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0], atol=0.21)
+    publisher.get_subscription_count.return_value = 0
+    topics._look()
+    assert topics.problem == ""
+
+
+def test_a_new_model_is_predicted_with(bench, tmp_path):
+    path = small.fitted_model(tmp_path)
+    bench.compensator(model_file=str(path), ramp_rate=1.0)
+    bench.ask(small.paper().home)
+    listen(bench, STANDING)
+    bench.until(lambda: bench.seen[STANDING], "predicted error", STARTED)
+    before = bench.seen[STANDING][-1].pose.pose.position.z
+    small.fitted_model(tmp_path, 60 * UM)
+    loaded = bench.begin("reload_model")
+    bench.until(loaded.done, "the new model", STARTED)
+    assert loaded.result().success
+    bench.until(lambda: bench.seen[STANDING][-1].pose.pose.position.z > 1.5 * before, "the new error", STARTED)
+    assert bench.seen[STANDING][-1].pose.pose.position.z == pytest.approx(2.0 * before, rel=1e-3)
+    assert not math.isnan(bench.seen[STANDING][-1].pose.covariance[0])  # its own posterior, not the old model's
+
+
+def test_a_message_holds_a_small_motion() -> None:
+    """Half a turn about z is (0, 0, 1, 0)."""
+    message = error_message([1.0, 2.0, 3.0, 0.0, 0.0, math.pi], None, "work", 5_000_000_007)
+    q = message.pose.pose.orientation
+    np.testing.assert_allclose([q.x, q.y, q.z, q.w], [0.0, 0.0, 1.0, 0.0], atol=1e-15)
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (5, 7)

@@ -1,0 +1,318 @@
+"""Whose readings count, and which: struts, temperatures and humidity have one owner, and must be such as can be.
+
+Truth: the shipped geometry's limits (2 mm a command, 250 mm/s, twice that for what is measured), and the arithmetic of
+temperatures beside each test.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+import rclpy
+from node_helpers import HOME, RELIABLE, Bench, closed_form_lengths, model_file, near
+from rclpy.node import Node
+from sensor_msgs.msg import JointState, Temperature
+from strategies import paper_geometry
+
+from hexapod_comp.errors import CommandError, LimitError
+from hexapod_comp.machine.geometry import STRUT_NAMES
+from hexapod_comp.ros import command_source
+from hexapod_comp.ros.health import ERROR, OK, WARN
+from hexapod_comp.ros.plausible import NoJump
+from hexapod_comp.ros.stamps import StampClock, StampGate
+
+AT_HOME = closed_form_lengths(HOME)
+SECOND = 1_000_000_000
+EXPANDING = {"expansion_ppm_per_K": 12.0}
+
+
+@pytest.fixture(params=["stranger", "witness"])
+def other(request: pytest.FixtureRequest, bench: Bench) -> Iterator[Node]:
+    """Another node: of a name of its own, or of the one that is there already."""
+    node = rclpy.create_node(request.param, context=bench.context)
+    yield node
+    node.destroy_node()
+
+
+@pytest.fixture
+def stranger(bench: Bench) -> Iterator[Node]:
+    node = rclpy.create_node("stranger", context=bench.context)
+    yield node
+    node.destroy_node()
+
+
+def heard(bench: Bench, topic: str, count: int) -> None:
+    (end,) = [end for end in bench.nodes[0].subscriptions if end.topic_name == topic]
+    bench.until(lambda: end.get_publisher_count() == count, "the publishers to be found")
+
+
+# ---- who measures ----
+
+
+def test_a_second_publisher_of_measured_struts_stops_the_machine(bench, stranger):
+    """Where it stands is in dispute: both are named, nothing of either is used, until one is left."""
+    bench.compensator(command_timeout=0.0, feedback_timeout=60.0)
+    bench.feed(AT_HOME)
+    bench.ask(HOME)
+    publisher = stranger.create_publisher(JointState, "/strut_states", RELIABLE)
+    values = bench.until_status(ERROR, "refusing commands: several_publishers: several publishers of /strut_states")
+    assert bench.status().message.endswith("/strut_states: /stranger, /witness")
+    assert values["measured_by"] == "/stranger, /witness"
+    bench.send(HOME)
+    bench.feed(AT_HOME)
+    bench.barrier()
+    assert len(bench.seen["strut_commands"]) == len(bench.seen["tool_pose_estimate"]) == 1
+    bench.until(lambda: bench.values()["bad_feedback"] == "1", "the count")
+    stranger.destroy_publisher(publisher)
+    bench.until_status(OK, "running")
+    assert bench.values()["measured_by"] == "/witness"
+    bench.ask(HOME)
+
+
+def test_twins_that_both_measure_are_told_apart_by_their_sequence(bench, other, monkeypatch):
+    """Of one name, as a killed drive and its successor are: only when both speak does neither count."""
+    monkeypatch.setattr(command_source, "SPEAKERS_HELD", 0.5)
+    bench.compensator(command_timeout=0.0, feedback_timeout=60.0)
+    bench.ask(HOME)
+    publisher = other.create_publisher(JointState, "/strut_states", RELIABLE)
+    heard(bench, "/strut_states", 2)
+    same = other.get_name() == "witness"
+    struts = JointState(name=list(STRUT_NAMES), position=AT_HOME.tolist())
+    for _ in range(3):
+        bench.feed(AT_HOME)
+        bench.barrier()
+        publisher.publish(struts)
+        bench.barrier()
+    what = "two publishers of /strut_states speak in turn" if same else "several publishers of /strut_states"
+    bench.until_status(ERROR, f"refusing commands: several_publishers: {what}")
+    if same:
+        bench.until_status(OK, "running")
+
+
+def test_several_may_measure_where_that_is_allowed(bench, stranger):
+    bench.compensator(command_timeout=0.0, feedback_timeout=60.0, allow_several_publishers=True)
+    publisher = stranger.create_publisher(JointState, "/strut_states", RELIABLE)
+    bench.until(lambda: bench.values().get("measured_by") == "/stranger, /witness", "both names")
+    heard(bench, "/strut_states", 2)
+    bench.until(lambda: publisher.get_subscription_count() >= 1, "the match")
+    bench.feed(AT_HOME)
+    bench.ask(HOME)
+    publisher.publish(JointState(name=list(STRUT_NAMES), position=AT_HOME.tolist()))
+    bench.until(lambda: len(bench.seen["tool_pose_estimate"]) == 2, "the stranger's reading")
+
+
+def test_temperatures_have_an_owner_too_and_a_second_one_does_not_stop_the_machine(bench, stranger, tmp_path):
+    """A drift of minutes is no reason to stop a cut: what is known stays in use, and it is said while it lasts."""
+    bench.compensator(model_file=model_file(tmp_path, struts=EXPANDING), command_timeout=0.0, ramp_rate=1.0)
+    bench.ask(HOME)
+    bench.warm("strut_3", 25.0)
+    publisher = stranger.create_publisher(Temperature, "/temperatures", RELIABLE)
+    wanted = "temperatures ignored: several_publishers: several publishers of /temperatures: /stranger, /witness"
+    values = bench.until_status(ERROR, wanted)
+    assert values["temperatures_by"] == "/stranger, /witness"
+    bench.warm("strut_3", 25.5)
+    bench.ask(HOME)
+    stranger.destroy_publisher(publisher)
+    bench.until_status(OK, "running")
+    assert bench.values()["temperature.strut_3_degC"] == "25.00"
+
+
+def test_several_thermometers_where_that_is_allowed(bench, stranger):
+    bench.compensator(command_timeout=0.0, allow_several_thermometers=True)
+    publisher = stranger.create_publisher(Temperature, "/temperatures", RELIABLE)
+    heard(bench, "/temperatures", 2)
+    bench.warm("strut_3", 25.0)
+    message = Temperature(temperature=24.0)
+    message.header.frame_id = "base"
+    bench.until(lambda: publisher.get_subscription_count() == 1, "the match")
+    publisher.publish(message)
+    bench.until(lambda: bench.values().get("temperature.base_degC") == "24.00", "the stranger's part")
+    assert bench.values()["temperature.strut_3_degC"] == "25.00"
+
+
+# ---- when it was measured ----
+
+
+def test_a_reading_from_the_future_or_the_past_is_refused_and_shuts_nothing_out(bench):
+    """By 0.6 s, with 0.5 s allowed; one that is 0.4 s ahead is taken, and so is the next one that is not."""
+    bench.compensator(feedback_timeout=60.0)
+    for later, reason in ((0.6, "stamp_future"), (-0.6, "stamp_past")):
+        bench.feed(AT_HOME, later=later)
+        bench.until_status(ERROR, f"bad feedback: {reason}")
+        assert not bench.seen["tool_pose_estimate"]
+    for later in (0.4, 0.0):
+        bench.estimate(bench.feed(AT_HOME, later=later))
+    bench.feed(AT_HOME, later=-0.2)
+    bench.until_status(ERROR, "bad feedback: stamp_order")
+
+
+def test_the_age_of_readings_need_not_matter(bench):
+    """A controller whose clock nobody has set."""
+    bench.compensator(feedback_timeout=60.0, max_reading_age=0.0)
+    bench.estimate(bench.feed(AT_HOME, later=-3e8))
+
+
+@pytest.mark.parametrize("capped", [True, False])
+def test_a_stamp_ahead_counts_as_now_where_it_must_not_shut_out(capped):
+    """Of readings, not of commands: there the order matters more."""
+    check = StampGate("reading", StampClock(lambda: 100 * SECOND), 0.5, capped=capped)
+    check.check(100 * SECOND + 400_000_000, 1.0)
+    check.accept(100 * SECOND + 400_000_000, 1.0)
+    if capped:
+        check.check(100 * SECOND, 1.0)
+        with pytest.raises(CommandError, match="ms earlier than the one before"):
+            check.check(100 * SECOND - 1, 1.0)
+    else:
+        with pytest.raises(CommandError, match="ms earlier than the one before"):
+            check.check(100 * SECOND, 1.0)
+
+
+# ---- what was measured ----
+
+
+@pytest.mark.parametrize(
+    ("jump", "by_stamp", "by_arrival", "passes"),
+    [
+        (2.9e-3, 0.0, 0.002, True),  # 2 mm + 2 ms · 500 mm/s = 3 mm
+        (3.1e-3, 0.0, 0.002, False),
+        (10e-3, 0.020, 0.0, True),  # delivered at once after a pause: 12 mm in the 20 ms between their stamps
+        (13e-3, 0.020, 0.0, False),
+        (50e-3, 0.002, 0.1, True),  # 52 mm
+        (1e30, 0.1, 0.1, False),
+    ],
+)
+def test_struts_move_no_faster_than_they_can(jump, by_stamp, by_arrival, passes):
+    guard = NoJump(paper_geometry())
+    guard.check(AT_HOME + 1.0, 0, 0.0)  # nothing is known yet
+    guard.passed(AT_HOME, 5 * SECOND, 1.0)
+    arguments = AT_HOME - jump * (np.arange(6) == 4), round((5 + by_stamp) * 1e9), 1.0 + by_arrival
+    if passes:
+        guard.check(*arguments)
+        return
+    with pytest.raises(LimitError, match="strut_5 has jumped by") as caught:
+        guard.check(*arguments)
+    assert (caught.value.reason, caught.value.strut) == ("jump", 4)
+
+
+def test_a_reading_that_cannot_be_is_neither_used_nor_a_start(bench):
+    """300 mm away within a moment: the next start goes on from where the struts stand."""
+    bench.compensator(feedback_timeout=60.0)
+    bench.estimate(bench.feed(AT_HOME))
+    bench.feed(closed_form_lengths(near(HOME, (0.0, 0.0, 0.2))))
+    assert "has jumped by" in bench.until_status(ERROR, "bad feedback: jump")["last_bad_feedback"]
+    assert len(bench.seen["tool_pose_estimate"]) == 1
+    np.testing.assert_array_equal(bench.ask(HOME).lengths, AT_HOME)
+
+
+def test_a_reading_that_cannot_be_stops_the_machine_all_the_same(bench):
+    """Either the strut is broken or its encoder."""
+    bench.compensator(feedback_timeout=60.0, command_timeout=0.0)
+    bench.estimate(bench.feed(AT_HOME))
+    bench.ask(HOME)
+    bench.feed(AT_HOME + 0.2 * (np.arange(6) == 2))
+    bench.until_status(ERROR, "refusing commands: following_error: strut_3")
+    assert "jump" in bench.status().message
+
+
+# ---- temperatures ----
+
+
+def refused(bench: Bench, part: str, temperature: float, text: str) -> None:
+    bench.warm(part, temperature)
+    values = bench.until_status(ERROR, "bad feedback: temperature")
+    assert text in values["last_bad_feedback"]
+
+
+def test_one_wild_temperature_moves_nothing(bench, tmp_path):
+    """119 °C among readings of 21 °C: steel of 0.5 m would move by 0.58 mm, at once with this ramp."""
+    bench.compensator(
+        model_file=model_file(tmp_path, struts=EXPANDING),
+        command_timeout=0.0,
+        ramp_rate=1.0,
+        temperature_time_constant_s=0.0,
+    )
+    for part in STRUT_NAMES:
+        bench.warm(part, 21.0)
+    before = bench.settle(HOME)
+    refused(bench, "strut_2", 119.0, "temperature of strut_2: has jumped from 21.00 to 119.00 °C in")
+    np.testing.assert_array_equal(bench.ask(HOME).lengths, before.lengths)
+    bench.warm("strut_2", 21.5)
+    assert bench.ask(HOME).lengths[1] < before.lengths[1], "it was not shut out"
+
+
+def test_the_first_temperature_of_all_must_be_one_of_a_shop(bench):
+    bench.compensator(command_timeout=0.0)
+    refused(bench, "strut_2", 119.0, "99.0 K from 20 °C, and no other part is known; allowed 40 K")
+
+
+@pytest.mark.parametrize("settings", [{"temperature_rate_limit": 0.0}, {"temperature_spread_limit": 0.0}])
+def test_each_rule_may_be_switched_off(bench, settings):
+    bench.compensator(command_timeout=0.0, **settings)
+    for part in STRUT_NAMES:
+        bench.warm(part, 21.0)
+    text = "the other parts' 21.00 °C" if "temperature_rate_limit" in settings else "has jumped"
+    refused(bench, "strut_2", 119.0, text)
+
+
+def test_a_thermometer_that_falls_silent_is_said_and_its_last_word_stays(bench):
+    bench.compensator(command_timeout=0.0, temperature_timeout=0.3)
+    bench.ask(HOME)
+    for part in ("strut_3", "base"):
+        bench.warm(part, 24.0)
+    values: dict[str, Any] = bench.until_status(WARN, "temperatures stale: strut_3, base")
+    assert values["stale_temperatures"] == "strut_3, base"
+    assert values["temperature.base_degC"] == "24.00"
+
+
+# ---- humidity ----
+
+
+def test_struts_that_swell_follow_the_humidity(bench, tmp_path):
+    """From 50 to 60 % a strut of 2 ppm per % grows by 20 ppm: its command is L/(1 + 20e-6). Rounding: 1e-15 m."""
+    bench.compensator(
+        model_file=model_file(tmp_path, struts={"moisture_ppm_per_percent": 2.0}), command_timeout=0.0, ramp_rate=1.0
+    )
+    dry = bench.ask(HOME)
+    assert not dry.corrections.any()
+    unknown = "not known, taken as 50"
+    bench.until(lambda: bench.values().get("humidity_percent") == unknown, "that nobody tells the humidity")
+    bench.moisten(0.6)
+    bench.settle(HOME)
+    np.testing.assert_allclose(bench.ask(HOME).lengths, dry.lengths / (1.0 + 20e-6), rtol=0.0, atol=1e-15)
+    bench.until(lambda: bench.values().get("humidity_percent") == "60.0", "the humidity")
+    assert bench.values()["humidity_by"] == "/witness"
+
+
+@pytest.mark.parametrize("wrong", [45.0, 0.0045, math.nan], ids=["percent", "twice a fraction", "NaN"])
+def test_a_humidity_that_cannot_be_is_refused(bench, wrong):
+    bench.compensator(command_timeout=0.0)
+    bench.moisten(wrong)
+    values = bench.until_status(ERROR, "bad feedback: humidity")
+    assert "humidity: must lie within 0.01…1, as a fraction" in values["last_bad_feedback"]
+    assert "humidity_percent" not in values
+
+
+def test_a_temperature_called_humidity_is_refused(bench):
+    bench.compensator(command_timeout=0.0)
+    bench.warm("humidity", 0.5)
+    values = bench.until_status(ERROR, "bad feedback: temperature")
+    assert "must be of one of strut_1" in values["last_bad_feedback"]
+
+
+def test_a_hygrometer_that_jumps_is_refused_and_one_that_falls_silent_is_said(bench):
+    bench.compensator(command_timeout=0.0, temperature_timeout=0.3)
+    bench.ask(HOME)
+    bench.moisten(0.4)
+    bench.moisten(0.9)
+    assert (
+        "humidity: has jumped from 0.40 to 0.90"
+        in bench.until_status(ERROR, "bad feedback: humidity")["last_bad_feedback"]
+    )
+    assert bench.until_status(WARN, "humidity stale")["humidity_percent"] == "40.0"

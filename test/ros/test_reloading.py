@@ -1,0 +1,166 @@
+"""Reloading a model must neither hang the node, nor move the machine to where it may not be.
+
+A file on a dead mount is imitated by a loading process that never ends; what the node itself may touch, by watching its
+calls. Limits are those of the shipped geometry: ±2 mm of correction.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+from node_helpers import CONFIG, HOME, model_file, near
+
+from hexapod_comp.compensation.journal import LARGEST_SOURCE, Source
+from hexapod_comp.errors import InputFileError
+from hexapod_comp.formats.files import read_text
+from hexapod_comp.formats.paths import confined_opener
+from hexapod_comp.ros import model_loading
+from hexapod_comp.ros.health import WARN
+from hexapod_comp.ros.model_loading import Loading, LoadingError, ModelName
+
+ROUNDING = 1e-12
+
+
+def field(displacement_um: float, outside: str = "hold") -> dict[str, object]:
+    """Return a field of one constant along z over the whole working volume."""
+    lines = [
+        {"axis": "z", "at": [i, j], "direction": "both", "dz_um": [displacement_um]} for i in (0, 1) for j in (0, 1)
+    ]
+    grid = {"grid_x_mm": [-200, 200], "grid_y_mm": [-200, 200], "grid_z_mm": [350, 550]}
+    return {**grid, "outside": outside, "lines": lines}
+
+
+# ---- nothing that breaks a limit ----
+
+
+def test_a_model_that_breaks_a_limit_at_the_last_command_moves_nothing(bench, tmp_path):
+    """5 mm of field need more than the 2 mm of correction allowed: said by the service, at once and in words."""
+    path = model_file(tmp_path, struts={"offset_um": 100.0})
+    node = bench.compensator(model_file=path, ramp_rate=1.0, command_timeout=0.0)
+    bench.ask(HOME)
+    before = dict(node._files.sources)
+    model_file(tmp_path, field=field(5000.0))
+    response = bench.trigger("reload_model")
+    assert not response.success
+    assert "the old model stays: strut_" in response.message
+    assert "is larger than ±2000 µm" in response.message
+    assert node._files.sources == before, "the journal must not name a model that is not in use"
+    bench.until_status(WARN, "the old model stays")
+    for _ in range(3):
+        np.testing.assert_allclose(bench.ask(HOME).corrections, -100e-6, rtol=0.0, atol=ROUNDING)
+    model_file(tmp_path, field=field(1000.0))
+    assert bench.trigger("reload_model").success
+
+
+def test_before_the_first_command_the_model_is_looked_at_at_home(bench, tmp_path):
+    path = model_file(tmp_path)
+    bench.compensator(model_file=path)
+    model_file(tmp_path, field=field(5000.0))
+    assert "is larger than ±2000 µm" in bench.trigger("reload_model").message
+
+
+def test_a_field_that_refuses_extrapolation_is_refused_outside_its_box(bench, tmp_path):
+    """Home is at z = 400 mm; where the machine stands is below the box, which begins at 350 mm."""
+    path = model_file(tmp_path)
+    bench.compensator(model_file=path, command_timeout=0.0)
+    for step in range(1, 55):
+        bench.ask(near(HOME, (0.0, 0.0, -1e-3 * step)))
+    model_file(tmp_path, field=field(10.0, "refuse"))
+    response = bench.trigger("reload_model")
+    assert not response.success
+    assert "is outside the field's box" in response.message
+
+
+def test_compensation_is_not_switched_on_where_it_breaks_a_limit(bench, tmp_path):
+    """Fine at home, not further up, where it went while compensation was off: the ramp would drag the struts there."""
+    steep = field(0.0)
+    for line in steep["lines"]:
+        line["dz_um"] = [2000.0, 4000.0]  # −2 mm at z = 350 mm, 0 at 400 mm, 6 mm at 550 mm
+    bench.compensator(model_file=model_file(tmp_path, field=steep), command_timeout=0.0, ramp_rate=1.0)
+    bench.ask(HOME)
+    assert bench.enable(False).success
+    bench.settle(HOME)
+    for step in range(1, 71):
+        last = bench.ask(near(HOME, (0.0, 0.0, 1e-3 * step)))
+    response = bench.enable(True)
+    assert not response.success
+    assert "is larger than ±2000 µm" in response.message
+    assert not bench.ask(near(HOME, (0.0, 0.0, 0.07))).corrections.any()
+    assert not last.corrections.any()
+
+
+# ---- nothing that is waited for without end ----
+
+
+def test_the_node_itself_does_not_touch_the_file(bench, tmp_path, monkeypatch):
+    """A look at a file on a dead mount never returns: only another process may take it."""
+    path = model_file(tmp_path)
+    bench.compensator(model_file=path)
+    for module, name in ((os, "stat"), (os, "lstat"), (os, "open"), (os, "readlink")):
+        real = getattr(module, name)
+
+        def watched(place, *arguments, real=real, **options):
+            assert str(tmp_path) not in os.fsdecode(place if not isinstance(place, int) else b"")
+            return real(place, *arguments, **options)
+
+        monkeypatch.setattr(module, name, watched)
+    response = bench.trigger("reload_model")
+    assert response.success, response.message
+
+
+def test_a_file_that_is_never_read_is_given_up_in_time(tmp_path, monkeypatch):
+    never = tmp_path / "never"
+    never.write_text("#!/bin/sh\necho $$ > ${0}.pid\nexec sleep 60\n")
+    never.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(never))
+    monkeypatch.setattr(model_loading, "LOADED_WITHIN", 0.5)
+    began = time.monotonic()
+    loading = Loading(ModelName("model.yaml", str(tmp_path), tmp_path), "paper")
+    loading._thread.join(10.0)
+    assert time.monotonic() - began < 5.0
+    with pytest.raises(LoadingError, match=r"model\.yaml: could not be read within 0\.5 s"):
+        loading.result()
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "never.pid").read_text()), 0)
+
+
+def test_what_becomes_a_pipe_after_the_look_at_its_name_is_refused(tmp_path):
+    """Nobody writes into it: to open it, as files are opened, would take until somebody does."""
+    path = tmp_path / "model.yaml"
+    os.mkfifo(path)
+    with pytest.raises(InputFileError, match="is not a regular file"):
+        read_text(path, confined_opener(tmp_path))
+
+
+def test_what_becomes_a_link_after_the_look_at_its_name_is_refused(tmp_path):
+    (tmp_path / "mine").mkdir()
+    outside = tmp_path / "outside.yaml"
+    outside.write_text("a: 1")
+    path = tmp_path / "mine" / "model.yaml"
+    path.symlink_to(outside)
+    with pytest.raises(InputFileError, match=f"leads to {outside}, but files are only read from"):
+        read_text(path, confined_opener(tmp_path / "mine"))
+    assert read_text(path, confined_opener(tmp_path)) == "a: 1"
+
+
+@pytest.mark.parametrize("padding", [0, LARGEST_SOURCE])
+def test_the_loading_process_hands_back_what_it_has_read(tmp_path, padding):
+    """The text that the journal keeps, and the model made of it; of a long file its hash alone."""
+    text = (CONFIG / "paper_machine.yaml").read_text(encoding="utf-8") + f"# {'é' * padding}\n"
+    path = tmp_path / "model.yaml"
+    path.write_text(text, encoding="utf-8")
+    loading = Loading(ModelName("model.yaml", str(tmp_path), Path()), "paper")
+    loading._thread.join(60.0)
+    model, source = loading.result()
+    assert model.name == "virtual machine"
+    whole = Source.of(str(path), text)
+    assert (source.name, source.sha256) == (whole.name, whole.sha256)
+    assert source.text == (None if padding else text)

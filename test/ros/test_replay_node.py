@@ -1,0 +1,195 @@
+"""Recordings of the real node: what a recorder hears over DDS, written as a bag, gives the same bits again.
+
+The truth is what the node has sent.
+"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from node_helpers import HOME, Bench, model_file, near
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+from hexapod_comp.errors import InputFileError
+from hexapod_comp.pose import Pose
+from hexapod_comp.ros.messages import pose_message
+from hexapod_comp.ros.recorder import BagRecorder
+
+pytest.importorskip("rosbags")
+
+from node_recorder import Recorder
+from replay_helpers import Messages, write_bag
+
+from hexapod_comp.replay.bag import Recording, read_recording
+from hexapod_comp.replay.replay import BEFORE, IDENTICAL, Replay, replay_recording
+
+
+def replayed(bag: Path, namespace: str | None = None) -> tuple[Recording, Replay]:
+    """Read a bag and replay it."""
+    recording = read_recording(bag, namespace)
+    return recording, replay_recording(recording)
+
+
+def along(n: int) -> Pose:
+    """Return the pose number `n` of a motion that turns struts round, slow enough for a command every millisecond."""
+    return near(
+        HOME, (6e-4 * np.sin(0.1 * n), 4e-4 * np.sin(0.13 * n), 2e-4 * np.sin(0.07 * n)), 0.06 * np.sin(0.1 * n)
+    )
+
+
+def test_a_run_with_everything_is_replayed_bit_for_bit(bench, tmp_path):
+    """Ramps in and out and at another rate, a temperature, another model, a reset to measured struts, refusals."""
+    model = model_file(tmp_path, struts={"offset_um": 30.0, "backlash_um": 8.0, "expansion_ppm_per_K": 11.0})
+    bench.compensator(model_file=model, temperature_time_constant_s=0.0)
+    recorder = Recorder(bench)
+    answers = [bench.ask(along(n)) for n in range(40)]
+    bench.warm("strut_3", 24.7)
+    answers += [bench.ask(along(n)) for n in range(40, 60)]
+    bench.enable(False)
+    answers += [bench.ask(along(n)) for n in range(60, 70)]
+    assert bench.set_parameter("compensator", "ramp_rate", 2.5e-3).successful
+    answers += [bench.ask(along(n)) for n in range(70, 80)]
+    other = model_file(tmp_path, "other.yaml", struts={"offset_um": -20.0, "pitch_ppm": 40.0})
+    assert bench.set_parameter("compensator", "model_file", other).successful
+    assert bench.trigger("reload_model").success
+    bench.enable(True)
+    answers += [bench.ask(along(n)) for n in range(80, 120)]
+    bench.send(near(HOME, (0.1, 0.0, 0.0)))  # too far in one step
+    bench.barrier()
+    bench.send(pose_message(HOME, "nowhere"))
+    bench.feed(answers[-1].lengths + 5e-6)
+    bench.until(lambda: bench.trigger("reset").success, "a machine that stands")
+    bench.feed(answers[-1].lengths + 5e-6)
+    bench.barrier()
+    answers += [bench.ask(along(n)) for n in range(119, 150)]
+    recorder.stop()
+    recording, result = replayed(write_bag(tmp_path / "run", recorder.messages))
+    assert (result.outcome == IDENTICAL).all()
+    assert len(result.outcome) == len(answers)
+    sent = np.array([answer.lengths for answer in answers])
+    assert result.lengths[:, 0].tobytes() == sent.tobytes(), "the truth is what the node sent, not what the bag says"
+    assert not result.states_differ
+    assert {event.entry.what for event in result.changes} == {"temperature", "enable", "ramp_rate", "model", "reset"}
+    assert [event.entry.values["reason"] for event in result.refused] == ["step", "frame_id"]
+    assert len(recording.sources) >= 3, "geometry and both models"
+
+
+def wait_for_page(bench: Bench) -> None:
+    """Wait until a page of the journal has come that was begun from now on; it comes with the diagnostics."""
+    pages = len(bench.seen["/diagnostics"])
+    bench.until(lambda: len(bench.seen["/diagnostics"]) > pages + 1, "another page of the journal")
+
+
+def test_what_the_verb_records_is_replayed_and_a_folder_that_is_there_is_left_alone(bench, tmp_path):
+    """The recorder runs as a user has it, in a process, beside a compensator that is moving already."""
+    bench.compensator()
+    answers = [bench.ask(along(n)) for n in range(20)]
+    command = [sys.executable, "-m", "hexapod_comp", "record", "--out", str(tmp_path / "run")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    journal = next(p for p in bench.nodes[0].publishers if p.topic_name.endswith("/journal"))
+    bench.until(journal.get_subscription_count, "the recorder", timeout=60.0)
+    commands = next(p for p in bench.nodes[0].publishers if p.topic_name == "/strut_commands")
+    bench.until(lambda: commands.get_subscription_count() > 1, "the recorder of commands")
+    wait_for_page(bench)  # what was commanded before the first one that it has cannot be judged
+    answers += [bench.ask(along(n)) for n in range(20, 60)]
+    wait_for_page(bench)
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=30.0)
+    assert process.returncode == 0, errors
+    assert "/compensator/journal" in output
+    recording, result = replayed(tmp_path / "run")
+    judged = result.outcome[result.outcome != BEFORE]
+    assert (judged == IDENTICAL).all()
+    assert len(judged) >= 40
+    assert recording.heard >= 40
+    with pytest.raises(InputFileError, match="is there already"):
+        BagRecorder(tmp_path / "run")
+
+
+def test_a_start_from_the_last_command_is_replayed_bit_for_bit(bench, tmp_path):
+    """A reset and an activation without feedback: the page says where the next command began."""
+    bench.compensator(model_file=model_file(tmp_path, struts={"offset_um": 30.0, "backlash_um": 8.0}))
+    recorder = Recorder(bench)
+    answers = [bench.ask(along(n)) for n in range(40)]
+    bench.until(lambda: bench.trigger("reset").success, "a machine that stands")
+    bench.send(near(HOME, (0.05, 0.0, 0.0)))  # further than a step from the last command
+    bench.barrier()
+    answers += [bench.ask(along(n)) for n in range(41, 60)]
+    assert bench.change("deactivate")
+    assert bench.change("activate")
+    answers += [bench.ask(along(n)) for n in range(60, 80)]
+    recorder.stop()
+    _, result = replayed(write_bag(tmp_path / "run", recorder.messages))
+    assert (result.outcome == IDENTICAL).all()
+    assert result.lengths[:, 0].tobytes() == np.array([answer.lengths for answer in answers]).tobytes()
+    assert [event.entry.values["reason"] for event in result.refused] == ["step"]
+    # A reset that forgets all comes before each of them, on a page of its own where a page was due in between.
+    resets = [event.entry.values["measured"] for event in result.changes if event.entry.what == "reset"]
+    resets = [measured for measured in resets if measured is not None]
+    assert resets[-2:] == [answers[39].lengths.tolist(), answers[58].lengths.tolist()]
+
+
+def test_recording_may_begin_in_motion_and_two_machines_share_a_bag(ros_context, capfd, tmp_path):
+    """A recorder that comes late replays what its first snapshot precedes; each machine has its own namespace."""
+    messages = Messages()
+    for namespace in ("mill", "lathe"):
+        with Bench(ros_context, capfd, namespace) as bench:
+            bench.compensator()
+            for n in range(140):
+                bench.ask(along(n))
+                if n % 10 == 9:
+                    bench.until(later(0.06), "the page that the journal now writes")
+            recorder = Recorder(bench)
+            for n in range(140, 200):
+                bench.ask(along(n))
+            recorder.stop()
+        messages += recorder.messages
+    bag = write_bag(tmp_path / "both", messages, "sqlite3")
+    for namespace in ("mill", "/lathe/"):
+        _, result = replayed(bag, namespace)
+        count, begun = len(result.outcome), int(np.argmax(result.outcome == IDENTICAL))
+        assert 60 <= count < 200, "what was kept for late subscribers, and all from then on"
+        assert begun <= count - 60, "a snapshot is among the pages that are kept"
+        assert (result.outcome[:begun] == BEFORE).all()
+        assert (result.outcome[begun:] == IDENTICAL).all()
+        np.testing.assert_array_equal(result.commands["pose"][-1, :3], along(199).position)
+
+
+def later(seconds: float) -> Callable[[], bool]:
+    """Return a condition that holds from a while from now on."""
+    end = time.monotonic() + seconds
+    return lambda: time.monotonic() > end
+
+
+def test_commands_without_stamp_are_replayed_too(bench, tmp_path):
+    """The answer's stamp is when they came."""
+    bench.compensator()
+    recorder = Recorder(bench)
+    for n in range(20):
+        count = len(bench.seen["strut_corrections"])
+        bench.send(pose_message(along(n), "base"))
+        bench.until(lambda count=count: len(bench.seen["strut_corrections"]) > count, "an answer")
+    recorder.stop()
+    _, result = replayed(write_bag(tmp_path / "run", recorder.messages))
+    assert len(result.outcome) == 20
+    assert (result.outcome == IDENTICAL).all()
+    assert not (result.outcome == BEFORE).any()
+
+
+def test_journal_reaches_late_subscribers(bench):
+    """Both topics are reliable and kept: the page that comes first tells all that is needed to go on."""
+    bench.compensator()
+    bench.warm("base", 22.0)
+    bench.ask(HOME)
+    for topic in ("compensator/journal", "compensator/files"):
+        (info,) = bench.witness.get_publishers_info_by_topic(topic)
+        assert info.topic_type == "std_msgs/msg/String"
+        assert info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+        assert info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL

@@ -1,0 +1,247 @@
+"""Stamps while clocks are set: what is fresh passes, what was overtaken does not, and no stream is shut out.
+
+Truth: the time at which each message was made by a clock that nobody sets; a simulation knows it, the gate does not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from hexapod_comp.errors import CommandError
+from hexapod_comp.ros.stamps import FORGET_ORDER_AFTER, StampClock, StampGate
+
+SECOND, MS = 1_000_000_000, 1_000_000
+
+STEPS = [sign * step for step in (0.01, 0.03, 0.1, 0.2, 0.3, 0.45, 0.6, 0.9, 1.2, 2.0) for sign in (-1.0, 1.0)]
+"""By how much the clock is set, s."""
+
+
+class TestClock:
+    """A system clock that can be set beside a monotonic one."""
+
+    __test__ = False
+
+    def __init__(self) -> None:
+        self.steady, self.ahead = 1000 * SECOND, 5 * 10**17
+        self.watch = StampClock(system=self.system, steady=lambda: self.steady)
+
+    def system(self) -> int:
+        return self.steady + self.ahead
+
+    @property
+    def now(self) -> float:
+        return self.steady * 1e-9
+
+
+@dataclass
+class Passed:
+    """What a gate let pass of one stream."""
+
+    longest_gap: float = 0.0  # s, between two accepted messages
+    refused: dict[str, int] = field(default_factory=dict)
+    overtaken: int = 0  # obeyed although a later one had been
+
+
+def stream(
+    step: float,
+    jitter: float = 1e-4,
+    lead: float = 0.0,
+    follows: bool = True,
+    max_age: float = 0.5,
+    late_copies: bool = False,
+    rate: float = 1000.0,
+) -> Passed:
+    """Send 0.8 s of messages through a gate; after a quarter of it the clock is set.
+
+    Each is on its way for 0.2 ms and an exponential jitter, in order, so that around the step some were stamped before
+    it and arrive after. `lead`: stamped so long ahead, as scheduled commands are. `follows`: the sender's clock is set
+    too. `late_copies`: now and then one comes once more, 37 ms later, which must not be obeyed.
+    """
+    rng, clock, count = np.random.default_rng(1), TestClock(), round(0.8 * rate)
+    gate, began, step_at = StampGate("command", clock.watch, max_age), clock.steady, 0.25 * count / rate
+    arrivals = np.maximum.accumulate(np.arange(count) / rate + 2e-4 + rng.exponential(jitter, count))
+    events = []
+    for k, arrival in enumerate(arrivals):
+        made = k / rate
+        stamp = began + round((made + lead + (step if follows and made >= step_at else 0.0)) * SECOND) + 5 * 10**17
+        events.append((arrival, k, stamp))
+        if late_copies and k % 50 == 10:
+            events.append((arrival + 0.037, k, stamp))
+    result, newest, last = Passed(), -1, 0.0
+    for arrival, k, stamp in sorted(events, key=lambda event: event[:2]):
+        clock.steady = began + round(arrival * SECOND)
+        clock.ahead = 5 * 10**17 + round((step if arrival >= step_at else 0.0) * SECOND)
+        try:
+            gate.check(stamp, clock.now)
+        except CommandError as error:
+            if k > newest:
+                result.refused[error.reason] = result.refused.get(error.reason, 0) + 1
+            continue
+        gate.accept(stamp, clock.now)
+        result.overtaken += k < newest
+        newest, result.longest_gap, last = max(k, newest), max(result.longest_gap, arrival - last), arrival
+    return result
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize(("lead", "rate"), [(0.0, 1000.0), (0.05, 1000.0), (0.0, 50.0)])
+def test_a_shared_clock_that_is_set_shuts_nothing_out(step, lead, rate):
+    """None is refused, also of those on their way, and no late copy is obeyed."""
+    passed = stream(step, lead=lead, rate=rate, late_copies=True)
+    assert passed.refused == {}
+    assert passed.overtaken <= (abs(step) < 0.1), "a step of the size of a copy's delay cannot be told from it"
+
+
+@pytest.mark.parametrize("step", STEPS[::3])
+def test_on_a_busy_network_no_more_is_lost_than_the_step_or_the_lateness(step):
+    """20 ms of jitter: a step of that size cannot be told from it. At rest the longest gap of this stream is 0.1 s."""
+    quiet, passed = stream(0.0, jitter=0.02), stream(step, jitter=0.02)
+    assert quiet.refused == {}
+    assert passed.longest_gap < quiet.longest_gap + 0.05
+    assert sum(passed.refused.values()) <= 1000 * min(abs(step), 0.1)
+
+
+@pytest.mark.parametrize("step", STEPS[1::3])
+def test_a_sender_with_a_clock_of_its_own_goes_on_when_ours_is_set(step):
+    passed = stream(step, follows=False, max_age=0.0, late_copies=True)
+    assert (passed.refused, passed.overtaken) == ({}, 0)
+
+
+@pytest.mark.parametrize("step", [-0.9, -0.3, -0.05])
+def test_a_sender_whose_clock_alone_is_set_back_is_heard_after_a_run_of_20_ms(step):
+    clock = TestClock()
+    gate = StampGate("command", clock.watch)
+    refused = []
+    for k in range(400):
+        clock.steady += 2 * MS
+        stamp = clock.system() + (round(step * SECOND) if k >= 200 else 0)
+        try:
+            gate.check(stamp, clock.now)
+            gate.accept(stamp, clock.now)
+        except CommandError as error:
+            refused.append((k, error.reason))
+    assert refused == [(200 + n, "stamp_order") for n in range(10)]
+    assert gate.sender_set_back == 1
+
+
+def test_what_was_held_up_and_comes_at_once_is_no_clock_that_was_set():
+    """Fifty commands of 50 ms ago, in order, within a millisecond: none is obeyed."""
+    clock = TestClock()
+    gate = StampGate("command", clock.watch)
+    gate.check(clock.system(), clock.now)
+    gate.accept(clock.system(), clock.now)
+    start = clock.system() - 50 * MS
+    for k in range(50):
+        clock.steady += MS // 50
+        with pytest.raises(CommandError, match="ms earlier than the one before"):
+            gate.check(start + k * MS, clock.now)
+
+
+@pytest.mark.parametrize("step", [-2.0, -0.3, 0.3, 2.0])
+def test_a_step_while_the_node_stands_still_splits_what_waits_where_it_was_made(step):
+    """0.4 s of commands wait, the clock is set in their middle: all come in their order."""
+    clock = TestClock()
+    gate = StampGate("command", clock.watch, 0.5)
+    for _ in range(100):
+        clock.steady += MS
+        gate.check(clock.system(), clock.now)
+        gate.accept(clock.system(), clock.now)
+    waiting = []
+    for k in range(400):
+        clock.steady += MS
+        clock.ahead += round(step * SECOND) if k == 200 else 0
+        waiting.append(clock.system())
+    for stamp in waiting:
+        gate.check(stamp, clock.now)
+        gate.accept(stamp, clock.now)
+
+
+@pytest.mark.parametrize("step", [-3600.0, -0.3, 0.3, 3600.0])
+def test_a_command_that_is_faster_than_the_only_one_before_is_read_by_the_new_setting(step):
+    """The first was on its way for 20 ms on a busy computer, the next for 1 ms, and the clock was set between."""
+    clock = TestClock()
+    gate = StampGate("command", clock.watch, 0.5)
+    for late in (20 * MS, MS):
+        stamp = clock.system()
+        clock.steady += late
+        assert gate.check(stamp, clock.now) == pytest.approx(late * 1e-9)
+        gate.accept(stamp, clock.now)
+        clock.ahead += round(step * SECOND)
+        clock.steady += 50 * MS
+
+
+def test_a_step_in_a_pause_counts_too_and_slewing_and_a_slow_read_do_not():
+    clock = TestClock()
+    for _ in range(3000):  # an hour at NTP's largest rate, 500 ppm
+        clock.steady += int(1.2 * SECOND)
+        clock.ahead += int(1.2 * SECOND * 500e-6)
+        clock.watch.read()
+    assert clock.watch.shift == 0
+    plain = clock.watch.system
+
+    def slow() -> int:
+        clock.steady += 30 * MS  # the processor is elsewhere between the two clocks
+        return plain()
+
+    clock.watch.system = slow
+    clock.watch.read()
+    clock.watch.system = plain
+    clock.watch.read()
+    assert clock.watch.shift == 0
+    clock.steady += 600 * SECOND
+    clock.ahead -= 3 * SECOND
+    clock.watch.read()
+    assert clock.watch.last_step == clock.watch.shift == -3 * SECOND
+    assert (clock.watch.set_back, clock.watch.set_forward) == (1, 0)
+
+
+def test_simulated_time_is_set_only_when_it_falls():
+    times = iter([0, 5 * SECOND, 5 * SECOND, 900 * SECOND, 1 * SECOND])
+    clock = StampClock(lambda: next(times))
+    for _ in range(4):
+        clock.read()
+    assert (clock.set_back, clock.set_forward, clock.shift) == (1, 0, -899 * SECOND)
+
+
+@pytest.mark.parametrize(
+    ("later", "pause", "passes"),
+    [
+        (0, 4, True),  # the same once more
+        (1, 4, True),
+        (-60 * MS, 4, False),
+        (-1, 4, False),
+        (-1, round(FORGET_ORDER_AFTER * 1000), True),  # a sender that was restarted
+    ],
+)
+def test_what_is_in_order(later, pause, passes):
+    clock = TestClock()
+    gate = StampGate("command", clock.watch)
+    stamp = clock.system()
+    gate.check(stamp, clock.now)
+    gate.accept(stamp, clock.now)
+    gate.check(0, clock.now)  # says nothing
+    gate.accept(0, clock.now)
+    clock.steady += pause * MS
+    if passes:
+        gate.check(stamp + later, clock.now)
+        return
+    with pytest.raises(CommandError, match=f"command is stamped {-later / MS:.1f} ms earlier") as caught:
+        gate.check(stamp + later, clock.now)
+    assert caught.value.reason == "stamp_order"
+
+
+def test_the_drive_refuses_old_commands_only_and_by_the_clock_in_force():
+    """`future=False`; and a clock set forward by 2 s makes no command on its way too old."""
+    clock = TestClock()
+    gate = StampGate("command", clock.watch, 0.1, future=False)
+    gate.check(clock.system() + 3600 * SECOND, clock.now)
+    with pytest.raises(CommandError, match=r"command is stamped 0\.101 s old, allowed 0\.1 s") as caught:
+        gate.check(clock.system() - 101 * MS, clock.now)
+    assert caught.value.reason == "stamp_past"
+    stamp = clock.system()
+    clock.ahead += 2 * SECOND
+    clock.steady += MS
+    assert gate.check(stamp, clock.now) == pytest.approx(1e-3)

@@ -1,0 +1,150 @@
+"""Where a compensator's first command may be: within a step of the last known struts, or nowhere.
+
+After its process has started, an activation, a reset; with feedback, without, and with stale feedback.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from node_helpers import HOME, closed_form_lengths, near
+
+from hexapod_comp.errors import CommandError
+from hexapod_comp.ros import health
+from hexapod_comp.ros.following import LastKnown, Recent, Standing
+from hexapod_comp.ros.health import ERROR, OK, WARN
+
+ROUNDING = 1e-12
+
+
+@pytest.fixture(autouse=True)
+def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A refusal colours the status for 0.3 s."""
+    monkeypatch.setattr(health, "SHOWN_FOR", 0.3)
+
+
+NEVER = {"start_without_feedback_after": 0.0}
+"""The default, which the bench changes."""
+
+
+def test_a_start_waits_for_the_struts(bench):
+    """Where they stand is not known, so not even home, where they may be, is commanded; that is said."""
+    bench.compensator(feedback_timeout=60.0, **NEVER)
+    bench.until_status(WARN, "waiting for strut_states")
+    bench.send(HOME)
+    text = bench.until_status(ERROR, "refusing commands: no_feedback; waiting for strut_states")["last_refusal"]
+    assert text.startswith("no strut_states yet: where the struts stand is not known; a machine without feedback needs")
+    assert not bench.seen["strut_commands"]
+    bench.estimate(bench.feed(closed_form_lengths(HOME)))
+    bench.send(near(HOME, (0.0, 0.0, 0.005)))
+    bench.until_status(ERROR, "refusing commands: step")
+    bench.ask(HOME)
+
+
+def test_without_feedback_the_first_command_may_be_anywhere(bench):
+    """Only where a parameter says after how long; what became known meanwhile counts all the same."""
+    bench.compensator(start_without_feedback_after=0.01)
+    bench.until_status(OK, "waiting for the first command")
+    bench.ask(near(HOME, (0.05, 0.05, 0.05), 10.0))
+
+
+def test_a_wait_for_feedback_has_an_end_where_a_parameter_says_so():
+    """By a clock of its own: 2 s after the start, not before it; a single reading ends it for good."""
+    known = LastKnown(2.0)
+    with pytest.raises(CommandError, match="from 2 s after the start on"):
+        known.struts(100.0, fresh=False)
+    known.begin(100.0)
+    assert known.waits(101.999)
+    with pytest.raises(CommandError, match="no strut_states yet"):
+        known.struts(101.999, fresh=False)
+    assert not known.waits(102.0)
+    assert known.struts(102.0, fresh=False) is None
+    known.measure(np.full(6, 0.5), 110.0)
+    known.begin(120.0)
+    assert not known.waits(120.0)
+    np.testing.assert_array_equal(known.struts(999.0, fresh=False), 0.5)
+    with pytest.raises(CommandError, match="needs start_without_feedback_after"):
+        LastKnown(0.0).struts(1e9, fresh=False)
+
+
+def test_a_start_from_struts_at_rest_is_from_the_mean_of_their_readings():
+    """Truth: 0.5 m, read 200 times with a noise of 0.1 µm; then a strut goes 10 µm away, and the newest counts."""
+    rng, standing = np.random.default_rng(3), Standing(Recent())
+    known = LastKnown(average=standing.mean)
+
+    def read(struts: np.ndarray, at: float) -> None:
+        known.measure(struts, at)
+        standing.measure(struts, at)
+
+    for n in range(200):
+        read(0.5 + rng.normal(0.0, 1e-7, 6), 7.0 + 0.002 * n)
+    np.testing.assert_allclose(known.struts(8.0, fresh=True), 0.5, atol=5e-8)
+    assert np.abs(known.struts(8.0, fresh=True) - 0.5).max() < 3e-8, "0.1 µm / √200 is 7 nm"
+    away = 0.5 + 1e-5 * (np.arange(6) == 2)
+    read(away, 7.4)
+    np.testing.assert_array_equal(known.struts(8.0, fresh=True), away)
+    read(away, 9.0)  # what came before is past
+    np.testing.assert_array_equal(known.struts(9.0, fresh=True), away)
+
+
+@pytest.mark.parametrize(
+    ("measured_at", "fresh", "wanted"),
+    [
+        (9.89, True, "told"),  # readings of a minute may count as fresh, but the struts have been sent elsewhere since
+        (9.91, True, "measured"),
+        (10.05, False, "told"),  # the drive may have lagged still when it was last heard
+        (10.11, False, "measured"),  # it was there, or somebody has moved it since
+    ],
+)
+def test_what_is_known_last_counts(measured_at, fresh, wanted):
+    """A drive follows and tells within 0.1 s; the last command was at 10 s."""
+    known = LastKnown(0.0)
+    known.tell(np.full(6, 0.4), 10.0)
+    np.testing.assert_array_equal(known.struts(11.0, fresh), 0.4)
+    known.measure(np.full(6, 0.5), measured_at)
+    np.testing.assert_array_equal(known.struts(11.0, fresh), 0.4 if wanted == "told" else 0.5)
+
+
+@pytest.mark.parametrize("feedback", ["never", "stale"])
+@pytest.mark.parametrize("way", ["reset", "deactivate, activate", "deactivate, cleanup, configure, activate"])
+def test_without_fresh_feedback_no_start_is_further_than_a_step_from_the_last_command(bench, way, feedback):
+    """Published 1 mm above home: the struts are on their way there, if not there, whatever has been forgotten."""
+    bench.compensator()
+    last = near(HOME, (0.0, 0.0, 0.001))
+    if feedback == "stale":
+        bench.estimate(bench.feed(closed_form_lengths(HOME)))
+    bench.ask(HOME)
+    before = bench.settle(last)
+    bench.until_status(WARN, "no new command")
+    if feedback == "stale":
+        bench.until_status(WARN, "no new command; feedback lost")
+    if way == "reset":
+        assert bench.trigger("reset").success
+    else:
+        assert all(bench.change(transition) for transition in way.split(", "))
+        bench.until(bench.matched, "discovery")
+    bench.send(near(HOME, (0.0, 0.0, 0.12)))
+    bench.until_status(ERROR, "refusing commands: step")
+    first = bench.ask(near(last, (0.0, 0.0, 0.001)))
+    assert np.abs(first.lengths - before.lengths).max() <= 2e-3 + ROUNDING
+    assert [m.header.stamp for m in bench.seen["strut_commands"]][-2:] == [
+        before.command.header.stamp,
+        first.command.header.stamp,
+    ]
+
+
+def test_struts_that_were_moved_and_measured_while_the_node_was_inactive_count_when_feedback_is_stale(bench):
+    bench.compensator()
+    bench.ask(HOME)
+    assert bench.change("deactivate")
+    elsewhere, told_at = near(HOME, (0.0, 0.0, 0.05)), time.monotonic()
+    bench.until(lambda: time.monotonic() > told_at + 0.1, "the time in which a drive follows")
+    bench.feed(closed_form_lengths(elsewhere))
+    bench.barrier()
+    assert bench.change("activate")
+    bench.until_status(WARN, "no new command; feedback lost")
+    bench.send(HOME)
+    bench.until_status(ERROR, "refusing commands: step")
+    bench.ask(elsewhere)

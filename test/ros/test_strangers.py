@@ -1,0 +1,362 @@
+"""What strangers send or are called must not end a node, forge its log, or fill its memory.
+
+A stranger here is a real participant on DDS or a real message; what the nodes say is read where it is
+written, on stderr and on /diagnostics.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+from geometry_msgs.msg import PoseStamped
+from hal_stand_in import StandInHal
+from lifecycle_msgs.srv import ChangeState
+from node_helpers import HOME, RELIABLE, Bench, closed_form_lengths
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import SetParameters
+from rclpy.utilities import get_rmw_implementation_identifier
+from sensor_msgs.msg import JointState, Temperature
+
+from hexapod_comp.errors import LONGEST_TEXT, CommandError, HexapodError, printable, shorten
+from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
+from hexapod_comp.machine.geometry import STRUT_NAMES
+from hexapod_comp.ros.guarding import CallbackGuard
+from hexapod_comp.ros.health import ERROR
+from hexapod_comp.ros.machine_files import MachineFiles
+from hexapod_comp.ros.messages import pose_message
+
+NAMELESS = Path(__file__).parents[1] / "nameless.py"
+
+FORGED = "base\n[INFO] [1.0] [compensator]: all is well\r\x1b[2J\x1b[31m\u202e"
+"""A text that begins a line of its own, clears the terminal, colours it, and turns what follows around."""
+
+HUGE = FORGED + 10_000_000 * "x"
+
+
+def bridge(bench: Bench) -> LinuxcncBridgeNode:
+    """Add a LinuxCNC bridge on a machine that is on; the witness no longer commands."""
+    bench.hush("tool_pose_command")
+    bench.hush("strut_states")
+    hal = StandInHal()
+    node = bench.add(LinuxcncBridgeNode, True, {"rate": 250.0, "timeout": 1.0}, hal=hal)
+    for n, length in enumerate(closed_form_lengths(HOME)):
+        hal[f"joint-fb.{n}"] = float(length) * 1e3
+    hal["z"] = 400.0
+    hal["machine-on"] = hal["enable"] = True
+    return node
+
+
+NODES: dict[str, Callable[[Bench], Any]] = {
+    "compensator": lambda bench: bench.compensator(),
+    "strut_drive": lambda bench: bench.drive(),
+    "linuxcnc_bridge": bridge,
+}
+
+
+@contextmanager
+def nameless(topic: str, kind: str) -> Iterator[None]:
+    """Have a publisher whose node's name is not UTF-8, in a process of its own."""
+    arguments = [sys.executable, str(NAMELESS), topic, kind]
+    with subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"ready\n"
+        yield
+        process.stdin.close()
+        assert process.wait(10.0) == 0
+
+
+# ---- a participant whose name is not UTF-8 ----
+
+needs_fast_dds = pytest.mark.skipif(
+    get_rmw_implementation_identifier() != "rmw_fastrtps_cpp", reason="test/nameless.py speaks to Fast DDS's rmw"
+)
+
+
+@needs_fast_dds
+@pytest.mark.parametrize(
+    ("name", "topic", "kind"),
+    [
+        ("compensator", "tool_pose_command", "PoseStamped"),
+        ("compensator", "strut_commands", "JointState"),
+        ("strut_drive", "strut_commands", "JointState"),
+        ("linuxcnc_bridge", "strut_corrections", "JointState"),
+    ],
+)
+def test_a_publisher_without_a_readable_name_stops_the_machine_and_not_the_node(bench, name, topic, kind):
+    """Who cannot tell who commands must not obey: also not one who was there first. It lives on, and says why."""
+    NODES[name](bench)
+    corrections = bench.witness.create_publisher(JointState, topic, RELIABLE) if name == "linuxcnc_bridge" else None
+    struts = JointState(name=list(STRUT_NAMES), position=closed_form_lengths(HOME).tolist())
+
+    def ask() -> None:
+        if name == "compensator":
+            bench.send(HOME)
+        elif corrections is None:
+            bench.publish(topic, struts)
+        else:
+            corrections.publish(struts)
+
+    due = 0.0
+
+    def refused() -> bool:
+        nonlocal due
+        if time.monotonic() >= due:  # without a pause they would pile up in the executor, before the status
+            ask()
+            due = time.monotonic() + 0.01
+        return int(bench.values(name).get("refused.unknown_publisher", "0")) > 3
+
+    with nameless(topic, kind):
+        bench.until(refused, "refusals")
+        seen = len(bench.seen["strut_commands"])
+        said = bench.values(name)["last_refusal"]
+        assert f"who publishes /{topic}" in said or f"/{topic} is also published" in said
+        assert r"not UTF-8: b'mill\xff\x1b[31m'" in said
+        assert bench.status(name).level == ERROR
+        assert "unknown_publisher" in bench.status(name).message
+        assert bench.values(name)["callback_errors"] == "0"
+        ask()
+        bench.barrier()
+        assert name == "strut_drive" or len(bench.seen["strut_commands"]) == seen
+    bench.until(lambda: "unknown_publisher" not in bench.status(name).message, "the stranger to be forgotten")
+    if name == "compensator":
+        bench.ask(HOME)
+
+
+@needs_fast_dds
+def test_several_publishers_allowed_means_also_those_without_a_readable_name(bench):
+    bench.compensator(allow_several_publishers=True)
+    with nameless("tool_pose_command", "PoseStamped"):
+        subscription = next(s for s in bench.nodes[0].subscriptions if s.topic_name == "/tool_pose_command")
+        bench.until(lambda: subscription.get_publisher_count() == 2, "the stranger")
+        bench.ask(HOME)
+        assert bench.nodes[0].guard.values()["callback_errors"] == "0"
+
+
+# ---- no callback ends a node ----
+
+
+def test_a_transition_that_raises_is_said(bench, monkeypatch):
+    """rclpy swallows it: the node went out of reach without a line."""
+    bench.compensator(start=False)
+    monkeypatch.setattr(MachineFiles, "geometry", lambda files: 1 / 0)
+    assert not bench.change("configure")
+    assert bench.logged("error in a callback, the node goes on: on_configure: ZeroDivisionError")
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_all_that_ros_calls_goes_through_the_guard(bench, name):
+    node = NODES[name](bench)
+    callbacks = [entity.callback for kind in (node.subscriptions, node.timers, node.services) for entity in kind]
+    assert len(callbacks) > 12
+    assert {callback.__code__.co_filename.rpartition("/")[2] for callback in callbacks} == {"guarding.py"}
+
+
+def broken(*_: object, **__: object) -> None:
+    raise ZeroDivisionError("nobody has foreseen this\x1b[2J\n[INFO] [1.0] [compensator]: all is well")
+
+
+@pytest.mark.parametrize(
+    ("what", "owner", "method"),
+    [
+        ("tool_pose_command", "compensator", "step"),
+        ("strut_states", "compensator", "estimate"),
+        ("temperatures", "compensator", "set_temperature"),
+        ("check_state", "_status", "problem"),
+        ("matching of tool_pose_command", "_status", "problem"),
+    ],
+)
+def test_a_callback_that_raises_is_counted_and_said_and_the_node_goes_on(bench, monkeypatch, what, owner, method):
+    """A subscription, a timer, an event: whatever is wrong with us, the next message is handled."""
+    node = bench.compensator()
+    bench.ask(HOME)
+    with monkeypatch.context() as patch:
+        patch.setattr(getattr(node, owner), method, broken)
+        bench.send(HOME)
+        bench.feed(closed_form_lengths(HOME))
+        bench.publish("temperatures", Temperature(temperature=20.0, header=pose_message(HOME, "base").header))
+        bench.speak("tool_pose_command") if what.startswith("matching") else None
+        bench.until(lambda: what in node.guard.values()["last_callback_error"], "the error to be caught")
+    values = bench.until_status(ERROR, "error in a callback")
+    assert int(values["callback_errors"]) > 0
+    assert "ZeroDivisionError: nobody has foreseen this" in values["last_callback_error"]
+    assert values["last_callback_error"].isprintable()
+    assert bench.logged("error in a callback, the node goes on: ")
+    bench.until(lambda: "callback" not in bench.status().message, "the error to be past")
+    bench.ask(HOME)
+
+
+def test_a_service_that_raises_answers_no(bench, monkeypatch):
+    node = bench.compensator()
+    monkeypatch.setattr(node.compensator, "reset", broken)
+    answer = bench.trigger("reset")
+    assert not answer.success
+    assert answer.message.startswith("nobody has foreseen this")
+    assert answer.message.isprintable()
+    assert node.guard.values()["refused_requests"] == "1"
+    assert bench.logged("reset refused: ")
+
+
+def test_the_guard_of_the_spin_loop_holds_whatever_comes():
+    said: list[str] = []
+    guard = CallbackGuard(lambda *_: None, lambda _, text: said.append(text))
+    assert guard.around("spinning", broken, "otherwise")(1, two=2) == "otherwise"
+    assert guard.around("spinning", lambda one: one)(1) == 1
+    assert len(said) == 1
+    assert "test_strangers.py" in said[0]
+    with pytest.raises(KeyboardInterrupt):
+        guard.around("spinning", lambda: (_ for _ in ()).throw(KeyboardInterrupt()))()
+
+
+# ---- what they send is shown on one line, short, and is not kept ----
+
+
+def strange_pose(text: str) -> PoseStamped:
+    return pose_message(HOME, text)
+
+
+def strange_struts(text: str) -> JointState:
+    return JointState(name=[text, *STRUT_NAMES[1:]], position=[0.5] * 6)
+
+
+def strange_temperature(text: str) -> Temperature:
+    message = Temperature(temperature=20.0)
+    message.header.frame_id = text
+    return message
+
+
+DOORS = {
+    "frame_id": ("compensator", "tool_pose_command", strange_pose),
+    "measured": ("compensator", "strut_states", strange_struts),
+    "sensor": ("compensator", "temperatures", strange_temperature),
+    "commanded": ("strut_drive", "strut_commands", strange_struts),
+    "correction": ("linuxcnc_bridge", "strut_corrections", strange_struts),
+}
+
+
+@pytest.mark.parametrize("text", [FORGED, HUGE], ids=["forged", "huge"])
+@pytest.mark.parametrize("door", DOORS)
+def test_text_in_a_message_neither_forges_a_line_nor_fills_anything(bench, door, text):
+    name, topic, message = DOORS[door]
+    NODES[name](bench)
+    publisher = bench._publishers.get(topic) or bench.witness.create_publisher(JointState, topic, RELIABLE)
+    counter = "bad_feedback" if topic in ("strut_states", "temperatures") else "refused"
+    stranger = message(text)
+    for count in range(1, 4):
+        if isinstance(stranger, JointState):
+            stranger.header.stamp = bench.now()
+        publisher.publish(stranger)
+        bench.until(lambda count=count: int(bench.values(name).get(counter, "0")) >= count, "a refusal")
+    assert_harmless(bench)
+    if name == "compensator":
+        assert len(bench.nodes[0]._journal._journal.page(0.0)) < 20_000
+
+
+def assert_harmless(bench: Bench) -> None:
+    """All that was said, in the log and in diagnostics, is on lines of our own, short, and printable."""
+    bench.barrier()
+    bench.logged("")
+    lines = bench._log.splitlines()
+    assert lines
+    assert not [line for line in lines if line.startswith("[INFO] [1.0]") or not line.isprintable()]
+    assert max(map(len, lines)) < LONGEST_TEXT + 200
+    for name in NODES:
+        for status in bench.statuses(name):
+            texts = [status.message, *(entry.value for entry in status.values)]
+            assert all(text.isprintable() and len(text) <= LONGEST_TEXT for text in texts)
+
+
+def test_text_in_a_request_neither_forges_a_line_nor_is_shown_whole(bench):
+    """A transition's label, a parameter's name and its value: rclpy and rcl quote them when they refuse."""
+    bench.compensator()
+    bench.drive()
+    request = ChangeState.Request()
+    request.transition.label = FORGED
+    assert not bench.call(ChangeState, "compensator/change_state", request).success
+    for name, text in ((FORGED, "x"), ("fault_jump", FORGED), ("fault_jump", HUGE[:200_000])):
+        parameter = ParameterMessage(name=name)
+        parameter.value.type, parameter.value.string_value = 4, text
+        answer = bench.call(SetParameters, "strut_drive/set_parameters", SetParameters.Request(parameters=[parameter]))
+        assert not answer.results[0].successful
+    assert_harmless(bench)
+
+
+def test_a_flood_of_refused_requests_gives_a_line_a_second(bench):
+    """Ours, rclpy's and rcl's lines alike: a transition that is not possible now or never, a parameter's wrong type."""
+    bench.compensator()
+    wrong = ParameterMessage(name="use_sim_time")
+    wrong.value.type, wrong.value.string_value = 4, "yes"
+    untyped = ParameterMessage(name="use_sim_time")
+    untyped.value.type = 255
+    possible, unknown = ChangeState.Request(), ChangeState.Request()
+    possible.transition.id, unknown.transition.label = 1, "fly"  # configure: it is active
+    floods = [
+        *((ChangeState, "compensator/change_state", request) for request in (possible, unknown)),
+        *(
+            (SetParameters, "compensator/set_parameters", SetParameters.Request(parameters=[p]))
+            for p in (wrong, untyped)
+        ),
+    ]
+    bench.logged("")
+    lines, began = len(bench._log.splitlines()), time.monotonic()
+    for kind, name, request in 13 * floods:
+        client = bench._client(kind, name)
+        futures = [client.call_async(request) for _ in range(8)]  # a service's queue holds ten
+        bench.until(lambda futures=futures: all(future.done() for future in futures), "all answers")
+        answers = [future.result() for future in futures]
+        assert not any(a.success if kind is ChangeState else a.results[0].successful for a in answers)
+    bench.logged("")
+    said = bench._log.splitlines()[lines:]
+    assert len(said) <= 2 * len(floods) * (2.0 + time.monotonic() - began), said[:9]
+    assert len(said) < 50
+    assert any("there is no transition" in line for line in said)
+    assert int(bench.nodes[0].guard.values()["refused_requests"]) >= 300
+
+
+@pytest.mark.parametrize("parameter", ["geometry_file", "model_file"])
+def test_a_file_name_does_not_forge_a_line(bench, tmp_path, parameter):
+    bench.compensator(start=False, **{parameter: str(tmp_path / f"{FORGED}.yaml")})
+    assert not bench.change("configure")
+    assert bench.logged("cannot configure: ")
+    assert_harmless(bench)
+
+
+def test_a_misspelt_parameter_does_not_forge_a_line(bench):
+    bench.compensator(start=False, **{f"modell_file{FORGED}": "x"})
+    assert bench.logged("there is no parameter modell_file")
+    assert_harmless(bench)
+
+
+@pytest.mark.parametrize("text", [FORGED, 3000 * "\x1b", 5000 * "x", "\ud800", "", "ordinary, 4 µm ± 1 °"])
+def test_every_error_of_ours_is_one_short_printable_line(text):
+    """repr is Python's own statement of what a character is; a text that is printable and short stays as it is."""
+    for error in (HexapodError(text), CommandError("frame_id", text)):
+        said = str(error)
+        assert said.isprintable()
+        assert len(said) <= LONGEST_TEXT
+        assert said == text or not text.isprintable() or len(text) > LONGEST_TEXT
+        assert printable(said, LONGEST_TEXT) == said
+    assert len(shorten(text)) <= 80
+    assert shorten(text) == repr(text) or len(repr(text)) > 80
+
+
+def test_shortening_does_not_copy_what_it_does_not_show():
+    import tracemalloc
+
+    text = 10_000_000 * "x"
+    tracemalloc.start()
+    try:
+        shorten(text), printable(text)
+        assert tracemalloc.get_traced_memory()[1] < 100_000
+    finally:
+        tracemalloc.stop()

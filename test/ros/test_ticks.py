@@ -1,0 +1,82 @@
+"""What is called at a rate: a rate that changes hundreds of times a second disturbs neither it nor a timer.
+
+Truth: the times of the calls by the monotonic clock.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.experimental import EventsExecutor
+
+from hexapod_comp.ros.callbacks import Ticker
+from hexapod_comp.ros.compensator import CompensatorNode
+
+
+@pytest.fixture
+def executor(ros_context: Context):
+    executor = EventsExecutor(context=ros_context)
+    yield executor
+    executor.shutdown()
+
+
+def spin(executor: EventsExecutor, seconds: float, each=lambda: None) -> None:
+    """Handle events for a while, and do something every 2 ms."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        each()
+        executor.spin_once(timeout_sec=0.002)
+
+
+def test_a_flood_of_rates_moves_neither_ticks_nor_timers(executor, ros_context):
+    """By timers that are reset, 500 times a second, there were 3 heartbeats a second, and gaps of 4 s."""
+    node = rclpy.create_node("ticking", context=ros_context)
+    executor.add_node(node)
+    ticks, checks = [], []
+    ticker = Ticker(node, lambda: ticks.append(time.monotonic()), 100.0)
+    node.create_timer(0.05, lambda: checks.append(time.monotonic()))
+    began, rates = time.monotonic(), iter(np.random.default_rng(1).uniform(90.0, 110.0, 10_000))
+    spin(executor, 0.5, lambda: ticker.set_rate(next(rates)))
+    ticker.close()
+    assert 35 <= len(ticks) <= 58, "90 to 110 Hz for half a second, on a busy computer"
+    assert np.diff([began, *ticks, time.monotonic()]).max() < 0.1
+    assert len(checks) >= 6
+    node.destroy_node()
+
+
+def test_a_rate_of_zero_rests_and_another_goes_on_from_the_last_tick(executor, ros_context):
+    node = rclpy.create_node("ticking", context=ros_context)
+    executor.add_node(node)
+    ticks = []
+    ticker = Ticker(node, lambda: ticks.append(time.monotonic()), 0.0)
+    spin(executor, 0.03)
+    assert not ticks
+    ticker.set_rate(1000.0)
+    spin(executor, 0.03)
+    assert ticks
+    ticker.set_rate(0.0)
+    spin(executor, 0.005)
+    count = len(ticks)
+    spin(executor, 0.03)
+    assert len(ticks) == count
+    ticker.close()
+    node.destroy_node()
+
+
+def test_no_timer_of_a_node_is_reset_when_a_parameter_is_set(executor, ros_context, monkeypatch):
+    """rclpy's timers, by the one way to reset them: whatever parameter is set, none is."""
+    node = CompensatorNode(context=ros_context)
+    executor.add_node(node)
+    node.trigger_configure()
+    resets = []
+    monkeypatch.setattr(rclpy.timer.Timer, "reset", lambda timer: resets.append(timer))
+    monkeypatch.setattr(rclpy.timer.Timer, "cancel", lambda timer: resets.append(timer))
+    for name in ("heartbeat_rate", "marker_rate"):
+        for rate in (5.0, 0.0, 7.0):
+            assert node.set_parameters([rclpy.parameter.Parameter(name, value=rate)])[0].successful
+    assert not resets
+    node.destroy_node()

@@ -1,0 +1,297 @@
+"""Watching a machine: what is heard becomes the right picture, and nothing is sent."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from http.client import HTTPConnection
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from node_helpers import HOME, closed_form_lengths, model_file, near
+from sensor_msgs.msg import JointState
+
+from hexapod_comp.cli import main
+from hexapod_comp.errors import HexapodError
+from hexapod_comp.machine.geometry import load_geometry
+from hexapod_comp.pose import Pose
+from hexapod_comp.ros import watching
+from hexapod_comp.ros.page import WatchPage, same_site, strut_colours, strut_ends, words
+from hexapod_comp.ros.ros_session import QUIET
+from hexapod_comp.ros.watching import View, Watcher
+
+OFFSETS = np.array([-100.0, -50.0, 0.0, 50.0, 100.0, 200.0])
+"""Of the struts, µm: actual = command + offset, so the corrections are −offset."""
+
+
+def watched(bench, geometry: str = "paper.yaml") -> Watcher:
+    """Return a watcher on the bench's executor."""
+    node = rclpy.create_node("hexapod_comp_watch", context=bench.context, namespace=bench.namespace, **QUIET)
+    return Watcher(load_geometry(geometry), bench.host(node))
+
+
+def test_what_is_heard_becomes_the_picture(bench, tmp_path):
+    """Truth: the struts between the hexagon and the triangle of Song et al. at the commanded pose, from plane geometry;
+    corrections are the offsets with the other sign. The estimate comes from the node's own commands; 1e-9 m is the
+    solver's tolerance."""
+    bench.compensator(model_file=model_file(tmp_path, struts={"offset_um": OFFSETS.tolist()}), ramp_rate=1.0)
+    watcher, pose = watched(bench), near(HOME, (0.02, -0.01, 0.03), 4.0)
+    bench.settle(pose)
+
+    def there() -> bool:
+        bench.ask(pose)
+        view = watcher.view()
+        return view.latency is not None and view.corrections is not None and view.left is not None
+
+    bench.until(there, "the picture of the pose")
+    view = watcher.view()
+    assert view.platform is not None
+    assert view.commanded is not None
+    ends = strut_ends(load_geometry("paper.yaml"), view.platform)
+    np.testing.assert_allclose(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1), closed_form_lengths(pose), atol=2e-9)
+    tips = np.deg2rad([60.0, 60.0, 180.0, 180.0, 300.0, 300.0])
+    triangle = 0.3 / np.sqrt(3.0) * np.stack([np.cos(tips), np.sin(tips), 0.0 * tips], axis=1)
+    np.testing.assert_allclose(ends[:, 1], pose.position + triangle @ pose.rotation.T, atol=2e-9)
+    np.testing.assert_allclose(view.commanded.position, pose.position, atol=2e-9)
+    np.testing.assert_allclose(view.corrections, -1e-6 * OFFSETS, atol=1e-12)
+    assert view.left is not None
+    assert np.abs(view.left.displacement).max() < 2e-9
+    assert view.latency is not None
+    assert 0.0 < view.latency.median <= view.latency.largest < 5.0
+
+
+@pytest.mark.parametrize(("geometry", "close"), [("paper.yaml", 2e-9), ("example_6_6.yaml", 5e-8)])
+def test_the_error_left_is_along_the_axes_of_work(bench, geometry, close):
+    """Truth: measured struts are the distances between the joints with the platform 20 µm off along base x, by plain
+    closure; seen from work that is the first row of its rotation. 2e-9 m is the solvers' tolerance; the 6-6 machine's
+    screws turn with their joints, which plain closure leaves out: 0.2 % of the way."""
+    bench.hush("strut_states")
+    bench.speak("strut_states")
+    machine = load_geometry(geometry)
+    watcher, home = watched(bench, geometry), machine.home
+
+    def measured(pose: Pose) -> np.ndarray:
+        tops = pose.position + machine.platform_joints @ pose.rotation.T
+        return np.linalg.norm(tops - machine.base_joints, axis=1)
+
+    bench.compensator(geometry_file=geometry, model_file="ideal")
+    bench.feed(measured(home))
+    bench.barrier()
+    shift = np.array([20e-6, 0.0, 0.0])
+
+    def there() -> bool:
+        bench.feed(measured(Pose(home.position + shift, home.rotation)))
+        bench.ask(home @ machine.tool)
+        left = watcher.view().left
+        return left is not None and np.abs(left.displacement - machine.work.rotation.T @ shift).max() < close
+
+    bench.until(there, "the error left")
+    view = watcher.view()
+    assert view.left is not None
+    assert view.left.turn < 1e-7
+    np.testing.assert_allclose(view.measured, measured(Pose(home.position + shift, home.rotation)), atol=1e-12)
+
+
+def test_refusals_in_words(bench):
+    bench.compensator(model_file="ideal")
+    watcher = watched(bench)
+    bench.ask(HOME)
+    bench.send(Pose([0.0, 0.0, 3.0], np.eye(3)))
+    bench.until(lambda: "refusing commands" in words(watcher.view(), "paper"), "the refusal")
+    text = words(watcher.view(), "paper")
+    assert "<td>last refusal</td>" in text.replace(' style="padding-right: 1em"', "")
+    assert "strut_drive" not in watcher.view().states
+
+
+def test_nothing_is_published(bench):
+    """Only what rclpy gives every node: its parameters' events."""
+    watcher = watched(bench)
+    name, namespace = watcher.node.get_name(), watcher.node.get_namespace()
+    bench.until(lambda: watcher.node.get_publisher_names_and_types_by_node(name, namespace), "the graph")
+    assert [topic for topic, _ in watcher.node.get_publisher_names_and_types_by_node(name, namespace)] == [
+        "/parameter_events"
+    ]
+    assert not list(watcher.node.services)
+    assert not list(watcher.node.clients)
+
+
+def test_what_is_old_or_no_machine_is_not_known(bench, monkeypatch):
+    """Struts without names, NaN before a controller is active, bytes that are no message: nothing, and no error."""
+    watcher = watched(bench)
+    names = [f"strut_{n}" for n in range(1, 7)]
+    for message in (JointState(), JointState(name=names, position=[float("nan")] * 6)):
+        bench.publish("strut_states", message)
+        bench.until(lambda: "strut_states" in watcher._newest, "a message")
+        assert watcher.view() == View()
+        watcher._newest.clear()
+    watcher._newest["tool_pose_estimate"] = (b"\0\1\0", np.inf)
+    assert watcher.view() == View()
+    bench.feed(closed_form_lengths(HOME))
+    bench.until(lambda: watcher.view().measured is not None, "measured struts")
+    monkeypatch.setattr(watching, "SILENT_AFTER", 0.0)
+    assert watcher.view() == View()
+
+
+def test_words_are_escaped_and_another_machine_is_named():
+    values = [KeyValue(key="model", value="<script>alert(1)</script>"), KeyValue(key="refused.<b>", value="3")]
+    status = DiagnosticStatus(level=b"\2", name="compensator: state", message="<img src=x>", values=values)
+    status.hardware_id = "left/other"
+    text = words(View(states={"compensator": status}), "paper")
+    assert "<script" not in text
+    assert "<img" not in text
+    assert "&lt;script&gt;" in text
+    assert "refused: &lt;b&gt;" in text
+    assert "runs the machine left/other, not paper" in text
+    for same in ("left/paper", "paper", ""):
+        status.hardware_id = same
+        assert "runs the machine" not in words(View(states={"compensator": status}), "paper")
+
+
+def test_colours_of_corrections():
+    """Truth: the legend: blue −100 µm, white 0, red +100 µm; grey where not known."""
+    colours = strut_colours(np.array([-100e-6, -50e-6, 0.0, 50e-6, 100e-6, 1.0]))
+    assert colours[:, 0].tolist() == [
+        [0, 0, 255],
+        [128, 128, 255],
+        [255, 255, 255],
+        [255, 128, 128],
+        [255, 0, 0],
+        [255, 0, 0],
+    ]
+    assert (colours[:, 0] == colours[:, 1]).all()
+    assert np.unique(strut_colours(None).reshape(-1, 3), axis=0).shape == (1, 3)
+
+
+def test_without_viser_the_verb_says_what_to_install(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["watch"]) == 2
+    assert "pip install viser" in capsys.readouterr().err
+
+
+def test_an_address_that_cannot_be_had():
+    """Nothing else is taken in its place, and nothing hangs."""
+    pytest.importorskip("viser", reason="the page needs viser")
+    geometry = load_geometry("paper.yaml")
+    page = WatchPage(geometry, port=free_port())
+    try:
+        port = int(page.address.rpartition(":")[2])
+        assert page._server.request_share_url() is None
+        with pytest.raises(HexapodError, match=f"cannot serve on 127.0.0.1, port {port}: .*in use"):
+            WatchPage(geometry, port=port)
+    finally:
+        page.close()
+    with pytest.raises(HexapodError, match="cannot serve on no such host"):
+        WatchPage(geometry, host="no such host")
+
+
+@pytest.mark.parametrize(
+    ("asked", "origin", "served"),
+    [
+        ("127.0.0.1:8080", None, True),
+        ("localhost:9000", "http://localhost:9000", True),  # through a tunnel
+        ("[::1]:8080", "http://[::1]:8080", True),
+        ("192.168.0.7:8080", "http://192.168.0.7:8080", True),  # with --host 0.0.0.0
+        ("machine.shop:8080", "http://machine.shop:8080", True),  # with --host machine.shop
+        ("127.0.0.1:8080", "http://evil.example", False),
+        ("127.0.0.1:8080", "http://127.0.0.1:3000", False),  # another server on this computer
+        ("127.0.0.1:8080", "null", False),  # a file, or a frame in a sandbox
+        ("evil.example:8080", "http://evil.example:8080", False),  # its name was made to mean 127.0.0.1
+        ("evil.example", None, False),
+        ("", None, False),
+        ("[::1", None, False),
+    ],
+)
+def test_only_the_page_s_own_site_is_served(asked, origin, served):
+    headers = {"Host": asked} | ({} if origin is None else {"Origin": origin})
+    assert same_site(headers, "machine.shop") is served
+
+
+def test_the_server_refuses_what_other_sites_ask_for():
+    """By what a browser sends: for the page itself, and for the connection behind it."""
+    pytest.importorskip("viser", reason="the page needs viser")
+    page = WatchPage(load_geometry("paper.yaml"), port=free_port())
+    upgrade = {
+        "Connection": "Upgrade",
+        "Upgrade": "websocket",
+        "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+        "Sec-WebSocket-Protocol": "viser-v1.1.1",
+    }
+    own = page.address.removeprefix("http://")
+    try:
+        for headers, status in (
+            ({"Host": own}, 200),
+            ({"Host": "evil.example"}, 403),
+            ({"Host": own, "Origin": page.address, **upgrade}, 101),
+            ({"Host": own, "Origin": "http://evil.example", **upgrade}, 403),
+            ({"Host": "evil.example", "Origin": "http://evil.example", **upgrade}, 403),
+        ):
+            connection = HTTPConnection(own, timeout=20.0)
+            connection.request("GET", "/", headers=headers)
+            assert connection.getresponse().status == status, headers
+            connection.close()
+    finally:
+        page.close()
+
+
+def free_port() -> int:
+    """Return a port that nobody has."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+def screenshot(browser: str, folder: Path, address: str, patience: int) -> list[str]:
+    """Return the command that writes page.png, as the page is after some of the browser's seconds."""
+    options = "--headless --no-sandbox --disable-dev-shm-usage --use-angle=swiftshader --enable-unsafe-swiftshader"
+    command = [browser, *options.split(), f"--user-data-dir={folder / 'profile'}", "--window-size=1200,1200"]
+    return [*command, f"--virtual-time-budget={patience * 1000}", f"--screenshot={folder / 'page.png'}", address]
+
+
+@pytest.mark.timeout(700)
+def test_the_page_in_a_browser(bench, tmp_path):
+    """Truth: strut 1 is corrected by +100 µm and struts 5 and 6 by −100 and −200 µm, red and blue
+    by the legend, and the compensator
+    runs, in green. The page dims what it renders, so hues count, not brightness."""
+    pytest.importorskip("viser", reason="the page needs viser")
+    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if browser is None:
+        pytest.skip("no Chromium here")
+    model = model_file(tmp_path, struts={"offset_um": OFFSETS.tolist()})
+    bench.drive(truth_file=model)
+    patient = {"max_command_age": 0.0, "command_timeout": 0.0, "max_reading_age": 0.0, "feedback_timeout": 60.0}
+    bench.compensator(model_file=model, **patient)  # the browser takes all there is of the processor
+    watcher, page = watched(bench), WatchPage(load_geometry("paper.yaml"), port=free_port())
+    newest, due = View(), 0.0
+
+    def shown() -> View:
+        nonlocal newest, due
+        if time.monotonic() > due:  # no faster than the bench hears its own messages
+            bench.send(HOME)
+            newest, due = watcher.view(), time.monotonic() + 0.3
+            page.show(newest)
+        return newest
+
+    try:
+        bench.settle(HOME)
+        bench.until(lambda: shown().platform is not None and bench.message() == "running", "the machine", 30.0)
+        for patience in (8, 40, 120):  # on a busy computer the scene comes later than the page
+            command = screenshot(browser, tmp_path, page.address, patience)
+            with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+                bench.until(lambda process=process: shown() and process.poll() is not None, "the screenshot", 200.0)
+            pixels = np.rint(255 * matplotlib.image.imread(tmp_path / "page.png")[..., :3]).astype(int)
+            scene, panel = pixels[:, :800], pixels[:, 800:]
+            others = np.stack([np.delete(scene, hue, axis=2).max(axis=2) for hue in (0, 2)], axis=2)
+            coloured = ((scene[..., [0, 2]] > 60) & (scene[..., [0, 2]] > 2 * others)).sum(axis=(0, 1))
+            if (coloured > 400).all():
+                break
+    finally:
+        page.close()
+    assert (coloured > 400).all(), coloured
+    assert (np.abs(panel - [0x3F, 0xB9, 0x50]).max(axis=2) < 30).sum() > 20
