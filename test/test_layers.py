@@ -61,8 +61,9 @@ def test_no_two_classes_share_a_name():
 
 
 def test_the_old_name_of_the_ros_room_finds_its_modules():
-    from hexapod_comp.nodes import start
     from hexapod_comp.nodes.messages import message_pose
+
+    from hexapod_comp.nodes import start
     from hexapod_comp.ros import start as same
 
     assert start is same
