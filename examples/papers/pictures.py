@@ -28,13 +28,7 @@ def configuration_figure(geometry: HexapodGeometry) -> Figure:
 
 
 def changes_figure(drawn: np.ndarray, printed: np.ndarray) -> Figure:
-    """Show how strut lengths of machines drawn within ±10 µm differ from the ideal ones, and the printed ones do.
-
-    Parameters
-    ----------
-    drawn, printed : ndarray
-        Real minus ideal length, µm; any shape.
-    """
+    """Show how strut lengths of machines drawn within ±10 µm differ from the ideal ones, and the printed ones do."""
     figure = Figure(figsize=(8.0, 3.6), layout="constrained")
     axes = figure.subplots()
     for values, colour, name in (

@@ -36,22 +36,7 @@ AT_20_DEGC = C
 
 
 def refuse_unknown(model: MachineModel, known: Collection[str], export: str) -> None:
-    """Refuse a model with a term that an export does not know.
-
-    Parameters
-    ----------
-    model : MachineModel
-        What shall be exported.
-    known : collection of str
-        Terms as :func:`terms` names them.
-    export : str
-        For the message.
-
-    Raises
-    ------
-    ModelError
-        With the first such term and its value.
-    """
+    """Refuse a model with a term that an export does not know."""
     for name, value in terms(model):
         if name not in known:
             problem = f"cannot be exported: {export} does not know it. Leave it out, or let the compensator run it"

@@ -41,29 +41,7 @@ def write_ros2_control(
     rate: int,
     joint_names: Sequence[str] = STRUT_NAMES,
 ) -> list[Path]:
-    """Write an ament_cmake package into a folder, which is made if it is missing.
-
-    Parameters
-    ----------
-    folder : str or Path
-        Files of these names in it are replaced.
-    geometry, model, hashes
-        As of :func:`~hexapod_comp.export.c_code.write_c`, whose files are in ``core``.
-    rate : int
-        Of the control loop, Hz.
-    joint_names : sequence of str, optional
-        Of the drives' joints, in strut order.
-
-    Returns
-    -------
-    list of Path
-        The files.
-
-    Raises
-    ------
-    ModelError
-        As of :func:`~hexapod_comp.export.c_code.write_c`.
-    """
+    """Write an ament_cmake package into a folder, which is made if it is missing."""
     folder = Path(folder)
     written = write_c(folder / "core", geometry, model, hashes)
     values = _values(geometry, model, rate, joint_names)

@@ -43,18 +43,10 @@ SAMPLES = 16
 
 @dataclass(frozen=True)
 class ScrewTable:
-    """One joint's compensation table.
+    """One joint's compensation table."""
 
-    Attributes
-    ----------
-    nominal : ndarray, shape (n,)
-        Joint commands, m, increasing.
-    trims : ndarray, shape (2, n)
-        What is added to the command of a joint that moves up, and of one that moves down, m.
-    """
-
-    nominal: np.ndarray
-    trims: np.ndarray
+    nominal: np.ndarray  # (n,): joint commands, m, increasing
+    trims: np.ndarray  # (2, n): what is added to the command of a joint that moves up, and of one that moves down, m
 
     def correction(self, joint: np.ndarray, up: np.ndarray) -> np.ndarray:
         """Return what LinuxCNC adds to joint commands (N,), m, for boolean directions (N,)."""
@@ -68,26 +60,15 @@ class ScrewTable:
 
 @dataclass(frozen=True)
 class Genhexkins:
-    """What LinuxCNC has been told of a machine, in SI.
+    """What LinuxCNC has been told of a machine, in SI."""
 
-    Attributes
-    ----------
-    base_joints, platform_joints : ndarray, shape (6, 3)
-        Joints in LinuxCNC's world (our ``work``) and in the moving frame (our ``tool``), m.
-    base_axes, platform_axes : ndarray, shape (6, 3)
-        Unit vectors of the cardan axes in the same frames; zeros without a lead.
-    lead : float
-        Screw lead, m.
-    tables : tuple of six ScrewTable
-        Compensation of the joints.
-    """
-
+    # (6, 3): joints in LinuxCNC's world (our ``work``) and in the moving frame (our ``tool``), m
     base_joints: np.ndarray
     platform_joints: np.ndarray
-    base_axes: np.ndarray
-    platform_axes: np.ndarray
-    lead: float
-    tables: tuple[ScrewTable, ...]
+    base_axes: np.ndarray  # (6, 3): unit vectors of the cardan axes in the same frames; zeros without a lead
+    platform_axes: np.ndarray  # (6, 3): unit vectors of the cardan axes in the same frames; zeros without a lead
+    lead: float  # Screw lead, m
+    tables: tuple[ScrewTable, ...]  # Compensation of the joints
 
     def joints(self, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
         """Return genhexkins' joints, shape (N, 6), m, for poses (N, 3), m, and (N, 3, 3)."""
@@ -114,22 +95,7 @@ class Genhexkins:
 
 
 def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
-    """Put a machine into LinuxCNC's terms.
-
-    Parameters
-    ----------
-    machine : RealMachine
-        At 20 °C.
-    box : ndarray, shape (2, 3)
-        Lowest and highest tool position in ``work``, m, for which the tables shall be fine.
-
-    Raises
-    ------
-    GeometryError
-        The struts' leads differ, or cardan axes come near a right angle: genhexkins cannot have that.
-    ModelError
-        The model has a term that is neither carried nor reported as not carried.
-    """
+    """Put a machine into LinuxCNC's terms."""
     refuse_unknown(machine.model, AT_20_DEGC, "LinuxCNC's export")
     geometry, structure = machine.geometry, machine.structure
     lead = float(geometry.screw_lead[0])
@@ -154,13 +120,7 @@ def make_genhexkins(machine: RealMachine, box: np.ndarray) -> Genhexkins:
 
 
 def _side(machine: RealMachine, box: np.ndarray) -> np.ndarray:
-    """Return +1 for each strut whose axis vectors are less than 90° apart, −1 where they are more, shape (6,).
-
-    Raises
-    ------
-    GeometryError
-        They come near 90°, at home or at level poses in the box: genhexkins' arcsine has a fold there.
-    """
+    """Return +1 for each strut whose axis vectors are less than 90° apart, −1 where they are more, shape (6,)."""
     geometry = machine.geometry
     if not geometry.screw_lead.any():
         return np.ones(6)

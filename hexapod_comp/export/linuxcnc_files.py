@@ -43,26 +43,7 @@ SETP = re.compile(r"setp\s+genhexkins\.(\S+)\s+(\S+)\s*")
 def write_genhexkins(
     genhexkins: Genhexkins, folder: str | Path, unit: str, titles: list[str], misfit: np.ndarray
 ) -> list[Path]:
-    """Write a HAL file, six compensation files and the ini lines; each file whole or not at all.
-
-    Parameters
-    ----------
-    genhexkins : Genhexkins
-        What to write.
-    folder : str or Path
-        Made if missing; files of these names in it are replaced.
-    unit : str
-        Machine unit, ``mm`` or ``inch``.
-    titles : list of str
-        What it is, for the comments.
-    misfit : ndarray, shape (6, 2)
-        What :func:`table_misfit` found, for the comments.
-
-    Raises
-    ------
-    InputFileError
-        The folder cannot be made or written to.
-    """
+    """Write a HAL file, six compensation files and the ini lines; each file whole or not at all."""
     folder = Path(folder)
     try:
         folder.mkdir(exist_ok=True)
@@ -136,20 +117,7 @@ def _ini_lines() -> list[str]:
 
 
 def read_genhexkins(folder: str | Path, unit: str) -> Genhexkins:
-    """Read a written set as LinuxCNC would.
-
-    Parameters
-    ----------
-    folder : str or Path
-        Where the files are.
-    unit : str
-        Machine unit, ``mm`` or ``inch``: the files do not decide it, [TRAJ]LINEAR_UNITS does.
-
-    Raises
-    ------
-    InputFileError
-        A file is missing, not one of this set, or not what LinuxCNC takes; with file and line.
-    """
+    """Read a written set as LinuxCNC would."""
     folder, size = Path(folder), MACHINE_UNITS[unit]
     texts = {name: read_text(folder / name) for name in (HAL_FILE, INI_FILE, *COMP_FILES)}
     _refuse_mixed(folder, texts)

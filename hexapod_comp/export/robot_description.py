@@ -62,22 +62,7 @@ LOOSE = 1e3
 def joint_positions(
     geometry: HexapodGeometry, platform: Pose, joint_names: Sequence[str] = STRUT_NAMES
 ) -> dict[str, float]:
-    """Return the position of every joint of :func:`urdf` at a pose.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        The nominal machine.
-    platform : Pose
-        ``pose_platform_in_base``.
-    joint_names : sequence of str, optional
-        Names of the struts' slides.
-
-    Returns
-    -------
-    dict of str to float
-        m and radians.
-    """
+    """Return the position of every joint of :func:`urdf` at a pose."""
     alpha, beta, gamma = platform.angles()
     values = dict(zip(PLATFORM_JOINTS, (*platform.position, beta, alpha, gamma), strict=True))
     ends = platform.position + geometry.platform_joints @ platform.rotation.T
@@ -91,17 +76,7 @@ def joint_positions(
 
 
 def urdf(geometry: HexapodGeometry, joint_names: Sequence[str] = STRUT_NAMES, ros2_control: bool = True) -> str:
-    """Return the machine as URDF: links ``base``, ``work``, ``platform``, ``tool``, the struts', the named frames'.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        The nominal machine.
-    joint_names : sequence of str, optional
-        Names of the struts' slides.
-    ros2_control : bool, optional
-        Add a block for ros2_control, whose hardware are the topics of a compensator with ``command_input: struts``.
-    """
+    """Return the machine as URDF: links ``base``, ``work``, ``platform``, ``tool``, the struts', the named frames'."""
     robot = ET.Element("robot", name=geometry.name)
     _link(robot, "base", [_ball(joint) for joint in geometry.base_joints])
     for name, pose in geometry.work_frames.items():

@@ -62,53 +62,24 @@ SAME_NODE = 1e-9
 
 @dataclass(frozen=True)
 class GridTable:
-    """Corrections on a grid, forward and backward.
+    """Corrections on a grid, forward and backward."""
 
-    Parameters
-    ----------
-    nodes : tuple of three ndarray
-        Increasing coordinates of the level tool in ``work``, m.
-    struts : ndarray, shape (2, nx, ny, nz, 6)
-        Strut correction = commanded − nominal strut length, m, forward and backward, backlash left out.
-    backlash : ndarray, shape (2, nx, ny, nz, 6)
-        Lost motion to be made up for on reversal of a strut, m.
-    poses : ndarray, shape (2, nx, ny, nz, 6)
-        Change of the commanded tool pose along the axes of ``work``: displacement, m, rotation vector, rad.
-    """
-
-    nodes: tuple[np.ndarray, np.ndarray, np.ndarray]
+    nodes: tuple[np.ndarray, np.ndarray, np.ndarray]  # Increasing coordinates of the level tool in ``work``, m
+    # (2, nx, ny, nz, 6): strut correction = commanded − nominal strut length, m, forward and backward, backlash left
+    # out
     struts: np.ndarray
-    backlash: np.ndarray
+    backlash: np.ndarray  # (2, nx, ny, nz, 6): lost motion to be made up for on reversal of a strut, m
+    # (2, nx, ny, nz, 6): change of the commanded tool pose along the axes of ``work``: displacement, m, rotation
+    # vector, rad
     poses: np.ndarray
 
     def strut_corrections(self, positions: np.ndarray, backward: np.ndarray, senses: np.ndarray) -> np.ndarray:
-        """Return strut corrections, shape (N, 6), m.
-
-        Parameters
-        ----------
-        positions : ndarray, shape (N, 3)
-            Commanded tool positions in ``work``, m.
-        backward : ndarray of bool, shape (N,)
-            Direction of the tool.
-        senses : ndarray, shape (N, 6)
-            Direction of each strut, +1 growing, −1 shrinking, 0 unknown.
-
-        Raises
-        ------
-        ModelError
-            A position outside the grid.
-        """
+        """Return strut corrections, shape (N, 6), m."""
         lost = self._between(self.backlash, positions, backward)
         return self._between(self.struts, positions, backward) + 0.5 * senses * lost
 
     def pose_corrections(self, positions: np.ndarray, backward: np.ndarray) -> np.ndarray:
-        """Return displacement, m, and rotation vector, rad, of the commanded tool pose, shape (N, 6).
-
-        Raises
-        ------
-        ModelError
-            A position outside the grid.
-        """
+        """Return displacement, m, and rotation vector, rad, of the commanded tool pose, shape (N, 6)."""
         return self._between(self.poses, positions, backward)
 
     def _between(self, values: np.ndarray, positions: np.ndarray, backward: np.ndarray) -> np.ndarray:
@@ -128,31 +99,7 @@ class GridTable:
 def make_table(
     geometry: HexapodGeometry, model: MachineModel, box: np.ndarray, step: float
 ) -> tuple[GridTable, list[str]]:
-    """Evaluate a model on a grid.
-
-    Parameters
-    ----------
-    geometry, model : HexapodGeometry, MachineModel
-        The machine, at 20 °C.
-    box : ndarray, shape (2, 3)
-        Lowest and highest tool position in ``work``, m.
-    step : float
-        Largest distance of neighbouring nodes along an axis, m; the cells are equal.
-
-    Returns
-    -------
-    GridTable, list of str
-        The table, and what of the model is not in it.
-
-    Raises
-    ------
-    ModelError
-        Too many nodes, or a term of the model that is neither carried nor reported as not carried.
-    LimitError
-        A node is out of the machine's reach.
-    OutsideFieldError
-        A node is outside the field's box, and the field refuses that.
-    """
+    """Evaluate a model on a grid."""
     refuse_unknown(model, AT_20_DEGC, "the table")
     nodes = _grid_nodes(box, step)
     shape = tuple(len(n) for n in nodes)
@@ -195,13 +142,7 @@ def _without_fine_waves(model: MachineModel, step: float) -> tuple[MachineModel,
 
 
 def _outside_field(machine: RealMachine, passes: Passes) -> int:
-    """Return how many rows have their measured point outside the field's box.
-
-    Raises
-    ------
-    OutsideFieldError
-        There is one, and the field refuses that.
-    """
+    """Return how many rows have their measured point outside the field's box."""
     field = machine.model.field
     low, high = field.box + np.array([[-EDGE], [EDGE]])
     points = passes.points(field.probe)
@@ -269,14 +210,7 @@ def write_table(table: GridTable, path: str | Path, titles: Sequence[str]) -> No
 
 
 def read_table(path: str | Path) -> GridTable:
-    """Read a table; its rows may stand in any order, its lengths and angles in any unit of theirs.
-
-    Raises
-    ------
-    InputFileError
-        Columns missing or unknown, numbers not finite, a direction that is none, positions that are no
-        complete grid, with file and line.
-    """
+    """Read a table; its rows may stand in any order, its lengths and angles in any unit of theirs."""
     table = Table(path)
     positions = table.numbers(table.required(POSITION, "length"))
     struts = table.numbers(table.required(CORRECTION, "length"))

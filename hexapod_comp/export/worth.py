@@ -34,65 +34,31 @@ CommandsOf = Callable[[Passes], np.ndarray]
 
 @dataclass(frozen=True)
 class Comparison:
-    """Errors of the tool without and with an export.
+    """Errors of the tool without and with an export."""
 
-    Attributes
-    ----------
-    passes : int
-        Poses times directions that were driven.
-    before, after : Size
-        3-D displacement error, m.
-    before_rotation, after_rotation : Size
-        Rotation error, rad.
-    """
-
-    passes: int
-    before: Size
-    after: Size
-    before_rotation: Size
-    after_rotation: Size
+    passes: int  # Poses times directions that were driven
+    before: Size  # 3-D displacement error, m
+    after: Size  # 3-D displacement error, m
+    before_rotation: Size  # Rotation error, rad
+    after_rotation: Size  # Rotation error, rad
 
 
 @dataclass(frozen=True)
 class ExportCheck:
-    """What one export leaves, and how large the effects are that it cannot carry.
+    """What one export leaves, and how large the effects are that it cannot carry."""
 
-    Attributes
-    ----------
-    level : Comparison
-        Level tool, inside the box.
-    tilted : Comparison or None
-        The same places with the tool tilted; None where no such pose is within the machine's limits.
-    field : Size
-        Displacement of the tool by the model's error field, m.
-    per_kelvin, per_humidity : Size or None
-        Displacement of the tool when struts, base and platform are 1 K warmer, and when the air is damper by 0.1, m;
-        None for a model that this does not act on.
-    """
-
-    level: Comparison
+    level: Comparison  # Level tool, inside the box
+    # The same places with the tool tilted; None where no such pose is within the machine's limits
     tilted: Comparison | None
-    field: Size
+    field: Size  # Displacement of the tool by the model's error field, m
+    # Displacement of the tool when struts, base and platform are 1 K warmer, and when the air is damper by 0.1, m; None
+    # for a model that this does not act on
     per_kelvin: Size | None
     per_humidity: Size | None
 
 
 def diagonal_passes(geometry: HexapodGeometry, box: np.ndarray, count: int, seed: int, tilt: float = 0.0) -> Passes:
-    """Draw positions in a box; each is passed forward and backward along a space diagonal.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        The nominal machine.
-    box : ndarray, shape (2, 3)
-        Lowest and highest tool position in ``work``, m.
-    count : int
-        Positions; there are twice as many passes.
-    seed : int
-        Of the random numbers.
-    tilt : float, optional
-        Angle by which the tool leans, rad, about a random horizontal axis.
-    """
+    """Draw positions in a box; each is passed forward and backward along a space diagonal."""
     rng = np.random.default_rng(seed)
     positions = rng.uniform(box[0], box[1], (count, 3))
     azimuth = rng.uniform(0.0, 2.0 * np.pi, count)
@@ -102,24 +68,7 @@ def diagonal_passes(geometry: HexapodGeometry, box: np.ndarray, count: int, seed
 
 
 class ExportTrial:
-    """A machine and the passes on which exports for it are tried; the model is taken for the truth.
-
-    Parameters
-    ----------
-    geometry, model : HexapodGeometry, MachineModel
-        The machine that the exports were made for, at 20 °C.
-    box : ndarray, shape (2, 3)
-        Lowest and highest tool position in ``work``, m.
-    count, seed : int
-        Positions to draw, each passed forward and backward, and the seed.
-    tilt : float
-        How far the tool leans in the second comparison, rad.
-
-    Raises
-    ------
-    LimitError, KinematicsError
-        The machine cannot reach a part of the box with a level tool.
-    """
+    """A machine and the passes on which exports for it are tried; the model is taken for the truth."""
 
     def __init__(
         self,
@@ -140,18 +89,7 @@ class ExportTrial:
         self._before = [trial.errors(trial.commands(None)) for trial in self._trials]
 
     def check(self, commands_of: CommandsOf) -> ExportCheck:
-        """Compare the tool error without and with an export.
-
-        Parameters
-        ----------
-        commands_of : callable
-            What the export makes of passes.
-
-        Raises
-        ------
-        KinematicsError
-            The machine has no pose for what the export commands.
-        """
+        """Compare the tool error without and with an export."""
         commands = [commands_of(trial.passes) for trial in self._trials]
         after = [trial.errors(lengths) for trial, lengths in zip(self._trials, commands, strict=True)]
         level, *tilted = (_comparison(*pair) for pair in zip(self._before, after, strict=True))

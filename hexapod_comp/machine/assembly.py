@@ -52,38 +52,7 @@ AMBIGUITY = 1.2
 
 
 def assembly_modes(structure: Structure, lengths: np.ndarray) -> list[Pose]:
-    """Return every real pose of a machine that has these strut lengths; no guess is needed.
-
-    Parameters
-    ----------
-    structure : Structure
-        Where the joints are. Its home sign and largest condition number are not used: all modes are returned.
-    lengths : array_like, shape (6,)
-        Strut lengths, m.
-
-    Returns
-    -------
-    list of Pose
-        ``pose_platform_in_base``, highest platform first; empty when no pose has these lengths. A singular
-        pose (double root) is listed once.
-
-    Raises
-    ------
-    NotFiniteError
-        A length is NaN, infinite or not positive.
-    SingularError
-        The machine moves with its struts locked: its poses are not countable.
-    KinematicsError
-        Joints of a 6-3 machine that define no circle or no triangle.
-
-    Notes
-    -----
-    Where platform joints coincide in the pairs (1, 2), (3, 4), (5, 6), the list is complete. For a real structure,
-    pairs within :data:`PAIR_GAP`, the modes of the machine with the pairs' midpoints are continued by Newton. With
-    deviations of a few tenths of a per cent of the platform's size, modes within a hair of a singular pose
-    (condition numbers above 100) can be missed there. On any other machine the list is what Newton finds from
-    2 · :data:`ORIENTATIONS` poses and from home: nothing proves that it is complete.
-    """
+    """Return every real pose of a machine that has these strut lengths; no guess is needed."""
     lengths = six_lengths(lengths)
     if not is_six_three(structure):
         return sorted(_sought_poses(structure, lengths), key=lambda pose: -pose.position[2])
@@ -102,29 +71,6 @@ def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.nd
     characteristic length · angle, unless the next is nearly as near.
     A machine that stands outside its own limits, which lengths alone cannot show, is refused or, where another
     mode keeps the limits, taken to be in that one.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        Home, joint cones and limits.
-    structure : Structure
-        Ideal or real joints.
-    lengths : array_like, shape (6,)
-        Strut lengths, m.
-
-    Returns
-    -------
-    Pose
-        ``pose_platform_in_base``.
-
-    Raises
-    ------
-    UnreachableError
-        No pose has these lengths.
-    OtherAssemblyModeError
-        No mode can be the working one (says how many there are and what rules each out), or two can.
-    NotFiniteError, SingularError, KinematicsError
-        As :func:`assembly_modes`.
     """
     modes = assembly_modes(structure, lengths)
     if not modes:
@@ -142,20 +88,6 @@ def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose)
     """Return what keeps a pose from being the working mode; empty when nothing does.
 
     The machine can work only with det J of home's sign, the platform on home's side, and its limits kept.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        Home, joint cones and limits.
-    structure : Structure
-        Ideal or real joints.
-    pose : Pose
-        ``pose_platform_in_base``.
-
-    Returns
-    -------
-    list of str
-        One short phrase per objection, with found and allowed values.
     """
     limits = geometry.limits
     measured = batch.examine(*structure.joints, geometry.limit_numbers.at, pose.position, pose.rotation)

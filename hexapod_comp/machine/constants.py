@@ -16,15 +16,7 @@ if TYPE_CHECKING:
 
 
 def members(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str] = ("", "")) -> dict[str, Any]:
-    """Return what ``hc_model`` holds.
-
-    Parameters
-    ----------
-    geometry, model : HexapodGeometry, MachineModel
-        The machine with the tool and work frame in use, and what it does differently.
-    hashes : tuple of two str
-        SHA-256 of the geometry file and of the model file.
-    """
+    """Return what ``hc_model`` holds."""
     model_texts = {"machine": model.machine, "model": model.name, "date": model.origin.date or ""}
     tool = geometry.tool
     return {

@@ -24,23 +24,6 @@ def tool_move(geometry: HexapodGeometry, model: MachineModel, pose: Pose) -> np.
     """Return what a machine does to its tool at a pose when the struts are told nominal lengths.
 
     All parts are at 20 °C and directions of motion not known: midway between both ways of approach.
-
-    Parameters
-    ----------
-    geometry, model : HexapodGeometry, MachineModel
-        The machine.
-    pose : Pose
-        ``pose_platform_in_base``.
-
-    Returns
-    -------
-    ndarray, shape (6,)
-        Displacement of the tool's tip, m, and rotation vector, rad, actual minus commanded, in ``base``.
-
-    Raises
-    ------
-    KinematicsError
-        The machine has no such pose.
     """
     machine = RealMachine(geometry, model)
     actual, _ = machine.pose_for(strut_lengths(Structure.of(geometry), pose), guess=pose)
@@ -55,20 +38,6 @@ def with_datum_held(
     """Return a model whose whole machine is shifted and turned so that it does not move the tool at a pose.
 
     The base is moved, joints and cardan axes: all errors that a datum does not take up stay as they are.
-
-    Parameters
-    ----------
-    geometry, model : HexapodGeometry, MachineModel
-        The machine.
-    pose : Pose
-        ``pose_platform_in_base``, at 20 °C, directions of motion not known.
-    part : ndarray, shape (6, 6), optional
-        Which part of :func:`tool_move` is taken away, a projection; all of it by default.
-
-    Raises
-    ------
-    KinematicsError
-        The machine has no such pose, or its field is too steep for one.
     """
     part = np.eye(6) if part is None else part
     tip = (pose @ geometry.tool).position

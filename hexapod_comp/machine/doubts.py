@@ -91,13 +91,6 @@ def twist_per_lead(geometry: HexapodGeometry, positions: np.ndarray, rotations: 
     """Return by which share of their lead screws are off that turn with cardan joints, largest over poses and struts.
 
     For a machine that does not say how its joints' axes stand: taken across the strut at home, the same at both ends.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        The machine.
-    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
-        ``pose_platform_in_base``, m.
     """
     neutral = np.asarray(geometry.base_cone_axes)
     across = np.cross(neutral, np.eye(3)[np.abs(neutral).argmin(axis=1)])

@@ -31,22 +31,7 @@ SECOND, THIRD = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 def joint_circles(base_joints: np.ndarray, lengths: np.ndarray, allowed: float) -> np.ndarray | None:
-    """Return the circles on which pairs of struts hold their platform joints; None when two cannot meet.
-
-    Parameters
-    ----------
-    base_joints : ndarray, shape (6, 3)
-        In ``base``, m.
-    lengths : ndarray, shape (6,)
-        m.
-    allowed : float
-        A pair that fails to meet by no more than this, m, is taken as stretched flat: at the edge of reach
-        rounding decides.
-
-    Returns
-    -------
-    ndarray, shape (3, 3, 3), or None
-    """
+    """Return the circles on which pairs of struts hold their platform joints; None when two cannot meet."""
     one, other = lengths[0::2], lengths[1::2]
     between = base_joints[1::2] - base_joints[0::2]
     apart = np.linalg.norm(between, axis=1)
@@ -65,15 +50,7 @@ def joint_circles(base_joints: np.ndarray, lengths: np.ndarray, allowed: float) 
 
 
 def start_angles(circles: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Return angles (φ1, φ2, φ3) near which the platform may close, shape (K, 3), rad.
-
-    Parameters
-    ----------
-    circles : ndarray, shape (3, 3, 3)
-        From :func:`joint_circles`.
-    sides : ndarray, shape (3,)
-        Platform sides, m.
-    """
+    """Return angles (φ1, φ2, φ3) near which the platform may close, shape (K, 3), rad."""
     roots = [_roots(*about_one) for about_one in zip(*_samples(circles, sides), strict=True)]
     angles, row = np.concatenate(roots), np.arange(sum(map(len, roots)))
     first = np.repeat(np.arange(3), [len(of_one) for of_one in roots])
@@ -172,21 +149,7 @@ def _eliminate_second(a: np.ndarray, b: np.ndarray, r: np.ndarray) -> np.ndarray
 
 
 def _roots(values: np.ndarray, bound: float) -> np.ndarray:
-    """Return the angles at which a degree-8 trigonometric polynomial may vanish, rad.
-
-    Parameters
-    ----------
-    values : ndarray, shape (SAMPLES,)
-        The polynomial at equal steps of the angle from 0.
-    bound : float
-        Size that its terms had before they cancelled.
-
-    Returns
-    -------
-    ndarray
-        Arguments of all roots z not inside the unit circle: roots come in pairs z, 1/z̄ of one argument.
-        Where the polynomial vanishes everywhere, a uniform grid.
-    """
+    """Return the angles at which a degree-8 trigonometric polynomial may vanish, rad."""
     half = np.fft.rfft(values)[: HALF_DEGREE + 1]
     largest = np.abs(half).max()
     if not largest > 1e-12 * SAMPLES * bound:

@@ -31,35 +31,20 @@ OUTSIDE_POLICIES = ("hold", "refuse")
 
 @dataclass(frozen=True)
 class GridField:
-    """Error of the measured point over a box, forward and backward.
+    """Error of the measured point over a box, forward and backward."""
 
-    Parameters
-    ----------
-    grid : tuple of three ndarray
-        Increasing node coordinates along x, y, z in ``base``, m; at least two each. The box between the
-        outermost nodes is the measured one.
-    lines : tuple of three ndarray
-        Coefficients of the lines along x, y, z, shape (2, n, m, 6, K): direction (forward, backward), node
-        index along each of the two cross axes, component, power of u, where u runs from −1 to 1 over the
-        box along the line. Shape (2, n, m, 6, 0) when a family was not measured. m and rad.
-    probe : ndarray, shape (3,)
-        The measured point in ``platform``, m.
-    reversal_threshold : float
-        How far the measured point must come back along an axis before its direction counts as reversed, m:
-        above what the struts' backlash moves it along an axis that is told to stand still.
-    outside : str
-        ``hold`` keeps the value at the boundary of the box, ``refuse`` makes the compensator refuse.
-
-    Raises
-    ------
-    ModelError
-        Nodes not increasing, shapes that do not fit the grid, or values that are not finite.
-    """
-
+    # Increasing node coordinates along x, y, z in ``base``, m; at least two each. The box between the outermost nodes
+    # is the measured one
     grid: tuple[np.ndarray, np.ndarray, np.ndarray]
+    # Coefficients of the lines along x, y, z, shape (2, n, m, 6, K): direction (forward, backward), node index along
+    # each of the two cross axes, component, power of u, where u runs from −1 to 1 over the box along the line. Shape
+    # (2, n, m, 6, 0) when a family was not measured. m and rad
     lines: tuple[np.ndarray, np.ndarray, np.ndarray]
-    probe: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    probe: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,): the measured point in ``platform``, m
+    # ``hold`` keeps the value at the boundary of the box, ``refuse`` makes the compensator refuse
     outside: str = "hold"
+    # How far the measured point must come back along an axis before its direction counts as reversed, m: above what the
+    # struts' backlash moves it along an axis that is told to stand still
     reversal_threshold: float = 10e-6
 
     def __post_init__(self) -> None:
@@ -91,22 +76,7 @@ class GridField:
         return np.array([[nodes[0] for nodes in self.grid], [nodes[-1] for nodes in self.grid]])
 
     def evaluate(self, position: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the error at a point of ``base``.
-
-        Parameters
-        ----------
-        position : array_like, shape (3,)
-            The measured point, m.
-        sense : array_like, shape (3,)
-            Direction of motion along each axis: +1 forward, −1 backward, 0 unknown (mean of both).
-
-        Returns
-        -------
-        error : ndarray, shape (6,)
-            dx, dy, dz (m), rx, ry, rz (rad).
-        outside : bool
-            True when the point lies outside the box and the boundary's value was held.
-        """
+        """Return the error at a point of ``base``."""
         error = np.empty(6)
         position = np.array(position, dtype=float)
         return error, field_at(self._struct, position, np.array(sense, dtype=float), error)

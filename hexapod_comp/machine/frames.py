@@ -59,13 +59,7 @@ def pose_text(pose: Pose) -> str:
 
 
 def refuse_names(tools: Mapping[str, Pose], work_frames: Mapping[str, Pose]) -> None:
-    """Raise where a name cannot be one, stands for something else, or is given to a tool and a work frame.
-
-    Raises
-    ------
-    GeometryError
-        Naming it.
-    """
+    """Raise where a name cannot be one, stands for something else, or is given to a tool and a work frame."""
     for key, named, usual in (("tools", tools, (TOOL,)), ("work_frames", work_frames, (BASE, WORK))):
         others = [name for name in named if name not in usual]
         if len(others) > MOST:

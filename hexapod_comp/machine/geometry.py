@@ -226,20 +226,7 @@ class HexapodGeometry:
 
 
 def paper_joints(a: float, b: float, d: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the joints of the paper's 6-3 machine from its three dimensions.
-
-    Parameters
-    ----------
-    a : float
-        Side of the platform triangle, m.
-    b, d : float
-        Long and short side of the semi-regular base hexagon, m.
-
-    Returns
-    -------
-    base_joints, platform_joints : ndarray, shape (6, 3)
-        Song et al., Figure 3, with its misprint in X_B5 mended (see doc/theory.md).
-    """
+    """Return the joints of the paper's 6-3 machine from its three dimensions."""
     for key, value in (("a", a), ("b", b), ("d", d)):
         if not (np.isfinite(value) and value > 0.0):
             raise GeometryError(key, "must be finite and positive, m", value)
@@ -280,13 +267,7 @@ def load_geometry(path: str | Path) -> HexapodGeometry:
 
 
 def parse_geometry(text: str, name: str | Path = "geometry") -> HexapodGeometry:
-    """Return the machine of a geometry file's text; `name` is what messages call the file.
-
-    Raises
-    ------
-    InputFileError
-        As :func:`load_geometry`.
-    """
+    """Return the machine of a geometry file's text; `name` is what messages call the file."""
     top = parse_yaml(text, name, GEOMETRY_FORMAT, GEOMETRY_VERSION)
     machine = top.text("machine")
     base, platform, axes = _read_joints(top)

@@ -41,28 +41,14 @@ FIRST_SLICE = 256
 
 @dataclass(frozen=True)
 class Structure:
-    """Where the twelve joints are: the nominal machine's, or the real one's.
+    """Where the twelve joints are: the nominal machine's, or the real one's."""
 
-    Parameters
-    ----------
-    base_joints, platform_joints : ndarray, shape (6, 3)
-        Joint centres in ``base`` and in ``platform``, m.
-    characteristic_length : float
-        Length that makes the condition number unit-free, m.
-    home_sign : float
-        Sign of det J in the working assembly mode.
-    max_condition : float
-        Largest condition number accepted as a solution.
-    home : Pose
-        ``pose_platform_in_base`` from which poses are sought when nothing better is known.
-    """
-
-    base_joints: np.ndarray
-    platform_joints: np.ndarray
-    characteristic_length: float
-    home_sign: float
-    max_condition: float
-    home: Pose
+    base_joints: np.ndarray  # (6, 3): joint centres in ``base`` and in ``platform``, m
+    platform_joints: np.ndarray  # (6, 3): joint centres in ``base`` and in ``platform``, m
+    characteristic_length: float  # Length that makes the condition number unit-free, m
+    home_sign: float  # Sign of det J in the working assembly mode
+    max_condition: float  # Largest condition number accepted as a solution
+    home: Pose  # ``pose_platform_in_base`` from which poses are sought when nothing better is known
 
     @property
     def joints(self) -> tuple[np.ndarray, np.ndarray]:
@@ -106,25 +92,13 @@ def structure_of(machine: Machine) -> Structure:
 
 @dataclass(frozen=True)
 class ForwardBatch:
-    """Result of :func:`solve_poses`; rows that failed hold NaN.
+    """Result of :func:`solve_poses`; rows that failed hold NaN."""
 
-    Attributes
-    ----------
-    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
-        Platform poses in ``base``, m.
-    outcomes : ndarray of int, shape (N,)
-        :class:`~hexapod_comp.core.Status`: ``OK``, or the reason of failure.
-    iterations : ndarray of int, shape (N,)
-        Newton steps.
-    conditions : ndarray, shape (N,)
-        Condition numbers.
-    """
-
-    positions: np.ndarray
-    rotations: np.ndarray
-    outcomes: np.ndarray
-    iterations: np.ndarray
-    conditions: np.ndarray
+    positions: np.ndarray  # (N, 3): platform poses in ``base``, m
+    rotations: np.ndarray  # (N, 3, 3): platform poses in ``base``, m
+    outcomes: np.ndarray  # (N,): :class:`~hexapod_comp.core.Status`: ``OK``, or the reason of failure
+    iterations: np.ndarray  # (N,): Newton steps
+    conditions: np.ndarray  # (N,): condition numbers
 
     @property
     def ok(self) -> np.ndarray:
@@ -155,22 +129,7 @@ def strut_lengths(machine: Machine, pose: Pose) -> np.ndarray:
 def strut_lengths_batch(
     structure: Structure, positions: np.ndarray, rotations: np.ndarray, threads: int | None = None
 ) -> np.ndarray:
-    """Return the strut lengths at N poses, shape (N, 6), m, using all cores.
-
-    Parameters
-    ----------
-    structure : Structure
-        Ideal or real joints.
-    positions, rotations : array_like, shape (N, 3), (N, 3, 3)
-        Platform poses in ``base``, m.
-    threads : int, optional
-        Most threads to use; all cores by default. A batch of some milliseconds stays on the calling thread.
-
-    Raises
-    ------
-    NotFiniteError
-        A pose is not finite; names its row.
-    """
+    """Return the strut lengths at N poses, shape (N, 6), m, using all cores."""
     positions, rotations = _batch_poses(positions, rotations)
     lengths = np.empty((len(positions), 6))
 
@@ -195,15 +154,7 @@ def jacobian(machine: Machine, pose: Pose) -> np.ndarray:
 
 
 def jacobian_batch(structure: Structure, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Return :func:`jacobian` at N poses, shape (N, 6, 6); NaN where a pose is.
-
-    Parameters
-    ----------
-    structure : Structure
-        Ideal or real joints.
-    positions, rotations : array_like, shape (N, 3), (N, 3, 3)
-        Platform poses in ``base``, m.
-    """
+    """Return :func:`jacobian` at N poses, shape (N, 6, 6); NaN where a pose is."""
     positions, rotations = _batch_poses(positions, rotations)
     matrices = np.empty((len(positions), 6, 6))
     batch.jacobians(*structure.joints, positions, rotations, matrices)
@@ -264,24 +215,7 @@ def solve_pose(machine: Machine, lengths: ArrayLike, guess: Pose | None = None) 
 def solve_poses(
     structure: Structure, lengths: np.ndarray, guess: Pose | tuple[np.ndarray, np.ndarray], threads: int | None = None
 ) -> ForwardBatch:
-    """Solve the forward kinematics of N sets of lengths, on all cores.
-
-    Parameters
-    ----------
-    structure : Structure
-        Ideal or real joints.
-    lengths : array_like, shape (N, 6)
-        m.
-    guess : Pose, or tuple of ndarray of shapes (N, 3), (N, 3, 3)
-        Start for every row, or positions and rotations with a start for each; m.
-    threads : int, optional
-        Most threads to use; all cores by default. A batch of some milliseconds stays on the calling thread.
-
-    Returns
-    -------
-    ForwardBatch
-        Rows without a solution are NaN and carry their outcome; nothing is raised for them.
-    """
+    """Solve the forward kinematics of N sets of lengths, on all cores."""
     lengths = np.ascontiguousarray(lengths, dtype=float)
     if lengths.ndim != 2 or lengths.shape[1] != 6:
         raise KinematicsError(f"lengths must have shape (N, 6), not {lengths.shape}", lengths.shape)
@@ -305,13 +239,7 @@ def solve_poses(
 
 
 def _guesses(guess: Pose | tuple[np.ndarray, np.ndarray], count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and rotations with a start for each row.
-
-    Raises
-    ------
-    KinematicsError
-        There are not as many as rows.
-    """
+    """Return positions and rotations with a start for each row."""
     if isinstance(guess, Pose):
         return np.broadcast_to(guess.position, (count, 3)), np.broadcast_to(guess.rotation, (count, 3, 3))
     positions, rotations = (np.asarray(rows, dtype=float) for rows in guess)
@@ -327,17 +255,6 @@ def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = 
     The calling thread begins alone. Others help only when it has worked for :data:`ALONE` of processor time and what
     is left would take it as long again, so that no batch is slower for the help, whatever its rows cost. It goes on
     to take slices as they do, and waits only for those that others have begun.
-
-    Parameters
-    ----------
-    run : callable
-        Gets each slice once, from any thread, in any order.
-    count : int
-        Rows in the batch.
-    threads : int, optional
-        Most threads to use, the calling one included; all cores that this process may use by default.
-    first : int
-        Rows in the first slice; more for work that has a fixed part.
     """
     workers = threads or len(os.sched_getaffinity(0))
     size, done, took, began = first, 0, 0.0, time.thread_time()
@@ -400,13 +317,6 @@ def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tup
 
     Where Newton wandered off, a trust-region minimiser tells the two causes apart: it either finds the
     closure, or stops where no further approach is possible.
-
-    Raises
-    ------
-    UnreachableError
-        The minimum is not a closure; carries the remaining length error.
-    NotConvergedError
-        The guess is so far away that numbers overflow.
     """
 
     from scipy.optimize import least_squares  # 39 MB with the next one that a running node does not need

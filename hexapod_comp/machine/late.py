@@ -41,26 +41,12 @@ def _nothing() -> np.ndarray:
 
 @dataclass(frozen=True)
 class LateGrowth:
-    """How the parts of a machine follow their thermometers.
+    """How the parts of a machine follow their thermometers."""
 
-    Parameters
-    ----------
-    time_constants : tuple of float
-        τ_k, s, increasing; none, one or two.
-    expansion : ndarray, shape (8, time constants)
-        b_k of struts 1–6, base, platform, 1/K.
-    thermometer : str
-        The part whose sensor stands for all; empty: each part has its own.
-
-    Raises
-    ------
-    ModelError
-        With key, value and what is allowed.
-    """
-
-    time_constants: tuple[float, ...] = ()
+    time_constants: tuple[float, ...] = ()  # τ_k, s, increasing; none, one or two
+    # (8, time constants): b_k of struts 1–6, base, platform, 1/K
     expansion: np.ndarray = field(default_factory=_nothing)
-    thermometer: str = ""
+    thermometer: str = ""  # The part whose sensor stands for all; empty: each part has its own
 
     def __post_init__(self) -> None:
         constants = tuple(float(value) for value in self.time_constants)
@@ -90,19 +76,11 @@ AT_ONCE = LateGrowth()
 
 @dataclass
 class Lag:
-    """How far a thermometer's late followers are behind it.
+    """How far a thermometer's late followers are behind it."""
 
-    Attributes
-    ----------
-    began, newest : float
-        Time of the first reading and of the newest one, s.
-    behind : list of float
-        d_k, K.
-    """
-
-    began: float
-    newest: float
-    behind: list[float]
+    began: float  # Time of the first reading and of the newest one, s
+    newest: float  # Time of the first reading and of the newest one, s
+    behind: list[float]  # d_k, K
 
     def take(self, change: float, time: float, time_constants: Sequence[float]) -> None:
         """Take a reading that differs from the last one by a `change`, K, at a time, s."""
@@ -120,21 +98,7 @@ def followed(behind: float, change: float, ages: float) -> float:
 
 
 def late(times: np.ndarray, values: np.ndarray, time_constants: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return how far lags are behind at each reading of some thermometers, K.
-
-    Parameters
-    ----------
-    times : ndarray, shape (N,)
-        When they were read, s, in any order.
-    values : ndarray, shape (N, sensors)
-        What they read, °C.
-    time_constants : sequence of K float
-        s.
-
-    Returns
-    -------
-    ndarray, shape (N, sensors, K)
-    """
+    """Return how far lags are behind at each reading of some thermometers, K."""
     constants, order = np.asarray(time_constants, dtype=float), np.argsort(times, kind="stable")
     changes, elapsed = np.diff(values[order], axis=0), np.diff(times[order])
     ages = elapsed[:, None] / constants

@@ -114,20 +114,7 @@ class Limits:
         return Struct("hc_limits", values)
 
     def margins(self, quantities: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Return what is left of each limit of single poses, and the values, by the limit's name.
-
-        Parameters
-        ----------
-        quantities : ndarray of :data:`~hexapod_comp.core.batch.QUANTITIES`, shape (N, S)
-            Of N poses in S stages.
-
-        Returns
-        -------
-        dict of str to (ndarray, ndarray)
-            Margins and values, shape (N, S, 6), (N, S, 1) for the condition number: m, rad. A margin is negative,
-            or NaN, exactly where :func:`~hexapod_comp.core.single.check_stage` refuses. Without ``clearance``
-            where it is not limited.
-        """
+        """Return what is left of each limit of single poses, and the values, by the limit's name."""
         angles, condition = np.arccos(np.clip(quantities["cosines"], -1.0, 1.0)), quantities["condition"][..., None]
         cones = np.array([self.base_cone, self.platform_cone]) - angles
         # An angle rounds where its cosine does not: the cosine says on which side of its limit it is.

@@ -27,13 +27,7 @@ LOOKED_AT = 33
 
 
 def check_magnitudes(model: MachineModel) -> None:
-    """Check the sizes of a model's numbers.
-
-    Raises
-    ------
-    ModelError
-        Naming the block, what is allowed and the largest value found; SI units.
-    """
+    """Check the sizes of a model's numbers."""
     for name in ("offset", "cosine", "sine", "backlash", "map_values", "map_backlash"):
         _check(f"struts.{name}", getattr(model.struts, name), STRUT_LENGTH, f"{STRUT_LENGTH * 1e3:g} mm")
     expansions = {f"thermal.{name}": getattr(model, name) for name in ("base_expansion", "platform_expansion")}

@@ -38,24 +38,12 @@ LARGEST_TURN = 0.1
 
 @dataclass(frozen=True)
 class Datum:
-    """A pose at which a calibration leaves the tool where the nominal machine has it.
+    """A pose at which a calibration leaves the tool where the nominal machine has it."""
 
-    Parameters
-    ----------
-    position, angles : tuple of float
-        ``pose_platform_in_base``: m, and the paper's α, β, γ, rad.
-    held : int
-        In how many of the six ways to shift and turn the whole machine. Those that the readings see are not held: there
-        the model says where the machine stands.
-
-    Raises
-    ------
-    ModelError
-        A number is not finite, or no such count.
-    """
-
-    position: tuple[float, float, float]
-    angles: tuple[float, float, float]
+    position: tuple[float, float, float]  # ``pose_platform_in_base``: m, and the paper's α, β, γ, rad
+    angles: tuple[float, float, float]  # ``pose_platform_in_base``: m, and the paper's α, β, γ, rad
+    # In how many of the six ways to shift and turn the whole machine. Those that the readings see are not held: there
+    # the model says where the machine stands
     held: int
 
     def __post_init__(self) -> None:
@@ -88,33 +76,19 @@ class Datum:
 
 @dataclass(frozen=True)
 class ModelOrigin:
-    """Where a model comes from; carried by the file, not used in the arithmetic.
+    """Where a model comes from; carried by the file, not used in the arithmetic."""
 
-    Parameters
-    ----------
-    date : str
-        ISO 8601 date of the fit.
-    sources : tuple of (str, str)
-        Name and SHA-256 of each data file that the model was fitted to.
-    held_out_residual : float or None
-        RMS tool error that the model left on data it was not fitted to, m; None when nobody measured it.
-    note : str
-        One line for people.
-    posterior : (str, str) or None
-        Name, beside the model file, and SHA-256 of the file that says how well the fit knows its parameters; None
-        when nobody says.
-    datum : Datum or None
-        Where the tool is not moved, and by how much that was free to choose; None when nobody says.
-    text_sha256 : str
-        Of the file that the model was read from, less the lines that name the posterior; empty when it was not read.
-    """
-
-    date: str = ""
-    sources: tuple[tuple[str, str], ...] = ()
+    date: str = ""  # ISO 8601 date of the fit
+    sources: tuple[tuple[str, str], ...] = ()  # Name and SHA-256 of each data file that the model was fitted to
+    # RMS tool error that the model left on data it was not fitted to, m; None when nobody measured it
     held_out_residual: float | None = None
-    note: str = ""
+    note: str = ""  # One line for people
+    # Name, beside the model file, and SHA-256 of the file that says how well the fit knows its parameters; None when
+    # nobody says
     posterior: tuple[str, str] | None = None
+    # Where the tool is not moved, and by how much that was free to choose; None when nobody says
     datum: Datum | None = None
+    # Of the file that the model was read from, less the lines that name the posterior; empty when it was not read
     text_sha256: str = dataclasses.field(default="", compare=False)
 
 
@@ -344,13 +318,7 @@ class RealMachine:
 
 
 def core_model(geometry: HexapodGeometry, model: MachineModel) -> Struct:
-    """Return a machine and its model for the core, ``hc_model``.
-
-    Raises
-    ------
-    ModelError
-        The model belongs to another machine.
-    """
+    """Return a machine and its model for the core, ``hc_model``."""
     if model.machine != geometry.name:
         problem = f"the model is for machine {model.machine!r}, the geometry is {geometry.name!r}"
         raise ModelError("machine", problem)
@@ -371,13 +339,7 @@ def write_temperatures(state: Struct, temperatures: Temperatures) -> None:
 
 
 class MachinesByTemperature:
-    """Real machines at temperatures that come again and again, each made once.
-
-    Parameters
-    ----------
-    geometry, model : HexapodGeometry, MachineModel
-        As for :class:`RealMachine`.
-    """
+    """Real machines at temperatures that come again and again, each made once."""
 
     def __init__(self, geometry: HexapodGeometry, model: MachineModel) -> None:
         self._geometry, self._model = geometry, model
@@ -417,24 +379,12 @@ class MachinesByTemperature:
 
 
 def commanded_box(geometry: HexapodGeometry, model: MachineModel) -> np.ndarray:
-    """Return the box of level tool positions in ``work`` for which a model was measured, shape (2, 3), m.
-
-    Raises
-    ------
-    ModelError
-        The model does not tell.
-    """
+    """Return the box of level tool positions in ``work`` for which a model was measured, shape (2, 3), m."""
     return measured_region(model).commanded(geometry)
 
 
 def measured_region(model: MachineModel) -> Region:
-    """Return where a model was measured.
-
-    Raises
-    ------
-    ModelError
-        The model does not tell.
-    """
+    """Return where a model was measured."""
     region = model.measured
     if region is None:
         raise ModelError("region", "the model tells of no box in which it was measured; give a box of tool positions")

@@ -175,22 +175,7 @@ def load_model(path: str | Path, geometry: HexapodGeometry) -> MachineModel:
 
 
 def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineModel:
-    """Return the model of a model file's text.
-
-    Parameters
-    ----------
-    text : str
-        All of it.
-    machine : str
-        Name of the machine that it must belong to.
-    name : str or Path
-        What messages call the file.
-
-    Raises
-    ------
-    InputFileError
-        As :func:`load_model`.
-    """
+    """Return the model of a model file's text."""
     top = parse_yaml(text, name, MODEL_FORMAT, MODEL_VERSION)
     _refuse_cut_off(top)
     given = top.text("machine")

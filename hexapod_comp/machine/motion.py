@@ -22,13 +22,6 @@ class MotionState:
     """Windows and directions of motion of the nine followed values.
 
     Given arrays are used in place; without them the state is that before the first value.
-
-    Attributes
-    ----------
-    low : ndarray, shape (9,)
-        Lower end of each window, m; NaN before the first value.
-    sense : ndarray, shape (9,)
-        +1 forward (increasing), −1 backward, 0 not yet known.
     """
 
     __slots__ = ("low", "sense")

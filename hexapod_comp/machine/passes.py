@@ -27,22 +27,12 @@ Poses = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Passes:
-    """Platform poses of a machine, each passed in a direction.
+    """Platform poses of a machine, each passed in a direction."""
 
-    Attributes
-    ----------
-    geometry : HexapodGeometry
-        The nominal machine.
-    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
-        Commanded ``pose_platform_in_base``, m.
-    directions : ndarray, shape (N, 3)
-        Directions of travel in ``base``; length does not matter.
-    """
-
-    geometry: HexapodGeometry
-    positions: np.ndarray
-    rotations: np.ndarray
-    directions: np.ndarray
+    geometry: HexapodGeometry  # The nominal machine
+    positions: np.ndarray  # (N, 3): commanded ``pose_platform_in_base``, m
+    rotations: np.ndarray  # (N, 3, 3): commanded ``pose_platform_in_base``, m
+    directions: np.ndarray  # (N, 3): directions of travel in ``base``; length does not matter
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -51,17 +41,7 @@ class Passes:
     def of_tool(
         geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray, directions: np.ndarray
     ) -> Passes:
-        """Return the passes that bring the tool to poses in the work frame.
-
-        Parameters
-        ----------
-        geometry : HexapodGeometry
-            With its tool and work frames.
-        positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
-            ``pose_tool_in_work``, m.
-        directions : ndarray, shape (N, 3)
-            Directions of travel in the work frame.
-        """
+        """Return the passes that bring the tool to poses in the work frame."""
         platform = geometry.platform_poses(positions, rotations)
         return Passes(geometry, *platform, directions @ geometry.work.rotation.T)
 
@@ -115,13 +95,7 @@ class Passes:
         return np.array([refusal is None for refusal in self.refusals()])
 
     def refuse_unreachable(self) -> None:
-        """Raise the error of the first pass that the nominal machine may not take.
-
-        Raises
-        ------
-        LimitError, KinematicsError
-            Naming the position.
-        """
+        """Raise the error of the first pass that the nominal machine may not take."""
         for position, refusal in zip(self.positions, self.refusals(), strict=True):
             if refusal is not None:
                 refusal.args = (f"{at(position)}: {refusal}",)

@@ -21,13 +21,7 @@ CARDAN = "#007f7f"
 
 
 def machine_figure(geometry: HexapodGeometry) -> Figure:
-    """Draw a machine at home: joints, struts and frames in space, joints and struts from above.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        Its tool and work frames are drawn where they differ from those that carry them.
-    """
+    """Draw a machine at home: joints, struts and frames in space, joints and struts from above."""
     figure = Figure(figsize=(12, 6), layout="constrained")
     space: Any = figure.add_subplot(1, 2, 1, projection="3d")
     above = figure.add_subplot(1, 2, 2)

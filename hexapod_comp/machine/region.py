@@ -25,25 +25,13 @@ PARALLEL = 1e-9
 
 @dataclass(frozen=True)
 class Region:
-    """A box of places of a point of the platform.
+    """A box of places of a point of the platform."""
 
-    Attributes
-    ----------
-    box : ndarray, shape (2, 3)
-        Lowest and highest place, m along the axes of `frame`.
-    point : ndarray, shape (3,)
-        The point in ``platform``, m: by default its origin.
-    position, angles : ndarray, shape (3,)
-        Of the box's frame in ``base``, m and α, β, γ in rad: the work frame in which was measured, by default ``base``.
-
-    Raises
-    ------
-    ModelError
-        A box without an inside, or places that are not finite.
-    """
-
-    box: np.ndarray
+    box: np.ndarray  # (2, 3): lowest and highest place, m along the axes of `frame`
+    # (3,): the point in ``platform``, m: by default its origin
     point: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    # (3,): of the box's frame in ``base``, m and α, β, γ in rad: the work frame in which was measured, by default
+    # ``base``
     position: np.ndarray = field(default_factory=lambda: np.zeros(3))
     angles: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
@@ -71,13 +59,7 @@ class Region:
             object.__setattr__(self, name, array)
 
     def contains(self, positions: np.ndarray, rotations: np.ndarray, slack: float = ON_THE_FACE) -> np.ndarray:
-        """Return whether the point is in the box, or out of it by no more than `slack`, m, at platform poses, (N,).
-
-        Parameters
-        ----------
-        positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
-            ``pose_platform_in_base``, m.
-        """
+        """Return whether the point is in the box, or out of it by no more than `slack`, m, at platform poses, (N,)."""
         places = (positions + rotations @ self.point - self.frame.position) @ self.frame.rotation
         return ((places >= self.box[0] - slack) & (places <= self.box[1] + slack)).all(axis=-1)
 

@@ -10,16 +10,10 @@ from numpy.typing import ArrayLike
 
 @dataclass(frozen=True)
 class Size:
-    """How large a set of vectors is.
+    """How large a set of vectors is."""
 
-    Attributes
-    ----------
-    rms, largest : float
-        Root mean square and largest length of the vectors.
-    """
-
-    rms: float
-    largest: float
+    rms: float  # Root mean square and largest length of the vectors
+    largest: float  # Root mean square and largest length of the vectors
 
     @staticmethod
     def of(vectors: np.ndarray) -> Size:

@@ -32,52 +32,30 @@ WAVE_PARTS, MAP_PARTS = ("cosine", "sine"), ("map_knots", "map_values", "map_bac
 
 @dataclass(frozen=True)
 class StrutErrors:
-    """Errors of the six struts; every array has shape (6,) unless it says otherwise, every default is zero.
+    """Errors of the six struts; every array has shape (6,) unless it says otherwise, every default is zero."""
 
-    Parameters
-    ----------
-    offset : ndarray
-        Length at a zero command error, m.
-    pitch : ndarray
-        Relative pitch error, m per m.
-    reference_length : ndarray
-        Command at which the pitch error is zero, m.
-    cosine, sine : ndarray, shape (6, n) or (6,)
-        Screw wave amplitudes, m: of the harmonics 1 to n per turn, n up to 4; of shape (6,), of the first alone. They
-        are kept as (6, n).
-    period : ndarray
-        Screw wave period, usually the lead, m; required above zero where an amplitude is not zero.
-    backlash : ndarray
-        Lost motion on reversal, m.
-    expansion : ndarray
-        Thermal expansion of the struts, 1/K.
-    moisture : ndarray
-        Growth of the struts by the air's relative humidity, m/m from 0 to 1.
-    map_knots : ndarray, shape (n,)
-        Commands of the length map, m, increasing; empty for none.
-    map_values : ndarray, shape (6, n)
-        Length error at the knots, m; a natural cubic spline runs between, the end values hold outside.
-    map_backlash : ndarray, shape (6, n)
-        By how much the lost motion on reversal is larger at the knots than `backlash`, m; in the same way. Left out, it
-        is the same everywhere.
-
-    Raises
-    ------
-    ModelError
-        Shapes, signs or slopes that no strut can have.
-    """
-
-    offset: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    pitch: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(6))  # Length at a zero command error, m
+    pitch: np.ndarray = field(default_factory=lambda: np.zeros(6))  # Relative pitch error, m per m
+    # Command at which the pitch error is zero, m
     reference_length: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    # (6, n): screw wave amplitudes, m: of the harmonics 1 to n per turn, n up to 4; of shape (6,), of the first alone.
+    # They are kept as (6, n)
     cosine: np.ndarray = field(default_factory=lambda: np.zeros((6, 1)))
+    # (6,): screw wave amplitudes, m: of the harmonics 1 to n per turn, n up to 4; of shape (6,), of the first alone.
+    # They are kept as (6, n)
     sine: np.ndarray = field(default_factory=lambda: np.zeros((6, 1)))
+    # Screw wave period, usually the lead, m; required above zero where an amplitude is not zero
     period: np.ndarray = field(default_factory=lambda: np.full(6, 0.01))
-    backlash: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    expansion: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    backlash: np.ndarray = field(default_factory=lambda: np.zeros(6))  # Lost motion on reversal, m
+    expansion: np.ndarray = field(default_factory=lambda: np.zeros(6))  # Thermal expansion of the struts, 1/K
+    # Growth of the struts by the air's relative humidity, m/m from 0 to 1
     moisture: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    # (n,): commands of the length map, m, increasing; empty for none
     map_knots: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    # (6, n): length error at the knots, m; a natural cubic spline runs between, the end values hold outside
     map_values: np.ndarray = field(default_factory=lambda: np.zeros((6, 0)))
+    # (6, n): by how much the lost motion on reversal is larger at the knots than `backlash`, m; in the same way. Left
+    # out, it is the same everywhere
     map_backlash: np.ndarray = field(default_factory=lambda: np.zeros((6, 0)))
 
     def __post_init__(self) -> None:

@@ -29,28 +29,14 @@ sensor's zero."""
 
 @dataclass(frozen=True)
 class Sensed:
-    """What a sensor reads.
+    """What a sensor reads."""
 
-    Attributes
-    ----------
-    title : str
-        For messages; ``{}`` stands for the sensor's name.
-    reference : float
-        What counts while nobody has told.
-    range : (float, float)
-        Readings outside are refused.
-    allowed : str
-        The same for people.
-    unit, difference : str
-        Unit of a reading, and of a difference of two, after a space.
-    """
-
-    title: str
-    reference: float
-    range: tuple[float, float]
-    allowed: str
-    unit: str = ""
-    difference: str = ""
+    title: str  # For messages; ``{}`` stands for the sensor's name
+    reference: float  # What counts while nobody has told
+    range: tuple[float, float]  # Readings outside are refused
+    allowed: str  # The same for people
+    unit: str = ""  # Unit of a reading, and of a difference of two, after a space
+    difference: str = ""  # Unit of a reading, and of a difference of two, after a space
 
 
 TEMPERATURE = Sensed(
@@ -100,13 +86,7 @@ class Temperatures:
     def restored(
         cls, values: Mapping[str, float], lags: Mapping[str, Sequence[float]], time_constants: int
     ) -> Temperatures:
-        """Return what a :meth:`snapshot` holds, for a model with so many time constants.
-
-        Raises
-        ------
-        ModelError
-            A temperature is not allowed, or a lag is not of such a model.
-        """
+        """Return what a :meth:`snapshot` holds, for a model with so many time constants."""
         for name, numbers in lags.items():
             if name not in values or len(numbers) != 2 + time_constants:
                 raise ModelError(f"snapshot.lags.{name}", f"must be {2 + time_constants} numbers", list(numbers))
@@ -121,11 +101,6 @@ class Temperatures:
         """Take a reading made at a time, s, on a clock that is never set; late parts follow.
 
         The first reading finds its followers at rest: what was before nobody knows.
-
-        Raises
-        ------
-        ModelError
-            As :meth:`set`; or there are time constants, and the time is not finite. Nothing was taken.
         """
         before = self.at(name)
         late_parts = bool(time_constants) and name != HUMIDITY
@@ -148,13 +123,7 @@ class Temperatures:
         return max(0.0, max(begun) + REST * late_growth.time_constants[-1] - time)
 
     def set(self, name: str, value: float) -> None:
-        """Take a reading, whenever it was made: late parts stay as far behind as they are.
-
-        Raises
-        ------
-        ModelError
-            Unknown name, not finite, or outside :data:`TEMPERATURE_RANGE` or :data:`HUMIDITY_RANGE`.
-        """
+        """Take a reading, whenever it was made: late parts stay as far behind as they are."""
         if name != HUMIDITY:
             check_part(name)
         quantity = quantity_of(name)

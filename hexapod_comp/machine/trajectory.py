@@ -33,21 +33,11 @@ COARSE = 20
 
 @dataclass(frozen=True)
 class Path:
-    """Poses to be sent one after the other at a constant rate.
+    """Poses to be sent one after the other at a constant rate."""
 
-    Attributes
-    ----------
-    positions : ndarray, shape (N, 3)
-        m, in the commanded frame.
-    rotations : ndarray, shape (N, 3, 3)
-        Rotation matrices.
-    rate : float
-        Poses per second, Hz.
-    """
-
-    positions: np.ndarray
-    rotations: np.ndarray
-    rate: float
+    positions: np.ndarray  # (N, 3): m, in the commanded frame
+    rotations: np.ndarray  # (N, 3, 3): rotation matrices
+    rate: float  # Poses per second, Hz
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -62,17 +52,6 @@ def move(geometry: HexapodGeometry, start: Pose, end: Pose, rate: float, feed: f
 
     Position runs straight, rotation along the shortest arc, both with the quintic 10t³ − 15t⁴ + 6t⁵, which
     starts and ends at rest.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        Its limits of step, speed and acceleration set the duration.
-    start, end : Pose
-        ``pose_tool_in_work``; the start is not part of the path, the end is.
-    rate : float
-        Poses per second, Hz.
-    feed : float, optional
-        Largest tool speed, m/s.
     """
     positions = np.array([start.position, end.position])
     return moves(geometry, positions, np.array([start.rotation, end.rotation]), rate, feed)[0]
@@ -85,26 +64,7 @@ def moves(
     rate: float,
     feed: float | None = None,
 ) -> tuple[Path, np.ndarray]:
-    """Return the moves (see :func:`move`) that join N tool poses, with a rest at each.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        Its limits of step, speed and acceleration set each move's duration.
-    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
-        Tool poses in the work frame, m; the first is not part of the path.
-    rate : float
-        Poses per second, Hz.
-    feed : float, optional
-        Largest tool speed, m/s.
-
-    Returns
-    -------
-    path : Path
-        All moves, one after the other.
-    counts : ndarray of int, shape (N − 1,)
-        Poses of each move.
-    """
+    """Return the moves (see :func:`move`) that join N tool poses, with a rest at each."""
     legs = np.arange(len(positions) - 1)
     share = np.tile(np.linspace(0.0, 1.0, COARSE + 1), len(legs))
     coarse = _interpolate(positions, rotations, np.repeat(legs, COARSE + 1), share)
@@ -127,19 +87,7 @@ def moves(
 
 
 def circle(centre: Pose, radius: float, feed: float, rate: float) -> Path:
-    """Return one full circle in the centre pose's xy plane, from rest to rest at its +x side.
-
-    Parameters
-    ----------
-    centre : Pose
-        Centre and orientation of the tool.
-    radius : float
-        m.
-    feed : float
-        Largest tool speed, m/s.
-    rate : float
-        Poses per second, Hz.
-    """
+    """Return one full circle in the centre pose's xy plane, from rest to rest at its +x side."""
     count = max(8, int(np.ceil(PEAK_OF_QUINTIC * 2.0 * np.pi * radius / feed * rate)))
     angle = 2.0 * np.pi * quintic(np.arange(count + 1) / count)
     offsets = radius * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
@@ -155,23 +103,7 @@ def quintic(t: np.ndarray) -> np.ndarray:
 def pocket(
     geometry: HexapodGeometry, corner: Pose, size: tuple[float, float], pitch: float, feed: float, rate: float
 ) -> Path:
-    """Return a rectangular pocket milled in a zigzag: every row reverses x, so that backlash shows.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        Its limits bound the speed of each stroke.
-    corner : Pose
-        Pose at the pocket's lowest x and y.
-    size : tuple of float
-        Length along x and y, m.
-    pitch : float
-        Distance of the rows, m.
-    feed : float
-        Largest tool speed, m/s.
-    rate : float
-        Poses per second, Hz.
-    """
+    """Return a rectangular pocket milled in a zigzag: every row reverses x, so that backlash shows."""
     rows = round(size[1] / pitch) + 1
     corners = []
     for row in range(rows):
@@ -186,18 +118,7 @@ def commanded_in_base(geometry: HexapodGeometry) -> HexapodGeometry:
 
 
 def feet_on(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> np.ndarray:
-    """Return the nearest place of a commanded polyline to each point, shape (n, 3), m: a late tool is no error.
-
-    Parameters
-    ----------
-    corners : ndarray, shape (N, 3)
-        Commanded positions, two at least, m.
-    points : ndarray, shape (n, 3)
-        Where the tool was, m.
-    sent : ndarray of int, shape (n,)
-        How many positions had been commanded when each was seen. Only what was commanded within the last
-        :data:`TRACK_WINDOW` counts, so that a path that crosses itself is not mistaken.
-    """
+    """Return the nearest place of a commanded polyline to each point, shape (n, 3), m: a late tool is no error."""
     start, along = corners[:-1], np.diff(corners, axis=0)
     square = np.maximum((along**2).sum(axis=1), 1e-30)
     newest = np.clip(sent, 1, len(start))
@@ -213,18 +134,7 @@ def feet_on(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> np.nda
 
 
 def motion_onto(corners: np.ndarray, points: np.ndarray, sent: np.ndarray) -> Pose | None:
-    """Return the rigid motion that brings points closest to a commanded polyline: the datum of a track aligned.
-
-    Parameters
-    ----------
-    corners, points, sent
-        As for :func:`feet_on`.
-
-    Returns
-    -------
-    Pose or None
-        T with T·points near the polyline; None for points in a line, which leave a turn open.
-    """
+    """Return the rigid motion that brings points closest to a commanded polyline: the datum of a track aligned."""
     every = max(1, len(points) // MOST_ALIGNED)
     points, sent, motion = points[::every], sent[::every], Pose.identity()
     for _ in range(ALIGNING_STEPS):

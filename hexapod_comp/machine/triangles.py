@@ -21,24 +21,6 @@ def closed_triangles(
 
     At a root of multiplicity m rounding spreads the solutions over ε^{1/m}, 1e-4 for m = 4, so distance
     alone does not tell copies from neighbours.
-
-    Parameters
-    ----------
-    circles : ndarray, shape (3, 3, 3)
-        Rows (centre, p, q) of each, m, in ``base``.
-    sides : ndarray, shape (3,)
-        |T1 − T2|, |T2 − T3|, |T3 − T1|, m.
-    starts : ndarray, shape (K, 3)
-        φ1, φ2, φ3, rad.
-    allowed : float
-        Largest error of a side, m.
-    distinct : float
-        Triangles whose corners all lie closer than this, m, are one.
-
-    Returns
-    -------
-    ndarray, shape (M, 3, 3)
-        T1..T3 as rows, in ``base``, m; of copies the one that closes best.
     """
     angles, points, errors = _settled(circles, sides, starts)
     left = errors.argsort()

@@ -28,21 +28,11 @@ FACES = ("−x", "+x", "−y", "+y", "−z", "+z")
 
 
 class ReachedBox(NamedTuple):
-    """A box of tool positions that a machine reaches.
+    """A box of tool positions that a machine reaches."""
 
-    Attributes
-    ----------
-    box : ndarray, shape (2, 3)
-        Lowest and highest corner, m in the work frame.
-    rotation : ndarray, shape (3, 3)
-        Orientation of the tool in the work frame, the same all over the box.
-    causes : dict of str to str
-        What stops each face, by its name as ``+x``.
-    """
-
-    box: np.ndarray
-    rotation: np.ndarray
-    causes: dict[str, str]
+    box: np.ndarray  # (2, 3): lowest and highest corner, m in the work frame
+    rotation: np.ndarray  # (3, 3): orientation of the tool in the work frame, the same all over the box
+    causes: dict[str, str]  # What stops each face, by its name as ``+x``
 
 
 def largest_box(reached: Reach) -> ReachedBox:
@@ -50,16 +40,6 @@ def largest_box(reached: Reach) -> ReachedBox:
 
     Every grid point within it is within all limits; then each face moves out as far as the limits let it, and all come
     in again by :data:`ROOM`.
-
-    Parameters
-    ----------
-    reached : Reach
-        What the machine reaches at one orientation.
-
-    Raises
-    ------
-    GeometryError
-        The reach is too small for its grid: no cell of it lies within.
     """
     piece = _home_piece(reached)
     corners = _largest_cells(piece)
@@ -83,11 +63,6 @@ def machine_box(geometry: HexapodGeometry, cells: int = CELLS) -> ReachedBox:
 
     Where the tool cannot be parallel to the work frame at home, as with one that is turned by 90°, it stays as it is at
     home.
-
-    Raises
-    ------
-    GeometryError
-        Nothing is within the limits.
     """
     level, home = np.eye(3), home_orientation(geometry)
     tip = geometry.tool_pose(geometry.home).position

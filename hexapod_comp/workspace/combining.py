@@ -40,13 +40,6 @@ def worst_case(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
     max |Σ u_e·v_e| over all u in ±1: not bounded, but found. All errors of one strut push the tool to and fro in one
     direction and count as one; those of a joint that several struts share, and of the tool, have directions of
     their own. The sums fill a body in space whose corner farthest out is sought (:func:`_farthest`).
-
-    Parameters
-    ----------
-    errors : SingleErrors
-        E errors.
-    vectors : ndarray, shape (N, E, 6)
-        Their effects to first order.
     """
     return _worst(_along_struts(errors, vectors).sum(axis=3))
 
@@ -69,23 +62,6 @@ def covariance_vectors(rows: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     error that is left after compensation at each pose, and :func:`monte_carlo` with normal deviates gives
     percentiles. In contrast to :func:`hexapod_comp.calibration.observability.expected_error`, pose by pose, and
     with nothing taken away for the datum.
-
-    Parameters
-    ----------
-    rows : ndarray, shape (N, 6, P)
-        ∂(displacement, rotation)/∂x of the parameters at each pose, as
-        :func:`hexapod_comp.calibration.sensitivity.derivatives` returns them.
-    covariance : ndarray, shape (P, P)
-        Of the parameters.
-
-    Returns
-    -------
-    ndarray, shape (N, P, 6)
-
-    Raises
-    ------
-    CalibrationError
-        The shapes do not fit, or the matrix is no covariance.
     """
     size = rows.shape[-1]
     if covariance.shape != (size, size):
@@ -94,13 +70,7 @@ def covariance_vectors(rows: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def covariance_factor(covariance: np.ndarray) -> np.ndarray:
-    """Return A with A·Aᵀ = a covariance, shape (P, P).
-
-    Raises
-    ------
-    CalibrationError
-        The matrix is no covariance.
-    """
+    """Return A with A·Aᵀ = a covariance, shape (P, P)."""
     scale = np.sqrt(np.abs(np.diag(covariance)))
     scale = np.where(scale > 0.0, scale, 1.0)
     normalised = covariance / np.outer(scale, scale)  # parameters of µm and of rad/m in one matrix
@@ -114,31 +84,19 @@ def covariance_factor(covariance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MonteCarlo:
-    """Percentiles of the combined error over many machines, with their confidence bounds.
+    """Percentiles of the combined error over many machines, with their confidence bounds."""
 
-    Attributes
-    ----------
-    percentiles : tuple of float
-        Q percentages.
-    values, low, high : ndarray, shape (Q, N, 2)
-        At each pose: percentile, and bounds between which the true one lies with the confidence asked for.
-    worst_values, worst_low, worst_high : ndarray, shape (Q, 2)
-        The same of each machine's largest error over all poses: its worst place is not every machine's.
-    draws : int
-        How many machines.
-    confidence : float
-        Of the bounds, 0…1.
-    """
-
-    percentiles: tuple[float, ...]
+    percentiles: tuple[float, ...]  # Q percentages
+    # (Q, N, 2): at each pose: percentile, and bounds between which the true one lies with the confidence asked for
     values: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    # (Q, 2): the same of each machine's largest error over all poses: its worst place is not every machine's
     worst_values: np.ndarray
     worst_low: np.ndarray
     worst_high: np.ndarray
-    draws: int
-    confidence: float
+    draws: int  # How many machines
+    confidence: float  # Of the bounds, 0…1
 
 
 def monte_carlo(
@@ -153,26 +111,6 @@ def monte_carlo(
 
     Each machine keeps its errors at all poses. The confidence bounds are order statistics: they hold for any
     distribution.
-
-    Parameters
-    ----------
-    vectors : ndarray, shape (N, E, 6)
-        Effects to first order.
-    draws : int
-        Machines.
-    percentiles : sequence of float
-        Percentages within (0, 100).
-    confidence : float
-        Of the bounds, within (0, 1).
-    seed : int
-        The same seed gives the same numbers.
-    distribution : str
-        ``uniform`` within ± the sizes, or ``normal`` with the sizes as standard deviations.
-
-    Raises
-    ------
-    ModelError
-        A value out of its range, or too few draws for such a percentile with such a confidence.
     """
     ranks = np.array([_ranks(draws, percentile, confidence) for percentile in percentiles])
     deviates = _deviates(vectors.shape[1], draws, distribution, seed)
@@ -219,39 +157,22 @@ def _ranks(draws: int, percentile: float, confidence: float) -> tuple[int, int, 
 
 @dataclass(frozen=True)
 class Allocation:
-    """What the errors may be, given what the tool's error may be.
+    """What the errors may be, given what the tool's error may be."""
 
-    Attributes
-    ----------
-    method : str
-        ``rss`` or ``worst_case``.
-    allowed : float
-        Allowed error of the tool at the worst pose, m or rad.
-    combined : float
-        What the budget as it is adds up to there.
-    pose : int
-        The worst pose's number.
-    scale : float
-        Largest factor that all sizes may be multiplied by.
-    alone : ndarray, shape (K,)
-        Largest factor of each type when all others stay: ∞ where it has no effect, NaN where the others alone are
-        too much.
-    only, without : ndarray, shape (K,)
-        What each type adds up to when there is no other, and what all others add up to without it, m or rad, each
-        at its own worst pose.
-    equal : ndarray, shape (K,)
-        Factors with which every type uses up the same part of what is allowed, and all together no more than that;
-        ∞ where a type has no effect.
-    """
-
-    method: str
-    allowed: float
-    combined: float
-    pose: int
-    scale: float
+    method: str  # ``rss`` or ``worst_case``
+    allowed: float  # Allowed error of the tool at the worst pose, m or rad
+    combined: float  # What the budget as it is adds up to there
+    pose: int  # The worst pose's number
+    scale: float  # Largest factor that all sizes may be multiplied by
+    # (K,): largest factor of each type when all others stay: ∞ where it has no effect, NaN where the others alone are
+    # too much
     alone: np.ndarray
+    # (K,): what each type adds up to when there is no other, and what all others add up to without it, m or rad, each
+    # at its own worst pose
     only: np.ndarray
     without: np.ndarray
+    # (K,): factors with which every type uses up the same part of what is allowed, and all together no more than that;
+    # ∞ where a type has no effect
     equal: np.ndarray
 
 
@@ -262,26 +183,7 @@ def allocate(
     method: str = RSS,
     quantity: int = DISPLACEMENT,
 ) -> Allocation:
-    """Return what each source may be so that the tool's error stays within what is allowed at every pose.
-
-    Parameters
-    ----------
-    errors : SingleErrors
-        The budget's errors.
-    vectors : ndarray, shape (N, E, 6)
-        Their effects to first order; some hundreds of poses: each type's search adds all of them up some ten times.
-    allowed : float
-        m, or rad for the rotation.
-    method : str
-        How errors add up: :func:`root_sum_of_squares` or :func:`worst_case`.
-    quantity : int
-        DISPLACEMENT or ROTATION.
-
-    Raises
-    ------
-    ModelError
-        Nothing is allowed, or the method is unknown, or there are no poses.
-    """
+    """Return what each source may be so that the tool's error stays within what is allowed at every pose."""
     _check_allocation(vectors, allowed, method)
     types = len(errors.kinds)
     parts = _squares(errors, vectors, quantity) if method == RSS else _along_struts(errors, vectors)

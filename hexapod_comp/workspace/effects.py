@@ -31,33 +31,16 @@ class Extremes:
     """Largest and smallest effect of each error type, and where they happen.
 
     Columns: largest and smallest translation, largest and smallest rotation.
-
-    Attributes
-    ----------
-    errors : SingleErrors
-        The E errors of K types.
-    values : ndarray, shape (K, 4)
-        m, m, rad, rad; NaN for a type without any effect to be had.
-    at_pose : ndarray of int, shape (K, 4)
-        Number of the pose; −1 for none.
-    at_error : ndarray of int, shape (K, 4)
-        Which single error.
-    positions, rotations : ndarray, shape (K, 4, 3), (K, 4, 3, 3)
-        That pose, ``pose_platform_in_base``, m.
-    failed : ndarray of int, shape (K,)
-        Effects without a certified solution: they are left out and counted.
-    poses : int
-        How many poses were looked at.
     """
 
-    errors: SingleErrors
-    values: np.ndarray
-    at_pose: np.ndarray
-    at_error: np.ndarray
-    positions: np.ndarray
-    rotations: np.ndarray
-    failed: np.ndarray
-    poses: int
+    errors: SingleErrors  # The E errors of K types
+    values: np.ndarray  # (K, 4): m, m, rad, rad; NaN for a type without any effect to be had
+    at_pose: np.ndarray  # (K, 4): number of the pose; −1 for none
+    at_error: np.ndarray  # (K, 4): which single error
+    positions: np.ndarray  # (K, 4, 3): that pose, ``pose_platform_in_base``, m
+    rotations: np.ndarray  # (K, 4, 3, 3): that pose, ``pose_platform_in_base``, m
+    failed: np.ndarray  # (K,): effects without a certified solution: they are left out and counted
+    poses: int  # How many poses were looked at
 
 
 def effect_vectors(
@@ -68,32 +51,7 @@ def effect_vectors(
     method: str = EXACT,
     threads: int | None = None,
 ) -> np.ndarray:
-    """Return what every error does to the tool at every pose, with its direction.
-
-    Parameters
-    ----------
-    geometry, errors : HexapodGeometry, SingleErrors
-        The nominal machine, with its tool and work frames; E errors, each acting alone.
-    positions, rotations : array_like, shape (N, 3), (N, 3, 3)
-        Nominal ``pose_platform_in_base``, m.
-    method : str
-        ``exact``: forward kinematics of the machine with the error, loops closed to rounding. ``linear``: by the
-        nominal machine's Jacobian. ``iteration``: by v. Daake et al.'s own, in small steps along tangents.
-    threads : int, optional
-        Threads to use; all cores by default.
-
-    Returns
-    -------
-    ndarray, shape (N, E, 6)
-        Displacement of the tool tip, m, and rotation vector, rad, actual minus nominal, along the axes of the
-        work frame. NaN where the pose is not finite, singular, above the limit of the condition number or in
-        another assembly mode, and where the machine with the error cannot close its loops.
-
-    Raises
-    ------
-    KinematicsError
-        Shapes do not fit, or the method is unknown.
-    """
+    """Return what every error does to the tool at every pose, with its direction."""
     positions, rotations = _poses(positions, rotations)
     each = _way(method)
     vectors = np.empty((len(positions), len(errors), 6))
@@ -143,11 +101,6 @@ def extremes(
 
     Of more poses than memory takes, hand over one part after the other and join the results with :func:`merged`:
     they are the same to the last bit however the poses are parted.
-
-    Parameters
-    ----------
-    first : int
-        Number of the first of these poses. The other arguments are those of :func:`effect_vectors`.
     """
     positions, rotations = _poses(positions, rotations)
     each = _way(method)
@@ -189,13 +142,7 @@ def _best_of_errors(errors: SingleErrors, vectors: Iterable[np.ndarray]) -> tupl
 
 
 def merged(parts: Iterable[Extremes]) -> Extremes:
-    """Return the extremes over several parts of a set of poses, given in the order of their poses.
-
-    Raises
-    ------
-    KinematicsError
-        There are no parts.
-    """
+    """Return the extremes over several parts of a set of poses, given in the order of their poses."""
     result: Extremes | None = None
     for part in parts:
         result = part if result is None else _merged_pair(result, part)
@@ -303,13 +250,7 @@ def _iterated(
 
 
 def _way(method: str) -> Callable[..., Iterator[np.ndarray]]:
-    """Return what yields the effects by a method.
-
-    Raises
-    ------
-    KinematicsError
-        It is unknown.
-    """
+    """Return what yields the effects by a method."""
     if method not in METHODS:
         raise KinematicsError(f"method must be one of {', '.join(METHODS)}, not {method!r}", method)
     return {EXACT: _exact, LINEAR: _linear, ITERATION: _iterated}[method]
@@ -356,13 +297,7 @@ def _sizes(vectors: np.ndarray) -> np.ndarray:
 
 
 def _poses(positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return poses as the core takes them: contiguous, a single rotation (3, 3) for all of them spread.
-
-    Raises
-    ------
-    KinematicsError
-        Their shapes are wrong.
-    """
+    """Return poses as the core takes them: contiguous, a single rotation (3, 3) for all of them spread."""
     positions = np.ascontiguousarray(positions, dtype=float)
     rotations = np.asarray(rotations, dtype=float)
     if rotations.shape == (3, 3):

@@ -11,18 +11,10 @@ from ..errors import GeometryError
 
 @dataclass(frozen=True)
 class Layer:
-    """A coloured mesh.
+    """A coloured mesh."""
 
-    Attributes
-    ----------
-    points : ndarray, shape (H, A, 3)
-        m in the work frame.
-    values : ndarray, shape (H, A)
-        SI.
-    """
-
-    points: np.ndarray
-    values: np.ndarray
+    points: np.ndarray  # (H, A, 3): m in the work frame
+    values: np.ndarray  # (H, A): SI
 
     def __post_init__(self) -> None:
         if self.points.ndim != 3 or self.points.shape[2] != 3 or self.points.shape[:2] != self.values.shape:
@@ -32,21 +24,11 @@ class Layer:
 
 @dataclass(frozen=True)
 class Quantity:
-    """What values mean and how they are shown.
+    """What values mean and how they are shown."""
 
-    Attributes
-    ----------
-    name : str
-        Such as "translation of the tool".
-    unit : str
-        Shown unit.
-    factor : float
-        Shown value per SI value.
-    """
-
-    name: str
-    unit: str
-    factor: float
+    name: str  # Such as "translation of the tool"
+    unit: str  # Shown unit
+    factor: float  # Shown value per SI value
 
     @property
     def label(self) -> str:

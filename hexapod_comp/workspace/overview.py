@@ -30,53 +30,22 @@ TURN = np.radians(5.0)
 
 @dataclass(frozen=True)
 class Overview:
-    """What is worth knowing of a machine before anything else.
+    """What is worth knowing of a machine before anything else."""
 
-    Attributes
-    ----------
-    geometry : HexapodGeometry
-        The machine.
-    reach : Reach
-        What it reaches with the tool as at home.
-    box : ReachedBox
-        The largest box in that.
-    campaign : ReachedBox
-        The box that campaigns take which give none: with the tool parallel to the work frame where it can be.
-    tilts : ndarray, shape (3, 2)
-        How far the tool tilts at home about x, y and z of the work frame, each alone, backward and forward, rad.
-    lengths : ndarray, shape (6,)
-        Strut lengths at home, m.
-    condition : float
-        Condition number at home.
-    doubts : tuple of str
-        What looks wrong.
-    """
-
-    geometry: HexapodGeometry
-    reach: Reach
-    box: ReachedBox
+    geometry: HexapodGeometry  # The machine
+    reach: Reach  # What it reaches with the tool as at home
+    box: ReachedBox  # The largest box in that
+    # The box that campaigns take which give none: with the tool parallel to the work frame where it can be
     campaign: ReachedBox
+    # (3, 2): how far the tool tilts at home about x, y and z of the work frame, each alone, backward and forward, rad
     tilts: np.ndarray
-    lengths: np.ndarray
-    condition: float
-    doubts: tuple[str, ...]
+    lengths: np.ndarray  # (6,): strut lengths at home, m
+    condition: float  # Condition number at home
+    doubts: tuple[str, ...]  # What looks wrong
 
 
 def overview(geometry: HexapodGeometry, cells: int = CELLS) -> Overview:
-    """Look a machine over.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        The machine.
-    cells : int
-        Of the reach's grid along its longest edge.
-
-    Raises
-    ------
-    GeometryError
-        Nothing is within the limits.
-    """
+    """Look a machine over."""
     reached = reach(geometry, home_orientation(geometry), cells)
     box = largest_box(reached)
     level = np.array_equal(reached.rotation.round(12), np.eye(3))

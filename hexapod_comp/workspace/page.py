@@ -33,40 +33,18 @@ LEVELS = 65535
 
 @dataclass(frozen=True)
 class PageData:
-    """What the page shows.
+    """What the page shows."""
 
-    Attributes
-    ----------
-    title : str
-        Headline: the machine.
-    note : str
-        What is seen and how the numbers came about; one paragraph.
-    errors : sequence of (str, str)
-        Each error's type and part, such as ("screw pitch ±20 µm", "strut 1"); errors of a type share a colour
-        scale.
-    quantities : sequence of Quantity
-        Such as translation and rotation.
-    frame_title : str
-        What the slider changes, such as "tilt about x".
-    frames : sequence of str
-        Its positions.
-    layers : sequence of str
-        Names of the nested shells, inside to outside.
-    points : ndarray, shape (F, S, H, A, 3)
-        Their meshes per frame, m in the work frame.
-    values : ndarray, shape (F, E, Q, S, H, A)
-        SI.
-    """
-
-    title: str
-    note: str
+    title: str  # Headline: the machine
+    note: str  # What is seen and how the numbers came about; one paragraph
+    # Each error's type and part, such as ("screw pitch ±20 µm", "strut 1"); errors of a type share a colour scale
     errors: Sequence[tuple[str, str]]
-    quantities: Sequence[Quantity]
-    frame_title: str
-    frames: Sequence[str]
-    layers: Sequence[str]
-    points: np.ndarray
-    values: np.ndarray
+    quantities: Sequence[Quantity]  # Such as translation and rotation
+    frame_title: str  # What the slider changes, such as "tilt about x"
+    frames: Sequence[str]  # Its positions
+    layers: Sequence[str]  # Names of the nested shells, inside to outside
+    points: np.ndarray  # (F, S, H, A, 3): their meshes per frame, m in the work frame
+    values: np.ndarray  # (F, E, Q, S, H, A): SI
 
     def __post_init__(self) -> None:
         counts = tuple(len(part) for part in (self.frames, self.errors, self.quantities, self.layers))
@@ -103,24 +81,7 @@ def page_data(study: Study, bodies: tuple[Shell, ...], frames: tuple[str, ...], 
 
 
 def write_page(path: str | Path, geometry: HexapodGeometry, data: PageData) -> None:
-    """Write the page, all or nothing.
-
-    Parameters
-    ----------
-    path : str or Path
-        HTML file.
-    geometry : HexapodGeometry
-        The machine; its outline at home is drawn.
-    data : PageData
-        Meshes and values.
-
-    Raises
-    ------
-    HexapodError
-        plotly is not installed.
-    InputFileError
-        The file cannot be written.
-    """
+    """Write the page, all or nothing."""
     write_text(path, page_text(geometry, data))
 
 

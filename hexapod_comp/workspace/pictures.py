@@ -54,19 +54,11 @@ WEDGE = 130.0
 
 @dataclass(frozen=True)
 class RankedRow:
-    """One bar pair of the ranked table.
+    """One bar pair of the ranked table."""
 
-    Attributes
-    ----------
-    name : str
-        Error type, with its size.
-    translation, rotation : tuple of float
-        Smallest and largest effect over the workspace, m and rad.
-    """
-
-    name: str
-    translation: tuple[float, float]
-    rotation: tuple[float, float]
+    name: str  # Error type, with its size
+    translation: tuple[float, float]  # Smallest and largest effect over the workspace, m and rad
+    rotation: tuple[float, float]  # Smallest and largest effect over the workspace, m and rad
 
 
 def shades(shares: np.ndarray) -> np.ndarray:
@@ -92,26 +84,7 @@ def shells_figure(
     title: str,
     limits: tuple[float, float] | None = None,
 ) -> Figure:
-    """Show shells of the workspace coloured by an effect (v. Daake et al., Figure 2), with the machine at home.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        The machine.
-    layers : sequence of Layer
-        From inside to outside; all but the innermost are cut open towards the eye.
-    quantity : Quantity
-        Of the values.
-    title : str
-        Machine, error and orientation.
-    limits : tuple of float, optional
-        Ends of the colour bar, SI; default the smallest and largest value.
-
-    Raises
-    ------
-    GeometryError
-        No layer, or values that are not finite.
-    """
+    """Show shells of the workspace coloured by an effect (v. Daake et al., Figure 2), with the machine at home."""
     values = _finite_values(layers) * quantity.factor
     scale = np.array(limits) * quantity.factor if limits else np.array([values.min(), values.max()])
     norm = Normalize(*scale)
@@ -131,19 +104,7 @@ def shells_figure(
 
 
 def causes_figure(geometry: HexapodGeometry, points: np.ndarray, findings: np.ndarray, title: str) -> Figure:
-    """Show what limits the workspace on its boundary, from above and from below.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        The machine.
-    points : ndarray, shape (H, A, 3)
-        Boundary mesh, m in the work frame.
-    findings : ndarray of int, shape (H, A)
-        Index into :data:`~hexapod_comp.workspace.reach.FINDINGS`.
-    title : str
-        Machine and orientation.
-    """
+    """Show what limits the workspace on its boundary, from above and from below."""
     faces, corners = _faces(points, 0.0)
     of_face = findings[corners]
     area = _areas(faces)
@@ -165,13 +126,7 @@ def causes_figure(geometry: HexapodGeometry, points: np.ndarray, findings: np.nd
 
 
 def overview_figure(overview: Overview) -> Figure:
-    """Show a machine at home with its frames, and in it what it reaches, by what limits it, and the largest box.
-
-    Parameters
-    ----------
-    overview : Overview
-        The machine looked over.
-    """
+    """Show a machine at home with its frames, and in it what it reaches, by what limits it, and the largest box."""
     geometry, body = overview.geometry, shell(overview.reach, RINGS, SECTORS)
     faces, corners = _faces(_in_base(geometry, body.points), 0.0)
     box = _in_base(geometry, _box_edges(overview.box.box))
@@ -224,20 +179,7 @@ def _box_edges(box: np.ndarray) -> np.ndarray:
 
 
 def ranking_figure(rows: Sequence[RankedRow], title: str) -> Figure:
-    """Show a ranked table as bars from smallest to largest effect over the workspace (v. Daake et al., Table 1).
-
-    Parameters
-    ----------
-    rows : sequence of RankedRow
-        From the worst down.
-    title : str
-        Machine and budget.
-
-    Raises
-    ------
-    GeometryError
-        No row.
-    """
+    """Show a ranked table as bars from smallest to largest effect over the workspace (v. Daake et al., Table 1)."""
     if not rows:
         raise GeometryError("rows", "of a ranking must be at least one")
     figure = Figure(figsize=(10.0, 1.9 + 0.42 * len(rows)), layout="constrained")

@@ -33,49 +33,25 @@ QUANTITIES = ("translation_max", "translation_min", "rotation_max", "rotation_mi
 
 @dataclass(frozen=True)
 class Extreme:
-    """One figure of the ranking.
+    """One figure of the ranking."""
 
-    Attributes
-    ----------
-    value : float
-        m or rad.
-    error : str
-        Which single error, with its type where several share a row.
-    position, angles : ndarray, shape (3,)
-        ``pose_tool_in_work`` where it happens: m; α, β, γ, rad.
-    pose : int
-        That pose's number.
-    """
-
-    value: float
-    error: str
-    position: np.ndarray
-    angles: np.ndarray
-    pose: int
+    value: float  # m or rad
+    error: str  # Which single error, with its type where several share a row
+    position: np.ndarray  # (3,): ``pose_tool_in_work`` where it happens: m; α, β, γ, rad
+    angles: np.ndarray  # (3,): ``pose_tool_in_work`` where it happens: m; α, β, γ, rad
+    pose: int  # That pose's number
 
 
 @dataclass(frozen=True)
 class RankingRow:
-    """One error type, or several that share a row.
+    """One error type, or several that share a row."""
 
-    Attributes
-    ----------
-    title : str
-        As people read it.
-    translation_max, translation_min : Extreme
-        Largest and smallest displacement of the tool, m.
-    rotation_max, rotation_min : Extreme
-        Largest and smallest of its rotation, the largest about three axes, rad.
-    failed : int
-        Effects that could not be had.
-    """
-
-    title: str
-    translation_max: Extreme
-    translation_min: Extreme
-    rotation_max: Extreme
-    rotation_min: Extreme
-    failed: int
+    title: str  # As people read it
+    translation_max: Extreme  # Largest and smallest displacement of the tool, m
+    translation_min: Extreme  # Largest and smallest displacement of the tool, m
+    rotation_max: Extreme  # Largest and smallest of its rotation, the largest about three axes, rad
+    rotation_min: Extreme  # Largest and smallest of its rotation, the largest about three axes, rad
+    failed: int  # Effects that could not be had
 
     def figures(self) -> np.ndarray:
         """Return the four values, m, m, rad, rad."""
@@ -84,21 +60,11 @@ class RankingRow:
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A row of v. Daake et al., Table 1, as printed; zeros where they print "≈ 0"; m and rad.
+    """A row of v. Daake et al., Table 1, as printed; zeros where they print "≈ 0"; m and rad."""
 
-    Attributes
-    ----------
-    title : str
-        As printed.
-    size : float
-        The error's size in the text, m.
-    figures : ndarray, shape (4,)
-        Translation max, min, m; rotation max, min, rad.
-    """
-
-    title: str
-    size: float
-    figures: np.ndarray
+    title: str  # As printed
+    size: float  # The error's size in the text, m
+    figures: np.ndarray  # (4,): translation max, min, m; rotation max, min, rad
 
 
 def _paper_row(title: str, size_um: float, um: tuple[float, float], mdeg: tuple[float, float]) -> PaperRow:
@@ -119,23 +85,7 @@ _SAME_AS_PAPER = {"quantisation": "quantization"}
 def ranked(
     extremes: Extremes, geometry: HexapodGeometry, joined: dict[str, tuple[str, ...]] | None = None
 ) -> list[RankingRow]:
-    """Return one row per error type, the largest displacement of the tool first (v. Daake et al., Table 1).
-
-    Parameters
-    ----------
-    extremes : Extremes
-        Over the workspace.
-    geometry : HexapodGeometry
-        For the tool's poses.
-    joined : dict of str to tuple of str, optional
-        Titles of types that share a row, by the row's title; those of v. Daake et al. by default, {} for none. A group
-        of which the budget has only one type keeps that type's own title.
-
-    Raises
-    ------
-    KinematicsError
-        A type has no effect that could be had at any pose.
-    """
+    """Return one row per error type, the largest displacement of the tool first (v. Daake et al., Table 1)."""
     rows = [_row(extremes, geometry, title, kinds) for title, kinds in _groups(extremes.errors, joined)]
     return sorted(rows, key=lambda row: -row.translation_max.value)
 

@@ -46,13 +46,7 @@ HALVINGS = 24
 
 
 class Examiner:
-    """Says what limits poses of a machine.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        Machine and limits.
-    """
+    """Says what limits poses of a machine."""
 
     def __init__(self, geometry: HexapodGeometry) -> None:
         self.geometry = geometry
@@ -60,24 +54,7 @@ class Examiner:
     def findings(
         self, positions: np.ndarray, rotations: np.ndarray, threads: int | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return what limits each of N poses, the first of :data:`FINDINGS` that applies.
-
-        Parameters
-        ----------
-        positions : ndarray, shape (N, 3)
-            Tool tip in the work frame, m.
-        rotations : ndarray, shape (N, 3, 3) or (1, 3, 3)
-            Orientation of the tool in the work frame; one may serve all.
-        threads : int, optional
-            Default: one per core.
-
-        Returns
-        -------
-        findings : ndarray of int8, shape (N,)
-            Index into :data:`FINDINGS`, 0 for a pose within all limits.
-        struts : ndarray of int8, shape (N, 2)
-            Struts concerned, 0…5; −1 where there is none, or no second one.
-        """
+        """Return what limits each of N poses, the first of :data:`FINDINGS` that applies."""
         findings, struts = np.empty(len(positions), np.int8), np.empty((len(positions), 2), np.int8)
 
         def run(rows: slice) -> None:
@@ -93,15 +70,7 @@ class Examiner:
     def boundary(
         self, inside: np.ndarray, outside: np.ndarray, rotation: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Bisect between M points within the limits and M beyond; return boundary, finding and struts there.
-
-        Parameters
-        ----------
-        inside, outside : ndarray, shape (M, 3)
-            Tool tips in the work frame, m.
-        rotation : ndarray, shape (3, 3)
-            Orientation of the tool in the work frame.
-        """
+        """Bisect between M points within the limits and M beyond; return boundary, finding and struts there."""
         inside, outside, rotations = inside.copy(), outside.copy(), rotation[None]
         findings, struts = self.findings(outside, rotations)
         for _ in range(HALVINGS):
@@ -115,52 +84,25 @@ class Examiner:
 
 @dataclass(frozen=True)
 class Boundary:
-    """Where the lines of a grid leave the reach, or enter it.
+    """Where the lines of a grid leave the reach, or enter it."""
 
-    Attributes
-    ----------
-    positions : ndarray, shape (M, 3)
-        Last point within the limits, m in the work frame.
-    findings : ndarray of int, shape (M,)
-        What limits there, index into :data:`FINDINGS`.
-    struts : ndarray of int, shape (M, 2)
-        Struts concerned, 0…5 or −1.
-    axis : ndarray of int, shape (M,)
-        Axis of the line, 0…2.
-    outward : ndarray, shape (M,)
-        +1 where the line leaves the reach in the sense of its axis, −1 where it enters.
-    """
-
-    positions: np.ndarray
-    findings: np.ndarray
-    struts: np.ndarray
-    axis: np.ndarray
-    outward: np.ndarray
+    positions: np.ndarray  # (M, 3): last point within the limits, m in the work frame
+    findings: np.ndarray  # (M,): what limits there, index into :data:`FINDINGS`
+    struts: np.ndarray  # (M, 2): struts concerned, 0…5 or −1
+    axis: np.ndarray  # (M,): axis of the line, 0…2
+    outward: np.ndarray  # (M,): +1 where the line leaves the reach in the sense of its axis, −1 where it enters
 
 
 @dataclass(frozen=True)
 class Reach:
-    """What a machine reaches at one orientation.
+    """What a machine reaches at one orientation."""
 
-    Attributes
-    ----------
-    geometry : HexapodGeometry
-        The machine.
-    rotation : ndarray, shape (3, 3)
-        Orientation of the tool in the work frame.
-    axes : tuple of three ndarray
-        Coordinates of the grid, m; the spacing is the same along all three.
-    findings : ndarray of int8, shape (X, Y, Z)
-        What limits each grid point, index into :data:`FINDINGS`.
-    boundary : Boundary
-        Where the grid's lines cross the boundary.
-    """
-
-    geometry: HexapodGeometry
-    rotation: np.ndarray
+    geometry: HexapodGeometry  # The machine
+    rotation: np.ndarray  # (3, 3): orientation of the tool in the work frame
+    # Coordinates of the grid, m; the spacing is the same along all three
     axes: tuple[np.ndarray, np.ndarray, np.ndarray]
-    findings: np.ndarray
-    boundary: Boundary
+    findings: np.ndarray  # (X, Y, Z): what limits each grid point, index into :data:`FINDINGS`
+    boundary: Boundary  # Where the grid's lines cross the boundary
 
     @property
     def within(self) -> np.ndarray:
@@ -243,42 +185,13 @@ def home_orientation(geometry: HexapodGeometry) -> np.ndarray:
 
 
 def orientations(geometry: HexapodGeometry, angles: Sequence[Sequence[float]]) -> np.ndarray:
-    """Return all combinations of angles, on top of the orientation at home.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        The machine.
-    angles : sequence of three array_like
-        Values of α, β and γ, rad; R = R_home·Ry(β)·Rx(α)·Rz(γ).
-
-    Returns
-    -------
-    ndarray, shape (N, 3, 3)
-    """
+    """Return all combinations of angles, on top of the orientation at home."""
     grid = np.stack(np.meshgrid(*angles, indexing="ij"), axis=-1).reshape(-1, 3)
     return home_orientation(geometry) @ rotation_from_angles(grid)
 
 
 def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: int = 40) -> Reach:
-    """Find what a machine reaches at one orientation.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        Machine and limits.
-    rotation : ndarray, shape (3, 3), optional
-        Orientation of the tool in the work frame; default as at home.
-    cells : int
-        Cells along the longest edge of the grid.
-
-    Raises
-    ------
-    GeometryError
-        Nothing is within the limits, or a number of cells that makes no sense.
-    PoseError
-        The orientation is no rotation.
-    """
+    """Find what a machine reaches at one orientation."""
     if not CELLS[0] <= cells <= CELLS[1]:
         raise GeometryError("cells", f"must lie in {CELLS[0]}…{CELLS[1]}", cells)
     rotation = home_orientation(geometry) if rotation is None else Pose(np.zeros(3), rotation).rotation
@@ -297,13 +210,7 @@ def reach(geometry: HexapodGeometry, rotation: np.ndarray | None = None, cells: 
 
 
 def reaches(geometry: HexapodGeometry, rotations: np.ndarray, cells: int = 40) -> tuple[Reach, ...]:
-    """Find what a machine reaches at each of some orientations, shape (M, 3, 3); see :func:`reach`.
-
-    Raises
-    ------
-    GeometryError
-        At one of them nothing is within the limits; names it.
-    """
+    """Find what a machine reaches at each of some orientations, shape (M, 3, 3); see :func:`reach`."""
     return tuple(reach(geometry, rotation, cells) for rotation in rotations)
 
 
@@ -312,11 +219,6 @@ def possible_box(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
 
     At constant orientation each strut holds the tool tip within a ball about a fixed point; the box holds what
     all six balls have in common.
-
-    Raises
-    ------
-    GeometryError
-        The balls have nothing in common.
     """
     at_origin, turned = geometry.platform_poses(np.zeros((1, 3)), rotation[None])
     struts = at_origin[0] + geometry.platform_joints @ turned[0].T - geometry.base_joints

@@ -32,33 +32,15 @@ PART = 65_536
 
 @dataclass(frozen=True)
 class Part:
-    """Poses of one orientation that are looked at together.
+    """Poses of one orientation that are looked at together."""
 
-    Attributes
-    ----------
-    geometry : HexapodGeometry
-        The machine.
-    errors : SingleErrors
-        The errors.
-    points : ndarray, shape (N, 3)
-        Tool tips in the work frame, m.
-    rotation : ndarray, shape (3, 3)
-        Orientation of the tool in the work frame.
-    method : str
-        As for :func:`~hexapod_comp.workspace.effects.extremes`.
-    first : int
-        Number of the first pose.
-    threads : int or None
-        Threads to use.
-    """
-
-    geometry: HexapodGeometry
-    errors: SingleErrors
-    points: np.ndarray
-    rotation: np.ndarray
-    method: str
-    first: int
-    threads: int | None
+    geometry: HexapodGeometry  # The machine
+    errors: SingleErrors  # The errors
+    points: np.ndarray  # (N, 3): tool tips in the work frame, m
+    rotation: np.ndarray  # (3, 3): orientation of the tool in the work frame
+    method: str  # As for :func:`~hexapod_comp.workspace.effects.extremes`
+    first: int  # Number of the first pose
+    threads: int | None  # Threads to use
 
 
 def look_at(part: Part) -> Extremes:
@@ -75,28 +57,7 @@ def survey(
     scheduler: str | None = None,
     progress: Callable[[int], object] = lambda count: None,
 ) -> Extremes:
-    """Return the extremes of every error's effect over all grid points within some reaches.
-
-    Parameters
-    ----------
-    reaches : iterable of Reach
-        One for each orientation.
-    errors : SingleErrors
-        Errors.
-    method : str
-        ``exact``, ``linear`` or ``iteration``.
-    workers : int
-        Local processes; 1 stays in this one, with all its threads.
-    scheduler : str, optional
-        Address of a Dask scheduler (``tcp://host:8786``) that takes the parts instead.
-    progress : callable
-        Called with the number of poses done since the last call.
-
-    Raises
-    ------
-    HexapodError
-        The scheduler's library is not installed, or it cannot be reached.
-    """
+    """Return the extremes of every error's effect over all grid points within some reaches."""
     alone = workers <= 1 and scheduler is None
     parts = _parts(reaches, errors, method, None if alone else 1)
     if scheduler is not None:
@@ -136,13 +97,7 @@ def _in_processes(parts: Iterable[Part], workers: int) -> Iterator[Extremes]:
 
 
 def _on_cluster(parts: Iterable[Part], scheduler: str) -> Iterator[Extremes]:
-    """Yield the parts' extremes in order, from a Dask cluster.
-
-    Raises
-    ------
-    HexapodError
-        Dask is missing, no scheduler answers, or it has no workers.
-    """
+    """Yield the parts' extremes in order, from a Dask cluster."""
     if not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d{1,5}", scheduler):
         raise HexapodError(f"a scheduler's address is like tcp://host:8786, not {scheduler!r}")
     try:

@@ -29,35 +29,16 @@ class Shell:
     """The boundary of a reach as a mesh of rings from bottom to top.
 
     Both poles are rings of one point, and the last azimuth repeats the first, so that the mesh is closed.
-
-    Attributes
-    ----------
-    geometry : HexapodGeometry
-        The machine.
-    rotation : ndarray, shape (3, 3)
-        Orientation of the tool in the work frame.
-    centre : ndarray, shape (3,)
-        Where the rays start, m in the work frame.
-    points : ndarray, shape (H, A, 3)
-        Tool tip on the boundary, m in the work frame.
-    findings : ndarray of int8, shape (H, A)
-        What limits there, index into :data:`~hexapod_comp.workspace.reach.FINDINGS`.
-    struts : ndarray of int8, shape (H, A, 2)
-        Struts concerned, 0…5 or −1.
-    folded : ndarray of bool, shape (H, A)
-        The ray enters the reach again beyond a gap: there is more than the mesh shows.
-    coverage : float
-        Volume inside the mesh over the volume of the reach.
     """
 
-    geometry: HexapodGeometry
-    rotation: np.ndarray
-    centre: np.ndarray
-    points: np.ndarray
-    findings: np.ndarray
-    struts: np.ndarray
-    folded: np.ndarray
-    coverage: float
+    geometry: HexapodGeometry  # The machine
+    rotation: np.ndarray  # (3, 3): orientation of the tool in the work frame
+    centre: np.ndarray  # (3,): where the rays start, m in the work frame
+    points: np.ndarray  # (H, A, 3): tool tip on the boundary, m in the work frame
+    findings: np.ndarray  # (H, A): what limits there, index into :data:`~hexapod_comp.workspace.reach.FINDINGS`
+    struts: np.ndarray  # (H, A, 2): struts concerned, 0…5 or −1
+    folded: np.ndarray  # (H, A): the ray enters the reach again beyond a gap: there is more than the mesh shows
+    coverage: float  # Volume inside the mesh over the volume of the reach
 
     @property
     def volume(self) -> float:
@@ -68,11 +49,6 @@ class Shell:
         """Return the mesh shrunk towards the centre, shape (H, A, 3), m in the work frame.
 
         Every point of it is within reach, since it lies on a ray before the boundary.
-
-        Raises
-        ------
-        GeometryError
-            The fraction is not in (0, 1].
         """
         if not 0.0 < fraction <= 1.0:
             raise GeometryError("fraction", "of the reach must lie in (0, 1]", fraction)
@@ -84,20 +60,7 @@ class Shell:
 
 
 def shell(reach: Reach, rings: int = 37, sectors: int = 72) -> Shell:
-    """Find the boundary of a reach along rays from its centre.
-
-    Parameters
-    ----------
-    reach : Reach
-        What the machine reaches at one orientation.
-    rings, sectors : int
-        Rings from pole to pole and points around; the mesh has (rings, sectors + 1) points.
-
-    Raises
-    ------
-    GeometryError
-        Too coarse a mesh.
-    """
+    """Find the boundary of a reach along rays from its centre."""
     _check_mesh(rings, sectors)
     ends, findings, struts, folded = _cast(reach, reach.centre, _directions(reach, rings, sectors))
     points = _closed(ends.reshape(rings, -1, 3))

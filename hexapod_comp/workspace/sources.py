@@ -32,31 +32,17 @@ LARGEST = 0.1
 
 @dataclass(frozen=True)
 class SingleErrors:
-    """Errors that act alone, one after the other; arrays have one entry an error.
+    """Errors that act alone, one after the other; arrays have one entry an error."""
 
-    Attributes
-    ----------
-    kind : ndarray of int, shape (E,)
-        Index into `kinds`.
-    part : ndarray of int, shape (E,)
-        LENGTH, BASE_JOINT, PLATFORM_JOINT or TOOL.
-    struts : ndarray of bool, shape (E, 6)
-        Whose length, or whose end, it changes: a ball joint that two struts share moves both. None for the tool.
-    vector : ndarray, shape (E, 3)
-        For joints and tool the displacement in their body's frame, m. For lengths the coefficients a, b, c of
-        δL = a + b·(L − L_home) + c·L.
-    kinds : tuple of str
-        Names of the error types, in the budget's order.
-    labels : tuple of str
-        Name of each error.
-    """
-
-    kind: np.ndarray
-    part: np.ndarray
+    kind: np.ndarray  # (E,): index into `kinds`
+    part: np.ndarray  # (E,): LENGTH, BASE_JOINT, PLATFORM_JOINT or TOOL
+    # (E, 6): whose length, or whose end, it changes: a ball joint that two struts share moves both. None for the tool
     struts: np.ndarray
+    # (E, 3): for joints and tool the displacement in their body's frame, m. For lengths the coefficients a, b, c of δL
+    # = a + b·(L − L_home) + c·L
     vector: np.ndarray
-    kinds: tuple[str, ...]
-    labels: tuple[str, ...]
+    kinds: tuple[str, ...]  # Names of the error types, in the budget's order
+    labels: tuple[str, ...]  # Name of each error
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -81,23 +67,12 @@ Row = tuple[int, np.ndarray, tuple[float, ...], str]
 
 @dataclass(frozen=True)
 class SourceType:
-    """A type of error as a budget may name it.
+    """A type of error as a budget may name it."""
 
-    Attributes
-    ----------
-    name : str
-        Key in the budget file, without its unit.
-    dimension : str
-        Kind of unit of its size.
-    title : str
-        What people read.
-    make : callable
-        From a size in SI and the struts that end in each platform joint, shape (joints, 6), to the single errors.
-    """
-
-    name: str
-    dimension: str
-    title: str
+    name: str  # Key in the budget file, without its unit
+    dimension: str  # Kind of unit of its size
+    title: str  # What people read
+    # From a size in SI and the struts that end in each platform joint, shape (joints, 6), to the single errors
     make: Callable[[float, np.ndarray], Iterable[Row]]
 
 
@@ -180,22 +155,7 @@ class Budget:
                 raise ModelError(f"errors.{name}", f"must be above zero and below {LARGEST:g} (m, or relative)", size)
 
     def single_errors(self, geometry: HexapodGeometry, shared_platform_joints: bool = True) -> SingleErrors:
-        """Return every single error of the budget.
-
-        Parameters
-        ----------
-        geometry : HexapodGeometry
-            The machine.
-        shared_platform_joints : bool
-            Platform joints that coincide nominally are one ball joint: one error moves the ends of all its struts,
-            as in :class:`~hexapod_comp.virtual.imperfections.ImperfectionBounds`. False: each strut has a joint of its
-            own, as in v. Daake et al.'s error model of one leg.
-
-        Raises
-        ------
-        ModelError
-            The budget is another machine's.
-        """
+        """Return every single error of the budget."""
         if self.machine != geometry.name:
             raise ModelError("machine", f"the budget is for {self.machine!r}, the geometry is {geometry.name!r}")
         first = first_of_same(geometry.platform_joints) if shared_platform_joints else np.arange(6)

@@ -35,39 +35,21 @@ RINGS, SECTORS = 19, 36
 
 @dataclass(frozen=True)
 class Combined:
-    """What the whole budget does at random poses of the workspace; columns are m and rad.
+    """What the whole budget does at random poses of the workspace; columns are m and rad."""
 
-    Attributes
-    ----------
-    worst_case, root_sum_of_squares : ndarray, shape (2,)
-        Largest over the poses.
-    monte_carlo : MonteCarlo
-        Uniform errors within the budget's bounds.
-    """
-
-    worst_case: np.ndarray
-    root_sum_of_squares: np.ndarray
-    monte_carlo: MonteCarlo
+    worst_case: np.ndarray  # (2,): largest over the poses
+    root_sum_of_squares: np.ndarray  # (2,): largest over the poses
+    monte_carlo: MonteCarlo  # Uniform errors within the budget's bounds
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How the three methods agree at random poses.
+    """How the three methods agree at random poses."""
 
-    Attributes
-    ----------
-    effects : int
-        How many were compared.
-    linear, tangential : float
-        Largest difference to the exact displacement, over the largest exact one of the same error type.
-    drift : float
-        Largest length error of a passive leg over the travel of the active one, for legs of wrong length.
-    """
-
-    effects: int
-    linear: float
-    tangential: float
-    drift: float
+    effects: int  # How many were compared
+    linear: float  # Largest difference to the exact displacement, over the largest exact one of the same error type
+    tangential: float  # Largest difference to the exact displacement, over the largest exact one of the same error type
+    drift: float  # Largest length error of a passive leg over the travel of the active one, for legs of wrong length
 
 
 @dataclass(frozen=True)
@@ -183,17 +165,7 @@ def random_poses(reaches: tuple[Reach, ...], count: int, seed: int) -> tuple[np.
 def compared(
     geometry: HexapodGeometry, errors: SingleErrors, reaches: tuple[Reach, ...], count: int, seed: int
 ) -> Agreement:
-    """Compare the three methods at random poses of the workspace, all errors but the tool's.
-
-    Parameters
-    ----------
-    geometry, errors, reaches
-        As in :class:`Study`.
-    count : int
-        Poses.
-    seed : int
-        Picks them.
-    """
+    """Compare the three methods at random poses of the workspace, all errors but the tool's."""
     moved = errors.select(errors.part != TOOL)
     positions, rotations = random_poses(reaches, count, seed)
     exact = effects(geometry, moved, positions, rotations, EXACT)[..., 0]
@@ -221,15 +193,7 @@ def shells_of(reaches: tuple[Reach, ...]) -> tuple[Shell, ...]:
 
 
 def mesh_effects(study: Study, body: Shell) -> tuple[np.ndarray, np.ndarray]:
-    """Return nested meshes of a shell and every error's effect on them.
-
-    Returns
-    -------
-    points : ndarray, shape (S, H, A, 3)
-        m in the work frame.
-    values : ndarray, shape (E, 2, S, H, A)
-        m and rad.
-    """
+    """Return nested meshes of a shell and every error's effect on them."""
     points = np.stack([body.scaled(fraction) for fraction in LAYERS])
     poses = [body.platform_poses(fraction) for fraction in LAYERS]
     positions, rotations = (np.concatenate([pose[k] for pose in poses]) for k in range(2))

@@ -32,28 +32,15 @@ MOST_CORRECTIONS = 20
 
 @dataclass(frozen=True)
 class TangentialResult:
-    """Where the iteration ends at each of N poses.
+    """Where the iteration ends at each of N poses."""
 
-    Attributes
-    ----------
-    vectors : ndarray, shape (N, 6)
-        Displacement of the tool and its rotation vector, actual minus nominal, along the axes of the work frame;
-        m, rad. NaN where the legs could not be brought back within the tolerance.
-    drift : ndarray, shape (N,)
-        Largest length error of a passive leg that any step left before correction, m.
-    travel : ndarray, shape (N,)
-        How far the active legs went, m.
-    steps : int
-        How many steps.
-    corrections : ndarray of int, shape (N,)
-        How many corrections.
-    """
-
+    # (N, 6): displacement of the tool and its rotation vector, actual minus nominal, along the axes of the work frame;
+    # m, rad. NaN where the legs could not be brought back within the tolerance
     vectors: np.ndarray
-    drift: np.ndarray
-    travel: np.ndarray
-    steps: int
-    corrections: np.ndarray
+    drift: np.ndarray  # (N,): largest length error of a passive leg that any step left before correction, m
+    travel: np.ndarray  # (N,): how far the active legs went, m
+    steps: int  # How many steps
+    corrections: np.ndarray  # (N,): how many corrections
 
 
 @dataclass
@@ -112,26 +99,6 @@ def tangential_effects(
 
     A leg of wrong length travels to it in steps, all other legs held. A joint travels to its wrong place in
     steps; its legs are active and take back the length that the joint's travel gives them.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        The nominal machine.
-    errors : SingleErrors
-        Errors.
-    index : int
-        Which of them.
-    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
-        Nominal ``pose_platform_in_base``, m.
-    step : float
-        Largest travel of leg or joint per step, m.
-    tolerance : float
-        ε, m.
-
-    Raises
-    ------
-    KinematicsError
-        Step or tolerance not above zero; SingularError.
     """
     for name, value in (("step", step), ("tolerance", tolerance)):
         if not 0.0 < value < math.inf:

@@ -28,24 +28,12 @@ TURN_STEP, LONGEST_TURN = math.radians(0.5), math.pi
 
 @dataclass(frozen=True)
 class Travel:
-    """How far a tool may go one way.
+    """How far a tool may go one way."""
 
-    Attributes
-    ----------
-    coordinate : str
-        One of :data:`COORDINATES`; the others stay.
-    sign : int
-        1 or −1.
-    distance : float
-        The furthest that all limits allow, m or rad.
-    error : HexapodError or None
-        What stands beyond; None where a turn ends at π.
-    """
-
-    coordinate: str
-    sign: int
-    distance: float
-    error: HexapodError | None
+    coordinate: str  # One of :data:`COORDINATES`; the others stay
+    sign: int  # 1 or −1
+    distance: float  # The furthest that all limits allow, m or rad
+    error: HexapodError | None  # What stands beyond; None where a turn ends at π
 
     @property
     def way(self) -> str:
@@ -77,27 +65,6 @@ def travel(
     number, assembly mode, correction, and the field's box where the model refuses what lies outside. Those of motions,
     step, speed and acceleration, do not. Directions of motion are not known, as for
     :func:`~hexapod_comp.compensation.checks.check` with ``poses``.
-
-    Parameters
-    ----------
-    machine : RealMachine
-        Limits, model, and the tool in use.
-    tool_pose : Pose
-        Of the tool in `frame`; angles are the paper's α, β, γ.
-    frame : Pose, optional
-        Seen from ``base``; the machine's work frame by default.
-    compensates : bool, optional
-        Corrections are on.
-
-    Returns
-    -------
-    tuple of Travel
-        +x, −x, +y, … −γ.
-
-    Raises
-    ------
-    LimitError, KinematicsError, OutsideFieldError
-        The pose itself is not allowed.
     """
     start = _Outset(machine, tool_pose, machine.geometry.work if frame is None else frame, compensates)
     return tuple(start.travel(coordinate, sign) for coordinate in COORDINATES for sign in (1, -1))
