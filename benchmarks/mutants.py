@@ -32,7 +32,7 @@ import scipy.spatial.transform  # noqa: F401
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "hexapod_comp"
 FOLDER = ROOT / "out" / "mutants"
-CORE = ("pose.py", "calibration/linear_problem.py", "calibration/sensitivity.py", "calibration/selection.py")
+CORE = ("pose.py", "calibration/estimator.py", "calibration/sensitivity.py", "calibration/selection.py")
 CORE += ("machine/*.py", "compensation/*.py")
 NOT_CORE = {"pictures.py"}
 

@@ -24,9 +24,9 @@ from pathlib import Path
 import numpy as np
 
 from hexapod_comp.calibration.candidates import MeasuringBox
+from hexapod_comp.calibration.estimator import physical_covariance
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.gains import Aim, seen_by
-from hexapod_comp.calibration.linear_problem import physical_covariance
 from hexapod_comp.calibration.observability import box_stations, expected_error
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.proposal import Goal, Proposal, Times, propose

@@ -23,7 +23,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is loaded: th
 
 import numpy as np
 
-from hexapod_comp.calibration.estimation import Estimation
+from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.lead import ScrewLead, look_for_lead

@@ -33,9 +33,9 @@ from ..measurements.standards import (
     notes_of,
 )
 from ..workspace.overview import corners
-from .cells import Cells
 from .fit import ModelFit
 from .observability import ToolError, listed
+from .observations import Cells
 from .report import tilt_doubt
 
 FORMAT, VERSION = "hexapod_comp/certificate", 1

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import CalibrationError
 from ..measurements.readings import CHANNELS, MeasurementSet
 from .changes import OTHER, READING, Change
-from .estimation import Estimation
+from .estimator import Estimation
 from .evidence import Evidence
 from .posterior import FittedParameters
 
@@ -116,7 +116,7 @@ def weigh(
 
 def _seen(estimation: Estimation) -> np.ndarray:
     """Return an orthonormal basis (places, n) of what is left of readings beside all that instruments do not know."""
-    free = estimation.free_of_unknowns(np.eye(len(estimation.cells.station)))
+    free = estimation.free_of_nuisance(np.eye(len(estimation.cells.station)))
     directions, sizes, _ = np.linalg.svd(free)
     return directions[:, sizes > SAME * sizes.max(initial=0.0)]
 

@@ -18,7 +18,7 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths
 from ..machine.model import Datum, MachineModel
 from ..pose import Pose
-from .estimation import Estimation
+from .estimator import Estimation
 from .sensitivity import carried
 from .smooth_field import DIGITS
 
@@ -164,7 +164,7 @@ def unseen_part(
     geometry = measurements.geometry
     arms = measurements.points() - (pose @ geometry.tool).position
     motions = carried(np.tile(np.eye(6), (len(arms), 1, 1)), arms)[cells.station]
-    rows = estimation.free_of_unknowns(np.einsum("ci,cip->cp", cells.directions, motions))
+    rows = estimation.free_of_nuisance(np.einsum("ci,cip->cp", cells.directions, motions))
     rows /= noise[cells.kind, None]
     size = np.repeat([1.0, 1.0 / geometry.characteristic_length], 3)
     rows *= tolerance * size

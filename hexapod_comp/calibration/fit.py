@@ -17,9 +17,8 @@ from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementS
 from ..pose import Pose
 from .courses import with_courses
 from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
-from .estimation import HUBER, OUTLIER, Estimation, Solution, iterate
+from .estimator import HUBER, OUTLIER, Estimation, LinearProblem, Posterior, Solution, iterate, physical_covariance
 from .lead import ScrewLead, look_for_lead
-from .linear_problem import LinearProblem, Posterior, physical_covariance
 from .observability import Allowed, Observability, ToolError, UnseenError, listed, observe, without_trace
 from .parameters import WAVES, FitSettings, ParameterSpace
 from .residuals import Residuals

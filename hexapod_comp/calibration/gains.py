@@ -16,7 +16,7 @@ from ..errors import CalibrationError
 from ..measurements.campaign import Campaign
 from ..measurements.readings import KINDS, MeasurementSet
 from ..virtual.trial import without_datum
-from .estimation import Estimation
+from .estimator import Estimation
 from .observability import POINTS, box_stations
 from .parameters import ParameterSpace
 from .plan import noise_factor

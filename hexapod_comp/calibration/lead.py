@@ -12,9 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core import MOST_HARMONICS
-from .cell_rows import at_once
-from .estimation import HUBER, MEDIAN_TO_SIGMA, Estimation
-from .linear_problem import LinearProblem, Posterior, solve
+from .estimator import HUBER, MEDIAN_TO_SIGMA, Estimation, LinearProblem, Posterior, at_once, solve
 from .parameters import WAVES
 
 SHORTEST, LONGEST = 1e-3, 30e-3

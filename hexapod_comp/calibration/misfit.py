@@ -16,8 +16,7 @@ import numpy as np
 from scipy.linalg.lapack import dtrtrs
 
 from ..measurements.readings import ANGULAR_KINDS, AXES, BACKWARD, FORWARD, KINDS, MeasurementSet
-from .cell_rows import CellRows, at_once
-from .linear_problem import whitened_precision
+from .estimator import DesignMatrix, at_once, whitened_precision
 from .parameters import FitSettings
 from .promise import Unexplained
 from .residuals import Residuals
@@ -228,7 +227,7 @@ class _Leaving:
         members = (np.flatnonzero(groups == group) for group in np.unique(groups))
         return at_once(lambda chosen: self._change(rows.select(chosen), left[chosen]), members)
 
-    def _change(self, rows: CellRows, left: np.ndarray) -> tuple[float, float, float]:
+    def _change(self, rows: DesignMatrix, left: np.ndarray) -> tuple[float, float, float]:
         """Return the squared change that leaving rows out makes, what it should be, and its degrees of freedom.
 
         With R and r the rows and their residuals, C₋g = (P − Rᵀ·R)⁻¹ = C + C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·R·C: a matrix of the
@@ -288,7 +287,7 @@ def _drift(r: Residuals) -> float:
     cells, linear = estimation.cells, estimation.cells.kind == KINDS.index("linear")
     if not linear.any() or len(np.unique(r.run[linear])) < LEAST_RUNS:
         return 0.0
-    column = estimation.free_of_unknowns(np.where(linear, cells.along * r.rank, 0.0)[:, None])[:, 0]
+    column = estimation.free_of_nuisance(np.where(linear, cells.along * r.rank, 0.0)[:, None])[:, 0]
     column /= solution.posterior.noise[cells.kind]
     free = column - r.rows.times(solution.posterior.covariance @ r.rows.transposed_times(column))
     information = float(column @ free)

@@ -14,9 +14,7 @@ from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
 from ..measurements.readings import AXES, Stations
 from ..pose import rotation_from_angles
 from ..virtual.trial import without_datum
-from .cell_rows import at_once
-from .estimation import Estimation
-from .linear_problem import LinearProblem, Posterior, physical_covariance
+from .estimator import Estimation, LinearProblem, Posterior, at_once, physical_covariance
 from .parameters import ParameterSpace
 from .promise import Unexplained
 from .sensitivity import Prediction, derivatives, predict
@@ -244,7 +242,7 @@ def without_trace(estimation: Estimation) -> tuple[UnseenError, ...]:
         seen[name] = np.einsum("ci,ci->c", cells.directions, errors[cells.station])
     if not seen:
         return ()
-    traces = np.linalg.norm(estimation.free_of_unknowns(np.stack([*seen.values()], axis=1)), axis=0)
+    traces = np.linalg.norm(estimation.free_of_nuisance(np.stack([*seen.values()], axis=1)), axis=0)
     return tuple(UnseenError(name, float(t)) for name, t in zip(seen, traces, strict=True) if t <= SEEN)
 
 

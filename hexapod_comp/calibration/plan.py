@@ -8,9 +8,8 @@ import numpy as np
 
 from ..measurements.campaign import Campaign
 from ..measurements.readings import DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
-from .estimation import Estimation
+from .estimator import Estimation, physical_covariance, solve
 from .fit import unseen_errors
-from .linear_problem import physical_covariance, solve
 from .observability import Observability, ToolError, UnseenError, expected_error, observe
 from .parameters import FitSettings, ParameterSpace
 from .promise import Scatter, Unexplained

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..formats.texts import aligned, number
 from ..measurements.readings import ANGULAR_KINDS, CHANNELS, SAME_ATTITUDE
-from .estimation import SETTLED
+from .estimator import SETTLED
 from .fit import ChannelFit, ModelFit, Outlier
 from .lead import ScrewLead
 from .observability import BlockSight, Observability, ToolError, UnseenError, listed

@@ -8,8 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from ..virtual.trial import without_datum
-from .cell_rows import CellRows
-from .estimation import Estimation, Solution
+from .estimator import DesignMatrix, Estimation, Solution
 from .observability import box_stations
 from .sensitivity import derivatives, predict
 
@@ -22,7 +21,7 @@ class Residuals:
     ----------
     estimation, solution : Estimation, Solution
         The fit.
-    rows : CellRows, shape (C, n)
+    rows : DesignMatrix, shape (C, n)
         Derivatives by the parameters in use.
     residual : ndarray, shape (C,)
         What is left.
@@ -34,7 +33,7 @@ class Residuals:
 
     estimation: Estimation
     solution: Solution
-    rows: CellRows
+    rows: DesignMatrix
     residual: np.ndarray
     run: np.ndarray
     direction: np.ndarray
@@ -62,7 +61,7 @@ class Residuals:
     def taken(self) -> np.ndarray:
         """Share of each cell that parameters and unknowns of the instruments take up, shape (C,)."""
         every = np.arange(len(self.residual))
-        return self.shared(every, every) + self.estimation.shares_of_unknowns()
+        return self.shared(every, every) + self.estimation.shares_of_nuisance()
 
     @property
     def metric(self) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..machine.rows import different_rows
 from ..measurements.readings import ANGULAR_KINDS, BACKWARD, FORWARD, KINDS
-from .estimation import MEDIAN_TO_SIGMA
+from .estimator import MEDIAN_TO_SIGMA
 from .promise import Scatter
 from .residuals import Residuals
 

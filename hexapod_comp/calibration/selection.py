@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .cell_rows import at_once
-from .linear_problem import LinearProblem, Posterior, condense, held_out_squares, log_evidence, solve
+from .estimator import LinearProblem, Posterior, at_once, condense, held_out_squares, log_evidence, solve
 from .parameters import ParameterSpace
 
 FIRST_ROUNDS, ROUNDS = 10, 4

@@ -10,7 +10,7 @@ from ..errors import InputFileError
 from ..measurements.campaign import Campaign, template
 from ..measurements.readings import BACKWARD, CHANNELS, KINDS, MeasurementSet
 from .check_readings import Explanation
-from .estimation import Estimation
+from .estimator import Estimation
 from .posterior import FittedParameters
 
 ABSOLUTE = (KINDS.index("position"), KINDS.index("attitude"))

@@ -22,8 +22,7 @@ from ..machine.passes import Passes
 from ..measurements.reach import GEOMETRIES, exchanged
 from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_KINDS, MeasurementSet, Stations
 from ..virtual.instruments import compensated
-from .estimation import Estimation
-from .linear_problem import LinearProblem, Posterior, physical_covariance, solve
+from .estimator import Estimation, LinearProblem, Posterior, physical_covariance, solve
 from .misfit import FAMILIES, family_of_run
 from .parameters import WAVES, FitSettings, ParameterSpace
 from .sensitivity import Prediction, predict
@@ -285,7 +284,7 @@ class _Plain:
             posterior = solve(space, problem, posterior.tolerances, posterior.noise, rounds=0)
         cells, weights = estimation.cells, estimation.uncertainty**-2
         values = np.bincount(cells.of_reading, weights * m.value) / np.bincount(cells.of_reading, weights)
-        values = members[cells.first] * estimation.free_of_unknowns(values[:, None])[:, 0]
+        values = members[cells.first] * estimation.free_of_nuisance(values[:, None])[:, 0]
         # A nominal machine whose screws turn errs too: what is fitted is not all that should have been read.
         expected = values - (problem.target - problem.rows.times(posterior.y))
         return np.bincount(m.run[cells.first], values * expected, len(m.runs)) < 0.0

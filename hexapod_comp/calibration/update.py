@@ -17,7 +17,7 @@ from ..measurements.readings import MeasurementSet
 from .changes import FAMILIES, OTHER, READING, REPAIRABLE, TEMPERATURE, Change, possible_changes, widened
 from .check_readings import CheckReadings, Explanation, explained, weigh
 from .datum import hold, unseen_part
-from .estimation import Estimation
+from .estimator import Estimation
 from .posterior import FittedParameters
 from .smooth_field import DIGITS
 from .verification import UNEXPLAINED, VALID, Verification

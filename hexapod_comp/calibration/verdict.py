@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..measurements.readings import ANGULAR_KINDS, DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
-from .estimation import SETTLED, Estimation, Solution
-from .linear_problem import physical_covariance
+from .estimator import SETTLED, Estimation, Solution, physical_covariance
 from .misfit import ChiSquare, chi_squares, held_by_priors, stated_scale, unexplained
 from .observability import Allowed, ToolError, expected_error
 from .parameters import FitSettings, ParameterSpace

@@ -19,8 +19,7 @@ from ..formats.texts import number
 from ..machine.late import MOST_TIME_CONSTANTS, PARTS, TIME_CONSTANT_RANGE, LateGrowth
 from ..machine.temperatures import REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE
 from ..measurements.readings import KINDS, MeasurementSet
-from .estimation import Estimation, Solution
-from .linear_problem import Posterior, physical_covariance, solve
+from .estimator import Estimation, Posterior, Solution, physical_covariance, solve
 from .parameters import LEAST_DAMPING, LEAST_WARMING, TOLERANCES, ParameterSpace, growth_root
 from .sensitivity import growth_causes, growth_columns, predict
 
@@ -117,7 +116,7 @@ def _late_columns(estimation: Estimation, x: np.ndarray, constants: np.ndarray, 
     behind = growth_causes(estimation.space, estimation.measurements.stations, constants)
     behind = behind[estimation.cells.station, :, 1:]
     columns = (_per_growth(estimation, x)[:, :, None] * behind).transpose(0, 2, 1) @ (size * growth_root(1))
-    return estimation.free_of_unknowns(columns.reshape(len(columns), -1))
+    return estimation.free_of_nuisance(columns.reshape(len(columns), -1))
 
 
 class _Scan:
@@ -329,7 +328,7 @@ def _effects(estimation: Estimation, x: np.ndarray, constants: TimeConstants) ->
     for k, value in enumerate(constants.values):
         shorter, longer = (growth_causes(space, stations, [value * math.exp(way)])[:, :, 1] for way in (-STEP, STEP))
         later = ((longer - shorter) / (2.0 * STEP))[estimation.cells.station]
-        yield estimation.free_of_unknowns((per_growth * later) @ growth[:, k : k + 1])[:, 0]
+        yield estimation.free_of_nuisance((per_growth * later) @ growth[:, k : k + 1])[:, 0]
 
 
 def _swelling(measurements: MeasurementSet, space: ParameterSpace, solution: Solution, known: _Known) -> Swelling:

@@ -8,9 +8,9 @@ from functools import partial
 
 import numpy as np
 
+from ..calibration.estimator import physical_covariance
 from ..calibration.evaluation import PaperMetric, paper_metric
 from ..calibration.fit import ModelFit, fit_model
-from ..calibration.linear_problem import physical_covariance
 from ..calibration.lines import fit_lines
 from ..calibration.observability import left_errors, stations_of
 from ..calibration.parameters import FitSettings

@@ -17,7 +17,7 @@ from foreign_machines import Errors, commands, machines, rotation, tool_errors
 from foreign_machines import aligned_rms as rms_aligned
 
 from hexapod_comp.calibration.datum import HeldDatum, unseen_part
-from hexapod_comp.calibration.estimation import Estimation
+from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.lines import fit_lines
 from hexapod_comp.calibration.parameters import FitSettings

@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, multivariate_normal
 
-from hexapod_comp.calibration.cell_rows import CellRows
-from hexapod_comp.calibration.estimation import Estimation, iterate
-from hexapod_comp.calibration.fit import ModelFit, fit_model
-from hexapod_comp.calibration.linear_problem import (
+from hexapod_comp.calibration.estimator import (
     HYPER,
+    DesignMatrix,
+    Estimation,
     LinearProblem,
     condense,
     held_out,
     held_out_squares,
+    iterate,
     physical_covariance,
     solve,
 )
+from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import BLOCKS, FitSettings, ParameterSpace
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.model import RealMachine
@@ -146,7 +147,7 @@ def problem_of(
     parts = [np.flatnonzero(kind == k) for k in range(len(KINDS))]
     return LinearProblem(
         target=target,
-        rows=CellRows.of(rows),
+        rows=DesignMatrix.of(rows),
         kind=kind,
         fold=fold,
         normal=np.array([rows[p].T @ rows[p] for p in parts]),
@@ -210,7 +211,7 @@ def test_held_out_lines_are_those_of_fits_without_the_line(few: int, monkeypatch
 
     Condensed, which moves errors by millionths of the noise, and cell by cell.
     """
-    monkeypatch.setattr("hexapod_comp.calibration.cell_rows.FEW", few)
+    monkeypatch.setattr("hexapod_comp.calibration.estimator.FEW", few)
     ours = readings()
     space, problem = linearised(ours)
     answer = solve(space, problem, space.start_tolerances(), ONES, 0)
@@ -423,7 +424,7 @@ def test_struts_without_backlash_do_not_upset_the_fit():
 
 def test_a_fit_that_does_not_settle_says_what_still_moves(monkeypatch):
     """One step from the nominal machine, with nothing but the struts' pitch: only that can have moved."""
-    monkeypatch.setattr("hexapod_comp.calibration.estimation.STEPS", 1)
+    monkeypatch.setattr("hexapod_comp.calibration.estimator.STEPS", 1)
     settings = replace(FEW, blocks=("pitch",), tolerances=(("structure", 1e-12), ("pitch", 100e-6)))
     space = ParameterSpace(readings(), settings)
     start = np.zeros(space.size), space.start_tolerances(), ONES

@@ -13,8 +13,8 @@ from foreign_machines import Errors, Machine, aligned_rms, goes_to, rotation, to
 from scipy.spatial.transform import Rotation
 
 from hexapod_comp.calibration.fit import ModelFit, fit_model, unseen_errors
+from hexapod_comp.calibration.observations import Lengths
 from hexapod_comp.calibration.parameters import FitSettings
-from hexapod_comp.calibration.unknowns import Lengths
 from hexapod_comp.errors import CalibrationError, InputFileError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import save_model

@@ -9,7 +9,7 @@ import calibration_helpers as small
 import numpy as np
 import pytest
 
-from hexapod_comp.calibration.estimation import Estimation
+from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.lead import ScrewLead, look_for_lead
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace

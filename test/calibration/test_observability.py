@@ -9,9 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import gmean
 
-from hexapod_comp.calibration.cell_rows import CellRows
-from hexapod_comp.calibration.estimation import Estimation
-from hexapod_comp.calibration.linear_problem import LinearProblem, Posterior, solve
+from hexapod_comp.calibration.estimator import DesignMatrix, Estimation, LinearProblem, Posterior, solve
 from hexapod_comp.calibration.observability import (
     MACHINE_ERRORS,
     Observability,
@@ -194,7 +192,7 @@ def by_hand(singular: np.ndarray) -> tuple[ParameterSpace, LinearProblem, Poster
     square, freedom = np.array([target @ target, 0, 0, 0, 0]), np.array([100.0, 0, 0, 0, 0])
     kind = np.zeros(100, dtype=int)
     problem = LinearProblem(
-        target, CellRows.of(rows), kind, np.arange(100), normal, moment, square, freedom, np.zeros(len(KINDS))
+        target, DesignMatrix.of(rows), kind, np.arange(100), normal, moment, square, freedom, np.zeros(len(KINDS))
     )
     return space, problem, solve(space, problem, space.start_tolerances(), ONES, 0)
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from hexapod_comp.calibration.cell_rows import Alike, CellRows
-from hexapod_comp.calibration.linear_problem import LinearProblem, log_evidence, solve
+from hexapod_comp.calibration.estimator import Alike, DesignMatrix, LinearProblem, log_evidence, solve
 from hexapod_comp.calibration.parameters import Block
 from hexapod_comp.calibration.selection import select
 
@@ -32,7 +31,7 @@ def two_blocks() -> SimpleNamespace:
 def problem_of(rows: np.ndarray, target: np.ndarray) -> LinearProblem:
     """Return readings of one kind, as many to a fold."""
     count, every = len(target), np.arange(len(target))
-    cells = CellRows(rows.shape, [Alike(every, np.arange(rows.shape[1]), rows)])
+    cells = DesignMatrix(rows.shape, [Alike(every, np.arange(rows.shape[1]), rows)])
     normal, moment = (rows.T @ rows)[None], (rows.T @ target)[None]
     one = np.array([float(count)])
     kind, fold = np.zeros(count, int), every // CELLS

@@ -22,8 +22,8 @@ from helpers import quick_pictures
 
 from hexapod_comp import cli
 from hexapod_comp.calibration import fit as fit_module
+from hexapod_comp.calibration.estimator import physical_covariance
 from hexapod_comp.calibration.fit import ModelFit
-from hexapod_comp.calibration.linear_problem import physical_covariance
 from hexapod_comp.calibration.observability import expected_error
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.posterior import load_posterior

@@ -3,19 +3,19 @@
 import numpy as np
 import pytest
 
-from hexapod_comp.calibration.cell_rows import Alike, CellRows
-from hexapod_comp.calibration.unknowns import of_zero
+from hexapod_comp.calibration.estimator import Alike, DesignMatrix
+from hexapod_comp.calibration.observations import of_zero
 
 SHAPE = (40, 12)
 
 
 @pytest.fixture
-def rows() -> CellRows:
+def rows() -> DesignMatrix:
     """Three parts of cells that are mixed up, moved by parameters of which some are common."""
     rng = np.random.default_rng(1)
     cells = np.split(rng.permutation(SHAPE[0]), [15, 27])
     columns = (np.arange(7), np.array([0, 1, 5, 9]), np.array([2, 10, 11]))
-    return CellRows(
+    return DesignMatrix(
         SHAPE, [Alike(c, k, rng.standard_normal((len(c), len(k)))) for c, k in zip(cells, columns, strict=True)]
     )
 
@@ -25,23 +25,23 @@ def close(ours: np.ndarray, wanted: np.ndarray) -> None:
     np.testing.assert_allclose(ours, wanted, rtol=0.0, atol=1e-12)
 
 
-def test_products(rows: CellRows):
+def test_products(rows: DesignMatrix):
     rng, whole = np.random.default_rng(2), rows.dense()
     y, v = rng.standard_normal((12, 3)), rng.standard_normal((40, 3))
     close(rows.times(y), whole @ y)
     close(rows.times(y[:, 0]), whole @ y[:, 0])
     close(rows.transposed_times(v), whole.T @ v)
     close(rows.normal(), whole.T @ whole)
-    close(CellRows.of(whole).times(y), whole @ y)
+    close(DesignMatrix.of(whole).times(y), whole @ y)
 
 
-def test_pairs_of_any_parts(rows: CellRows):
+def test_pairs_of_any_parts(rows: DesignMatrix):
     rng, whole = np.random.default_rng(3), rows.dense()
     matrix, first, second = rng.standard_normal((12, 12)), *rng.integers(0, 40, (2, 60))
     close(rows.between(matrix, first, second), np.diag(whole[first] @ matrix @ whole[second].T))
 
 
-def test_some_cells_and_some_parameters(rows: CellRows):
+def test_some_cells_and_some_parameters(rows: DesignMatrix):
     whole, cells, used = rows.dense(), np.random.default_rng(4).permutation(40)[:17], np.array([0, 2, 5, 6, 10])
     close(rows.select(cells).dense(), whole[cells])
     factors = np.linspace(0.5, 2.0, 40)
@@ -49,7 +49,7 @@ def test_some_cells_and_some_parameters(rows: CellRows):
     close(rows.select(cells).using(used, factors[cells]).dense(), (factors[:, None] * whole)[np.ix_(cells, used)])
 
 
-def test_a_zero_is_taken_off_the_cells_of_its_part_alone(rows: CellRows):
+def test_a_zero_is_taken_off_the_cells_of_its_part_alone(rows: DesignMatrix):
     """What is left of cells of equal noise is what their mean leaves."""
     wanted, members = rows.dense(), np.sort(rows.parts[1].cells[3:9])
     rows.project_out([of_zero(members, np.ones(6))])
@@ -66,7 +66,7 @@ def test_condensed_cells_say_the_same_in_fewer_rows():
     cells = np.split(rng.permutation(63), [3, 23])
     values = rng.standard_normal((3, 4)), rng.standard_normal((20, 5)), rng.standard_normal((40, 3)) @ np.eye(3, 9, 2)
     columns = np.arange(4), np.arange(5), np.arange(2, 11)
-    rows = CellRows(shape, [Alike(*part) for part in zip(cells, columns, values, strict=True)])
+    rows = DesignMatrix(shape, [Alike(*part) for part in zip(cells, columns, values, strict=True)])
     target, group, whole = rng.standard_normal(63), np.zeros(63, dtype=int), rows.dense()
     group[np.concatenate([part[::2] for part in cells])] = 1
     few, along, owner = rows.condensed(target, group, rng.standard_normal((12, 15)))

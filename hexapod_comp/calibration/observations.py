@@ -1,9 +1,10 @@
-"""What the instruments of a run do not know: their zeros, the slopes of their beams, where a length starts from.
+"""What was observed: cells of repeated readings, and the nuisance parameters of the instruments that read them.
 
-A length is read from a centre c to the measured point p + e: it is |p + e − c| − |p − c₀| + zero longer than commanded,
-with c₀ the centre's place in the file. The centres of a run belong to one body, c = m + R·(c₀ − m) + δ, with m their
-mean. δ and R are fitted to the readings wherever the machine's parameters stand (variable projection): a centre may
-be millimetres off its place, and errors need not be small beside the length.
+Nuisance are zeros, the slopes of beams, and where a length starts from. A length is read from a centre c to the
+measured point p + e: it is |p + e − c| − |p − c₀| + zero longer than commanded, with c₀ the centre's place in the file.
+The centres of a run belong to one body, c = m + R·(c₀ − m) + δ, with m their mean. δ and R are fitted to the readings
+wherever the machine's parameters stand (variable projection): a centre may be millimetres off its place, and errors
+need not be small beside the length.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import CalibrationError
+from ..machine.rows import different_rows
 from ..machine.size import rms
-from ..measurements.readings import LEAST_TRAVEL
+from ..measurements.readings import ABSOLUTE_KINDS, KINDS, LEAST_TRAVEL, LENGTH, MeasurementSet
 
 CENTRE = 5e-3
 """Standard deviation of where a centre is, beside its place in the file, along each axis, m."""
@@ -33,7 +35,7 @@ ROUNDS, SETTLED = 20, 1e-10
 """Most Gauss–Newton steps to a body's place, and the step, m, after which it has settled."""
 
 
-class Unknown(NamedTuple):
+class Nuisance(NamedTuple):
     """What one channel of one run does not know, in units of the standard deviation of its cells.
 
     Attributes
@@ -67,7 +69,7 @@ class Unknown(NamedTuple):
         values[where] -= self.basis @ (weight * along.T).T
 
 
-def of_zero(members: np.ndarray, scale: np.ndarray, along: np.ndarray | None = None) -> Unknown:
+def of_zero(members: np.ndarray, scale: np.ndarray, along: np.ndarray | None = None) -> Nuisance:
     """Return an unknown zero, and the slope along a line.
 
     Parameters
@@ -84,7 +86,7 @@ def of_zero(members: np.ndarray, scale: np.ndarray, along: np.ndarray | None = N
         slope = scale * (along - along.mean())
         slope -= columns[0] * (columns[0] @ slope)
         columns.append(slope / np.linalg.norm(slope))
-    return Unknown(members, np.stack(columns, axis=1), np.ones(len(columns)))
+    return Nuisance(members, np.stack(columns, axis=1), np.ones(len(columns)))
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,7 @@ class Lengths:
 
     def seen(
         self, displacement: np.ndarray, value: np.ndarray, scale: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, list[Unknown]]:
+    ) -> tuple[np.ndarray, np.ndarray, list[Nuisance]]:
         """Return what these lengths show, once their body has been put where it explains them best.
 
         What is left of the lengths counts as their noise where it is more: far from the answer a circle's centre would
@@ -138,7 +140,7 @@ class Lengths:
         -------
         expected, directions : ndarray, shape (n,) and (n, 3)
             Change of length but for its zero, m; and unit vectors along which the point's displacement changes it.
-        unknowns : list of Unknown
+        unknowns : list of Nuisance
             The zero (without any direction where it is known), and the body's place.
 
         Raises
@@ -174,7 +176,7 @@ class Lengths:
         u, s, _ = np.linalg.svd(columns / noise, full_matrices=False)
         # As seen from the file's place, where the prior's mean is: else being off it would cost nothing.
         seen = distance - nominal - columns @ off / scale
-        return seen, n, [zero, Unknown(self.members, u, s**2 / (1.0 + s**2))]
+        return seen, n, [zero, Nuisance(self.members, u, s**2 / (1.0 + s**2))]
 
     def _prior(self, arms: np.ndarray) -> np.ndarray:
         """Return the root of the covariance of the body's place and turn, shape (6, 6), m; `arms` have the size 1."""
@@ -193,3 +195,87 @@ class Lengths:
             problem = f"the lengths of run {self.name} put their centre {shown} mm (in base) off its place in the file"
             hint = f"it must be known to {FAR * CENTRE * 1e3:g} mm; do places, units and commanded poses fit?"
             raise CalibrationError("centre", f"{problem}; {hint}")
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Readings of one channel at one station are one cell: they differ by noise only.
+
+    Attributes
+    ----------
+    of_reading : ndarray of int, shape (N,)
+        Cell of each reading.
+    first : ndarray of int, shape (C,)
+        First reading of each cell.
+    station, channel, kind, group : ndarray of int, shape (C,)
+        Of each cell; a group is one channel of one run, whose unknowns its cells share.
+    directions : ndarray, shape (C, 6)
+        w of each cell; of a length, from its centre's place in the file.
+    along : ndarray, shape (C,)
+        Commanded coordinate along the line, m.
+    fold : ndarray of int, shape (C,)
+        What is left out together in cross-validation: a line's run, a ball bar's circle, or a scattered pose.
+    """
+
+    of_reading: np.ndarray
+    first: np.ndarray
+    station: np.ndarray
+    channel: np.ndarray
+    kind: np.ndarray
+    group: np.ndarray
+    directions: np.ndarray
+    along: np.ndarray
+    fold: np.ndarray
+
+    @staticmethod
+    def of(measurements: MeasurementSet) -> Cells:
+        """Return the cells of a set."""
+        m = measurements
+        centre = different_rows(np.nan_to_num(m.centre))[1]
+        first, of_reading = different_rows(np.stack([m.station, m.channel, centre], axis=1))
+        groups = different_rows(np.stack([m.run, m.channel], axis=1))[1]
+        absolute = np.isin(np.array(KINDS)[m.kind[first]], ABSOLUTE_KINDS)
+        whole = _left_out_whole(m)[m.run[first]]
+        poses = np.hstack([m.stations.positions, m.stations.rotations.reshape(-1, 9)]).round(9)
+        pose = different_rows(poses)[1][m.station[first]]
+        fold_key = np.where(whole, -1 - m.run[first], pose)
+        return Cells(
+            of_reading=of_reading,
+            first=first,
+            station=m.station[first],
+            channel=m.channel[first],
+            kind=m.kind[first],
+            group=np.where(absolute, -1, groups[first]),
+            directions=m.directions()[first],
+            along=m.along()[first],
+            fold=np.unique(fold_key, return_inverse=True)[1].ravel(),
+        )
+
+    def groups(self, measurements: MeasurementSet) -> tuple[list[tuple[np.ndarray, np.ndarray | None]], list[Lengths]]:
+        """Return the cells of each channel of each run: those with a zero, and their slope's lever; and lengths."""
+        c, m = self, measurements
+        points = m.points()
+        zeros: list[tuple[np.ndarray, np.ndarray | None]] = []
+        lengths = []
+        for group in np.unique(c.group[c.group >= 0]):
+            members = np.flatnonzero(c.group == group)
+            if c.channel[members[0]] == LENGTH:
+                run = m.runs[m.run[c.first[members[0]]]]
+                places = points[c.station[members]], m.centre[c.first[members]]
+                lengths.append(Lengths(run.name, members, *places, run.known_zero))
+                continue
+            sloping = KINDS[c.kind[members[0]]] == "straightness" and np.ptp(c.along[members]) > 0.0
+            zeros.append((members, c.along[members] if sloping else None))
+        return zeros, lengths
+
+
+def _left_out_whole(measurements: MeasurementSet) -> np.ndarray:
+    """Return which runs are left out as a whole, shape (runs,): lines, and circles of one length about one centre."""
+    m = measurements
+    whole = np.array([run.is_line for run in m.runs])
+    of_length = m.channel == LENGTH
+    distance = np.linalg.norm(m.points()[m.station] - m.centre, axis=1)
+    for run in np.unique(m.run[of_length]):
+        members = of_length & (m.run == run)
+        whole[run] = np.ptp(np.column_stack([m.centre, distance])[members], axis=0).max() < LEAST_TRAVEL
+    return whole

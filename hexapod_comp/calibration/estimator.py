@@ -1,0 +1,876 @@
+"""The estimator: readings against parameters, by a whitened, chunked, robust Gauss–Newton with evidence.
+
+Each linear problem is Bayesian: every block of parameters has a prior whose size (a hyperparameter) is estimated from
+the readings, as is the noise of every kind of channel: empirical Bayes, by MacKay's fixed point. Nuisance parameters of
+the instruments are projected out of the design matrix beforehand, so they cost nothing.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dpstrf, dtrtrs
+
+from ..errors import CalibrationError, KinematicsError, ModelError
+from ..measurements.readings import KINDS, LEAST_NOISE, MeasurementSet, refuse_absurd
+from .observations import Cells, Nuisance, of_zero
+from .parameters import ParameterSpace
+from .sensitivity import Prediction, Slopes, predict
+
+FEW = 8
+"""Fewer cells of a group are kept as they are."""
+
+FAINT = 1e-11
+"""What moves cells by less than this variance, of their noise's, does not count."""
+
+
+Given = TypeVar("Given")
+Result = TypeVar("Result")
+
+
+def at_once(work: Callable[[Given], Result], items: Iterable[Given]) -> list[Result]:
+    """Return the results of independent work with matrices: NumPy lets as many threads work as there are processors."""
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        return list(pool.map(work, items))
+
+
+class Alike(NamedTuple):
+    """Cells that the same parameters move.
+
+    Attributes
+    ----------
+    cells : ndarray of int, shape (n,)
+        Which.
+    columns : ndarray of int, shape (m,)
+        These parameters, ascending.
+    values : ndarray, shape (n, m)
+        Derivatives.
+    """
+
+    cells: np.ndarray
+    columns: np.ndarray
+    values: np.ndarray
+
+
+class DesignMatrix:
+    """A matrix of a row for each cell and a column for each parameter.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Cells and parameters.
+    parts : sequence of Alike
+        Each cell stands in one of them.
+    """
+
+    def __init__(self, shape: tuple[int, int], parts: Sequence[Alike]) -> None:
+        self.shape, self.parts = shape, tuple(parts)
+        self._part, self._place = np.zeros(shape[0], dtype=int), np.zeros(shape[0], dtype=int)
+        for n, part in enumerate(self.parts):
+            self._part[part.cells], self._place[part.cells] = n, np.arange(len(part.cells))
+
+    @staticmethod
+    def of(matrix: np.ndarray) -> DesignMatrix:
+        """Return a dense matrix as such rows."""
+        return DesignMatrix(matrix.shape, [Alike(np.arange(len(matrix)), np.arange(matrix.shape[1]), matrix)])
+
+    def dense(self) -> np.ndarray:
+        """Return the whole matrix."""
+        result = np.zeros(self.shape)
+        for part in self.parts:
+            result[np.ix_(part.cells, part.columns)] = part.values
+        return result
+
+    def times(self, y: np.ndarray) -> np.ndarray:
+        """Return the product with y, (size,) or (size, k)."""
+        result = np.zeros((self.shape[0], *y.shape[1:]))
+        for part in self.parts:
+            result[part.cells] = part.values @ y[part.columns]
+        return result
+
+    def transposed_times(self, v: np.ndarray) -> np.ndarray:
+        """Return the transposed matrix's product with v, (C,) or (C, k)."""
+        result = np.zeros((self.shape[1], *v.shape[1:]))
+        for part in self.parts:
+            result[part.columns] += part.values.T @ v[part.cells]
+        return result
+
+    def normal(self) -> np.ndarray:
+        """Return rowsᵀ·rows, shape (size, size)."""
+        result = np.zeros((self.shape[1], self.shape[1]))
+        for part in self.parts:
+            result[np.ix_(part.columns, part.columns)] += part.values.T @ part.values
+        return result
+
+    def between(self, matrix: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Return aᵀ·M·b for the rows a and b of pairs of cells, shape (pairs,)."""
+        result = np.empty(len(first))
+        for (p, q), pairs in _alike(self._part[first], self._part[second]):
+            a, b = self.parts[p], self.parts[q]
+            reached = a.values[self._place[first[pairs]]] @ matrix[np.ix_(a.columns, b.columns)]
+            result[pairs] = np.einsum("ci,ci->c", reached, b.values[self._place[second[pairs]]])
+        return result
+
+    def select(self, cells: np.ndarray) -> DesignMatrix:
+        """Return the rows of some cells, in their order; without copying where they stand in a row."""
+        owner, parts = self._part[cells], []
+        for n in np.unique(owner):
+            at = np.flatnonzero(owner == n)
+            part = self.parts[n]
+            parts.append(Alike(at, part.columns, part.values[in_a_row(self._place[cells[at]])]))
+        return DesignMatrix((len(cells), self.shape[1]), parts)
+
+    def using(self, used: np.ndarray, factors: np.ndarray) -> DesignMatrix:
+        """Return the rows times a factor each, (C,), with the columns of some parameters only."""
+        place = np.full(self.shape[1], -1)
+        place[used] = np.arange(len(used))
+        parts = []
+        for part in self.parts:
+            kept = np.flatnonzero(place[part.columns] >= 0)
+            values = factors[part.cells, None] * part.values[:, in_a_row(kept)]
+            parts.append(Alike(part.cells, place[part.columns[kept]], values))
+        return DesignMatrix((self.shape[0], len(used)), parts)
+
+    def condensed(
+        self, target: np.ndarray, group: np.ndarray, draws: np.ndarray
+    ) -> tuple[DesignMatrix, np.ndarray, np.ndarray]:
+        """Return fewer rows that say the same, with their targets and groups.
+
+        Cells of a group that the same parameters move are turned, orthogonally, so that a few of them have all that
+        parameters do: some twenty along a line, however densely it was read. The others are left out.
+
+        Parameters
+        ----------
+        target : ndarray, shape (C,)
+            What the rows explain.
+        group : ndarray of int, shape (C,)
+            Of each cell.
+        draws : ndarray, shape (size, D)
+            Parameters as they may be, over √D.
+        """
+
+        def few_of(part: Alike) -> list[np.ndarray]:
+            order = np.argsort(group[part.cells], kind="stable")
+            pieces = np.split(order, np.flatnonzero(np.diff(group[part.cells[order]])) + 1)
+            few = np.concatenate([np.zeros(0, dtype=int), *(piece for piece in pieces if len(piece) < FEW)])
+            listed = [(part.values[few], target[part.cells[few]], group[part.cells[few]])]
+            for piece in (piece for piece in pieces if len(piece) >= FEW):
+                cells = part.cells[piece]
+                rows, along = _moved(part.values[in_a_row(piece)], target[cells], draws[part.columns])
+                listed.append((rows, along, np.full(len(along), group[cells[0]])))
+            return [np.concatenate(arrays) for arrays in zip(*listed, strict=True)]
+
+        parts, of_rows, count = [], [], 0
+        for part, (values, *own) in zip(self.parts, at_once(few_of, self.parts), strict=True):
+            parts.append(Alike(np.arange(count, count + len(values)), part.columns, values))
+            of_rows.append(own)
+            count += len(values)
+        targets, groups = (np.concatenate(arrays) for arrays in zip(*of_rows, strict=True))
+        return DesignMatrix((count, self.shape[1]), parts), targets, groups
+
+    def project_out(self, unknowns: Sequence[Nuisance]) -> None:
+        """Take off, in place, what unknowns of instruments may explain; the cells of each stand in one part."""
+        owner = np.array([self._part[unknown.members[0]] for unknown in unknowns])
+
+        def clear(part: int) -> None:
+            for n in np.flatnonzero(owner == part).tolist():
+                unknowns[n].project_out(self.parts[part].values, in_a_row(self._place[unknowns[n].members]))
+
+        at_once(clear, range(len(self.parts)))
+
+
+def _moved(values: np.ndarray, target: np.ndarray, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return Qᵀ·values and Qᵀ·target, with the columns of Q an orthonormal basis of what draws of parameters do.
+
+    A pivoted Cholesky factor tells which draws are enough; all cells are kept where none are.
+    """
+    shown = values @ draws
+    _, pivots, rank, _ = dpstrf((shown.T @ shown).T, tol=FAINT, overwrite_a=1)
+    if rank >= min(shown.shape):
+        return values, target
+    basis = np.linalg.qr(shown[:, pivots[:rank] - 1])[0].T
+    return basis @ values, basis @ target
+
+
+def in_a_row(indices: np.ndarray) -> np.ndarray | slice:
+    """Return indices as a slice where they follow each other: then indexing copies nothing."""
+    if len(indices) and indices[-1] - indices[0] == len(indices) - 1 and (np.diff(indices) == 1).all():
+        return slice(int(indices[0]), int(indices[-1]) + 1)
+    return indices
+
+
+def _alike(first: np.ndarray, second: np.ndarray) -> Iterator[tuple[tuple[int, int], np.ndarray]]:
+    """Yield each pair of numbers that occurs, and where."""
+    many = int(second.max(initial=0)) + 1
+    pairs, group = np.unique(first * many + second, return_inverse=True)
+    for n, pair in enumerate(pairs.tolist()):
+        yield divmod(pair, many), np.flatnonzero(group == n)
+
+
+SCALE_ROUNDS = 12
+"""Rounds of estimating tolerances and noise for one linearisation."""
+
+SCALE_SETTLED = 1e-6
+"""The rounds stop when no tolerance and no noise changes by more than this share."""
+
+LONGEST_STRIDE = 16.0
+"""An extrapolation goes no further than so many rounds squared would."""
+
+LEAP = np.log(10.0)
+"""It changes no tolerance and no noise by more than this logarithm: rounds that still gain speed lead nowhere."""
+
+HYPER = 0.1
+"""How many parameters the first guess of a tolerance is worth."""
+
+LARGEST_TOLERANCE = {"structure": 5e-3}
+"""No machine is built worse than this, m; a misfit that grows the tolerance further has another cause."""
+
+LEAST_FREEDOM = 10.0
+"""Noise is estimated from at least so many readings beyond those that the parameters use up."""
+
+DRAWS, SEED = 160, 5
+"""Draws of the parameters that show what they do along a line."""
+
+TOGETHER = 1000
+"""Rows of small folds that are looked at together."""
+
+
+class Condensed(NamedTuple):
+    """The cells of a linear problem, each fold's and kind's in as few rows as its parameters can be told by.
+
+    Attributes
+    ----------
+    target : ndarray, shape (K,)
+        In place of the cells' targets.
+    rows : DesignMatrix, shape (K, size)
+        In place of theirs.
+    cell, first : ndarray of int, shape (K,) and (C,)
+        The first cell of the fold and kind that a row, or a cell, belongs to.
+    rest : ndarray, shape (folds, kinds)
+        Squares of what of the cells' targets no parameter moves.
+    """
+
+    target: np.ndarray
+    rows: DesignMatrix
+    cell: np.ndarray
+    first: np.ndarray
+    rest: np.ndarray
+
+
+@dataclass(frozen=True)
+class LinearProblem:
+    """The fit linearised at one parameter vector x = root·y, free of what instruments do not know.
+
+    Attributes
+    ----------
+    target : ndarray, shape (C,)
+        Cells' values that the parameters explain, over their standard deviation at unit noise factors.
+    rows : DesignMatrix, shape (C, size)
+        Their derivatives by y, alike.
+    kind, fold : ndarray of int, shape (C,)
+        As in :class:`Cells`.
+    normal : ndarray, shape (kinds, size, size)
+        rowsᵀ·rows of each kind.
+    moment : ndarray, shape (kinds, size)
+        rowsᵀ·target of each kind.
+    square : ndarray, shape (kinds,)
+        Sum of squared targets, the scatter of readings about their cell's mean included.
+    freedom : ndarray, shape (kinds,)
+        Readings minus unknowns projected out.
+    least_noise : ndarray, shape (kinds,)
+        Smallest noise factors that an instrument can have.
+    per_length : ndarray, shape (C, 6)
+        Derivatives by the struts' lengths, scaled as the rows, with what instruments do not know still in them.
+    unknowns : tuple of Nuisance
+        What that is.
+    """
+
+    target: np.ndarray
+    rows: DesignMatrix
+    kind: np.ndarray
+    fold: np.ndarray
+    normal: np.ndarray
+    moment: np.ndarray
+    square: np.ndarray
+    freedom: np.ndarray
+    least_noise: np.ndarray
+    per_length: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
+    unknowns: tuple[Nuisance, ...] = ()
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """What a linear problem says about the parameters y that it uses.
+
+    Attributes
+    ----------
+    used : ndarray of int, shape (n,)
+        Which parameters; the others' blocks are out.
+    y : ndarray, shape (n,)
+        The most probable ones.
+    covariance : ndarray, shape (n, n)
+        Theirs.
+    tolerances : ndarray, shape (blocks,)
+        Size of each block's prior; zero: the block is out.
+    noise : ndarray, shape (kinds,)
+        Factor on the standard deviation of each kind's readings.
+    determined : ndarray, shape (n,)
+        Share of each parameter that comes from the data; the rest comes from the prior.
+    spread : ndarray, shape (n,)
+        The prior's standard deviation of each y.
+    log_determinant : float
+        Logarithm of the determinant of the precision of y over that.
+    """
+
+    used: np.ndarray
+    y: np.ndarray
+    covariance: np.ndarray
+    tolerances: np.ndarray
+    noise: np.ndarray
+    determined: np.ndarray
+    spread: np.ndarray
+    log_determinant: float
+
+
+def solve(
+    space: ParameterSpace,
+    problem: LinearProblem,
+    tolerances: np.ndarray,
+    noise: np.ndarray,
+    rounds: int = SCALE_ROUNDS,
+    silent: np.ndarray | None = None,
+) -> Posterior:
+    """Return the posterior of a linear problem; tolerances and noise factors are estimated with it.
+
+    Parameters
+    ----------
+    space : ParameterSpace
+        Blocks and their priors' shapes.
+    problem : LinearProblem
+        The data.
+    tolerances : ndarray, shape (blocks,)
+        To start from; a block with zero is left out.
+    noise : ndarray, shape (kinds,)
+        To start from.
+    rounds : int
+        Fixed-point rounds; 0 takes tolerances and noise as they are.
+    silent : ndarray of int, optional
+        Parameters of which the readings say nothing: they are left out.
+    """
+    used = np.setdiff1d(np.flatnonzero(space.spread(tolerances)), [] if silent is None else silent)
+    kinds = np.unique(problem.kind)
+    normal, moment = problem.normal[np.ix_(kinds, used, used)], problem.moment[np.ix_(kinds, used)]
+    scales = [np.concatenate([tolerances, noise])]
+    for turn in range(rounds + 1):
+        tolerances, noise = scales[-1][: len(tolerances)], scales[-1][len(tolerances) :]
+        spread = space.spread(tolerances)[used]
+        inverse, log_determinant = _inverse(_whitened(noise[kinds], normal, spread))
+        z = inverse @ (spread * (noise[kinds] ** -2 @ moment))
+        determined = 1.0 - np.diag(inverse)
+        inverse *= spread[:, None] * spread
+        posterior = Posterior(used, spread * z, inverse, tolerances, noise, determined, spread, log_determinant)
+        if turn < rounds:
+            noise, tolerances = _noise(problem, kinds, normal, moment, posterior), _tolerances(space, posterior, z)
+            scales.append(np.concatenate([tolerances, noise]))
+            ratio = scales[-1][scales[-1] > 0.0] / scales[-2][scales[-1] > 0.0]
+            if np.abs(np.log(ratio)).max() < SCALE_SETTLED:
+                break
+            if len(scales) == 3:
+                scales = [_extrapolated(*scales)]
+    return posterior
+
+
+def _extrapolated(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> np.ndarray:
+    """Return where three rounds of a fixed point that converge slowly lead, in logarithms (SQUAREM).
+
+    Varadhan, Roland (2008), Scandinavian Journal of Statistics 35, 335: first − 2·a·r + a²·v, with r and v first and
+    second differences and a = −|r|/|v|, no shorter than a round and at most :data:`LONGEST_STRIDE` of them.
+    """
+    live = third > 0.0
+    logs = np.log(np.stack([first[live], second[live], third[live]]))
+    step, bend = logs[1] - logs[0], logs[2] - 2.0 * logs[1] + logs[0]
+    stride = float(np.clip(np.linalg.norm(step) / max(float(np.linalg.norm(bend)), 1e-12), 1.0, LONGEST_STRIDE))
+    result = third.copy()
+    led = logs[0] + 2.0 * stride * step + stride**2 * bend
+    result[live] = np.exp(np.clip(led, logs[2] - LEAP, logs[2] + LEAP))
+    return result
+
+
+def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the inverse of a positive definite matrix, which is overwritten, and the logarithm of its determinant.
+
+    Raises
+    ------
+    CalibrationError
+        It is not, to rounding: readings outweigh the priors more than 1e16 times.
+    """
+    factor, failed = dpotrf(matrix.T, lower=1, overwrite_a=1)
+    if failed:
+        problem = "are too few to tell noise from the machine's errors, or their uncertainty is below any instrument's"
+        raise CalibrationError("measurements", problem)
+    log_determinant = 2.0 * float(np.log(np.diag(factor)).sum())
+    lower, _ = dpotri(factor, lower=1, overwrite_c=1)
+    inverse = lower.T + lower  # dpotrf has left zeros above
+    inverse[np.diag_indices_from(inverse)] *= 0.5
+    return inverse, log_determinant
+
+
+def _noise(
+    problem: LinearProblem, kinds: np.ndarray, normal: np.ndarray, moment: np.ndarray, posterior: Posterior
+) -> np.ndarray:
+    """Return new noise factors: squared residuals over what freedom the parameters leave; sums of some kinds."""
+    result, y = posterior.noise.copy(), posterior.y
+    for k, information, sums in zip(kinds, normal, moment, strict=True):
+        rest = problem.square[k] - 2.0 * y @ sums + y @ information @ y
+        freedom = problem.freedom[k] - np.vdot(posterior.covariance, information) / result[k] ** 2
+        if freedom > LEAST_FREEDOM and rest > 0.0:
+            result[k] = np.sqrt(rest / freedom)
+    return np.maximum(result, problem.least_noise)
+
+
+def _tolerances(space: ParameterSpace, posterior: Posterior, z: np.ndarray) -> np.ndarray:
+    """Return new tolerances: MacKay's fixed point, squared parameters over how many are determined.
+
+    The first guess counts as a tenth of a parameter, which keeps an empty block from collapsing.
+    """
+    result, start = posterior.tolerances.copy(), space.start_tolerances()
+    for n, block in enumerate(space.blocks):
+        members = (posterior.used >= block.part.start) & (posterior.used < block.part.stop)
+        if members.any():
+            first = HYPER * (start[n] / result[n]) ** 2
+            factor = np.sqrt((z[members] @ z[members] + first) / (posterior.determined[members].sum() + HYPER))
+            result[n] = min(result[n] * np.clip(factor, 0.1, 10.0), LARGEST_TOLERANCE.get(block.name, np.inf))
+    return result
+
+
+def log_evidence(problem: LinearProblem, posterior: Posterior) -> float:
+    """Return the logarithm of the readings' probability under a posterior's tolerances and noise, but for a constant.
+
+    MacKay (1992), Neural Computation 4, 415: how well the readings are met, less what it takes to single the parameters
+    out of their priors.
+    """
+    kinds = np.unique(problem.kind)
+    weights, moment = posterior.noise[kinds] ** -2, problem.moment[np.ix_(kinds, posterior.used)]
+    unmet = weights @ (problem.square[kinds] - moment @ posterior.y)
+    return float(-0.5 * (unmet + posterior.log_determinant - problem.freedom[kinds] @ np.log(weights)))
+
+
+def condense(problem: LinearProblem, posterior: Posterior) -> Condensed:
+    """Return what leaving out folds looks at, for fits with the parameters of a posterior, or some of them."""
+    group = problem.fold * len(problem.freedom) + problem.kind
+    _, cells, member = np.unique(group, return_index=True, return_inverse=True)
+    first = cells[member.ravel()]
+    draws = np.zeros((problem.rows.shape[1], DRAWS))
+    z = np.random.default_rng(SEED).standard_normal((len(posterior.used), DRAWS)) / np.sqrt(DRAWS)
+    root = np.linalg.cholesky(whitened_precision(problem, posterior))
+    draws[posterior.used] = posterior.spread[:, None] * dtrtrs(root, z, lower=1, trans=1)[0]
+    rows, target, cell = problem.rows.condensed(problem.target, first, draws / posterior.noise[problem.kind].min())
+    shape = int(problem.fold.max()) + 1, len(problem.freedom)
+    rest = np.bincount(group, problem.target**2, shape[0] * shape[1])
+    rest -= np.bincount(group[cell], target**2, len(rest))
+    return Condensed(target, rows, cell, first, np.maximum(rest, 0.0).reshape(shape))
+
+
+def held_out(problem: LinearProblem, condensed: Condensed, posterior: Posterior) -> np.ndarray:
+    """Return the errors, in standard deviations, at cells whose fold the fit did not see, shape (C,)."""
+    solved = _solved_without(problem, condensed, posterior)
+    return _errors(problem.rows, problem.target, problem.fold, solved) / posterior.noise[problem.kind]
+
+
+def held_out_squares(problem: LinearProblem, condensed: Condensed, posterior: Posterior) -> np.ndarray:
+    """Return the sums of squares of :func:`held_out` by fold and kind, over the stated noise, shape (folds, kinds)."""
+    squares, (fold, kind) = condensed.rest.copy(), (each[condensed.cell] for each in (problem.fold, problem.kind))
+    errors = _errors(condensed.rows, condensed.target, fold, _solved_without(problem, condensed, posterior))
+    np.add.at(squares, (fold, kind), errors**2)
+    return squares
+
+
+def _errors(rows: DesignMatrix, target: np.ndarray, fold: np.ndarray, solved: np.ndarray) -> np.ndarray:
+    """Return what is left of targets at each fold's own answer (folds, size)."""
+    result = target.copy()
+    for part in rows.parts:
+        for first in range(0, len(part.cells), TOGETHER):
+            cells, values = part.cells[first : first + TOGETHER], part.values[first : first + TOGETHER]
+            result[cells] -= np.einsum("ci,ci->c", values, solved[np.ix_(fold[cells], part.columns)])
+    return result
+
+
+def _solved_without(problem: LinearProblem, condensed: Condensed, posterior: Posterior) -> np.ndarray:
+    """Return the most probable y of fits that did not see one fold, shape (folds, size): exact, and no fit is repeated.
+
+    Without a fold with rows R and residuals r, y changes by −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r, with C the parameters' covariance,
+    or by −(C⁻¹ − Rᵀ·R)⁻¹·Rᵀ·r: a matrix of the rows' size, where they are few, or of the parameters'.
+    """
+    used, spread, fold = posterior.used, posterior.spread, problem.fold[condensed.cell]
+    solved, small = np.zeros((len(condensed.rest), problem.rows.shape[1])), len(used) // 2
+    # It is not needed where no fold is large.
+    precision = whitened_precision(problem, posterior) if np.bincount(fold).max() > small else np.zeros((0, 0))
+
+    def solve_without(some: tuple[np.ndarray, list[int]]) -> None:
+        chosen, ends = some
+        scale = 1.0 / posterior.noise[problem.kind[condensed.cell[chosen]]]
+        rows = condensed.rows.select(chosen).using(used, scale)
+        left = scale * condensed.target[chosen] - rows.times(posterior.y)
+        if ends[1] > small:
+            seen = rows.normal()
+            seen *= spread[:, None]
+            seen *= spread
+            factor = np.linalg.cholesky(np.subtract(precision, seen, out=seen))
+            changes = spread * dpotrs(factor, spread * rows.transposed_times(left), lower=1)[0]
+        else:
+            shared, whole = rows.times(posterior.covariance), rows.dense()
+            changes = np.empty((len(ends) - 1, len(used)))
+            for n, (a, b) in enumerate(pairwise(ends)):
+                changes[n] = np.linalg.solve(np.eye(b - a) - shared[a:b] @ whole[a:b].T, left[a:b]) @ shared[a:b]
+        solved[np.ix_(fold[chosen[ends[:-1]]], used)] = posterior.y - changes
+
+    at_once(solve_without, _whole_folds(fold, small))
+    return solved
+
+
+def _whole_folds(fold: np.ndarray, small: int) -> Iterator[tuple[np.ndarray, list[int]]]:
+    """Yield rows in the order of their folds, and where each ends: some thousand of small folds, or a large one."""
+    order = np.argsort(fold, kind="stable")
+    ends = [0, *(np.flatnonzero(np.diff(fold[order])) + 1).tolist(), len(order)]
+    first = 0
+    for n, (start, end) in enumerate(pairwise(ends), 1):
+        last = n == len(ends) - 1
+        if last or end - ends[first] >= TOGETHER or max(end - start, ends[n + 1] - end) > small:
+            yield order[ends[first] : end], [e - ends[first] for e in ends[first : n + 1]]
+            first = n
+
+
+def whitened_precision(problem: LinearProblem, posterior: Posterior) -> np.ndarray:
+    """Return the precision of y over the prior's spread, shape (n, n)."""
+    kinds = np.unique(problem.kind)
+    information = problem.normal[np.ix_(kinds, posterior.used, posterior.used)]
+    return _whitened(posterior.noise[kinds], information, posterior.spread)
+
+
+def _whitened(noise: np.ndarray, information: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Return the same from the noise (kinds,) and the information (kinds, n, n) of each kind, and the spread (n,)."""
+    precision = np.tensordot(noise**-2, information, 1)
+    precision *= spread[:, None] * spread
+    precision[np.diag_indices_from(precision)] += 1.0
+    return precision
+
+
+def physical_covariance(space: ParameterSpace, posterior: Posterior) -> np.ndarray:
+    """Return the covariance of the parameters x, shape (size, size), SI; all blocks must be in use."""
+    return space.physical(space.physical(posterior.covariance).T)
+
+
+STEPS = 20
+"""Most Gauss–Newton steps; a handful is enough for deviations of a tenth of a millimetre."""
+
+SLOW, LEAST_SHARE = 0.7, 0.3
+"""A step whose change is not below so much of the last one's is shortened by half, to this share at least:
+tolerances and parameters that wait for each other could otherwise swing for ever."""
+
+SETTLED = 1e-2
+"""The fit stops when no parameter moves by more than this share of its standard deviation."""
+
+HUBER = 2.5
+"""Residuals beyond so many standard deviations lose weight in proportion."""
+
+MEDIAN_TO_SIGMA = 1.4826
+"""Standard deviation of a normal distribution over the median of its absolute values."""
+
+CHUNK = 512
+"""Cells whose derivatives are worked out together: a processor's cache holds them."""
+
+ROUNDING = 1e-12
+"""A direction whose component is below this does not have it: frames turned by right angles are right to rounding."""
+
+OUTLIER = 5.0
+"""Residuals beyond so many standard deviations are listed."""
+
+
+class _Group(NamedTuple):
+    """Cells of one kind whose errors have the same components; those of a run, and of an unknown, stand together."""
+
+    kind: int
+    components: np.ndarray
+    cells: np.ndarray
+
+
+class Estimation:
+    """Readings against parameters.
+
+    Parameters
+    ----------
+    measurements : MeasurementSet
+        The readings.
+    space : ParameterSpace
+        The parameters.
+    alone : bool
+        Nothing else is known of the machine: the readings must be enough.
+
+    Raises
+    ------
+    CalibrationError
+        Readings that no machine's error can have, or fewer than unknowns: nothing would be determined.
+    """
+
+    def __init__(self, measurements: MeasurementSet, space: ParameterSpace, alone: bool = True) -> None:
+        refuse_absurd(measurements)
+        self.measurements, self.space = measurements, space
+        self.cells = Cells.of(measurements)
+        self.uncertainty = measurements.stated
+        self._zeros, self._lengths = self.cells.groups(measurements)
+        self._components = np.abs(self.cells.directions) > ROUNDING
+        for lengths in self._lengths:
+            self._components[lengths.members, :3] = True  # their directions change with the answer
+        self._groups = self._group_alike()
+        needed = len(space.blocks[0].labels)
+        free = len(self.cells.station) - len(self._zeros) - sum(along is not None for _, along in self._zeros)
+        free -= sum(lengths.count for lengths in self._lengths)
+        if alone and free < needed:
+            problem = f"{len(measurements)} readings at {len(self.cells.station)} distinct places leave {free} "
+            raise CalibrationError("measurements", problem + f"numbers for the structure's {needed} parameters")
+
+    def linearise(
+        self, x: np.ndarray, reading_weights: np.ndarray, prediction: Prediction | None = None
+    ) -> tuple[LinearProblem, np.ndarray]:
+        """Return the linear problem at a parameter vector, and each reading's residual there, m or rad.
+
+        Parameters
+        ----------
+        x : ndarray, shape (size,)
+            Parameters, SI.
+        reading_weights : ndarray, shape (N,)
+            Trust in each reading, 0…1.
+        prediction : Prediction, optional
+            What the machine of these parameters does, if that is known.
+
+        Raises
+        ------
+        CalibrationError
+            No machine is like that, or it cannot take one of the poses.
+        """
+        c, m = self.cells, self.measurements
+        weights = reading_weights / self.uncertainty**2
+        total = np.bincount(c.of_reading, weights)
+        scale = np.sqrt(total)
+        values = np.bincount(c.of_reading, weights * m.value) / total
+        prediction, directions = prediction or self._predicted(x), c.directions.copy()
+        expected, unknowns = self._unknowns(directions, prediction.errors[c.station], values, scale)
+        misfit = m.value - expected[c.of_reading]
+        mean = np.bincount(c.of_reading, weights * misfit) / total
+        rows, moved = self._rows(x, prediction, scale[:, None] * directions)
+        target, unknown = scale * mean, np.zeros(len(mean))
+        per_length = rows.using(np.arange(self.space.size)[self.space.offsets], np.ones(len(mean))).dense()
+        for part in unknowns:
+            unknown[part.members] += part.explained(target) / scale[part.members]
+            part.project_out(target)
+            part.project_out(moved)
+        rows.project_out(unknowns)
+        residuals = misfit - unknown[c.of_reading]
+        scatter = np.bincount(m.kind, weights * (misfit - mean[c.of_reading]) ** 2, len(KINDS))
+        # Huber's proposal 2: noise comes from the residuals cut off, weight² · residual², or outliers blow it up.
+        beyond = np.bincount(m.kind, weights * (1.0 - reading_weights) * residuals**2, len(KINDS))
+        problem = self._problem(target + moved, rows, scatter - beyond, unknowns)
+        return replace(problem, per_length=per_length, unknowns=tuple(unknowns)), residuals
+
+    def _rows(self, x: np.ndarray, prediction: Prediction, directions: np.ndarray) -> tuple[DesignMatrix, np.ndarray]:
+        """Return each cell's derivatives by y, and what all parameters do together, (C,).
+
+        Along directions (C, 6), over the standard deviations of the cells' values.
+        """
+        c, space, moved = self.cells, self.space, np.empty(len(self.cells.station))
+        slopes, y = Slopes(space, prediction, self.measurements.stations, whitened=True), space.whitened_parameters(x)
+
+        def rows_of(group: _Group) -> Alike:
+            columns = slopes.columns(group.components)
+            rows = np.empty((len(group.cells), len(columns)))
+            for first in range(0, len(rows), CHUNK):
+                part, cells = rows[first : first + CHUNK], group.cells[first : first + CHUNK]
+                slopes.write(part, columns, c.station[cells], directions[cells], group.components)
+                moved[cells] = part @ y[columns]
+            return Alike(group.cells, columns, rows)
+
+        return DesignMatrix((len(moved), space.size), at_once(rows_of, self._groups)), moved
+
+    def free_of_nuisance(self, rows: np.ndarray) -> np.ndarray:
+        """Return what is left of cells' derivatives (C, K) beside all that instruments do not know, over their noise.
+
+        The noise is the stated one.
+        """
+        scale, unknowns = self._stated_unknowns()
+        rows = scale[:, None] * rows
+        for part in unknowns:
+            part.project_out(rows)
+        return rows
+
+    def shares_of_nuisance(self) -> np.ndarray:
+        """Return how much of each cell's value what instruments do not know takes up, shape (C,), 0…1."""
+        shares = np.zeros(len(self.cells.station))
+        for part in self._stated_unknowns()[1]:
+            shares[part.members] += part.basis**2 @ part.share
+        return shares
+
+    def _stated_unknowns(self) -> tuple[np.ndarray, list[Nuisance]]:
+        """Return one over the cells' stated noise, (C,), and what instruments do not know, at the nominal machine."""
+        scale = np.sqrt(np.bincount(self.cells.of_reading, self.uncertainty**-2))
+        values = np.zeros(len(scale))
+        return scale, self._unknowns(self.cells.directions.copy(), np.zeros((len(scale), 6)), values, scale)[1]
+
+    def _predicted(self, x: np.ndarray) -> Prediction:
+        """Return what the machine of a parameter vector does.
+
+        Raises
+        ------
+        CalibrationError
+            No machine is like that, or it cannot take one of the poses.
+        """
+        try:
+            return predict(self.space, x, self.measurements.stations)
+        except (ModelError, KinematicsError) as error:
+            hint = "do units, directions and commanded poses fit, and are all blocks allowed?"
+            problem = f"left the machines that can be ({error}); {hint}"
+            raise CalibrationError("fit", problem) from error
+
+    def _unknowns(
+        self, directions: np.ndarray, errors: np.ndarray, values: np.ndarray, scale: np.ndarray
+    ) -> tuple[np.ndarray, list[Nuisance]]:
+        """Return what cells with errors (C, 6) should read, and what is unknown; renews `directions` of lengths."""
+        expected = np.einsum("ci,ci->c", directions, errors)
+        unknowns = [of_zero(members, scale[members], along) for members, along in self._zeros]
+        for lengths in self._lengths:
+            n = lengths.members
+            expected[n], directions[n, :3], parts = lengths.seen(errors[n, :3], values[n], scale[n])
+            unknowns += parts
+        return expected, unknowns
+
+    def _problem(
+        self, target: np.ndarray, rows: DesignMatrix, scatter: np.ndarray, unknowns: list[Nuisance]
+    ) -> LinearProblem:
+        """Gather the sums that everything later needs."""
+        kind, size, kinds = self.cells.kind, self.space.size, len(KINDS)
+        normal, moment, square = np.zeros((kinds, size, size)), np.zeros((kinds, size)), scatter.copy()
+        freedom = np.bincount(self.measurements.kind, minlength=kinds).astype(float)
+        for part in unknowns:
+            freedom[kind[part.members[0]]] -= part.share.sum()
+        products = at_once(lambda part: part.values.T @ part.values, rows.parts)
+        for group, (_, columns, values), product in zip(self._groups, rows.parts, products, strict=True):
+            normal[group.kind][np.ix_(columns, columns)] += product
+            moment[group.kind][columns] += target[group.cells] @ values
+            square[group.kind] += target[group.cells] @ target[group.cells]
+        least_noise = LEAST_NOISE / np.array([self.measurements.stated_of(k) for k in range(kinds)])
+        return LinearProblem(target, rows, kind, self.cells.fold, normal, moment, square, freedom, least_noise)
+
+    def _group_alike(self) -> list[_Group]:
+        """Return the cells in groups of one kind whose errors have the same components."""
+        c = self.cells
+        for members in [members for members, _ in self._zeros] + [lengths.members for lengths in self._lengths]:
+            self._components[members] |= self._components[members].any(axis=0)
+        key = c.kind * 64 + self._components @ (1 << np.arange(6))
+        order = np.lexsort((c.group, self.measurements.run[c.first], key))
+        return [
+            _Group(int(c.kind[cells[0]]), np.flatnonzero(self._components[cells[0]]), cells)
+            for cells in np.split(order, np.flatnonzero(np.diff(key[order])) + 1)
+        ]
+
+    def robust_weights(self, residuals: np.ndarray) -> np.ndarray:
+        """Return Huber's weights of residuals (N,), 1 for all that are no surprise.
+
+        What is a surprise is measured by the median of each kind's residuals, which gross errors do not move.
+        """
+        size = np.abs(residuals) / self.uncertainty
+        weights = np.ones(len(size))
+        for k in np.unique(self.measurements.kind):
+            members = self.measurements.kind == k
+            cut = HUBER * MEDIAN_TO_SIGMA * np.median(size[members])
+            if cut > 0.0:
+                weights[members] = np.minimum(1.0, cut / np.maximum(size[members], cut))
+        return weights
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A settled fit.
+
+    Attributes
+    ----------
+    problem : LinearProblem
+        Linearised at the answer.
+    posterior : Posterior
+        The answer.
+    x : ndarray, shape (size,)
+        Its parameters, SI.
+    residuals, weights : ndarray, shape (N,)
+        Of each reading, m or rad; and the trust it got, 0…1.
+    steps : int
+        Gauss–Newton steps.
+    change : float
+        Largest change of a parameter in the last one, in its standard deviation.
+    """
+
+    problem: LinearProblem
+    posterior: Posterior
+    x: np.ndarray
+    residuals: np.ndarray
+    weights: np.ndarray
+    steps: int
+    change: float
+
+    @cached_property
+    def condensed(self) -> Condensed:
+        """The cells in as few rows as the parameters in use can be told by."""
+        return condense(self.problem, self.posterior)
+
+    @cached_property
+    def held_out(self) -> np.ndarray:
+        """Errors, in standard deviations, at cells whose fold a fit does not see, shape (C,)."""
+        return held_out(self.problem, self.condensed, self.posterior)
+
+
+def iterate(
+    estimation: Estimation,
+    x: np.ndarray,
+    tolerances: np.ndarray,
+    noise: np.ndarray,
+    progress: Callable[[str], object],
+) -> Solution:
+    """Run Gauss–Newton steps until the parameters settle, from the nominal machine or from an answer.
+
+    Raises
+    ------
+    CalibrationError
+        They do not.
+    """
+    weights, robust = np.ones(len(estimation.measurements)), estimation.space.settings.robust
+    share, last = 1.0, np.inf
+    all_alike = 0 if x.any() else 1  # steps whose residuals are the machine's errors: they weigh no reading
+    for step in range(1, STEPS + 1):
+        problem, residuals = estimation.linearise(x, weights)
+        posterior = solve(estimation.space, problem, tolerances, noise)
+        tolerances, noise = posterior.tolerances, posterior.noise
+        change, block = _change(estimation.space.physical(posterior.y) - x, estimation.space, posterior)
+        progress(f"step {step}: largest change {change:.2g} standard deviations")
+        if step > all_alike + (2 if robust else 1) and change > SLOW * last:  # the first with weights may change more
+            share = max(LEAST_SHARE, 0.5 * share)
+        x, last = x + share * (estimation.space.physical(posterior.y) - x), change
+        if (change < SETTLED and (step > all_alike + 1 or not robust)) or step == STEPS:
+            break
+        if robust and step > all_alike:
+            weights = estimation.robust_weights(residuals)
+    if change > 1.0:
+        moving = f"did not settle within {STEPS} steps: {block} still changes by {change:.2g} standard deviations"
+        raise CalibrationError("fit", f"{moving}; are all blocks allowed, and is it measured in enough places?")
+    return Solution(problem, posterior, x, residuals, weights, step, change)
+
+
+def _change(change: np.ndarray, space: ParameterSpace, posterior: Posterior) -> tuple[float, str]:
+    """Return the largest change of a parameter x in its standard deviation, and the block that it belongs to."""
+    deviations = np.sqrt(np.diag(physical_covariance(space, posterior)))
+    sizes = np.abs(change) / deviations
+    block = max(space.blocks, key=lambda block: sizes[block.part].max())
+    return float(sizes[block.part].max()), block.name
