@@ -23,12 +23,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is loaded: th
 
 import numpy as np
 
+from hexapod_comp.calibration.blocks import HARMONICS
 from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.lead import ScrewLead, look_for_lead
 from hexapod_comp.calibration.parameters import BLOCKS, FitSettings, ParameterSpace
-from hexapod_comp.calibration.selection import HARMONICS
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.loop.story import demo_campaign, demo_place
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry

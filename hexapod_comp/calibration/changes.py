@@ -13,7 +13,8 @@ import numpy as np
 
 from ..machine.geometry import STRUT_NAMES
 from ..measurements.readings import AXES
-from .parameters import BLOCKS, Block, ParameterSpace
+from .blocks import Block
+from .parameters import BLOCKS, ParameterSpace
 from .posterior import FittedParameters
 
 DATUM, STRUT, TEMPERATURE, AGEING, READING, OTHER = "datum", "strut", "temperature", "ageing", "reading", "other"

@@ -18,9 +18,9 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths
 from ..machine.model import Datum, MachineModel
 from ..pose import Pose
+from .assumptions import ASSUMED
 from .estimator import Estimation
 from .sensitivity import carried
-from .smooth_field import DIGITS
 
 SEEN = 1.0
 """A motion of the whole machine is seen when one of the structure's tolerance changes the readings by more than so many
@@ -131,7 +131,7 @@ def hold(
     refuse_unreachable(geometry, pose)
     given_up = tool_move(geometry, model, pose)
     model = with_datum_held(geometry, model, pose, part)
-    rounded = {name: getattr(model, name).round(DIGITS) for name in ("base_deviation", "base_axes_turn")}
+    rounded = {name: getattr(model, name).round(ASSUMED.digits) for name in ("base_deviation", "base_axes_turn")}
     held = HeldDatum(pose, part, given_up)
     return replace(model, **rounded, origin=replace(model.origin, datum=held.datum)), held
 

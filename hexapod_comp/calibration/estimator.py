@@ -692,7 +692,7 @@ class Estimation:
             rows = np.empty((len(group.cells), len(columns)))
             for first in range(0, len(rows), CHUNK):
                 part, cells = rows[first : first + CHUNK], group.cells[first : first + CHUNK]
-                slopes.write(part, columns, c.station[cells], directions[cells], group.components)
+                slopes.write(part, c.station[cells], directions[cells], group.components)
                 moved[cells] = part @ y[columns]
             return Alike(group.cells, columns, rows)
 

@@ -15,15 +15,16 @@ from ..machine.size import rms
 from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementSet, refuse_unmoved
 from ..pose import Pose
+from .assumptions import ASSUMED
+from .blocks import WAVES
 from .courses import with_courses
 from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
 from .estimator import HUBER, OUTLIER, Estimation, LinearProblem, Posterior, Solution, iterate, physical_covariance
 from .lead import ScrewLead, look_for_lead
 from .observability import Allowed, Observability, ToolError, UnseenError, listed, observe, without_trace
-from .parameters import WAVES, FitSettings, ParameterSpace
+from .parameters import FitSettings, ParameterSpace
 from .residuals import Residuals
 from .selection import Decision, select
-from .smooth_field import DIGITS
 from .suspicions import SCATTERED, SURE, SWAPPED, causes
 from .verdict import Verdict, judge
 from .warming import HeatSeen, TimeConstants, seek_time_constants
@@ -489,4 +490,4 @@ def _named(
         note += f", expected tool error {level.after * 1e6:.3f} µm RMS, up to {level.high * 1e6:.3f} (95 %)"
     residual = rms(lengths) if lengths else None
     origin = ModelOrigin(date.today().isoformat(), measurements.files, residual, note)
-    return replace(space.model(solution.x.round(DIGITS)), origin=origin)
+    return replace(space.model(solution.x.round(ASSUMED.digits)), origin=origin)

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core import MOST_HARMONICS
+from .blocks import WAVES
 from .estimator import HUBER, MEDIAN_TO_SIGMA, Estimation, LinearProblem, Posterior, at_once, solve
-from .parameters import WAVES
 
 SHORTEST, LONGEST = 1e-3, 30e-3
 """Periods that are looked for, m. Above, a wave is as smooth as what a length map is for."""

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .blocks import HARMONICS
 from .estimator import LinearProblem, Posterior, at_once, condense, held_out_squares, log_evidence, solve
 from .parameters import ParameterSpace
 
@@ -27,7 +28,6 @@ the readings are as much more probable with it as with a number that is found so
 LEAST_GAIN = 1e-4
 """A block does not help when its gain is below this: it is rounding, which depends on the libraries, or of no use."""
 
-HARMONICS = ("wave 2", "wave 3", "wave 4")
 RARE = (HARMONICS, ("backlash map",))
 """What not every screw has, and no general block explains: harmonics, and wear."""
 

@@ -22,9 +22,10 @@ from ..machine.passes import Passes
 from ..measurements.reach import GEOMETRIES, exchanged
 from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_KINDS, MeasurementSet, Stations
 from ..virtual.instruments import compensated
+from .blocks import WAVES
 from .estimator import Estimation, LinearProblem, Posterior, physical_covariance, solve
 from .misfit import FAMILIES, family_of_run
-from .parameters import WAVES, FitSettings, ParameterSpace
+from .parameters import FitSettings, ParameterSpace
 from .sensitivity import Prediction, predict
 
 PLAIN = ("pitch", *WAVES, "backlash")

@@ -14,12 +14,12 @@ import numpy as np
 from ..errors import CalibrationError
 from ..machine.model import MachineModel
 from ..measurements.readings import MeasurementSet
+from .assumptions import ASSUMED
 from .changes import FAMILIES, OTHER, READING, REPAIRABLE, TEMPERATURE, Change, possible_changes, widened
 from .check_readings import CheckReadings, Explanation, explained, weigh
 from .datum import hold, unseen_part
 from .estimator import Estimation
 from .posterior import FittedParameters
-from .smooth_field import DIGITS
 from .verification import UNEXPLAINED, VALID, Verification
 
 STEPS = 3
@@ -120,7 +120,7 @@ def _held(
     )
     space, before = fitted.space, fitted.held
     model = replace(
-        space.model(fitted.x.round(DIGITS), old.name), reversal_threshold=old.reversal_threshold, origin=origin
+        space.model(fitted.x.round(ASSUMED.digits), old.name), reversal_threshold=old.reversal_threshold, origin=origin
     )
     if before is None:
         return model, fitted

@@ -19,9 +19,12 @@ from ..formats.texts import number
 from ..machine.late import MOST_TIME_CONSTANTS, PARTS, TIME_CONSTANT_RANGE, LateGrowth
 from ..machine.temperatures import REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE
 from ..measurements.readings import KINDS, MeasurementSet
+from .assumptions import ASSUMED
+from .blocks.block import Linkage
+from .blocks.growth import growth_causes, growth_columns, growth_root
 from .estimator import Estimation, Posterior, Solution, physical_covariance, solve
-from .parameters import LEAST_DAMPING, LEAST_WARMING, TOLERANCES, ParameterSpace, growth_root
-from .sensitivity import growth_causes, growth_columns, predict
+from .parameters import TOLERANCES, ParameterSpace
+from .sensitivity import predict
 
 GRID = 40
 """Time constants tried, from :data:`SHORTEST` to :data:`LONGEST` times what the readings span: a sixth apart."""
@@ -107,13 +110,14 @@ def _tried(estimation: Estimation) -> Posterior:
 def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
     """Return what the relative growth of each part moves each cell by, shape (C, 8), m or rad."""
     space, cells = estimation.space, estimation.cells
-    columns = growth_columns(space, predict(space, x, estimation.measurements.stations))[cells.station]
+    stations = estimation.measurements.stations
+    columns = growth_columns(Linkage(predict(space, x, stations), space.probe, stations))[cells.station]
     return np.einsum("ci,cip->cp", cells.directions, columns)
 
 
 def _late_columns(estimation: Estimation, x: np.ndarray, constants: np.ndarray, size: float) -> np.ndarray:
     """Return what late parts of a size, 1/K, move the cells by, (C, K·8), over the stated noise, free of zeros."""
-    behind = growth_causes(estimation.space, estimation.measurements.stations, constants)
+    behind = growth_causes(estimation.space.settings, estimation.measurements.stations, constants)
     behind = behind[estimation.cells.station, :, 1:]
     columns = (_per_growth(estimation, x)[:, :, None] * behind).transpose(0, 2, 1) @ (size * growth_root(1))
     return estimation.free_of_nuisance(columns.reshape(len(columns), -1))
@@ -326,7 +330,9 @@ def _effects(estimation: Estimation, x: np.ndarray, constants: TimeConstants) ->
         return
     growth, per_growth = x[block.part].reshape(len(PARTS), -1), _per_growth(estimation, x)
     for k, value in enumerate(constants.values):
-        shorter, longer = (growth_causes(space, stations, [value * math.exp(way)])[:, :, 1] for way in (-STEP, STEP))
+        shorter, longer = (
+            growth_causes(space.settings, stations, [value * math.exp(way)])[:, :, 1] for way in (-STEP, STEP)
+        )
         later = ((longer - shorter) / (2.0 * STEP))[estimation.cells.station]
         yield estimation.free_of_nuisance((per_growth * later) @ growth[:, k : k + 1])[:, 0]
 
@@ -371,7 +377,7 @@ def _swelling_text(swelling: Swelling) -> str:
     head = f"humidity; changed by {100.0 * swelling.change:.1f} %: struts grow by {1e4 * swelling.moisture:.2f}"
     stated = f"ppm per % (stated {1e4 * swelling.stated:g})"
     if math.isnan(swelling.deviation):
-        least = f"it changed by less than {100.0 * LEAST_DAMPING:g} %, or growth explains nothing"
+        least = f"it changed by less than {100.0 * ASSUMED.least_damping:g} %, or growth explains nothing"
         return f"{head} {stated}, as stated: {least}"
     unsure = "" if swelling.determined > SEEN_SHARE else "; these readings do not determine it"
     return f"{head} ± {1e4 * swelling.deviation:.2f} {stated}{unsure}"
@@ -382,7 +388,7 @@ def _heat_text(warming: HeatSeen) -> str:
     whose = f"; {warming.thermometer} stands for all parts" if warming.thermometer else ""
     lines = [f"heat; change of each thermometer: {listed}{whose}"]
     if not warming.parts:
-        least = f"temperatures changed by less than {LEAST_WARMING:g} K, or growth explains nothing"
+        least = f"temperatures changed by less than {ASSUMED.least_warming:g} K, or growth explains nothing"
         lines.append(f"  expansion is not determined: {least}; what was stated stays")
     constants = warming.time_constants
     for p in warming.parts:

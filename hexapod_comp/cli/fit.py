@@ -71,7 +71,7 @@ def fit_settings(args: argparse.Namespace) -> FitSettings:
 
 
 def _blocks_called(name: str) -> tuple[str, ...]:
-    from ..calibration.selection import HARMONICS
+    from ..calibration.blocks import HARMONICS
 
     several = {"field": ("field displacement", "field rotation", "field reversal"), "harmonics": HARMONICS}
     return several.get(name, (name,))

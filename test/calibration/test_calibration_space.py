@@ -10,14 +10,9 @@ from numpy.polynomial import legendre
 from scipy.interpolate import CubicSpline
 from scipy.spatial.distance import cdist
 
+from hexapod_comp.calibration.assumptions import ASSUMED
+from hexapod_comp.calibration.blocks.field import SmoothField
 from hexapod_comp.calibration.parameters import BLOCKS, FitSettings, ParameterSpace
-from hexapod_comp.calibration.smooth_field import (
-    DECAY,
-    GRID_TOLERANCE,
-    KNOT_DISTANCE,
-    MAP_CORRELATION_LENGTH,
-    SmoothField,
-)
 from hexapod_comp.errors import ModelError
 from hexapod_comp.measurements.campaign import template
 from hexapod_comp.measurements.readings import MeasurementSet
@@ -80,7 +75,7 @@ def test_degrees_count_for_more_along_short_sides():
     assert slab.powers.max(axis=0).tolist() == [4, 4, 2]
     totals = slab.powers @ [1.0, 1.0, np.sqrt(2.0)]
     assert totals.max() <= 4.0
-    np.testing.assert_allclose(slab.prior, DECAY**totals, rtol=1e-14)
+    np.testing.assert_allclose(slab.prior, ASSUMED.field_decay**totals, rtol=1e-14)
     assert len({tuple(p) for p in slab.powers}) == len(slab.powers) == len(set(slab.terms))
 
 
@@ -111,7 +106,7 @@ def grid_difference(field: SmoothField, coefficients: tuple[np.ndarray, np.ndarr
     return np.abs(found - field.evaluate(*coefficients, points, sense)).max(axis=0)
 
 
-@pytest.mark.parametrize(("degree", "allowed"), [(1, GRID_TOLERANCE), (3, GRID_TOLERANCE), (6, 100e-9)])
+@pytest.mark.parametrize(("degree", "allowed"), [(1, ASSUMED.grid_tolerance), (3, ASSUMED.grid_tolerance), (6, 100e-9)])
 def test_grid_field_is_the_same_field(degree: int, allowed: float):
     """Stated: 30 nm and 30 nrad at points of its own; twice that elsewhere.
 
@@ -137,7 +132,7 @@ def test_flat_boxes_carry_no_power_across(flat: list[int]):
     grid = field.as_grid(*coefficients)
     found = np.array([grid.evaluate(p, np.ones(3))[0] for p in points])
     wanted = field.evaluate(*coefficients, points, np.ones((20, 3)))
-    np.testing.assert_allclose(found, wanted, atol=2.0 * GRID_TOLERANCE)
+    np.testing.assert_allclose(found, wanted, atol=2.0 * ASSUMED.grid_tolerance)
 
 
 def test_boxes_flat_but_for_rounding_are_flat():
@@ -153,7 +148,7 @@ def test_boxes_flat_but_for_rounding_are_flat():
 def test_vector_names_and_sizes(space: ParameterSpace):
     """Twelve joints (three shared ones on the platform) and six offsets are 33; every parameter has a name."""
     sizes = {block.name: len(block.labels) for block in space.blocks}
-    knots, worn = (len(knots) for knots in space.knots.values())
+    knots, worn = (len(space.block(name).knots) for name in ("map", "backlash map"))
     terms, turning = len(space.field.terms), len(space.field.reversal_terms)
     expected = (33, 6, 12, 12, 12, 12, 6, 6 * knots, 6 * worn, 3 * terms, 3 * terms, 18 * turning)
     cold = [name for name in BLOCKS if name not in ("expansion", "moisture", "late")]  # nothing grew
@@ -186,17 +181,17 @@ def test_without_a_lead_there_are_no_waves(readings: MeasurementSet):
 
 def test_knots_cover_the_commands_close_enough(space: ParameterSpace, readings: MeasurementSet):
     commands = readings.stations.commands
-    knots, worn = space.knots["map"], space.knots["backlash map"]
+    knots, worn = space.block("map").knots, space.block("backlash map").knots
     assert knots[0] <= commands.min() < commands.max() <= knots[-1]
-    assert np.diff(knots).max() <= KNOT_DISTANCE * (1.0 + 1e-12)
+    assert np.diff(knots).max() <= ASSUMED.knot_distance * (1.0 + 1e-12)
     assert set(worn) <= set(knots)
     assert worn[[0, -1]].tolist() == knots[[0, -1]].tolist()
 
 
 def test_prior_of_the_map_is_matern(space: ParameterSpace):
     """Matérn 5/2 as in Rasmussen and Williams, eq. 4.17; 1e-9 of independent variance keep it regular."""
-    root, knots = space.block("map").root, space.knots["map"]
-    distance = np.sqrt(5.0) * cdist(knots[:, None], knots[:, None]) / MAP_CORRELATION_LENGTH
+    root, knots = space.block("map").root, space.block("map").knots
+    distance = np.sqrt(5.0) * cdist(knots[:, None], knots[:, None]) / ASSUMED.map_correlation
     wanted = (1.0 + distance + distance**2 / 3.0) * np.exp(-distance)
     n = len(knots)
     np.testing.assert_allclose((root @ root.T)[:n, :n], wanted, atol=2e-9)
@@ -223,12 +218,12 @@ def test_whitening_is_the_chain_rule(space: ParameterSpace):
 
 
 def test_spline_weights_are_the_natural_spline(space: ParameterSpace):
-    knots = space.knots["map"]
+    knots = space.block("map").knots
     values = np.random.default_rng(8).standard_normal(len(knots))
     commands = np.linspace(knots[0] - 0.01, knots[-1] + 0.01, 50)
     spline = CubicSpline(knots, values, bc_type="natural")
     held = np.clip(commands, knots[0], knots[-1])
-    np.testing.assert_allclose(space.spline_weights(commands) @ values, spline(held), atol=1e-13)
+    np.testing.assert_allclose(space.block("map").weights(commands) @ values, spline(held), atol=1e-13)
 
 
 def test_model_says_what_the_vector_says(readings: MeasurementSet):

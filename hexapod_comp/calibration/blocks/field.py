@@ -1,5 +1,6 @@
-"""What is smooth: a six-component field as polynomials over the measured box, with its way into a :class:`GridField`,
-and the errors of a length map.
+"""The field: what no strut and no joint explains, six components as polynomials over the measured box.
+
+Displacement, rotation, and what of both changes sign with the direction of motion (reversal) are blocks of their own.
 """
 
 from __future__ import annotations
@@ -9,79 +10,19 @@ import itertools
 import numpy as np
 from numpy.polynomial import legendre
 
-from ..machine.field import CROSS_AXES, GridField
-from ..measurements.readings import LEAST_SIDE
+from ...machine.field import CROSS_AXES, GridField
+from ...measurements.readings import AXES, LEAST_SIDE
+from ..assumptions import ASSUMED
+from .block import Block, Columns, Draft, Errors, Facts, Linkage
 
-COMPONENT_UNITS = (("dx", "m"), ("dy", "m"), ("dz", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
-
-DECAY = 0.6
-"""How much smaller the prior is with every degree: a smooth field has little in its high terms."""
-
-REVERSAL_DEGREE = 2
-"""Degree of what depends on the direction of motion."""
-
-GRID_TOLERANCE = 30e-9
-"""What interpolation between a grid's lines may add to the polynomial, m and rad: far below any reading."""
-
-DIGITS = 11
-"""Digits after the point of what goes into a model file, m, rad or m/m: a hundredth of a nanometre."""
-
-CHECKED = 400
-"""Random points at which that is checked."""
-
-MOST_NODES = 17
-"""Nodes along the longest axis at most: more make the model file too long to read."""
-
-KNOT_DISTANCE = 0.017
-"""Largest distance of the length map's knots, m: a wave of 60 mm has then three and a half knots."""
-
-WEAR_KNOTS = 2
-"""Wear is smoother than a length map: every second of its knots is enough."""
-
-MAP_CORRELATION_LENGTH = 0.04
-"""How far the errors of a length map are alike, m (Matérn 5/2)."""
-
-
-def map_knots(low: float, high: float) -> np.ndarray:
-    """Return equidistant knots over the commands seen, at most :data:`KNOT_DISTANCE` apart."""
-    span = max(high - low, KNOT_DISTANCE)
-    return np.linspace(low, low + span, int(np.ceil(span / KNOT_DISTANCE)) + 1)
-
-
-def wear_knots(knots: np.ndarray) -> np.ndarray:
-    """Return those of a length map's knots that wear needs, both ends among them.
-
-    A natural spline through them is one through all knots.
-    """
-    last = len(knots) - 1
-    return knots[np.linspace(0, last, max(2, last // WEAR_KNOTS + 1)).round().astype(int)]
-
-
-def map_root(knots: np.ndarray) -> np.ndarray:
-    """Return a root of the Matérn 5/2 correlation between the knots of one strut, shape (n, n)."""
-    d = np.sqrt(5.0) * np.abs(knots[:, None] - knots) / MAP_CORRELATION_LENGTH
-    return np.linalg.cholesky((1.0 + d + d * d / 3.0) * np.exp(-d) + 1e-9 * np.eye(len(knots)))
+COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")
 
 
 class SmoothField:
     """Products of Legendre polynomials in x, y, z over a box, the degree in proportion to its sides.
 
-    Parameters
-    ----------
-    box : ndarray, shape (2, 3)
-        Corners of the measured points, m in ``base``; a side of no length carries no power.
-    degree : int
-        Highest degree along the box's longest side. Every degree along a shorter side counts for more, so
-        that the field is equally smooth in all directions.
-
-    Attributes
-    ----------
-    powers : ndarray of int, shape (terms, 3)
-        Degrees along x, y, z of each term.
-    prior : ndarray, shape (terms,)
-        Relative size of the terms' priors.
-    reversal_powers, reversal_prior : ndarray
-        The same of what depends on the direction of motion: fewer terms.
+    A side of no length carries no power; every degree along a shorter side counts for more than one along the longest,
+    so that the field is equally smooth in all directions. What depends on the direction of motion has fewer terms.
     """
 
     def __init__(self, box: np.ndarray, degree: int) -> None:
@@ -90,18 +31,9 @@ class SmoothField:
         self._sides = np.where(flat, 0.0, np.ptp(self.box, axis=0))
         cost = np.sqrt(max(self._sides.max(), 1e-3) / np.where(flat, 1.0, self._sides))
         self.degree = degree
-        self.powers, self.prior = _terms(degree, cost, flat)
-        self.reversal_powers, self.reversal_prior = _terms(min(degree, REVERSAL_DEGREE), cost, flat)
-
-    @property
-    def terms(self) -> tuple[str, ...]:
-        """Names of the terms: ``x2y1`` is P₂(x)·P₁(y)."""
-        return _names(self.powers)
-
-    @property
-    def reversal_terms(self) -> tuple[str, ...]:
-        """Names of the terms of what depends on the direction."""
-        return _names(self.reversal_powers)
+        self.powers, self.prior = _terms(degree, cost, flat)  # (terms, 3) along x, y, z; relative size of the priors
+        self.reversal_powers, self.reversal_prior = _terms(min(degree, ASSUMED.reversal_degree), cost, flat)
+        self.terms, self.reversal_terms = _names(self.powers), _names(self.reversal_powers)
 
     def basis(self, points: np.ndarray) -> np.ndarray:
         """Return the terms' values at points (n, 3), m; held at the box; shape (n, terms)."""
@@ -120,17 +52,7 @@ class SmoothField:
     def evaluate(
         self, coefficients: np.ndarray, reversal: np.ndarray, points: np.ndarray, sense: np.ndarray
     ) -> np.ndarray:
-        """Return the field at points, shape (n, 6), m and rad.
-
-        Parameters
-        ----------
-        coefficients : ndarray, shape (6, terms)
-            Mean of both directions, m and rad.
-        reversal : ndarray, shape (3, 6, reversal terms)
-            Forward minus backward along x, y, z, m and rad.
-        points, sense : ndarray, shape (n, 3)
-            Places, m, and directions of motion along the axes, −1…1.
-        """
+        """Return the field at points, shape (n, 6), m and rad."""
         turning = np.einsum("nt,act,na->nc", self.reversal_basis(points), reversal, 0.5 * sense)
         return self.basis(points) @ coefficients.T + turning
 
@@ -140,22 +62,15 @@ class SmoothField:
         Terms that do not depend on the direction of motion stand on the lines along the axis of their highest
         power: across it their powers are small, and bilinear interpolation is exact up to 1. What changes sign
         with the motion along an axis stands on the lines along that axis.
-
-        Parameters
-        ----------
-        coefficients : ndarray, shape (6, terms)
-            Mean of both directions, m and rad.
-        reversal : ndarray, shape (3, 6, reversal terms)
-            Forward minus backward along x, y, z, m and rad.
         """
-        points = np.random.default_rng(0).uniform(self.box[0], self.box[1], (CHECKED, 3))
-        sense = np.where(np.arange(CHECKED)[:, None] % 2, 1.0, -1.0) * np.ones(3)
+        points = np.random.default_rng(0).uniform(self.box[0], self.box[1], (ASSUMED.field_checks, 3))
+        sense = np.where(np.arange(ASSUMED.field_checks)[:, None] % 2, 1.0, -1.0) * np.ones(3)
         wanted = self.evaluate(coefficients, reversal, points, sense)
         nodes = 2
         while True:
             field = self._on_lines(coefficients, reversal, nodes)
             values = np.array([field.evaluate(p, s)[0] for p, s in zip(points, sense, strict=True)])
-            if nodes >= MOST_NODES or (np.abs(values - wanted).max(axis=0) <= GRID_TOLERANCE).all():
+            if nodes >= ASSUMED.field_nodes or (np.abs(values - wanted).max(axis=0) <= ASSUMED.grid_tolerance).all():
                 return field
             nodes = 2 * nodes - 1
 
@@ -174,7 +89,7 @@ class SmoothField:
             family[..., : mean.shape[-1]] += mean
             family[0, ..., : half.shape[-1]] += half
             family[1, ..., : half.shape[-1]] -= half
-            families.append(family.round(DIGITS) if family.any() else family[..., :0])
+            families.append(family.round(ASSUMED.digits) if family.any() else family[..., :0])
         return GridField((grid[0], grid[1], grid[2]), (families[0], families[1], families[2]))
 
     def _family(self, grid: tuple, axis: int, coefficients: np.ndarray, powers: np.ndarray) -> np.ndarray:
@@ -189,6 +104,90 @@ class SmoothField:
         return np.einsum("nmt,ct,tp->nmcp", weights, coefficients, along)
 
 
+class _Field(Block):
+    """Three components of the field, each with the basis to itself."""
+
+    first: int  # of its components
+
+    def __init__(self, smooth: SmoothField) -> None:
+        self.smooth, count = smooth, len(smooth.terms)
+        self._owner = np.repeat(np.arange(self.first, self.first + 3), count)  # component of each parameter
+        self.labels = tuple(f"{COMPONENTS[self.first + c]} {t}" for c in range(3) for t in smooth.terms)
+        self.root = np.diag(np.tile(smooth.prior, 3))
+
+    @classmethod
+    def of(cls, facts: Facts) -> _Field:
+        """Every machine may have it."""
+        return cls(facts.smooth)
+
+    def moving(self, components: np.ndarray) -> np.ndarray:
+        """Each component has parameters of its own."""
+        return np.flatnonzero(np.isin(self._owner, components))
+
+    def design(self, linkage: Linkage, whitened: bool) -> Columns:
+        """The terms where the point stands, by each direction's share of the component."""
+        basis = self.smooth.basis(linkage.points) * (self.smooth.prior if whitened else 1.0)
+
+        def columns(errors: Errors) -> np.ndarray:
+            own = [c for c in errors.components if self.first <= c < self.first + 3]
+            moved = errors.directions[:, own, None] * basis[errors.at][:, None]
+            return moved.reshape(len(errors.at), -1)
+
+        return columns
+
+    def into(self, draft: Draft, x: np.ndarray) -> None:
+        """Into its components."""
+        draft.field[self.first : self.first + 3] = x.reshape(3, -1)
+
+
+class FieldDisplacement(_Field):
+    """Displacement along x, y, z."""
+
+    name, unit, tolerance, first = "field displacement", "m", 5e-6, 0
+
+
+class FieldRotation(_Field):
+    """Rotation about x, y, z."""
+
+    name, unit, tolerance, first = "field rotation", "rad", 20e-6, 3
+
+
+class FieldReversal(Block):
+    """Forward minus backward along x, y, z, of all six components."""
+
+    name, unit, tolerance = "field reversal", "m, rad", 1e-6
+
+    def __init__(self, smooth: SmoothField) -> None:
+        self.smooth, count = smooth, len(smooth.reversal_terms)
+        self._owner = np.repeat(np.tile(np.arange(6), 3), count)
+        self.labels = tuple(f"{c} {t} reversal {a}" for a in AXES for c in COMPONENTS for t in smooth.reversal_terms)
+        self.root = np.diag(np.tile(smooth.reversal_prior, 18))
+
+    @classmethod
+    def of(cls, facts: Facts) -> FieldReversal:
+        """Every machine may have it."""
+        return cls(facts.smooth)
+
+    def moving(self, components: np.ndarray) -> np.ndarray:
+        """Each component has parameters of its own."""
+        return np.flatnonzero(np.isin(self._owner, components))
+
+    def design(self, linkage: Linkage, whitened: bool) -> Columns:
+        """Half the terms, by the direction of motion along each axis."""
+        basis = self.smooth.reversal_basis(linkage.points) * (self.smooth.reversal_prior if whitened else 1.0)
+        half = 0.5 * linkage.stations.sense[:, :3]
+
+        def columns(errors: Errors) -> np.ndarray:
+            weights = half[errors.at][:, :, None] * errors.directions[:, None, errors.components]
+            return (weights[..., None] * basis[errors.at][:, None, None]).reshape(len(errors.at), -1)
+
+        return columns
+
+    def into(self, draft: Draft, x: np.ndarray) -> None:
+        """By axis of motion and component."""
+        draft.reversal[:] = x.reshape(draft.reversal.shape)
+
+
 def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the powers (n, 3) of all terms up to a degree, and the relative size of their priors (n,)."""
     every = np.array(list(itertools.product(range(degree + 1), repeat=3)))
@@ -196,7 +195,7 @@ def _terms(degree: int, cost: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray,
     bilinear = (every.max(axis=1) <= 1) & (every.sum(axis=1) <= 2)  # squareness, twist and roll are always asked for
     kept = ((total <= degree + 1e-9) | bilinear) & ~(every[:, flat] > 0).any(axis=1)
     order = np.argsort(total[kept], kind="stable")
-    return every[kept][order], DECAY ** total[kept][order]
+    return every[kept][order], ASSUMED.field_decay ** total[kept][order]
 
 
 def _names(powers: np.ndarray) -> tuple[str, ...]:

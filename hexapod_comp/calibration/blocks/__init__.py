@@ -1,0 +1,34 @@
+"""The errors that a machine may have, one file each; see doc/architecture.md, "Add an error term"."""
+
+from .backlash import Backlash, BacklashMap
+from .block import Block
+from .field import FieldDisplacement, FieldReversal, FieldRotation
+from .growth import Expansion, Late, Moisture
+from .length_map import LengthMap
+from .pitch import Pitch
+from .structure import Structure
+from .waves import Wave, Wave2, Wave3, Wave4
+
+ERRORS: tuple[type[Block], ...] = (
+    Structure,
+    Pitch,
+    Wave,
+    Wave2,
+    Wave3,
+    Wave4,
+    Backlash,
+    LengthMap,
+    BacklashMap,
+    FieldDisplacement,
+    FieldRotation,
+    FieldReversal,
+    Expansion,
+    Moisture,
+    Late,
+)
+"""The registry: all blocks, in the order of the parameter vector."""
+
+WAVES = {wave.name: wave.times for wave in (Wave, Wave2, Wave3, Wave4)}
+"""Blocks of the screw waves, and how often a turn each repeats."""
+
+HARMONICS = tuple(name for name, times in WAVES.items() if times > 1)

@@ -1,0 +1,75 @@
+"""Backlash: what a strut's nut lags its screw by, half to either side; and how wear changes it along the stroke."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .block import Block, Draft, Facts, Linkage, StrutBlock
+from .length_map import LengthMap, map_knots
+
+
+class Backlash(StrutBlock):
+    """b of each strut: δl = −b/2 · its direction of motion."""
+
+    name, unit, tolerance = "backlash", "m", 5e-6
+
+    @classmethod
+    def of(cls, facts: Facts) -> Backlash:
+        """Every screw may have it."""
+        return cls()
+
+    def lengthening(self, linkage: Linkage) -> np.ndarray:
+        """−1/2 · direction."""
+        return -0.5 * linkage.stations.sense[:, 3:, None]
+
+    def into(self, draft: Draft, x: np.ndarray) -> None:
+        """Negative backlash, which noise can make of a small one, is none: more than noise the fit has refused."""
+        draft.struts["backlash"] = np.maximum(x, 0.0)
+
+
+class BacklashMap(LengthMap):
+    """By how much backlash differs along a worn screw: smoother than a length map, with every second of its knots."""
+
+    name, unit, tolerance = "backlash map", "m", 2e-6
+
+    @classmethod
+    def of(cls, facts: Facts) -> BacklashMap:
+        """Every screw may wear; a natural spline through some of a map's knots is one through all."""
+        knots = map_knots(*facts.region.commands)
+        block = cls(knots[np.linspace(0, len(knots) - 1, max(2, (len(knots) - 1) // 2 + 1)).round().astype(int)])
+        block.model_knots = knots
+        return block
+
+    model_knots: np.ndarray  # those of the length map, which models have
+
+    def lengthening(self, linkage: Linkage) -> np.ndarray:
+        """−1/2 · direction, where the nut stands."""
+        return -0.5 * linkage.stations.sense[:, 3:, None] * self.weights(linkage.stations.commands)
+
+    def into(self, draft: Draft, x: np.ndarray) -> None:
+        """It stands at the length map's knots."""
+        if x.any():
+            draft.struts |= {
+                "map_knots": self.model_knots,
+                "map_backlash": x.reshape(6, -1) @ self.weights(self.model_knots).T,
+            }
+
+
+def without_negative(blocks: Sequence[Block], x: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return parameters and directions that mean the same machine without negative backlash.
+
+    A nut cannot lead its screw, but an estimate can find so: by noise, or for swapped directions. Backlash −b in one
+    direction is b in the other; cutting it off here would make the fit add it again in every step.
+    """
+    backlash = next((block for block in blocks if isinstance(block, Backlash)), None)
+    if backlash is None:
+        return x, sense
+    x, sense = x.copy(), sense.copy()
+    turned = np.where(x[backlash.part] < 0.0, -1.0, 1.0)
+    sense[:, 3:] *= turned
+    for block in blocks:
+        if isinstance(block, Backlash | BacklashMap):
+            x[block.part] *= np.repeat(turned, len(block.labels) // 6)
+    return x, sense

@@ -1,0 +1,149 @@
+"""Growth of struts, base and platform: by heat, at once or late, and by the air's humidity.
+
+Parts grow by what their thermometers read above 20 °C; :mod:`hexapod_comp.machine.late` says how late parts follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...machine.late import PARTS, LateGrowth, late
+from ...machine.temperatures import REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE
+from ...measurements.readings import Stations
+from ..assumptions import ASSUMED
+from .block import Block, Columns, Draft, Errors, Facts, Linkage, StrutBlock
+
+if TYPE_CHECKING:
+    from ..parameters import FitSettings
+
+
+def per_growth(linkage: Linkage) -> np.ndarray:
+    """Return by how much the growth of struts 1-6, base and platform lengthens each strut, relative, (M, 6, 8), m."""
+    along = [np.einsum("mik,mik->mi", linkage.directions, joints) for joints in (linkage.base_joints, -linkage.arms)]
+    struts = np.eye(6) * linkage.lengths[:, None]
+    return np.concatenate([struts, np.stack(along, axis=2)], axis=2)
+
+
+def growth_columns(linkage: Linkage) -> np.ndarray:
+    """Return ∂e by the relative growth of struts 1-6, base and platform at each station, shape (M, 6, 8), m and rad."""
+    return linkage.per_length @ per_growth(linkage)
+
+
+def growth_causes(settings: FitSettings, stations: Stations, constants: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return what parts grow by, (M, 8, 1 + K), K: their thermometers above 20 °C, and by how far lags are behind."""
+    sensors = LateGrowth(thermometer=settings.thermometer)
+    read = stations.temperatures[:, [sensors.sensor_of(part) for part in range(len(PARTS))]]
+    above = (read - REFERENCE_TEMPERATURE)[..., None]
+    if not len(constants) or not np.isfinite(stations.times).all():
+        return np.concatenate([above, np.zeros((*read.shape, len(constants)))], axis=2)
+    return np.concatenate([above, late(stations.times, read, constants)], axis=2)
+
+
+def growth_root(terms: int, struts: float = ASSUMED.struts_warmed_alike) -> np.ndarray:
+    """Return the root of the prior's correlation between the parts' growth, shape (8·terms, 8·terms)."""
+    alike = np.eye(len(PARTS))
+    alike[:6, :6] += struts * (1.0 - np.eye(6))
+    return np.kron(np.linalg.cholesky(alike), np.eye(terms))
+
+
+def as_warmed(settings: FitSettings, stations: Stations) -> tuple[str, set[str]]:
+    """Return the thermometer that stations had, if only one, and which blocks of growth they cannot show."""
+    temperatures = stations.temperatures
+    seen = np.flatnonzero((temperatures != REFERENCE_TEMPERATURE).any(axis=0))
+    thermometer = settings.thermometer or (PARTS[seen[0]] if len(seen) == 1 else "")
+    seen = np.array([PARTS.index(thermometer)]) if thermometer else np.arange(len(PARTS))
+    warmed = bool(np.ptp(temperatures[:, seen], axis=0).max() >= ASSUMED.least_warming)
+    damped = bool(np.ptp(np.nan_to_num(stations.humidity, nan=REFERENCE_HUMIDITY)) >= ASSUMED.least_damping)
+    shown = {"expansion": warmed, "moisture": damped, "late": warmed and bool(np.isfinite(stations.times).all())}
+    return thermometer, {name for name, fits in shown.items() if not fits}
+
+
+class Expansion(Block):
+    """Growth of each part by its thermometer, 1/K, beyond the stated; struts of one material grow alike."""
+
+    name, unit, tolerance = "expansion", "1/K", 10e-6
+
+    def __init__(self, settings: FitSettings) -> None:
+        self._settings = settings
+        self.labels = tuple(f"{part} expansion beyond the stated" for part in PARTS)
+        self.root = growth_root(1, ASSUMED.struts_warmed_alike if settings.thermometer else ASSUMED.struts_alike)
+
+    @classmethod
+    def of(cls, facts: Facts) -> Expansion | None:
+        """Where temperatures changed, which the settings' blocks tell."""
+        return cls(facts.settings)
+
+    def causes(self, stations: Stations) -> np.ndarray:
+        """Return what parts grow by, (M, 8, terms), K."""
+        return growth_causes(self._settings, stations, ())
+
+    def design(self, linkage: Linkage, whitened: bool) -> Columns:
+        """Every part lengthens the struts by its growth."""
+        grown, causes = per_growth(linkage), self.causes(linkage.stations)
+
+        def columns(errors: Errors) -> np.ndarray:
+            each = np.einsum("ns,nsp->np", errors.gains, grown[errors.at])
+            moved = (each[..., None] * causes[errors.at]).reshape(len(errors.at), -1)
+            return moved @ self.root if whitened else moved
+
+        return columns
+
+    def into(self, draft: Draft, x: np.ndarray) -> None:
+        """It adds to what is stated."""
+        draft.growth = draft.growth + x
+
+
+class Late(Expansion):
+    """What of a part's growth comes late, 1/K, for each time constant."""
+
+    name, unit, tolerance = "late", "1/K", 10e-6
+
+    def __init__(self, settings: FitSettings) -> None:
+        self._settings, self._constants = settings, settings.time_constants or ()
+        self.labels = tuple(f"{part} late by {constant:.0f} s" for part in PARTS for constant in self._constants)
+        self.root = growth_root(len(self._constants))
+
+    @classmethod
+    def of(cls, facts: Facts) -> Late | None:
+        """Where time constants are known."""
+        return cls(facts.settings) if facts.settings.time_constants else None
+
+    def causes(self, stations: Stations) -> np.ndarray:
+        """How far lags are behind."""
+        return growth_causes(self._settings, stations, self._constants)[..., 1:]
+
+    def into(self, draft: Draft, x: np.ndarray) -> None:
+        """One column a time constant."""
+        draft.late = x.reshape(len(PARTS), -1)
+
+
+class Moisture(StrutBlock):
+    """Growth of all struts, of one material, by relative humidity, m/m from dry to damp, beyond the stated."""
+
+    name, unit, tolerance = "moisture", "1", 1e-4
+
+    def __init__(self) -> None:
+        super().__init__(("moisture of the struts beyond the stated",), np.eye(1))
+        self.root = np.eye(1)
+
+    @classmethod
+    def of(cls, facts: Facts) -> Moisture | None:
+        """Where struts are stated to swell."""
+        return cls() if facts.settings.strut_moisture is not None else None
+
+    def lengthening(self, linkage: Linkage) -> np.ndarray:
+        """Lengths times humidity beyond that of the reference."""
+        damp = np.nan_to_num(linkage.stations.humidity - REFERENCE_HUMIDITY)
+        return (linkage.lengths * damp[:, None])[..., None]
+
+    def design(self, linkage: Linkage, whitened: bool) -> Columns:
+        """One parameter for all struts."""
+        each = super().design(linkage, whitened)
+        return lambda errors: each(errors).sum(axis=1, keepdims=True)
+
+    def into(self, draft: Draft, x: np.ndarray) -> None:
+        """It adds to what is stated."""
+        draft.struts["moisture"] = draft.struts["moisture"] + x

@@ -1,0 +1,52 @@
+"""Length map: what a screw's length errs smoothly along its stroke, as a natural cubic spline."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from ...machine.geometry import STRUT_NAMES
+from ..assumptions import ASSUMED
+from .block import Draft, Facts, Linkage, StrutBlock
+
+
+def map_knots(low: float, high: float) -> np.ndarray:
+    """Return equidistant knots over the commands seen, m."""
+    span = max(high - low, ASSUMED.knot_distance)
+    return np.linspace(low, low + span, int(np.ceil(span / ASSUMED.knot_distance)) + 1)
+
+
+def map_root(knots: np.ndarray) -> np.ndarray:
+    """Return a root of the Matérn 5/2 correlation between the knots of one strut, shape (n, n)."""
+    d = np.sqrt(5.0) * np.abs(knots[:, None] - knots) / ASSUMED.map_correlation
+    return np.linalg.cholesky((1.0 + d + d * d / 3.0) * np.exp(-d) + 1e-9 * np.eye(len(knots)))
+
+
+class LengthMap(StrutBlock):
+    """The map's values at its knots, strut by strut."""
+
+    name, unit, tolerance = "map", "m", 5e-6
+
+    def __init__(self, knots: np.ndarray) -> None:
+        self.knots = knots
+        labels = tuple(f"{s} {self.name} at {1e3 * k:.0f} mm" for s in STRUT_NAMES for k in knots)
+        super().__init__(labels, map_root(knots))
+        self._cardinal = CubicSpline(knots, np.eye(len(knots)), bc_type="natural")
+
+    @classmethod
+    def of(cls, facts: Facts) -> LengthMap:
+        """Every screw may have one, over the commands seen."""
+        return cls(map_knots(*facts.region.commands))
+
+    def weights(self, commands: np.ndarray) -> np.ndarray:
+        """Return what each knot's value adds at some commands (…), shape (…, knots); held outside."""
+        return self._cardinal(np.clip(commands, *self.knots[[0, -1]]))
+
+    def lengthening(self, linkage: Linkage) -> np.ndarray:
+        """The spline's weights."""
+        return self.weights(linkage.stations.commands)
+
+    def into(self, draft: Draft, x: np.ndarray) -> None:
+        """Its knots are the model's."""
+        if x.any():
+            draft.struts |= {"map_knots": self.knots, "map_values": x.reshape(6, -1)}

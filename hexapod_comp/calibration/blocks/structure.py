@@ -1,0 +1,47 @@
+"""Structure: where the twelve joints really are, and the struts' offsets."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...machine.geometry import STRUT_NAMES
+from ...measurements.readings import AXES
+from .block import Block, Columns, Draft, Errors, Facts, Linkage
+
+
+class Structure(Block):
+    """Deviations of six base joints and of the platform's ball joints, x, y, z each; then six offsets of length."""
+
+    name, unit, tolerance = "structure", "m", 100e-6
+
+    def __init__(self, groups: np.ndarray) -> None:
+        count = int(groups.max()) + 1
+        labels = [f"base {i + 1} {a}" for i in range(6) for a in AXES]
+        labels += [f"platform {g + 1} {a}" for g in range(count) for a in AXES]
+        self.labels = tuple(labels + [f"{s} offset" for s in STRUT_NAMES])
+        self.root, self._groups = np.eye(len(self.labels)), groups
+        self._shared = groups[:, None] == np.arange(count)
+
+    @classmethod
+    def of(cls, facts: Facts) -> Structure:
+        """Every fit has it."""
+        return cls(facts.platform_groups)
+
+    def design(self, linkage: Linkage, whitened: bool) -> Columns:
+        """A base joint moves against its strut; a platform joint with it, for all struts that end there."""
+        u = linkage.directions
+        in_platform = -np.einsum("nij,nki->nkj", linkage.rotations, u)
+
+        def columns(errors: Errors) -> np.ndarray:
+            each, n = errors.gains[..., None], len(errors.at)
+            base, arms = (each * part[errors.at] for part in (u, in_platform))
+            joined = np.einsum("nsk,sg->ngk", arms, self._shared.astype(float))
+            return np.concatenate([base.reshape(n, -1), joined.reshape(n, -1), errors.gains], axis=1)
+
+        return columns
+
+    def into(self, draft: Draft, x: np.ndarray) -> None:
+        """Joints go into both bodies; coinciding ones alike."""
+        joints = x[:-6].reshape(-1, 3)
+        draft.machine |= {"base_deviation": joints[:6], "platform_deviation": joints[6:][self._groups]}
+        draft.struts["offset"] = x[-6:]
