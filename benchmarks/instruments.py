@@ -27,8 +27,7 @@ from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import RealMachine
-from hexapod_comp.measurements.campaign import Campaign, load_campaign, template
-from hexapod_comp.measurements.campaign_runs import PLANES, CampaignRun, circle_run, tilts
+from hexapod_comp.measurements.campaign import PLANES, Campaign, CampaignRun, circle_run, load_campaign, template, tilts
 from hexapod_comp.virtual.instruments import measure
 
 TILT = np.radians(10.0)

@@ -11,7 +11,7 @@ from ..core import Status
 from ..errors import GeometryError
 from ..machine.field import CROSS_AXES
 from ..machine.geometry import HexapodGeometry
-from ..measurements.campaign_runs import (
+from ..measurements.campaign import (
     LINE_INSTRUMENTS,
     PLANES,
     POSE_INSTRUMENTS,

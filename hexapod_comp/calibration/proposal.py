@@ -9,8 +9,7 @@ import numpy as np
 
 from ..errors import CalibrationError
 from ..machine.kinematics import Structure, strut_lengths_batch
-from ..measurements.campaign import Campaign, template
-from ..measurements.campaign_runs import CampaignRun
+from ..measurements.campaign import Campaign, CampaignRun, template
 from .candidates import MeasuringBox, candidates
 from .gains import Aim, Selection, seen_by
 from .parameters import Extent, FitSettings, ParameterSpace

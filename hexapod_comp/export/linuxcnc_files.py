@@ -25,7 +25,7 @@ from ..errors import InputFileError
 from ..formats.csv import number_in
 from ..formats.files import read_text
 from ..formats.outputs import write_text
-from ..formats.yaml import UNITS
+from ..formats.schema import UNITS
 from ..machine.geometry import STRUT_NAMES
 from .linuxcnc import MOST_POINTS, Genhexkins, ScrewTable
 

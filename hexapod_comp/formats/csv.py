@@ -27,8 +27,8 @@ from ..errors import InputFileError, PoseError
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
 from .files import MAX_CSV_BYTES, open_input, too_large
 from .paths import input_file
+from .schema import LARGEST, UNITS, spellings
 from .texts import DECIMAL_COMMA, MICRO_ERRORS, THOUSANDS, number_hint, plain_number
-from .yaml import LARGEST, UNITS, spellings
 
 LABEL_COLUMNS = ("sequence", "name")
 POSITION_COLUMNS = ("x", "y", "z")

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..errors import GeometryError, PoseError
+from ..formats.schema import Section
 from ..formats.texts import number
-from ..formats.yaml import Section
 from ..pose import Pose
 
 BASE, WORK, TOOL = "base", "work", "tool"

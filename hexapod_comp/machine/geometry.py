@@ -19,7 +19,8 @@ from ..core.single import check_stage
 from ..errors import FrameError, GeometryError, InputFileError, KinematicsError, LimitError, shorten
 from ..formats.files import read_text
 from ..formats.paths import input_file
-from ..formats.yaml import Section, parse_yaml
+from ..formats.schema import Section
+from ..formats.yaml import parse_yaml
 from ..pose import Pose
 from .frames import BASE, TOOL, WORK, read_named_poses, read_pose, refuse_names
 from .limits import STRUT_NAMES as STRUT_NAMES

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import yaml
 
-from ..formats.yaml import UNITS, in_si
+from ..formats.schema import in_unit
 from .field import COMPONENTS, GridField, no_field
 from .model import Datum, MachineModel
 from .region import Region
@@ -31,57 +29,12 @@ STRUT_TERMS = {
 LATE_PARTS = ("late_struts", "late_base", "late_platform")
 """What follows a thermometer late, in the order of the rows of :class:`~.late.LateGrowth`."""
 
-LONGEST_LINE = 2**30
-"""Characters: LibYAML, unlike PyYAML's own writer, takes no infinity."""
-
 COMPONENT_UNITS = {name: ("length", "um") if name[0] == "d" else ("angle", "urad") for name in COMPONENTS}
-
-
-class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
-    """Rows of numbers on one line, everything else in blocks, nothing by reference."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
-
-
-def _represent_list(dumper: yaml.SafeDumper, data: list) -> yaml.Node:
-    row = not any(isinstance(item, list | dict) for item in data)
-    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=row)
-
-
-_Dumper.add_representer(list, _represent_list)
-
-
-def block_text(content: dict[str, Any]) -> str:
-    """Return content as YAML, in its order, each row of numbers on one line however long."""
-    return str(yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=LONGEST_LINE))
 
 
 def written(values: Any, kind: str, unit: str) -> Any:
     """Return SI values in a unit, as nested lists of floats that read back to the same values."""
-    factor = UNITS[kind][unit]
-    return _map_numbers(lambda value: _in_unit(value, factor), np.asarray(values, dtype=float).tolist())
-
-
-def _map_numbers(function: Callable[[float], float], values: Any) -> Any:
-    return [_map_numbers(function, item) for item in values] if isinstance(values, list) else function(values)
-
-
-def _in_unit(value: float, factor: float) -> float:
-    """Return the shortest number that reads back as `value`, or as its neighbour where no number does."""
-    exact = _exact_in_unit(value, factor)
-    if exact is None:
-        nearest = value / factor
-        exact = _exact_in_unit(float(in_si(nearest, factor)), factor)  # what will be read is written alike
-        return nearest if exact is None else exact
-    return exact
-
-
-def _exact_in_unit(value: float, factor: float) -> float | None:
-    quotient = value / factor
-    candidates = [float(f"{quotient:.{digits}g}") for digits in (15, 16, 17)]
-    candidates += [math.nextafter(quotient, math.inf), math.nextafter(quotient, -math.inf)]
-    return next((number + 0.0 for number in candidates if in_si(number, factor) == value), None)
+    return in_unit(values, unit)
 
 
 def _per_strut(values: np.ndarray, kind: str, unit: str) -> Any:

@@ -1,6 +1,6 @@
 """Model files: the machine model as YAML, readable by people, refused when anything in it is in doubt.
 
-Keys end in their unit, as in geometry files (:data:`hexapod_comp.formats.yaml.UNITS`); below stand the units that
+Keys end in their unit, as in geometry files (:data:`hexapod_comp.formats.schema.UNITS`); below stand the units that
 :func:`save_model` writes, reading takes any unit of the same kind. A value *per strut* is one number for
 all six or a list of six. Everything marked optional may be left out and is then zero or as stated::
 
@@ -108,7 +108,8 @@ from ..errors import InputFileError, ModelError
 from ..formats.files import read_text
 from ..formats.outputs import write_text
 from ..formats.paths import input_file
-from ..formats.yaml import Section, parse_yaml
+from ..formats.schema import Section
+from ..formats.yaml import block_text, parse_yaml
 from .field import CROSS_AXES, OUTSIDE_POLICIES, GridField, no_field
 from .geometry import HexapodGeometry
 from .late import PARTS, LateGrowth
@@ -119,7 +120,6 @@ from .model_blocks import (
     DIRECTIONS,
     LATE_PARTS,
     STRUT_TERMS,
-    block_text,
     datum_block,
     field_block,
     region_block,

@@ -1,32 +1,38 @@
 """What to measure: the lines, diagonals and poses of a calibration campaign, and the instruments used on them.
 
 A campaign is a plan: :func:`template` lists its readings as a :class:`MeasurementSet` without values, which
-``hexapod_comp plan`` examines and ``hexapod_comp measure`` fills in from the virtual machine.
+``hexapod_comp plan`` examines and ``hexapod_comp simulate`` fills in from the virtual machine. Besides grid lines,
+diagonals and scattered poses a campaign may list runs one by one, in measuring order: lines, circles, spheres, tilts
+about a place, and poses, each under one instrument.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 
-from ..errors import InputFileError
+from ..errors import ModelError
 from ..formats.paths import input_file
-from ..formats.yaml import Section, read_yaml
+from ..formats.schema import Choice, Numbers, Section, Whole, complaints_about, in_unit, read_whole
+from ..formats.yaml import block_text, read_yaml
 from ..machine.field import CROSS_AXES
 from ..machine.geometry import HexapodGeometry
-from ..machine.model_blocks import block_text, written
-from ..pose import Pose, rotation_from_angles
-from .campaign_runs import CampaignRun, line_readings, read_runs
+from ..pose import Pose, angles_from_rotation, rotation_from_angles
 from .readings import (
     ANGULAR_KINDS,
     AXES,
+    BACKWARD,
     DEFAULT_UNCERTAINTY,
+    FORWARD,
+    FROM_PREVIOUS,
     KINDS,
     LARGEST_READING,
+    LEAST_TRAVEL,
     UNKNOWN,
     FileLine,
     MeasurementSet,
@@ -40,97 +46,377 @@ CAMPAIGN_VERSION = 1
 INSTRUMENTS = ("1-D", "5-D", "6-D")
 """Lasers on grid lines: linear only; with two straightnesses, pitch and yaw; with roll as well."""
 
+LINE_INSTRUMENTS = ("linear", "straightness", "rotation", "5-D", "6-D")
+"""What reads a line: a linear laser; straightness, or pitch and yaw, with their optics; all of these; and roll. Along a
+line that is not parallel to an axis of the work frame the last two read its length alone."""
+
+POSE_INSTRUMENTS = ("tracker", "tracker_6d")
+"""What reads scattered poses: a tracker's position alone, and with the attitude."""
+
+LENGTH_INSTRUMENTS = ("ball_bar", "station", "probe")
+"""What reads a length from a centre: a telescoping ball bar, there and back; a tracking interferometer; a probe that
+touches spheres."""
+
+BALL_INSTRUMENTS = ("r_test",)
+"""What reads where the tool's ball is beside three sensors, while the tool tilts about it."""
+
+LISTED_INSTRUMENTS = (*LINE_INSTRUMENTS, *POSE_INSTRUMENTS, *LENGTH_INSTRUMENTS, *BALL_INSTRUMENTS)
+
+PLANES = {"xy": (0, 1), "yz": (1, 2), "zx": (2, 0)}
+"""Planes of circles, in the work frame: a circle goes from the first axis to the second."""
+
+MOST_POINTS = 10_000
+"""Of one run."""
+
 MOST_READINGS = 500_000
 """Larger campaigns are refused: at one reading a second this one takes six days, and a unit may be wrong."""
 
 DIAGONALS = (0, 4, 16)
 """None, the box's four body diagonals, or these and the two diagonals of each of its six faces."""
 
+CELLS_OF_A_BOX, STEPS_OF_A_CELL = 4, 4
+"""How many cells the longest edge of a machine's own box has, and how many steps a cell, where a file does not say."""
+
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+"""Points that turn by it are spread evenly: neighbours are never alike."""
+
+OwnBox = Callable[[], tuple[np.ndarray, np.ndarray]]
+"""Gives a machine's own box, (2, 3), m in the work frame, and the tool's attitude there, (3, 3)."""
+
+
+# Runs that a campaign lists.
+
+
+@dataclass(frozen=True)
+class CampaignRun:
+    """One run: the poses of the tool, and the instrument that reads them; ModelError where it cannot."""
+
+    name: str
+    instrument: str  # one of LISTED_INSTRUMENTS
+    # pose_tool_in_work, (n, 3), m, and (n, 3, 3). Those of a line stand on it, equally turned, from its start to its
+    # end; they are passed there and back, and so are those of a ball bar.
+    positions: np.ndarray
+    rotations: np.ndarray
+    centres: np.ndarray | None = None  # from where lengths are read, (n, 3), in the work frame, m
+    known_zero: bool = False  # the lengths are known as a whole
+    alternate: bool = False  # a line's places are read once: every second one on the way there, the others back
+
+    def __post_init__(self) -> None:
+        where = f"run {self.name}"
+        if self.instrument not in LISTED_INSTRUMENTS:
+            raise ModelError(where, f"instrument must be one of {', '.join(LISTED_INSTRUMENTS)}", self.instrument)
+        if not 1 <= len(self.positions) <= MOST_POINTS:
+            raise ModelError(where, f"must have 1 to {MOST_POINTS} points", len(self.positions))
+        if (self.instrument in LENGTH_INSTRUMENTS) != (self.centres is not None):
+            raise ModelError(where, "a length needs its centre, and nothing else has one", self.instrument)
+        if self.is_line and np.linalg.norm(self.way) < LEAST_TRAVEL:
+            raise ModelError(where, "starts and ends at the same place")
+        if self.axis is None and self.instrument in ("straightness", "rotation"):
+            problem = "is not parallel to an axis of the work frame: only a linear laser reads it"
+            raise ModelError(where, problem, self.instrument)
+
+    @property
+    def is_line(self) -> bool:
+        """Whether it is read along a line."""
+        return self.instrument in LINE_INSTRUMENTS
+
+    @property
+    def way(self) -> np.ndarray:
+        """From the first position to the last, shape (3,), m."""
+        return np.asarray(self.positions[-1] - self.positions[0])
+
+    @property
+    def axis(self) -> int | None:
+        """0, 1 or 2 for a line parallel to x, y or z of the work frame, None for any other."""
+        moving = np.flatnonzero(np.abs(self.way) > LEAST_TRAVEL)
+        return int(moving[0]) if len(moving) == 1 else None
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """What is read at each point."""
+        if self.instrument in LENGTH_INSTRUMENTS:
+            return ("length",)
+        if self.instrument in BALL_INSTRUMENTS:
+            return tuple(f"displacement_{a}" for a in AXES)
+        positions = tuple(f"position_{a}" for a in AXES)
+        if not self.is_line:
+            return positions if self.instrument == "tracker" else (*positions, *(f"attitude_{a}" for a in AXES))
+        return line_channels(self.instrument, self.axis)
+
+    def count(self, cycles: int) -> int:
+        """Return how many readings :meth:`readings` yields."""
+        return len(self.positions) * len(self.channels) * self._passes(cycles) // (1 + self.alternate)
+
+    def _passes(self, cycles: int) -> int:
+        """Return how often the poses are passed: a tracker's once, a line and a circle there and back."""
+        if self.instrument in POSE_INSTRUMENTS:
+            return 1
+        return (2 if self.is_line or self.instrument == "ball_bar" else 1) * cycles
+
+    def readings(self, cycles: int) -> Iterator[Reading]:
+        """Yield the readings, values of zero; a line's in so many passes forward and backward, each pose's once."""
+        poses = [Pose(*pose) for pose in zip(self.positions, self.rotations, strict=True)]
+        if self.is_line:
+            yield from line_readings(self.name, poses, self.channels, cycles, self.alternate)
+            return
+        way_of = UNKNOWN if self.instrument in POSE_INSTRUMENTS else FROM_PREVIOUS
+        of_file = [None] * len(poses) if self.centres is None else [tuple(c) for c in self.centres.tolist()]
+        for number in range(self._passes(cycles)):
+            order = -1 if self.instrument == "ball_bar" and number % 2 else 1
+            for pose, centre in list(zip(poses, of_file, strict=True))[::order]:
+                for channel in self.channels:
+                    reading = Reading(self.name, number + 1, way_of, pose, channel, 0.0)
+                    yield reading._replace(centre=centre, known_zero=self.known_zero)
+
+    def content(self) -> dict[str, Any]:
+        """Return the entry of a campaign file."""
+        head: dict[str, Any] = {"name": self.name, "instrument": self.instrument}
+        angles = (np.degrees(angles_from_rotation(self.rotations)).round(9) + 0.0).tolist()
+        positions = in_unit(self.positions + 0.0, "mm")
+        if self.centres is not None:
+            centres = in_unit(self.centres + 0.0, "mm")
+            head |= {"centre_mm": centres[0]} if (self.centres == self.centres[0]).all() else {"centres_mm": centres}
+        if self.known_zero:
+            head["zero"] = "known"
+        if not self.is_line:
+            return {**head, "poses_mm": positions, "angles_deg": angles}
+        head |= {"line_mm": [positions[0], positions[-1]], "points": len(positions), "angles_deg": angles[0]}
+        return head | ({"stops": "alternate"} if self.alternate else {})
+
+
+def line_channels(instrument: str, axis: int | None) -> tuple[str, ...]:
+    """Return what an instrument reads on a line along an axis of the work frame (None: along none of them)."""
+    if axis is None or instrument in ("1-D", "linear"):
+        return ("linear",)
+    straight, turning = (tuple(f"{kind}_{AXES[a]}" for a in CROSS_AXES[axis]) for kind in ("straightness", "rotation"))
+    five = ("linear", *straight, *turning)
+    six = (*five, f"rotation_{AXES[axis]}")
+    return {"straightness": straight, "rotation": turning, "5-D": five, "6-D": six}[instrument]
+
+
+def line_run(name: str, instrument: str, ends: np.ndarray, points: int, rotation: np.ndarray) -> CampaignRun:
+    """Return a run between two places of the work frame, shape (2, 3), m, at one attitude of the tool."""
+    positions = np.linspace(ends[0], ends[1], points).round(12)
+    return CampaignRun(name, instrument, positions, np.tile(rotation, (points, 1, 1)))
+
+
+def circle_run(
+    name: str,
+    centre: np.ndarray,
+    radius: float,
+    points: int,
+    axes: np.ndarray,
+    rotation: np.ndarray,
+    known_zero: bool = False,
+) -> CampaignRun:
+    """Return a ball bar's run, so many readings each way, on a full circle about its fixed ball, m in the work frame.
+
+    The circle starts at the first of the `axes`, unit vectors across each other, and goes to the second.
+    """
+    angles = np.linspace(0.0, 2.0 * np.pi, points)
+    places = centre + radius * (np.cos(angles)[:, None] * axes[0] + np.sin(angles)[:, None] * axes[1])
+    centres = np.tile(np.asarray(centre, dtype=float), (points, 1))
+    return CampaignRun(name, "ball_bar", places.round(12), np.tile(rotation, (points, 1, 1)), centres, known_zero)
+
+
+def tilts(points: int, largest: float) -> np.ndarray:
+    """Return attitudes of a tool that tilts outwards in a spiral up to an angle, rad, level first, (points, 3, 3)."""
+    share = np.sqrt(np.arange(points) / max(points - 1, 1))
+    turns = np.arange(points) * GOLDEN_ANGLE
+    angles = np.stack([share * np.cos(turns), share * np.sin(turns), np.zeros(points)], axis=1)
+    return rotation_from_angles((largest * angles).round(9))
+
+
+def line_readings(
+    name: str, poses: Sequence[Pose], channels: Iterable[str], cycles: int, alternate: bool = False
+) -> Iterator[Reading]:
+    """Yield the readings of passes forward and backward over a line, values of zero; all each way, or alternate ones.
+
+    Forward is along the first of x, y, z of the work frame that moves, whichever way the poses are listed.
+    """
+    way = poses[-1].position - poses[0].position
+    if way[np.flatnonzero(np.abs(way) > LEAST_TRAVEL)[0]] < 0.0:
+        poses = poses[::-1]
+    channels, stops = tuple(channels), (poses[::2], poses[1::2]) if alternate else (poses, poses)
+    for cycle in range(1, cycles + 1):
+        for direction, there in zip((FORWARD, BACKWARD), stops, strict=True):
+            for pose in there[::direction]:
+                for channel in channels:
+                    yield Reading(name, cycle, direction, pose, channel, 0.0)
+
+
+# The entries of a campaign file, by what they list: each makes a run of itself.
+
+Angles = Annotated[np.ndarray, Numbers("deg", (3,))]
+Zero = Annotated[str, Choice("known", "unknown")]
+
+
+def _level() -> np.ndarray:
+    return np.zeros(3)
+
+
+@dataclass(frozen=True)
+class LineEntry:
+    """A line between two places."""
+
+    line: Annotated[np.ndarray, Numbers("mm", (2, 3))]
+    points: Annotated[int, Whole(2, MOST_POINTS)] = 2
+    angles: Angles = field(default_factory=_level)
+    stops: Annotated[str, Choice("all", "alternate")] = "all"
+
+    def run(self, name: str, instrument: str) -> CampaignRun:
+        """Return the run."""
+        positions = np.linspace(self.line[0], self.line[1], self.points).round(12)
+        rotations = np.tile(rotation_from_angles(self.angles), (self.points, 1, 1))
+        return CampaignRun(name, instrument, positions, rotations, alternate=self.stops == "alternate")
+
+
+@dataclass(frozen=True)
+class CircleEntry:
+    """A ball bar's circle."""
+
+    plane: Annotated[str, Choice(*PLANES)]
+    centre: Annotated[np.ndarray, Numbers("mm", (3,))]
+    radius: Annotated[float, Numbers("mm")]
+    points: Annotated[int, Whole(5, MOST_POINTS)]
+    angles: Angles = field(default_factory=_level)
+    zero: Zero = "unknown"
+
+    def run(self, name: str, instrument: str) -> CampaignRun:
+        """Return the run."""
+        axes, rotation = np.eye(3)[list(PLANES[self.plane])], rotation_from_angles(self.angles)
+        return circle_run(name, self.centre, self.radius, self.points, axes, rotation, self.zero == "known")
+
+
+@dataclass(frozen=True)
+class SphereEntry:
+    """Touches spread over the upper half of a sphere, or of each sphere of a plate."""
+
+    centres: Annotated[np.ndarray, Numbers("mm", (None, 3))]
+    radius: Annotated[float, Numbers("mm")]
+    points: Annotated[int, Whole(4, MOST_POINTS)]
+    angles: Angles = field(default_factory=_level)
+    zero: Zero = "unknown"
+
+    def run(self, name: str, instrument: str) -> CampaignRun:
+        """Return the run."""
+        up, turns = (np.arange(self.points) + 0.5) / self.points, np.arange(self.points) * GOLDEN_ANGLE
+        level = np.sqrt(1.0 - up**2)
+        outwards = np.stack([level * np.cos(turns), level * np.sin(turns), up], axis=1)
+        places = (self.centres[:, None] + self.radius * outwards).reshape(-1, 3).round(12)
+        rotations = np.tile(rotation_from_angles(self.angles), (len(places), 1, 1))
+        centres = np.repeat(self.centres, self.points, axis=0)
+        return CampaignRun(name, instrument, places, rotations, centres, self.zero == "known")
+
+
+@dataclass(frozen=True)
+class TiltsEntry:
+    """An R-test at one place."""
+
+    position: Annotated[np.ndarray, Numbers("mm", (3,))]
+    points: Annotated[int, Whole(4, MOST_POINTS)]
+    tilt: Annotated[float, Numbers("deg")]
+
+    def run(self, name: str, instrument: str) -> CampaignRun:
+        """Return the run."""
+        return CampaignRun(name, instrument, np.tile(self.position, (self.points, 1)), tilts(self.points, self.tilt))
+
+
+@dataclass(frozen=True)
+class PosesEntry:
+    """Listed poses; lengths have one centre, or one each."""
+
+    poses: Annotated[np.ndarray, Numbers("mm", (None, 3))]
+    angles: Annotated[np.ndarray | None, Numbers("deg", (None, 3))] = None
+    centre: Annotated[np.ndarray | None, Numbers("mm", (3,))] = None
+    centres: Annotated[np.ndarray | None, Numbers("mm", (None, 3))] = None
+    zero: Zero = "unknown"
+
+    def run(self, name: str, instrument: str) -> CampaignRun:
+        """Return the run."""
+        count = len(self.poses)
+        for key, given in (("angles_deg", self.angles), ("centres_mm", self.centres)):
+            if given is not None and len(given) != count:
+                raise ModelError(f"run {name}: {key}", f"must be as many as poses: {count}", len(given))
+        centres = self.centres if self.centre is None else np.tile(self.centre, (count, 1))
+        angles = np.zeros_like(self.poses) if self.angles is None else self.angles
+        return CampaignRun(name, instrument, self.poses, rotation_from_angles(angles), centres, self.zero == "known")
+
+
+SHORT_FORMS: dict[str, Any] = {"ball_bar": CircleEntry, "probe": SphereEntry, "r_test": TiltsEntry}
+"""What an instrument's entry lists where it lists no poses."""
+
+
+def read_runs(top: Section) -> tuple[CampaignRun, ...]:
+    """Return the runs that a campaign file lists under ``runs``."""
+    runs: list[CampaignRun] = []
+    for entry in top.sections("runs"):
+        name = entry.text("name")
+        if name in {run.name for run in runs}:
+            raise entry.error("name", "is given to two runs: readings of one run share their unknown zeros", name)
+        instrument = entry.choice("instrument", LISTED_INSTRUMENTS)
+        schema = LineEntry if instrument in LINE_INSTRUMENTS else SHORT_FORMS.get(instrument, PosesEntry)
+        if instrument not in LINE_INSTRUMENTS and entry.quantity_key("poses", "length") is not None:
+            schema = PosesEntry
+        given = {}
+        if schema is PosesEntry and instrument in LENGTH_INSTRUMENTS and not entry.quantity_key("centres", "length"):
+            given["centre"] = entry.quantity("centre", "length", (3,))
+        with complaints_about(entry.path):
+            runs.append(read_whole(schema, entry, **given).run(name, instrument))
+    return tuple(runs)
+
+
+# The campaign.
+
 
 @dataclass(frozen=True)
 class Campaign:
-    """A calibration campaign on a box of commanded tool positions.
+    """A calibration campaign on a box of commanded tool positions; ModelError where there can be no such one."""
 
-    Parameters
-    ----------
-    box : ndarray, shape (2, 3)
-        Lowest and highest corner in the work frame, m.
-    cell : float
-        Distance of the grid's lines, m.
-    step : float
-        Distance of the readings along a line, m.
-    instrument : str or None
-        One of :data:`INSTRUMENTS` on every grid line; None for no lines.
-    diagonals : int
-        One of :data:`DIAGONALS`, read by a 1-D laser.
-    cycles : int
-        Passes forward and backward over each line.
-    poses : int
-        Scattered poses in the box, each read by a tracker in position and attitude.
-    tilt : float
-        Largest tilt about x and y of the scattered poses, rad.
-    noise : tuple of float
-        Standard deviation of a reading by kind (:data:`KINDS`), m or rad.
-    beam_slope : float
-        Standard deviation of a straightness beam's unknown slope, rad.
-    centre_off : float
-        Standard deviation of where the centre of lengths is beside its place in the file, along each axis, m.
-    repeatability : float
-        Standard deviation of where the machine really stops, along each axis, m.
-    level : ndarray, shape (3, 3)
-        Attitude of the tool in the work frame on lines; scattered poses tilt from there.
-    runs : tuple of CampaignRun
-        Runs one by one, in measuring order, after all others.
-
-    Raises
-    ------
-    InputFileError
-        Values that no campaign can have (the path is empty: the caller knows it).
-    """
-
-    box: np.ndarray
-    cell: float
-    step: float
-    instrument: str | None = "5-D"
-    diagonals: int = 4
-    cycles: int = 1
-    poses: int = 0
-    tilt: float = 0.0
-    noise: tuple[float, ...] = tuple(DEFAULT_UNCERTAINTY.values())
-    beam_slope: float = 100e-6
-    centre_off: float = 0.3e-3
-    repeatability: float = 0.0
-    level: np.ndarray = field(default_factory=lambda: np.eye(3))
-    runs: tuple[CampaignRun, ...] = ()
+    box: Annotated[np.ndarray, Numbers("mm", (2, 3))]  # lowest and highest corner in the work frame, m
+    cell: Annotated[float, Numbers("mm")]  # distance of the grid's lines, m
+    step: Annotated[float, Numbers("mm")]  # distance of the readings along a line, m
+    instrument: str | None = "5-D"  # one of INSTRUMENTS on every grid line; None for no lines
+    diagonals: int = 4  # one of DIAGONALS, read by a 1-D laser
+    cycles: Annotated[int, Whole(1, MOST_READINGS)] = 1  # passes forward and backward over each line
+    poses: Annotated[int, Whole(0, MOST_READINGS)] = 0  # scattered in the box, read in position and attitude
+    tilt: Annotated[float, Numbers("deg")] = 0.0  # largest tilt about x and y of the scattered poses, rad
+    noise: tuple[float, ...] = tuple(DEFAULT_UNCERTAINTY.values())  # 1 σ of a reading by kind (KINDS), m or rad
+    beam_slope: Annotated[float, Numbers("urad")] = 100e-6  # 1 σ of a straightness beam's unknown slope, rad
+    centre_off: Annotated[float, Numbers("mm")] = 0.3e-3  # 1 σ of a centre of lengths beside its place, each axis, m
+    repeatability: Annotated[float, Numbers("um")] = 0.0  # 1 σ of where the machine really stops, each axis, m
+    level: np.ndarray = field(default_factory=lambda: np.eye(3))  # tool in the work frame; scattered poses tilt from it
+    runs: tuple[CampaignRun, ...] = ()  # one by one, in measuring order, after all others
 
     def __post_init__(self) -> None:
         box = np.array(self.box, dtype=float)
         object.__setattr__(self, "box", box)
         if box.shape != (2, 3) or not (np.isfinite(box).all() and (box[0] < box[1]).all()):
-            raise InputFileError("campaign", "box", "must be its lowest and its highest corner", box.tolist())
+            raise ModelError("box", "must be its lowest and its highest corner", box.tolist())
         for name in ("cell", "step"):
             if not 0.0 < getattr(self, name) <= np.ptp(box, axis=0).min() + 1e-9:
                 problem = "must be above zero and no longer than the box's shortest side, m"
-                raise InputFileError("campaign", name, problem, getattr(self, name))
+                raise ModelError(name, problem, getattr(self, name))
         if self.instrument is not None and self.instrument not in INSTRUMENTS:
-            raise InputFileError("campaign", "instrument", f"must be one of {', '.join(INSTRUMENTS)}", self.instrument)
+            raise ModelError("instrument", f"must be one of {', '.join(INSTRUMENTS)}", self.instrument)
         if self.diagonals not in DIAGONALS:
-            raise InputFileError("campaign", "diagonals", f"must be one of {DIAGONALS}", self.diagonals)
+            raise ModelError("diagonals", f"must be one of {DIAGONALS}", self.diagonals)
         if not (1 <= self.cycles <= MOST_READINGS and 0 <= self.poses <= MOST_READINGS):
             problem = f"must be at least 1 and 0, and at most {MOST_READINGS}"
-            raise InputFileError("campaign", "cycles, poses", problem, [self.cycles, self.poses])
+            raise ModelError("cycles, poses", problem, [self.cycles, self.poses])
         if not (self.instrument or self.diagonals or self.poses or self.runs):
-            raise InputFileError("campaign", "instrument", "or diagonals, poses or runs: nothing is measured")
+            raise ModelError("instrument", "or diagonals, poses or runs: nothing is measured")
         if not 0.0 <= self.tilt < math.inf:
-            raise InputFileError("campaign", "tilt", "must be finite and not negative", self.tilt)
-        for name in ("beam_slope", "centre_off", "repeatability"):
-            if not 0.0 <= getattr(self, name) <= LARGEST_READING:
-                raise InputFileError("campaign", name, f"must be 0…{LARGEST_READING:g} m or rad", getattr(self, name))
-        if len(self.noise) != len(KINDS) or not all(0.0 <= sigma <= LARGEST_READING for sigma in self.noise):
-            raise InputFileError("campaign", "noise", f"must be 0…{LARGEST_READING:g} m or rad", list(self.noise))
+            raise ModelError("tilt", "must be finite and not negative", self.tilt)
+        sizes = {name: getattr(self, name) for name in ("beam_slope", "centre_off", "repeatability")}
+        for name, size in (*sizes.items(), *(("noise", sigma) for sigma in self.noise)):
+            if not 0.0 <= size <= LARGEST_READING:
+                raise ModelError(name, f"must be 0…{LARGEST_READING:g} m or rad", size)
+        if len(self.noise) != len(KINDS):
+            raise ModelError("noise", f"must be one number for each of {', '.join(KINDS)}", list(self.noise))
         if not self._roughly() <= MOST_READINGS:
             problem = f"would be some {self._roughly():.3g} readings, at most {MOST_READINGS} are allowed"
-            raise InputFileError("campaign", "cell, step, cycles, poses, runs", problem)
+            raise ModelError("cell, step, cycles, poses, runs", problem)
 
     def _roughly(self) -> float:
         """Return about how many readings the campaign takes, without making any."""
@@ -154,137 +440,71 @@ class Campaign:
 
     def channels(self, axis: int) -> tuple[str, ...]:
         """Return what is read on a grid line along an axis."""
-        across = [AXES[a] for a in CROSS_AXES[axis]]
-        five = ("linear", *(f"straightness_{a}" for a in across), *(f"rotation_{a}" for a in across))
-        return {"1-D": five[:1], "5-D": five, "6-D": (*five, f"rotation_{AXES[axis]}")}[self.instrument or "1-D"]
-
-
-CELLS_OF_A_BOX, STEPS_OF_A_CELL = 4, 4
-"""How many cells the longest edge of a machine's own box has, and how many steps a cell, where a file does not say."""
-
-OwnBox = Callable[[], tuple[np.ndarray, np.ndarray]]
-"""Gives a machine's own box, (2, 3), m in the work frame, and the tool's attitude there, (3, 3)."""
+        return line_channels(self.instrument or "1-D", axis)
 
 
 def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
     """Read a campaign file (YAML, see config/campaign_5d.yaml), or a shipped one by its name.
 
-    Parameters
-    ----------
-    path : str or Path
-        File, or the name of a shipped one.
-    own_box : callable, optional
-        Asked where the file gives no box: see :func:`hexapod_comp.workspace.box.machine_box`.
-
-    Raises
-    ------
-    InputFileError
-        With file, key and value.
+    Where the file gives no box, `own_box` is asked: see :func:`hexapod_comp.workspace.box.machine_box`.
     """
     path = input_file(path, "campaign")
     top = read_yaml(path, CAMPAIGN_FORMAT, CAMPAIGN_VERSION)
     instrument = top.choice("instrument", (*INSTRUMENTS, "none"), "none")
-    diagonals = top.integer("diagonals", 0)
-    box, level, cell, step = _read_grid(top, own_box, instrument != "none" or diagonals != 0)
-    try:
-        campaign = Campaign(
-            box=box,
-            cell=cell,
-            step=step,
-            level=level,
-            instrument=None if instrument == "none" else instrument,
-            diagonals=diagonals,
-            cycles=top.integer("cycles", 1),
-            poses=top.integer("poses", 0),
-            tilt=float(top.quantity("tilt", "angle", default=0.0)),
-            noise=_read_noise(top.section("noise")) if "noise" in top else Campaign.noise,
-            beam_slope=float(top.quantity("beam_slope", "angle", default=Campaign.beam_slope)),
-            centre_off=float(top.quantity("centre_off", "length", default=Campaign.centre_off)),
-            repeatability=float(top.quantity("repeatability", "length", default=0.0)),
-            runs=read_runs(top) if "runs" in top else (),
-        )
-    except InputFileError as error:
-        if error.path != "campaign":
-            raise
-        raise InputFileError(path, error.key, error.problem, error.value) from error
-    top.finish()
-    return campaign
+    diagonals = top.choice("diagonals", DIAGONALS, 0)
+    given = _grid(top, own_box, instrument != "none" or diagonals != 0)
+    given |= {"instrument": None if instrument == "none" else instrument, "diagonals": diagonals}
+    if "noise" in top:
+        section = top.section("noise")
+        units = {kind: "urad" if kind in ANGULAR_KINDS else "um" for kind in KINDS}
+        noise = zip(units.items(), Campaign.noise, strict=True)
+        given["noise"] = tuple(Numbers(unit).read(section, kind, usual) for (kind, unit), usual in noise)
+        section.finish()
+    if "runs" in top:
+        given["runs"] = read_runs(top)
+    return read_whole(Campaign, top, **given)
 
 
-def _read_grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Return the box, m, the tool's attitude in it, and the distances of lines and of readings, m.
+def _grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> dict[str, Any]:
+    """Return box, the tool's attitude in it, and the distances of lines and of readings, where the file has none.
 
     A campaign without lines of its own, of scattered poses or of runs that it lists, needs no distances.
     """
+    mm, given = Numbers("mm"), dict[str, Any]()
     if own_box is None or top.quantity_key("box", "length") is not None:
-        box, level, cells = top.quantity("box", "length", (2, 3)), np.eye(3), None
-        if not with_lines:
-            cells = float(np.ptp(box, axis=0).min())
+        given["box"] = top.quantity("box", "length", (2, 3))
+        if with_lines:
+            return given
+        cell = float(np.ptp(given["box"], axis=0).min())
     else:
-        box, level = own_box()
-        cells = float(np.ptp(box, axis=0).max()) / CELLS_OF_A_BOX
-    cell = float(top.quantity("cell", "length", default=cells))
-    step = float(top.quantity("step", "length", default=None if cells is None else cell / STEPS_OF_A_CELL))
-    return box, level, cell, step
-
-
-def _read_noise(section: Section) -> tuple[float, ...]:
-    noise = tuple(
-        float(section.quantity(kind, "angle" if kind in ANGULAR_KINDS else "length", default=default))
-        for kind, default in zip(KINDS, Campaign.noise, strict=True)
-    )
-    section.finish()
-    return noise
+        given["box"], given["level"] = own_box()
+        cell = float(np.ptp(given["box"], axis=0).max()) / CELLS_OF_A_BOX
+    given["cell"] = mm.read(top, "cell", cell)
+    given["step"] = mm.read(top, "step", given["cell"] / STEPS_OF_A_CELL)
+    return given
 
 
 def campaign_text(campaign: Campaign, remarks: Sequence[str] = ()) -> str:
-    """Return the file (YAML) of a campaign that lists its runs, with remarks on top.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        All that it measures are its runs.
-    remarks : sequence of str
-        Lines of comment.
-    """
-    noise = {
-        f"{kind}_urad" if kind in ANGULAR_KINDS else f"{kind}_um": written(
-            sigma, *(("angle", "urad") if kind in ANGULAR_KINDS else ("length", "um"))
-        )
-        for kind, sigma in zip(KINDS, campaign.noise, strict=True)
-    }
-    content = {
-        "format": CAMPAIGN_FORMAT,
-        "version": CAMPAIGN_VERSION,
-        "box_mm": written(campaign.box, "length", "mm"),
-        "cycles": campaign.cycles,
-        "noise": noise,
-        "beam_slope_urad": written(campaign.beam_slope, "angle", "urad"),
-        "centre_off_mm": written(campaign.centre_off, "length", "mm"),
-        "repeatability_um": written(campaign.repeatability, "length", "um"),
-        "runs": [run.content() for run in campaign.runs],
-    }
+    """Return the file (YAML) of a campaign all of whose readings are its runs', with remarks as comments on top."""
+    content = {"format": CAMPAIGN_FORMAT, "version": CAMPAIGN_VERSION, "box_mm": in_unit(campaign.box, "mm")}
+    content["cycles"] = campaign.cycles
+    units = ["urad" if kind in ANGULAR_KINDS else "um" for kind in KINDS]
+    noise = zip(KINDS, units, campaign.noise, strict=True)
+    content["noise"] = {f"{kind}_{unit}": in_unit(sigma, unit) for kind, unit, sigma in noise}
+    content["beam_slope_urad"] = in_unit(campaign.beam_slope, "urad")
+    content["centre_off_mm"] = in_unit(campaign.centre_off, "mm")
+    content["repeatability_um"] = in_unit(campaign.repeatability, "um")
+    content["runs"] = [run.content() for run in campaign.runs]
     return "".join(f"# {line}\n" for line in remarks) + block_text(content)
 
 
 def template(campaign: Campaign, geometry: HexapodGeometry, seed: int = 0, name: str = "campaign") -> MeasurementSet:
-    """Return the readings of a campaign with values of zero.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        What to measure.
-    geometry : HexapodGeometry
-        The machine as designed.
-    seed : int
-        Picks the scattered poses.
-    name : str
-        Of the campaign's file, for messages.
+    """Return the readings of a campaign on a nominal machine with values of zero; a seed picks the scattered poses.
 
     Raises
     ------
     InputFileError
-        A pose of the campaign is out of the machine's reach.
+        A pose of the campaign is out of the machine's reach; names the campaign's file.
     """
     listed = (reading for run in campaign.runs for reading in run.readings(campaign.cycles))
     readings = [*_lines(campaign), *_diagonals(campaign), *_scattered(campaign, seed), *listed]
@@ -296,13 +516,13 @@ def _lines(campaign: Campaign) -> Iterator[Reading]:
     if campaign.instrument is None:
         return
     for axis in range(3):
-        first, second = (campaign.nodes(a) for a in CROSS_AXES[axis])
+        across = CROSS_AXES[axis]
+        first, second = (campaign.nodes(a) for a in across)
         for a in first:
             for b in second:
                 ends = campaign.box.copy()
-                ends[:, CROSS_AXES[axis]] = a, b
-                name = f"{AXES[axis]} line at {AXES[CROSS_AXES[axis][0]]} {a * 1e3:.1f}, "
-                name += f"{AXES[CROSS_AXES[axis][1]]} {b * 1e3:.1f}"
+                ends[:, across] = a, b
+                name = f"{AXES[axis]} line at {AXES[across[0]]} {a * 1e3:.1f}, {AXES[across[1]]} {b * 1e3:.1f}"
                 yield from _line(campaign, name, ends, campaign.channels(axis))
 
 

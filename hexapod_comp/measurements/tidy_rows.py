@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import InputFileError
 from ..formats.csv import Table, si_from_text
-from ..formats.yaml import UNITS, spellings
+from ..formats.schema import UNITS, spellings
 from ..machine.geometry import STRUT_NAMES
 from ..machine.rows import changed_rows
 from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures

@@ -61,7 +61,8 @@ import numpy as np
 
 from ..errors import InputFileError, PoseError
 from ..formats.csv import AS_USUAL, ENCODINGS, MOST_SKIPPED, Layout, Table, read_pose_arrays
-from ..formats.yaml import MOST_NEIGHBOURS, Section, read_yaml
+from ..formats.schema import MOST_NEIGHBOURS, Section
+from ..formats.yaml import read_yaml
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, solve_poses, strut_lengths_batch
 from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures

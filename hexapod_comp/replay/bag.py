@@ -22,7 +22,8 @@ import numpy as np
 from ..compensation.journal import IDEAL_SOURCE, ROLES, JournalError, Page, Snapshot, Source, read_page, read_sources
 from ..errors import HexapodError, InputFileError, printable
 from ..formats.files import read_text
-from ..formats.yaml import Section, yaml_content
+from ..formats.schema import Section
+from ..formats.yaml import yaml_content
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.model import MachineModel
 from .unpacking import (

@@ -17,12 +17,12 @@ import numpy as np
 from ..compensation.thermal import TemperatureFilter
 from ..errors import InputFileError, ModelError
 from ..formats.paths import input_file
-from ..formats.yaml import Section, read_yaml
+from ..formats.schema import Section
+from ..formats.yaml import read_yaml
 from ..machine.late import PARTS
 from ..machine.model import MachineModel, RealMachine
 from ..machine.temperatures import HUMIDITY, HUMIDITY_RANGE, REFERENCE_TEMPERATURE, TEMPERATURE_RANGE
-from ..measurements.campaign import Campaign
-from ..measurements.campaign_runs import CampaignRun
+from ..measurements.campaign import Campaign, CampaignRun
 from ..measurements.readings import AXES, MeasurementSet, Stations
 from .instruments import compensated, measure
 

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputFileError, ModelError
+from ..errors import ModelError
 from ..formats.paths import input_file
-from ..formats.yaml import Section, read_yaml
+from ..formats.schema import complaints_about
+from ..formats.yaml import read_yaml
 from ..machine.geometry import HexapodGeometry, first_of_same
 
 BUDGET_FORMAT = "hexapod_comp/error_budget"
@@ -184,27 +185,16 @@ def load_budget(path: str | Path) -> Budget:
     top = read_yaml(path, BUDGET_FORMAT, BUDGET_VERSION)
     machine, section = top.text("machine"), top.section("errors")
     top.finish()
-    sizes = _read_sizes(section)
-    section.finish()
-    try:
-        return Budget(machine, sizes)
-    except ModelError as error:
-        raise InputFileError(path, error.key, error.problem, error.value) from error
-
-
-def _read_sizes(section: Section) -> dict[str, float]:
-    """Return the sizes in SI, in the order of :data:`SOURCE_TYPES`."""
     sizes = {}
     for source in SOURCE_TYPES:
-        if section.quantity_key(source.name, source.dimension) is not None:
-            key = section.quantity_key(source.name, source.dimension)
+        if (key := section.quantity_key(source.name, source.dimension)) is not None:
             size = float(section.quantity(source.name, source.dimension))
             if not 0.0 < size < LARGEST:
-                raise section.error(str(key), f"must be above zero and below {LARGEST:g} in SI units", size)
+                raise section.error(key, f"must be above zero and below {LARGEST:g} in SI units", size)
             sizes[source.name] = size
-    unknown = section.left()
-    if unknown:
+    if unknown := section.left():
         known = ", ".join(source.name for source in SOURCE_TYPES)
         problem = f"is no error type with its unit; types are {known}"
         raise section.error(unknown[0], problem, section.take(unknown[0]))
-    return sizes
+    with complaints_about(path):
+        return Budget(machine, sizes)

@@ -18,7 +18,7 @@ from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.errors import CalibrationError, InputFileError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import save_model
-from hexapod_comp.measurements.campaign_runs import circle_run
+from hexapod_comp.measurements.campaign import circle_run
 from hexapod_comp.measurements.readings import AXES, LENGTH, UNKNOWN, MeasurementSet, Reading
 from hexapod_comp.measurements.runs import assemble
 from hexapod_comp.measurements.tidy_csv import read_tidy

@@ -17,8 +17,7 @@ from hexapod_comp.calibration.proposal_report import proposal_report, verdict
 from hexapod_comp.cli.arguments import INSTRUMENTS
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.measurements.campaign import Campaign, campaign_text, load_campaign, template
-from hexapod_comp.measurements.campaign_runs import LISTED_INSTRUMENTS
+from hexapod_comp.measurements.campaign import LISTED_INSTRUMENTS, Campaign, campaign_text, load_campaign, template
 
 HOUR = 3600.0
 UM = 1e-6

@@ -21,8 +21,7 @@ from hexapod_comp.errors import CalibrationError, InputFileError, ModelError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
-from hexapod_comp.measurements.campaign import Campaign, template
-from hexapod_comp.measurements.campaign_runs import CampaignRun
+from hexapod_comp.measurements.campaign import Campaign, CampaignRun, template
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
 from hexapod_comp.measurements.tidy_csv import read_tidy
 from hexapod_comp.measurements.writing import write_measurements

@@ -14,8 +14,7 @@ from hexapod_comp.errors import ModelError
 from hexapod_comp.machine.late import LateGrowth
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
-from hexapod_comp.measurements.campaign import Campaign, template
-from hexapod_comp.measurements.campaign_runs import CampaignRun
+from hexapod_comp.measurements.campaign import Campaign, CampaignRun, template
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
 from hexapod_comp.virtual.instruments import measure
 

@@ -9,7 +9,8 @@ import pytest
 
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.formats.files import MAX_FILE_BYTES, read_text
-from hexapod_comp.formats.yaml import MOST_NEIGHBOURS, UNITS, Section, read_yaml
+from hexapod_comp.formats.schema import MOST_NEIGHBOURS, UNITS, Section
+from hexapod_comp.formats.yaml import read_yaml
 
 HEAD = "format: test\nversion: 1\n"
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from hexapod_comp.errors import InputFileError
-from hexapod_comp.measurements.campaign import Campaign, campaign_text, load_campaign, template
-from hexapod_comp.measurements.campaign_runs import CampaignRun, line_run
+from hexapod_comp.measurements.campaign import Campaign, CampaignRun, campaign_text, line_run, load_campaign, template
 from hexapod_comp.measurements.readings import CHANNELS
 from hexapod_comp.pose import rotation_from_angles
 

@@ -1,0 +1,456 @@
+"""What the files of people hold: keys that end in their unit, read strictly into SI, and written back to the same bits.
+
+A file's schema is a dataclass. The annotation of a field says what its key holds; a field with a default is optional::
+
+    @dataclass(frozen=True)
+    class Struts:
+        stroke: Annotated[np.ndarray, Numbers("mm", (2,))]         # stroke_mm, stroke_in, …; required
+        offset: Annotated[np.ndarray, Numbers("um", PER_STRUT)] = field(default_factory=lambda: np.zeros(6))
+        outside: Annotated[str, Choice("hold", "refuse")] = "hold"
+        wave: Wave | None = None               # a section with a schema of its own
+        lines: tuple[Line, ...] = ()           # a list of such sections
+
+    struts = read(Struts, section)             # whatever is unknown, missing, not finite or of another shape is refused
+    content = write(struts)                    # with the units of the annotations, without what equals its default
+
+Fields without an annotation of this module are no keys: ``read(Campaign, top, level=...)`` gives them, and may give
+others in place of the file. :class:`Section` is what is read: values are taken out, and what stays behind is an error.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from decimal import Decimal
+from functools import cache
+from itertools import islice
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from ..errors import GeometryError, InputFileError
+from .texts import number_hint
+
+MOST_NEIGHBOURS = 1000
+"""Keys looked through for the one that a misspelt key may mean: in a hostile file that would take minutes."""
+
+UNITS: dict[str, dict[str, float]] = {
+    "length": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "in": 0.0254},
+    "angle": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": np.pi / 180.0, "arcsec": np.pi / 648000.0},
+    "ratio": {"ppm": 1e-6, "percent": 1e-2},
+    "expansion": {"ppm_per_K": 1e-6},
+    "moisture": {"ppm_per_percent": 1e-4},
+    "temperature": {"degC": 1.0},
+    "difference": {"K": 1.0},
+    "speed": {"m_s": 1.0, "mm_s": 1e-3, "m_min": 1.0 / 60.0},
+    "acceleration": {"m_s2": 1.0, "mm_s2": 1e-3},
+    "time": {"s": 1.0, "ms": 1e-3},
+    "pressure": {"Pa": 1.0, "hPa": 1e2, "kPa": 1e3},
+}
+"""Unit suffixes per kind of quantity, and their size in SI (temperatures stay in degrees Celsius)."""
+
+DIMENSIONS = {unit: dimension for dimension, units in UNITS.items() for unit in units}
+"""Kind of quantity of each unit."""
+
+LARGEST = 1e12
+"""No number of a file is larger, in whatever unit: products of several stay finite."""
+
+MICROS = "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"
+"""They look alike, and either may be on a keyboard: both stand for the u of um and urad."""
+
+PER_STRUT = "per strut"
+"""Shape of six numbers that may be given as one for all."""
+
+Shape = tuple[int | None, ...]
+"""Lengths of an array's axes; None leaves one free."""
+
+
+@cache
+def spellings(dimension: str) -> dict[str, float]:
+    """Return the units of a kind of quantity with their sizes, by every spelling: µm and μm too, where um is."""
+    units = UNITS[dimension]
+    return units | {micro + unit[1:]: size for unit, size in units.items() if unit[0] == "u" for micro in MICROS}
+
+
+def in_si(values: Any, factor: float) -> Any:
+    """Return numbers in SI from their unit's size, moving the decimal point where that is all there is to do.
+
+    So 12.3 µm in a file is the very float that 12.3e-6 is in source code, not its neighbour.
+    """
+    digits = round(math.log10(factor))
+    if digits == 0 or 10.0**digits != factor:
+        return values * factor
+    array = np.asarray(values, dtype=float)
+    moved = [float(Decimal(repr(number)).scaleb(digits)) for number in array.ravel().tolist()]
+    return np.array(moved).reshape(array.shape)[()]
+
+
+def in_unit(values: Any, unit: str) -> Any:
+    """Return SI values in a unit, as nested lists of the shortest floats that read back to the same values."""
+    factor = UNITS[DIMENSIONS[unit]][unit]
+
+    def exact(value: float) -> float | None:
+        quotient = value / factor
+        candidates = [float(f"{quotient:.{digits}g}") for digits in (15, 16, 17)]
+        candidates += [math.nextafter(quotient, math.inf), math.nextafter(quotient, -math.inf)]
+        return next((number + 0.0 for number in candidates if in_si(number, factor) == value), None)
+
+    def converted(value: Any) -> Any:
+        if isinstance(value, list):
+            return [converted(item) for item in value]
+        result = exact(value)
+        if result is None:  # no float reads back as this one: its neighbour then, which is what will be read
+            result = exact(float(in_si(value / factor, factor)))
+        return value / factor if result is None else result
+
+    return converted(np.asarray(values, dtype=float).tolist())
+
+
+class Section:
+    """One mapping of a file: values are taken out by key, and whatever stays behind is an error."""
+
+    def __init__(self, path: str | Path, key: str, content: Any):
+        self.path, self.key = path, key  # file and place in it, for messages; no place at its top
+        if not isinstance(content, dict):
+            raise InputFileError(path, key, "must be a mapping of keys to values", content)
+        self._left = dict(content)
+        self._known: set[str] = set()
+
+    def __contains__(self, key: str) -> bool:
+        self._known.add(key)
+        return key in self._left
+
+    def where(self, key: str) -> str:
+        """Return the full key path of `key`."""
+        return f"{self.key}.{key}" if self.key else key
+
+    def error(self, key: str, problem: str, value: Any = None) -> InputFileError:
+        """Return (not raise) an error about `key`."""
+        return InputFileError(self.path, self.where(key), problem, value)
+
+    def take(self, key: str) -> Any:
+        """Take a required value of any kind."""
+        if key not in self:
+            raise self.error(key, f"is missing{self._meant([key], 0.6)}")
+        return self._left.pop(key)
+
+    def _meant(self, keys: list[str], likeness: float) -> str:
+        """Return which key may have been meant by one of some that are missing, to follow a complaint."""
+        left = list(islice(self._left, MOST_NEIGHBOURS))
+        near = [result for key in keys for result in difflib.get_close_matches(key, left, 1, likeness)]
+        return f"; did you mean it by {near[0]!r}?" if near else ""
+
+    def text(self, key: str) -> str:
+        """Take a required non-empty string."""
+        value = self.take(key)
+        if not isinstance(value, str) or not value.strip():
+            raise self.error(key, "must be text", value)
+        return value
+
+    def choice(self, key: str, allowed: tuple[Any, ...], default: Any = None) -> Any:
+        """Take one of the `allowed` words, or numbers."""
+        if default is not None and key not in self:
+            return default
+        value = self.take(key)
+        if not any(value == one and type(value) is type(one) for one in allowed):
+            raise self.error(key, f"must be one of {', '.join(map(str, allowed))}", value)
+        return value
+
+    def unit(self, key: str, dimension: str) -> float:
+        """Take the name of a unit; return its size in SI."""
+        value = self.take(key)
+        if not isinstance(value, str) or value not in spellings(dimension):
+            raise self.error(key, f"must be one of {', '.join(UNITS[dimension])}", value)
+        return spellings(dimension)[value]
+
+    def integer(self, key: str, default: int | None = None) -> int:
+        """Take a whole number."""
+        value = default if default is not None and key not in self else self.take(key)
+        if type(value) is not int:
+            raise self.error(key, "must be a whole number", value)
+        return value
+
+    def section(self, key: str) -> Section:
+        """Take a required sub-mapping."""
+        return Section(self.path, self.where(key), self.take(key))
+
+    def sections(self, key: str) -> Iterator[Section]:
+        """Take a list of sub-mappings."""
+        value = self.take(key)
+        if not isinstance(value, list):
+            raise self.error(key, "must be a list", value)
+        for index, item in enumerate(value):
+            yield Section(self.path, f"{self.where(key)}[{index}]", item)
+
+    def array(self, key: str, shape: Shape = ()) -> np.ndarray:
+        """Take finite numbers of a given shape."""
+        value = self.take(key)
+        self._refuse_non_numbers(key, value)
+        try:
+            array = np.array(value, dtype=float)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise self.error(key, f"must be numbers of shape {_shape_text(shape)}", value) from error
+        if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
+            raise self.error(key, f"must be numbers of shape {_shape_text(shape)}, not {_shape_text(array.shape)}")
+        if not np.isfinite(array).all():
+            bad = np.argwhere(~np.isfinite(array))[0]
+            raise self.error(key + "".join(f"[{i}]" for i in bad), "must be finite", float(array[tuple(bad)]))
+        if (np.abs(array) > LARGEST).any():
+            raise self.error(key, f"must be numbers within ±{LARGEST:g}", float(array.flat[np.abs(array).argmax()]))
+        return array
+
+    def _refuse_non_numbers(self, key: str, value: Any) -> None:
+        """Raise on text, booleans or mappings anywhere inside nested lists."""
+        stack = [(key, value)]
+        while stack:
+            where, item = stack.pop()
+            if isinstance(item, list):
+                stack.extend((f"{where}[{i}]", part) for i, part in enumerate(item))
+            elif isinstance(item, bool) or not isinstance(item, int | float):
+                hint = number_hint(item) if isinstance(item, str) else ""
+                raise self.error(where, f"must be a number{hint}", item)
+
+    def quantity_key(self, name: str, dimension: str) -> str | None:
+        """Return the key that carries `name` with a unit of `dimension`, or None when there is none."""
+        usual = [f"{name}_{unit}" for unit in UNITS[dimension]]
+        self._known.update(usual)
+        keys = [f"{name}_{unit}" for unit in spellings(dimension) if f"{name}_{unit}" in self._left]
+        if name in self._left:
+            raise self.error(name, f"has no unit; write one of {', '.join(usual)}", self._left[name])
+        if len(keys) > 1:
+            raise self.error(keys[0], f"is given twice, also as {keys[1]}")
+        return keys[0] if keys else None
+
+    def quantity(self, name: str, dimension: str, shape: Shape = (), default: Any = None) -> np.ndarray:
+        """Take numbers with a unit: ``stroke`` finds ``stroke_mm``, …; in SI, as the default where there are none."""
+        key = self.quantity_key(name, dimension)
+        if key is None:
+            if default is not None:
+                return np.array(default, dtype=float)
+            usual = [f"{name}_{unit}" for unit in UNITS[dimension]]
+            raise self.error(name, f"is missing; write one of {', '.join(usual)}{self._meant(usual, 0.8)}")
+        return in_si(self.array(key, shape), spellings(dimension)[key[len(name) + 1 :]])
+
+    def per_strut(self, name: str, dimension: str, default: float | None = None) -> np.ndarray:
+        """Take a quantity given once for all struts or as a list of six; return shape (6,), SI."""
+        key = self.quantity_key(name, dimension)
+        if key is not None and isinstance(self._left[key], list):
+            return self.quantity(name, dimension, (6,))
+        return np.full(6, self.quantity(name, dimension, (), default))
+
+    def pairs_per_strut(self, name: str, dimension: str) -> np.ndarray:
+        """Take one pair for all struts or six pairs; return shape (6, 2), SI."""
+        key = self.quantity_key(name, dimension)
+        given = None if key is None else self._left[key]
+        if isinstance(given, list) and any(isinstance(item, list) for item in given):
+            return self.quantity(name, dimension, (6, 2))
+        return np.tile(self.quantity(name, dimension, (2,)), (6, 1))
+
+    def left(self) -> list[str]:
+        """Return the keys that nobody has asked for yet."""
+        return list(self._left)
+
+    def finish(self) -> None:
+        """Raise if keys are left that nobody asked for: a misspelt key must not be lost in silence."""
+        if self._left:
+            key = next(iter(self._left))
+            near = difflib.get_close_matches(key, sorted(self._known), 1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise self.error(key, f"is not a known key here{hint}", self._left[key])
+
+
+def _shape_text(shape: Shape) -> str:
+    return "×".join("n" if n is None else str(n) for n in shape) or "a single number"
+
+
+@contextmanager
+def complaints_about(path: str | Path) -> Iterator[None]:
+    """Turn what a dataclass raises about its values (GeometryError, ModelError) into an error that names the file."""
+    try:
+        yield
+    except GeometryError as error:
+        raise InputFileError(path, error.key, error.problem, error.value) from error
+
+
+# What a key holds.
+
+
+class Kind:
+    """How a key's value is taken from a section, and written."""
+
+    def read(self, section: Section, name: str, default: Any) -> Any:
+        """Return the value of a key; the default where there is no such key, unless it is MISSING."""
+        return default if default is not MISSING and name not in section else self.take(section, name)
+
+    def take(self, section: Section, name: str) -> Any:
+        """Return the value of a key that must be there."""
+        raise NotImplementedError
+
+    def write(self, name: str, value: Any) -> tuple[str, Any]:
+        """Return key and value of a file."""
+        return name, value
+
+
+@dataclass(frozen=True)
+class Numbers(Kind):
+    """Finite numbers: in SI where they have a unit, and read in any unit of its kind; plain ones with unit ""."""
+
+    unit: str  # in which it is written
+    shape: Shape | str = ()  # or PER_STRUT
+
+    def read(self, section: Section, name: str, default: Any) -> Any:
+        if default is not MISSING and self.unit and section.quantity_key(name, DIMENSIONS[self.unit]) is None:
+            return default
+        return super().read(section, name, MISSING if self.unit else default)
+
+    def take(self, section: Section, name: str) -> Any:
+        if isinstance(self.shape, str):
+            return section.per_strut(name, DIMENSIONS[self.unit])
+        values = (
+            section.quantity(name, DIMENSIONS[self.unit], self.shape) if self.unit else section.array(name, self.shape)
+        )
+        return values if np.ndim(values) else float(values)
+
+    def write(self, name: str, value: Any) -> tuple[str, Any]:
+        if self.shape == PER_STRUT and (value == value[0]).all():
+            value = value[0]
+        return (f"{name}_{self.unit}", in_unit(value, self.unit)) if self.unit else (name, np.asarray(value).tolist())
+
+
+@dataclass(frozen=True)
+class Whole(Kind):
+    """A whole number within bounds."""
+
+    low: int
+    high: int
+
+    def take(self, section: Section, name: str) -> int:
+        value = section.integer(name)
+        if not self.low <= value <= self.high:
+            raise section.error(name, f"must be {self.low} to {self.high}", value)
+        return value
+
+
+class Choice(Kind):
+    """One of some words, or numbers."""
+
+    def __init__(self, *words: Any) -> None:
+        self.words = words
+
+    def take(self, section: Section, name: str) -> Any:
+        return section.choice(name, self.words)
+
+
+class Text(Kind):
+    """A text that is not empty."""
+
+    def take(self, section: Section, name: str) -> str:
+        return section.text(name)
+
+
+class Names(Kind):
+    """A list of names, as of columns; where counts are given, so many."""
+
+    def __init__(self, *counts: int, what: str = "column names") -> None:
+        self.counts, self.what = counts, what
+
+    def take(self, section: Section, name: str) -> tuple[str, ...]:
+        given = section.take(name)
+        well = isinstance(given, list) and given and all(isinstance(text, str) and text.strip() for text in given)
+        if not well or (self.counts and len(given) not in self.counts):
+            count = f"{' or '.join(map(str, self.counts))} " if self.counts else ""
+            raise section.error(name, f"must be a list of {count}{self.what}", given)
+        return tuple(given)
+
+    def write(self, name: str, value: Any) -> tuple[str, Any]:
+        return name, list(value)
+
+
+@dataclass(frozen=True)
+class Unit(Kind):
+    """The name of a unit; its size in SI is what is kept."""
+
+    dimension: str
+
+    def take(self, section: Section, name: str) -> float:
+        return section.unit(name, self.dimension)
+
+
+@dataclass(frozen=True)
+class Nested(Kind):
+    """A section with a schema of its own, or a list of such sections."""
+
+    schema: Any
+    listed: bool = False
+
+    def take(self, section: Section, name: str) -> Any:
+        if self.listed:
+            return tuple(read_whole(self.schema, one) for one in section.sections(name))
+        return read_whole(self.schema, section.section(name))
+
+    def write(self, name: str, value: Any) -> tuple[str, Any]:
+        return name, [write(one) for one in value] if self.listed else write(value)
+
+
+@cache
+def keys_of(schema: type) -> dict[str, tuple[Any, Any]]:
+    """Return what each field of a schema holds, by its annotation, and its default (MISSING: the key is required)."""
+    hints = get_type_hints(schema, include_extras=True)
+    result = {one.name: (_kind(hints[one.name]), _default(one)) for one in fields(schema)}
+    return {name: pair for name, pair in result.items() if pair[0] is not None}
+
+
+def _default(one: Field[Any]) -> Any:
+    return one.default if one.default_factory is MISSING else one.default_factory()
+
+
+def _kind(hint: Any) -> Any:
+    """Return what an annotation says of a key: a kind, a schema, a schema or None, a tuple of schemas; else None."""
+    if get_origin(hint) is Annotated:
+        return next((kind for kind in get_args(hint)[1:] if isinstance(kind, Kind)), None)
+    parts = get_args(hint)
+    if get_origin(hint) in (Union, UnionType):
+        return next((kind for part in parts if (kind := _kind(part)) is not None), None)
+    if get_origin(hint) is tuple and len(parts) == 2 and parts[1] is Ellipsis:
+        return Nested(parts[0], listed=True) if is_dataclass(parts[0]) and keys_of(parts[0]) else None  # type: ignore[arg-type]
+    return Nested(hint) if is_dataclass(hint) and keys_of(hint) else None  # type: ignore[arg-type]
+
+
+T = TypeVar("T")
+
+
+def read(schema: Callable[..., T], section: Section, **given: Any) -> T:
+    """Return what a section holds; fields that are `given` are not looked for in it.
+
+    Raises
+    ------
+    InputFileError
+        With file, key, value and what is allowed; also about what the dataclass itself refuses.
+    """
+    keys: dict[str, tuple[Any, Any]] = keys_of(schema)  # type: ignore[arg-type]
+    values = {name: kind.read(section, name, default) for name, (kind, default) in keys.items() if name not in given}
+    with complaints_about(section.path):
+        return schema(**values, **given)
+
+
+def read_whole(schema: Callable[..., T], section: Section, **given: Any) -> T:
+    """Return what a section holds, as :func:`read`; keys that the schema does not know are refused."""
+    result = read(schema, section, **given)
+    section.finish()
+    return result
+
+
+def write(value: Any) -> dict[str, Any]:
+    """Return the content of a file that :func:`read` makes the same of, without what equals its default."""
+    content = {}
+    for name, (kind, default) in keys_of(type(value)).items():  # type: ignore[arg-type]
+        own = getattr(value, name)
+        if default is MISSING or not (own is default or np.array_equal(own, default)):
+            key, written = kind.write(name, own)
+            content[key] = written
+    return content

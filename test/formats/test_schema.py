@@ -1,0 +1,108 @@
+"""Schemas: a dataclass whose fields are the keys of a file, read with their units and written back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Annotated
+
+import numpy as np
+import pytest
+
+from hexapod_comp.errors import InputFileError, ModelError
+from hexapod_comp.formats.schema import (
+    PER_STRUT,
+    Choice,
+    Names,
+    Numbers,
+    Section,
+    Text,
+    Unit,
+    Whole,
+    read,
+    read_whole,
+    write,
+)
+
+
+@dataclass(frozen=True)
+class Wave:
+    """A section."""
+
+    period: Annotated[float, Numbers("mm")]
+    cosine: Annotated[np.ndarray, Numbers("um", PER_STRUT)] = field(default_factory=lambda: np.zeros(6))
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A file."""
+
+    name: Annotated[str, Text()]
+    stroke: Annotated[np.ndarray, Numbers("mm", (2,))]
+    ratio: Annotated[float, Numbers("")] = 1.0
+    points: Annotated[int, Whole(2, 9)] = 2
+    outside: Annotated[str, Choice("hold", "refuse")] = "hold"
+    columns: Annotated[tuple[str, ...], Names(3)] = ()
+    unit: Annotated[float, Unit("angle")] = 1.0
+    wave: Wave | None = None
+    waves: tuple[Wave, ...] = ()
+    inside: str = "no key"
+
+    def __post_init__(self) -> None:
+        if self.stroke[1] <= self.stroke[0]:
+            raise ModelError("stroke", "must rise", self.stroke.tolist())
+
+
+GIVEN = {"name": "x", "stroke_mm": [330, 880.1]}
+
+
+def machine(**content):
+    return read_whole(Machine, Section("some.yaml", "", {**GIVEN, **content}))
+
+
+def test_units_shapes_and_defaults():
+    """Truth: 880.1 mm is the very 0.8801 of source code, an inch 25.4 mm, one number stands for six struts."""
+    read_in = machine(wave={"period_in": 0.2, "cosine_µm": 1.1}, waves=[{"period_mm": 5}], columns=["a", "b", "c"])
+    assert read_in.stroke.tolist() == [0.33, 0.8801]
+    assert read_in.wave.period == pytest.approx(5.08e-3, rel=1e-15)
+    assert read_in.wave.cosine.tolist() == [1.1e-6] * 6
+    assert [one.period for one in read_in.waves] == [0.005]
+    assert (read_in.ratio, read_in.points, read_in.outside, read_in.columns) == (1.0, 2, "hold", ("a", "b", "c"))
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ({"stroke_mm": [1, 2, 3]}, r"stroke_mm: must be numbers of shape 2, not 3"),
+        ({"stroke_mm": [880, 330]}, r"stroke: must rise \(found \[0\.88, 0\.33\]\)"),
+        ({"points": 10}, r"points: must be 2 to 9 \(found 10\)"),
+        ({"points": 2.0}, "points: must be a whole number"),
+        ({"outside": "held"}, r"outside: must be one of hold, refuse \(found 'held'\)"),
+        ({"columns": ["a"]}, "columns: must be a list of 3 column names"),
+        ({"unit": "mm"}, "unit: must be one of rad, mrad"),
+        ({"wave": {"perod_mm": 5}}, r"wave\.period: is missing; write one of .*; did you mean it by 'perod_mm'"),
+        ({"wave": 5}, "wave: must be a mapping"),
+        ({"waves": [{"period_mm": 5, "sine": 1}]}, r"waves\[0\]\.sine: is not a known key here"),
+        ({"inside": "x"}, "inside: is not a known key here"),
+        ({"raito": 2}, r"raito: is not a known key here; did you mean 'ratio'\?"),
+    ],
+)
+def test_what_is_refused(content, said):
+    with pytest.raises(InputFileError, match=rf"^some\.yaml: {said}"):
+        machine(**content)
+
+
+def test_written_files_read_back_to_the_same_values():
+    """Property; to one rounding, and what has been read is written back unchanged."""
+    rng = np.random.default_rng(4)
+    wave = Wave(float(rng.uniform(0.001, 0.01)), rng.normal(0.0, 1e-5, 6))
+    first = replace(machine(ratio=0.1, columns=["a", "b", "c"]), wave=wave, waves=(wave, Wave(0.005)))
+    content = write(first)
+    assert set(content) == {"name", "stroke_mm", "ratio", "columns", "wave", "waves"}  # not what equals its default
+    back = read_whole(Machine, Section("some.yaml", "", content))
+    np.testing.assert_allclose([back.wave.period, *back.wave.cosine], [wave.period, *wave.cosine], rtol=3e-16)
+    assert write(back) == content
+
+
+def test_what_is_given_is_not_looked_for():
+    section = Section("some.yaml", "", {"name": "x", "outside": "refuse"})
+    assert read(Machine, section, stroke=np.array([0.1, 0.2]), inside="y").inside == "y"
