@@ -29,8 +29,8 @@ from benchmarks.smooth_imperfections import with_wavy_field
 from hexapod_comp.calibration.evaluation import Worth, worth
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.lines import fit_lines
-from hexapod_comp.calibration.observability import ToolError
 from hexapod_comp.calibration.parameters import FitSettings
+from hexapod_comp.calibration.posterior import ToolError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.measurements.campaign import Campaign, load_campaign, template

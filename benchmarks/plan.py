@@ -27,8 +27,8 @@ from hexapod_comp.calibration.candidates import MeasuringBox
 from hexapod_comp.calibration.estimator import physical_covariance
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.gains import Aim, seen_by
-from hexapod_comp.calibration.observability import box_stations, expected_error
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
+from hexapod_comp.calibration.posterior import box_stations, expected_error
 from hexapod_comp.calibration.proposal import Goal, Proposal, Times, propose
 from hexapod_comp.calibration.proposal_report import verdict
 from hexapod_comp.errors import CalibrationError

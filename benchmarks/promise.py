@@ -31,8 +31,8 @@ from benchmarks.calibration import LARGE, LEAD, SMALL
 from benchmarks.smooth_imperfections import with_wavy_field
 from hexapod_comp.calibration.blocks import WAVES
 from hexapod_comp.calibration.fit import ModelFit, fit_model
-from hexapod_comp.calibration.observability import expected_error
 from hexapod_comp.calibration.parameters import BLOCKS, FitSettings
+from hexapod_comp.calibration.posterior import expected_error
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine

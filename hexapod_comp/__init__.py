@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .calibration.fit import ModelFit as ModelFit
     from .calibration.fit import fit_model as fit_model
     from .calibration.parameters import FitSettings as FitSettings
-    from .calibration.posterior import load_posterior as load_posterior
+    from .calibration.posterior_file import load_posterior as load_posterior
     from .calibration.report import fit_report as fit_report
     from .calibration.update import update_model as update_model
     from .calibration.verification import Verification as Verification
@@ -61,7 +61,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "calibration.fit": ("ModelFit", "fit_model"),
     "calibration.parameters": ("FitSettings",),
-    "calibration.posterior": ("load_posterior",),
+    "calibration.posterior_file": ("load_posterior",),
     "calibration.report": ("fit_report",),
     "calibration.update": ("update_model",),
     "calibration.verification": ("Verification", "verify_model"),

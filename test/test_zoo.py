@@ -39,8 +39,8 @@ from scipy.spatial.transform import Rotation
 from hexapod_comp import cli
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
-from hexapod_comp.calibration.posterior import FittedParameters, load_posterior
-from hexapod_comp.calibration.prediction import ErrorPredictor
+from hexapod_comp.calibration.posterior import ErrorPredictor, FittedParameters
+from hexapod_comp.calibration.posterior_file import load_posterior
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model

@@ -43,6 +43,9 @@ class Assumptions:
     shortest_lead: float = assumed(0.1e-3, "m", "shortest lead of a screw", "below it no line shows a period")
     longest_lead: float = assumed(1.0, "m", "longest lead of a screw", "longer than struts")
     beyond_stroke: float = assumed(50e-3, "m", "encoders may read so far beyond the stroke", "zeros of their own")
+    # Posterior (posterior.py, datum.py)
+    seen: float = assumed(1.0, "σ", "change of all readings from which on a direction is observable", "one σ of noise")
+    weak: float = assumed(5.0, "σ", "observable directions below are listed as weak", "known to a fifth")
 
     def rows(self) -> list[tuple[str, str, str, str]]:
         """Return name, value with unit, meaning and source of every assumption."""

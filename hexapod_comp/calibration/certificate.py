@@ -34,8 +34,8 @@ from ..measurements.standards import (
 )
 from ..workspace.overview import corners
 from .fit import ModelFit
-from .observability import ToolError, listed
 from .observations import Cells
+from .posterior import ToolError, listed
 from .report import tilt_doubt
 
 FORMAT, VERSION = "hexapod_comp/certificate", 1

@@ -22,10 +22,6 @@ from .assumptions import ASSUMED
 from .estimator import Estimation
 from .sensitivity import carried
 
-SEEN = 1.0
-"""A motion of the whole machine is seen when one of the structure's tolerance changes the readings by more than so many
-standard deviations."""
-
 
 @dataclass(frozen=True)
 class HeldDatum:
@@ -170,7 +166,7 @@ def unseen_part(
     rows *= tolerance * size
     hidden = np.eye(6) if before is None else _range(before / size[:, None] * size)
     strength, directions = np.linalg.eigh(hidden.T @ rows.T @ rows @ hidden)
-    unseen = hidden @ directions[:, strength <= SEEN**2]
+    unseen = hidden @ directions[:, strength <= ASSUMED.seen**2]
     return size[:, None] * (unseen @ unseen.T) / size
 
 

@@ -1,8 +1,8 @@
 """What a model is worth: the virtual machine told what the model says, seen where nothing was fitted.
 
-Two measures. The honest one is the error vector of the tool in space at random points of the workspace,
-passed in random directions. That of Mou & King (1998) is the mean absolute displacement error along lines
-parallel to the grid, which is all that a linear laser sees.
+Two measures. The honest one is the error vector of the tool in space at random points of the workspace, passed in
+random directions. That of Mou & King (1998) is the mean absolute displacement error along lines parallel to the grid,
+which is all that a linear laser sees.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import numpy as np
 
 from ..errors import ModelError
 from ..machine.field import CROSS_AXES
-from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel, RealMachine
 from ..machine.passes import BOTH_WAYS, Passes, random_passes
 from ..machine.size import Size
@@ -25,22 +24,12 @@ INCH = 0.0254
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Error of the tool at points that nothing was fitted to, both ways through each.
-
-    Attributes
-    ----------
-    points : int
-        How many.
-    raw, aligned : Size
-        The error vector, m, as it is, and after the datum has been aligned: one rotation and one shift for everything.
-    rotation : Size
-        The platform's rotation error after the common rotation has been taken out, rad.
-    """
+    """Error of the tool at points that nothing was fitted to, both ways through each."""
 
     points: int
-    raw: Size
-    aligned: Size
-    rotation: Size
+    raw: Size  # the error vector as it is, m
+    aligned: Size  # the same after one rotation and one shift of everything
+    rotation: Size  # the rotation less the common one, rad
 
 
 def held_out(
@@ -54,29 +43,16 @@ def held_out(
     sensed: Temperatures | None = None,
     level: np.ndarray | None = None,
 ) -> HeldOut:
-    """Return the error of the tool at random points of a box, passed there and back in random directions.
+    """Return the error of the tool at random points of a box (2, 3), m in work, passed both ways in random directions.
 
-    Parameters
-    ----------
-    truth, model : RealMachine, MachineModel or None
-        The machine, and what the compensator believes; None for the machine as it is.
-    box : ndarray, shape (2, 3)
-        Lowest and highest position of the tool in the work frame, m.
-    points, seed : int
-        How many, at least three: fewer do not tell a rotation. Equal seeds give equal passes, whatever the model.
-    repeatability : float
-        Standard deviation, along each axis, of where the machine really stops, m.
-    tilt : float
-        Largest tilt of the tool about x and y, rad.
-    sensed : Temperatures, optional
-        What the compensator believes the temperatures to be; 20 °C by default.
-    level : ndarray, shape (3, 3), optional
-        Attitude of a level tool in the work frame; parallel to it by default.
+    `model` None is the machine as it is. `repeatability` is the standard deviation, along each axis, of where it really
+    stops, m; `tilt` the largest of the tool about x and y, rad; `sensed` what the compensator believes the temperatures
+    to be; `level` the attitude of a level tool in the work frame. Equal seeds give equal passes, whatever the model.
 
     Raises
     ------
     ModelError
-        Fewer than three points, or as :meth:`hexapod_comp.virtual.trial.Trial.commands`.
+        Fewer than three points, which tell no rotation, or as :meth:`hexapod_comp.virtual.trial.Trial.commands`.
     """
     if points < 3:
         raise ModelError("points", "must be at least three", points)
@@ -91,17 +67,9 @@ def held_out(
 
 @dataclass(frozen=True)
 class PaperMetric:
-    """Mou & King's own measure, without and with a model.
+    """Mou & King's own measure, without and with a model."""
 
-    Attributes
-    ----------
-    before, after : float
-        Mean absolute displacement error along lines, m.
-    lines, readings : int
-        How many.
-    """
-
-    before: float
+    before: float  # mean absolute displacement error along lines, m
     after: float
     lines: int
     readings: int
@@ -120,88 +88,48 @@ def paper_metric(
     """Return the mean absolute displacement error along lines parallel to the grid, without and with a model.
 
     Mou & King: the predicted values "were compared with the laser interferometer readings at various points within
-    the selected workspace". So: lines along x, y and z at random places between the grid's, from end to end of
-    the box, forward and backward, each with its zero where an interferometer is zeroed: at the first reading,
-    the line's start. That reading, zero by definition, does not count. The others stand every `step`, half a
-    step off those that a fit has seen. The laser that checks is perfect.
-
-    Parameters
-    ----------
-    truth, model, box, seed, sensed, level
-        As for :func:`held_out`.
-    step : float
-        Distance of the readings along a line, m.
-    lines : int
-        Lines along each axis.
+    the selected workspace". So: `lines` along each of x, y and z at random places between the grid's, from end to end
+    of the box, forward and backward, each with its zero where an interferometer is zeroed: at the first reading, the
+    line's start. That reading, zero by definition, does not count. The others stand every `step`, m, half a step off
+    those that a fit has seen. The laser that checks is perfect.
 
     Raises
     ------
     ModelError
         A line has fewer than two readings, or as for :func:`held_out`.
     """
-    rng = np.random.default_rng(seed)
+    rng, level, box = np.random.default_rng(seed), np.eye(3) if level is None else level, np.asarray(box, dtype=float)
     errors: list[list[np.ndarray]] = [[], []]
     for axis in range(3):
-        passes = _check_lines(truth.geometry, box, axis, step, lines, rng, np.eye(3) if level is None else level)
+        between = np.arange(box[0, axis] + 0.5 * step, box[1, axis], step)
+        if not len(between):
+            raise ModelError("step", "leaves no reading on a line of the box, m", step)
+        along = np.concatenate([box[:1, axis], between, between[::-1]])  # zeroed at the start, there and back
+        across = list(CROSS_AXES[axis])
+        places = np.empty((lines, len(along), 3))
+        places[..., axis] = along
+        places[..., across] = rng.uniform(box[0, across], box[1, across], (lines, 2))[:, None]
+        ways = np.zeros_like(places)
+        ways[..., axis] = np.where(np.arange(len(along)) <= len(between), *BOTH_WAYS)
+        rotations = np.broadcast_to(level, (lines * len(along), 3, 3))
+        passes = Passes.of_tool(truth.geometry, places.reshape(-1, 3), rotations, ways.reshape(-1, 3))
+        trial = Trial(truth, passes)
         for readings, applied in zip(errors, (None, model), strict=True):
-            readings.append(_laser_readings(truth, passes, applied, lines, sensed))
+            displacement = trial.errors(trial.commands(applied, sensed)).displacement
+            read = displacement.reshape(lines, -1, 3) @ passes.directions[0]
+            readings.append((read[:, 1:] - read[:, :1]).ravel())
     before, after = (np.abs(np.concatenate(readings)) for readings in errors)
     return PaperMetric(float(before.mean()), float(after.mean()), 3 * lines, len(before))
 
 
-def _check_lines(
-    geometry: HexapodGeometry,
-    box: np.ndarray,
-    axis: int,
-    step: float,
-    lines: int,
-    rng: np.random.Generator,
-    level: np.ndarray,
-) -> Passes:
-    """Return passes along lines parallel to an axis of the work frame: line by line, forward, then back."""
-    box = np.asarray(box, dtype=float)
-    between = np.arange(box[0, axis] + 0.5 * step, box[1, axis], step)
-    if not len(between):
-        raise ModelError("step", "leaves no reading on a line of the box, m", step)
-    along = np.concatenate([box[:1, axis], between, between[::-1]])  # zeroed at the start, there and back
-    across = list(CROSS_AXES[axis])
-    points = np.empty((lines, len(along), 3))
-    points[..., axis] = along
-    points[..., across] = rng.uniform(box[0, across], box[1, across], (lines, 2))[:, None]
-    directions = np.zeros_like(points)
-    directions[..., axis] = np.where(np.arange(len(along)) <= len(between), *BOTH_WAYS)
-    rotations = np.broadcast_to(level, (lines * len(along), 3, 3))
-    return Passes.of_tool(geometry, points.reshape(-1, 3), rotations, directions.reshape(-1, 3))
-
-
-def _laser_readings(
-    truth: RealMachine, passes: Passes, model: MachineModel | None, lines: int, sensed: Temperatures | None
-) -> np.ndarray:
-    """Return what a laser reads on :func:`_check_lines`, m, without the first reading of each, its zero."""
-    trial = Trial(truth, passes)
-    errors = trial.errors(trial.commands(model, sensed)).displacement
-    readings = errors.reshape(lines, -1, 3) @ passes.directions[0]
-    return (readings[:, 1:] - readings[:, :1]).ravel()
-
-
 @dataclass(frozen=True)
 class Worth:
-    """Everything that is said about what a model is worth on a virtual machine.
+    """What a model is worth on a virtual machine."""
 
-    Attributes
-    ----------
-    before, after : HeldOut
-        The tool's error in space without and with the model.
-    paper : PaperMetric
-        Mou & King's own measure.
-    promised : (float, float) or None
-        Where a fit expects the RMS error in space with the model, the datum aligned, m.
-    """
-
-    before: HeldOut
+    before: HeldOut  # the tool's error in space without and with the model
     after: HeldOut
     paper: PaperMetric
-    promised: tuple[float, float] | None = None
+    promised: tuple[float, float] | None = None  # where a fit expects the RMS error with the model, datum aligned, m
 
     @property
     def kept(self) -> bool | None:
@@ -219,10 +147,7 @@ def worth(
     sensed: Temperatures | None = None,
     level: np.ndarray | None = None,
 ) -> Worth:
-    """Return what a model is worth on a virtual machine; parameters as :func:`held_out` has them.
-
-    `repeatability` spoils the points in space; the paper's metric does without.
-    """
+    """Return what a model is worth on a virtual machine; `repeatability` spoils the points in space alone."""
     before = held_out(truth, None, box, points, seed, repeatability, level=level)
     after = held_out(truth, model, box, points, seed, repeatability, sensed=sensed, level=level)
     return Worth(before, after, paper_metric(truth, model, box, seed=seed, sensed=sensed, level=level))

@@ -21,8 +21,8 @@ from .courses import with_courses
 from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
 from .estimator import HUBER, OUTLIER, Estimation, LinearProblem, Posterior, Solution, iterate, physical_covariance
 from .lead import ScrewLead, look_for_lead
-from .observability import Allowed, Observability, ToolError, UnseenError, listed, observe, without_trace
 from .parameters import FitSettings, ParameterSpace
+from .posterior import Allowed, Observability, ToolError, UnseenError, listed, observe, without_trace
 from .residuals import Residuals
 from .selection import Decision, select
 from .suspicions import SCATTERED, SURE, SWAPPED, causes
@@ -108,7 +108,7 @@ class ModelFit:
     observability : Observability
         What the data determine.
     unseen_errors : tuple of UnseenError
-        Machine errors that the readings do not show (:data:`~.observability.MACHINE_ERRORS`).
+        Machine errors that the readings do not show (:data:`~.posterior.MACHINE_ERRORS`).
     verdict : Verdict
         What the model promises, and what is wrong.
     outliers : tuple of Outlier

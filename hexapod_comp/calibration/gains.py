@@ -15,12 +15,10 @@ from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from ..errors import CalibrationError
 from ..measurements.campaign import Campaign
 from ..measurements.readings import KINDS, MeasurementSet
-from ..virtual.trial import without_datum
 from .estimator import Estimation
-from .observability import POINTS, box_stations
 from .parameters import ParameterSpace
 from .plan import noise_factor
-from .sensitivity import derivatives, predict
+from .posterior import POINTS, box_errors
 
 STRENGTH = 0.05
 """Directions that a run's readings see by less than so many standard deviations of their prior are left out of it."""
@@ -66,16 +64,13 @@ class Aim:
 
 def _square(space: ParameterSpace, tilt: float) -> np.ndarray:
     """Return M, shape (size, size), m²: the mean square tool error with the datum aligned is tr(M·C)."""
-    stations = box_stations(space, tilt)
-    reached = 0.0 if stations is None else len(stations) / (2.0 * POINTS)
-    if stations is None or reached < LEAST_REACHED:
+    errors = box_errors(space, np.zeros(space.size), tilt)
+    reached = 0.0 if errors is None else len(errors.places) / (2.0 * POINTS)
+    if errors is None or reached < LEAST_REACHED:
         problem = f"{np.degrees(tilt):g}° is within the limits at {100.0 * reached:.0f} % of the box only"
         raise CalibrationError("tilt", f"{problem}, {100.0 * LEAST_REACHED:g} % are needed")
-    points = stations.positions + stations.rotations @ space.probe
-    rows = derivatives(space, predict(space, np.zeros(space.size), stations), stations)[:, :3]
-    rows = without_datum(points, rows).reshape(-1, space.size)
-    rows = space.whitened(rows) * space.spread(space.start_tolerances())
-    return np.asarray(rows.T @ rows / len(stations))
+    spread = space.spread(space.start_tolerances())
+    return spread[:, None] * space.whitened(space.whitened(errors.mean_squares()[0]).T) * spread
 
 
 def seen_by(space: ParameterSpace, campaign: Campaign, measured: MeasurementSet) -> list[np.ndarray]:

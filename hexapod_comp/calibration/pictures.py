@@ -22,10 +22,8 @@ from ..measurements.readings import AXES, KINDS
 from ..virtual.trial import Trial
 from .fit import ModelFit
 from .lines import LineFit, LinesFit
-from .observability import errors_in_space
-from .posterior import FittedParameters
-from .prediction import COMPONENTS as PREDICTED
-from .prediction import ErrorPredictor, PredictedError
+from .posterior import COMPONENTS as PREDICTED
+from .posterior import ErrorPredictor, FittedParameters, PredictedError, errors_in_space
 
 SAMPLES = 161
 """Points of a curve."""

@@ -10,8 +10,8 @@ from ..measurements.campaign import Campaign
 from ..measurements.readings import DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
 from .estimator import Estimation, physical_covariance, solve
 from .fit import unseen_errors
-from .observability import Observability, ToolError, UnseenError, expected_error, observe
 from .parameters import FitSettings, ParameterSpace
+from .posterior import Observability, ToolError, UnseenError, expected_error, observe
 from .promise import Scatter, Unexplained
 from .verdict import TILT
 

@@ -1,314 +1,538 @@
-"""What a fit knows of its parameters and how well, kept in a file beside the model file.
+"""The posterior: what a fit knows of its parameters and how well, and what that says of the tool's error.
 
-The model file names it with its hash, so that one model's figures are never taken for another's. The file holds all
-that the readings left behind: parameters, covariance, tolerances and noise, and what they mean. New readings can be
-added to it without the old ones.
+The only place that turns a covariance of parameters into tool error. To first order the error is e(x) = e₀ + J·δx at
+every place; with Σ the parameters' covariance its own is J·Σ·Jᵀ, and with M the mean of JᵀJ over the places of a box
+its mean square is tr(M·Σ). As a rule the *datum is aligned*: the shift and the turn that best explain the
+displacements, and the mean rotation, are taken off e and J, as a shop does that sets its zero and squares its work.
+
+Mou & King (1998): "predict the linear displacement errors of any point within designated machine workspace".
 """
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
-import zipfile
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..errors import HexapodError, InputFileError, ModelError, PoseError
-from ..formats.files import MAX_ARCHIVE_BYTES, MEGABYTE, Opener, parsing, read_bytes
-from ..formats.json import json_content
-from ..formats.outputs import new_file
-from ..formats.paths import input_file
-from ..machine.geometry import HexapodGeometry
-from ..machine.model import MachineModel
-from ..machine.model_file import model_text, save_model, text_sha256
-from ..measurements.readings import KINDS
-from ..pose import Pose
+from ..core import Status
+from ..errors import CalibrationError
+from ..machine.kinematics import Structure, strut_lengths_batch
+from ..machine.model import RealMachine
+from ..machine.motion import FOLLOWED
+from ..machine.passes import Passes, Poses, random_directions
+from ..machine.size import rms
+from ..machine.temperatures import HUMIDITY, REFERENCE_TEMPERATURE, Temperatures
+from ..measurements.readings import AXES, Stations, attitude_error
+from ..pose import rotation_from_angles
+from .assumptions import ASSUMED
 from .datum import HeldDatum
-from .fit import ModelFit
-from .parameters import Extent, FitSettings, ParameterSpace
+from .estimator import Estimation, LinearProblem, physical_covariance
+from .estimator import Posterior as Estimate
+from .parameters import ParameterSpace
+from .promise import Unexplained
+from .sensitivity import Prediction, carried, derivatives, predict
 
-FORMAT = "hexapod_comp/posterior"
-VERSION = 1
+if TYPE_CHECKING:
+    from .fit import ModelFit
 
-SUFFIX = ".posterior.npz"
+COMPONENTS = ("x", "y", "z", "rx", "ry", "rz")
+"""Displacement along, and rotation about, the axes of the work frame."""
 
-HELD = {"datum_position": (3,), "datum_rotation": (3, 3), "datum_part": (6, 6), "datum_given_up": (6,)}
-"""Arrays of a held datum."""
+POINTS, DRAWS, SEED = 300, 300, 7
+"""Random points and draws of the parameters behind an expected tool error."""
 
-REGION_SHAPES = {
-    "commands": (2,), "box": (2, 3), "work_box": (2, 3), "level": (3, 3), "probe": (3,)
-}  # fmt: skip
-
-LARGEST = 1e6
-"""No number of a fit is larger, SI: what is would overflow where it is squared."""
-
-ROUNDING = 1e-6
-"""By how much a correlation may be larger than one: the covariance is the inverse of what readings and priors know."""
-
-MOST_LISTED = 100
-"""No list of a fit's settings is longer."""
+CHUNK = 256
+"""Poses handled together: bounds the memory of their derivatives."""
 
 
 @dataclass(frozen=True)
 class FittedParameters:
-    """The parameters of a joint fit and how well they are known.
+    """The parameters of a joint fit and how well they are known."""
 
-    Attributes
-    ----------
-    space : ParameterSpace
-        What they mean.
-    x : ndarray, shape (size,)
-        The most probable ones, SI.
-    covariance : ndarray, shape (size, size)
-        Theirs.
-    tolerances : ndarray, shape (blocks,)
-        Size of each block's prior.
-    noise : ndarray, shape (kinds,)
-        Factor on the stated standard deviation of each kind's readings.
-    held : HeldDatum or None
-        Where the model holds the tool; `x` and `covariance` are as readings and priors left them, before. None in
-        older files.
-    """
-
-    space: ParameterSpace
-    x: np.ndarray
-    covariance: np.ndarray
-    tolerances: np.ndarray
-    noise: np.ndarray
-    held: HeldDatum | None = None
+    space: ParameterSpace  # what they mean
+    x: np.ndarray  # (size,), the most probable ones, SI
+    covariance: np.ndarray  # (size, size)
+    tolerances: np.ndarray  # (blocks,), size of each block's prior
+    noise: np.ndarray  # (kinds,), factor on the stated standard deviation of each kind's readings
+    held: HeldDatum | None = None  # where the model holds the tool; x and covariance are as before; None in old files
 
     @staticmethod
     def of(fit: ModelFit) -> FittedParameters:
         """Return what a fit knows."""
-        posterior = fit.solution.posterior
+        estimate = fit.solution.posterior
         return FittedParameters(
-            fit.space, fit.solution.x, fit.covariance, posterior.tolerances, posterior.noise, fit.held
+            fit.space, fit.solution.x, fit.covariance, estimate.tolerances, estimate.noise, fit.held
         )
 
 
-def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, path: str | Path) -> list[Path]:
-    """Write a model file, and beside it what its fit knows; return what was written beside.
+# The tool's error to first order
 
-    Parameters
-    ----------
-    model : MachineModel
-        The model.
-    fitted : FittedParameters or None
-        What the fit knows; None where nobody knows, as after scheme lines.
-    path : str or Path
-        The model file. Into a pipe only the model is written.
 
-    Raises
-    ------
-    InputFileError
-        A file cannot be written.
+class Datum(NamedTuple):
+    """A small motion of everything about a centre, and the tool's mean rotation: what aligning takes off."""
+
+    centre: np.ndarray  # (3,), m
+    motion: np.ndarray  # (6, 1 + size), shift, m, and turn, rad
+    rotation: np.ndarray  # (3, 1 + size)
+
+
+class FirstOrder(NamedTuple):
+    """The tool's errors at N places and how parameters move them, along and about the same axes, m and rad."""
+
+    places: np.ndarray  # (N, 3)
+    columns: np.ndarray  # (N, 6, 1 + size): displacement and rotation vector, then their derivatives
+
+    @staticmethod
+    def of(space: ParameterSpace, prediction: Prediction, stations: Stations) -> FirstOrder:
+        """Return the errors of the measured point at predicted stations, in ``base``."""
+        slopes = derivatives(space, prediction, stations)
+        places = stations.positions + stations.rotations @ space.probe
+        return FirstOrder(places, np.concatenate([prediction.errors[:, :, None], slopes], axis=2))
+
+    @property
+    def values(self) -> np.ndarray:
+        """The errors, shape (N, 6)."""
+        return self.columns[:, :, 0]
+
+    @property
+    def slopes(self) -> np.ndarray:
+        """Their derivatives, shape (N, 6, size)."""
+        return self.columns[:, :, 1:]
+
+    def select(self, chosen: np.ndarray | slice) -> FirstOrder:
+        """Return some of the places."""
+        return FirstOrder(self.places[chosen], self.columns[chosen])
+
+    def datum(self) -> Datum:
+        """Return what explains the displacements best, by least squares, and the mean rotation."""
+        centre = self.places.mean(axis=0)
+        unit = np.tile(np.eye(6), (len(self.places), 1, 1))
+        explain = np.linalg.pinv(carried(unit, self.places - centre)[:, :3].reshape(-1, 6))
+        motion = explain @ self.columns[:, :3].reshape(len(explain[0]), -1)
+        return Datum(centre, motion, self.columns[:, 3:].mean(axis=0))
+
+    def aligned(self, datum: Datum | None = None) -> FirstOrder:
+        """Return the same with a datum taken off, by default that of these places."""
+        datum = self.datum() if datum is None else datum
+        whole = carried(datum.motion[None], self.places - datum.centre)
+        whole[:, 3:] = datum.rotation
+        return FirstOrder(self.places, self.columns - whole)
+
+    def mean_squares(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return M of displacement and of rotation, (size, size): δxᵀ·M·δx is the mean square that δx makes."""
+        count, size = len(self.places), self.slopes.shape[2]
+        parts = (self.slopes[:, rows].reshape(-1, size) for rows in (slice(3), slice(3, 6)))
+        return tuple(part.T @ part / count for part in parts)  # type: ignore[return-value]
+
+    def known(self, covariance: np.ndarray | None, moved: np.ndarray | float = 0.0) -> PredictedError:
+        """Return the errors with their mean squares about the truth; `moved`, (N, 6), is by how much a model was."""
+        if covariance is None:
+            return PredictedError(self.values, None)
+        moves = np.broadcast_to(moved, self.values.shape)
+        spread = self.slopes @ covariance @ np.swapaxes(self.slopes, 1, 2)
+        return PredictedError(self.values, spread + moves[:, :, None] * moves[:, None, :])
+
+
+@dataclass(frozen=True)
+class PredictedError:
+    """What the tool's tip does at N poses when the struts are told nominal lengths, in ``work``, m and rad."""
+
+    values: np.ndarray  # (N, 6), displacement and rotation vector, actual minus commanded; NaN where there is no pose
+    covariance: np.ndarray | None  # (N, 6, 6); None: nobody knows
+
+    @property
+    def deviations(self) -> np.ndarray | None:
+        """Standard deviations of `values`, shape (N, 6); None where they are not known."""
+        if self.covariance is None:
+            return None
+        return np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0))
+
+
+class ErrorPredictor:
+    """Predicts the tool's error without compensation, by a model at its temperatures, at any pose.
+
+    Σ has the prior of what no reading showed, so that the uncertainty of an error as the machine stands includes where
+    it stands as a whole. A model whose datum is held has been moved away from the most probable machine by h: about
+    what it predicts the truth then scatters by J·Σ·Jᵀ + h·hᵀ. Without fitted parameters no covariance is known.
     """
-    file = Path(path)
-    if fitted is None or (file.exists() and not file.is_file()):
-        save_model(model, path)
-        return []
-    unnamed = model_text(replace(model, origin=replace(model.origin, posterior=None)))
-    beside, content = file.with_name(file.stem + SUFFIX), _content(fitted, text_sha256(unnamed))
-    with new_file(beside, "wb") as stream:  # first: a model file never names what is not there yet
-        stream.write(content)
-    posterior = beside.name, hashlib.sha256(content).hexdigest()
-    save_model(replace(model, origin=replace(model.origin, posterior=posterior)), path)
-    return [beside]
+
+    def __init__(self, machine: RealMachine, fitted: FittedParameters | None) -> None:
+        self._machine, self._fitted = machine, fitted
+        self._datum = self._find_datum()
+
+    def predict(self, poses: Poses, senses: np.ndarray | None = None) -> tuple[PredictedError, PredictedError | None]:
+        """Return the errors as the machine stands, and with the datum aligned over the model's box, None without one.
+
+        `senses`, (N, 9), are directions of motion as in :class:`~hexapod_comp.machine.motion.MotionState`; by default
+        not known, midway between both: a backlash and a reversal of the field then add nothing.
+        """
+        count, covariance = len(poses[0]), None if self._fitted is None else self._fitted.covariance
+        standing, aligned = [], []
+        for start in range(0, max(count, 1), CHUNK):
+            part = slice(start, start + CHUNK)
+            errors = self._errors((poses[0][part], poses[1][part]), None if senses is None else senses[part])
+            standing.append(errors.known(covariance, self._given_up(errors.places)))
+            if self._datum is not None:
+                aligned.append(errors.aligned(self._datum).known(covariance))
+        return _joined(standing), _joined(aligned) if aligned else None
+
+    def slopes(self, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the tips in ``work``, (N, 3), m, and how the fit's parameters move the tool there, (N, 6, size).
+
+        As the machine stands and with the datum aligned; and what holding the datum took off the former, (N, 6).
+        """
+        if self._fitted is None or self._datum is None:
+            raise CalibrationError("model", "tells neither how well it is known, nor where it was measured")
+        errors = self._errors(poses)
+        return errors.places, errors.slopes, errors.aligned(self._datum).slopes, self._given_up(errors.places)
+
+    def _errors(self, poses: Poses, senses: np.ndarray | None = None) -> FirstOrder:
+        """Return the errors of the tool's tip in ``work``; NaN where the machine has no pose."""
+        machine, fitted, count = self._machine, self._fitted, len(poses[0])
+        geometry, structure, work = machine.geometry, machine.structure, machine.geometry.work.rotation
+        positions, rotations = (np.ascontiguousarray(part, dtype=float) for part in poses)
+        nominal = strut_lengths_batch(Structure.of(geometry), positions, rotations)
+        senses = np.zeros((count, FOLLOWED)) if senses is None else np.ascontiguousarray(senses, dtype=float)
+        modelled, actual = (positions.copy(), rotations.copy()), (np.empty_like(positions), np.empty_like(rotations))
+        outcomes = np.empty(count, np.intc)
+        machine.forward_many(nominal, senses, *modelled, *actual, outcomes, np.empty(count))
+        solved = outcomes == Status.OK
+        displacements = actual[0] - positions + (actual[1] - rotations) @ geometry.tool.position
+        columns = np.full((count, 6, 1 + (0 if fitted is None else fitted.space.size)), np.nan)
+        columns[solved, :3, 0] = displacements[solved] @ work
+        columns[solved, 3:, 0] = attitude_error(actual[1][solved], rotations[solved]) @ work
+        if fitted is not None and solved.any():
+            space, reached = fitted.space, int(solved.sum())
+            warmth = np.tile([machine.temperatures.at(name) for name in Temperatures.NAMES], (reached, 1))
+            air = np.full(reached, np.nan), np.full(reached, machine.temperatures.at(HUMIDITY))
+            stations = Stations(positions[solved], rotations[solved], nominal[solved], senses[solved], warmth, *air)
+            there = modelled[0][solved], modelled[1][solved]
+            joints = (np.tile(j, (reached, 1, 1)) for j in (structure.base_joints, structure.platform_joints))
+            rows = derivatives(space, Prediction(np.zeros((reached, 6)), *there, *joints), stations)
+            rows = carried(rows, there[1] @ (geometry.tool.position - space.probe))
+            columns[solved, :, 1:] = np.concatenate([work.T @ rows[:, :3], work.T @ rows[:, 3:]], axis=1)
+        return FirstOrder(geometry.tool_poses(positions, rotations)[0], columns)
+
+    def _given_up(self, tips: np.ndarray) -> np.ndarray:
+        """Return the errors that the most probable machine has at tips (N, 3) beyond the model that holds the datum,
+        shape (N, 6): a motion of the whole machine."""
+        if self._fitted is None or self._fitted.held is None:
+            return np.zeros((len(tips), 6))
+        geometry, held = self._machine.geometry, self._fitted.held
+        return held.moved(tips - geometry.tool_pose(held.pose).position, geometry.work.rotation)
+
+    def _find_datum(self) -> Datum | None:
+        """Return the datum of the measured box; None where there is none, or the machine does not reach it."""
+        geometry, region = self._machine.geometry, self._machine.model.measured
+        if region is None:
+            return None
+        level = geometry.work.rotation @ geometry.tool.rotation.T if self._fitted is None else self._fitted.space.level
+        places = np.stack(np.meshgrid(*(np.linspace(low, high, 3) for low, high in region.box.T)), axis=-1)
+        errors = self._errors(region.poses(places.reshape(-1, 3), level))
+        reached = np.isfinite(errors.columns).all(axis=(1, 2))
+        return errors.select(reached).datum() if reached.sum() >= 3 else None
 
 
-def _content(fitted: FittedParameters, model_sha256: str) -> bytes:
-    space, stream = fitted.space, io.BytesIO()
-    head = {"format": FORMAT, "version": VERSION, "machine": space.geometry.name, "settings": asdict(space.settings)}
-    head |= {"kinds": KINDS, "model_sha256": model_sha256}
-    arrays = {name: getattr(fitted, name) for name in ("x", "tolerances", "noise")}
-    arrays["covariance"] = fitted.covariance[np.tril_indices(space.size)]  # it is symmetric
-    arrays |= {f"region_{name}": value for name, value in vars(space.region).items()}
-    if fitted.held is not None:
-        values = fitted.held.pose.position, fitted.held.pose.rotation, fitted.held.part, fitted.held.given_up
-        arrays |= dict(zip(HELD, values, strict=True))
-    np.savez_compressed(stream, head=np.array(json.dumps(head)), labels=np.array(space.labels), **arrays)
-    return stream.getvalue()
+def _joined(parts: list[PredictedError]) -> PredictedError:
+    """Return the errors of several parts of a list of poses."""
+    covariances = [part.covariance for part in parts if part.covariance is not None]
+    return PredictedError(
+        np.concatenate([part.values for part in parts]), np.concatenate(covariances) if covariances else None
+    )
 
 
-def load_posterior(
-    model: MachineModel,
-    geometry: HexapodGeometry,
-    path: str | Path,
-    opener: Opener | None = None,
-) -> tuple[FittedParameters | None, str]:
-    """Return what a model's fit knows of its parameters, or why that is not known.
+# Over the measured box
 
-    Parameters
-    ----------
-    model, geometry : MachineModel, HexapodGeometry
-        The model and its machine.
-    path : str or Path
-        The model's file, as :func:`~hexapod_comp.machine.model_file.load_model` takes it.
-    opener : callable, optional
-        As Python's ``open`` takes it, such as :func:`~hexapod_comp.formats.paths.confined_opener`.
 
-    Returns
-    -------
-    FittedParameters or None, str
-        None: not known, for the reason given.
+@dataclass(frozen=True)
+class ToolError:
+    """The tool error of a machine before and after compensation, RMS in a box, the datum aligned."""
+
+    before: float  # 3-D error of the machine as fitted, told nominal lengths, m
+    after: float  # 3-D error to expect with the model, m
+    low: float  # it lies above this with 97.5 %, m,
+    high: float  # and below this, which allows for errors of which the readings do not tell whether they are there
+    rotation_before: float  # rad, as above
+    rotation_after: float
+    rotation_low: float | None  # None where the readings do not show how the tool rolls: only priors would say it
+    rotation_high: float | None
+    rotation_unknown: str = ""  # why they are None
+
+
+Allowed = tuple[ParameterSpace, np.ndarray, np.ndarray]
+"""A larger space, the way from a fit's parameters to its most probable ones, and their covariance."""
+
+
+def box_stations(space: ParameterSpace, tilt: float = 0.0) -> Stations | None:
+    """Return random reachable stations in the measured box, in the work frame, each passed there and back.
+
+    First all there, then all back. The tool is tilted by `tilt`, rad, from level, each time about another horizontal
+    axis of the work frame.
     """
-    if model.origin.posterior is None:
-        return None, f"model {model.name!r} carries no covariance of a fit"
-    name, digest = model.origin.posterior
-    try:
-        file = input_file(path).with_name(name)
-        content = read_bytes(file, MAX_ARCHIVE_BYTES, opener)
-        if hashlib.sha256(content).hexdigest() != digest:
-            return None, f"{name} is not the file that was written with model {model.name!r}"
-        head, arrays = _unpacked(content, file)
-        if head.get("model_sha256") != model.origin.text_sha256:
-            return None, (
-                f"{name} belongs to another text than that of model {model.name!r}: the model file was altered after "
-                "its fit, or comes from an earlier version; fit again"
-            )
-        return _parsed(head, arrays, file, geometry), ""
-    except HexapodError as error:
-        return None, str(error)
+    rng = np.random.default_rng(SEED)
+    points = space.places(rng.uniform(space.work_box[0], space.work_box[1], (POINTS, 3)))
+    directions = random_directions(rng, POINTS)
+    headings = rng.uniform(0.0, 2.0 * np.pi, POINTS)
+    angles = tilt * np.stack([np.cos(headings), np.sin(headings), np.zeros(POINTS)], axis=1)
+    work = space.geometry.work.rotation
+    rotations = work @ rotation_from_angles(angles) @ work.T @ space.level
+    every = Passes(space.geometry, points - rotations @ space.probe, rotations, directions)
+    reachable = every.reachable()
+    return stations_of(every.select(reachable).both_ways()) if reachable.any() else None
 
 
-NOT_ONE = "is no file of a fit's posterior"
+def stations_of(passes: Passes) -> Stations:
+    """Return the stations of some passes, told nominal lengths, at 20 °C."""
+    count = len(passes)
+    return Stations(
+        positions=passes.positions,
+        rotations=passes.rotations,
+        commands=passes.nominal_commands(),
+        sense=passes.senses(),
+        temperatures=np.full((count, len(Temperatures.NAMES)), REFERENCE_TEMPERATURE),
+        times=np.full(count, np.nan),
+        humidity=np.full(count, np.nan),
+    )
 
 
-def _unpacked(content: bytes, path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return a file's head and its arrays, all of which are finite."""
-    with parsing(path, NOT_ONE):
-        size = sum(part.file_size for part in zipfile.ZipFile(io.BytesIO(content)).infolist())
-    if size > MAX_ARCHIVE_BYTES:
-        raise InputFileError(path, "", f"unpacks to more than {MAX_ARCHIVE_BYTES // MEGABYTE} MB")
-    with parsing(path, NOT_ONE), np.load(io.BytesIO(content), allow_pickle=False) as archive:
-        arrays = {name: np.asarray(archive[name]) for name in archive.files}
-        head = json_content(str(arrays.pop("head")))
-    if not isinstance(head, dict):
-        raise InputFileError(path, "head", "must be an object", head)
-    for name, array in arrays.items():
-        if name != "labels" and not (array.dtype.kind == "f" and (np.abs(array) <= LARGEST).all()):
-            raise InputFileError(path, name, f"must be finite numbers, up to ±{LARGEST:g}")
-    return head, arrays
+def box_errors(space: ParameterSpace, x: np.ndarray, tilt: float = 0.0) -> FirstOrder | None:
+    """Return the errors at :func:`box_stations`, the datum aligned; None where no machine takes such poses."""
+    stations = box_stations(space, tilt)
+    return None if stations is None else FirstOrder.of(space, predict(space, x, stations), stations).aligned()
 
 
-def _parsed(
-    head: dict[str, Any], arrays: dict[str, np.ndarray], path: Path, geometry: HexapodGeometry
-) -> FittedParameters:
-    """Return the parameters of a file's content.
+def expected_error(
+    space: ParameterSpace,
+    x: np.ndarray,
+    covariance: np.ndarray,
+    tilt: float = 0.0,
+    prior: np.ndarray | None = None,
+    allowed: Allowed | None = None,
+    beyond: Unexplained | None = None,
+) -> ToolError | None:
+    """Return the tool error that drawn machines of a covariance leave over the measured box, both directions.
 
-    Raises
-    ------
-    InputFileError
-        It is of another version or machine, or its parts do not belong together.
+    The error before is that of x, or of machines of a `prior` covariance. What is `allowed` in a larger space with
+    nothing ruled out widens the interval upwards, and so does what is `beyond`. None where no pose is within reach.
     """
-    known = FORMAT, VERSION, geometry.name
-    given = tuple(head.get(key) for key in ("format", "version", "machine"))
-    if given != known:
-        raise InputFileError(path, "head", f"must be {known}", given)
-
-    def array(name: str, *shape: int) -> np.ndarray:
-        if name not in arrays or arrays[name].shape != shape:
-            given = list(arrays[name].shape) if name in arrays else "none"
-            raise InputFileError(path, name, f"must be an array of shape {shape}", given)
-        return arrays[name]
-
-    region = Extent(**{name: array(f"region_{name}", *shape) for name, shape in REGION_SHAPES.items()})
-    try:
-        space = ParameterSpace((geometry, region), _settings(path, head.get("settings")))
-    except (ModelError, PoseError) as error:
-        raise InputFileError(path, "head.settings", str(error)) from error
-    labels = arrays.get("labels", np.zeros(0))
-    if tuple(labels.ravel().tolist()) != space.labels:
-        problem = "are not those of this geometry's parameters; was the geometry changed?"
-        raise InputFileError(path, "labels", problem)
-    n = space.size
-    covariance = np.zeros((n, n))
-    covariance[np.tril_indices(n)] = array("covariance", n * (n + 1) // 2)
-    covariance += np.tril(covariance, -1).T
-    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    if (np.diag(covariance) < 0.0).any() or (
-        np.abs(covariance) > (1.0 + 1e-6) * np.outer(deviations, deviations)
-    ).any():
-        raise InputFileError(path, "covariance", "must be a covariance: no correlation is larger than one")
-    tolerances, noise = array("tolerances", len(space.blocks)), _noise(path, arrays, head.get("kinds"))
-    for name, values in (("tolerances", tolerances), ("noise", noise)):
-        if not (values > 0.0).all():
-            raise InputFileError(path, name, "must be above zero", values.min())
-    held = None
-    if any(name in arrays for name in HELD):  # older files have none
-        position, rotation, part, given_up = (array(name, *shape) for name, shape in HELD.items())
-        with parsing(path, "datum", PoseError):
-            held = HeldDatum(Pose(position, rotation), part, given_up)
-    return FittedParameters(space, array("x", n), covariance, tolerances, noise, held)
+    stations = box_stations(space, tilt)
+    if stations is None:
+        return None
+    prediction, beyond = predict(space, x, stations), beyond or Unexplained()
+    errors = FirstOrder.of(space, prediction, stations).aligned()
+    squares = errors.mean_squares()
+    if prior is None:
+        parts = errors.values[:, :3], errors.values[:, 3:]
+        before = [float(np.sqrt((part**2).sum(axis=1).mean())) for part in parts]
+    else:
+        before = [rms(_sizes(square, _drawn(prior))) for square in squares]
+    sizes = possible = [_sizes(square, _drawn(covariance)) for square in squares]
+    if allowed is not None:
+        wide, shift, wide_covariance = allowed
+        drawn = shift[:, None] + _drawn(wide_covariance)
+        wide_squares = FirstOrder.of(wide, prediction, stations).aligned().mean_squares()
+        possible = [_sizes(square, drawn) for square in wide_squares]
+    return ToolError(
+        float(np.hypot(before[0], beyond.displacement.stops)),
+        *beyond.promised(sizes[0], possible[0], errors.places),
+        float(np.hypot(before[1], beyond.rotation.stops)),
+        *beyond.promised_rotation(sizes[1], possible[1]),
+    )
 
 
-def _noise(path: Path, arrays: dict[str, np.ndarray], kinds: Any) -> np.ndarray:
-    """Return a file's noise factors in the order of :data:`KINDS`; 1 for kinds that it does not know.
+def left_errors(
+    space: ParameterSpace,
+    prediction: Prediction,
+    stations: Stations,
+    covariance: np.ndarray,
+    allowed: Allowed | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return errors that a model may leave at stations, by drawn machines, and those that readings do not rule out.
 
-    Files that do not name the kinds are older, and have the first ones.
+    Both of shape (M, 6, D), m and rad, the datum not aligned.
     """
-    factors = arrays.get("noise", np.zeros((0, 0)))
-    if factors.ndim != 1:
-        raise InputFileError(path, "noise", "must be a list of numbers", list(factors.shape))
-    names = list(KINDS[: len(factors)]) if kinds is None else kinds
-    if not isinstance(names, list) or len(names) != len(factors) or not all(name in KINDS for name in names):
-        raise InputFileError(path, "head.kinds", f"must name the kind of each noise factor, of {list(KINDS)}", names)
-    known = dict(zip(names, factors.tolist(), strict=True))
-    return np.array([known.get(name, 1.0) for name in KINDS])
+    left = derivatives(space, prediction, stations) @ _drawn(covariance)
+    if allowed is None:
+        return left, left
+    wide, shift, wide_covariance = allowed
+    return left, derivatives(wide, prediction, stations) @ (shift[:, None] + _drawn(wide_covariance))
 
 
-def _settings(path: Path, given: Any) -> FitSettings:
-    """Return the settings of a file's head, each of the type that it has by default."""
-    if not isinstance(given, dict):
-        raise InputFileError(path, "head.settings", "must be an object", given)
-    for name, value in given.items():
-        if name not in SETTINGS:
-            raise InputFileError(path, f"head.settings.{name}", "is not known to this release", value)
-        allowed, fits = SETTINGS[name]
-        if not fits(value):
-            raise InputFileError(path, f"head.settings.{name}", f"must be {allowed}", value)
-    lists = {name: tuple(tuple(v) if isinstance(v, list) else v for v in value)
-             for name, value in given.items() if isinstance(value, list)}  # fmt: skip
-    return FitSettings(**{**given, **lists})
+def errors_in_space(
+    space: ParameterSpace, x: np.ndarray, covariance: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the error in space without compensation, and the RMS error left with it, at points (n, 3), m in ``base``.
+
+    Level tool, there and back, the datum aligned over these points; shape (n,), m, NaN out of reach.
+    """
+    level = np.tile(space.level, (len(points), 1, 1))
+    along_x = np.tile(space.geometry.work.rotation[:, 0], (len(points), 1))
+    every = Passes(space.geometry, points - space.level @ space.probe, level, along_x)
+    reachable = every.reachable()
+    before, left = np.full((2, len(points)), np.nan)
+    if reachable.any():
+        stations = stations_of(every.select(reachable).both_ways())
+        errors = FirstOrder.of(space, predict(space, x, stations), stations).aligned()
+        slopes = errors.slopes[:, :3]
+        squares = (errors.values[:, :3] ** 2).sum(axis=1), ((slopes @ covariance) * slopes).sum(axis=(1, 2))
+        before[reachable], left[reachable] = (np.sqrt(part.reshape(2, -1).mean(axis=0)) for part in squares)
+    return before, left
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
+def _sizes(square: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+    """Return the RMS that drawn parameters (size, D) make, by their mean-square matrix, shape (D,)."""
+    return np.sqrt(np.maximum(np.einsum("id,id->d", drawn, square @ drawn), 0.0))
 
 
-def _is_list(value: Any, fits: Callable[[Any], bool]) -> bool:
-    return isinstance(value, list) and len(value) <= MOST_LISTED and all(map(fits, value))
+def _drawn(covariance: np.ndarray) -> np.ndarray:
+    """Return draws of parameters with a covariance, shape (size, DRAWS)."""
+    values, vectors = np.linalg.eigh(covariance)
+    z = np.random.default_rng(SEED).standard_normal((len(covariance), DRAWS))
+    return np.asarray(vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * z))
 
 
-_TEXT = "text", lambda value: isinstance(value, str)
-_NUMBER = "a number", _is_number
-_OR_NULL = "a number or null", lambda value: value is None or _is_number(value)
-_SWITCH = "true or false", lambda value: isinstance(value, bool)
+# What the readings determine
 
-SETTINGS: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "blocks": ("a list of names", lambda value: _is_list(value, lambda v: isinstance(v, str))),
-    "shared_platform_joints": _SWITCH,
-    "lead": _OR_NULL,
-    "field_degree": ("a whole number", lambda value: type(value) is int),
-    "strut_expansion": _NUMBER,
-    "base_expansion": _NUMBER,
-    "platform_expansion": _NUMBER,
-    "strut_moisture": _OR_NULL,
-    "thermometer": _TEXT,
-    "time_constants": ("a list of numbers, or null", lambda value: value is None or _is_list(value, _is_number)),
-    "tolerances": (
-        "a list of names and numbers",
-        lambda value: _is_list(
-            value, lambda v: isinstance(v, list) and len(v) == 2 and isinstance(v[0], str) and _is_number(v[1])
-        ),
-    ),
-    "robust": _SWITCH,
-    "scale": _OR_NULL,
-    "alignment": _OR_NULL,
+
+@dataclass(frozen=True)
+class BlockSight:
+    """How well the data see one block."""
+
+    name: str
+    unit: str
+    parameters: int  # how many
+    determined: float  # how many of them the data determine; the prior the rest
+    tolerance: float  # standard deviation of the block's prior
+    error: float  # median standard error of its parameters
+
+
+@dataclass(frozen=True)
+class Observability:
+    """What the data determine: rank, condition number, indices, weak and unseen directions."""
+
+    blocks: tuple[BlockSight, ...]
+    structure_rank: int  # directions of the structure that the data see, of structure_size
+    structure_size: int
+    rank: int  # the same of all parameters
+    size: int
+    condition: float  # largest over smallest singular value of what is seen, each parameter in its tolerance
+    indices: dict[str, float]  # O1 … O4, of the seen directions
+    weak: tuple[tuple[float, str], ...]  # strength, in σ, and main parameters of directions that are only just seen
+    unseen: tuple[str, ...]  # structure parameters that the data do not see
+    tilt: float  # furthest that the tool was tilted from level in the readings, rad
+
+
+def observe(space: ParameterSpace, problem: LinearProblem, estimate: Estimate, tilt: float = 0.0) -> Observability:
+    """Return what a linear problem's data determine.
+
+    The four indices: O1 (Borm and Menq: geometric mean over √readings), O2 (Driels and Pathre: 1/condition), O3
+    (Nahvi: smallest), O4 (Nahvi and Hollerbach: smallest²/largest).
+    """
+    spread = space.spread(estimate.tolerances)
+    information = spread[:, None] * np.tensordot(estimate.noise**-2, problem.normal, 1) * spread
+    singular, vectors = _singular(information)
+    seen = singular[singular > ASSUMED.seen]
+    errors = np.sqrt(np.diag(physical_covariance(space, estimate)))
+    structure, labels = space.blocks[0], space.labels
+    alone, directions = _singular(information[structure.part, structure.part])
+    hidden = (directions[:, alone <= ASSUMED.seen] ** 2).sum(axis=1) > 0.5
+    indices = {}
+    if len(seen):
+        indices["O1"] = float(np.exp(np.log(seen).mean()) / np.sqrt(len(problem.target)))
+        indices |= {"O2": float(seen[-1] / seen[0]), "O3": float(seen[-1]), "O4": float(seen[-1] ** 2 / seen[0])}
+    weak = []
+    for n in np.flatnonzero((singular > ASSUMED.seen) & (singular < ASSUMED.weak))[::-1][:5]:
+        main = np.argsort(-np.abs(vectors[:, n]))[:3]
+        weak.append((float(singular[n]), ", ".join(f"{vectors[i, n]:+.2f} {labels[i]}" for i in main)))
+    blocks = tuple(
+        BlockSight(
+            name=block.name,
+            unit=block.unit,
+            parameters=len(block.labels),
+            determined=float(estimate.determined[block.part].sum()),
+            tolerance=float(tolerance),
+            error=float(np.median(errors[block.part])),
+        )
+        for block, tolerance in zip(space.blocks, estimate.tolerances, strict=True)
+    )
+    return Observability(
+        blocks=blocks,
+        structure_rank=int((alone > ASSUMED.seen).sum()),
+        structure_size=len(structure.labels),
+        rank=len(seen),
+        size=space.size,
+        condition=float(seen[0] / seen[-1]) if len(seen) else np.inf,
+        indices=indices,
+        weak=tuple(weak),
+        unseen=tuple(label for label, is_hidden in zip(structure.labels, hidden, strict=True) if is_hidden),
+        tilt=tilt,
+    )
+
+
+def _singular(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the singular values of the whitened derivatives, largest first, and their directions."""
+    values, vectors = np.linalg.eigh(information)
+    return np.sqrt(np.maximum(values[::-1], 0.0)), vectors[:, ::-1]
+
+
+MACHINE_ERRORS: dict[str, tuple[tuple[str, str], ...]] = {
+    "squareness xy": (("dx", "y1"), ("dy", "x1")),
+    "squareness xz": (("dx", "z1"), ("dz", "x1")),
+    "squareness yz": (("dy", "z1"), ("dz", "y1")),
+    "twist dx ~ y z": (("dx", "y1z1"),),
+    "twist dy ~ x z": (("dy", "x1z1"),),
+    "twist dz ~ x y": (("dz", "x1y1"),),
+    "size": (("dx", "x1"), ("dy", "y1"), ("dz", "z1")),
+    "roll of x": (("rx", "x1"),),
+    "roll of y": (("ry", "y1"),),
+    "roll of z": (("rz", "z1"),),
 }
-"""What each of the fit's settings is; a test holds it to :class:`FitSettings`."""
+"""Machine errors in the field's terms (component, term), by the names under which machinists know them."""
+
+
+class UnseenError(NamedTuple):
+    """An error of a machine that its readings do not show."""
+
+    name: str
+    trace: float  # by how much one of the field's tolerance changes all readings, root sum of squares, σ as stated
+
+    @property
+    def reason(self) -> str:
+        """Why it is not seen."""
+        if self.trace <= 1e-6:  # rounding
+            return "no reading shows it"
+        return f"below the noise: it changes all readings together by {self.trace:.2g} σ, seen from {ASSUMED.seen:g} on"
+
+
+def listed(errors: Iterable[UnseenError]) -> str:
+    """Return errors in words, those together that are not seen for the same reason."""
+    by_reason: dict[str, list[str]] = {}
+    for error in errors:
+        by_reason.setdefault(error.reason, []).append(error.name)
+    return "; ".join(f"{', '.join(names)} ({reason})" for reason, names in by_reason.items())
+
+
+def without_trace(estimation: Estimation) -> tuple[UnseenError, ...]:
+    """Return the machine errors that readings do not show above their noise; none when their space has no field."""
+    space, cells, measurements = estimation.space, estimation.cells, estimation.measurements
+    points, still = measurements.points(), np.zeros((len(measurements.stations), 3))
+    index = {label: n for n, label in enumerate(space.labels)}
+    tolerances, half = space.spread(space.start_tolerances()), np.ptp(space.box, axis=0)
+    seen: dict[str, np.ndarray] = {}
+    for name, parts in MACHINE_ERRORS.items():
+        wanted = [index[label] for label in (f"{c} {term}" for c, term in parts) if label in index]
+        if len(wanted) < len(parts):
+            continue
+        # A shear or a size is the same per length, and the terms run from -1 to 1 over sides of the box.
+        x = np.zeros(space.size)
+        x[wanted] = [np.prod([half[AXES.index(letter)] for letter in term if letter in AXES]) for _, term in parts]
+        y = space.whitened_parameters(x)
+        x *= (tolerances / np.abs(y).max())[np.abs(y).argmax()]
+        errors = space.field_errors(x, points, still)
+        seen[name] = np.einsum("ci,ci->c", cells.directions, errors[cells.station])
+    if not seen:
+        return ()
+    traces = np.linalg.norm(estimation.free_of_nuisance(np.stack([*seen.values()], axis=1)), axis=0)
+    return tuple(UnseenError(name, float(t)) for name, t in zip(seen, traces, strict=True) if t <= ASSUMED.seen)

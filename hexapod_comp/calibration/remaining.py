@@ -20,8 +20,7 @@ from ..measurements.campaign import Campaign, template
 from ..measurements.readings import CHANNELS, DEFAULT_UNCERTAINTY, MeasurementSet
 from ..workspace.combining import NORMAL, covariance_factor, monte_carlo, root_sum_of_squares
 from .estimator import Estimation
-from .posterior import FittedParameters
-from .prediction import ErrorPredictor
+from .posterior import ErrorPredictor, FittedParameters
 
 POINTS, SEED = 300, 7
 """Random poses of the measured box."""

@@ -12,8 +12,8 @@ from ..measurements.readings import ANGULAR_KINDS, CHANNELS, SAME_ATTITUDE
 from .estimator import SETTLED
 from .fit import ChannelFit, ModelFit, Outlier
 from .lead import ScrewLead
-from .observability import BlockSight, Observability, ToolError, UnseenError, listed
 from .plan import Plan
+from .posterior import BlockSight, Observability, ToolError, UnseenError, listed
 from .verdict import TILT
 from .warming import warming_json, warming_text
 

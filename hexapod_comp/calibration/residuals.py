@@ -7,10 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ..virtual.trial import without_datum
 from .estimator import DesignMatrix, Estimation, Solution
-from .observability import box_stations
-from .sensitivity import derivatives, predict
+from .posterior import box_errors
 
 
 @dataclass(frozen=True)
@@ -76,17 +74,11 @@ class Residuals:
     @cached_property
     def _metrics(self) -> tuple[np.ndarray, np.ndarray]:
         space, used = self.estimation.space, self.solution.posterior.used
-        stations = box_stations(space)
-        if stations is None:
+        errors = box_errors(space, self.solution.x)
+        if errors is None:
             return np.zeros((len(used),) * 2), np.zeros((len(used),) * 2)
-        count = len(stations)
-        slopes = derivatives(space, predict(space, self.solution.x, stations), stations)
-        slopes = space.whitened(slopes.reshape(-1, space.size))[:, used].reshape(count, 6, -1)
-        points = stations.positions + stations.rotations @ space.probe
-        turned = slopes[:, 3:] - slopes[:, 3:].mean(axis=0)
-        parts = (part.reshape(3 * count, -1) for part in (without_datum(points, slopes[:, :3]), turned))
-        displacement, rotation = (np.asarray(part.T @ part) / count for part in parts)
-        return displacement, rotation
+        displacement, rotation = (space.whitened(space.whitened(m).T) for m in errors.mean_squares())
+        return displacement[np.ix_(used, used)], rotation[np.ix_(used, used)]
 
     @property
     def expected(self) -> float:

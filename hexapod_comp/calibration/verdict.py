@@ -10,8 +10,8 @@ import numpy as np
 from ..measurements.readings import ANGULAR_KINDS, DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
 from .estimator import SETTLED, Estimation, Solution, physical_covariance
 from .misfit import ChiSquare, chi_squares, held_by_priors, stated_scale, unexplained
-from .observability import Allowed, ToolError, expected_error
 from .parameters import FitSettings, ParameterSpace
+from .posterior import Allowed, ToolError, expected_error
 from .promise import Unexplained
 from .residuals import Residuals
 from .suspicions import suspicions

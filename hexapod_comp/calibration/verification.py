@@ -17,8 +17,7 @@ from ..measurements.readings import MeasurementSet
 from .changes import DATUM, FAMILIES, OTHER, STRUT, TEMPERATURE, Change, possible_changes, widened
 from .check_readings import CheckReadings, explained, weigh
 from .evidence import Evidence
-from .posterior import FittedParameters
-from .prediction import ErrorPredictor
+from .posterior import ErrorPredictor, FittedParameters
 from .settling import Settling, settle
 from .suspicions import misread
 

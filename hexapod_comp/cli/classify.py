@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
 def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry) -> int:
     """Show what a model's calibration leaves, and which measurement would remove most of it."""
     from ..calibration.pictures import predicted_error_figure
-    from ..calibration.posterior import load_posterior
+    from ..calibration.posterior_file import load_posterior
     from ..calibration.remaining import measurement_rows, remaining, remaining_json, remaining_text
     from ..errors import CommandError
     from ..machine.model import RealMachine

@@ -147,7 +147,7 @@ def _refuse(args: argparse.Namespace, result: _Result) -> None:
 def _write(args: argparse.Namespace, result: _Result, measured: MeasurementSet, worth: Worth | None) -> None:
     """Write the model and what else was asked for, and show it."""
     from ..calibration.lines_report import worth_json, worth_text
-    from ..calibration.posterior import save_with_posterior
+    from ..calibration.posterior_file import save_with_posterior
     from ..formats.outputs import write_text
     from ..machine.region import region_json
     from ..measurements.standards import judge, standards_json, standards_text

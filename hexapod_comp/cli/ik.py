@@ -13,7 +13,7 @@ from . import arguments, common
 if TYPE_CHECKING:
     import numpy as np
 
-    from ..calibration.prediction import PredictedError
+    from ..calibration.posterior import PredictedError
     from ..compensation.checks import CheckResult
     from ..formats.csv import Row
     from ..machine.geometry import HexapodGeometry
@@ -203,8 +203,8 @@ class _Predicted:
     @staticmethod
     def of(machine: RealMachine, model_file: str, poses: Poses, senses: np.ndarray) -> _Predicted:
         """Predict for platform poses; what the model file says of its fit is read."""
-        from ..calibration.posterior import load_posterior
-        from ..calibration.prediction import ErrorPredictor
+        from ..calibration.posterior import ErrorPredictor
+        from ..calibration.posterior_file import load_posterior
 
         fitted, unknown = load_posterior(machine.model, machine.geometry, model_file)
         standing, aligned = ErrorPredictor(machine, fitted).predict(poses, senses)
@@ -213,7 +213,7 @@ class _Predicted:
 
     def columns(self, row: int) -> dict[str, Any]:
         """Return one row's errors and their standard deviations, units in the names."""
-        from ..calibration.prediction import COMPONENTS
+        from ..calibration.posterior import COMPONENTS
         from ..formats.csv import PREDICTED_ERRORS
 
         numbers = [part for predicted in (self.standing, self.aligned) for part in _parts(predicted)]
@@ -226,7 +226,7 @@ class _Predicted:
 
     def text(self, direction: str) -> str:
         """Return the first pose's errors as a table for people."""
-        from ..calibration.prediction import COMPONENTS
+        from ..calibration.posterior import COMPONENTS
 
         cells = ["not known" if value is None else texts.number(value, 2) for value in self.columns(0).values()]
         rows = zip(*(cells[start : start + 6] for start in range(0, 24, 6)), strict=True)

@@ -107,7 +107,7 @@ def checked(args: argparse.Namespace, path: str) -> Checked:
 def _known(args: argparse.Namespace, path: str) -> tuple[MachineModel, FittedParameters]:
     """Return a model and what its fit knows."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as for fit
-    from ..calibration.posterior import load_posterior
+    from ..calibration.posterior_file import load_posterior
     from ..errors import CommandError
     from ..machine.geometry import load_geometry
     from ..machine.model_file import load_model

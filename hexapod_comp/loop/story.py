@@ -12,8 +12,8 @@ from ..calibration.estimator import physical_covariance
 from ..calibration.evaluation import PaperMetric, paper_metric
 from ..calibration.fit import ModelFit, fit_model
 from ..calibration.lines import fit_lines
-from ..calibration.observability import left_errors, stations_of
 from ..calibration.parameters import FitSettings
+from ..calibration.posterior import left_errors, stations_of
 from ..calibration.report import tool_error_text
 from ..calibration.sensitivity import predict
 from ..compensation.compensator import Compensator

@@ -112,7 +112,7 @@ class PredictionProcess:
 
 
 class PredictedErrorTopics:
-    """``~/predicted_error`` and ``~/predicted_error_aligned``: see :class:`..calibration.prediction.ErrorPredictor`.
+    """``~/predicted_error`` and ``~/predicted_error_aligned``: see :class:`..calibration.posterior.ErrorPredictor`.
 
     Parameters
     ----------

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.posterior import FittedParameters, load_posterior
-from ..calibration.prediction import ErrorPredictor, PredictedError
+from ..calibration.posterior import ErrorPredictor, FittedParameters, PredictedError
+from ..calibration.posterior_file import load_posterior
 from ..compensation.journal import Source
 from ..errors import HexapodError
 from ..formats.json import json_text

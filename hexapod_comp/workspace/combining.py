@@ -60,7 +60,7 @@ def covariance_vectors(rows: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
     They stand where effects of single errors stand elsewhere: their :func:`root_sum_of_squares` is the RMS
     error that is left after compensation at each pose, and :func:`monte_carlo` with normal deviates gives
-    percentiles. In contrast to :func:`hexapod_comp.calibration.observability.expected_error`, pose by pose, and
+    percentiles. In contrast to :func:`hexapod_comp.calibration.posterior.expected_error`, pose by pose, and
     with nothing taken away for the datum.
     """
     size = rows.shape[-1]

@@ -16,7 +16,7 @@ from calibration_helpers import FEW, campaign, measured, virtual_machine
 from hexapod_comp.calibration import certificate, pictures
 from hexapod_comp.calibration.certificate import Details, Filed, certificate_text, left_out, load_details
 from hexapod_comp.calibration.fit import ModelFit, fit_model
-from hexapod_comp.calibration.observability import UnseenError
+from hexapod_comp.calibration.posterior import UnseenError
 from hexapod_comp.calibration.report import fit_report
 from hexapod_comp.calibration.sensitivity import predict
 from hexapod_comp.errors import InputFileError

@@ -21,8 +21,8 @@ from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.lines import fit_lines
 from hexapod_comp.calibration.parameters import FitSettings
-from hexapod_comp.calibration.posterior import FittedParameters, load_posterior, save_with_posterior
-from hexapod_comp.calibration.prediction import ErrorPredictor
+from hexapod_comp.calibration.posterior import ErrorPredictor, FittedParameters
+from hexapod_comp.calibration.posterior_file import load_posterior, save_with_posterior
 from hexapod_comp.errors import CalibrationError, InputFileError, ModelError
 from hexapod_comp.machine.datum import tool_move
 from hexapod_comp.machine.geometry import load_geometry

@@ -17,8 +17,8 @@ from foreign_machines import machines
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.misfit import FAMILIES, family_of_run, stated_scale
-from hexapod_comp.calibration.observability import expected_error
 from hexapod_comp.calibration.parameters import FitSettings
+from hexapod_comp.calibration.posterior import expected_error
 from hexapod_comp.calibration.promise import Scatter, Unexplained
 from hexapod_comp.calibration.report import as_json, fit_report
 from hexapod_comp.calibration.suspicions import SWAPPED, causes, suspicions

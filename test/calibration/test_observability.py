@@ -10,7 +10,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import gmean
 
 from hexapod_comp.calibration.estimator import DesignMatrix, Estimation, LinearProblem, Posterior, solve
-from hexapod_comp.calibration.observability import (
+from hexapod_comp.calibration.parameters import TOLERANCES, FitSettings, ParameterSpace
+from hexapod_comp.calibration.plan import plan
+from hexapod_comp.calibration.posterior import (
     MACHINE_ERRORS,
     Observability,
     ToolError,
@@ -19,8 +21,6 @@ from hexapod_comp.calibration.observability import (
     observe,
     without_trace,
 )
-from hexapod_comp.calibration.parameters import TOLERANCES, FitSettings, ParameterSpace
-from hexapod_comp.calibration.plan import plan
 from hexapod_comp.calibration.report import tilt_doubt
 from hexapod_comp.calibration.sensitivity import predict
 from hexapod_comp.formats.paths import config_file

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from hexapod_comp.calibration.fit import fit_model
-from hexapod_comp.calibration.posterior import FittedParameters
-from hexapod_comp.calibration.prediction import ErrorPredictor
+from hexapod_comp.calibration.posterior import ErrorPredictor, FittedParameters
 from hexapod_comp.calibration.remaining import POINTS, Remaining, _rows, _tried, remaining
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.passes import Poses

@@ -24,9 +24,9 @@ from hexapod_comp import cli
 from hexapod_comp.calibration import fit as fit_module
 from hexapod_comp.calibration.estimator import physical_covariance
 from hexapod_comp.calibration.fit import ModelFit
-from hexapod_comp.calibration.observability import expected_error
 from hexapod_comp.calibration.parameters import FitSettings
-from hexapod_comp.calibration.posterior import load_posterior
+from hexapod_comp.calibration.posterior import expected_error
+from hexapod_comp.calibration.posterior_file import load_posterior
 from hexapod_comp.cli.fit import beyond_limits
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry

@@ -14,8 +14,8 @@ from hypothesis import given
 from scipy.spatial.transform import Rotation
 from strategies import fixed, seeds
 
-from hexapod_comp.calibration.observability import box_stations
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
+from hexapod_comp.calibration.posterior import box_stations
 from hexapod_comp.errors import ModelError
 from hexapod_comp.machine.region import Region
 from hexapod_comp.pose import Pose

@@ -1,0 +1,248 @@
+"""The file of a posterior, beside the model file, which names it with its hash: no model gets the figures of another.
+
+It holds all that the readings left behind: parameters, covariance, tolerances and noise, and what they mean. New
+readings can be added to it without the old ones.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import HexapodError, InputFileError, ModelError, PoseError
+from ..formats.files import MAX_ARCHIVE_BYTES, MEGABYTE, Opener, parsing, read_bytes
+from ..formats.json import json_content
+from ..formats.outputs import new_file
+from ..formats.paths import input_file
+from ..machine.geometry import HexapodGeometry
+from ..machine.model import MachineModel
+from ..machine.model_file import model_text, save_model, text_sha256
+from ..measurements.readings import KINDS
+from ..pose import Pose
+from .datum import HeldDatum
+from .parameters import Extent, FitSettings, ParameterSpace
+from .posterior import FittedParameters
+
+FORMAT, VERSION, SUFFIX = "hexapod_comp/posterior", 1, ".posterior.npz"
+
+HELD = {"datum_position": (3,), "datum_rotation": (3, 3), "datum_part": (6, 6), "datum_given_up": (6,)}
+"""Arrays of a held datum."""
+
+REGION_SHAPES = {
+    "commands": (2,), "box": (2, 3), "work_box": (2, 3), "level": (3, 3), "probe": (3,)
+}  # fmt: skip
+
+LARGEST, MOST_LISTED = 1e6, 100
+"""No number of a fit is larger, SI: what is would overflow where it is squared; no list of its settings is longer."""
+
+NOT_ONE = "is no file of a fit's posterior"
+
+
+def save_with_posterior(model: MachineModel, fitted: FittedParameters | None, path: str | Path) -> list[Path]:
+    """Write a model file, and beside it what its fit knows; return what was written beside.
+
+    Parameters
+    ----------
+    model : MachineModel
+        The model.
+    fitted : FittedParameters or None
+        What the fit knows; None where nobody knows, as after scheme lines.
+    path : str or Path
+        The model file. Into a pipe only the model is written.
+
+    Raises
+    ------
+    InputFileError
+        A file cannot be written.
+    """
+    file = Path(path)
+    if fitted is None or (file.exists() and not file.is_file()):
+        save_model(model, path)
+        return []
+    unnamed = model_text(replace(model, origin=replace(model.origin, posterior=None)))
+    beside, content = file.with_name(file.stem + SUFFIX), _content(fitted, text_sha256(unnamed))
+    with new_file(beside, "wb") as stream:  # first: a model file never names what is not there yet
+        stream.write(content)
+    posterior = beside.name, hashlib.sha256(content).hexdigest()
+    save_model(replace(model, origin=replace(model.origin, posterior=posterior)), path)
+    return [beside]
+
+
+def _content(fitted: FittedParameters, model_sha256: str) -> bytes:
+    space, stream = fitted.space, io.BytesIO()
+    head = {"format": FORMAT, "version": VERSION, "machine": space.geometry.name, "settings": asdict(space.settings)}
+    head |= {"kinds": KINDS, "model_sha256": model_sha256}
+    arrays = {name: getattr(fitted, name) for name in ("x", "tolerances", "noise")}
+    arrays["covariance"] = fitted.covariance[np.tril_indices(space.size)]  # it is symmetric
+    arrays |= {f"region_{name}": value for name, value in vars(space.region).items()}
+    if fitted.held is not None:
+        values = fitted.held.pose.position, fitted.held.pose.rotation, fitted.held.part, fitted.held.given_up
+        arrays |= dict(zip(HELD, values, strict=True))
+    np.savez_compressed(stream, head=np.array(json.dumps(head)), labels=np.array(space.labels), **arrays)
+    return stream.getvalue()
+
+
+def load_posterior(
+    model: MachineModel,
+    geometry: HexapodGeometry,
+    path: str | Path,
+    opener: Opener | None = None,
+) -> tuple[FittedParameters | None, str]:
+    """Return what a model's fit knows of its parameters, or why that is not known.
+
+    Parameters
+    ----------
+    model, geometry : MachineModel, HexapodGeometry
+        The model and its machine.
+    path : str or Path
+        The model's file, as :func:`~hexapod_comp.machine.model_file.load_model` takes it.
+    opener : callable, optional
+        As Python's ``open`` takes it, such as :func:`~hexapod_comp.formats.paths.confined_opener`.
+
+    Returns
+    -------
+    FittedParameters or None, str
+        None: not known, for the reason given.
+    """
+    if model.origin.posterior is None:
+        return None, f"model {model.name!r} carries no covariance of a fit"
+    name, digest = model.origin.posterior
+    try:
+        file = input_file(path).with_name(name)
+        content = read_bytes(file, MAX_ARCHIVE_BYTES, opener)
+        if hashlib.sha256(content).hexdigest() != digest:
+            return None, f"{name} is not the file that was written with model {model.name!r}"
+        head, arrays = _unpacked(content, file)
+        if head.get("model_sha256") != model.origin.text_sha256:
+            return None, (
+                f"{name} belongs to another text than that of model {model.name!r}: the model file was altered after "
+                "its fit, or comes from an earlier version; fit again"
+            )
+        return _parsed(head, arrays, file, geometry), ""
+    except HexapodError as error:
+        return None, str(error)
+
+
+def _unpacked(content: bytes, path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return a file's head and its arrays, all of which are finite."""
+    with parsing(path, NOT_ONE):
+        size = sum(part.file_size for part in zipfile.ZipFile(io.BytesIO(content)).infolist())
+    if size > MAX_ARCHIVE_BYTES:
+        raise InputFileError(path, "", f"unpacks to more than {MAX_ARCHIVE_BYTES // MEGABYTE} MB")
+    with parsing(path, NOT_ONE), np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        arrays = {name: np.asarray(archive[name]) for name in archive.files}
+        head = json_content(str(arrays.pop("head")))
+    if not isinstance(head, dict):
+        raise InputFileError(path, "head", "must be an object", head)
+    for name, array in arrays.items():
+        if name != "labels" and not (array.dtype.kind == "f" and (np.abs(array) <= LARGEST).all()):
+            raise InputFileError(path, name, f"must be finite numbers, up to ±{LARGEST:g}")
+    return head, arrays
+
+
+def _parsed(
+    head: dict[str, Any], arrays: dict[str, np.ndarray], path: Path, geometry: HexapodGeometry
+) -> FittedParameters:
+    """Return the parameters of a file's content; refuse another version or machine, or parts that do not fit."""
+    known = FORMAT, VERSION, geometry.name
+    given = tuple(head.get(key) for key in ("format", "version", "machine"))
+    if given != known:
+        raise InputFileError(path, "head", f"must be {known}", given)
+
+    def array(name: str, *shape: int) -> np.ndarray:
+        if name not in arrays or arrays[name].shape != shape:
+            given = list(arrays[name].shape) if name in arrays else "none"
+            raise InputFileError(path, name, f"must be an array of shape {shape}", given)
+        return arrays[name]
+
+    region = Extent(**{name: array(f"region_{name}", *shape) for name, shape in REGION_SHAPES.items()})
+    try:
+        space = ParameterSpace((geometry, region), _settings(path, head.get("settings")))
+    except (ModelError, PoseError) as error:
+        raise InputFileError(path, "head.settings", str(error)) from error
+    labels = arrays.get("labels", np.zeros(0))
+    if tuple(labels.ravel().tolist()) != space.labels:
+        problem = "are not those of this geometry's parameters; was the geometry changed?"
+        raise InputFileError(path, "labels", problem)
+    n = space.size
+    covariance = np.zeros((n, n))
+    covariance[np.tril_indices(n)] = array("covariance", n * (n + 1) // 2)
+    covariance += np.tril(covariance, -1).T
+    variances = np.diag(covariance)
+    largest = (1.0 + 1e-6) * np.sqrt(np.maximum(np.outer(variances, variances), 0.0))  # but for rounding
+    if (variances < 0.0).any() or (np.abs(covariance) > largest).any():
+        raise InputFileError(path, "covariance", "must be a covariance: no correlation is larger than one")
+    tolerances, noise = array("tolerances", len(space.blocks)), _noise(path, arrays, head.get("kinds"))
+    for name, values in (("tolerances", tolerances), ("noise", noise)):
+        if not (values > 0.0).all():
+            raise InputFileError(path, name, "must be above zero", values.min())
+    held = None
+    if any(name in arrays for name in HELD):  # older files have none
+        position, rotation, part, given_up = (array(name, *shape) for name, shape in HELD.items())
+        with parsing(path, "datum", PoseError):
+            held = HeldDatum(Pose(position, rotation), part, given_up)
+    return FittedParameters(space, array("x", n), covariance, tolerances, noise, held)
+
+
+def _noise(path: Path, arrays: dict[str, np.ndarray], kinds: Any) -> np.ndarray:
+    """Return a file's noise factors in the order of KINDS, 1 for those that it lacks; older ones do not name them."""
+    factors = arrays.get("noise", np.zeros((0, 0)))
+    if factors.ndim != 1:
+        raise InputFileError(path, "noise", "must be a list of numbers", list(factors.shape))
+    names = list(KINDS[: len(factors)]) if kinds is None else kinds
+    if not isinstance(names, list) or len(names) != len(factors) or not all(name in KINDS for name in names):
+        raise InputFileError(path, "head.kinds", f"must name the kind of each noise factor, of {list(KINDS)}", names)
+    known = dict(zip(names, factors.tolist(), strict=True))
+    return np.array([known.get(name, 1.0) for name in KINDS])
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
+
+
+def _is_list(value: Any, fits: Callable[[Any], bool]) -> bool:
+    return isinstance(value, list) and len(value) <= MOST_LISTED and all(map(fits, value))
+
+
+def _is_named(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and isinstance(value[0], str) and _is_number(value[1])
+
+
+FITS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "bool": ("true or false", lambda value: isinstance(value, bool)),
+    "int": ("a whole number", lambda value: type(value) is int),
+    "float": ("a number", _is_number),
+    "float | None": ("a number or null", lambda value: value is None or _is_number(value)),
+    "str": ("text", lambda value: isinstance(value, str)),
+    "tuple[str, ...]": ("a list of names", lambda value: _is_list(value, lambda v: isinstance(v, str))),
+    "tuple[float, ...] | None": (
+        "a list of numbers, or null",
+        lambda value: value is None or _is_list(value, _is_number),
+    ),
+    "tuple[tuple[str, float], ...]": ("a list of names and numbers", lambda value: _is_list(value, _is_named)),
+}
+"""What a setting of a fit may be in a file, by the type of its field in :class:`FitSettings`."""
+
+
+def _settings(path: Path, given: Any) -> FitSettings:
+    """Return the settings of a file's head, each of the type of its field."""
+    if not isinstance(given, dict):
+        raise InputFileError(path, "head.settings", "must be an object", given)
+    types = {one.name: str(one.type) for one in fields(FitSettings)}
+    for name, value in given.items():
+        if name not in types:
+            raise InputFileError(path, f"head.settings.{name}", "is not known to this release", value)
+        allowed, fits = FITS[types[name]]
+        if not fits(value):
+            raise InputFileError(path, f"head.settings.{name}", f"must be {allowed}", value)
+    lists = {name: tuple(tuple(v) if isinstance(v, list) else v for v in value)
+             for name, value in given.items() if isinstance(value, list)}  # fmt: skip
+    return FitSettings(**{**given, **lists})
