@@ -37,7 +37,7 @@ VERSIONS ?= 3.10 3.11 3.12 3.13 3.14
 
 help:
 	@echo 'make demo    measure, fit and run a machine with hidden errors; figures, out/demo.png'
-	@echo 'make test    ruff, mypy and the tests, in three processes for two cores'
+	@echo 'make test    ruff, mypy, import-linter, codespell and the tests, in three processes for two cores'
 	@echo 'make test-all     the same with every Python found here, each in .venv-3.x; VERSIONS="3.10 3.13" for some'
 	@echo 'make test-docs    run the sessions of the pages, minutes, and hold their output to what is shown'
 	@echo 'make docs    the pages of doc/ as a site with a search and the Python reference, in out/doc'
@@ -62,6 +62,8 @@ test: $(VENV)/with-ros,test $(CORE)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/codespell
 	@# Three processes, each with a ROS domain of its own: the first takes the tests that wait for nodes (test/conftest.py).
 	@# The matrices of the tests are small: more threads of OpenBLAS would only wait for each other.
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile --ignore=test/linuxcnc/test_linuxcnc.py \

@@ -105,6 +105,8 @@ setup(
             "hypothesis>=6.98",
             "ruff==0.17.*",
             "mypy==2.4.*",
+            "import-linter>=2.1",
+            "codespell>=2.3",
             "setuptools>=70.1",  # builds wheels by itself
             "colcon-core>=0.18",
             "colcon-ros>=0.5",
