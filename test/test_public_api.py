@@ -106,13 +106,3 @@ def test_a_client_calibrates_and_compensates(tmp_path: Path):
 def test_a_client_ranks_errors():
     """The screws' pitch comes first, as in the ranking that doc/classification.md shows."""
     assert client.worst_error("positioning_unit", "error_budget") == "screw pitch"
-
-
-def test_no_two_classes_share_a_name():
-    """A name in a message, an import or a talk at the machine means one thing."""
-    places: dict[str, list[str]] = {}
-    for path in DOOR.parent.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ClassDef):
-                places.setdefault(node.name, []).append(f"{path.relative_to(DOOR.parent)}:{node.lineno}")
-    assert {name: found for name, found in places.items() if len(found) > 1} == {}
