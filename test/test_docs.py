@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import importlib.util
 import re
 import sys
@@ -57,14 +58,24 @@ def test_the_code_that_the_theory_names_is_there():
     """``room.module.name`` in theory.md, down to methods and private functions, is defined in that module or C file."""
     text = (ROOT / "doc" / "theory.md").read_text(encoding="utf-8")
     rooms = "|".join(path.name for path in (ROOT / "hexapod_comp").iterdir() if (path / "__init__.py").is_file())
-    named = re.findall(rf"`((?:{rooms})\.[a-z]\w*|pose)\.((?:\w+\.)?\w+)`", text)
+    named = re.findall(rf"`((?:(?:{rooms})\.[a-z]|pose\.)[\w.]*)`", text)
     assert len(named) >= 100
-    for module, name in named:
-        in_c = ROOT / "hexapod_comp" / f"{module.replace('.', '/')}.c"
-        if in_c.is_file() and re.search(rf"^(?:\w+ )+\*?{name}\(", in_c.read_text(encoding="utf-8"), re.MULTILINE):
-            continue
-        source = (ROOT / "hexapod_comp" / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8")
-        assert name.rpartition(".")[2] in defined(ast.parse(source)), f"{module}.{name}"
+    for dotted in named:
+        parts = dotted.split(".")
+        stems = [(ROOT / "hexapod_comp").joinpath(*parts[:n]) for n in range(1, len(parts) + 1)]
+        found = [path for stem in stems for end in (".c", ".py") if (path := stem.with_suffix(end)).is_file()]
+        assert any(parts[-1] in {path.stem, *names_in(path)} for path in found), dotted
+
+
+@functools.cache
+def names_in(path: Path) -> set[str]:
+    """Return the names that a Python or C file defines."""
+    text = path.read_text(encoding="utf-8")
+    return (
+        defined(ast.parse(text))
+        if path.suffix == ".py"
+        else set(re.findall(r"^(?:\w+ )+\*?(\w+)\(", text, re.MULTILINE))
+    )
 
 
 def defined(tree: ast.AST) -> set[str]:
