@@ -33,13 +33,13 @@ FILES = ("package.xml", "colcon.pkg", "setup.py", "setup.cfg", "pyproject.toml",
 
 # Import name → key in rosdep's python.yaml and name on PyPI, where the three differ. ROS packages are
 # imported under their own name, which is also their key.
-PYTHON3 = ("cffi", "hypothesis", "matplotlib", "numpy", "packaging", "pytest", "scipy", "tqdm", "yaml")
+PYTHON3 = ("cffi", "hypothesis", "jinja2", "matplotlib", "numpy", "packaging", "pytest", "scipy", "tqdm", "yaml")
 ROSDEP_KEYS = {name: f"python3-{name}" for name in PYTHON3}
 PYPI_NAMES = {"yaml": "pyyaml"}
-# setuptools runs setup.py wherever that is read, mpl_toolkits comes with matplotlib , apsw
+# setuptools runs setup.py wherever that is read, mpl_toolkits comes with matplotlib, markupsafe with jinja2, apsw
 # and lz4 with rosbags, websockets with viser, hal and linuxcnc with LinuxCNC, benchmarks are the source tree's; the
 # others are optional extras, what only `pytest -n` needs, and benchmark tools.
-COMING_WITH = {"setuptools", "mpl_toolkits", "apsw", "lz4", "websockets", "hal", "linuxcnc", "benchmarks"}
+COMING_WITH = {"setuptools", "mpl_toolkits", "markupsafe", "apsw", "lz4", "websockets", "hal", "linuxcnc", "benchmarks"}
 EXEMPT = COMING_WITH | {"xdist", "argcomplete", "plotly", "distributed", "rosbags", "mujoco", "pinocchio", "viser"}
 WITHOUT_ROS = """
 import importlib, sys
@@ -265,6 +265,7 @@ NOBLE = {
     "python3-cffi": "python3-cffi",
     "python3-colcon-common-extensions": "python3-colcon-common-extensions",
     "python3-hypothesis": "python3-hypothesis",
+    "python3-jinja2": "python3-jinja2",
     "python3-matplotlib": "python3-matplotlib",
     "python3-mypy": "python3-mypy",
     "python3-numpy": "python3-numpy",
