@@ -35,13 +35,21 @@ from tqdm import tqdm
 from benchmarks.calibration import LARGE, LEAD
 from benchmarks.smooth_imperfections import with_wavy_field
 from hexapod_comp.calibration.changes import AGEING, DATUM, OTHER, STRUT, TEMPERATURE
+from hexapod_comp.calibration.check import (
+    NAMED,
+    UNDECIDED,
+    UNEXPLAINED,
+    VALID,
+    Verification,
+    refusal,
+    update_model,
+    verify_model,
+)
 from hexapod_comp.calibration.check_plan import propose_check
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.posterior import FittedParameters
-from hexapod_comp.calibration.update import refusal, update_model
-from hexapod_comp.calibration.verification import NAMED, UNDECIDED, UNEXPLAINED, VALID, Verification, verify_model
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.measurements.campaign import Campaign, template

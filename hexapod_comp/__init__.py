@@ -18,14 +18,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from .calibration.check import Verification as Verification
+    from .calibration.check import update_model as update_model
+    from .calibration.check import verify_model as verify_model
     from .calibration.fit import ModelFit as ModelFit
     from .calibration.fit import fit_model as fit_model
     from .calibration.parameters import FitSettings as FitSettings
     from .calibration.posterior_file import load_posterior as load_posterior
     from .calibration.report import fit_report as fit_report
-    from .calibration.update import update_model as update_model
-    from .calibration.verification import Verification as Verification
-    from .calibration.verification import verify_model as verify_model
     from .compensation.checks import CheckResult as CheckResult
     from .compensation.checks import check as check
     from .compensation.compensator import Compensator as Compensator
@@ -63,8 +63,7 @@ _HOMES = {
     "calibration.parameters": ("FitSettings",),
     "calibration.posterior_file": ("load_posterior",),
     "calibration.report": ("fit_report",),
-    "calibration.update": ("update_model",),
-    "calibration.verification": ("Verification", "verify_model"),
+    "calibration.check": ("Verification", "update_model", "verify_model"),
     "compensation.checks": ("CheckResult", "check"),
     "compensation.compensator": ("Compensator",),
     "compensation.state": ("Correction",),

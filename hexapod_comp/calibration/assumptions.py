@@ -47,12 +47,39 @@ class Assumptions:
     seen: float = assumed(1.0, "σ", "change of all readings from which on a direction is observable", "one σ of noise")
     weak: float = assumed(5.0, "σ", "observable directions below are listed as weak", "known to a fifth")
 
+    # Changes of a machine since its fit (changes.py, check.py)
+    prior_odds: tuple[float, ...] = assumed(
+        (1.0, 1.0, 1.0, 0.125, 0.25, 0.5),
+        "",
+        "of datum, strut, temperature, ageing, a wrong reading and all else",
+        "ageing as likely as each of the last one's four groups: each can stand for the other",
+    )
+    moved: tuple = assumed((3e-6, 3e-4), "m", "how far joints, struts or the datum may have moved", "wear to crash")
+    grown: tuple = assumed((4e-6, 120e-6), "m/m", "growth of a body", "steel by a third of a kelvin to ten kelvin")
+    aged: tuple = assumed((0.02, 0.2), "tolerances", "ageing of everything", "joints by 2 to 20 µm of 100")
+    bent: tuple = assumed((0.5, 8.0), "tolerances", "a smooth field's growth", "5 µm and 20 µrad")
+    worn_pitch: tuple = assumed((1e-5, 3e-4), "m/m", "wear of one screw's pitch", "up to several classes of ISO 3408")
+    worn_backlash: tuple = assumed((1e-6, 3e-5), "m", "wear of one screw's backlash", "preload lost")
+    wrong_reading: tuple = assumed((5.0, 1000.0), "σ", "how far off one wrong reading may be", "a slip of a digit")
+    scattered: tuple = assumed((2.0, 100.0), "σ", "additional scatter of all readings", "air, vibration")
+    false_alarms: float = assumed(0.01, "", "share of unchanged machines that may be called changed", "usual level")
+    sure: float = assumed(
+        0.9, "", "share of the probability at which one kind of change is stated", "chosen: 10 % wrong"
+    )
+    clear: float = assumed(4.0, "σ", "changes of this size are surely seen", "1 in 16,000 missed by chance")
+    unchanged_draws: int = assumed(4000, "", "unchanged machines drawn to find the false alarms", "1 % to ± 0.16 %")
+    most_check_readings: int = assumed(500, "", "readings of a check; more are a calibration", "chosen")
+
     def rows(self) -> list[tuple[str, str, str, str]]:
         """Return name, value with unit, meaning and source of every assumption."""
+
+        def shown(value: Any) -> str:
+            return "–".join(map(shown, value)) if isinstance(value, tuple) else f"{value:g}"
+
         return [
             (
                 f.name,
-                f"{getattr(self, f.name):g} {f.metadata['unit']}".strip(),
+                f"{shown(getattr(self, f.name))} {f.metadata['unit']}".strip(),
                 f.metadata["what"],
                 f.metadata["source"],
             )

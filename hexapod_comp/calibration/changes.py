@@ -1,19 +1,24 @@
-"""What may have happened to a machine since it was calibrated, as changes of its parameters.
+"""What may have happened to a machine since its fit, and how well check readings bear each change out.
 
-Every change has a prior N(0, scale²) for each of its columns, and several scales, all equally likely beforehand: a
-crash may move a strut by 5 µm as well as by 300 µm.
+The fit's posterior says how the readings of an unchanged machine scatter about its model: N(0, S), S = J·Σ·Jᵀ + noise.
+A change moves the parameters by A·θ, θ ~ N(0, s²), so that under it they are N(0, S + s²·J·A·Aᵀ·Jᵀ). The ratio of both
+densities is its Bayes factor. Each change has several scales s, equally likely: a strut may move by 5 µm or by 300.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
+from ..errors import CalibrationError
 from ..machine.geometry import STRUT_NAMES
-from ..measurements.readings import AXES
-from .blocks import Block
+from ..measurements.readings import AXES, CHANNELS, MeasurementSet
+from .assumptions import ASSUMED
+from .estimator import Estimation
 from .parameters import BLOCKS, ParameterSpace
 from .posterior import FittedParameters
 
@@ -27,74 +32,31 @@ FAMILIES = {
     READING: "a single reading is wrong",
     OTHER: "it has changed in a way that none of these explains",
 }
-"""Kinds of change, and what each is called."""
+"""Kinds of change, and what each is called. All but the last two are parameters that few readings can repair."""
 
-PRIOR = {DATUM: 1.0, STRUT: 1.0, TEMPERATURE: 1.0, AGEING: 0.125, READING: 0.25, OTHER: 0.5}
-"""How likely they are beforehand, beside each other. So are the groups of a kind, equally, and the changes of a group:
-else a bend would count for little beside all joints and screws, and what is one would be called ageing. For the same
-reason ageing is as likely as one of the last kind's four groups: each can stand for the other, and for much else."""
-
-REPAIRABLE = (DATUM, STRUT, TEMPERATURE, AGEING)
-"""Kinds that few readings can repair: they are parameters of the model."""
-
-LENGTHS = (3e-6, 1e-5, 3e-5, 1e-4, 3e-4)
-"""How far joints, struts or the datum may have moved, m."""
-
-GROWTHS = (4e-6, 12e-6, 36e-6, 120e-6)
-"""How much a body may have grown, m/m: steel by a third of a kelvin to ten kelvin."""
-
-SHARES = (0.02, 0.05, 0.1, 0.2)
-"""By which share of its tolerance everything may have aged: the joints by 2 to 20 µm of 100."""
-
-BENDS = (0.5, 1.0, 2.0, 4.0, 8.0)
-"""How large a smooth field may have grown, in its first tolerances (5 µm, 20 µrad). As fine as :data:`SHARES`: of two
-explanations by many directions the one whose scales fit better would win, whichever is true."""
-
-FIELD = ("field displacement", "field rotation")
-"""Blocks of which it is made."""
-
-PITCHES, BACKLASHES = (1e-5, 3e-5, 1e-4, 3e-4), (1e-6, 3e-6, 1e-5, 3e-5)
-"""What wear may do to one screw, m/m and m."""
+ROUNDING = 1e-9
+"""Directions of readings or effects that are smaller, beside the largest, are rounding."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """One thing that may have happened.
+    """One thing that may have happened: parameters move by `columns`·θ, θ ~ N(0, scale²)."""
 
-    Attributes
-    ----------
-    family : str
-        Of :data:`FAMILIES`.
-    name : str
-        For people.
-    columns : ndarray, shape (size, k)
-        How the parameters change with each of its coefficients, SI.
-    scales : tuple of float
-        Standard deviations that the coefficients may have.
-    shown : tuple of (str, float, str)
-        Label, factor and unit in which each coefficient is shown; empty where they mean nothing one by one.
-    group : str
-        Changes of one kind that are alike; all groups of a kind are equally likely beforehand.
-    """
-
-    family: str
+    family: str  # of FAMILIES
     name: str
-    columns: np.ndarray
-    scales: tuple[float, ...]
-    shown: tuple[tuple[str, float, str], ...] = ()
-    group: str = ""
+    scales: np.ndarray  # (m,): standard deviations of θ
+    columns: np.ndarray | None = None  # (size, k), SI; None: readings have changed, not the machine
+    shown: tuple[tuple[str, float, str], ...] = ()  # label, factor, unit of each θ; empty: they mean nothing one by one
+    group: str = ""  # changes of a kind that are alike; all groups of a kind are equally likely beforehand
+
+
+def _scales(ends: tuple[float, float], ratio: float = 10.0**0.5) -> np.ndarray:
+    """Return scales between two ends, `ratio` apart: half a decade."""
+    return np.geomspace(*ends, round(np.log(ends[1] / ends[0]) / np.log(ratio)) + 1)
 
 
 def widened(fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS) -> FittedParameters:
-    """Return what a fit knows, in a space that has more blocks; these are zero and, so far, certain.
-
-    Parameters
-    ----------
-    fitted : FittedParameters
-        What a fit knows.
-    blocks : tuple of str
-        Blocks to have besides those of the fit, where the machine can have them.
-    """
+    """Return what a fit knows, in a space that has more blocks; these are zero and, so far, certain."""
     old = fitted.space
     kept = {block.name for block in old.blocks}
     settings = replace(old.settings, blocks=tuple(name for name in BLOCKS if name in kept or name in blocks))
@@ -108,103 +70,212 @@ def widened(fitted: FittedParameters, blocks: tuple[str, ...] = BLOCKS) -> Fitte
     return FittedParameters(space, x, covariance, tolerances, fitted.noise, fitted.held)
 
 
-def possible_changes(space: ParameterSpace, modelled: tuple[str, ...]) -> list[Change]:
-    """Return what may have happened to a machine.
+def possible_changes(space: ParameterSpace, modelled: Sequence[str]) -> list[Change]:
+    """Return what may have happened to a machine, in a space that has all blocks; those of its fit, `modelled`, age."""
+    geometry, unit = space.geometry, np.eye(space.size)
+    start, count = space.blocks[0].part.start, int(space.platform_groups.max()) + 1
+    base = start + np.arange(18).reshape(6, 3)
+    platform = start + 18 + np.arange(3 * count).reshape(count, 3)
+    offsets = np.arange(space.size)[space.offsets]
+    lengths, growths = _scales(ASSUMED.moved), _scales(ASSUMED.grown)
 
-    Parameters
-    ----------
-    space : ParameterSpace
-        The parameters in which changes are written; has all blocks, see :func:`widened`.
-    modelled : tuple of str
-        Blocks of the fit: what of the machine can age.
-    """
-    return [
-        _datum(space),
-        *_struts(space),
-        *_temperatures(space),
-        Change(AGEING, "all of it, a little", _prior_root(space, modelled), SHARES),
-        *_joints(space),
-        *_screws(space),
-        Change(OTHER, "a smooth bend in space", _prior_root(space, FIELD), BENDS, group="bend"),
-    ]
+    def shown(names: Sequence[str], factor: float = 1e6, what: str = "µm") -> tuple[tuple[str, float, str], ...]:
+        return tuple((name, factor, what) for name in names)
 
-
-class _Structure:
-    """Where the structure's parameters stand in a vector."""
-
-    def __init__(self, space: ParameterSpace) -> None:
-        start, self.size = space.blocks[0].part.start, space.size
-        groups = int(space.platform_groups.max()) + 1
-        self.base = start + np.arange(18).reshape(6, 3)
-        self.platform = start + 18 + np.arange(3 * groups).reshape(groups, 3)
-        self.offsets = start + 18 + 3 * groups + np.arange(6)
-
-    def units(self, places: np.ndarray) -> np.ndarray:
-        """Return unit columns for some places, shape (size, k)."""
-        columns = np.zeros((self.size, len(places)))
-        columns[places, np.arange(len(places))] = 1.0
-        return columns
-
-
-def _datum(space: ParameterSpace) -> Change:
-    """Return a rigid motion of base or workpiece; turns are about the box's centre, by how far its corners move."""
-    at, columns, work = _Structure(space), np.zeros((space.size, 6)), space.geometry.work.rotation
+    # The datum turns about the box's centre; a turn is counted by how far it moves the box's corners.
     size = 0.5 * float(np.linalg.norm(np.ptp(space.work_box, axis=0))) or 1.0
-    arms = space.geometry.base_joints - space.places(space.work_box.mean(axis=0))
-    for n, axis in enumerate(work.T):
-        columns[at.base, n] = axis
-        columns[at.base, 3 + n] = np.cross(axis, arms) / size
-    shown = [(a, 1e6, "µm") for a in AXES] + [(f"about {a}", 1e6 / size, "µrad") for a in AXES]
-    return Change(DATUM, "base or workpiece, in the work frame", columns, LENGTHS, tuple(shown))
+    arms, rigid = geometry.base_joints - space.places(space.work_box.mean(axis=0)), np.zeros((space.size, 6))
+    for n, axis in enumerate(geometry.work.rotation.T):
+        rigid[base, n], rigid[base, 3 + n] = axis, np.cross(axis, arms) / size
+    turns = shown([f"about {a}" for a in AXES], 1e6 / size, "µrad")
+    changes = [Change(DATUM, "base or workpiece, in the work frame", lengths, rigid, shown(AXES) + turns)]
 
+    for name, place in zip(STRUT_NAMES, offsets, strict=True):
+        changes.append(Change(STRUT, name, lengths, unit[:, [place]], shown([name])))
+    changes.append(Change(STRUT, "several struts", lengths, unit[:, offsets], shown(STRUT_NAMES)))
 
-def _struts(space: ParameterSpace) -> Iterator[Change]:
-    offsets = _Structure(space)
-    for name, place in zip(STRUT_NAMES, offsets.offsets, strict=True):
-        yield Change(STRUT, name, offsets.units(np.array([place])), LENGTHS, ((name, 1e6, "µm"),))
-    shown = tuple((name, 1e6, "µm") for name in STRUT_NAMES)
-    yield Change(STRUT, "several struts", offsets.units(offsets.offsets), LENGTHS, shown)
-
-
-def _temperatures(space: ParameterSpace) -> Iterator[Change]:
-    """Yield growth of the struts, of the base, of all bodies alike, and of each by itself."""
-    at, geometry, pitch = _Structure(space), space.geometry, space.block("pitch")
-    grown = np.zeros((space.size, 3))
-    grown[at.offsets, 0] = space.home_lengths
-    if pitch is not None:
+    grown, bodies = np.zeros((space.size, 3)), ("struts", "base", "platform")
+    grown[offsets, 0] = space.home_lengths
+    if pitch := space.block("pitch"):
         grown[pitch.part, 0] = 1.0
-    grown[at.base, 1] = geometry.base_joints
-    grown[at.platform[space.platform_groups], 2] = geometry.platform_joints
-    names = ("struts", "base", "platform")
-    for name, n in (("struts", 0), ("base", 1)):
-        yield Change(TEMPERATURE, name, grown[:, n : n + 1], GROWTHS, ((name, 1e6, "ppm"),))
-    yield Change(TEMPERATURE, "all alike", grown.sum(axis=1, keepdims=True), GROWTHS, (("all", 1e6, "ppm"),))
-    yield Change(TEMPERATURE, "each by itself", grown, GROWTHS, tuple((name, 1e6, "ppm") for name in names))
+    grown[base, 1], grown[platform[space.platform_groups], 2] = geometry.base_joints, geometry.platform_joints
+    for name, labels, columns in (
+        ("struts", ["struts"], grown[:, :1]),
+        ("base", ["base"], grown[:, 1:2]),
+        ("all alike", ["all"], grown.sum(axis=1, keepdims=True)),
+        ("each by itself", bodies, grown),
+    ):
+        changes.append(Change(TEMPERATURE, name, growths, columns, shown(labels, 1e6, "ppm")))
 
-
-def _joints(space: ParameterSpace) -> Iterator[Change]:
-    at = _Structure(space)
-    shown = tuple((axis, 1e6, "µm") for axis in AXES)
-    for body, joints in (("base", at.base), ("platform", at.platform)):
+    # Ageing and a bend can stand for each other: were one's scales coarser, the other would win, whichever is true.
+    prior = space.physical(np.diag(space.spread(space.start_tolerances())))
+    owner = np.repeat([block.name for block in space.blocks], [len(block.labels) for block in space.blocks])
+    aged, bend = prior[:, np.isin(owner, modelled)], prior[:, np.isin(owner, ("field displacement", "field rotation"))]
+    changes.append(Change(AGEING, "all of it, a little", _scales(ASSUMED.aged, 2.0), aged))
+    for body, joints in (("base", base), ("platform", platform)):
         for n, places in enumerate(joints, start=1):
-            yield Change(OTHER, f"{body} joint {n}", at.units(places), LENGTHS, shown, "joints")
+            changes.append(Change(OTHER, f"{body} joint {n}", lengths, unit[:, places], shown(AXES), "joints"))
+    for name, ends, what in (("pitch", ASSUMED.worn_pitch, "ppm"), ("backlash", ASSUMED.worn_backlash, "µm")):
+        for strut, column in zip(STRUT_NAMES, unit.T[owner == name], strict=False):  # no such block: none
+            screw = Change(
+                OTHER, f"{name} of {strut}", _scales(ends), column[:, None], shown([strut], 1e6, what), "screws"
+            )
+            changes.append(screw)
+    changes.append(Change(OTHER, "a smooth bend in space", _scales(ASSUMED.bent, 2.0), bend, group="bend"))
+    return changes
 
 
-def _screws(space: ParameterSpace) -> Iterator[Change]:
-    for name, scales, factor, unit in (("pitch", PITCHES, 1e6, "ppm"), ("backlash", BACKLASHES, 1e6, "µm")):
-        block = space.block(name)
-        for n, strut in enumerate(STRUT_NAMES if block else ()):
-            column = np.zeros((space.size, 1))
-            column[block.part.start + n] = 1.0  # type: ignore[union-attr]
-            yield Change(OTHER, f"{name} of {strut}", column, scales, ((strut, factor, unit),), "screws")
+@dataclass(frozen=True)
+class CheckReadings:
+    """Check readings beside what a model and its fit expect, as n numbers free of what the instruments do not know."""
+
+    residuals: np.ndarray  # (n,): what the fit does not expect of them, in standard deviations
+    rows: np.ndarray  # (n, size): how the parameters move them
+    noise: np.ndarray  # (n, n): their covariance where the machine is known
+    single: np.ndarray  # (n, places): the effect of one reading that is wrong by one of its standard deviations
+    names: tuple[str, ...]  # of the places
+    seen: np.ndarray = field(repr=False)  # (n, places): the numbers, as orthonormal combinations of the places
+
+    @staticmethod
+    def of(fitted: FittedParameters, measurements: MeasurementSet, x: np.ndarray | None = None) -> CheckReadings:
+        """Return readings beside a fit in a space that has all blocks; linearised at `x` where that is given.
+
+        Raises
+        ------
+        CalibrationError
+            Readings of another point than the fit's, such that tell nothing, or so many that they are a calibration.
+        """
+        space = fitted.space
+        away = float(np.abs(measurements.probe - space.probe).max())
+        if away > ROUNDING:
+            problem = f"are of a point {away * 1e3:.4g} mm from that of the fit; give its place (--probe-mm)"
+            raise CalibrationError("measurements", problem)
+        estimation = Estimation(measurements, space, alone=False)
+        cells = estimation.cells
+        if len(cells.kind) > ASSUMED.most_check_readings:
+            problem = f"{len(cells.kind)} readings at distinct places are no check"
+            raise CalibrationError("measurements", f"{problem} (at most {ASSUMED.most_check_readings}); fit them")
+        linear, _ = estimation.linearise(fitted.x if x is None else x, np.ones(len(measurements)))
+        free, sizes, _ = np.linalg.svd(estimation.free_of_nuisance(np.eye(len(cells.kind))))
+        seen = free[:, sizes > ROUNDING * sizes.max(initial=0.0)].T
+        if not len(seen):
+            problem = "tell nothing: the unknown zeros of their runs take all of them; read more places of each run"
+            raise CalibrationError("measurements", problem)
+        rows, sigma = seen @ space.unwhitened(linear.rows.dense()), fitted.noise[cells.kind]
+        m = measurements
+        names = tuple(f"{m.sources[n]}: {CHANNELS[m.channel[n]]} of run {m.runs[m.run[n]].name}" for n in cells.first)
+        residuals = seen @ linear.target - rows @ fitted.x
+        return CheckReadings(residuals, rows, (seen * sigma**2) @ seen.T, seen * sigma, names, seen)
+
+    def part(self, contrasts: np.ndarray) -> CheckReadings:
+        """Return what some combinations of the places tell, shape (k, places), orthonormal and free of unknowns."""
+        kept, used = contrasts @ self.seen.T, np.flatnonzero(contrasts.any(axis=0))
+        return CheckReadings(
+            residuals=kept @ self.residuals,
+            rows=kept @ self.rows,
+            noise=kept @ self.noise @ kept.T,
+            single=kept @ self.single[:, used],
+            names=tuple(self.names[n] for n in used),
+            seen=kept @ self.seen[:, used],
+        )
+
+    def covariance(self, of_parameters: np.ndarray) -> np.ndarray:
+        """Return the readings' covariance when the parameters have one, shape (n, n)."""
+        return self.noise + self.rows @ of_parameters @ self.rows.T
+
+    def chi_square(self, of_parameters: np.ndarray | float = 0.0) -> float:
+        """Return the squared differences over those to expect when the parameters have a covariance, per number."""
+        covariance = self.noise if np.isscalar(of_parameters) else self.covariance(np.asarray(of_parameters))
+        return float(self.residuals @ np.linalg.solve(covariance, self.residuals)) / len(self.residuals)
+
+    def effects(self, changes: Sequence[Change]) -> Iterator[tuple[Change, np.ndarray]]:
+        """Yield what may have happened with its effect (n, k): changes, one wrong reading, or more scatter in all."""
+        for change in changes:
+            yield change, self.rows @ change.columns
+        for name, column in zip(self.names, self.single.T, strict=True):
+            yield Change(READING, name, _scales(ASSUMED.wrong_reading)), column[:, None]
+        yield Change(OTHER, "each reading by itself", _scales(ASSUMED.scattered), group="scatter"), self.single
 
 
-def _prior_root(space: ParameterSpace, names: tuple[str, ...]) -> np.ndarray:
-    """Return a root of the prior's covariance of some blocks at their first tolerances, shape (size, k)."""
-    start = dict(zip((block.name for block in space.blocks), space.start_tolerances(), strict=True))
-    chosen: list[Block] = [block for block in space.blocks if block.name in names]
-    columns, done = np.zeros((space.size, sum(len(b.labels) for b in chosen))), 0
-    for block in chosen:
-        columns[block.part, done : done + len(block.labels)] = start[block.name] * block.root
-        done += len(block.labels)
-    return columns
+@dataclass(frozen=True)
+class Hypothesis:
+    """A change as readings see it, in coordinates in which those of an unchanged machine are N(0, 1)."""
+
+    change: Change
+    directions: np.ndarray  # (n, k), orthonormal
+    gains: np.ndarray  # (k,): how large the effect of θ = 1 is along them
+    least_gain: float  # of all θ; 0 where one moves no reading
+    log_prior: float = 0.0  # of each of its scales
+
+    @staticmethod
+    def of(change: Change, effect: np.ndarray) -> Hypothesis:
+        """Return a change with its effect (n, k) on whitened readings."""
+        if effect.shape[1] == 1:  # most of them: no need to decompose
+            gains = np.linalg.norm(effect, axis=0)
+            directions = effect / (gains or 1.0)
+        else:
+            directions, gains, _ = np.linalg.svd(effect, full_matrices=False)
+        felt = gains > ROUNDING * max(gains.max(initial=0.0), 1.0)
+        least = float(gains.min()) if felt.sum() == effect.shape[1] else 0.0
+        return Hypothesis(change, directions[:, felt], gains[felt], least)
+
+    def log_bayes_factors(self, z: np.ndarray) -> np.ndarray:
+        """Return log evidence over that of no change for whitened readings (N, n), scale by scale: (N, m)."""
+        grown = np.outer(self.change.scales**2, self.gains**2)
+        along = (z @ self.directions) ** 2
+        return 0.5 * (along @ (grown / (1.0 + grown)).T - np.log1p(grown).sum(axis=1))
+
+
+class Evidence:
+    """Changes, given with their effects (n, k) on readings that have a covariance where nothing has changed.
+
+    The kinds have their prior odds, the groups of a kind share them equally, as do the changes of a group and the
+    scales of each: else a bend would count for little beside all joints and screws.
+    """
+
+    def __init__(self, covariance: np.ndarray, effects: Iterator[tuple[Change, np.ndarray]]) -> None:
+        self._whitening = solve_triangular(np.linalg.cholesky(covariance), np.eye(len(covariance)), lower=True)
+        seen = [Hypothesis.of(change, self._whitening @ effect) for change, effect in effects]
+        groups = Counter((h.change.family, h.change.group) for h in seen)
+        in_kind = Counter(family for family, _ in groups)
+        odds = dict(zip(FAMILIES, ASSUMED.prior_odds, strict=True))
+        self.hypotheses = []
+        for h in seen:
+            family, group = h.change.family, h.change.group
+            share = odds[family] / (sum(odds.values()) * in_kind[family] * groups[family, group] * len(h.change.scales))
+            self.hypotheses.append(replace(h, log_prior=float(np.log(share))))
+
+    def log_weights(self, readings: np.ndarray) -> list[np.ndarray]:
+        """Return the log weight of each hypothesis over that of no change for sets of readings (N, n): (N, m) each."""
+        return self._of_whitened(readings @ self._whitening.T)
+
+    def _of_whitened(self, z: np.ndarray) -> list[np.ndarray]:
+        return [h.log_bayes_factors(z) + h.log_prior for h in self.hypotheses]
+
+    def probability_unchanged(self, readings: np.ndarray) -> float:
+        """Return in which share of checks a machine that has not changed reads as strangely as this, or more so.
+
+        Strange is what some change explains much better: the evidence of all of them together.
+        """
+        z = np.random.default_rng(11).standard_normal((ASSUMED.unchanged_draws, len(readings)))
+        z = np.vstack([self._whitening @ readings, z])
+        changed = np.logaddexp.reduce(np.concatenate(self._of_whitened(z), axis=1), axis=1)
+        return float((changed >= changed[0]).mean())
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Mean and covariance of the parameters' difference from the fit's if one explanation of readings is right."""
+
+    mean: np.ndarray  # (size,), SI
+    covariance: np.ndarray  # (size, size)
+
+    @staticmethod
+    def of(check: CheckReadings, fitted: FittedParameters, change: Change | None, scale: float = 0.0) -> Explanation:
+        """Return what readings make of the parameters if a change of one scale has happened; None: no change."""
+        prior = fitted.covariance
+        if change is not None and change.columns is not None:
+            prior = prior + scale**2 * change.columns @ change.columns.T
+        reached = check.rows @ prior
+        gain = np.linalg.solve(check.covariance(prior), reached).T
+        return Explanation(gain @ check.residuals, prior - gain @ reached)

@@ -15,9 +15,7 @@ from ..errors import CalibrationError
 from ..machine.geometry import STRUT_NAMES
 from ..measurements.campaign import Campaign, template
 from ..measurements.readings import CHANNELS, FORWARD, MeasurementSet
-from .changes import STRUT, TEMPERATURE, Change, possible_changes, widened
-from .check_readings import CheckReadings, weigh
-from .evidence import Hypothesis
+from .changes import STRUT, TEMPERATURE, Change, CheckReadings, Evidence, Hypothesis, possible_changes, widened
 from .posterior import FittedParameters
 
 USUAL = 12
@@ -137,17 +135,17 @@ class _Weighing:
 
     def __init__(self, fitted: FittedParameters, laid_out: MeasurementSet, changes: list[Change]) -> None:
         self._fitted, self._laid_out, self._changes = fitted, laid_out, changes
-        self._every = CheckReadings(fitted, laid_out)
+        self._every = CheckReadings.of(fitted, laid_out)
         sizes = dict.fromkeys(((STRUT, name) for name in STRUT_NAMES), CRASH) | {(TEMPERATURE, "struts"): WARMTH}
         named = [(c, sizes[c.family, c.name]) for c in changes if (c.family, c.name) in sizes]
         self._changes_named = [change for change, _ in named]
-        self._named = np.array([size * change.columns[:, 0] for change, size in named])
+        self._named = np.array([size * c.columns[:, 0] for c, size in named if c.columns is not None])
 
     def clearness(self, choice: _Choice) -> float:
         """Return the log odds of the right kind of change over all others; those that are told worst count most."""
         check = self._every.part(choice.contrasts(len(self._laid_out)))
-        evidence = weigh(check, self._fitted, self._changes, self._laid_out)
-        weights = np.array([_log_sum(w, 1) for w in evidence.weights_of_each(self._named @ check.rows.T)])
+        evidence = Evidence(check.covariance(self._fitted.covariance), check.effects(self._changes))
+        weights = np.array([_log_sum(w, 1) for w in evidence.log_weights(self._named @ check.rows.T)])
         own, other = (
             np.array([of(h, c) for h in evidence.hypotheses for c in self._changes_named]) for of in (_same, _other)
         )
@@ -157,9 +155,13 @@ class _Weighing:
 
 def _same(hypothesis: Hypothesis, change: Change) -> bool:
     """Return whether a hypothesis is a change by name, of a strut, or of its kind."""
-    return hypothesis.family == change.family and (change.family != STRUT or hypothesis.name == change.name)
+    return hypothesis.change.family == change.family and (
+        change.family != STRUT or hypothesis.change.name == change.name
+    )
 
 
 def _other(hypothesis: Hypothesis, change: Change) -> bool:
     """Return whether a hypothesis is of another kind, or another strut; several struts at once are neither."""
-    return hypothesis.family != change.family or (hypothesis.name in STRUT_NAMES and hypothesis.name != change.name)
+    return hypothesis.change.family != change.family or (
+        hypothesis.change.name in STRUT_NAMES and hypothesis.change.name != change.name
+    )

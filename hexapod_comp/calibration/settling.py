@@ -9,7 +9,7 @@ import numpy as np
 from ..errors import InputFileError
 from ..measurements.campaign import Campaign, template
 from ..measurements.readings import BACKWARD, CHANNELS, KINDS, MeasurementSet
-from .check_readings import Explanation
+from .changes import Explanation
 from .estimator import Estimation
 from .posterior import FittedParameters
 

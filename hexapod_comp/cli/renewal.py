@@ -21,9 +21,9 @@ NOT_FITTED = {
 
 def renew(args: argparse.Namespace) -> int:
     """Write a renewed model; 1 when the readings cannot renew it."""
+    from ..calibration.check import refusal, update_model
+    from ..calibration.check_report import update_report, verification_json, verification_report
     from ..calibration.posterior_file import SUFFIX, save_with_posterior
-    from ..calibration.update import refusal, update_model
-    from ..calibration.verification_report import update_report, verification_json, verification_report
     from ..errors import CommandError
     from ..formats.outputs import write_text
     from ..formats.paths import input_file

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING
 from . import common
 
 if TYPE_CHECKING:
+    from ..calibration.check import Verification
     from ..calibration.posterior import FittedParameters
-    from ..calibration.verification import Verification
     from ..machine.model import MachineModel
     from ..measurements.readings import MeasurementSet
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb; 1 when the machine has changed."""
-    from ..calibration.verification import VALID
-    from ..calibration.verification_report import verification_json, verification_report
+    from ..calibration.check import VALID
+    from ..calibration.check_report import verification_json, verification_report
 
     _refuse_what_does_not_fit(args)
     if args.propose is not None:
@@ -87,7 +87,7 @@ def checked(args: argparse.Namespace, path: str) -> Checked:
     """
     import numpy as np
 
-    from ..calibration.verification import verify_model
+    from ..calibration.check import verify_model
     from ..measurements.files import read_measurements
     from ..virtual.instruments import compensated
 

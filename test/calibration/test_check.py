@@ -21,17 +21,27 @@ from hexapod_comp.calibration.changes import (
     READING,
     STRUT,
     TEMPERATURE,
+    Change,
+    Evidence,
+    Hypothesis,
     possible_changes,
     widened,
 )
+from hexapod_comp.calibration.check import (
+    NAMED,
+    UNDECIDED,
+    UNEXPLAINED,
+    VALID,
+    Verification,
+    refusal,
+    update_model,
+    verify_model,
+)
 from hexapod_comp.calibration.check_plan import propose_check
+from hexapod_comp.calibration.check_report import verification_json, verification_report
 from hexapod_comp.calibration.evaluation import held_out
-from hexapod_comp.calibration.evidence import Evidence, Hypothesis
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.posterior import FittedParameters
-from hexapod_comp.calibration.update import refusal, update_model
-from hexapod_comp.calibration.verification import NAMED, UNDECIDED, UNEXPLAINED, VALID, Verification, verify_model
-from hexapod_comp.calibration.verification_report import verification_json, verification_report
 from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.datum import tool_move
 from hexapod_comp.machine.model import MachineModel, RealMachine
@@ -103,29 +113,29 @@ def test_evidence_is_the_ratio_of_two_normal_densities() -> None:
     rng = np.random.default_rng(1)
     root, effect, z = rng.standard_normal((5, 5)), rng.standard_normal((5, 2)), rng.standard_normal(5)
     covariance = root @ root.T + np.eye(5)
-    evidence = Evidence(covariance)
-    evidence.add(STRUT, "it", effect, (0.5, 3.0))
+    scales = np.array([0.5, 3.0])
+    evidence = Evidence(covariance, iter([(Change(STRUT, "it", scales), effect)]))
     densities = [
         multivariate_normal.logpdf(z, cov=covariance + s**2 * effect @ effect.T)
         - multivariate_normal.logpdf(z, cov=covariance)
-        for s in (0.5, 3.0)
+        for s in scales
     ]
-    np.testing.assert_allclose(evidence.hypotheses[0].log_ratios(evidence.whitened(z)[None])[0], densities, atol=1e-9)
+    found = evidence.log_weights(z[None])[0][0] - evidence.hypotheses[0].log_prior
+    np.testing.assert_allclose(found, densities, atol=1e-9)
 
 
 def test_an_effect_that_no_reading_shows_changes_no_probability() -> None:
     """A change that moves no reading has the evidence of no change: a ratio of one."""
-    unseen = Hypothesis.of(DATUM, "it", np.zeros((4, 3)), (1.0, 10.0))
-    np.testing.assert_array_equal(unseen.log_ratios(np.ones((1, 4))), 0.0)
+    unseen = Hypothesis.of(Change(DATUM, "it", np.array([1.0, 10.0])), np.zeros((4, 3)))
+    np.testing.assert_array_equal(unseen.log_bayes_factors(np.ones((1, 4))), 0.0)
     assert unseen.least_gain == 0.0
 
 
 def test_unchanged_machines_look_strange_as_rarely_as_stated() -> None:
     """Of 100 sets drawn unchanged a tenth has a share below 0.1: 10, standard deviation 3."""
     rng = np.random.default_rng(2)
-    evidence = Evidence(np.eye(6))
-    evidence.add(STRUT, "one", rng.standard_normal((6, 1)), (3.0, 30.0))
-    evidence.add(OTHER, "all", np.eye(6), (2.0,))
+    one, scatter = Change(STRUT, "one", np.array([3.0, 30.0])), Change(OTHER, "all", np.array([2.0]))
+    evidence = Evidence(np.eye(6), iter([(one, rng.standard_normal((6, 1))), (scatter, np.eye(6))]))
     rare = sum(evidence.probability_unchanged(z) < 0.1 for z in rng.standard_normal((100, 6)))
     assert 1 <= rare <= 22
 
