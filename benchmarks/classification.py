@@ -26,8 +26,8 @@ from tqdm import tqdm
 
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.pose import rotation_from_angles
+from hexapod_comp.workspace.budget import BASE_JOINT, LENGTH, PLATFORM_JOINT, Budget, SingleErrors
 from hexapod_comp.workspace.effects import ITERATION, Extremes, effect_vectors, extremes, merged
-from hexapod_comp.workspace.sources import BASE_JOINT, LENGTH, PLATFORM_JOINT, Budget, SingleErrors
 
 CONFIG = Path(__file__).resolve().parents[1] / "config"
 

@@ -30,10 +30,9 @@ from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.warming import MEMBERS, SEEN_SHARE
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.machine.late import PARTS
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.passes import Passes, random_passes
-from hexapod_comp.machine.temperatures import Temperatures
+from hexapod_comp.machine.temperatures import PARTS, Temperatures
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.virtual.imperfections import draw_model

@@ -51,8 +51,8 @@ if TYPE_CHECKING:
     from .replay.bag import read_recording as read_recording
     from .replay.replay import Replay as Replay
     from .replay.replay import replay_recording as replay_recording
-    from .workspace.sources import Budget as Budget
-    from .workspace.sources import load_budget as load_budget
+    from .workspace.budget import Budget as Budget
+    from .workspace.budget import load_budget as load_budget
     from .workspace.study import Study as Study
     from .workspace.study import classify as classify
 
@@ -80,7 +80,7 @@ _HOMES = {
     "pose": ("Pose",),
     "replay.bag": ("Recording", "read_recording"),
     "replay.replay": ("Replay", "replay_recording"),
-    "workspace.sources": ("Budget", "load_budget"),
+    "workspace.budget": ("Budget", "load_budget"),
     "workspace.study": ("Study", "classify"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

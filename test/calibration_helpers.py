@@ -18,8 +18,7 @@ from hexapod_comp.calibration.posterior import FittedParameters
 from hexapod_comp.calibration.posterior_file import save_with_posterior
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.machine.model import MachineModel, RealMachine
-from hexapod_comp.machine.motion import MotionState
+from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine
 from hexapod_comp.machine.passes import Passes
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import AXES, FROM_PREVIOUS, KINDS, FileLine, MeasurementSet, Reading

@@ -7,13 +7,12 @@ from collections.abc import Callable
 import numpy as np
 
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.workspace.budget import load_budget
 from hexapod_comp.workspace.effects import effects
-from hexapod_comp.workspace.layers import TRANSLATION, Layer
 from hexapod_comp.workspace.pictures import shells_figure
 from hexapod_comp.workspace.ranking import PAPER_TABLE, QUANTITIES, RankingRow, paper_row
 from hexapod_comp.workspace.reach import orientations, reach, reaches
-from hexapod_comp.workspace.shells import shell
-from hexapod_comp.workspace.sources import load_budget
+from hexapod_comp.workspace.shells import TRANSLATION, Layer, shell
 from hexapod_comp.workspace.study import LAYERS, RINGS, SECTORS, Study, classify, compared
 
 from .comparing import MET, MISSED, OPEN, SHOWN, Column, Exhibit, NumberTable, Paper, Statement, judged, within

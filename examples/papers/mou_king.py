@@ -15,13 +15,13 @@ from hexapod_comp.calibration.evaluation import INCH, Worth, worth
 from hexapod_comp.calibration.lines import LinesFit, fit_lines
 from hexapod_comp.calibration.pictures import strut_error_figure, strut_length_errors
 from hexapod_comp.formats.texts import number
+from hexapod_comp.machine.arrays import rms
 from hexapod_comp.machine.field import CROSS_AXES, GridField
 from hexapod_comp.machine.geometry import STRUT_NAMES, HexapodGeometry
 from hexapod_comp.machine.model import RealMachine, commanded_box
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.passes import Passes
 from hexapod_comp.machine.pictures import weights_figure
-from hexapod_comp.machine.size import rms
 from hexapod_comp.measurements.campaign import Campaign, load_campaign, template
 from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.virtual.instruments import measure

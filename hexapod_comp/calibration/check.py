@@ -13,8 +13,8 @@ from datetime import date
 import numpy as np
 
 from ..errors import CalibrationError, ModelError
+from ..machine.arrays import rms
 from ..machine.model import MachineModel, RealMachine
-from ..machine.size import rms
 from ..measurements.readings import MeasurementSet
 from .assumptions import ASSUMED
 from .changes import (

@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import CalibrationError
-from ..machine.datum import tool_move, with_datum_held
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import Structure, strut_lengths
-from ..machine.model import Datum, MachineModel
+from ..machine.model import Datum, MachineModel, tool_move, with_datum_held
 from ..pose import Pose
 from .assumptions import ASSUMED
 from .estimator import Estimation

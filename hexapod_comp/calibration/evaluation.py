@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import ModelError
+from ..machine.arrays import Size
 from ..machine.field import CROSS_AXES
 from ..machine.model import MachineModel, RealMachine
 from ..machine.passes import BOTH_WAYS, Passes, random_passes
-from ..machine.size import Size
 from ..machine.temperatures import Temperatures
 from ..virtual.trial import Trial
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import CalibrationError, HexapodError
+from ..machine.arrays import rms
 from ..machine.model import MachineModel, ModelOrigin
-from ..machine.size import rms
 from ..machine.temperatures import REFERENCE_TEMPERATURE
 from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementSet, refuse_unmoved
 from ..pose import Pose

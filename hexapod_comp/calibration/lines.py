@@ -44,9 +44,9 @@ import numpy as np
 from numpy.polynomial import Legendre, Polynomial, legendre
 
 from ..errors import CalibrationError
+from ..machine.arrays import rms
 from ..machine.field import CROSS_AXES, GridField
 from ..machine.model import MachineModel, ModelOrigin
-from ..machine.size import rms
 from ..measurements.readings import AXES, KINDS, LEAST_NOISE, MeasurementSet, refuse_unmoved
 from ..pose import Pose
 from .datum import HeldDatum, hold

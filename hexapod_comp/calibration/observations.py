@@ -16,8 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import CalibrationError
-from ..machine.rows import different_rows
-from ..machine.size import rms
+from ..machine.arrays import different_rows, rms
 from ..measurements.readings import ABSOLUTE_KINDS, KINDS, LEAST_TRAVEL, LENGTH, MeasurementSet
 
 CENTRE = 5e-3

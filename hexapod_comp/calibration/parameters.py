@@ -15,10 +15,10 @@ from ..core import MOST_HARMONICS
 from ..errors import CalibrationError, ModelError
 from ..machine.geometry import HexapodGeometry, first_of_same
 from ..machine.kinematics import Structure, strut_lengths
-from ..machine.late import PARTS, LateGrowth
 from ..machine.model import MachineModel
 from ..machine.region import Region
 from ..machine.struts import StrutErrors
+from ..machine.temperatures import PARTS, LateGrowth
 from ..measurements.readings import MeasurementSet, spans
 from .assumptions import ASSUMED
 from .blocks import ERRORS, Block, growth

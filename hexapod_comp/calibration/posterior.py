@@ -18,11 +18,10 @@ import numpy as np
 
 from ..core import Status
 from ..errors import CalibrationError
+from ..machine.arrays import rms
 from ..machine.kinematics import Structure, strut_lengths_batch
-from ..machine.model import RealMachine
-from ..machine.motion import FOLLOWED
+from ..machine.model import FOLLOWED, RealMachine
 from ..machine.passes import Passes, Poses, random_directions
-from ..machine.size import rms
 from ..machine.temperatures import HUMIDITY, REFERENCE_TEMPERATURE, Temperatures
 from ..measurements.readings import AXES, Stations, attitude_error
 from ..pose import rotation_from_angles
@@ -165,7 +164,7 @@ class ErrorPredictor:
     def predict(self, poses: Poses, senses: np.ndarray | None = None) -> tuple[PredictedError, PredictedError | None]:
         """Return the errors as the machine stands, and with the datum aligned over the model's box, None without one.
 
-        `senses`, (N, 9), are directions of motion as in :class:`~hexapod_comp.machine.motion.MotionState`; by default
+        `senses`, (N, 9), are directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`; by default
         not known, midway between both: a backlash and a reversal of the field then add nothing.
         """
         count, covariance = len(poses[0]), None if self._fitted is None else self._fitted.covariance

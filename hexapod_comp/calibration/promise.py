@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..machine.size import rms
+from ..machine.arrays import rms
 
 TWICE, LACK_MARGIN = 2.0, 1.5
 """An end of an interval stands so far out: in standard deviations, and in sizes of a lack."""

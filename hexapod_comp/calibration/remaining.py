@@ -18,7 +18,7 @@ from ..machine.passes import Poses
 from ..machine.region import region_json, region_text
 from ..measurements.campaign import Campaign, template
 from ..measurements.readings import CHANNELS, DEFAULT_UNCERTAINTY, MeasurementSet
-from ..workspace.combining import NORMAL, covariance_factor, monte_carlo, root_sum_of_squares
+from ..workspace.combined import NORMAL, covariance_factor, monte_carlo, root_sum_of_squares
 from .estimator import Estimation
 from .posterior import ErrorPredictor, FittedParameters
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..machine.rows import different_rows
+from ..machine.arrays import different_rows
 from ..measurements.readings import ANGULAR_KINDS, BACKWARD, FORWARD, KINDS
 from .estimator import MEDIAN_TO_SIGMA
 from .promise import Scatter

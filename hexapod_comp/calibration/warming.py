@@ -16,8 +16,14 @@ from itertools import combinations
 import numpy as np
 
 from ..formats.texts import number
-from ..machine.late import MOST_TIME_CONSTANTS, PARTS, TIME_CONSTANT_RANGE, LateGrowth
-from ..machine.temperatures import REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE
+from ..machine.temperatures import (
+    MOST_TIME_CONSTANTS,
+    PARTS,
+    REFERENCE_HUMIDITY,
+    REFERENCE_TEMPERATURE,
+    TIME_CONSTANT_RANGE,
+    LateGrowth,
+)
 from ..measurements.readings import KINDS, MeasurementSet
 from .assumptions import ASSUMED
 from .blocks.block import Linkage
@@ -346,7 +352,7 @@ def _swelling(measurements: MeasurementSet, space: ParameterSpace, solution: Sol
 
 
 MEMBERS = {"struts": slice(0, 6), "base": slice(6, 7), "platform": slice(7, 8)}
-"""Which of :data:`~hexapod_comp.machine.late.PARTS` belong to each kind of part."""
+"""Which of :data:`~hexapod_comp.machine.temperatures.PARTS` belong to each kind of part."""
 
 
 def _parts(

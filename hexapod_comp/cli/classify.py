@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ..machine.geometry import HexapodGeometry
+    from ..workspace.budget import Budget
     from ..workspace.shells import Shell
-    from ..workspace.sources import Budget
     from ..workspace.study import Study
 
 
@@ -39,8 +39,7 @@ def run(args: argparse.Namespace) -> int:
     from ..machine.geometry import load_geometry
     from ..workspace.ranking import beside, ranking_rows
     from ..workspace.reach import orientations, reaches
-    from ..workspace.report import as_json, report
-    from ..workspace.study import classify, shells_of
+    from ..workspace.study import as_json, classify, report, shells_of
 
     geometry = load_geometry(args.machine)
     if args.clearance_mm is not None:
@@ -112,7 +111,7 @@ def _budget(file: str, geometry: HexapodGeometry) -> Budget:
     """Return the budget of a file; what does not fit the machine is refused before the work starts."""
     from ..errors import InputFileError, ModelError
     from ..formats.paths import input_file
-    from ..workspace.sources import load_budget
+    from ..workspace.budget import load_budget
 
     path = input_file(file, "error_budget")
     budget = load_budget(path)
@@ -132,8 +131,8 @@ def _names(tilts: tuple[float, ...]) -> tuple[str, ...]:
 
 def _figures(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...]) -> dict[str, Figure]:
     """Draw the pictures: of the orientation in the middle of the list."""
-    from ..workspace.layers import TRANSLATION, Layer
     from ..workspace.pictures import RankedRow, causes_figure, ranking_figure, shells_figure
+    from ..workspace.shells import TRANSLATION, Layer
     from ..workspace.study import mesh_effects
 
     middle = len(bodies) // 2
@@ -155,7 +154,7 @@ def _figures(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...]) ->
 def _publish(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...]) -> None:
     """Keep shells on a latched topic, for RViz and Foxglove, until Ctrl-C."""
     from ..ros.shell_markers import TOPIC, show_shells
-    from ..workspace.layers import TRANSLATION, Layer
+    from ..workspace.shells import TRANSLATION, Layer
     from ..workspace.study import mesh_effects
 
     middle = len(bodies) // 2

@@ -46,8 +46,8 @@ def mention_default(args: argparse.Namespace, geometry: HexapodGeometry) -> None
 def load_campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campaign:
     """Return the campaign that the options name; one without a box gets the largest that the machine reaches."""
     from ..measurements.campaign import load_campaign
-    from ..workspace.box import machine_box
     from ..workspace.overview import corners
+    from ..workspace.reach import machine_box
 
     if args.campaign is None:
         args.campaign = "campaign_5d.yaml" if geometry.name == "paper" else "campaign.yaml"

@@ -109,8 +109,7 @@ def _solve(
     from ..errors import KinematicsError
     from ..machine.assembly import working_mode
     from ..machine.kinematics import Structure, solve_pose, solve_poses
-    from ..machine.model import RealMachine
-    from ..machine.motion import DIRECTIONS, FOLLOWED
+    from ..machine.model import DIRECTIONS, FOLLOWED, RealMachine
     from ..pose import Pose
 
     machine = RealMachine(geometry, model)

@@ -111,7 +111,7 @@ def _targets(args: argparse.Namespace, geometry: HexapodGeometry) -> _Targets:
     import numpy as np
 
     from ..formats.csv import read_pose_arrays
-    from ..machine.motion import DIRECTIONS, FOLLOWED
+    from ..machine.model import DIRECTIONS, FOLLOWED
 
     if args.line is not None:
         start, end, angles = args.line

@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     from ..machine.model import RealMachine
     from ..machine.model_file import save_model
     from ..virtual.named import imagine
-    from ..workspace.box import machine_box
+    from ..workspace.reach import machine_box
 
     geometry = load_geometry(args.machine)
     model = imagine(geometry, args.seed, _bounds(args, geometry), args.name or "")
@@ -66,7 +66,7 @@ def _bounds(args: argparse.Namespace, geometry: HexapodGeometry) -> Imperfection
     import numpy as np
 
     from ..virtual.named import usual_bounds
-    from ..workspace.box import machine_box
+    from ..workspace.reach import machine_box
 
     given: dict[str, Any] = {"shared_platform_joints": not args.separate_joints}
     for option, (name, unit) in IN_SI.items():

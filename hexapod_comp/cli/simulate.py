@@ -74,7 +74,7 @@ def _warmth(measured: MeasurementSet) -> str:
 
 def _rises(measured: MeasurementSet) -> dict[str, float]:
     """Return how far each part's sensor went, K."""
-    from ..machine.late import PARTS
+    from ..machine.temperatures import PARTS
 
     values = measured.stations.temperatures
     return dict(zip(PARTS, (values.max(axis=0) - values.min(axis=0)).tolist(), strict=True))
@@ -94,7 +94,7 @@ def _as_json(measured: MeasurementSet, args: argparse.Namespace) -> dict[str, An
 
 def _channels(measured: MeasurementSet) -> Iterator[tuple[str, int, float, float, str]]:
     """Yield each kind of channel that was read, how often, its RMS and largest reading, and their unit."""
-    from ..machine.size import rms
+    from ..machine.arrays import rms
     from ..measurements.readings import ANGULAR_KINDS, KINDS
 
     for number, kind in enumerate(KINDS):

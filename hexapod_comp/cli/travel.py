@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
-    from ..machine.frames import pose_text
+    from ..machine.geometry import pose_text
     from ..machine.model import RealMachine
     from ..pose import Pose
     from ..workspace.travel import travel, travel_text

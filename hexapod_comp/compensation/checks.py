@@ -16,8 +16,7 @@ from ..core.batch import QUANTITIES, examine_poses
 from ..errors import GeometryError, HexapodError, LimitError, NotConvergedError, NotFiniteError, OutsideFieldError
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.limits import REASONS, STAGES
-from ..machine.model import MachineModel, RealMachine
-from ..machine.motion import MotionState
+from ..machine.model import MachineModel, MotionState, RealMachine
 from ..machine.passes import Poses
 from ..machine.trajectory import moves
 from ..pose import Pose, stacked
@@ -159,7 +158,7 @@ def check(
     progress : callable, optional
         Called with the number of rows just done.
     senses : ndarray, shape (N, 9), optional
-        Directions of motion as in :class:`~hexapod_comp.machine.motion.MotionState`, for the mode ``poses``; by
+        Directions of motion as in :class:`~hexapod_comp.machine.model.MotionState`, for the mode ``poses``; by
         default not known. The other modes follow the motion.
 
     Raises

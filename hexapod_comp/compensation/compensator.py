@@ -17,13 +17,10 @@ from ..core import Status, Struct, ffi, lib
 from ..core.batch import given
 from ..core.single import backwards, solve_linear
 from ..errors import HexapodError, ModelError, NotConvergedError, NotFiniteError, PoseError
-from ..machine.frames import TOOL
-from ..machine.geometry import HexapodGeometry
+from ..machine.geometry import TOOL, HexapodGeometry
 from ..machine.kinematics import forward_error, jacobian
-from ..machine.late import PARTS, Lag
-from ..machine.model import MachineModel, RealMachine, core_model, write_temperatures
-from ..machine.motion import MotionState
-from ..machine.temperatures import HUMIDITY, Temperatures, check_part
+from ..machine.model import MachineModel, MotionState, RealMachine, core_model, write_temperatures
+from ..machine.temperatures import HUMIDITY, PARTS, Lag, Temperatures, check_part
 from ..pose import Pose
 from .findings import pose_of, refusal
 from .state import PLACES, Correction, named_parts, pack_pose, read_parts

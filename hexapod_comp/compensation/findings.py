@@ -11,8 +11,7 @@ import numpy as np
 from ..core import QUATERNION_NORM_TOLERANCE, Status, ffi
 from ..errors import HexapodError, LimitError, NotConvergedError, OutsideFieldError, PoseError
 from ..machine.field import GridField
-from ..machine.frames import pose_text
-from ..machine.geometry import HexapodGeometry
+from ..machine.geometry import HexapodGeometry, pose_text
 from ..machine.limits import STRUT_NAMES
 from ..machine.model import MachineModel
 from ..pose import Pose

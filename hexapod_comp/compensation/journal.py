@@ -32,8 +32,7 @@ from .. import core
 from ..errors import HexapodError, InputFileError, shorten
 from ..formats.files import Opener, read_text
 from ..formats.json import json_content
-from ..machine.frames import BASE, TOOL, WORK
-from ..machine.geometry import STRUT_NAMES, HexapodGeometry, parse_geometry
+from ..machine.geometry import BASE, STRUT_NAMES, TOOL, WORK, HexapodGeometry, parse_geometry
 from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL, parse_model
 from .compensator import Compensator

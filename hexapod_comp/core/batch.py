@@ -433,6 +433,6 @@ def follow_point(
     low: np.ndarray,
     sense: np.ndarray,
 ) -> None:
-    """Follow the measured point of a platform pose along the three axes, see :mod:`hexapod_comp.machine.motion`."""
+    """Follow the measured point of a platform pose along the three axes, see :mod:`hexapod_comp.machine.model`."""
     motion = written("low", low, 9), written("sense", sense, 9)
     lib.hc_follow_point(pose_of(position, rotation), given("probe", probe, 3), threshold, *motion)

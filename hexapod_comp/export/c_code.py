@@ -19,9 +19,8 @@ from ..compensation.compensator import DEFAULT_RAMP_RATE, Compensator
 from ..core import Status, dtype_of
 from ..errors import HexapodError, TooEarlyError
 from ..formats.outputs import write_text
-from ..machine.constants import members
 from ..machine.geometry import HexapodGeometry
-from ..machine.model import MachineModel
+from ..machine.model import MachineModel, members
 from ..machine.temperatures import Temperatures
 from ..machine.trajectory import moves
 from ..pose import Pose, rotation_from_angles, stacked

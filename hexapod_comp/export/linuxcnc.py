@@ -23,10 +23,10 @@ from scipy.interpolate import make_lsq_spline
 
 from ..core.batch import screw_twists, strut_commands
 from ..errors import GeometryError
+from ..machine.arrays import rms
 from ..machine.geometry import STRUT_NAMES
 from ..machine.model import RealMachine
 from ..machine.passes import Passes
-from ..machine.size import rms
 from .carried import AT_20_DEGC, refuse_unknown
 
 MOST_POINTS = 256

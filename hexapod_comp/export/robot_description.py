@@ -14,8 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..core.single import quaternion_of
-from ..machine.frames import BASE
-from ..machine.geometry import STRUT_NAMES, HexapodGeometry
+from ..machine.geometry import BASE, STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import strut_lengths
 from ..pose import Pose, roll_pitch_yaw
 

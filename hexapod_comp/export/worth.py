@@ -13,12 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..machine.arrays import Size
 from ..machine.geometry import HexapodGeometry
-from ..machine.late import PARTS
 from ..machine.model import MachineModel, RealMachine
 from ..machine.passes import Passes
-from ..machine.size import Size
-from ..machine.temperatures import HUMIDITY, REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE, Temperatures
+from ..machine.temperatures import HUMIDITY, PARTS, REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE, Temperatures
 from ..virtual.trial import ToolErrors, Trial
 
 WARMER, DAMPER = dict.fromkeys(PARTS, REFERENCE_TEMPERATURE + 1.0), {HUMIDITY: REFERENCE_HUMIDITY + 0.1}

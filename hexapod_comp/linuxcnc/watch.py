@@ -27,8 +27,7 @@ from ..core.single import follow_nine
 from ..errors import HexapodError, KinematicsError
 from ..formats.texts import plain_number
 from ..machine.geometry import load_geometry
-from ..machine.model import RealMachine
-from ..machine.motion import MotionState
+from ..machine.model import MotionState, RealMachine
 from ..pose import Pose
 from ..ros import heard_signals
 from ..virtual.named import find_model

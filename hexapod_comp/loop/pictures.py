@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ..formats.figures import WITH, WITHOUT, picture_text
-from ..machine.size import rms
+from ..machine.arrays import rms
 from .records import PathRecord, PoseRecord, SessionResult, Track
 from .report import ErrorRow
 from .story import Calibration

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..formats.texts import aligned, number
-from ..machine.size import rms
+from ..machine.arrays import rms
 from ..pose import Pose
 from .records import Answering, PathRecord, PoseRecord, SessionResult, Track
 

@@ -17,10 +17,10 @@ from ..errors import GeometryError, HexapodError, InputFileError, NoAnswerError
 from ..formats.csv import Row, length_values
 from ..formats.paths import config_file
 from ..formats.texts import CODES, own_terminal
+from ..machine.arrays import rms
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
 from ..machine.model_file import save_model
-from ..machine.size import rms
 from ..machine.trajectory import Path
 from ..pose import Pose
 from . import session

@@ -18,10 +18,10 @@ from ..calibration.report import tool_error_text
 from ..calibration.sensitivity import predict
 from ..compensation.compensator import Compensator
 from ..formats.texts import number
+from ..machine.arrays import rms
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel, RealMachine
 from ..machine.passes import Passes
-from ..machine.size import rms
 from ..machine.trajectory import Path, circle, commanded_in_base, join, move, pocket
 from ..measurements.campaign import Campaign, template
 from ..measurements.readings import ANGULAR_KINDS
@@ -29,7 +29,7 @@ from ..pose import Pose
 from ..virtual.instruments import measure
 from ..virtual.machine import StrutDrive
 from ..virtual.trial import without_datum
-from ..workspace.box import machine_box
+from ..workspace.reach import machine_box
 from .records import PathRecord, PoseRecord, SessionResult, Track
 from .report import ALIGNED, ErrorRow, error_rows
 from .session import MOVE_FEED

@@ -9,25 +9,23 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core import Status, Struct, batch, lib
-from ..core.single import backwards
+from ..core.single import backwards, rotate
 from ..errors import ModelError, NotConvergedError
 from ..pose import Pose
-from .constants import members
+from .arrays import changed_rows
 from .field import GridField, no_field
 from .geometry import HexapodGeometry
-from .kinematics import Structure, forward_error, over_chunks
-from .late import AT_ONCE, PARTS, Lag, LateGrowth, late
-from .motion import MotionState
+from .kinematics import Structure, forward_error, over_chunks, strut_lengths
 from .region import Region
-from .rows import changed_rows
 from .struts import StrutErrors
-from .temperatures import HUMIDITY, Temperatures
+from .temperatures import AT_ONCE, HUMIDITY, MOST_TIME_CONSTANTS, PARTS, Lag, LateGrowth, Temperatures, late
 
 LARGEST_DEVIATION = 0.05
 """Joint deviations above this, m, are a unit error, not a machine."""
@@ -171,6 +169,35 @@ class MachineModel:
         if self.region is None and any(family.shape[4] for family in self.field.lines):
             return Region(self.field.box, self.field.probe)
         return self.region
+
+
+FOLLOWED = 9
+"""Three axes of the measured point, then six struts."""
+
+
+DIRECTIONS = {"forward": 1.0, "midway": 0.0, "backward": -1.0}
+"""The sense of all axes and all struts that were approached in one direction; midway: not known."""
+
+
+class MotionState:
+    """Directions of motion with a reversal threshold, so that noise at standstill does not flip a backlash.
+
+    Each of the nine followed values drags a window as wide as the threshold behind it, like a nut its lost motion; only
+    a value that leaves its window has a direction.
+
+    Given arrays are used in place; without them the state is that before the first value.
+    """
+
+    __slots__ = ("low", "sense")
+
+    def __init__(self, low: np.ndarray | None = None, sense: np.ndarray | None = None) -> None:
+        self.low = np.full(FOLLOWED, math.nan) if low is None else low
+        self.sense = np.zeros(FOLLOWED) if sense is None else sense
+
+    def copy_from(self, other: MotionState) -> None:
+        """Take over the state of another."""
+        self.low[:] = other.low
+        self.sense[:] = other.sense
 
 
 class RealMachine:
@@ -338,6 +365,61 @@ def write_temperatures(state: Struct, temperatures: Temperatures) -> None:
             view["behind"][index][: len(lag.behind)] = lag.behind
 
 
+def members(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str] = ("", "")) -> dict[str, Any]:
+    """Return what ``hc_model`` holds."""
+    model_texts = {"machine": model.machine, "model": model.name, "date": model.origin.date or ""}
+    tool = geometry.tool
+    return {
+        **model_texts,
+        "geometry_sha256": hashes[0],
+        "model_sha256": hashes[1],
+        "base": _body(geometry, model, 0),
+        "platform": _body(geometry, model, 1),
+        "home": _pose(geometry.home),
+        "work": _pose(geometry.work),
+        "tool": _pose(tool),
+        "tool_inverse": _pose(tool.inverse()),
+        "limits": geometry.limit_numbers.view,
+        "struts": model.struts.members(geometry),
+        "map": {
+            "knot_count": len(model.struts.map_knots),
+            "knots": model.struts.map_knots,
+            "pieces": model.struts.spline_coefficients(),
+        },
+        "field": model.field.members(),
+        "late": _late(model),
+        "axis_threshold": model.field.reversal_threshold,
+        "strut_threshold": model.reversal_threshold,
+    }
+
+
+def _body(geometry: HexapodGeometry, model: MachineModel, index: int) -> dict[str, Any]:
+    name, axes = ("base", "platform")[index], geometry.kernel_axes[index]
+    if name == "base" and model.base_axes_turn.any():
+        turn = np.eye(3)
+        rotate(turn, *model.base_axes_turn.tolist())
+        axes = axes @ turn.T
+    return {
+        "joints": geometry.kernel_joints[index],
+        "deviation": getattr(model, f"{name}_deviation"),
+        "axes": axes,
+        "expansion": getattr(model, f"{name}_expansion"),
+    }
+
+
+def _pose(pose: Pose) -> dict[str, Any]:
+    return {"position": pose.position, "rotation": pose.rotation}
+
+
+def _late(model: MachineModel) -> dict[str, Any]:
+    late = model.late_growth
+    count = len(late.time_constants)
+    constants, expansion = np.zeros(MOST_TIME_CONSTANTS), np.zeros((len(PARTS), MOST_TIME_CONSTANTS))
+    constants[:count], expansion[:, :count] = late.time_constants, late.expansion
+    sensors = [late.sensor_of(part) for part in range(len(PARTS))]
+    return {"count": count, "time_constants": constants, "expansion": expansion, "sensors": sensors}
+
+
 class MachinesByTemperature:
     """Real machines at temperatures that come again and again, each made once."""
 
@@ -389,3 +471,49 @@ def measured_region(model: MachineModel) -> Region:
     if region is None:
         raise ModelError("region", "the model tells of no box in which it was measured; give a box of tool positions")
     return region
+
+
+ROUNDS = 10
+"""Field and turning screws see a moved machine a little otherwise: each round leaves less than a thousandth."""
+
+SETTLED = 1e-12
+"""The tool is not moved when it is by less, m and rad."""
+
+
+def tool_move(geometry: HexapodGeometry, model: MachineModel, pose: Pose) -> np.ndarray:
+    """Return what a machine does to its tool at a pose when the struts are told nominal lengths.
+
+    All parts are at 20 °C and directions of motion not known: midway between both ways of approach.
+    """
+    from scipy.spatial.transform import Rotation  # 14 MB that a running node does not need
+
+    machine = RealMachine(geometry, model)
+    actual, _ = machine.pose_for(strut_lengths(Structure.of(geometry), pose), guess=pose)
+    displacement = (actual @ geometry.tool).position - (pose @ geometry.tool).position
+    turn = Rotation.from_matrix(actual.rotation @ pose.rotation.T).as_rotvec()
+    return np.concatenate([displacement, turn])
+
+
+def with_datum_held(
+    geometry: HexapodGeometry, model: MachineModel, pose: Pose, part: np.ndarray | None = None
+) -> MachineModel:
+    """Return a model whose whole machine is shifted and turned so that it does not move the tool at a pose.
+
+    The base is moved, joints and cardan axes: all errors that a datum does not take up stay as they are.
+    """
+    from scipy.spatial.transform import Rotation
+
+    part = np.eye(6) if part is None else part
+    tip = (pose @ geometry.tool).position
+    for _ in range(ROUNDS):
+        move = tool_move(geometry, model, pose)
+        taken = part @ move
+        if np.abs(taken).max() <= SETTLED:
+            return model
+        about, back = tip + move[:3], Rotation.from_rotvec(-taken[3:])
+        joints = about - taken[:3] + back.apply(geometry.base_joints + model.base_deviation - about)
+        model = replace(model, base_deviation=joints - geometry.base_joints)
+        if geometry.screw_lead.any():
+            axes = back * Rotation.from_rotvec(model.base_axes_turn.copy())
+            model = replace(model, base_axes_turn=axes.as_rotvec())
+    raise NotConvergedError("the whole machine cannot be moved so that the tool stays at the datum", limit=ROUNDS)

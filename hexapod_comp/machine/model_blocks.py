@@ -27,7 +27,7 @@ STRUT_TERMS = {
 """Per-strut terms: kind of quantity, and the unit in which they are written."""
 
 LATE_PARTS = ("late_struts", "late_base", "late_platform")
-"""What follows a thermometer late, in the order of the rows of :class:`~.late.LateGrowth`."""
+"""What follows a thermometer late, in the order of the rows of :class:`~.temperatures.LateGrowth`."""
 
 COMPONENT_UNITS = {name: ("length", "um") if name[0] == "d" else ("angle", "urad") for name in COMPONENTS}
 

@@ -59,7 +59,7 @@ all six or a list of six. Everything marked optional may be left out and is then
       base_expansion_ppm_per_K: 0.0
       platform_expansion_ppm_per_K: 0.0
       thermometer: base               # optional: this part's sensor stands for all; else each part has its own
-      time_constants_s: [1800, 7200]  # optional: how late parts follow, one or two, see hexapod_comp.machine.late
+      time_constants_s: [1800, 7200]  # optional: how late parts follow, one or two, see machine.temperatures
       late_struts_ppm_per_K:          # optional, 6 × time constants: what of a strut's growth comes so late
       late_base_ppm_per_K: [0, 0]     # optional: the same of the base, and of the platform
       late_platform_ppm_per_K: [0, 0]
@@ -112,7 +112,6 @@ from ..formats.schema import Section
 from ..formats.yaml import block_text, parse_yaml
 from .field import CROSS_AXES, OUTSIDE_POLICIES, GridField, no_field
 from .geometry import HexapodGeometry
-from .late import PARTS, LateGrowth
 from .magnitudes import check_magnitudes
 from .model import Datum, MachineModel, ModelOrigin
 from .model_blocks import (
@@ -130,6 +129,7 @@ from .model_blocks import (
 )
 from .region import Region
 from .struts import WAVE_PARTS, StrutErrors
+from .temperatures import PARTS, LateGrowth
 
 MODEL_FORMAT = "hexapod_comp/model"
 MODEL_VERSION = 1

@@ -446,7 +446,7 @@ class Campaign:
 def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
     """Read a campaign file (YAML, see config/campaign_5d.yaml), or a shipped one by its name.
 
-    Where the file gives no box, `own_box` is asked: see :func:`hexapod_comp.workspace.box.machine_box`.
+    Where the file gives no box, `own_box` is asked: see :func:`hexapod_comp.workspace.reach.machine_box`.
     """
     path = input_file(path, "campaign")
     top = read_yaml(path, CAMPAIGN_FORMAT, CAMPAIGN_VERSION)

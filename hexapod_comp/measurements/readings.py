@@ -23,8 +23,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import CalibrationError
+from ..machine.arrays import rms
 from ..machine.geometry import HexapodGeometry
-from ..machine.size import rms
 from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
 from ..pose import Pose
 
@@ -198,7 +198,7 @@ class Stations:
     commands : ndarray, shape (M, 6)
         Strut commands, or encoder readings, m.
     sense : ndarray, shape (M, 9)
-        Directions of motion as in :class:`hexapod_comp.machine.motion.MotionState`.
+        Directions of motion as in :class:`hexapod_comp.machine.model.MotionState`.
     temperatures : ndarray, shape (M, 8)
         Struts 1–6, base, platform, °C.
     times : ndarray, shape (M,)

@@ -11,8 +11,8 @@ import numpy as np
 from ..errors import InputFileError
 from ..formats.csv import Table, si_from_text
 from ..formats.schema import UNITS, spellings
+from ..machine.arrays import changed_rows
 from ..machine.geometry import STRUT_NAMES
-from ..machine.rows import changed_rows
 from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Temperatures
 from ..pose import Pose
 from .air import AIR_RANGES, LARGEST_INDEX

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ..compensation.compensator import DEFAULT_RAMP_RATE
 from ..compensation.thermal import DEFAULT_TIME_CONSTANT, HUMIDITY_RATE
-from ..machine.frames import TOOL
+from ..machine.geometry import TOOL
 from .arguments import Program
 from .parameters import read_table
 

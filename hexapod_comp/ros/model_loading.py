@@ -23,10 +23,10 @@ from ..errors import HexapodError
 from ..formats.json import json_text
 from ..formats.paths import confined_file, confined_opener
 from ..machine.field import GridField
-from ..machine.late import LateGrowth
 from ..machine.model import Datum, MachineModel, ModelOrigin
 from ..machine.region import Region
 from ..machine.struts import StrutErrors
+from ..machine.temperatures import LateGrowth
 
 LOADED_WITHIN = 30.0
 """A file that takes longer to read is given up, s; the shipped ones take one second, nearly all of it imports."""

@@ -16,8 +16,8 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ..errors import GeometryError
-from ..workspace.layers import Layer, Quantity
 from ..workspace.pictures import shades
+from ..workspace.shells import Layer, Quantity
 from .running import keep_discovery_local
 
 SHELL_QOS = QoSProfile(

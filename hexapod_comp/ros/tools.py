@@ -11,8 +11,7 @@ from std_msgs.msg import String
 
 from ..compensation.compensator import Compensator
 from ..errors import CommandError, HexapodError
-from ..machine.frames import BASE, WORK
-from ..machine.geometry import HexapodGeometry
+from ..machine.geometry import BASE, WORK, HexapodGeometry
 from .command_source import CommandSource
 from .compensator_status import CompensatorStatus
 from .messages import read_message

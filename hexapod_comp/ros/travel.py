@@ -10,7 +10,7 @@ from std_srvs.srv import Trigger
 
 from ..compensation.compensator import Compensator
 from ..errors import CommandError, HexapodError
-from ..machine.frames import WORK, pose_text
+from ..machine.geometry import WORK, pose_text
 from ..pose import Pose
 from ..workspace.travel import Travel, travel, travel_text
 from .callbacks import LateAnswer

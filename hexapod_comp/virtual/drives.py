@@ -20,8 +20,7 @@ import numpy as np
 
 from ..errors import ModelError
 from ..machine.geometry import STRUT_NAMES
-from ..machine.model import RealMachine
-from ..machine.motion import MotionState
+from ..machine.model import MotionState, RealMachine
 
 LEAST_LAG = 1e-3
 """Shortest lag of a drive that has one, s: below, the integration steps would become too many."""

@@ -13,8 +13,8 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..machine.arrays import different_rows
 from ..machine.model import MachineModel, MachinesByTemperature, RealMachine
-from ..machine.rows import different_rows
 from ..measurements.campaign import Campaign
 from ..measurements.readings import (
     ABSOLUTE_KINDS,

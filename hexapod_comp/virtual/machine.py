@@ -17,8 +17,7 @@ from ..core.batch import follow_point, run_drives
 from ..errors import CommandError, ModelError
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import forward_error
-from ..machine.model import RealMachine
-from ..machine.motion import MotionState
+from ..machine.model import MotionState, RealMachine
 from ..pose import Pose
 from .drives import DriveParameters, Faults, to_step
 

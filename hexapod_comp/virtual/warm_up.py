@@ -19,9 +19,8 @@ from ..errors import InputFileError, ModelError
 from ..formats.paths import input_file
 from ..formats.schema import Section
 from ..formats.yaml import read_yaml
-from ..machine.late import PARTS
 from ..machine.model import MachineModel, RealMachine
-from ..machine.temperatures import HUMIDITY, HUMIDITY_RANGE, REFERENCE_TEMPERATURE, TEMPERATURE_RANGE
+from ..machine.temperatures import HUMIDITY, HUMIDITY_RANGE, PARTS, REFERENCE_TEMPERATURE, TEMPERATURE_RANGE
 from ..measurements.campaign import Campaign, CampaignRun
 from ..measurements.readings import AXES, MeasurementSet, Stations
 from .instruments import compensated, measure

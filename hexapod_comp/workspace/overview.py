@@ -10,13 +10,21 @@ import numpy as np
 from ..core import Status
 from ..formats.texts import aligned, number
 from ..machine.doubts import doubts, twist_per_lead
-from ..machine.frames import BASE
-from ..machine.geometry import HexapodGeometry
+from ..machine.geometry import BASE, HexapodGeometry
 from ..machine.kinematics import condition_number, strut_lengths
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
 from ..virtual.named import USUAL_LEAD
-from .box import CELLS, ReachedBox, largest_box, machine_box
-from .reach import Examiner, Reach, home_orientation, orientations, reach
+from .reach import (
+    BOX_CELLS,
+    Examiner,
+    Reach,
+    ReachedBox,
+    home_orientation,
+    largest_box,
+    machine_box,
+    orientations,
+    reach,
+)
 
 MOST_TILT = np.radians(90.0)
 """Beyond this no tilt is looked for, rad."""
@@ -44,7 +52,7 @@ class Overview:
     doubts: tuple[str, ...]  # What looks wrong
 
 
-def overview(geometry: HexapodGeometry, cells: int = CELLS) -> Overview:
+def overview(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> Overview:
     """Look a machine over."""
     reached = reach(geometry, home_orientation(geometry), cells)
     box = largest_box(reached)

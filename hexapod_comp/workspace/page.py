@@ -19,9 +19,8 @@ import numpy as np
 from ..errors import GeometryError, HexapodError
 from ..formats.outputs import write_text
 from ..machine.geometry import HexapodGeometry
-from .layers import ROTATION, TRANSLATION, Quantity
 from .pictures import VIEW_AZIMUTH, VIEW_ELEVATION, WEDGE, outline
-from .shells import Shell
+from .shells import ROTATION, TRANSLATION, Quantity, Shell
 from .study import LAYERS, Study, mesh_effects
 
 MOST_BYTES = 7_000_000

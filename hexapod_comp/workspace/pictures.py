@@ -27,10 +27,9 @@ from ..errors import GeometryError
 from ..formats.figures import picture_text
 from ..machine.geometry import HexapodGeometry
 from ..machine.pictures import draw_flat, draw_in_space
-from .layers import ROTATION, TRANSLATION, Layer, Quantity
 from .overview import Overview
 from .reach import FINDINGS
-from .shells import shell
+from .shells import ROTATION, TRANSLATION, Layer, Quantity, shell
 from .study import RINGS, SECTORS
 
 COLOURS = "viridis"

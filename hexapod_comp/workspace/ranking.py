@@ -13,8 +13,8 @@ from ..formats.texts import aligned, number
 from ..machine.geometry import HexapodGeometry, first_of_same
 from ..machine.kinematics import Structure, strut_lengths
 from ..pose import angles_from_rotation
+from .budget import SingleErrors
 from .effects import Extremes
-from .sources import SingleErrors
 
 MICRO = 1e6
 MILLIDEGREE = np.pi / 180e3

@@ -43,8 +43,7 @@ from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.posterior import FittedParameters
 from hexapod_comp.errors import CalibrationError, ModelError
-from hexapod_comp.machine.datum import tool_move
-from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.machine.model import MachineModel, RealMachine, tool_move
 from hexapod_comp.machine.region import Region
 from hexapod_comp.measurements.readings import CHANNELS, FORWARD, MeasurementSet
 from hexapod_comp.virtual.instruments import compensated, measure

@@ -24,9 +24,8 @@ from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.posterior import ErrorPredictor, FittedParameters
 from hexapod_comp.calibration.posterior_file import load_posterior, save_with_posterior
 from hexapod_comp.errors import CalibrationError, InputFileError, ModelError
-from hexapod_comp.machine.datum import tool_move
 from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.machine.model import Datum, MachineModel, RealMachine
+from hexapod_comp.machine.model import Datum, MachineModel, RealMachine, tool_move
 from hexapod_comp.machine.model_file import load_model, model_text, parse_model, save_model
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import KINDS

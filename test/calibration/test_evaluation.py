@@ -12,8 +12,7 @@ from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import Structure, jacobian
-from hexapod_comp.machine.model import MachineModel, RealMachine
-from hexapod_comp.machine.motion import MotionState
+from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine
 from hexapod_comp.machine.passes import Passes, random_passes
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.temperatures import Temperatures

@@ -11,9 +11,9 @@ from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.warming import warming_json, warming_text
 from hexapod_comp.errors import ModelError
-from hexapod_comp.machine.late import LateGrowth
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.machine.temperatures import LateGrowth
 from hexapod_comp.measurements.campaign import Campaign, CampaignRun, template
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
 from hexapod_comp.virtual.instruments import measure

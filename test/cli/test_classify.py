@@ -26,7 +26,7 @@ from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import Structure, solve_pose, strut_lengths
 from hexapod_comp.pose import Pose
-from hexapod_comp.workspace import runner, study
+from hexapod_comp.workspace import study
 
 PNG = b"\x89PNG\r\n\x1a\n"
 TYPES = ("screw_pitch", "quantisation", "base_joint_xy", "base_joint_z", "platform_joint_xy", "platform_joint_z")
@@ -239,10 +239,11 @@ def test_without_plotly_the_rest_is_there(tmp_path: Path, monkeypatch: pytest.Mo
 def test_options_reach_the_survey(monkeypatch: pytest.MonkeyPatch) -> None:
     """What they do there is test_runner's."""
     given: list[tuple[object, ...]] = []
+    original = study.survey
 
     def spy(reaches: object, errors: object, *options: object) -> object:
         given.append(options)
-        return runner.survey(reaches, errors, progress=options[3])
+        return original(reaches, errors, progress=options[3])
 
     monkeypatch.setattr(study, "survey", spy)
     options = ("--workers", 3, "--scheduler", "tcp://127.0.0.1:8786", "--method", "linear")
@@ -445,8 +446,8 @@ def test_an_interruption_leaves_no_half_written_file(
         raise KeyboardInterrupt
 
     where = {
-        "survey": "hexapod_comp.workspace.runner.look_at",
-        "report": "hexapod_comp.workspace.report.report",
+        "survey": "hexapod_comp.workspace.study.look_at",
+        "report": "hexapod_comp.workspace.study.report",
         "drawing": "hexapod_comp.workspace.pictures.ranking_figure",
     }
     monkeypatch.setattr(where[when], interrupted)

@@ -31,9 +31,8 @@ from hexapod_comp.errors import GeometryError, HexapodError
 from hexapod_comp.formats.csv import read_lengths, read_poses
 from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
+from hexapod_comp.machine.model import MachineModel, ModelOrigin, MotionState, RealMachine
 from hexapod_comp.machine.model_file import load_model, model_text
-from hexapod_comp.machine.motion import MotionState
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.pose import Pose
 

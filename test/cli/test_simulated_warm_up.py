@@ -17,9 +17,9 @@ from hexapod_comp import cli
 from hexapod_comp.errors import InputFileError, ModelError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.machine.late import PARTS
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.machine.temperatures import PARTS
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import KINDS
 from hexapod_comp.measurements.tidy_csv import read_tidy

@@ -18,10 +18,9 @@ from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.compensation.thermal import DEFAULT_TIME_CONSTANT, Plausibility, TemperatureFilter, Thermometers
 from hexapod_comp.errors import ModelError
 from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.machine.late import LateGrowth
 from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.struts import StrutErrors
-from hexapod_comp.machine.temperatures import Temperatures
+from hexapod_comp.machine.temperatures import LateGrowth, Temperatures
 
 ROUNDING = 1e-10
 """°C."""

@@ -32,9 +32,8 @@ from hexapod_comp.export.table import (
 from hexapod_comp.export.worth import ExportTrial, diagonal_passes
 from hexapod_comp.machine.field import GridField, no_field
 from hexapod_comp.machine.geometry import HexapodGeometry
-from hexapod_comp.machine.model import MachineModel, RealMachine, commanded_box
+from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine, commanded_box
 from hexapod_comp.machine.model_file import load_model
-from hexapod_comp.machine.motion import MotionState
 from hexapod_comp.machine.passes import Passes
 from hexapod_comp.machine.region import Region
 from hexapod_comp.machine.struts import StrutErrors

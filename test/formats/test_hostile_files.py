@@ -32,7 +32,7 @@ from hexapod_comp.measurements.campaign import load_campaign
 from hexapod_comp.measurements.files import read_measurements
 from hexapod_comp.measurements.wide_csv import load_columns
 from hexapod_comp.virtual.warm_up import load_warm_up
-from hexapod_comp.workspace.sources import load_budget
+from hexapod_comp.workspace.budget import load_budget
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 PAPER = load_geometry("paper")

@@ -24,7 +24,7 @@ from hexapod_comp.machine.model import MachineModel, ModelOrigin
 from hexapod_comp.machine.model_file import load_model, save_model
 from hexapod_comp.machine.region import Region
 from hexapod_comp.measurements.campaign import load_campaign
-from hexapod_comp.workspace.sources import load_budget
+from hexapod_comp.workspace.budget import load_budget
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 PAPER = paper_geometry()

@@ -25,9 +25,8 @@ from scipy.ndimage import distance_transform_edt
 
 from hexapod_comp import cli
 from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
+from hexapod_comp.machine.model import MachineModel, ModelOrigin, MotionState, RealMachine
 from hexapod_comp.machine.model_file import save_model
-from hexapod_comp.machine.motion import MotionState
 
 pytestmark = [pytest.mark.skipif(bool(why_not()), reason=f"LinuxCNC: {why_not()}"), pytest.mark.timeout(600)]
 

@@ -28,11 +28,11 @@ from scipy.stats import binom
 from hexapod_comp import cli
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
+from hexapod_comp.machine.arrays import Size
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
 from hexapod_comp.machine.model_file import load_model, save_model
 from hexapod_comp.machine.passes import Passes
-from hexapod_comp.machine.size import Size
 from hexapod_comp.machine.trajectory import move
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros.messages import message_pose

@@ -20,7 +20,7 @@ from hexapod_comp.formats.json import plain
 from hexapod_comp.loop import run as loop
 from hexapod_comp.loop.records import Answering, PathRecord, PoseRecord, SessionResult, Track
 from hexapod_comp.loop.report import ALIGNED, AS_IT_IS, ErrorRow, busy_text, error_rows, error_table, pose_block
-from hexapod_comp.machine.size import rms
+from hexapod_comp.machine.arrays import rms
 from hexapod_comp.machine.trajectory import circle
 from hexapod_comp.pose import Pose, rotation_from_angles
 

@@ -27,7 +27,7 @@ from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.pose import Pose, rotation_from_angles
 from hexapod_comp.virtual.named import find_model
-from hexapod_comp.workspace.box import machine_box
+from hexapod_comp.workspace.reach import machine_box
 
 RATE = 250.0
 

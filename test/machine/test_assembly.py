@@ -19,11 +19,12 @@ from hexapod_comp.errors import KinematicsError, NotFiniteError, OtherAssemblyMo
 from hexapod_comp.machine.assembly import (
     _sought_poses,
     assembly_modes,
+    joint_circles,
     mode_objections,
     platform_pair_gap,
+    start_angles,
     working_mode,
 )
-from hexapod_comp.machine.elimination import joint_circles, start_angles
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import Structure
 from hexapod_comp.pose import Pose

@@ -10,9 +10,8 @@ import yaml
 
 from hexapod_comp.calibration.evaluation import worth
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
-from hexapod_comp.machine.model import MachineModel, RealMachine
+from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine
 from hexapod_comp.machine.model_file import load_model
-from hexapod_comp.machine.motion import MotionState
 from hexapod_comp.pose import Pose
 
 ROOT = Path(__file__).parents[2]

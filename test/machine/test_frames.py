@@ -13,8 +13,7 @@ import yaml
 from foreign_machines import with_frames
 
 from hexapod_comp.errors import FrameError, InputFileError
-from hexapod_comp.machine.frames import MOST
-from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
+from hexapod_comp.machine.geometry import MOST, HexapodGeometry, load_geometry
 from hexapod_comp.pose import Pose
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "config" / "example_6_6.yaml"

@@ -11,11 +11,10 @@ from scipy.integrate import solve_ivp
 
 from hexapod_comp.errors import InputFileError, KinematicsError, ModelError
 from hexapod_comp.machine.kinematics import Structure, strut_lengths_batch
-from hexapod_comp.machine.late import PARTS, LateGrowth, late
 from hexapod_comp.machine.model import MachineModel, MachinesByTemperature, ModelOrigin, RealMachine
 from hexapod_comp.machine.model_file import load_model, save_model
 from hexapod_comp.machine.struts import StrutErrors
-from hexapod_comp.machine.temperatures import Temperatures
+from hexapod_comp.machine.temperatures import PARTS, LateGrowth, Temperatures, late
 from hexapod_comp.pose import Pose
 from hexapod_comp.virtual.trial import drive
 

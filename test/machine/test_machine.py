@@ -25,8 +25,7 @@ from hexapod_comp.core.single import follow_nine
 from hexapod_comp.errors import ModelError, NotConvergedError, NotFiniteError, UnreachableError
 from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.kinematics import Structure, solve_pose
-from hexapod_comp.machine.model import MachineModel, RealMachine
-from hexapod_comp.machine.motion import MotionState
+from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.temperatures import Temperatures
 from hexapod_comp.pose import Pose

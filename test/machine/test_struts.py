@@ -15,8 +15,7 @@ from strategies import fixed, paper_geometry, random_pose, random_struts, seeds,
 from hexapod_comp.core.batch import screw_twists, strut_commands
 from hexapod_comp.core.single import actual_length
 from hexapod_comp.errors import ModelError
-from hexapod_comp.machine.model import MachineModel, RealMachine
-from hexapod_comp.machine.motion import MotionState
+from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine
 from hexapod_comp.machine.struts import STEEPEST_ERROR, StrutErrors
 from hexapod_comp.machine.temperatures import Temperatures
 from hexapod_comp.pose import Pose

@@ -17,9 +17,8 @@ from hexapod_comp.errors import GeometryError, InputFileError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.measurements.campaign import load_campaign
 from hexapod_comp.pose import Pose
-from hexapod_comp.workspace.box import FACES, ROOM, _largest_cells, largest_box, machine_box
 from hexapod_comp.workspace.overview import overview
-from hexapod_comp.workspace.reach import FINDINGS, reach
+from hexapod_comp.workspace.reach import FACES, FINDINGS, ROOM, _largest_cells, largest_box, machine_box, reach
 
 ROOT = Path(__file__).resolve().parents[2]
 

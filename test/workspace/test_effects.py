@@ -15,9 +15,18 @@ from hexapod_comp.machine import kinematics
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import Structure, solve_pose, strut_lengths
 from hexapod_comp.pose import Pose
-from hexapod_comp.workspace.effects import EXACT, ITERATION, LINEAR, effect_vectors, effects, extremes, merged
-from hexapod_comp.workspace.sources import BASE_JOINT, LENGTH, PLATFORM_JOINT, TOOL, Budget, SingleErrors
-from hexapod_comp.workspace.tangential import STEP, tangential_effects
+from hexapod_comp.workspace.budget import BASE_JOINT, LENGTH, PLATFORM_JOINT, TOOL, Budget, SingleErrors
+from hexapod_comp.workspace.effects import (
+    EXACT,
+    ITERATION,
+    LINEAR,
+    STEP,
+    effect_vectors,
+    effects,
+    extremes,
+    merged,
+    tangential_effects,
+)
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 

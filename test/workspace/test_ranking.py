@@ -16,7 +16,8 @@ from hexapod_comp.calibration.sensitivity import Prediction, derivatives
 from hexapod_comp.errors import CalibrationError, KinematicsError, ModelError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.pose import Pose
-from hexapod_comp.workspace.combining import (
+from hexapod_comp.workspace.budget import Budget, SingleErrors
+from hexapod_comp.workspace.combined import (
     DISPLACEMENT,
     NORMAL,
     ROTATION,
@@ -30,7 +31,6 @@ from hexapod_comp.workspace.combining import (
 )
 from hexapod_comp.workspace.effects import LINEAR, Extremes, effect_vectors, extremes
 from hexapod_comp.workspace.ranking import PAPER_TABLE, beside, paper_row, ranked, ranking_rows, ranking_text
-from hexapod_comp.workspace.sources import Budget, SingleErrors
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 

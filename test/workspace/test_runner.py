@@ -13,11 +13,11 @@ from strategies import PAPER_FILE
 from hexapod_comp.errors import HexapodError, KinematicsError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
-from hexapod_comp.workspace import runner
+from hexapod_comp.workspace import study as runner
+from hexapod_comp.workspace.budget import SingleErrors, load_budget
 from hexapod_comp.workspace.effects import EXACT, LINEAR, Extremes, extremes
 from hexapod_comp.workspace.reach import Reach, orientations, reach
-from hexapod_comp.workspace.runner import survey
-from hexapod_comp.workspace.sources import SingleErrors, load_budget
+from hexapod_comp.workspace.study import survey
 
 PART = 17
 """Poses per part in these tests: each orientation has some parts, and a last one that is not full."""

@@ -13,8 +13,7 @@ from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.kinematics import Structure, solve_pose, strut_lengths
 from hexapod_comp.pose import Pose
-from hexapod_comp.workspace.effects import effects
-from hexapod_comp.workspace.sources import (
+from hexapod_comp.workspace.budget import (
     BASE_JOINT,
     LENGTH,
     PLATFORM_JOINT,
@@ -24,6 +23,7 @@ from hexapod_comp.workspace.sources import (
     SingleErrors,
     load_budget,
 )
+from hexapod_comp.workspace.effects import effects
 
 HEAD = "format: hexapod_comp/error_budget\nversion: 1\nmachine: positioning_unit\n"
 

@@ -1,6 +1,6 @@
 """Growth of struts, base and platform: by heat, at once or late, and by the air's humidity.
 
-Parts grow by what their thermometers read above 20 °C; :mod:`hexapod_comp.machine.late` says how late parts follow.
+Parts grow by what their thermometers read above 20 °C; :mod:`hexapod_comp.machine.temperatures` says how late parts follow.
 """
 
 from __future__ import annotations
@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...machine.late import PARTS, LateGrowth, late
-from ...machine.temperatures import REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE
+from ...machine.temperatures import PARTS, REFERENCE_HUMIDITY, REFERENCE_TEMPERATURE, LateGrowth, late
 from ...measurements.readings import Stations
 from ..assumptions import ASSUMED
 from .block import Block, Columns, Draft, Errors, Facts, Linkage, StrutBlock

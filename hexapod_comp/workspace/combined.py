@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 from scipy.stats import binom
 
 from ..errors import CalibrationError, ModelError
-from .sources import SingleErrors
+from .budget import SingleErrors
 
 DISPLACEMENT, ROTATION = 0, 1
 """Columns of every result."""
