@@ -1,6 +1,7 @@
 """Growth of struts, base and platform: by heat, at once or late, and by the air's humidity.
 
-Parts grow by what their thermometers read above 20 °C; :mod:`hexapod_comp.machine.temperatures` says how late parts follow.
+Parts grow by what their thermometers read above 20 °C; :mod:`hexapod_comp.machine.temperatures` says how late parts
+follow.
 """
 
 from __future__ import annotations
