@@ -22,19 +22,7 @@ USAGE_ERROR, INTERRUPTED = 2, 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Arguments after the program's name; those of this process by default.
-
-    Returns
-    -------
-    int
-        Exit code: 0 fine, 1 the verb's own "no", 2 bad input or no room for the output, 130 interrupted, 141 nobody
-        reads the output any more.
-    """
+    """Run the command line."""
     arguments = sys.argv[1:] if argv is None else argv
     return run_with_plain_streams(lambda: _run(arguments)) or 0
 

@@ -36,13 +36,7 @@ OF_THE_MODEL = ("correction", "assembly", "not_converged")
 
 
 def fit_settings(args: argparse.Namespace) -> FitSettings:
-    """Return what the options say about a fit of scheme joint.
-
-    Raises
-    ------
-    ModelError
-        An unknown block.
-    """
+    """Return what the options say about a fit of scheme joint."""
     from ..calibration.parameters import TOLERANCES, FitSettings
 
     given: dict[str, Any] = {}
@@ -185,13 +179,7 @@ def _region(result: _Result, measured: MeasurementSet) -> str:
 
 
 def _details(args: argparse.Namespace) -> Details | None:
-    """Return what the details file says, if there is one.
-
-    Raises
-    ------
-    CalibrationError
-        There is no certificate that it could be for.
-    """
+    """Return what the details file says, if there is one."""
     if args.details is None:
         return None
     from ..calibration.certificate import load_details

@@ -54,28 +54,14 @@ def run(args: argparse.Namespace) -> int:
 
 @dataclass(frozen=True)
 class _Targets:
-    """Tool poses, each with its directions of motion.
+    """Tool poses, each with its directions of motion."""
 
-    Attributes
-    ----------
-    rows : list of Row
-        Where each comes from.
-    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
-        ``pose_tool_in_work``, m.
-    senses : ndarray, shape (N, 9)
-        Of axes and struts.
-    directions : list of str
-        What they are called.
-    along : ndarray, shape (N,), or None
-        Way from the start of a line, m.
-    """
-
-    rows: list[Row]
-    positions: np.ndarray
-    rotations: np.ndarray
-    senses: np.ndarray
-    directions: list[str]
-    along: np.ndarray | None = None
+    rows: list[Row]  # where each comes from
+    positions: np.ndarray  # (N, 3), (N, 3, 3): ``pose_tool_in_work``, m
+    rotations: np.ndarray  # (N, 3), (N, 3, 3)
+    senses: np.ndarray  # (N, 9): of axes and struts
+    directions: list[str]  # what they are called
+    along: np.ndarray | None = None  # (N,), or None: way from the start of a line, m
 
     def where(self, n: int) -> str:
         """Say which pose one is, for messages."""

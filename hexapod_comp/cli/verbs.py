@@ -6,21 +6,11 @@ from typing import NamedTuple
 
 
 class Verb(NamedTuple):
-    """A verb in ``--help``.
+    """A verb in ``--help``."""
 
-    Attributes
-    ----------
-    group : str
-        Under which heading it is listed.
-    summary : str
-        One line.
-    text : str
-        What stands below its options.
-    """
-
-    group: str
-    summary: str
-    text: str
+    group: str  # under which heading it is listed
+    summary: str  # one line
+    text: str  # what stands below its options
 
 
 DESCRIPTION = """Error compensation for hexapod machine tools: tool poses in, compensated strut lengths out.

@@ -78,13 +78,7 @@ class Checked:
 
 
 def checked(args: argparse.Namespace, path: str) -> Checked:
-    """Return a model beside the check readings that the options name.
-
-    Raises
-    ------
-    CommandError
-        It is not known how well the model's parameters are known.
-    """
+    """Return a model beside the check readings that the options name."""
     import numpy as np
 
     from ..calibration.check import verify_model

@@ -94,34 +94,18 @@ def unmarked(cell: str) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """Where a value comes from.
+    """Where a value comes from."""
 
-    Attributes
-    ----------
-    line : int
-        Line in the file, the header being line 1.
-    label : str
-        The row's ``sequence`` or ``name``, or its number.
-    """
-
-    line: int
-    label: str
+    line: int  # line in the file, the header being line 1
+    label: str  # the row's ``sequence`` or ``name``, or its number
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How a CSV file is written, where its header does not show it.
+    """How a CSV file is written, where its header does not show it."""
 
-    Attributes
-    ----------
-    encoding : str
-        One of :data:`ENCODINGS`; empty: detected.
-    above, below : int
-        Rows to skip above the header, empty ones and comments too, and below it: titles, a row of units.
-    """
-
-    encoding: str = ""
-    above: int = 0
+    encoding: str = ""  # one of :data:`ENCODINGS`; empty: detected
+    above: int = 0  # rows to skip above the header, empty ones and comments too, and below it: titles, a row of units
     below: int = 0
 
 
@@ -129,28 +113,7 @@ AS_USUAL = Layout()
 
 
 class Table:
-    """A CSV file with its header understood.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-    layout : Layout
-        How it is written.
-
-    Attributes
-    ----------
-    path : str or Path
-        The file.
-    sha256 : str
-        Of the bytes that were read, hexadecimal.
-    notes : list of str
-        What was odd about it.
-    header : list of str
-        Column names.
-    rows : list of (int, list of str)
-        Line and cells of each row; all as many as the header's.
-    """
+    """A CSV file with its header understood."""
 
     def __init__(self, path: str | Path, layout: Layout = AS_USUAL) -> None:
         self.path = path
@@ -430,15 +393,6 @@ def si_from_text(text: str, number: float, unit: float) -> float:
     """Return a number in SI: where the unit moves the decimal point only, the float that is nearest to the text.
 
     So 203.2 mm is the very 0.2032 of source code, and what was written with all its digits comes back.
-
-    Parameters
-    ----------
-    text : str
-        As it stands in the file.
-    number : float
-        What it is, finite.
-    unit : float
-        Size of its unit in SI.
     """
     digits = SHIFTS.get(unit)
     if digits is None:
@@ -483,20 +437,7 @@ def read_poses(path: str | Path) -> tuple[list[Row], list[Pose]]:
 
 
 def read_pose_arrays(path: str | Path) -> tuple[list[Row], np.ndarray, np.ndarray]:
-    """Read poses as :func:`read_poses` does, for files of many thousand rows.
-
-    Returns
-    -------
-    rows : list of Row
-        Where each pose stands.
-    positions, rotations : ndarray, shape (N, 3), (N, 3, 3)
-        m and rotation matrices.
-
-    Raises
-    ------
-    InputFileError
-        Naming file, line and column.
-    """
+    """Read poses as :func:`read_poses` does, for files of many thousand rows."""
     table = Table(input_file(path, "poses"))
     positions, rotations = table.poses()
     table.refuse_unknown()
@@ -522,18 +463,6 @@ def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
 
     The columns that ``ik --model`` and ``ik --line`` add are known and passed over: ``nominal_L…``, ``correction_L…``,
     ``error_…``, ``direction``, ``along`` and the pose.
-
-    Returns
-    -------
-    rows : list of Row
-        Where each set stands.
-    lengths : ndarray, shape (N, 6)
-        m.
-
-    Raises
-    ------
-    InputFileError
-        Naming file, line and column.
     """
     table = Table(input_file(path, "lengths"))
     lengths = table.numbers(table.required(LENGTH_COLUMNS, "length"))

@@ -25,13 +25,7 @@ def picture_text(text: str, limit: int = 200) -> str:
 
 
 def save(figure: Figure, path: str | Path) -> None:
-    """Write a figure as PNG, making the folder when it is missing.
-
-    Raises
-    ------
-    InputFileError
-        It cannot be written.
-    """
+    """Write a figure as PNG, making the folder when it is missing."""
     make_folder(Path(path).parent)
     with new_file(path, "wb") as stream:
         figure.savefig(stream, dpi=140, format="png")

@@ -39,22 +39,7 @@ KINDS = {stat.S_IFIFO: "FIFO", stat.S_IFCHR: "device", stat.S_IFBLK: "device", s
 
 
 def open_input(path: str | Path, most: int, opener: Opener | None = None) -> io.FileIO:
-    """Open a regular file of at most `most` bytes, or what the caller has opened already, for reading.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file, or one of :data:`OPEN_STREAMS`.
-    most : int
-        Bytes; what grows while it is read, or is a pipe, the reader has to count.
-    opener : callable, optional
-        Such as :func:`~hexapod_comp.formats.paths.confined_opener`.
-
-    Raises
-    ------
-    InputFileError
-        Missing, a folder, not a regular file, unreadable or too large; or refused by the opener.
-    """
+    """Open a regular file of at most `most` bytes, or what the caller has opened already, for reading."""
     try:
         file = open(path, "rb", buffering=0, opener=opener or _open_at_once)  # noqa: SIM115 - the caller closes it
         try:
@@ -97,13 +82,7 @@ def read_bytes(path: str | Path, most: int = MAX_FILE_BYTES, opener: Opener | No
 
 
 def read_text(path: str | Path, opener: Opener | None = None, most: int = MAX_FILE_BYTES) -> str:
-    """Return the text of a UTF-8 file of bounded size, with line feeds.
-
-    Raises
-    ------
-    InputFileError
-        As :func:`open_input`; empty, or not UTF-8.
-    """
+    """Return the text of a UTF-8 file of bounded size, with line feeds."""
     content = read_bytes(path, most, opener)
     try:
         text = content.decode("utf-8-sig", MICRO_ERRORS).replace("\r\n", "\n").replace("\r", "\n")

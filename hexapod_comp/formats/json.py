@@ -20,14 +20,7 @@ from .texts import CODES
 
 
 def json_content(text: str, most: int = MAX_FILE_BYTES) -> Any:
-    """Return what JSON text from outside holds.
-
-    Raises
-    ------
-    ValueError
-        Not JSON, of more than `most` characters (short lists take twenty times their text), too deep, or with NaN or
-        Infinity, for which JSON has no words.
-    """
+    """Return what JSON text from outside holds."""
     if len(text) > most:
         raise ValueError(f"has {len(text)} characters, at most {most} are allowed")
     try:
@@ -47,20 +40,7 @@ def json_text(result: Any, indent: int | None = 1) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Return a result as what JSON has words for; its numbers come back as the very same floats.
-
-    Parameters
-    ----------
-    value : object
-        A dataclass or named tuple becomes an object with its fields as keys, which should end in their units; a
-        :class:`Pose` one in mm and degrees, as in CSV files; an error one with ``reason`` and ``problem``. Arrays,
-        tuples, sets (sorted) become lists, paths and dates text. What is not finite becomes null.
-
-    Raises
-    ------
-    TypeError
-        It holds something else, as a function: a fault of the caller.
-    """
+    """Return a result as what JSON has words for; its numbers come back as the very same floats."""
     if isinstance(value, str | int | None):
         return value
     if isinstance(value, float):

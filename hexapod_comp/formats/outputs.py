@@ -43,14 +43,7 @@ _protected: dict[tuple[int, int], str] = {}
 
 @contextmanager
 def inputs_protected(args: argparse.Namespace) -> Iterator[None]:
-    """Refuse, as long as this context is open, to write what the arguments read; what they name is tried at once.
-
-    Raises
-    ------
-    InputFileError
-        An output is one of the inputs, or another output, or its place cannot take it: better now than after a long
-        calculation.
-    """
+    """Refuse, as long as this context is open, to write what the arguments read; what they name is tried at once."""
     try:
         for name in READ:
             given = getattr(args, name, None)
@@ -93,18 +86,6 @@ def new_file(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
 
     It takes the place of one that is there, with that one's mode and, where this user may give files away, its owner.
     Into what is no regular file, as a pipe or a device, is just written.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file; links are followed.
-    mode : str
-        ``w`` or ``wb``.
-
-    Raises
-    ------
-    InputFileError
-        It is read by this command, protected against writing, or cannot be written.
     """
     refuse_replacing_input(path)
     encoding = None if "b" in mode else "utf-8"
@@ -153,13 +134,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def make_folder(path: str | Path) -> None:
-    """Make a folder that is missing, with those above it.
-
-    Raises
-    ------
-    InputFileError
-        It cannot be made.
-    """
+    """Make a folder that is missing, with those above it."""
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:

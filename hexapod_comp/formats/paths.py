@@ -38,29 +38,7 @@ MOST_LOOKED_AT = 500
 
 
 def config_file(name: str | os.PathLike[str], kind: str = "", beside: bool = False) -> Path:
-    """Find a configuration file: the user's own where `name` is a path to one, else a shipped one.
-
-    Parameters
-    ----------
-    name : str or path
-        Path of a file (``~`` is understood), or the name of a shipped file relative to its folder,
-        with or without ``.yaml``: ``paper``, ``paper.yaml``.
-    kind : str
-        What it should be, for the message where it is missing: ``geometry``, ``model``, … as its line ``format`` says,
-        or one of :data:`SUFFIXES`; any kind by default.
-    beside : bool
-        Whether the message may tell which files lie in its folder.
-
-    Returns
-    -------
-    Path
-        An existing file.
-
-    Raises
-    ------
-    InputFileError
-        There is no such file; the message lists those of its kind.
-    """
+    """Find a configuration file: the user's own where `name` is a path to one, else a shipped one."""
     own = os.path.expanduser(name)
     if os.path.isfile(own):
         return Path(own)
@@ -72,20 +50,7 @@ def config_file(name: str | os.PathLike[str], kind: str = "", beside: bool = Fal
 
 
 def input_file(name: str | os.PathLike[str], kind: str = "") -> Path:
-    """Find what is to be read: anything but a folder at a path, pipes too; else a shipped file.
-
-    Parameters
-    ----------
-    name : str or path
-        As for :func:`config_file`, or ``-`` for standard input.
-    kind : str
-        As for :func:`config_file`.
-
-    Raises
-    ------
-    InputFileError
-        As :func:`config_file`.
-    """
+    """Find what is to be read: anything but a folder at a path, pipes too; else a shipped file."""
     own = os.path.expanduser(name)
     if own == "-":
         return Path("/dev/stdin")
@@ -93,27 +58,7 @@ def input_file(name: str | os.PathLike[str], kind: str = "") -> Path:
 
 
 def confined_file(name: str | os.PathLike[str], folder: Path | None, kind: str = "") -> Path:
-    """Find a configuration file as :func:`config_file` does, but only in one folder or among the shipped ones.
-
-    Parameters
-    ----------
-    name : str or path
-        Path of a file, also relative to `folder`, or the name of a shipped one.
-    folder : Path or None
-        Folder, with all below it, from which files may be read; None: only shipped ones.
-    kind : str
-        As for :func:`config_file`; whoever asks is not told what lies in folders.
-
-    Returns
-    -------
-    Path
-        An existing regular file, without links: what is replaced later cannot lead elsewhere.
-
-    Raises
-    ------
-    InputFileError
-        There is no such file, it is not a regular one, or it lies elsewhere, be it by ``..`` or a link.
-    """
+    """Find a configuration file as :func:`config_file` does, but only in one folder or among the shipped ones."""
     own = os.path.expanduser(os.fspath(name))
     if own and folder is not None and os.path.exists(folder / own):
         own = os.path.join(folder, own)
@@ -129,16 +74,6 @@ def confined_opener(folder: Path | None) -> Callable[[str, int], int]:
 
     Between the look at a name and its opening the file may be replaced, by a pipe or by a link that leads elsewhere. So
     nothing is waited for, and what counts is the open file.
-
-    Parameters
-    ----------
-    folder : Path or None
-        As for :func:`confined_file`.
-
-    Returns
-    -------
-    callable
-        Takes path and flags, returns the descriptor; raises InputFileError.
     """
 
     def opened(path: str, flags: int) -> int:
@@ -203,11 +138,6 @@ def config_folder() -> Path:
     It is sought from this file upwards, so it always belongs to the code that runs: ``config`` beside
     the package in a source tree (also with an editable or symlinked installation), else
     ``share/hexapod_comp/config`` in the prefix into which pip or colcon installed both.
-
-    Raises
-    ------
-    InputFileError
-        The installation has lost its files.
     """
     package = Path(__file__).resolve().parents[1]
     if (package.parent / "package.xml").is_file():

@@ -425,13 +425,7 @@ T = TypeVar("T")
 
 
 def read(schema: Callable[..., T], section: Section, **given: Any) -> T:
-    """Return what a section holds; fields that are `given` are not looked for in it.
-
-    Raises
-    ------
-    InputFileError
-        With file, key, value and what is allowed; also about what the dataclass itself refuses.
-    """
+    """Return what a section holds; fields that are `given` are not looked for in it."""
     keys: dict[str, tuple[Any, Any]] = keys_of(schema)  # type: ignore[arg-type]
     values = {name: kind.read(section, name, default) for name, (kind, default) in keys.items() if name not in given}
     with complaints_about(section.path):

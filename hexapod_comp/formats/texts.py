@@ -82,13 +82,6 @@ class PlainStream:
 
     What is printed may quote files and arguments: names of machines, of runs, labels. When it cannot be written, it
     goes nowhere from then on, so that nothing complains again at the program's end.
-
-    Parameters
-    ----------
-    stream : TextIO or None
-        Where it goes; None: nowhere, as where a program is started without such a stream.
-    needed : bool
-        Whether a text that cannot be written is an error.
     """
 
     def __init__(self, stream: TextIO | None, needed: bool) -> None:
@@ -101,15 +94,7 @@ class PlainStream:
         return getattr(self.terminal, name)
 
     def write(self, text: str) -> int:
-        """Write a text.
-
-        Raises
-        ------
-        BrokenPipeError
-            Nobody reads any more.
-        InputFileError
-            It cannot be written: the disk is full.
-        """
+        """Write a text."""
         try:
             return self.terminal.write(CODES.sub(lambda code: repr(code[0])[1:-1], text))
         except OSError as error:

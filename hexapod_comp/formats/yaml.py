@@ -73,29 +73,7 @@ def read_yaml(path: str | Path, file_format: str, version: int) -> Section:
 
 
 def parse_yaml(text: str, name: str | Path, file_format: str, version: int) -> Section:
-    """Parse YAML with the safe loader and check its `format` and `version` lines.
-
-    Parameters
-    ----------
-    text : str
-        All of it.
-    name : str or Path
-        Where it comes from, for messages.
-    file_format : str
-        Expected value of the key ``format``.
-    version : int
-        Expected value of the key ``version``.
-
-    Returns
-    -------
-    Section
-        The top level, from which ``format`` and ``version`` have been taken.
-
-    Raises
-    ------
-    InputFileError
-        Not YAML, another format or version.
-    """
+    """Parse YAML with the safe loader and check its `format` and `version` lines."""
     content = yaml_content(text, name)
     if not isinstance(content, dict):
         raise InputFileError(name, "", "must hold keys and values at its top level", content)
@@ -110,13 +88,7 @@ def parse_yaml(text: str, name: str | Path, file_format: str, version: int) -> S
 
 
 def yaml_content(text: str, name: str | Path, most_nodes: int = MAX_NODES) -> Any:
-    """Return what YAML holds: plain values, lists and mappings, not too many and not too deep.
-
-    Raises
-    ------
-    InputFileError
-        Not YAML; with references or tags; a key given twice or no text; too large. Names the line.
-    """
+    """Return what YAML holds: plain values, lists and mappings, not too many and not too deep."""
     try:
         _refuse_tricks(text, most_nodes)
         return yaml.load(text, Loader=_StrictLoader)

@@ -45,26 +45,11 @@ LARGEST_INDEX = 1.001
 
 @dataclass(frozen=True, eq=False)
 class Air:
-    """State of the air along a laser's beam, for one reading or for many.
+    """State of the air along a laser's beam, for one reading or for many."""
 
-    Parameters
-    ----------
-    temperature : float or ndarray
-        °C.
-    pressure : float or ndarray
-        As the barometer on the spot shows it, not reduced to sea level, Pa.
-    humidity : float or ndarray
-        Relative, as a fraction 0…1.
-
-    Raises
-    ------
-    ModelError
-        Not finite, outside :data:`AIR_RANGES`, or shapes that do not go together; says which reading.
-    """
-
-    temperature: Values
-    pressure: Values
-    humidity: Values
+    temperature: Values  # °C
+    pressure: Values  # as the barometer on the spot shows it, not reduced to sea level, Pa
+    humidity: Values  # relative, as a fraction 0…1
 
     def __post_init__(self) -> None:
         for name, (low, high, allowed) in AIR_RANGES.items():
@@ -97,25 +82,6 @@ def ciddor_index(air: Air, vacuum_wavelength: float = VACUUM_WAVELENGTH, co2_ppm
     1566 (1996), eqs. 1–5: standard refractivities of dry air and of water vapour, each in proportion to its
     density by the BIPM 1981/91 equation. Gas constant and molar masses cancel. Its own uncertainty is 2 to
     5·10⁻⁸; 0.1 K of air temperature is twice that.
-
-    Parameters
-    ----------
-    air : Air
-        State of the air.
-    vacuum_wavelength : float
-        m.
-    co2_ppm : float
-        CO₂, 10⁻⁶ of the molecules.
-
-    Returns
-    -------
-    ndarray
-        n, in the shape of the air's readings.
-
-    Raises
-    ------
-    ModelError
-        Wavelength or CO₂ outside the equation's range.
     """
     low, high = WAVELENGTH_RANGE
     _check_range("vacuum wavelength", vacuum_wavelength, low, high, f"{low:g}…{high:g} m")
@@ -163,25 +129,6 @@ def correct_displacement(raw: Values, air: Air, assumed_index: Values = 1.0) -> 
 
     It counts by how much the optical path n·L has grown, and divides by the index that it assumes. So
     L = raw·n_assumed/n.
-
-    Parameters
-    ----------
-    raw : float or ndarray
-        Displacement shown, from the run's zero, m: the whole way, not its deviation from the target.
-    air : Air
-        Air when each reading was taken.
-    assumed_index : float or ndarray
-        Index that the instrument divided by: 1 when it counts vacuum wavelengths, its setting otherwise.
-
-    Returns
-    -------
-    ndarray
-        Displacement, m.
-
-    Raises
-    ------
-    ModelError
-        An index that no air has.
     """
     _check_range("assumed index", assumed_index, 1.0, LARGEST_INDEX, f"1…{LARGEST_INDEX:g}")
     return np.asarray(raw) * (assumed_index / ciddor_index(air))

@@ -499,13 +499,7 @@ def campaign_text(campaign: Campaign, remarks: Sequence[str] = ()) -> str:
 
 
 def template(campaign: Campaign, geometry: HexapodGeometry, seed: int = 0, name: str = "campaign") -> MeasurementSet:
-    """Return the readings of a campaign on a nominal machine with values of zero; a seed picks the scattered poses.
-
-    Raises
-    ------
-    InputFileError
-        A pose of the campaign is out of the machine's reach; names the campaign's file.
-    """
+    """Return the readings of a campaign on a nominal machine with values of zero; a seed picks the scattered poses."""
     listed = (reading for run in campaign.runs for reading in run.readings(campaign.cycles))
     readings = [*_lines(campaign), *_diagonals(campaign), *_scattered(campaign, seed), *listed]
     return assemble(geometry, [reading._replace(source=FileLine(name, 0)) for reading in readings])

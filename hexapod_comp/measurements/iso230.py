@@ -38,18 +38,10 @@ SURE_REVERSAL = 3.0
 
 @dataclass(frozen=True, eq=False)
 class OneDirection:
-    """Figures of the approach from one side; m targets.
+    """Figures of the approach from one side; m targets."""
 
-    Attributes
-    ----------
-    mean : ndarray, shape (m,)
-        Mean unidirectional deviation x̄ᵢ, m.
-    standard_deviation : ndarray, shape (m,)
-        Estimator sᵢ of the repeatability, with n − 1, m.
-    """
-
-    mean: np.ndarray
-    standard_deviation: np.ndarray
+    mean: np.ndarray  # (m,): mean unidirectional deviation x̄ᵢ, m
+    standard_deviation: np.ndarray  # (m,): estimator sᵢ of the repeatability, with n − 1, m
 
     @property
     def repeatability_at_targets(self) -> np.ndarray:
@@ -80,15 +72,9 @@ class OneDirection:
 
 @dataclass(frozen=True, eq=False)
 class BothDirections:
-    """Figures that take the approaches from both sides together; m targets.
+    """Figures that take the approaches from both sides together; m targets."""
 
-    Attributes
-    ----------
-    up, down : OneDirection
-        What they are made of.
-    """
-
-    up: OneDirection
+    up: OneDirection  # what they are made of
     down: OneDirection
 
     @property
@@ -142,25 +128,13 @@ class BothDirections:
 
 @dataclass(frozen=True, eq=False)
 class PositioningTest:
-    """A positioning test with its figures, as :func:`evaluate` returns it.
+    """A positioning test with its figures, as :func:`evaluate` returns it."""
 
-    Attributes
-    ----------
-    targets : ndarray, shape (m,)
-        Commanded positions along the line, m.
-    cycles : int
-        n, approaches of each target from each side.
-    up, down : OneDirection or None
-        Figures by direction; None for the one that was not run.
-    notes : tuple of str
-        Where the test departs from the standard's, and what looks wrong: one sentence each.
-    """
-
-    targets: np.ndarray
-    cycles: int
-    up: OneDirection | None
+    targets: np.ndarray  # (m,): commanded positions along the line, m
+    cycles: int  # n, approaches of each target from each side
+    up: OneDirection | None  # figures by direction; None for the one that was not run
     down: OneDirection | None
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # where the test departs from the standard's, and what looks wrong: one sentence each
 
     @property
     def both(self) -> BothDirections | None:
@@ -191,27 +165,7 @@ class PositioningTest:
 
 
 def evaluate(targets: np.ndarray, deviations: np.ndarray, directions: Sequence[str] = DIRECTIONS) -> PositioningTest:
-    """Return the figures of ISO 230-2:2014 for one axis, or one line.
-
-    Parameters
-    ----------
-    targets : array_like, shape (m,)
-        Commanded positions along the line, m.
-    deviations : array_like, shape (len(directions), n, m)
-        Position reached minus target by direction, cycle and target, m; corrected for air and at 20 °C.
-    directions : sequence of str
-        What the first index means: ``("up", "down")``, or one of the two alone for a unidirectional test.
-
-    Returns
-    -------
-    PositioningTest
-
-    Raises
-    ------
-    ModelError
-        What cannot be computed: fewer than two cycles, a missing or not finite reading, a target twice. What
-        merely departs from the standard is in the notes.
-    """
+    """Return the figures of ISO 230-2:2014 for one axis, or one line."""
     names = _checked_directions(directions)
     positions = _checked_targets(targets)
     readings = _checked_deviations(deviations, names, len(positions))

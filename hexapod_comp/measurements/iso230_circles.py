@@ -33,26 +33,15 @@ ROUNDS, SETTLED = 5, 1e-9
 
 @dataclass(frozen=True, eq=False)
 class CircularTest:
-    """A circular test with its figures, as :func:`evaluate_circle` returns it.
+    """A circular test with its figures, as :func:`evaluate_circle` returns it."""
 
-    Attributes
-    ----------
-    radius : float
-        Of the nominal path, m.
-    readings : dict of str to int
-        How many in each sense that was run, by :data:`SENSES`.
-    figures : dict of str to float
-        By the standard's symbols, m: ``G_ccw`` and ``G_cw``, circular deviations; ``G_b``, the bidirectional one;
-        ``F_max_ccw``, ``F_min_ccw`` and so on, radial deviations; ``D``, the mean bidirectional radial deviation.
-        What the test cannot tell is left out.
-    notes : tuple of str
-        Where the test departs from the standard's: one sentence each.
-    """
-
-    radius: float
-    readings: dict[str, int]
+    radius: float  # of the nominal path, m
+    readings: dict[str, int]  # how many in each sense that was run, by :data:`SENSES`
+    # by the standard's symbols, m: ``G_ccw`` and ``G_cw``, circular deviations; ``G_b``, the bidirectional one;
+    # ``F_max_ccw``, ``F_min_ccw`` and so on, radial deviations; ``D``, the mean bidirectional radial deviation. What
+    # the test cannot tell is left out.
     figures: dict[str, float]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # where the test departs from the standard's: one sentence each
 
 
 def evaluate_circle(
@@ -63,24 +52,6 @@ def evaluate_circle(
     G is the least distance of two concentric circles with the whole path between them; for G(b) with both paths. F is
     taken about the centre of the least-squares circle of its own path, D is by how much the radius of the
     least-squares circle of both paths together exceeds the nominal one.
-
-    Parameters
-    ----------
-    radius : float
-        Of the nominal path, m.
-    angles : array_like, shape (n,)
-        Where the readings were taken, from the nominal centre, rad.
-    deviations : array_like, shape (n,)
-        Length that the instrument read less the radius, m; its own centre may stand off the path's.
-    senses : array_like, shape (n,)
-        ``FORWARD`` counter-clockwise, ``BACKWARD`` clockwise.
-    length_known : bool
-        The instrument's length is calibrated; if not, F and D are left out.
-
-    Raises
-    ------
-    ModelError
-        What cannot be computed: too few readings in a sense, too short an arc, a value that is not finite.
     """
     path = _checked(radius, angles, deviations, senses)
     parts = {name: [column[path[2] == sense] for column in path[:2]] for name, sense in SENSES.items()}

@@ -27,17 +27,7 @@ LARGEST_CORRECTION = 0.02
 
 
 def impossible(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) -> Iterator[tuple[int, str]]:
-    """Yield number and reason of each pose that the nominal machine cannot take, or not with the commands given.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        The machine as designed.
-    poses : ndarray, shape (N, 3) and ndarray, shape (N, 3, 3)
-        Commanded ``pose_platform_in_base``, m.
-    commands : ndarray, shape (N, 6)
-        Commanded strut lengths, m; NaN where none are given.
-    """
+    """Yield number and reason of each pose that the nominal machine cannot take, or not with the commands given."""
     lengths = strut_lengths_batch(Structure.of(geometry), *poses)
     for number, (position, rotation, needed, command) in enumerate(zip(*poses, lengths, commands, strict=True)):
         if refusal := geometry.refusal(position, rotation, needed):

@@ -85,95 +85,46 @@ LEAST_TRAVEL = 1e-6
 
 
 class FileLine(NamedTuple):
-    """Where a reading stands.
+    """Where a reading stands."""
 
-    Attributes
-    ----------
-    file : str
-        Name of the file, or of what made the reading.
-    line : int
-        Line in it; 0 when it has none.
-    """
-
-    file: str
-    line: int
+    file: str  # name of the file, or of what made the reading
+    line: int  # line in it; 0 when it has none
 
     def __str__(self) -> str:
         return f"{self.file}: line {self.line}" if self.line else self.file
 
 
 class Reading(NamedTuple):
-    """One reading as an instrument or a file gives it, in SI; the unit in which files become sets.
+    """One reading as an instrument or a file gives it, in SI; the unit in which files become sets."""
 
-    Attributes
-    ----------
-    run : str
-        Readings of one run share the unknown zeros.
-    cycle : int
-        Which of several passes of the run, from 1.
-    direction : int
-        ``FORWARD``, ``BACKWARD``, ``UNKNOWN`` or ``FROM_PREVIOUS``.
-    pose : Pose
-        Commanded ``pose_tool_in_work``.
-    channel : str
-        One of :data:`CHANNELS`.
-    value : float
-        Error read, actual minus commanded, m or rad.
-    uncertainty : float
-        Its standard deviation; NaN when not known.
-    temperatures : tuple of float
-        struts 1–6, base, platform, °C.
-    commands : tuple of float or None
-        Strut readings, m, when the file has them; otherwise the machine was told nominal lengths.
-    source : FileLine
-        For messages.
-    time : float
-        When it was taken, s, on a clock that all readings share; NaN when not known.
-    centre : tuple of float or None
-        From where a length is read: a place in the work frame, m, known to some millimetres; None for others.
-    known_zero : bool
-        A length that is known as a whole, as with a calibrated bar.
-    humidity : float
-        Relative humidity of the air, a fraction; NaN when not known.
-    """
-
-    run: str
-    cycle: int
-    direction: int
-    pose: Pose
-    channel: str
-    value: float
-    uncertainty: float = np.nan
-    temperatures: tuple[float, ...] = (REFERENCE_TEMPERATURE,) * 8
+    run: str  # readings of one run share the unknown zeros
+    cycle: int  # which of several passes of the run, from 1
+    direction: int  # ``FORWARD``, ``BACKWARD``, ``UNKNOWN`` or ``FROM_PREVIOUS``
+    pose: Pose  # commanded ``pose_tool_in_work``
+    channel: str  # one of :data:`CHANNELS`
+    value: float  # error read, actual minus commanded, m or rad
+    uncertainty: float = np.nan  # its standard deviation; NaN when not known
+    temperatures: tuple[float, ...] = (REFERENCE_TEMPERATURE,) * 8  # struts 1–6, base, platform, °C
+    # strut readings, m, when the file has them; otherwise the machine was told nominal lengths
     commands: tuple[float, ...] | None = None
-    source: FileLine = FileLine("", 0)
-    time: float = np.nan
+    source: FileLine = FileLine("", 0)  # for messages
+    time: float = np.nan  # when it was taken, s, on a clock that all readings share; NaN when not known
+    # from where a length is read: a place in the work frame, m, known to some millimetres; None for others
     centre: tuple[float, ...] | None = None
-    known_zero: bool = False
-    humidity: float = np.nan
+    known_zero: bool = False  # a length that is known as a whole, as with a calibrated bar
+    humidity: float = np.nan  # relative humidity of the air, a fraction; NaN when not known
 
 
 @dataclass(frozen=True)
 class Run:
-    """What the readings of one run share.
+    """What the readings of one run share."""
 
-    Attributes
-    ----------
-    name : str
-        As in the file.
-    axis : ndarray, shape (3,)
-        Unit vector of the run's line in ``base``, zero for scattered poses. It points along the first of x,
-        y, z along which the line travels: that is forward.
-    origin : ndarray, shape (3,)
-        First commanded point of the line, m in ``base``.
-    known_zero : bool
-        Its lengths are known as a whole.
-    """
-
-    name: str
+    name: str  # as in the file
+    # (3,): unit vector of the run's line in ``base``, zero for scattered poses. It points along the first of x, y, z
+    # along which the line travels: that is forward.
     axis: np.ndarray
-    origin: np.ndarray
-    known_zero: bool = False
+    origin: np.ndarray  # (3,): first commanded point of the line, m in ``base``
+    known_zero: bool = False  # its lengths are known as a whole
 
     @property
     def is_line(self) -> bool:
@@ -189,31 +140,15 @@ class Run:
 
 @dataclass(frozen=True)
 class Stations:
-    """Where the machine stood: commands and what it felt.
+    """Where the machine stood: commands and what it felt."""
 
-    Attributes
-    ----------
-    positions, rotations : ndarray, shape (M, 3), (M, 3, 3)
-        Commanded ``pose_platform_in_base``, m.
-    commands : ndarray, shape (M, 6)
-        Strut commands, or encoder readings, m.
-    sense : ndarray, shape (M, 9)
-        Directions of motion as in :class:`hexapod_comp.machine.model.MotionState`.
-    temperatures : ndarray, shape (M, 8)
-        Struts 1–6, base, platform, °C.
-    times : ndarray, shape (M,)
-        When these were read, s; NaN where that is not known.
-    humidity : ndarray, shape (M,)
-        Relative humidity of the air, a fraction; NaN where that is not known.
-    """
-
-    positions: np.ndarray
-    rotations: np.ndarray
-    commands: np.ndarray
-    sense: np.ndarray
-    temperatures: np.ndarray
-    times: np.ndarray
-    humidity: np.ndarray
+    positions: np.ndarray  # (M, 3): commanded ``pose_platform_in_base``, m
+    rotations: np.ndarray  # (M, 3, 3)
+    commands: np.ndarray  # (M, 6): strut commands, or encoder readings, m
+    sense: np.ndarray  # (M, 9): directions of motion as in :class:`hexapod_comp.machine.model.MotionState`
+    temperatures: np.ndarray  # (M, 8): struts 1–6, base, platform, °C
+    times: np.ndarray  # (M,): when these were read, s; NaN where that is not known
+    humidity: np.ndarray  # (M,): relative humidity of the air, a fraction; NaN where that is not known
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -296,15 +231,7 @@ class MeasurementSet:
         return rms(members) if len(members) else 1.0
 
     def misfit(self, noise: Mapping[int, float], times: float) -> str:
-        """Return what is wrong with kinds of reading that are further off, or stated to be, than they may; or nothing.
-
-        Parameters
-        ----------
-        found : mapping of int to float
-            What is left of each kind (its index), standard deviation, m or rad.
-        times : float
-            How many times the stated one it may be.
-        """
+        """Return which kinds of reading are off, or stated to be, by more than they may: so many times their noise."""
         far, coarse = [], []
         for kind, value in noise.items():
             stated, unit = self.stated_of(kind), "µrad" if KINDS[kind] in ANGULAR_KINDS else "µm"
@@ -385,13 +312,7 @@ class MeasurementSet:
 
 
 def refuse_absurd(measurements: MeasurementSet) -> None:
-    """Refuse readings, and uncertainties of readings, that no machine's error can have.
-
-    Raises
-    ------
-    CalibrationError
-        One is beyond :data:`LARGEST_READING`, or no number; names its place.
-    """
+    """Refuse readings, and uncertainties of readings, that no machine's error can have."""
     for name, values in (("value", measurements.value), ("uncertainty", measurements.stated)):
         absurd = np.flatnonzero(~(np.abs(values) <= LARGEST_READING))
         if len(absurd):
@@ -402,20 +323,7 @@ def refuse_absurd(measurements: MeasurementSet) -> None:
 
 
 def refuse_unmoved(measurements: MeasurementSet, left: np.ndarray) -> None:
-    """Refuse a kind of reading that shows nothing: an instrument without any noise would have infinite weight.
-
-    Parameters
-    ----------
-    measurements : MeasurementSet
-        The readings.
-    left : ndarray, shape (N,)
-        What the nominal machine and the instruments' unknown zeros leave of them, m or rad.
-
-    Raises
-    ------
-    CalibrationError
-        Of a kind nothing is left, to :data:`LEAST_NOISE`.
-    """
+    """Refuse a kind of reading that shows nothing: an instrument without any noise would have infinite weight."""
     for k in np.unique(measurements.kind):
         members = measurements.kind == k
         if np.abs(left[members]).max() <= LEAST_NOISE:
@@ -431,11 +339,5 @@ def spans(points: np.ndarray) -> bool:
 
 
 def attitude_error(actual: np.ndarray, commanded: np.ndarray) -> np.ndarray:
-    """Return the rotation vector(s) that turn commanded into actual rotations, rad in their common frame.
-
-    Parameters
-    ----------
-    actual, commanded : ndarray, shape (..., 3, 3)
-        Rotation matrices.
-    """
+    """Return the rotation vector(s) that turn commanded into actual rotations, rad in their common frame."""
     return Rotation.from_matrix(actual @ np.swapaxes(commanded, -1, -2)).as_rotvec()

@@ -72,24 +72,7 @@ def assemble(
     notes: Iterable[str] = (),
     in_reach: bool = True,
 ) -> MeasurementSet:
-    """Return the set of some readings: runs recognised as lines, stations made unique, reach checked.
-
-    Parameters
-    ----------
-    geometry, readings : HexapodGeometry, sequence of Reading
-        The machine as designed; readings in the order in which they were taken, as far as ``FROM_PREVIOUS`` needs it.
-    probe : array_like, shape (3,), optional
-        Measured point in ``platform``, m; the tool's tip by default.
-    files, notes : iterable of (str, str), iterable of str
-        Name and SHA-256 of each file, and remarks so far.
-    in_reach : bool
-        Refuse commands that the nominal machine cannot take; the figures of a standard do not need that.
-
-    Raises
-    ------
-    InputFileError
-        No readings, an unknown channel, values not finite, poses out of reach, line channels without a line.
-    """
+    """Return the set of some readings: runs recognised as lines, stations made unique, reach checked."""
     probe = np.array(geometry.tool.position if probe is None else probe, dtype=float)
     _check_channels(readings)
     arrays = _Arrays(
@@ -166,13 +149,7 @@ def _platform_poses(geometry: HexapodGeometry, readings: Sequence[Reading]) -> t
 
 
 def _centres(geometry: HexapodGeometry, readings: Sequence[Reading], points: np.ndarray) -> np.ndarray:
-    """Return from where lengths are read, (N, 3), m in ``base``, NaN for others; `points` are the measured ones.
-
-    Raises
-    ------
-    InputFileError
-        A length without a centre, or at it; a centre of something else; a run whose zero is known and unknown.
-    """
+    """Return from where lengths are read, (N, 3), m in ``base``, NaN for others; `points` are the measured ones."""
     centres = np.full((len(readings), 3), np.nan)
     known: dict[str, bool] = {}
     for n, r in enumerate(readings):
@@ -231,12 +208,6 @@ def _recognise(readings: list[Reading], arrays: _Arrays, points: np.ndarray, wor
     """Return a run from its readings and their commanded points (n, 3), with its line if it has line channels.
 
     Which way along the line is forward is a matter of the work frame, whose axes are the rows of `work_axes`.
-
-    Raises
-    ------
-    InputFileError
-        Line channels whose commanded points do not lie on a line, or at one place only; channels of lines and others
-        mixed.
     """
     first, name = readings[0], readings[0].run
     of_line = OF_LINES[arrays.channel]
@@ -354,13 +325,7 @@ def _way(arrays: _Arrays, along: np.ndarray, direction: int) -> float:
 
 
 def joined(sets: Sequence[MeasurementSet]) -> MeasurementSet:
-    """Return several sets of one machine as one; runs of equal names stay apart.
-
-    Raises
-    ------
-    InputFileError
-        Sets of different measured points, or a file twice.
-    """
+    """Return several sets of one machine as one; runs of equal names stay apart."""
     first = sets[0]
     hashes = [sha for s in sets for _, sha in s.files]
     for s in sets:

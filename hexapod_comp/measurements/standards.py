@@ -48,43 +48,21 @@ CIRCLE_COLUMNS = {
 
 @dataclass(frozen=True)
 class LinearRun:
-    """A linear run as ISO 230-2 and 230-6 want it.
+    """A linear run as ISO 230-2 and 230-6 want it."""
 
-    Attributes
-    ----------
-    name : str
-        Of the run.
-    axes : tuple of int
-        Along which axes of the work frame it travels: one, or more for a diagonal.
-    targets : ndarray, shape (m,)
-        Commanded coordinates along the line, rising, m.
-    deviations : ndarray, shape (2, cycles, m)
-        Readings, forward and backward, m.
-    """
-
-    name: str
-    axes: tuple[int, ...]
-    targets: np.ndarray
-    deviations: np.ndarray
+    name: str  # of the run
+    axes: tuple[int, ...]  # along which axes of the work frame it travels: one, or more for a diagonal
+    targets: np.ndarray  # (m,): commanded coordinates along the line, rising, m
+    deviations: np.ndarray  # (2, cycles, m): readings, forward and backward, m
 
 
 @dataclass(frozen=True)
 class Judged:
-    """Figures of all runs that a standard judges, by the runs' names.
+    """Figures of all runs that a standard judges, by the runs' names."""
 
-    Attributes
-    ----------
-    axes : dict of str to PositioningTest
-        Lines along an axis: ISO 230-2.
-    diagonals : dict of str to dict of str to PositioningTest
-        ``body`` and ``face`` diagonals: ISO 230-6.
-    circles : dict of str to CircularTest
-        ISO 230-4.
-    """
-
-    axes: dict[str, PositioningTest]
-    diagonals: dict[str, dict[str, PositioningTest]]
-    circles: dict[str, CircularTest]
+    axes: dict[str, PositioningTest]  # lines along an axis: ISO 230-2
+    diagonals: dict[str, dict[str, PositioningTest]]  # ``body`` and ``face`` diagonals: ISO 230-6
+    circles: dict[str, CircularTest]  # ISO 230-4
 
     def __bool__(self) -> bool:
         return bool(self.axes or self.diagonals or self.circles)

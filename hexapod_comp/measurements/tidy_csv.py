@@ -98,24 +98,7 @@ def read_tidy(
     probe: np.ndarray | None = None,
     in_reach: bool = True,
 ) -> MeasurementSet:
-    """Read tidy CSV files (described above) as one set.
-
-    Parameters
-    ----------
-    paths : path or sequence of paths
-        Files.
-    geometry : HexapodGeometry
-        The machine that was measured.
-    probe : array_like, shape (3,), optional
-        The measured point in ``platform``, m; the tool's tip by default.
-    in_reach : bool
-        Refuse commands that the nominal machine cannot take; the figures of a standard do not need that.
-
-    Raises
-    ------
-    InputFileError
-        Naming file, line, column, value and what is allowed.
-    """
+    """Read tidy CSV files (described above) as one set."""
     paths = [paths] if isinstance(paths, str | Path) else list(paths)
     readings: list[Reading] = []
     files: list[tuple[str, str]] = []

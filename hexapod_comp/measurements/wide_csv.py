@@ -90,109 +90,53 @@ ZEROS = ("home", "given", "measured")
 
 @dataclass(frozen=True)
 class UncertaintyColumns:
-    """Where uncertainties stand.
+    """Where uncertainties stand."""
 
-    Attributes
-    ----------
-    columns : tuple of str
-        One for all axes, or three.
-    unit : float
-        Size of their unit in SI, divided by the coverage factor: what makes standard deviations of them.
-    """
-
-    columns: tuple[str, ...]
-    unit: float
+    columns: tuple[str, ...]  # one for all axes, or three
+    unit: float  # size of their unit in SI, divided by the coverage factor: what makes standard deviations of them
 
 
 @dataclass(frozen=True)
 class PoseColumns:
-    """Where a pose stands.
+    """Where a pose stands."""
 
-    Attributes
-    ----------
-    position : tuple of str
-        Columns of x, y, z.
-    unit : float
-        Size of their unit, m.
-    offset : ndarray, shape (3,)
-        Added to the position, m.
-    turn : tuple of str
-        Columns of a quaternion (x, y, z, w) or of the paper's three angles; empty when there are none.
-    angle_unit : float
-        Size of the angles' unit, rad.
-    uncertainty : tuple of float or UncertaintyColumns
-        Standard deviations of position (m) and attitude (rad), NaN when not known; or where each row's stand.
-    """
-
-    position: tuple[str, ...]
-    unit: float
-    offset: np.ndarray
+    position: tuple[str, ...]  # columns of x, y, z
+    unit: float  # size of their unit, m
+    offset: np.ndarray  # (3,): added to the position, m
+    # columns of a quaternion (x, y, z, w) or of the paper's three angles; empty when there are none
     turn: tuple[str, ...]
-    angle_unit: float
+    angle_unit: float  # size of the angles' unit, rad
+    # standard deviations of position (m) and attitude (rad), NaN when not known; or where each row's stand
     uncertainty: tuple[float | UncertaintyColumns, float | UncertaintyColumns]
 
 
 @dataclass(frozen=True)
 class PoseFile:
-    """Commanded poses in a file of their own.
+    """Commanded poses in a file of their own."""
 
-    Attributes
-    ----------
-    path : Path
-        Beside the columns file.
-    name : str
-        Column of the measured file that names the pose; empty: row by row.
-    """
-
-    path: Path
-    name: str
+    path: Path  # beside the columns file
+    name: str  # column of the measured file that names the pose; empty: row by row
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Where temperatures, humidity and time of each row stand.
+    """Where temperatures, humidity and time of each row stand."""
 
-    Attributes
-    ----------
-    temperatures : dict of str to str
-        Columns by part; ``everywhere`` for all that have none.
-    humidity : (str, float) or None
-        Column, and the size of its unit.
-    times : tuple of str
-        Columns, joined by a space where there are several; empty when there are none.
-    time_format : str
-        As ``strptime`` has it; empty: numbers.
-    time_unit : float
-        Size of the numbers' unit, s.
-    """
-
-    temperatures: dict[str, str]
-    humidity: tuple[str, float] | None
-    times: tuple[str, ...]
-    time_format: str
-    time_unit: float
+    temperatures: dict[str, str]  # columns by part; ``everywhere`` for all that have none
+    humidity: tuple[str, float] | None  # column, and the size of its unit
+    times: tuple[str, ...]  # columns, joined by a space where there are several; empty when there are none
+    time_format: str  # as ``strptime`` has it; empty: numbers
+    time_unit: float  # size of the numbers' unit, s
 
 
 @dataclass(frozen=True)
 class StrutColumns:
-    """Where strut readings stand.
+    """Where strut readings stand."""
 
-    Attributes
-    ----------
-    readings : tuple of str
-        Six columns.
-    length_per_unit : ndarray, shape (6,)
-        m per unit of the reading.
-    zero : str
-        One of :data:`ZEROS`.
-    zero_length : ndarray, shape (6,)
-        Lengths at reading zero, m, when given.
-    """
-
-    readings: tuple[str, ...]
-    length_per_unit: np.ndarray
-    zero: str
-    zero_length: np.ndarray
+    readings: tuple[str, ...]  # six columns
+    length_per_unit: np.ndarray  # (6,): m per unit of the reading
+    zero: str  # one of :data:`ZEROS`
+    zero_length: np.ndarray  # (6,): lengths at reading zero, m, when given
 
 
 @dataclass(frozen=True)
@@ -209,13 +153,7 @@ class Columns:
 
 
 def load_columns(path: str | Path) -> Columns:
-    """Read a columns file.
-
-    Raises
-    ------
-    InputFileError
-        With file, key and value.
-    """
+    """Read a columns file."""
     top = read_yaml(path, COLUMNS_FORMAT, COLUMNS_VERSION)
     columns = Columns(
         layout=_layout(top),
@@ -358,29 +296,7 @@ class _Poses:
 def read_wide(
     path: str | Path, columns_path: str | Path, geometry: HexapodGeometry, in_reach: bool = True
 ) -> MeasurementSet:
-    """Read a wide CSV file as one run of absolute positions and, where there are any, attitudes.
-
-    Parameters
-    ----------
-    path : path
-        The CSV file, one pose a row.
-    columns_path : path
-        The columns file that explains it.
-    geometry : HexapodGeometry
-        The machine that was measured; the measured point is its tool's tip.
-    in_reach : bool
-        Refuse commands that the nominal machine cannot take; the figures of a standard do not need that.
-
-    Returns
-    -------
-    MeasurementSet
-        Its notes name the columns that were not used.
-
-    Raises
-    ------
-    InputFileError
-        Naming file, line and column.
-    """
+    """Read a wide CSV file as one run of absolute positions and, where there are any, attitudes."""
     columns = load_columns(columns_path)
     table = Table(path, columns.layout)
     used: set[str] = set()

@@ -25,11 +25,6 @@ def write_measurements(measurements: MeasurementSet, path: str | Path) -> None:
     Commanded poses are written to 10⁻¹³ m and 10⁻¹² degrees; values that are not a number are left empty, to be filled
     in. The measured point is not a column: where it is not the tool's tip, a comment in the file says where it is, and
     it has to be given again for reading.
-
-    Raises
-    ------
-    InputFileError
-        The file cannot be written.
     """
     comment = ""
     if not np.array_equal(measurements.probe, measurements.geometry.tool.position):

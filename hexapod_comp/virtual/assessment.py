@@ -24,30 +24,20 @@ from .trial import drive, model_commands
 
 @dataclass(frozen=True)
 class Assessment:
-    """Ideal and real machine at P poses, for M machines; SI units.
+    """Ideal and real machine at P poses, for M machines; SI units."""
 
-    Attributes
-    ----------
-    seeds : tuple of int
-        The machines' seeds.
-    ideal_lengths : ndarray, shape (P, 6)
-        Strut lengths of the nominal machine (Song et al., Table 2); where screws turn with the joints, its commands.
-    real_lengths : ndarray, shape (M, P, 6)
-        Strut commands that bring each real machine exactly to the poses (Song et al., Table 4).
-    taken_positions, taken_rotations : ndarray, shape (M, P, 3), (M, P, 3, 3)
-        ``pose_tool_in_work`` that each real machine takes when told the ideal lengths.
-    pose_errors : ndarray, shape (M, P, 6)
-        The same as displacement, m, and rotation vector, rad, along the work frame's axes.
-    round_trip : ndarray, shape (M, P, 2)
-        Distance, m, and angle, rad, between the pose and the one found from `real_lengths`.
-    """
-
-    seeds: tuple[int, ...]
+    seeds: tuple[int, ...]  # the machines' seeds
+    # (P, 6): strut lengths of the nominal machine (Song et al., Table 2); where screws turn with the joints, its
+    # commands
     ideal_lengths: np.ndarray
+    # (M, P, 6): strut commands that bring each real machine exactly to the poses (Song et al., Table 4)
     real_lengths: np.ndarray
+    # (M, P, 3), (M, P, 3, 3): ``pose_tool_in_work`` that each real machine takes when told the ideal lengths
     taken_positions: np.ndarray
-    taken_rotations: np.ndarray
+    taken_rotations: np.ndarray  # (M, P, 3), (M, P, 3, 3)
+    # (M, P, 6): the same as displacement, m, and rotation vector, rad, along the work frame's axes
     pose_errors: np.ndarray
+    # (M, P, 2): distance, m, and angle, rad, between the pose and the one found from `real_lengths`
     round_trip: np.ndarray
 
     @property
@@ -56,14 +46,7 @@ class Assessment:
         return self.real_lengths - self.ideal_lengths
 
     def statistics(self, percentiles: Sequence[float] = (50.0, 95.0, 100.0)) -> dict[str, np.ndarray]:
-        """Return percentiles over the machines, pose by pose, each of shape (P, len(percentiles)).
-
-        Returns
-        -------
-        dict
-            ``strut_change``: largest magnitude of the six, m; ``displacement``, m, and ``rotation``, rad, of
-            the tool under ideal commands.
-        """
+        """Return percentiles over the machines, pose by pose, each of shape (P, len(percentiles))."""
         quantities = {
             "strut_change": np.abs(self.strut_changes).max(axis=2),
             "displacement": np.linalg.norm(self.pose_errors[..., :3], axis=2),
@@ -81,32 +64,7 @@ def assess(
     names: Sequence[str] | None = None,
     progress: Callable[[int], object] = lambda machines: None,
 ) -> Assessment:
-    """Draw machines and run each of them both ways at all poses.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        The nominal machine.
-    poses : sequence of Pose
-        ``pose_tool_in_work``.
-    bounds : ImperfectionBounds
-        What is drawn. Directions of motion are taken as unknown: backlash has no effect here.
-    seed : int
-        Of the first machine; the others follow one by one.
-    machines : int
-        How many.
-    names : sequence of str, optional
-        What the poses are called in errors.
-    progress : callable, optional
-        Called with the number of machines just done.
-
-    Raises
-    ------
-    KinematicsError
-        A pose that a machine cannot take; says which.
-    ModelError
-        Seed or bounds that are none.
-    """
+    """Draw machines and run each of them both ways at all poses."""
     names = names or [f"pose {n + 1}" for n in range(len(poses))]
     tool = np.array([pose.position for pose in poses]), np.array([pose.rotation for pose in poses])
     passes = Passes.of_tool(geometry, *tool, np.zeros_like(tool[0]))

@@ -31,47 +31,22 @@ LONGEST_DELAY = 10.0
 
 @dataclass(frozen=True)
 class DriveParameters:
-    """What the six drives and the instruments are able to do.
+    """What the six drives and the instruments are able to do."""
 
-    Parameters
-    ----------
-    step : float
-        Length of one motor step, m; 0 for none.
-    max_speed : float or None
-        Largest motor speed, m/s; None: the geometry's limit; ``inf`` for none.
-    max_acceleration : float
-        Largest motor acceleration, m/s²; ``inf`` for none.
-    lag : float
-        Distance behind a steadily moving command, per speed, s. Holds up to a speed of
-        max_acceleration·lag/2; faster, the drive keeps the distance in which it can stop. A command
-        that comes in steps of a period T lags T/2 more on average. On a circle of radius r the tool runs
-        (lag·speed)²/4r inside it. 0 is a drive without dynamics, which is on its command at once; speed
-        and acceleration must then be ``inf``.
-    stops : ndarray, shape (6, 2), or None
-        Lengths at which the motors are stopped, m; None: the geometry's stroke.
-    encoder_resolution : float
-        Length of one encoder count, m; 0 for none.
-    encoder_noise : float
-        Standard deviation of an encoder reading, before it is counted, m.
-    tracker_noise : float
-        Standard deviation of each coordinate of the tracker's tool position, m.
-    initial_lengths : ndarray, shape (6,), or None
-        Motor positions at the start, m; None: those that bring the real machine home.
-
-    Raises
-    ------
-    ModelError
-        With the parameter's name, its value and what is allowed.
-    """
-
-    step: float = 0.1e-6
-    max_speed: float | None = None
-    max_acceleration: float = 10.0
+    step: float = 0.1e-6  # length of one motor step, m; 0 for none
+    max_speed: float | None = None  # largest motor speed, m/s; None: the geometry's limit; ``inf`` for none
+    max_acceleration: float = 10.0  # largest motor acceleration, m/s²; ``inf`` for none
+    # distance behind a steadily moving command, per speed, s. Holds up to a speed of max_acceleration·lag/2; faster,
+    # the drive keeps the distance in which it can stop. A command that comes in steps of a period T lags T/2 more on
+    # average. On a circle of radius r the tool runs (lag·speed)²/4r inside it. 0 is a drive without dynamics, which is
+    # on its command at once; speed and acceleration must then be ``inf``.
     lag: float = 0.005
+    # (6, 2), or None: lengths at which the motors are stopped, m; None: the geometry's stroke
     stops: np.ndarray | None = None
-    encoder_resolution: float = 0.1e-6
-    encoder_noise: float = 0.05e-6
-    tracker_noise: float = 0.0
+    encoder_resolution: float = 0.1e-6  # length of one encoder count, m; 0 for none
+    encoder_noise: float = 0.05e-6  # standard deviation of an encoder reading, before it is counted, m
+    tracker_noise: float = 0.0  # standard deviation of each coordinate of the tracker's tool position, m
+    # (6,), or None: motor positions at the start, m; None: those that bring the real machine home
     initial_lengths: np.ndarray | None = None
 
     def __post_init__(self) -> None:
@@ -114,32 +89,14 @@ class DriveParameters:
 
 @dataclass(frozen=True)
 class Faults:
-    """What goes wrong; struts are counted 0…5.
+    """What goes wrong; struts are counted 0…5."""
 
-    Parameters
-    ----------
-    stuck : int or None
-        Strut whose motor does not move.
-    encoder_lost : int or None
-        Strut whose encoder reads NaN.
-    feedback_delay : float
-        Age of the encoder readings when they arrive, s.
-    feedback_drop : float
-        Share of the readings that never arrive, 0…1.
-    jump : (int, float) or None
-        Strut and distance, m, by which its motor is knocked away, once, when the fault is set. The encoder
-        sees it and the drive pulls the motor back.
-
-    Raises
-    ------
-    ModelError
-        An index, ratio or time that cannot be.
-    """
-
-    stuck: int | None = None
-    encoder_lost: int | None = None
-    feedback_delay: float = 0.0
-    feedback_drop: float = 0.0
+    stuck: int | None = None  # strut whose motor does not move
+    encoder_lost: int | None = None  # strut whose encoder reads NaN
+    feedback_delay: float = 0.0  # age of the encoder readings when they arrive, s
+    feedback_drop: float = 0.0  # share of the readings that never arrive, 0…1
+    # strut and distance, m, by which its motor is knocked away, once, when the fault is set. The encoder sees it and
+    # the drive pulls the motor back.
     jump: tuple[int, float] | None = None
 
     def __post_init__(self) -> None:

@@ -44,63 +44,33 @@ class ImperfectionBounds:
 
     The defaults are Song et al.'s assessment: ±10 µm on every joint coordinate and on every strut, nothing
     else.
-
-    Parameters
-    ----------
-    joint : float
-        Bound of every joint coordinate's deviation, m (±).
-    strut_offset : float
-        Bound of every strut's length offset, m (±).
-    pitch : float
-        Bound of every screw's relative pitch error, m per m (±); zero error at the home length.
-    wave : (float, float)
-        Lowest and highest amplitude of the periodic screw error, m; its phase is drawn too.
-    harmonics : (float, float)
-        The same of the errors that repeat two, three and four times a turn.
-    wave_period : float
-        Period of the error, m: the screw's lead.
-    backlash : (float, float)
-        Lowest and highest lost motion of a strut, m.
-    field_displacement, field_rotation : float
-        Largest displacement (m) and rotation (rad) of each component of a smooth six-component field; the
-        drawn field reaches it somewhere in its box.
-    field_reversal : float
-        Share of the field by which forward and backward may differ, 0…1.
-    field_box : ndarray, shape (2, 3) or None
-        Corners of the field's box, m in ``base``; needed when there is a field.
-    length_map : float
-        Root mean square of every strut's smooth length error, m: waves from a tenth to a third of its stroke,
-        but not below 60 and 200 mm.
-    wear : float
-        By how much the lost motion of a strut is larger, at most, where its screw is worn most, m.
-    strut_expansion, body_expansion : (float, float)
-        Lowest and highest thermal expansion of a strut, and of base and platform, 1/K.
-    shared_platform_joints : bool
-        True: platform joints that coincide nominally are one ball joint and move together. False: each
-        strut has a joint of its own.
-
-    Raises
-    ------
-    ModelError
-        Bounds that are not finite, negative or the wrong way round.
     """
 
-    joint: float = 10e-6
-    strut_offset: float = 10e-6
-    pitch: float = 0.0
+    joint: float = 10e-6  # bound of every joint coordinate's deviation, m (±)
+    strut_offset: float = 10e-6  # bound of every strut's length offset, m (±)
+    pitch: float = 0.0  # bound of every screw's relative pitch error, m per m (±); zero error at the home length
+    # lowest and highest amplitude of the periodic screw error, m; its phase is drawn too
     wave: tuple[float, float] = (0.0, 0.0)
-    wave_period: float = 0.01
-    backlash: tuple[float, float] = (0.0, 0.0)
+    wave_period: float = 0.01  # period of the error, m: the screw's lead
+    backlash: tuple[float, float] = (0.0, 0.0)  # lowest and highest lost motion of a strut, m
+    # largest displacement (m) and rotation (rad) of each component of a smooth six-component field; the drawn field
+    # reaches it somewhere in its box
     field_displacement: float = 0.0
     field_rotation: float = 0.0
-    field_reversal: float = 0.1
+    field_reversal: float = 0.1  # share of the field by which forward and backward may differ, 0…1
+    # (2, 3) or None: corners of the field's box, m in ``base``; needed when there is a field
     field_box: np.ndarray | None = None
+    # root mean square of every strut's smooth length error, m: waves from a tenth to a third of its stroke, but not
+    # below 60 and 200 mm
     length_map: float = 0.0
+    # lowest and highest thermal expansion of a strut, and of base and platform, 1/K
     strut_expansion: tuple[float, float] = (0.0, 0.0)
     body_expansion: tuple[float, float] = (0.0, 0.0)
+    # true: platform joints that coincide nominally are one ball joint and move together. False: each strut has a joint
+    # of its own.
     shared_platform_joints: bool = True
-    harmonics: tuple[float, float] = (0.0, 0.0)
-    wear: float = 0.0
+    harmonics: tuple[float, float] = (0.0, 0.0)  # the same of the errors that repeat two, three and four times a turn
+    wear: float = 0.0  # by how much the lost motion of a strut is larger, at most, where its screw is worn most, m
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -127,28 +97,7 @@ class ImperfectionBounds:
 
 
 def draw_model(geometry: HexapodGeometry, bounds: ImperfectionBounds, seed: int, name: str = "") -> MachineModel:
-    """Draw the hidden truth of one virtual machine.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        The nominal machine.
-    bounds : ImperfectionBounds
-        How imperfect it may be.
-    seed : int
-        Not negative; the same seed gives the same machine.
-    name : str, optional
-        Name of the model; ``virtual-<seed>`` by default.
-
-    Returns
-    -------
-    MachineModel
-
-    Raises
-    ------
-    ModelError
-        A seed that is not one, or draws that cannot describe a machine.
-    """
+    """Draw the hidden truth of one virtual machine."""
     rng = seeded(seed)
     base = bounds.joint * rng.uniform(-1.0, 1.0, (6, 3))
     platform = bounds.joint * rng.uniform(-1.0, 1.0, (6, 3))
@@ -188,21 +137,7 @@ def with_length_map(
     rms: float = 5e-6,
     waves: tuple[float, float] = (0.06, 0.2),
 ) -> MachineModel:
-    """Return a model whose struts have a smooth length error as well: sine waves of random length and phase.
-
-    Parameters
-    ----------
-    model : MachineModel
-        The machine so far; a map and wear that it has are replaced.
-    geometry : HexapodGeometry
-        Tells the struts' stroke.
-    seed : int
-        0 or above.
-    rms : float
-        Root mean square of each strut's error over its stroke, m.
-    waves : (float, float)
-        Shortest and longest wave, m.
-    """
+    """Return a model whose struts have a smooth length error as well: sine waves of random length and phase."""
     rng = seeded(seed, "length map")
     knots = _knots(geometry, waves[0])
     lengths, phases = rng.uniform(*waves, (6, MAP_WAVES)), rng.uniform(0.0, 2.0 * np.pi, (6, MAP_WAVES))
@@ -214,19 +149,7 @@ def with_length_map(
 
 
 def with_wear(model: MachineModel, geometry: HexapodGeometry, seed: int, most: float = 5e-6) -> MachineModel:
-    """Return a model whose screws are worn where they ran most: their lost motion is larger there.
-
-    Parameters
-    ----------
-    model : MachineModel
-        The machine so far; wear that it has is replaced.
-    geometry : HexapodGeometry
-        Tells the struts' stroke.
-    seed : int
-        0 or above.
-    most : float
-        By how much the lost motion is larger in the middle of the worn part, at most, m; at least half of it.
-    """
+    """Return a model whose screws are worn where they ran most: their lost motion is larger there."""
     rng, shortest = seeded(seed, "wear"), geometry.limits.stroke[:, :1]
     stroke = geometry.limits.stroke[:, 1:] - shortest
     struts = model.struts
@@ -247,13 +170,7 @@ def _knots(geometry: HexapodGeometry, shortest: float) -> np.ndarray:
 
 
 def seeded(seed: int, what: str = "") -> np.random.Generator:
-    """Return a generator for a seed; one of its own for each kind of imperfection that is named.
-
-    Raises
-    ------
-    ModelError
-        A seed that is not one.
-    """
+    """Return a generator for a seed; one of its own for each kind of imperfection that is named."""
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise ModelError("seed", "must be a whole number, 0 or above", seed)
     return np.random.default_rng([int(seed), len(what)] if what else int(seed))

@@ -45,24 +45,6 @@ def measure(
     absolute: nothing is subtracted; nor from lengths whose zero is known. Lengths are distances, from centres whose
     body stands beside its place in the file. Each reading states its instrument's noise as its uncertainty, at least
     :data:`~hexapod_comp.measurements.readings.LEAST_NOISE`; an instrument without noise states nothing.
-
-    Parameters
-    ----------
-    template : MeasurementSet
-        Stations with the commands that the machine is given; its values are not used.
-    campaign : Campaign
-        Noise, beam slope and repeatability.
-    truth : RealMachine
-        The real machine; its own temperatures give way to the stations'.
-    seed : int
-        0 or above; the same seed gives the same readings.
-    advance : callable, optional
-        Called with the number of stations done since the last call.
-
-    Raises
-    ------
-    HexapodError
-        The machine cannot take one of the poses; names the reading.
     """
     errors = station_errors(template, truth, advance)[template.station]
     errors[:, :3] += _stopping(template, campaign.repeatability, np.random.default_rng([seed, VISITS]))
@@ -97,20 +79,7 @@ def station_errors(
 
 
 def compensated(template: MeasurementSet, model: MachineModel) -> MeasurementSet:
-    """Return a template whose machine is told what a model's compensation tells it.
-
-    Parameters
-    ----------
-    template : MeasurementSet
-        Stations with nominal commands.
-    model : MachineModel
-        Its own errors are undone at every station, at the station's temperatures and directions of motion.
-
-    Raises
-    ------
-    HexapodError
-        A pose at which the model cannot be undone; names the reading.
-    """
+    """Return a template whose machine is told what a model's compensation tells it."""
     stations = template.stations
     machines = MachinesByTemperature(template.geometry, model).at_each(
         stations.temperatures, stations.times, stations.humidity

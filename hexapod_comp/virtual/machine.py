@@ -34,20 +34,6 @@ class StrutDrive:
     """A machine that moves: commands in, encoder readings and the true pose out.
 
     Time passes only in :meth:`advance`. The same seed and the same calls give the same readings.
-
-    Parameters
-    ----------
-    machine : RealMachine
-        The hidden truth.
-    parameters : DriveParameters, optional
-        Drives and instruments.
-    seed : int
-        Of the noise and of the dropped readings.
-
-    Raises
-    ------
-    ModelError
-        Parameters that do not fit the machine.
     """
 
     def __init__(self, machine: RealMachine, parameters: DriveParameters | None = None, seed: int = 0) -> None:
@@ -127,18 +113,7 @@ class StrutDrive:
         return self._stopped != 0
 
     def set_command(self, lengths: np.ndarray) -> None:
-        """Take six strut commands; lengths beyond a stop are taken, and reported by :attr:`stopped`.
-
-        Parameters
-        ----------
-        lengths : array_like, shape (6,)
-            m.
-
-        Raises
-        ------
-        CommandError
-            Not six finite lengths; the last command stays in force.
-        """
+        """Take six strut commands; lengths beyond a stop are taken, and reported by :attr:`stopped`."""
         lengths = np.asarray(lengths, dtype=float)
         if lengths.shape != (6,):
             raise CommandError("strut_count", f"six strut lengths are needed, not shape {lengths.shape}")
@@ -150,19 +125,7 @@ class StrutDrive:
         self._follow_commanded_point()
 
     def advance(self, dt: float) -> None:
-        """Let time pass and read the encoders once at its end.
-
-        Parameters
-        ----------
-        dt : float
-            s. The drives run in ticks of at most 0.25 ms; what is left over is kept for the next call, so
-            where the motors go does not depend on how the time is cut.
-
-        Raises
-        ------
-        ModelError
-            Negative, not finite, or longer than :data:`LONGEST_ADVANCE`.
-        """
+        """Let time pass and read the encoders once at its end."""
         if not 0.0 <= dt <= LONGEST_ADVANCE:
             raise ModelError("dt", f"must lie within 0…{LONGEST_ADVANCE:g} s", dt)
         self._left_over += dt
@@ -243,34 +206,16 @@ class StrutDrive:
         return self._play.copy()
 
     def true_pose(self) -> Pose:
-        """Return the true ``pose_platform_in_base``.
-
-        Raises
-        ------
-        KinematicsError
-            The machine cannot stand where its motors are, e.g. after a jump.
-        """
+        """Return the true ``pose_platform_in_base``."""
         self._refuse_impossible()
         return Pose(*self._true_pose)
 
     def true_tool_pose(self) -> Pose:
-        """Return the true ``pose_tool_in_work``.
-
-        Raises
-        ------
-        KinematicsError
-            As :meth:`true_pose`.
-        """
+        """Return the true ``pose_tool_in_work``."""
         return self._tool_pose(np.zeros(3))
 
     def tracker_pose(self) -> Pose:
-        """Return ``pose_tool_in_work`` as a laser tracker reads it: the truth, its position with noise.
-
-        Raises
-        ------
-        KinematicsError
-            As :meth:`true_pose`.
-        """
+        """Return ``pose_tool_in_work`` as a laser tracker reads it: the truth, its position with noise."""
         return self._tool_pose(self.parameters.tracker_noise * self._rng.standard_normal(3))
 
     def _tool_pose(self, noise: np.ndarray) -> Pose:

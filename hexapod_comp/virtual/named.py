@@ -42,13 +42,7 @@ USUAL_LEAD = 0.01
 
 
 def usual_bounds(geometry: HexapodGeometry, **given: Any) -> ImperfectionBounds:
-    """Return :data:`USUAL` bounds for a machine; what is given goes before.
-
-    Raises
-    ------
-    ModelError
-        As :class:`~hexapod_comp.virtual.imperfections.ImperfectionBounds`.
-    """
+    """Return :data:`USUAL` bounds for a machine; what is given goes before."""
     leads = np.abs(geometry.screw_lead)
     usual = {**USUAL, "wave_period": float(leads.max()) if leads.any() else USUAL_LEAD}
     return ImperfectionBounds(**{**usual, **given})
@@ -57,24 +51,7 @@ def usual_bounds(geometry: HexapodGeometry, **given: Any) -> ImperfectionBounds:
 def imagine(
     geometry: HexapodGeometry, seed: int, bounds: ImperfectionBounds | None = None, name: str = ""
 ) -> MachineModel:
-    """Draw a virtual machine's hidden errors, dated today so that they can be written to a file.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        Any machine.
-    seed : int
-        0 or above; the same seed gives the same machine.
-    bounds : ImperfectionBounds, optional
-        By default :func:`usual_bounds`.
-    name : str, optional
-        Of the model.
-
-    Raises
-    ------
-    ModelError
-        As :func:`~hexapod_comp.virtual.imperfections.draw_model`.
-    """
+    """Draw a virtual machine's hidden errors, dated today so that they can be written to a file."""
     model = draw_model(geometry, usual_bounds(geometry) if bounds is None else bounds, seed, name)
     return replace(model, origin=replace(model.origin, date=date.today().isoformat()))
 
@@ -85,22 +62,7 @@ def truth_name(name: str | None, geometry: HexapodGeometry) -> str:
 
 
 def find_model(name: str | Path, geometry: HexapodGeometry) -> MachineModel:
-    """Return the model that a name stands for.
-
-    Parameters
-    ----------
-    name : str or Path
-        A model file, or the name of a shipped one; ``ideal``; ``random`` or ``random:SEED``.
-    geometry : HexapodGeometry
-        The machine.
-
-    Raises
-    ------
-    InputFileError
-        As :func:`~hexapod_comp.machine.model_file.load_model`.
-    ModelError
-        A seed that is none.
-    """
+    """Return the model that a name stands for."""
     if not is_random(name):
         return load_model(name, geometry)
     _, colon, seed = str(name).partition(":")

@@ -28,22 +28,13 @@ NameOf = Callable[[int], str]
 
 @dataclass(frozen=True)
 class ToolErrors:
-    """What a point of the platform, the tool's tip as a rule, does beside what it was sent to do, in ``base``.
+    """What a point of the platform, the tool's tip as a rule, does beside what it was sent to do, in ``base``."""
 
-    Attributes
-    ----------
-    points : ndarray, shape (N, 3)
-        Where the point was sent, m.
-    displacement, rotation : ndarray, shape (N, 3)
-        Actual minus commanded position, m, and rotation vector from commanded to actual, rad.
-    field_share : ndarray, shape (N, 3)
-        The part of the displacement that the machine's field adds, m.
-    """
-
-    points: np.ndarray
+    points: np.ndarray  # (N, 3): where the point was sent, m
+    # (N, 3): actual minus commanded position, m, and rotation vector from commanded to actual, rad
     displacement: np.ndarray
-    rotation: np.ndarray
-    field_share: np.ndarray
+    rotation: np.ndarray  # (N, 3)
+    field_share: np.ndarray  # (N, 3): the part of the displacement that the machine's field adds, m
 
     def as_array(self) -> np.ndarray:
         """Return displacement, m, and rotation vector, rad, shape (N, 6)."""
@@ -53,11 +44,6 @@ class ToolErrors:
         """Return the same once the datum is aligned: less the turn and shift that best explain the displacements.
 
         Rotations lose their mean.
-
-        Raises
-        ------
-        ModelError
-            Fewer than three points, or points in a line.
         """
         actual = self.points + self.displacement
         motion = best_motion(actual, self.points)
@@ -85,14 +71,9 @@ def without_datum(points: np.ndarray, displacements: np.ndarray, by: slice = sli
 
 @dataclass(frozen=True)
 class Driven:
-    """Where a machine went.
+    """Where a machine went."""
 
-    Attributes
-    ----------
-    actual, without_field : tuple of ndarray, shape (N, 3) and (N, 3, 3)
-        ``pose_platform_in_base``, m, and what structure and struts alone would have made of it.
-    """
-
+    # (N, 3) and (N, 3, 3): ``pose_platform_in_base``, m, and what structure and struts alone would have made of it
     actual: Poses
     without_field: Poses
 
@@ -115,28 +96,7 @@ def drive(
     name_of: NameOf | None = None,
     advance: Callable[[int], object] = lambda rows: None,
 ) -> Driven:
-    """Return where machines go under strut commands.
-
-    Parameters
-    ----------
-    machines : sequence of N RealMachine
-        The machine of each row, at that row's temperatures.
-    starts : Poses
-        Where the search for each pose starts: the commanded poses.
-    senses : ndarray, shape (N, 9)
-        Directions of motion of axes and struts.
-    commands : ndarray, shape (N, 6)
-        Strut commands, m.
-    name_of : callable, optional
-        What a row is called in errors; by default where it starts.
-    advance : callable, optional
-        Called with the number of rows just done.
-
-    Raises
-    ------
-    KinematicsError
-        A machine has no pose for its row's commands; names the row.
-    """
+    """Return where machines go under strut commands."""
     commands, senses = np.ascontiguousarray(commands, dtype=float), np.ascontiguousarray(senses, dtype=float)
     modelled = np.array(starts[0], order="C"), np.array(starts[1], order="C")
     actual = np.empty_like(modelled[0]), np.empty_like(modelled[1])
@@ -162,11 +122,6 @@ def model_commands(
     """Return the strut commands by which models reach poses, shape (N, 6), m, and the structure's own poses.
 
     :meth:`RealMachine.commands_for` without its objects: a study asks for millions.
-
-    Raises
-    ------
-    NotConvergedError
-        A model's field is no small correction; names the row.
     """
     positions, rotations = np.ascontiguousarray(targets[0]), np.ascontiguousarray(targets[1])
     commands, modelled = np.empty((len(positions), 6)), (np.empty_like(positions), np.empty_like(rotations))
@@ -185,57 +140,22 @@ def model_commands(
 
 @dataclass(frozen=True)
 class Trial:
-    """A machine and the passes that it is sent through.
+    """A machine and the passes that it is sent through."""
 
-    Parameters
-    ----------
-    machine : RealMachine
-        The truth, at its real temperatures.
-    passes : Passes
-        Poses and directions.
-    """
-
-    machine: RealMachine
-    passes: Passes
+    machine: RealMachine  # the truth, at its real temperatures
+    passes: Passes  # poses and directions
 
     def commands(self, model: MachineModel | None, sensed: Temperatures | None = None) -> np.ndarray:
-        """Return what the machine is told, shape (N, 6), m.
-
-        Parameters
-        ----------
-        model : MachineModel or None
-            What the compensator believes; None for nominal lengths.
-        sensed : Temperatures, optional
-            What the compensator believes the temperatures to be; 20 °C by default.
-
-        Raises
-        ------
-        ModelError
-            The model is another machine's.
-        NotConvergedError
-            The model's field is no small correction.
-        """
+        """Return what the machine is told, shape (N, 6), m."""
         if model is None:
             return self.passes.nominal_commands()
         believed = RealMachine(self.passes.geometry, model, sensed)
         return model_commands([believed] * len(self.passes), self.passes.poses, self.passes.senses())[0]
 
     def drive(self, commands: np.ndarray) -> Driven:
-        """Return where the machine goes under strut commands, shape (N, 6), m.
-
-        Raises
-        ------
-        KinematicsError
-            The machine has no pose for a row's commands; names the commanded position.
-        """
+        """Return where the machine goes under strut commands, shape (N, 6), m."""
         return drive([self.machine] * len(self.passes), self.passes.poses, self.passes.senses(), commands)
 
     def errors(self, commands: np.ndarray) -> ToolErrors:
-        """Return the errors of the tool's tip under strut commands, shape (N, 6), m.
-
-        Raises
-        ------
-        KinematicsError
-            As :meth:`drive`.
-        """
+        """Return the errors of the tool's tip under strut commands, shape (N, 6), m."""
         return self.drive(commands).errors(self.passes.poses, self.passes.geometry.tool.position)

@@ -45,39 +45,19 @@ APART, NOISE = 20, 17
 
 @dataclass(frozen=True)
 class WarmUp:
-    """How a machine warms, and what is read meanwhile.
+    """How a machine warms, and what is read meanwhile."""
 
-    Parameters
-    ----------
-    rise : ndarray, shape (9,)
-        How far each part goes in the end, K, and the humidity, a fraction.
-    time_constants : ndarray, shape (9,)
-        s.
-    humidity : float
-        At the beginning, a fraction; NaN: nobody tells.
-    sensors : tuple of str
-        Parts that have a thermometer, and ``humidity`` for a hygrometer. Others are read as at 20 °C, or not at all.
-    noise : tuple of (float, float)
-        Standard deviation of a reading once a second, K, and of the humidity.
-    cold_rounds : int
-        How often the three lines are measured before the power is on: without, growth takes up whatever a model of the
-        campaign gets wrong on them.
-    rounds, every, pace : int
-        How often the three lines are measured; how long after each other, s, and how long a reading takes, s. A round
-        begins when half of its time is over.
-
-    Raises
-    ------
-    ModelError
-        Names what cannot be.
-    """
-
-    rise: np.ndarray
-    time_constants: np.ndarray
-    humidity: float = math.nan
+    rise: np.ndarray  # (9,): how far each part goes in the end, K, and the humidity, a fraction
+    time_constants: np.ndarray  # (9,): s
+    humidity: float = math.nan  # at the beginning, a fraction; NaN: nobody tells
+    # parts that have a thermometer, and ``humidity`` for a hygrometer. Others are read as at 20 °C, or not at all.
     sensors: tuple[str, ...] = PARTS
-    noise: tuple[float, float] = (0.05, 0.01)
+    noise: tuple[float, float] = (0.05, 0.01)  # standard deviation of a reading once a second, K, and of the humidity
+    # how often the three lines are measured before the power is on: without, growth takes up whatever a model of the
+    # campaign gets wrong on them
     cold_rounds: int = 1
+    # how often the three lines are measured; how long after each other, s, and how long a reading takes, s. A round
+    # begins when half of its time is over.
     rounds: int = 18
     every: int = 600
     pace: int = 4
@@ -156,13 +136,7 @@ class WarmUp:
         return replace(cold, runs=(*cold.runs, *runs))
 
     def stations(self, planned: MeasurementSet, seed: int) -> tuple[Stations, Stations]:
-        """Return the stations of such a campaign as they are, and as the sensors have it.
-
-        Raises
-        ------
-        ModelError
-            A round's readings take longer than half the time between two rounds.
-        """
+        """Return the stations of such a campaign as they are, and as the sensors have it."""
         first = len(planned.runs) - len(AXES) * self.rounds
         of_station = np.full(len(planned.stations), -1)
         of_station[planned.station] = np.maximum((planned.run - first) // len(AXES), -1)
@@ -208,26 +182,7 @@ class WarmUp:
 
 
 def load_warm_up(path: str | Path, seed: int = 0) -> tuple[WarmUp, np.ndarray]:
-    """Read a warm-up file (YAML, see config/warm_up.yaml), or a shipped one by its name.
-
-    Parameters
-    ----------
-    path : str or Path
-        File, or the name of a shipped one.
-    seed : int
-        Draws how the struts differ.
-
-    Returns
-    -------
-    WarmUp
-    expansion : ndarray, shape (3,)
-        Of struts, base and platform, 1/K, for a machine whose own errors have none.
-
-    Raises
-    ------
-    InputFileError
-        With file, key and value.
-    """
+    """Read a warm-up file (YAML, see config/warm_up.yaml), or a shipped one by its name."""
     path = input_file(path, "warm_up")
     top = read_yaml(path, WARM_UP_FORMAT, WARM_UP_VERSION)
     damp = top.quantity_key("humidity", "ratio") is not None
