@@ -24,8 +24,9 @@ static double close_triangle(triangle *t, const double angles[3])
     double cost = 0.0;
     int i;
     for (i = 0; i < 3; i++) {
-        const double c = cos(angles[i]), s = sin(angles[i]);
+        double c, s;
         const vec centre = row_of(t->circles[i][0]), p = row_of(t->circles[i][1]), q = row_of(t->circles[i][2]);
+        sine_cosine(angles[i], &s, &c);
         t->points[i] = add(add(centre, scale(c, p)), scale(s, q));
         tangents[i] = subtract(scale(c, q), scale(s, p));
     }

@@ -48,7 +48,7 @@ void hc_motions_many(size_t count, const double *positions, const double *rotati
                                  dot(y, r.row[0]) - dot(x, r.row[1]));
         const double sine = 0.5 * norm(twice), versine = 0.25 * (dot(x, x) + dot(y, y) + dot(z, z));
         const double share = sine > 1e-4 || versine > 1.0
-                                 ? 0.5 * atan2(sine, 1.0 - versine) / sine
+                                 ? 0.5 * arc_tangent(sine, 1.0 - versine) / sine
                                  : 0.5 + sine * sine / 12.0; /* the series' next term is below 1e-17 */
         const vec turn_by = scale(share, twice);
         for (k = 0; k < 3; k++) {

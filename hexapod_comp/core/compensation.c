@@ -93,7 +93,7 @@ static finding check_acceleration(const hc_last *last, hc_last *next, double lim
 {
     const hc_time since = elapsed(last, next);
     const double period = fmax(since.made >= 0.0 ? since.made : since.received, SHORTEST_PERIOD);
-    const double keep = exp(-period / SMOOTHED_OVER);
+    const double keep = exponential(-period / SMOOTHED_OVER, 0.0);
     finding worst = found(HC_OK, -1, limit);
     int i;
     for (i = 0; i < 6; i++) {
@@ -393,7 +393,7 @@ static void follow_late(hc_state *state, int index, double value, double time)
     state->newest[index] = fmax(state->newest[index], time);
     for (k = 0; k < late->count; k++) {
         const double ages = elapsed / late->time_constants[k];
-        const double gone = -expm1(-ages);
+        const double gone = -exponential(-ages, 1.0);
         const double kept = ages > 0.0 ? gone / ages : 1.0;
         state->behind[index][k] = state->behind[index][k] * (1.0 - gone) - change * kept;
     }
@@ -624,7 +624,7 @@ void hc_init(hc_state *state, const hc_model *model, double ramp_rate)
 
 const char *hc_version(void)
 {
-    return "1";
+    return "2";
 }
 
 const char *hc_reason(hc_status status)

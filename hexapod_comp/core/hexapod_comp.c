@@ -4,6 +4,8 @@
  */
 #include "core.h"
 
+#include "elementary.c"
+
 #include "pose.c"
 
 #include "kinematics.c"

@@ -112,7 +112,7 @@ static finding check_joints(const double base[6][3], const hc_pose *pose, const 
         joint_cosines(pose, now, limits, i, cosines);
         for (body = 0; body < 2; body++) {
             if (!(cosines[body] >= limits->cone_cosines[body][i])) {
-                return found(body ? HC_PLATFORM_CONE : HC_BASE_CONE, i, acos(held(cosines[body], -1.0, 1.0)));
+                return found(body ? HC_PLATFORM_CONE : HC_BASE_CONE, i, arc_cosine(held(cosines[body], -1.0, 1.0)));
             }
         }
     }

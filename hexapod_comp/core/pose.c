@@ -48,8 +48,10 @@ static void rotate(double r[3][3], double wx, double wy, double wz)
         sine = 1.0 - square / 6.0;
         versine = 0.5 - square / 24.0;
     } else {
-        const double angle = sqrt(square), half = sin(0.5 * angle);
-        sine = sin(angle) / angle;
+        const double angle = sqrt(square);
+        double half, cosine;
+        sine_cosine(0.5 * angle, &half, &cosine);
+        sine = 2.0 * half * cosine / angle;
         versine = 2.0 * half * half / square;
     }
     for (j = 0; j < 3; j++) {

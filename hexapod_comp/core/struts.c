@@ -28,7 +28,7 @@ static double screw_twist(const double base_axis[3], const double platform_axis[
     const double length = now->length[i];
     const vec u = vector(s.x / length, s.y / length, s.z / length);
     const vec b = row_of(base_axis), p = lever(pose, platform_axis);
-    return atan2(dot(b, cross(p, u)), dot(b, p) - dot(b, u) * dot(p, u));
+    return arc_tangent(dot(b, cross(p, u)), dot(b, p) - dot(b, u) * dot(p, u));
 }
 
 /* How much longer the command must be for the screw's rotation, m: a platform that turns by an angle about the strut turns
@@ -55,9 +55,7 @@ static turn screw_turn(const hc_strut *strut, double command)
 {
     turn at = {1.0, 0.0};
     if (strut->harmonics != 0.0) {
-        const double angle = strut->wavenumber * command;
-        at.cosine = cos(angle);
-        at.sine = sin(angle);
+        sine_cosine(strut->wavenumber * command, &at.sine, &at.cosine);
     }
     return at;
 }

@@ -8,6 +8,7 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks.same_bits import SANITIZED, STRICT, Build, builds, missing, printed
@@ -19,6 +20,7 @@ from hexapod_comp.machine.model_file import load_model
 
 SOURCE = Path(core.__file__).parent / "hexapod_batch.c"
 BUILDS = {build.name: build for build in builds()}
+ULPS = Path(__file__).parent / "ulps.c"
 QUICK = Build("sanitizers", ["gcc", *SANITIZED, "-O0", "-g0", "-DWIDE="])
 
 
@@ -40,3 +42,14 @@ def test_sanitizers_have_nothing_to_say_and_the_numbers_are_the_same(tmp_path):
     plain, sanitized = (printed(build, tmp_path, 500) for build in (BUILDS["gcc -O0"], QUICK))
     assert plain == sanitized
     assert plain.count("\ntool ") > 500  # most of the commands and estimates were answered
+
+
+def test_elementary_functions_are_right_to_one_unit_in_the_last_place(tmp_path):
+    """Of five million arguments, beside the C library in long double."""
+    if missing(BUILDS["gcc -O3"]) or np.finfo(np.longdouble).nmant < 63:
+        pytest.skip("no gcc, or no long double here")
+    words = ["gcc", *FLAGS, *STRICT, f"-I{SOURCE.parent}", str(ULPS), "-o", str(tmp_path / "ulps"), "-lm"]
+    made = subprocess.run(words, capture_output=True, text=True)
+    assert made.stderr == ""
+    ran = subprocess.run([str(tmp_path / "ulps"), "500000"], capture_output=True, text=True, check=True)
+    assert max(map(float, ran.stdout.split())) < 1.0
