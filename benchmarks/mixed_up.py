@@ -2,7 +2,7 @@
 
 Machines as of ``promise``, read by a 5-D laser, rightly and with channels exchanged or signs reversed. Counted: where
 the first cause that is named is the one that was made; of readings that were taken rightly, where any is named. Only
-causes are sought, nothing is fitted: what is written or not follows from them.
+blocks are chosen and causes are sought, nothing is fitted: what is written or not follows from them.
 
 Usage: python -m benchmarks.mixed_up [--machines 4] [--first 600] [--workers 2] [--kind NAME ...]
 
@@ -28,9 +28,9 @@ from tqdm import tqdm
 
 from benchmarks.calibration import LEAD
 from benchmarks.promise import FOREIGN, KNOWN, OWN, setting
-from hexapod_comp.calibration.misfit import FAMILIES, family_of_run
+from hexapod_comp.calibration.fit import mixed_up
+from hexapod_comp.calibration.mixups import FAMILIES, family_of_run
 from hexapod_comp.calibration.parameters import FitSettings
-from hexapod_comp.calibration.suspicions import suspicions
 from hexapod_comp.measurements.readings import CHANNELS, MeasurementSet
 
 MADE = {
@@ -69,7 +69,7 @@ def first_named(kind: str, seed: int, made: str) -> str:
     with tempfile.TemporaryDirectory() as folder:
         readings = setting(kind, seed, Path(folder), ("5-D", 4))[-1]
     change: Callable[[MeasurementSet], MeasurementSet] = MADE[made]
-    return next(iter(suspicions(change(readings), FitSettings(blocks=KNOWN, lead=LEAD))), "")
+    return next(iter(mixed_up(change(readings), FitSettings(blocks=KNOWN, lead=LEAD))), "")
 
 
 def main() -> int:

@@ -63,7 +63,7 @@ def isolated_ros(hexapod_domain: int) -> int:
 @pytest.fixture
 def unsuspected(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out of fits what else their readings might be: where that is not asked, it takes longest."""
-    monkeypatch.setattr("hexapod_comp.calibration.verdict.suspicions", lambda *_: [])
+    monkeypatch.setattr("hexapod_comp.calibration.fit.mixups", lambda *_: [])
 
 
 @pytest.fixture

@@ -69,6 +69,19 @@ class Assumptions:
     clear: float = assumed(4.0, "σ", "changes of this size are surely seen", "1 in 16,000 missed by chance")
     unchanged_draws: int = assumed(4000, "", "unchanged machines drawn to find the false alarms", "1 % to ± 0.16 %")
     most_check_readings: int = assumed(500, "", "readings of a check; more are a calibration", "chosen")
+    # Mix-ups (mixups.py)
+    mixup_odds: float = assumed(1e4, "", "prior odds against any one mix-up", "1 campaign in 100, some 100 ways")
+    mixup_readings: int = assumed(2500, "", "readings, at random, by which mix-ups are weighed", "tell by far; time")
+    mixup_few: int = assumed(400, "", "readings by which other frames and machines are tried first", "time")
+    mixup_rounds: int = assumed(10, "", "rounds of estimating priors and noise for an alternative", "as in selection")
+    mixup_first_rounds: int = assumed(2, "", "the same where other frames and machines are tried first", "time")
+    noisy: float = assumed(1.5, "", "noise found over noise stated that is remarked on", "χ² of 2.25")
+    mixup_finalists: int = assumed(3, "", "alternatives of a sort for which they are estimated", "time")
+    parallel: float = assumed(0.999, "", "cosine from which a line is parallel to an axis", "2.6° off")
+    negative_backlash: float = assumed(4.0, "σ", "backlash so far below zero is no noise", "3 in 100,000")
+    strange_check: float = assumed(100.0, "", "χ² per number above which check readings may be misread", "10 × noise")
+    plausible_check: float = assumed(10.0, "", "χ² per number of check readings read rightly", "3 × noise")
+    as_good_check: float = assumed(3.0, "", "χ² ratio to the best at which another is named", "1.7 × noise")
 
     def rows(self) -> list[tuple[str, str, str, str]]:
         """Return name, value with unit, meaning and source of every assumption."""

@@ -21,11 +21,11 @@ from .courses import with_courses
 from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
 from .estimator import HUBER, OUTLIER, Estimation, LinearProblem, Posterior, Solution, iterate, physical_covariance
 from .lead import ScrewLead, look_for_lead
+from .mixups import SWAPPED, mixups, swapped_directions
 from .parameters import FitSettings, ParameterSpace
 from .posterior import Allowed, Observability, ToolError, UnseenError, listed, observe, without_trace
 from .residuals import Residuals
 from .selection import Decision, select
-from .suspicions import SCATTERED, SURE, SWAPPED, causes
 from .verdict import Verdict, judge
 from .warming import HeatSeen, TimeConstants, seek_time_constants
 
@@ -199,9 +199,20 @@ def fit_model(
     try:
         return _fit(measurements, begun, progress, datum)
     except HexapodError as error:
-        if named := causes(measurements, begun.everything.space.settings, progress):
+        blocks = [block.name for block in begun.everything.space.blocks]
+        named = mixups(begun.everything, begun.problem, blocks, progress)
+        if swapped_directions(begun.everything, begun.problem, blocks):
+            named.append(SWAPPED)
+        if named:
             error.with_lines("\n".join(f"  {cause}" for cause in named))
         raise
+
+
+def mixed_up(measurements: MeasurementSet, settings: FitSettings) -> list[str]:
+    """Return how readings must have been taken to be more probable, by name, the best first; nothing is fitted."""
+    begun = _begin(measurements, settings, lambda text: None)
+    decisions = select(begun.everything.space, begun.problem, np.ones(len(KINDS)), lambda text: None)[0]
+    return mixups(begun.everything, begun.problem, [d.block for d in decisions if d.kept])
 
 
 class _Begun(NamedTuple):
@@ -215,9 +226,9 @@ class _Begun(NamedTuple):
 
 def _fit(measurements: MeasurementSet, begun: _Begun, progress: Callable[[str], object], datum: Pose) -> ModelFit:
     """Choose blocks, fit them, and judge what comes of it."""
-    everything, problem, lead, constants = begun
+    everything, nominal, lead, constants = begun
     settings = everything.space.settings
-    decisions, (problem, possible), answer = _choose(everything, problem, settings, progress)
+    decisions, (problem, possible), answer = _choose(everything, nominal, settings, progress)
     space, estimation, solution = answer
     channels = tuple(_channels(estimation, solution))
     notes = [
@@ -236,7 +247,8 @@ def _fit(measurements: MeasurementSet, begun: _Begun, progress: Callable[[str], 
         return Residuals.of(everything, known), way
 
     noise = {KINDS.index(c.kind): c.estimated for c in channels}
-    verdict = judge(estimation, solution, allowed, with_all, settings, noise, progress)
+    mixed = mixups(everything, nominal, [d.block for d in decisions if d.kept], progress)
+    verdict = judge(estimation, solution, allowed, with_all, settings, noise, mixed)
     no_trace = unseen_errors(measurements, settings)
     if rolls := [error for error in no_trace if error.name.startswith("roll")]:
         verdict = verdict.without_rotation(listed(rolls))
@@ -384,7 +396,7 @@ def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
         return []
     values = solution.x[block.part]
     sigmas = values / np.sqrt(np.diag(physical_covariance(space, solution.posterior))[block.part])
-    negative = np.flatnonzero(sigmas < -SURE)
+    negative = np.flatnonzero(sigmas < -ASSUMED.negative_backlash)
     if len(negative) > 3:
         listed = ", ".join(f"{v * 1e6:.2f}" for v in values)
         problem = f"{SWAPPED}: the struts would have a backlash of {listed} µm"
@@ -431,7 +443,7 @@ def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:
                 f"{c.kind} readings are off by {c.estimated:.3g} {unit} (allowed {LARGEST_NOISE:g}); do units fit?"
             )
             raise CalibrationError("measurements", problem)
-    noisy = [f"{c.kind} {c.estimated / c.stated:.1f} times" for c in channels if c.estimated > SCATTERED * c.stated]
+    noisy = [f"{c.kind} {c.estimated / c.stated:.1f} times" for c in channels if c.estimated > ASSUMED.noisy * c.stated]
     if not noisy:
         return []
     problem = "readings scatter more than stated: something of the machine, or of an instrument, is not in the model"

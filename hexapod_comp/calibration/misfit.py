@@ -17,6 +17,7 @@ from scipy.linalg.lapack import dtrtrs
 
 from ..measurements.readings import ANGULAR_KINDS, AXES, BACKWARD, FORWARD, KINDS, MeasurementSet
 from .estimator import DesignMatrix, at_once, whitened_precision
+from .mixups import FAMILIES, family_of_run
 from .parameters import FitSettings
 from .promise import Unexplained
 from .residuals import Residuals
@@ -28,9 +29,6 @@ describes look misfitted by chance, in each way of leaving some out."""
 
 CLEAR_DRIFT = 3.0
 """A drift of the scale is one from so many standard deviations on."""
-
-PARALLEL = 0.999
-"""Cosine from which a line is parallel to an axis of the work frame."""
 
 PLACE = 1e-3
 """Lines whose middles are closer, m, lie in one plane across an axis."""
@@ -62,9 +60,6 @@ ALL = (
 GENERAL, FINE_TERMS = ("map", "backlash map", "field displacement", "field rotation", "field reversal"), 0.3
 """Blocks of coarse and fine terms; and how well the size of the fine ones is known by that of the coarse, as the
 standard deviation of its logarithm."""
-
-FAMILIES = ("x lines", "y lines", "z lines", "other lines", "other runs")
-"""Families of runs, by direction in the work frame."""
 
 CUT = 4.0
 """Residuals count for no more standard deviations than that: a gross error is a single reading's."""
@@ -153,14 +148,6 @@ def held_by_priors(residuals: Residuals) -> bool:
     noise = r.estimation.uncertainty * posterior.noise[r.estimation.measurements.kind]
     lengths = ~np.isin(r.estimation.measurements.kind, [KINDS.index(kind) for kind in ANGULAR_KINDS])
     return bool(left > HELD * prior and (not lengths.any() or left > np.median(noise[lengths])))
-
-
-def family_of_run(measurements: MeasurementSet) -> np.ndarray:
-    """Return the index into :data:`FAMILIES` of each run."""
-    axes = np.array([run.axis for run in measurements.runs]).reshape(-1, 3) @ measurements.geometry.work.rotation
-    parallel = np.abs(axes) > PARALLEL
-    family = np.where(parallel.any(axis=1), parallel.argmax(axis=1), 3)
-    return np.where(axes.any(axis=1), family, 4)
 
 
 def _left_out(r: Residuals, everything: Callable[[], tuple[Residuals, np.ndarray]]) -> tuple[float, str, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,6 @@ from .parameters import FitSettings, ParameterSpace
 from .posterior import Allowed, ToolError, expected_error
 from .promise import Unexplained
 from .residuals import Residuals
-from .suspicions import suspicions
 
 DOUBTFUL = 3.0
 """Readings whose noise is estimated so many times as large as stated put the whole fit in doubt."""
@@ -73,7 +72,7 @@ def judge(
     everything: Callable[[], tuple[Residuals, np.ndarray]],
     settings: FitSettings,
     noise: Mapping[int, float],
-    progress: Callable[[str], object] = lambda text: None,
+    mixed_up: Sequence[str] = (),
 ) -> Verdict:
     """Return what a settled fit promises and what is wrong with it.
 
@@ -89,8 +88,8 @@ def judge(
         Of the fit, with all blocks that it might have used.
     noise : mapping of int to float
         Standard deviation that was estimated for each kind of channel, m or rad.
-    progress : callable
-        Called with what goes on.
+    mixed_up : sequence of str
+        How the readings must have been taken to be more probable.
     """
     measurements, space = estimation.measurements, estimation.space
     residuals = Residuals.of(estimation, solution)
@@ -104,8 +103,7 @@ def judge(
     families, runs = chi_squares(residuals)
     far_off, doubtful = measurements.misfit(noise, MISFIT), measurements.misfit(noise, DOUBTFUL)
     doubts = [*([] if far_off else [doubtful]), *beyond.doubts(), _unsettled(solution)]
-    left = None if any(doubts) else noise
-    refusals = [far_off, _useless(level), _held(residuals), *suspicions(measurements, settings, progress, left)]
+    refusals = [far_off, _useless(level), _held(residuals), *mixed_up]
     remarks = [*beyond.remarks(), _unstated(measurements), NOT_TILTED if level_only else ""]
     listed = (tuple(filter(None, part)) for part in (refusals, doubts, remarks))
     return Verdict(level, tilted, beyond, families, runs, *listed)

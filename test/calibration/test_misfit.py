@@ -15,13 +15,13 @@ from calibration_helpers import BOX, FEW, SETTINGS, campaign, measured, virtual_
 from foreign_machines import machines
 
 from hexapod_comp.calibration.evaluation import held_out
-from hexapod_comp.calibration.fit import fit_model
-from hexapod_comp.calibration.misfit import FAMILIES, family_of_run, stated_scale
+from hexapod_comp.calibration.fit import fit_model, mixed_up
+from hexapod_comp.calibration.misfit import stated_scale
+from hexapod_comp.calibration.mixups import FAMILIES, SWAPPED, family_of_run
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.posterior import expected_error
 from hexapod_comp.calibration.promise import Scatter, Unexplained
 from hexapod_comp.calibration.report import as_json, fit_report
-from hexapod_comp.calibration.suspicions import SWAPPED, causes, suspicions
 from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import RealMachine
@@ -228,13 +228,6 @@ def test_one_run_is_held_by_the_priors(readings):
     assert fit.misfit in "; ".join(fit.verdict.refusals)
 
 
-@pytest.fixture
-def some(readings, monkeypatch) -> MeasurementSet:
-    """Return the readings, of which 500 are looked at when causes are sought."""
-    monkeypatch.setattr("hexapod_comp.calibration.suspicions.ENOUGH", 500)
-    return readings
-
-
 def reversed_where(readings: MeasurementSet, members: np.ndarray) -> MeasurementSet:
     return readings.with_values(np.where(members, -readings.value, readings.value))
 
@@ -251,9 +244,9 @@ CAUSES = {
 
 
 @pytest.mark.parametrize("cause", CAUSES)
-def test_the_cause_is_named(some, cause):
+def test_the_cause_is_named(readings, cause):
     """The first that is named is what was done; of half the runs, which half is reversed is anybody's guess."""
-    named = suspicions(CAUSES[cause](some), FEW)
+    named = mixed_up(CAUSES[cause](readings), FEW)
     assert named
     assert named[0].startswith(cause) or ("of 25 runs" in cause and "12 of 25 runs" in named[0])
 
@@ -265,8 +258,8 @@ def test_runs_with_a_reversed_channel_are_named_where_screws_turn(tmp_path):
     side = float(np.ptp(machine.box, axis=0).min())
     truth = RealMachine(geometry, draw_model(geometry, ImperfectionBounds(joint=500e-6), 3))
     m = measured(truth, Campaign(machine.box, side, 0.5 * side, "5-D", 4), 3)
-    assert suspicions(m, FitSettings()) == []
-    named = suspicions(reversed_where(m, (m.channel == ROTATION_X) & (m.run % 2 == 0)), FitSettings())
+    assert mixed_up(m, FitSettings()) == []
+    named = mixed_up(reversed_where(m, (m.channel == ROTATION_X) & (m.run % 2 == 0)), FitSettings())
     assert named[0].startswith("rotation_x of ")
     assert " runs (" in named[0]
 
@@ -279,19 +272,18 @@ def test_exchanged_channels_are_named_where_the_plain_model_lacks_much(tmp_path)
         geometry, with_length_map(draw_model(geometry, ImperfectionBounds(joint=800e-6), 3), geometry, 3)
     )
     m = measured(truth, Campaign(machine.box, float(np.ptp(machine.box, axis=0).min()), 0.02, "5-D", 4), 3)
-    assert suspicions(m, FitSettings()) == []
+    assert mixed_up(m, FitSettings()) == []
     x, y = ROTATION_X, CHANNELS.index("rotation_y")
     both = np.isin(m.channel, (x, y))
-    named = suspicions(replace(m, channel=np.where(both, x + y - m.channel, m.channel)), FitSettings())
+    named = mixed_up(replace(m, channel=np.where(both, x + y - m.channel, m.channel)), FitSettings())
     assert named[0].startswith("rotation_x and rotation_y: exchanged")
 
 
-def test_nothing_is_suspected_without_a_cause(some):
-    assert suspicions(some, FEW) == []
-    assert causes(some, FEW) == []
+def test_nothing_is_suspected_without_a_cause(readings):
+    assert mixed_up(readings, FEW) == []
 
 
-def test_a_fit_that_fails_names_the_cause(some, monkeypatch):
+def test_a_fit_that_fails_names_the_cause(readings, monkeypatch):
     """Large errors and a reversed sign end in no machine at all: whoever reads that must learn why."""
 
     def fail(*_):
@@ -299,30 +291,31 @@ def test_a_fit_that_fails_names_the_cause(some, monkeypatch):
 
     monkeypatch.setattr("hexapod_comp.calibration.fit._fit", fail)
     with pytest.raises(CalibrationError, match=r"did not settle\n  x lines: sign reversed fits \d+\.\d times better$"):
-        fit_model(CAUSES["x lines: sign reversed"](some), FEW)
+        fit_model(CAUSES["x lines: sign reversed"](readings), FEW)
     with pytest.raises(CalibrationError, match=r"did not settle$"):
-        fit_model(some, FEW)
+        fit_model(readings, FEW)
 
 
-def test_the_sign_of_everything_shows_in_the_backlash_alone(some):
+def test_the_sign_of_everything_shows_in_the_backlash_alone(readings):
     """To first order the machine with all errors reversed reads so, but its screws would lead their nuts."""
-    assert causes(some.with_values(-some.value), FEW) == [SWAPPED]
+    with pytest.raises(CalibrationError, match=SWAPPED):
+        fit_model(readings.with_values(-readings.value), FEW)
 
 
-def test_what_fits_better_otherwise_is_not_written(some):
+def test_what_fits_better_otherwise_is_not_written(readings):
     """Straightness of the x lines is small here: exchanged, it scatters by 2.5 µm, and nothing else makes that 1 µm."""
     exchanged = np.arange(len(CHANNELS))
     y, z = (CHANNELS.index(f"straightness_{axis}") for axis in "yz")
     exchanged[[y, z]] = z, y
-    of_x_lines = family(some) == 0
-    fit = fit_model(replace(some, channel=np.where(of_x_lines, exchanged[some.channel], some.channel)), FEW)
+    of_x_lines = family(readings) == 0
+    fit = fit_model(replace(readings, channel=np.where(of_x_lines, exchanged[readings.channel], readings.channel)), FEW)
     assert fit.misfit.startswith("x lines, straightness_y and straightness_z: exchanged fits")
 
 
-def test_a_unit_that_all_lengths_share_is_named_once(some):
+def test_a_unit_that_all_lengths_share_is_named_once(readings):
     """Straightness and distances in µinch; the angles are as they should be."""
-    lengths = some.kind != ROTATION
-    named = suspicions(some.with_values(np.where(lengths, some.value / 0.0254, some.value)), FEW)
+    lengths = readings.kind != ROTATION
+    named = mixed_up(readings.with_values(np.where(lengths, readings.value / 0.0254, readings.value)), FEW)
     assert named[0].startswith("all lengths: µinch in place of µm fits")
 
 
