@@ -35,7 +35,6 @@ from .assumptions import ASSUMED
 from .estimator import (
     Estimation,
     LinearProblem,
-    Posterior,
     log_evidence,
     solve,
     whitened_precision,
@@ -98,8 +97,10 @@ def mixups(
         problem, _ = everything.linearise(np.zeros(everything.space.size), np.ones(len(m)))
     progress("are the readings more probable, taken another way?")
     try:
+        # What every screw has belongs to readings taken rightly, though a fit may do without where they are mixed up.
+        blocks = {*blocks, *(name for name in EXPECTED if everything.space.block(name))}
         model = _Fitted(everything, problem, blocks)
-        if set(blocks) <= set(EXPECTED) and (model.posterior.noise[model.kinds] < ASSUMED.noisy).all():
+        if blocks <= set(EXPECTED) and (model.posterior.noise[model.kinds] < ASSUMED.noisy).all():
             return []  # a machine and its screws alone describe the readings: nothing is left to explain
         found = [*model.reversed_signs(), *model.other_units(), *model.otherwise(_relabelled(m))]
         found += _elsewhere(m, model, blocks)
@@ -130,17 +131,18 @@ class _Fitted:
     """The fitted model's linear problem, and how probable readings that were taken otherwise are under it."""
 
     def __init__(
-        self, estimation: Estimation, problem: LinearProblem, blocks: Collection[str], start: Posterior | None = None
+        self, estimation: Estimation, problem: LinearProblem, blocks: Collection[str], start: _Fitted | None = None
     ) -> None:
         self.estimation, self.problem = estimation, problem
         self.space = space = estimation.space
+        kept = np.array([n == 0 or block.name in blocks for n, block in enumerate(space.blocks)])
+        self._first_guess = np.where(kept, space.start_tolerances(), 0.0)
         if start is None:
-            kept = np.array([n == 0 or block.name in blocks for n, block in enumerate(space.blocks)])
-            tolerances = np.where(kept, space.start_tolerances(), 0.0)
-            self.posterior = solve(space, problem, tolerances, np.ones(len(KINDS)), ASSUMED.mixup_rounds)
+            self.posterior = solve(space, problem, self._first_guess, np.ones(len(KINDS)), ASSUMED.mixup_rounds)
         else:
-            tolerances = start.tolerances[start.tolerances > 0.0]
-            self.posterior = solve(space, problem, tolerances, start.noise, ASSUMED.mixup_first_rounds)
+            known = dict(zip([b.name for b in start.space.blocks], start.posterior.tolerances, strict=True))
+            tolerances = np.array([known[block.name] for block in space.blocks])
+            self.posterior = solve(space, problem, tolerances, start.posterior.noise, ASSUMED.mixup_first_rounds)
         self.kinds = np.unique(problem.kind)
         self.evidence = log_evidence(problem, self.posterior)
         self._rows = problem.rows.dense()[:, self.posterior.used]
@@ -153,7 +155,8 @@ class _Fitted:
         `choices` is the logarithm of how many equally probable alternatives this one was chosen from.
         """
         p = self.posterior
-        tried = solve(self.space, problem, p.tolerances, p.noise * scale if rounds == 0 else p.noise, rounds)
+        # From the first guess on, as the fit itself: noise that a mix-up has blown up can hold its own ground.
+        tried = solve(self.space, problem, self._first_guess, np.ones(len(KINDS)), rounds)
         jacobian = float(problem.freedom[self.kinds] @ np.log(scale[self.kinds]))
         gain = log_evidence(problem, tried) + jacobian - self.evidence - choices
         return Alternative(name, gain, float((p.noise * scale / tried.noise)[self.kinds].max()))
@@ -245,7 +248,7 @@ class _Fitted:
             scale[kinds] = factor
             change = self.estimation.free_of_nuisance(((scale[self.problem.kind] - 1.0) * values)[:, None])[:, 0]
             problem = self.with_target(self.problem.target + change, scale)
-            tried.append((self.compared(name, problem, scale, 0), problem, scale))
+            tried.append((self.compared(name, problem, scale, ASSUMED.mixup_first_rounds), problem, scale))
         tried = sorted(tried, key=lambda t: -t[0].gain)[:1]
         return [self.compared(t.name, problem, scale, ASSUMED.mixup_rounds) for t, problem, scale in tried]
 
@@ -257,8 +260,8 @@ class _Fitted:
         for name, measurements in others:
             problem = _linearised(measurements, self.space, prediction if measurements.stations is here else None)
             if problem is not None:
-                tried.append((self.compared(name, problem, unscaled, 0), problem))
-        tried = sorted((t for t in tried if t[0].gain > 0.0), key=lambda t: -t[0].gain)[: ASSUMED.mixup_finalists]
+                tried.append((self.compared(name, problem, unscaled, ASSUMED.mixup_first_rounds), problem))
+        tried = sorted(tried, key=lambda t: -t[0].gain)[: ASSUMED.mixup_finalists]
         return [self.compared(t.name, problem, unscaled, ASSUMED.mixup_rounds) for t, problem in tried]
 
     def _cell_values(self, values: np.ndarray) -> np.ndarray:
@@ -293,10 +296,10 @@ def _elsewhere(m: MeasurementSet, model: _Fitted, blocks: Collection[str]) -> li
         return []
     few = _thinned(m, ASSUMED.mixup_few)
     settings = replace(model.space.settings, blocks=tuple(blocks))
-    small = _of(few, settings, blocks, model.posterior)
+    small = _of(few, settings, blocks, model)
     clear = []
     for name, moved in _moved_machines():
-        if (other := _of(moved(few), settings, blocks, model.posterior)) is not None and small is not None:
+        if (other := _of(moved(few), settings, blocks, model)) is not None and small is not None:
             gain = other.evidence - small.evidence
             if gain > np.log(ASSUMED.mixup_odds):
                 clear.append((gain, name, moved))
@@ -309,7 +312,7 @@ def _elsewhere(m: MeasurementSet, model: _Fitted, blocks: Collection[str]) -> li
 
 
 def _of(
-    m: MeasurementSet | None, settings: FitSettings, blocks: Collection[str], start: Posterior | None = None
+    m: MeasurementSet | None, settings: FitSettings, blocks: Collection[str], start: _Fitted | None = None
 ) -> _Fitted | None:
     """Return the fitted model of readings with stations of their own; None where no machine can have taken them."""
     if m is None:
