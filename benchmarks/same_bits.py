@@ -64,8 +64,8 @@ def builds() -> list[Build]:
 
 def compiled(build: Build, folder: Path) -> subprocess.CompletedProcess[str]:
     """Return what compiling the driver said; it is then ``driver`` in the folder."""
-    sources = [str(DRIVER), str(SOURCES / "hexapod_batch.c")]
-    words = [*build.words, *(flag for flag in FLAGS if flag != "-O3"), *STRICT, f"-I{folder}", f"-I{SOURCES}", *sources]
+    flags = [*(flag for flag in FLAGS if flag != "-O3"), *STRICT, f"-I{folder}", f"-I{SOURCES}"]
+    words = [*build.words, *flags, str(DRIVER)]  # which includes the core
     return subprocess.run([*words, "-lm", "-o", str(folder / "driver")], capture_output=True, text=True)
 
 

@@ -16,7 +16,7 @@ import time
 import numpy as np
 
 from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.core.single import quaternion_of
+from hexapod_comp.core.batch import quaternion_of
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.workspace.travel import travel

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .core import QUATERNION_NORM_TOLERANCE
-from .core.single import quaternion_of, read_pose, rotation_flaw
+from .core.batch import quaternion_of, read_pose, rotation_flaw
 from .errors import PoseError
 
 LARGEST_ANGLE = 1000.0

@@ -201,7 +201,7 @@ def _strut_panel(axes: Axes, fit: ModelFit) -> None:
     commands = fit.measurements.stations.commands
     for strut, name in enumerate(STRUT_NAMES):
         at = np.linspace(commands[:, strut].min(), commands[:, strut].max(), 4 * SAMPLES)
-        errors, _ = strut_errors(machine.state.at, strut, at)
+        errors, _ = strut_errors(machine.state, strut, 0.0, at)
         label = f"{name}, wave ±{waves[strut] * 1e6:.1f} µm" if waves.any() else name
         axes.plot(at * 1e3, (errors - struts.offset[strut]) * 1e6, lw=1.2, color=SIX_COLOURS[strut], label=label)
     axes.set(title="strut errors: pitch and length map", xlabel="command, mm", ylabel="error, µm")

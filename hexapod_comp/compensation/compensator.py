@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..core import Status, Struct, ffi, lib
-from ..core.batch import given
-from ..core.single import backwards, solve_linear
+from ..core.batch import backwards, given, solve_linear
 from ..errors import HexapodError, ModelError, NotConvergedError, NotFiniteError, PoseError
 from ..machine.geometry import TOOL, HexapodGeometry
 from ..machine.kinematics import forward_error, jacobian

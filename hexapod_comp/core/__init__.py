@@ -1,4 +1,4 @@
-"""The arithmetic, in C99, and its face in Python: structs and statuses, :mod:`.batch` and :mod:`.single`."""
+"""The arithmetic, in C99, and its face in Python: structs and statuses; :mod:`.batch` has the functions."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ except ImportError as error:
 VERSION, SOURCES_HASH = ffi.string(lib.hc_version()).decode(), ffi.string(lib.hc_sources()).decode()
 """Version of the arithmetic, which changes when a bit of an answer does, and SHA-256 of the sources that were built."""
 
-QUATERNION_NORM_TOLERANCE = 1e-3
+QUATERNION_NORM_TOLERANCE = lib.QUATERNION_TOLERANCE
 """A quaternion whose norm is further from 1 than this is refused: it was never a rotation."""
 
-LONGEST_RAMP_STEP = 0.02
+LONGEST_RAMP_STEP = lib.LONGEST_RAMP_STEP
 """A pause between commands counts as no more than this in a ramp, s: a late command must not step."""
 
 MOST_ITERATIONS, MOST_HARMONICS = lib.HC_MOST_ITERATIONS, lib.HC_MOST_HARMONICS

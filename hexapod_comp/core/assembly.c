@@ -87,6 +87,8 @@ static double settle(const double (*circles)[3][3], const double sides[3], doubl
     return fmax(fabs(t.errors[0]), fmax(fabs(t.errors[1]), fabs(t.errors[2])));
 }
 
+/* Minimise the side errors of triangles over three angles each, n x 3, in place; circles 3 x 3 x 3 (centre, p, q), sides 3.
+ * Writes the corners, n x 9, m, and each one's largest side error, m. */
 void hc_settle_many(const double *circles, const double *sides, size_t count, double *angles, double *points,
                     double *errors)
 {

@@ -4,6 +4,7 @@
  */
 #include "core.h"
 
+/* dL/d(v, w), n x 6 x 6, twist in `base`: row i is (u_i, R t_i x u_i). */
 void hc_jacobian_many(const double *base, const double *platform, size_t count, const double *positions,
                       const double *rotations, double *jacobians)
 {
@@ -19,6 +20,7 @@ void hc_jacobian_many(const double *base, const double *platform, size_t count, 
     }
 }
 
+/* Condition numbers of the Jacobian, rotations divided by the characteristic length, and signs of det J. */
 void hc_condition_many(const double *base, const double *platform, size_t count, const double *positions,
                        const double *rotations, double characteristic_length, double *conditions, double *signs)
 {
@@ -31,7 +33,9 @@ void hc_condition_many(const double *base, const double *platform, size_t count,
     }
 }
 
-/* Rotations are subtracted before they are multiplied: the smallest motion is off by no more than the poses are. */
+/* From each pose to another: displacement of a point of the platform, and rotation vector, along the columns of `axes`;
+ * 6 x n, m and rad. NaN after exactly half a turn, whose axis could point either way. Rotations are subtracted before they
+ * are multiplied: the smallest motion is off by no more than the poses are. */
 void hc_motions_many(size_t count, const double *positions, const double *rotations, const double *to_positions,
                      const double *to_rotations, const double *point, const double *axes, double *motions)
 {
@@ -59,6 +63,7 @@ void hc_motions_many(size_t count, const double *positions, const double *rotati
     }
 }
 
+/* Angles about the struts from the base's cardan axes to the platform's, n x 6, rad. */
 void hc_screw_twists(const double *base, const double *platform, const double *base_axes, const double *platform_axes,
                      size_t count, const double *positions, const double *rotations, double *twists)
 {
@@ -74,6 +79,7 @@ void hc_screw_twists(const double *base, const double *platform, const double *b
     }
 }
 
+/* Error of a strut at commands, without backlash and growth: m, and its slope. */
 void hc_strut_errors(const hc_state *state, int strut, double sense, size_t count, const double *commands, double *errors,
                      double *slopes)
 {
@@ -84,6 +90,7 @@ void hc_strut_errors(const hc_state *state, int strut, double sense, size_t coun
     }
 }
 
+/* Commands that give a strut real lengths, m; `shift` for its screw's rotation. */
 void hc_strut_commands(const hc_state *state, int strut, double sense, double shift, size_t count, const double *lengths,
                        double *commands)
 {
@@ -93,6 +100,7 @@ void hc_strut_commands(const hc_state *state, int strut, double sense, double sh
     }
 }
 
+/* Lower end of the window, and direction of motion, after each of some values that follow each other. */
 void hc_follow(double threshold, size_t count, const double *values, double *low, double *sense)
 {
     double windows[9] = {NAN}, directions[9] = {0.0};
@@ -103,6 +111,8 @@ void hc_follow(double threshold, size_t count, const double *values, double *low
     }
 }
 
+/* The model backwards, each pose by itself, its directions of motion given: what to command. `solved` is 0 where the field
+ * cannot be undone. */
 void hc_backwards_many(const hc_state *state, size_t count, const double *positions, const double *rotations,
                        const double *senses, double *model_positions, double *model_rotations, double *commands, int *solved)
 {
@@ -122,6 +132,8 @@ void hc_backwards_many(const hc_state *state, size_t count, const double *positi
     }
 }
 
+/* The model forwards: where the platform goes. Model poses are guesses, and solutions where the outcome is HC_OK; only
+ * there the poses are written. */
 void hc_forwards_many(const hc_state *state, size_t count, const double *commands, const double *senses,
                       double *model_positions, double *model_rotations, double *positions, double *rotations,
                       int *outcomes, double *conditions)

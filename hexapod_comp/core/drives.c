@@ -47,6 +47,8 @@ static void place_motor(hc_drives *drives, int i)
     drives->play[i] = half > 0.0 ? held(drives->play[i] + drives->motor[i] - before, -half, half) : 0.0;
 }
 
+/* Some ticks towards six commands. A drive brakes for its stops as for any command; what still runs into one (a jump, a
+ * command turned round too late) is stopped there dead. `sense` (9): directions of motion, 3 to 8 are written. */
 void hc_run_drives(hc_drives *drives, const double commands[6], long ticks, double sense[9])
 {
     int i;
@@ -72,10 +74,13 @@ void hc_run_drives(hc_drives *drives, const double commands[6], long ticks, doub
     }
 }
 
-void hc_follow_point(const hc_pose *pose, const double probe[3], double threshold, double low[9], double sense[9])
+/* Follow the measured point of a platform pose along the three axes. */
+void hc_follow_point(const double *position, const double *rotation, const double probe[3], double threshold, double low[9],
+                     double sense[9])
 {
-    const vec arm = lever(pose, probe);
-    follow(pose->position[0] + arm.x, threshold, low, sense, 0);
-    follow(pose->position[1] + arm.y, threshold, low, sense, 1);
-    follow(pose->position[2] + arm.z, threshold, low, sense, 2);
+    const hc_pose pose = pose_of(position, rotation);
+    const vec point = add(row_of(position), lever(&pose, probe));
+    follow(point.x, threshold, low, sense, 0);
+    follow(point.y, threshold, low, sense, 1);
+    follow(point.z, threshold, low, sense, 2);
 }

@@ -58,12 +58,17 @@ static void examine_nominal(const double base[6][3], const double platform[6][3]
     examine(base, pose, &now, limits, found);
 }
 
-void hc_examine(const double *base, const double *platform, const hc_limits *limits, const hc_pose *pose,
-                hc_quantities *found)
+/* The limited quantities of one pose, nominal. */
+void hc_examine(const double *base, const double *platform, const hc_limits *limits, const double *position,
+                const double *rotation, hc_quantities *found)
 {
-    examine_nominal((const double(*)[3])base, (const double(*)[3])platform, pose, limits, found);
+    const hc_pose pose = pose_of(position, rotation);
+    examine_nominal((const double(*)[3])base, (const double(*)[3])platform, &pose, limits, found);
 }
 
+/* n x 2 quantities, nominal and compensated, of poses that follow each other or are `independent`, each with the
+ * directions given; `low` and `sense` (9) are the motion, updated. Of `flags`, HC_NOT_CONVERGED says that the second is not
+ * written, HC_OUTSIDE_FIELD that the field's value was held at the boundary. */
 void hc_examine_many(const hc_state *state, size_t count, const double *positions, const double *rotations,
                      int independent, double *low, double *sense, hc_quantities *found, int *flags)
 {
@@ -88,6 +93,8 @@ void hc_examine_many(const hc_state *state, size_t count, const double *position
     }
 }
 
+/* The first limit that each pose breaks, a hc_status, and the struts concerned, n x 2, -1 for none. The last rotation serves
+ * all poses that have none. */
 void hc_check_poses(const double *base, const double *platform, const hc_limits *limits, size_t count,
                     const double *positions, size_t rotation_count, const double *rotations, signed char *findings,
                     signed char *struts)

@@ -139,6 +139,7 @@ static void fill_lane(lanes *a, int n, const double position[3], const double ro
     }
 }
 
+/* Inverse kinematics: |P + R t - b|. */
 void hc_strut_lengths_many(const double *base, const double *platform, size_t count, const double *positions,
                       const double *rotations, double *lengths)
 {
@@ -194,6 +195,9 @@ static void settle_lanes(const double base[6][3], const double platform[6][3], l
     }
 }
 
+/* Forward kinematics: Newton from the poses given, which solutions overwrite. A solution must have a condition number of at
+ * most `largest_condition` and home's sign of det J, 0 for any. `outcomes` are hc_status; `conditions` are NaN where
+ * there is none. */
 void hc_solve_pose_many(const double *base, const double *platform, size_t count, const double *lengths, double *positions,
                         double *rotations, double characteristic_length, double home_sign, double largest_condition,
                         int *outcomes, int *iterations, double *conditions)

@@ -1,10 +1,11 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * See single.h.
+ * One pose, one point, one strut at a time: what Python asks of the core beside a compensator and batches. Rotations are nine
+ * doubles, by rows.
  */
 #include "core.h"
-#include "single.h"
 
+/* The largest element of |R'R - 1|, infinite for a left-handed matrix. */
 double hc_rotation_flaw(const double *r)
 {
     const vec x = row_of(r), y = row_of(r + 3), z = row_of(r + 6);
@@ -22,6 +23,7 @@ double hc_rotation_flaw(const double *r)
     return dot(cross(x, y), z) < 0.0 ? HUGE_VAL : flaw;
 }
 
+/* A pose out of position and quaternion, refused as in hc_command. */
 hc_status hc_read_pose(const double numbers[7], double *position, double *rotation)
 {
     hc_pose pose;
@@ -62,21 +64,25 @@ void hc_quaternion(const double *rotation, double q[4])
     q[3] = (r[k][j] - r[j][k]) / root;
 }
 
+/* Replace R by exp(w) R. */
 void hc_rotate(double *rotation, double x, double y, double z)
 {
     rotate((double(*)[3])rotation, x, y, z);
 }
 
+/* Remove the rounding that products leave in a rotation. */
 void hc_orthonormalise(double *rotation)
 {
     orthonormalise((double(*)[3])rotation);
 }
 
+/* Solve a 6 x 6 system in place; returns the sign of its determinant, 0 for a singular matrix. */
 double hc_solve_linear(double *matrix, double *right)
 {
     return solve_six((double(*)[6])matrix, right);
 }
 
+/* Check lengths and pose of one stage; `struts`: which one, and a second one, -1 for none. */
 hc_status hc_check_stage(const double *base, const double *platform, const double *position, const double *rotation,
                          const double *lengths, const hc_limits *limits, int struts[2], double *value, double *condition)
 {
@@ -90,11 +96,13 @@ hc_status hc_check_stage(const double *base, const double *platform, const doubl
     return f.status;
 }
 
+/* The smallest distance between the segments a-b and c-d. */
 double hc_segment_distance(const double a[3], const double b[3], const double c[3], const double d[3])
 {
     return segment_distance(a, b, c, d);
 }
 
+/* Directions of motion and windows (9) after values of the measured point's axes and of the struts (9). */
 void hc_follow_nine(const double *values, double axis_threshold, double strut_threshold, double *low, double *sense)
 {
     int i;
@@ -103,16 +111,20 @@ void hc_follow_nine(const double *values, double axis_threshold, double strut_th
     }
 }
 
+/* Six components of a field at a point; returns whether that is outside its box. */
 int hc_field_at(const hc_field *field, const double *point, const double *sense, double *error)
 {
     return field_at(field, row_of(point), sense, error);
 }
 
+/* Real length of a strut for a command, m. */
 double hc_actual_length(const hc_state *state, int strut, double command, double sense, double shift)
 {
     return actual_length(state, strut, command, sense, shift);
 }
 
+/* Write six lengths, and as velocities their change since the last ones over a period, s, 0: at rest; at most `fastest`, then
+ * all in proportion. */
 void hc_write_lengths(const double *lengths, double period, double fastest, double *position, double *velocity)
 {
     int i;
@@ -125,11 +137,14 @@ void hc_write_lengths(const double *lengths, double period, double fastest, doub
     }
 }
 
+/* Take temperatures, humidity and lags that somebody has written into the state. */
 void hc_place(hc_state *state)
 {
     place_machine(state);
 }
 
+/* The model backwards: HC_OK, HC_NOT_CONVERGED, or HC_OUTSIDE_FIELD where the field is held at the boundary of its box; low
+ * and sense (9) go on. */
 hc_status hc_backwards(const hc_state *state, const double *position, const double *rotation, double *low, double *sense,
                        double *model_position, double *model_rotation, double *commands)
 {

@@ -6,6 +6,8 @@
 
 #define HALVINGS 32 /* of a step */
 
+/* From a tool pose in `frame` along the unit vector `shift`, or about `turn`, the other one being 0, in steps and up to
+ * `longest`, m or rad. `state` had no command yet, so that poses are judged one by one. */
 void hc_go(const hc_state *state, const hc_pose *tool, const hc_pose *frame, const double shift[3], const double turn[3],
            double step, double longest, hc_way *way)
 {

@@ -38,47 +38,19 @@ MODEL_FILE, VECTORS_FILE = "hexapod_model.h", "hexapod_vectors.h"
 
 @dataclass(frozen=True)
 class Vector:
-    """One line of the self-test.
+    """One line of the self-test: what the core is given, and what it must answer."""
 
-    Attributes
-    ----------
-    kind : str
-        ``c`` command, ``p`` estimate of the pose, ``t`` temperature, ``e`` enable, ``f`` forget, ``r`` reset to
-        measured struts.
-    values : tuple of float
-        Its numbers, as the core's function takes them.
-    time : float
-        Of a command, s.
-    status : int
-        What the Python compensator said, a :class:`~hexapod_comp.core.Status`.
-    expected : tuple of six float
-        Strut commands, m; of an estimate, position, m, and last row of the rotation matrix.
-    """
-
-    kind: str
-    values: tuple[float, ...]
-    time: float
-    status: int
-    expected: tuple[float, ...]
+    kind: str  # command, pose estimate, temperature, enable, forget, reset to measured struts: c p t e f r
+    values: tuple[float, ...]  # as the core's function takes them
+    time: float  # of a command, s
+    status: int  # hc_status
+    expected: tuple[
+        float, ...
+    ]  # six strut commands, m; of an estimate, position, m, and last row of the rotation matrix
 
 
 def write_c(folder: str | Path, geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str]) -> list[Path]:
-    """Write the core, this machine's constants and its self-test into a folder, which is made if it is missing.
-
-    Parameters
-    ----------
-    folder : str or Path
-        Files of these names in it are replaced.
-    geometry, model : HexapodGeometry, MachineModel
-        The machine and what it does differently.
-    hashes : tuple of two str
-        SHA-256 of the geometry file and of the model file; a replay looks whether they are those of a recording.
-
-    Returns
-    -------
-    list of Path
-        The files.
-    """
+    """Write the core, this machine's constants and its self-test; `hashes`: SHA-256 of geometry file and model file."""
     files = {path.name: path.read_text(encoding="utf-8") for path in sources()}
     files[MODEL_FILE] = model_header(geometry, model, hashes)
     files[VECTORS_FILE] = vectors_header(self_test(geometry, model))
@@ -97,85 +69,56 @@ def sources() -> list[Path]:
 
 
 def model_header(geometry: HexapodGeometry, model: MachineModel, hashes: tuple[str, str]) -> str:
-    """Return ``hexapod_model.h``: geometry, limits and model as one constant of type hc_model.
-
-    Raises
-    ------
-    ModelError
-        The model has a term of which the core knows nothing.
-    """
+    """Return ``hexapod_model.h``: geometry, limits and model as one hc_model; a term unknown to the core is refused."""
     refuse_unknown(model, carried.C, "the C core")
-    arrays: dict[str, np.ndarray] = {}
-    text = _struct(members(geometry, model, hashes), dtype_of("hc_model"), "hexapod", arrays, 1)
-    lines = [
-        "/* Written by hexapod_comp export --c. Constants of one machine, for hexapod_comp.c; include it once.",
-        " * m, rad, 1/K; frames and meanings as in hexapod_comp.h. You may use and ship this file as you like. */",
-        "#ifndef HEXAPOD_MODEL_H",
-        "#define HEXAPOD_MODEL_H",
-        "",
-        '#include "hexapod_comp.h"',
-        "",
-        *(_array(name, values) for name, values in arrays.items()),
-        f"static const hc_model hexapod_model = {text};",
-        "",
-        "#endif",
-    ]
-    return "\n".join(lines) + "\n"
+    arrays: list[str] = []
+    text = _initialiser(members(geometry, model, hashes), dtype_of("hc_model"), "hexapod", arrays)
+    return f"""\
+/* Written by hexapod_comp export --c. Constants of one machine, for hexapod_comp.c; include it once.
+ * m, rad, 1/K; frames and meanings as in hexapod_comp.h. You may use and ship this file as you like. */
+#ifndef HEXAPOD_MODEL_H
+#define HEXAPOD_MODEL_H
+
+#include "hexapod_comp.h"
+
+{"".join(arrays)}
+static const hc_model hexapod_model = {text};
+
+#endif
+"""
 
 
-def _struct(values: dict[str, Any], layout: np.dtype, path: str, arrays: dict[str, np.ndarray], depth: int) -> str:
-    """Return the initialiser of a struct; what it points to is put into `arrays` by name."""
-    inner = "    " * depth
-    lines = []
-    for name, value in values.items():
-        text = _initialiser(value, layout[name], f"{path}_{name}", arrays, depth)
-        lines.append(f"{inner}.{name} = {text},\n")
-    return "{\n" + "".join(lines) + "    " * (depth - 1) + "}"
-
-
-def _initialiser(value: Any, kind: np.dtype, path: str, arrays: dict[str, np.ndarray], depth: int) -> str:
-    if isinstance(value, str):
-        return _text(value)
-    if isinstance(value, dict):
-        return _struct(value, kind, path, arrays, depth + 1)
-    if kind.base == np.uintp:
-        if not kind.shape:
-            arrays[path] = value
-            return path
+def _initialiser(value: Any, kind: np.dtype, path: str, arrays: list[str], margin: str = "\n") -> str:
+    """Return the C initialiser of a value; what a pointer points to becomes an array of its own, named by its path."""
+    inner = margin + "    "
+    if isinstance(value, str):  # what is not plain ASCII is written in octal, byte by byte
         return (
-            "{" + ", ".join(_initialiser(v, kind.base, f"{path}_{n}", arrays, depth) for n, v in enumerate(value)) + "}"
+            '"' + "".join(chr(b) if 32 <= b < 127 and b not in b'"\\?' else f"\\{b:03o}" for b in value.encode()) + '"'
         )
-    if kind.base.names and not isinstance(value, np.ndarray):
-        return "{" + ", ".join(_struct(v, kind.base, path, arrays, depth + 1) for v in value) + "}"
-    if kind.base.names:
-        return _struct({name: value[name] for name in kind.names or ()}, kind, path, arrays, depth + 1)
+    if kind.base.names and isinstance(value, np.ndarray):
+        value = {name: value[name] for name in kind.base.names}
+    if isinstance(value, dict):
+        parts = (f".{n} = {_initialiser(v, kind[n], f'{path}_{n}', arrays, inner)}," for n, v in value.items())
+        return "{" + "".join(inner + part for part in parts) + margin + "}"
+    if kind.base == np.uintp and not kind.shape:
+        numbers = np.ravel(value).tolist() or [0.0]  # C has no arrays without elements
+        rows = (", ".join(map(_numbers, numbers[k : k + 6])) for k in range(0, len(numbers), 6))
+        arrays.append(f"static const double {path}[{len(numbers)}] = {{\n    " + ",\n    ".join(rows) + "};\n")
+        return path
+    if kind.base == np.uintp or kind.base.names:
+        return (
+            "{" + ", ".join(_initialiser(v, kind.base, f"{path}_{n}", arrays, inner) for n, v in enumerate(value)) + "}"
+        )
     while kind.subdtype:
         kind = kind.base
-    return _values(np.asarray(value).astype(kind))
+    return _numbers(np.asarray(value).astype(kind).tolist())
 
 
-def _array(name: str, values: np.ndarray) -> str:
-    """Return the definition of a flat array; C has none without elements, so an empty one gets a zero."""
-    flat = np.ravel(values) if values.size else np.zeros(1)
-    rows = [", ".join(_number(v) for v in flat[k : k + 6]) for k in range(0, len(flat), 6)]
-    return f"static const double {name}[{len(flat)}] = {{\n    " + ",\n    ".join(rows) + "};\n"
-
-
-def _values(values: np.ndarray) -> str:
-    if values.ndim == 0:
-        return _number(values[()])
-    return "{" + ", ".join(_values(np.asarray(part)) for part in values) + "}"
-
-
-def _number(value: Any) -> str:
-    """Return a number as C: whole ones of integer type stay so, others come back as the same double."""
-    return str(int(value)) if isinstance(value, (int, np.integer)) else repr(float(value)).replace("inf", "HUGE_VAL")
-
-
-def _text(value: str) -> str:
-    """Return a string literal; whatever is not plain ASCII is written in octal, byte by byte."""
-    plain = "".join(chr(b) if 32 <= b < 127 and chr(b) not in '"\\?' else f"\\{b:03o}" for b in value.encode())
-    return f'"{plain}"'
+def _numbers(value: Any) -> str:
+    """Return numbers as C, those of integer type as such, others so that they come back as the same double."""
+    if isinstance(value, (list, tuple)):
+        return "{" + ", ".join(map(_numbers, value)) + "}"
+    return str(value) if isinstance(value, int) else repr(value).replace("inf", "HUGE_VAL").replace("nan", "NAN")
 
 
 def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> list[Vector]:
@@ -186,7 +129,8 @@ def self_test(geometry: HexapodGeometry, model: MachineModel, seed: int = 1) -> 
     """
     recorder = Recorder(geometry, model)
     random = np.random.default_rng(seed)
-    stream = _stream(geometry, [_near_home(geometry, random) for _ in range(4)])
+    path, _ = moves(geometry, *stacked([_near_home(geometry, random) for _ in range(4)]), 1.0 / PERIOD)
+    stream = [path.pose(k) for k in range(len(path))]
     quarter = max(1, len(stream) // 4)
     recorder.commands(stream[:quarter])
     recorder.take("t", (2.0, 24.5))
@@ -222,12 +166,6 @@ def _near_home(geometry: HexapodGeometry, random: np.random.Generator) -> Pose:
             continue
         return geometry.tool_pose(pose)
     return geometry.tool_pose(home)
-
-
-def _stream(geometry: HexapodGeometry, poses: Sequence[Pose]) -> list[Pose]:
-    """Return the stream that joins tool poses, in steps that the machine's limits allow."""
-    path, _ = moves(geometry, *stacked(poses), 1.0 / PERIOD)
-    return [path.pose(k) for k in range(len(path))]
 
 
 class Recorder:
@@ -280,39 +218,27 @@ def status_of(error: HexapodError) -> int:
 
 def vectors_header(vectors: Sequence[Vector]) -> str:
     """Return ``hexapod_vectors.h``."""
-    rows = []
+    rows = ""
     for v in vectors:
-        values = [*v.values, *[0.0] * (7 - len(v.values))]
-        rows.append(f"    {{'{v.kind}', {v.status}, {_c(v.time)}, {{{_row(values)}}}, {{{_row(v.expected)}}}}},")
-    return "\n".join(
-        [
-            "/* Written by hexapod_comp export --c: what the Python compensator answered, for hexapod_selftest.c. */",
-            "#ifndef HEXAPOD_VECTORS_H",
-            "#define HEXAPOD_VECTORS_H",
-            "",
-            "#include <math.h>",
-            "",
-            "typedef struct {",
-            "    char kind;",
-            "    int status;",
-            "    double time, input[7], expected[6];",
-            "} hexapod_vector;",
-            "",
-            f"static const double hexapod_ramp_rate = {_c(DEFAULT_RAMP_RATE)};",
-            "",
-            "static const hexapod_vector hexapod_vectors[] = {",
-            *rows,
-            "};",
-            "",
-            "#endif",
-            "",
-        ]
-    )
+        numbers = f"{v.time!r}, {_numbers(v.values + (7 - len(v.values)) * (0.0,))}, {_numbers(v.expected)}"
+        rows += f"    {{'{v.kind}', {v.status}, {numbers}}},\n"
+    return f"""\
+/* Written by hexapod_comp export --c: what the Python compensator answered, for hexapod_selftest.c. */
+#ifndef HEXAPOD_VECTORS_H
+#define HEXAPOD_VECTORS_H
 
+#include <math.h>
 
-def _row(values: Iterable[float]) -> str:
-    return ", ".join(_c(v) for v in values)
+typedef struct {{
+    char kind;
+    int status;
+    double time, input[7], expected[6];
+}} hexapod_vector;
 
+static const double hexapod_ramp_rate = {DEFAULT_RAMP_RATE!r};
 
-def _c(value: float) -> str:
-    return "NAN" if np.isnan(value) else _number(float(value))
+static const hexapod_vector hexapod_vectors[] = {{
+{rows}}};
+
+#endif
+"""

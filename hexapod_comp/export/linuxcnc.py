@@ -126,7 +126,7 @@ def _side(machine: RealMachine, box: np.ndarray) -> np.ndarray:
         return np.ones(6)
     nodes = _box_nodes(box, 5)
     level = geometry.platform_poses(nodes, np.tile(np.eye(3), (len(nodes), 1, 1)))
-    cosines = np.cos(screw_twists(machine.body, *(np.ascontiguousarray(part) for part in level)))
+    cosines = np.cos(screw_twists(*machine.body, *(np.ascontiguousarray(part) for part in level)))
     side = np.where(np.cos(machine.constants.view["struts"]["twist_home"]) > 0.0, 1.0, -1.0)
     nearest = (side * cosines).min(axis=0)
     if nearest.min() < np.sin(FOLD):
@@ -181,7 +181,7 @@ def exact_trims(machine: RealMachine, strut: int, joints: np.ndarray, sense: flo
     twist = float(constants["twist_home"])
     since = twist - np.pi * np.round(twist / np.pi)  # what the arcsine makes of it
     shift = float(constants["lead"]) * since / (2.0 * np.pi)
-    return strut_commands(machine.state.at, strut, joints, sense, shift) - joints
+    return strut_commands(machine.state, strut, sense, shift, joints) - joints
 
 
 def table_misfit(machine: RealMachine, genhexkins: Genhexkins, box: np.ndarray) -> np.ndarray:

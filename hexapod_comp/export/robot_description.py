@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..core.single import quaternion_of
+from ..core.batch import quaternion_of
 from ..machine.geometry import BASE, STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import strut_lengths
 from ..pose import Pose, roll_pitch_yaw

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..core.single import follow_nine
+from ..core.batch import follow_nine
 from ..errors import HexapodError, KinematicsError
 from ..formats.texts import plain_number
 from ..machine.geometry import load_geometry

@@ -96,5 +96,5 @@ def twist_per_lead(geometry: HexapodGeometry, positions: np.ndarray, rotations: 
     across = np.cross(neutral, np.eye(3)[np.abs(neutral).argmin(axis=1)])
     across /= np.linalg.norm(across, axis=1)[:, None]
     machine = (*geometry.kernel_joints, across, across @ geometry.home.rotation)
-    twists = screw_twists(machine, np.ascontiguousarray(positions), np.ascontiguousarray(rotations))
+    twists = screw_twists(*machine, np.ascontiguousarray(positions), np.ascontiguousarray(rotations))
     return float(np.abs(twists).max() / (2.0 * np.pi))

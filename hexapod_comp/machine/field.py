@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ..core import Struct
-from ..core.single import field_at
+from ..core.batch import field_at
 from ..errors import ModelError
 
 COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")
@@ -79,7 +79,7 @@ class GridField:
         """Return the error at a point of ``base``."""
         error = np.empty(6)
         position = np.array(position, dtype=float)
-        return error, field_at(self._struct, position, np.array(sense, dtype=float), error)
+        return error, bool(field_at(self._struct, position, np.array(sense, dtype=float), error))
 
     @functools.cached_property
     def _struct(self) -> Struct:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ..core import Status, Struct, batch
-from ..core.single import check_stage
+from ..core.batch import check_stage
 from ..errors import FrameError, GeometryError, InputFileError, KinematicsError, LimitError, PoseError, shorten
 from ..formats.files import read_text
 from ..formats.paths import input_file
@@ -246,7 +246,7 @@ class HexapodGeometry:
         self, position: np.ndarray, rotation: np.ndarray, lengths: np.ndarray
     ) -> LimitError | KinematicsError | None:
         """Return why the nominal machine may not stand in a platform pose with its strut lengths, None if it may."""
-        outcome = check_stage(*self.kernel_joints, position, rotation, lengths, self.limit_numbers)
+        outcome = check_stage(*self.kernel_joints, position, rotation, lengths, limits=self.limit_numbers)
         finding, strut, value, _, _ = outcome
         return None if finding == Status.OK else self.limits.error(finding, strut, 0, value)
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core import Status, Struct, batch, lib
-from ..core.single import backwards, rotate
+from ..core.batch import backwards, rotate
 from ..errors import ModelError, NotConvergedError
 from ..pose import Pose
 from .arrays import changed_rows

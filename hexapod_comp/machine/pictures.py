@@ -136,7 +136,7 @@ def direction_figure() -> Figure:
     threshold = 2.0
     there = np.concatenate([np.linspace(0.0, 12.0, 60), np.full(60, 12.0), np.linspace(12.0, 3.0, 60)])
     values = there + 0.3 * np.random.default_rng(1).standard_normal(len(there))
-    low, sense = follow(values, threshold)
+    low, sense = follow(threshold, values)
     figure = Figure(figsize=(7, 4), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
     number, window = np.arange(len(values)), low

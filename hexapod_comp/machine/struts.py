@@ -169,4 +169,4 @@ def home_twists(geometry: HexapodGeometry) -> np.ndarray:
     if not geometry.screw_lead.any():
         return np.zeros(6)
     body = *geometry.kernel_joints, *geometry.kernel_axes
-    return screw_twists(body, geometry.home.position[None], geometry.home.rotation[None])[0]
+    return screw_twists(*body, geometry.home.position[None], geometry.home.rotation[None])[0]

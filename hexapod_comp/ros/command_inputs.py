@@ -13,7 +13,7 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
 
 from ..compensation.compensator import Compensator
-from ..core.single import quaternion_of
+from ..core.batch import quaternion_of
 from ..errors import HexapodError
 from ..machine.kinematics import Structure, forward_error, solve_poses, strut_lengths
 from ..pose import Pose

@@ -10,7 +10,7 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
-from ..core.single import quaternion_of, write_lengths
+from ..core.batch import quaternion_of, write_lengths
 from ..errors import CommandError
 from ..machine.geometry import STRUT_NAMES
 from ..pose import Pose

@@ -17,7 +17,7 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
-from ..core.single import write_lengths
+from ..core.batch import write_lengths
 from ..errors import CommandError
 from ..machine.geometry import STRUT_NAMES
 from .messages import LARGEST_MESSAGE, StrutMessage, pose_numbers, read_message

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..core import Status
-from ..core.batch import backwards
+from ..core.batch import backwards_many
 from ..errors import ModelError, NotConvergedError
 from ..machine.kinematics import forward_error
 from ..machine.model import MachineModel, RealMachine
@@ -129,7 +129,7 @@ def model_commands(
     arrays = positions, rotations, np.ascontiguousarray(senses, dtype=float), *modelled, commands, solved
     for machine, alike in groupby(machines):
         rows = slice(done, done + len(list(alike)))
-        backwards(machine.state.at, *(array[rows] for array in arrays))
+        backwards_many(machine.state, *(array[rows] for array in arrays))
         done = rows.stop
     if not solved.all():
         n = int(solved.argmin())

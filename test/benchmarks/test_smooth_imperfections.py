@@ -36,7 +36,7 @@ FORWARD, BACKWARD = np.ones(3), -np.ones(3)
 def strut_errors(model: MachineModel) -> np.ndarray:
     """Return what the machine's struts do with :data:`COMMANDS`, shape (6, n), m."""
     machine = RealMachine(PAPER, model)
-    return np.array([batch.strut_errors(machine.state.at, strut, COMMANDS)[0] for strut in range(6)])
+    return np.array([batch.strut_errors(machine.state, strut, 0.0, COMMANDS)[0] for strut in range(6)])
 
 
 def field_errors(model: MachineModel, points: np.ndarray, sense: np.ndarray = FORWARD) -> np.ndarray:

@@ -14,7 +14,7 @@ import pytest
 from foreign_machines import Errors, Machine, with_frames
 
 from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.core.single import quaternion_of
+from hexapod_comp.core.batch import quaternion_of
 from hexapod_comp.errors import FrameError, LimitError, PoseError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model_file import load_model

@@ -3,7 +3,7 @@
  * Goes through everything that the core does, on the machine of hexapod_model.h, and prints each number in full: the same
  * lines under every compiler and instruction set, and no complaint of a sanitizer. `driver N` goes on for N commands.
  */
-#include "hexapod_batch.h"
+#include "hexapod_batch.c"
 #include "hexapod_model.h"
 
 #include <math.h>
@@ -40,7 +40,7 @@ static void show_status(const char *what, int status)
 }
 
 /* A small rotation, exact to rounding: rows of (1 - |w|^2) + 2 (w w' + [w]) over 1 + |w|^2. */
-static void turn(double angle, double rotation[9])
+static void turned_to(double angle, double rotation[9])
 {
     const double x = angle * drawn(), y = angle * drawn(), z = angle * drawn();
     const double square = x * x + y * y + z * z, share = 2.0 / (1.0 + square), one = share - 1.0;
@@ -134,7 +134,7 @@ static void draw_poses(void)
         for (i = 0; i < 3; i++) {
             positions[3 * n + i] = hexapod_model.home.position[i] + 0.04 * drawn();
         }
-        turn(0.1, rotations + 9 * n);
+        turned_to(0.1, rotations + 9 * n);
         for (i = 0; i < 9; i++) {
             senses[9 * n + i] = drawn() > 0.0 ? 1.0 : -1.0;
         }
@@ -214,7 +214,7 @@ static void model(void)
         show_status("finding", 10000 * findings[n] + 100 * struts[2 * n] + struts[2 * n + 1]);
     }
     pose = hexapod_model.home;
-    hc_examine(base, platform, &hexapod_model.limits, &pose, found);
+    hc_examine(base, platform, &hexapod_model.limits, pose.position, pose.rotation[0], found);
     show("home", (const double *)&found[0], (int)(sizeof found[0] / sizeof(double)));
 }
 
@@ -241,7 +241,7 @@ static void triangles(void)
     double circles[27], sides[3], axes[9];
     int i, k;
     for (i = 0; i < 3; i++) {
-        turn(3.0, axes);
+        turned_to(3.0, axes);
         for (k = 0; k < 3; k++) {
             circles[9 * i + k] = 0.3 * drawn();
             circles[9 * i + 3 + k] = 0.4 * axes[k];
@@ -282,7 +282,7 @@ static void drives(void)
             wanted[i] = 0.5 + 0.12 * drawn();
         }
         hc_run_drives(&all, wanted, 37, sense);
-        hc_follow_point(&hexapod_model.home, probe, 1e-3, low, sense);
+        hc_follow_point(hexapod_model.home.position, hexapod_model.home.rotation[0], probe, 1e-3, low, sense);
         show("motor", all.motor, 6);
         show("play", all.play, 6);
         show("sense", sense, 9);

@@ -119,7 +119,7 @@ def test_motions_are_scipy_s_rotation_vectors():
 
 def test_a_window_follows_with_play():
     """As a nut in its thread: 2 wide, pushed up to 5, the way back shows after 2."""
-    low, sense = batch.follow(np.array([0.0, 5.0, 3.5, 3.0, 2.5, 5.5]), 2.0)
+    low, sense = batch.follow(2.0, np.array([0.0, 5.0, 3.5, 3.0, 2.5, 5.5]))
     assert low.tolist() == [-1.0, 3.0, 3.0, 3.0, 2.5, 3.5]
     assert sense.tolist() == [0.0, 1.0, 1.0, 1.0, -1.0, 1.0]
 

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from strategies import paper_geometry
 
 from hexapod_comp.core import Status, batch
-from hexapod_comp.core.single import rotate
+from hexapod_comp.core.batch import rotate
 from hexapod_comp.errors import (
     KinematicsError,
     NotFiniteError,

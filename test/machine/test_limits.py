@@ -21,7 +21,7 @@ from strategies import fixed, paper_geometry, random_model, random_pose, seeds, 
 from hexapod_comp.compensation.checks import check
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.core import Status, Struct, batch
-from hexapod_comp.core.single import check_stage
+from hexapod_comp.core.batch import check_stage
 from hexapod_comp.errors import HexapodError, LimitError
 from hexapod_comp.machine.assembly import mode_objections
 from hexapod_comp.machine.geometry import HexapodGeometry
@@ -347,7 +347,7 @@ def hold_together(machine: HexapodGeometry, limits: Limits, pose: Pose, lengths:
     at = *machine.kernel_joints, pose.position, pose.rotation
     found = batch.examine(*machine.kernel_joints, numbers.at, pose.position, pose.rotation)
     found["lengths"][0, 0] = lengths
-    finding, strut, _, other, _ = check_stage(*at, lengths, numbers)
+    finding, strut, _, other, _ = check_stage(*at, lengths, limits=numbers)
     expected = first_broken(limits, numbers, found)
     if finding == Status.OK:
         assert expected == set()

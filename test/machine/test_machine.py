@@ -21,7 +21,7 @@ from strategies import (
     skewed_geometry,
 )
 
-from hexapod_comp.core.single import follow_nine
+from hexapod_comp.core.batch import follow_nine
 from hexapod_comp.errors import ModelError, NotConvergedError, NotFiniteError, UnreachableError
 from hexapod_comp.machine.field import GridField
 from hexapod_comp.machine.kinematics import Structure, solve_pose

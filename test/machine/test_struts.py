@@ -12,8 +12,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 from strategies import fixed, paper_geometry, random_pose, random_struts, seeds, skewed_geometry
 
-from hexapod_comp.core.batch import screw_twists, strut_commands
-from hexapod_comp.core.single import actual_length
+from hexapod_comp.core.batch import actual_length, screw_twists, strut_commands
 from hexapod_comp.errors import ModelError
 from hexapod_comp.machine.model import MachineModel, MotionState, RealMachine
 from hexapod_comp.machine.struts import STEEPEST_ERROR, StrutErrors
@@ -36,7 +35,7 @@ def length(struts, command, sense=0.0, strut=0, growth=0.0, shift=0.0):
 
 
 def command_for_length(machine, strut, wanted, sense=0.0, shift=0.0):
-    return strut_commands(machine.state.at, strut, np.array([wanted]), sense, shift)[0]
+    return strut_commands(machine.state, strut, sense, shift, np.array([wanted]))[0]
 
 
 def on_strut_4(value):
@@ -109,7 +108,7 @@ def test_growth_comes_from_the_temperature_above_20_degrees():
     """Truth: L·(1 + a·(T − T_ref)) (DESIGN): 12 ppm/K · 15 K of 0.5 m are 90 µm, on strut 2 alone."""
     model = MachineModel("paper", struts=StrutErrors(expansion=np.full(6, 12e-6)))
     machine = RealMachine(PAPER, model, Temperatures({"strut_2": 35.0}))
-    lengths = [actual_length(machine.state, i, 0.5) for i in range(6)]
+    lengths = [actual_length(machine.state, i, 0.5, 0.0, 0.0) for i in range(6)]
     np.testing.assert_allclose(np.array(lengths) - 0.5, np.where(np.arange(6) == 1, 90e-6, 0.0), atol=2e-16)
 
 
@@ -185,7 +184,7 @@ def test_undone_also_where_the_error_is_as_steep_as_allowed(period, offset, phas
     )
     machine = machine_of(struts)
     command = command_for_length(machine, 0, at)
-    assert actual_length(machine.state, 0, command) == pytest.approx(at, abs=1e-15)
+    assert actual_length(machine.state, 0, command, 0.0, 0.0) == pytest.approx(at, abs=1e-15)
 
 
 # What no strut can be.
@@ -262,7 +261,7 @@ def test_sine_of_the_twist_is_genhexkins(seed):
     axes = rng.normal(size=(2, 6, 3))
     axes /= np.linalg.norm(axes, axis=2)[:, :, None]
     for i, strut in enumerate(struts_at(geometry, pose)):
-        twist = screw_twists((*geometry.kernel_joints, *axes), pose.position[None], pose.rotation[None])[0, i]
+        twist = screw_twists(*geometry.kernel_joints, *axes, pose.position[None], pose.rotation[None])[0, i]
         truth = genhexkins_correction(2.0 * np.pi, axes[0, i], axes[1, i], strut, pose.rotation)
         assert np.sin(twist) == pytest.approx(np.sin(truth), abs=1e-11)
 
@@ -321,7 +320,7 @@ def test_sign_and_size_by_hand():
     base[0], platform[0] = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
     axes = np.tile([1.0, 0.0, 0.0], (6, 1))
     turned = Rotation.from_rotvec([0.0, 0.0, np.deg2rad(10.0)]).as_matrix()
-    twist = screw_twists((base, platform, axes, axes), np.array([[0.0, 0.0, 0.4]]), turned[None])[0, 0]
+    twist = screw_twists(base, platform, axes, axes, np.array([[0.0, 0.0, 0.4]]), turned[None])[0, 0]
     assert np.rad2deg(twist) == pytest.approx(10.0, abs=1e-12)
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from strategies import fixed, seeds
 
-from hexapod_comp.core.single import quaternion_of
+from hexapod_comp.core.batch import quaternion_of
 from hexapod_comp.errors import CommandError, PoseError
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.pose import Pose

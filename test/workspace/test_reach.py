@@ -11,7 +11,7 @@ from helpers import segment_distance
 from strategies import PAPER_FILE, paper_geometry
 
 from hexapod_comp.core import Status
-from hexapod_comp.core.single import segment_distance as closest
+from hexapod_comp.core.batch import segment_distance as closest
 from hexapod_comp.errors import GeometryError, PoseError
 from hexapod_comp.machine import kinematics
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
