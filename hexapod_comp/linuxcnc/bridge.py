@@ -57,20 +57,7 @@ LONGEST_FAREWELL = 1.0
 
 
 class LinuxcncBridgeNode(MachineNode):
-    """Lifecycle node around a HAL component and a :class:`CorrectionGuard`.
-
-    Parameters
-    ----------
-    hal : module, optional
-        LinuxCNC's module ``hal``; found where LinuxCNC is installed.
-    **options
-        Those of ``rclpy`` nodes.
-
-    Raises
-    ------
-    HalError, ParameterError
-        No LinuxCNC, or a parameter's value is not allowed.
-    """
+    """Lifecycle node around a HAL component and a :class:`CorrectionGuard`."""
 
     def __init__(self, hal: Any = None, **options: Any) -> None:
         super().__init__("linuxcnc_bridge", PARAMETERS, **options)

@@ -19,35 +19,23 @@ TEXTS = {
 
 @dataclass
 class BridgeStatus:
-    """Counters of a bridge, and the status made of them.
+    """Counters of a bridge, and the status made of them."""
 
-    Attributes
-    ----------
-    guard : CorrectionGuard
-        Between the compensator and the controller.
-    cycles, sent, states, heard : Flow
-        Cycles of the loop, commands and measured struts published, corrections that came.
-    refusals, bad_pins : Refusals
-        Corrections and pins that were not used.
-    machine_on, enabled : bool
-        The controller's switches.
-    resets : int
-        How often the compensator was asked to start anew.
-    latency : float
-        Age of the last correction's command when it came, s.
-    """
-
-    guard: CorrectionGuard
+    guard: CorrectionGuard  # between the compensator and the controller
+    # cycles of the loop, commands and measured struts published, corrections that came
     cycles: Flow = field(default_factory=Flow)
+    # cycles of the loop, commands and measured struts published, corrections that came
     sent: Flow = field(default_factory=Flow)
+    # cycles of the loop, commands and measured struts published, corrections that came
     states: Flow = field(default_factory=Flow)
+    # cycles of the loop, commands and measured struts published, corrections that came
     heard: Flow = field(default_factory=Flow)
-    refusals: Refusals = field(default_factory=Refusals)
-    bad_pins: Refusals = field(default_factory=Refusals)
-    machine_on: bool = False
-    enabled: bool = False
-    resets: int = 0
-    latency: float = 0.0
+    refusals: Refusals = field(default_factory=Refusals)  # corrections and pins that were not used
+    bad_pins: Refusals = field(default_factory=Refusals)  # corrections and pins that were not used
+    machine_on: bool = False  # the controller's switches
+    enabled: bool = False  # the controller's switches
+    resets: int = 0  # how often the compensator was asked to start anew
+    latency: float = 0.0  # age of the last correction's command when it came, s
 
     def judged(self, active: bool, now: float) -> tuple[bytes, str]:
         """Return level and message of the diagnostics."""

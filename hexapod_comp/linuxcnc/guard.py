@@ -40,39 +40,13 @@ class GuardStatus(IntEnum):
 
 
 class CorrectionGuard:
-    """Six corrections that follow what a compensator asks for, within a limit and along a ramp.
-
-    Parameters
-    ----------
-    limit : float
-        Largest magnitude of a correction that is accepted, m.
-    ramp_rate : float
-        Largest speed of the output, m/s. All six move in proportion, the one with the longest way at this speed.
-    timeout : float
-        A correction older than this is lost, s.
-    on_loss : str, optional
-        ``zero`` or ``hold``, see :data:`ON_LOSS`.
-
-    Attributes
-    ----------
-    output : list of float
-        The six corrections now, m; zero at first.
-    status : GuardStatus
-        What they are doing.
-    accepted, rejected : int
-        Corrections taken, and those too large or not finite, which were not.
-
-    Raises
-    ------
-    HexapodError
-        A number is not positive and finite, or `on_loss` is something else.
-    """
+    """Six corrections that follow what a compensator asks for, within a limit and along a ramp."""
 
     def __init__(self, limit: float, ramp_rate: float, timeout: float, on_loss: str = "zero") -> None:
         self.follow(limit, ramp_rate, timeout, on_loss)
-        self.output: list[float] = list(ZERO)
-        self.status = GuardStatus.OFF
-        self.accepted = self.rejected = 0
+        self.output: list[float] = list(ZERO)  # the six corrections now, m; zero at first
+        self.status = GuardStatus.OFF  # what they are doing
+        self.accepted = self.rejected = 0  # corrections taken, and those too large or not finite, which were not
         self._newest: list[float] = list(ZERO)
         self._accepted_at = self._updated_at = -math.inf
 
@@ -91,21 +65,7 @@ class CorrectionGuard:
         return now - self._accepted_at
 
     def offer(self, correction: Sequence[float], now: float) -> None:
-        """Take a correction as what the output shall become.
-
-        Parameters
-        ----------
-        correction : sequence of float, shape (6,)
-            m.
-        now : float
-            Monotonic time, s.
-
-        Raises
-        ------
-        CommandError
-            ``strut_count``, ``not_finite`` or ``correction`` (too large). It is counted and forgotten: neither
-            output nor age change.
-        """
+        """Take a correction as what the output shall become."""
         values = [float(value) for value in correction]
         try:
             self._check(values)
@@ -128,20 +88,7 @@ class CorrectionGuard:
                 )
 
     def update(self, now: float, enabled: bool) -> list[float]:
-        """Move the output on and return it.
-
-        Parameters
-        ----------
-        now : float
-            Monotonic time, s.
-        enabled : bool
-            Follow the corrections; otherwise return to zero.
-
-        Returns
-        -------
-        list of float, shape (6,)
-            m.
-        """
+        """Move the output on and return it."""
         reach = self._ramp_rate * self._elapsed(now)
         target, arrived = self._aim(now, enabled)
         ways = [there - here for there, here in zip(target, self.output, strict=True)]

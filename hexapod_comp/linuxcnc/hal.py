@@ -38,18 +38,7 @@ class HalError(HexapodError):
 
 
 def load_module(name: str = "hal") -> ModuleType:
-    """Import one of LinuxCNC's Python modules.
-
-    Parameters
-    ----------
-    name : str
-        ``hal`` or ``linuxcnc``.
-
-    Raises
-    ------
-    HalError
-        LinuxCNC is not installed, or its module is for another version of Python; names both.
-    """
+    """Import one of LinuxCNC's Python modules."""
     with _own_signals():
         return _import(name)
 
@@ -100,17 +89,7 @@ def _absence(name: str) -> str:
 
 @dataclass(frozen=True)
 class Pin:
-    """One pin of a component.
-
-    Parameters
-    ----------
-    name : str
-        Name within the component.
-    kind : str
-        ``float``, ``bit``, ``s32`` or ``u32``.
-    direction : str
-        ``in`` or ``out``.
-    """
+    """One pin of a component."""
 
     name: str
     kind: str
@@ -123,22 +102,7 @@ def pins(direction: str, kind: str, *names: str) -> tuple[Pin, ...]:
 
 
 class HalComponent:
-    """A userspace HAL component; its pins exist from the start, :meth:`ready` lets ``loadusr -W`` go on.
-
-    Parameters
-    ----------
-    name : str
-        Of the component; pins are ``name.pin``.
-    wanted : iterable of Pin
-        Its pins.
-    hal : module, optional
-        LinuxCNC's ``hal``; :func:`load_module` finds it.
-
-    Raises
-    ------
-    HalError
-        There is no HAL, or it refuses the component, e.g. because one of that name exists.
-    """
+    """A userspace HAL component; its pins exist from the start, :meth:`ready` lets ``loadusr -W`` go on."""
 
     def __init__(self, name: str, wanted: Iterable[Pin], hal: Any = None) -> None:
         hal = load_module() if hal is None else hal
@@ -180,13 +144,7 @@ class HalComponent:
 
 
 def quaternion_from_axes(a: float, b: float, c: float) -> tuple[float, float, float, float]:
-    """Return the unit quaternion (x, y, z, w) of LinuxCNC's rotary axes: R = Rz(C)·Ry(B)·Rx(A) (genhexkins).
-
-    Parameters
-    ----------
-    a, b, c : float
-        Roll, pitch, yaw, degrees.
-    """
+    """Return the unit quaternion (x, y, z, w) of LinuxCNC's rotary axes: R = Rz(C)·Ry(B)·Rx(A) (genhexkins)."""
     cr, sr = _half(a)
     cp, sp = _half(b)
     cy, sy = _half(c)
@@ -201,18 +159,7 @@ def quaternion_from_axes(a: float, b: float, c: float) -> tuple[float, float, fl
 def pose_from_axes(
     x: float, y: float, z: float, a: float, b: float, c: float, tool_offset: float = 0.0
 ) -> tuple[float, float, float, float, float, float, float]:
-    """Return position and unit quaternion (x, y, z, w) of the platform that LinuxCNC's genhexkins commands.
-
-    Parameters
-    ----------
-    x, y, z : float
-        Commanded axes; the position is in their unit.
-    a, b, c : float
-        Roll, pitch, yaw, degrees.
-    tool_offset : float
-        Its tool length T, in the same unit. The axes tell where the point (0, 0, −T) of the platform is, shifted by
-        T so that a level platform has the same axes with any tool: the platform is at axes − T·ẑ + R·T·ẑ.
-    """
+    """Return position and unit quaternion (x, y, z, w) of the platform that LinuxCNC's genhexkins commands."""
     i, j, k, w = quaternion_from_axes(a, b, c)
     return (
         x + tool_offset * 2.0 * (i * k + w * j),

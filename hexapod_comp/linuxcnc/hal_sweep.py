@@ -25,15 +25,7 @@ ROW = re.compile(r"^\s*(\d+)\s+User\s+(\S+)\s+(\d+)\s", re.MULTILINE)
 
 
 def dead_components(listing: str, name: str) -> list[int]:
-    """Return the numbers of components of a name whose process is gone.
-
-    Parameters
-    ----------
-    listing : str
-        What ``halcmd show comp`` prints.
-    name : str
-        Of the component.
-    """
+    """Return the numbers of components of a name whose process is gone."""
     rows = ROW.findall(listing)
     return [int(number) for number, known, pid in rows if known == name and not _is_alive(int(pid))]
 
@@ -58,13 +50,7 @@ def _is_zombie(pid: int) -> bool:
 
 
 def remove(number: int) -> None:
-    """Free a component.
-
-    Raises
-    ------
-    OSError
-        LinuxCNC's library is not there, or refuses.
-    """
+    """Free a component."""
     library = ctypes.CDLL(LIBRARY)
     # Whoever calls hal_exit must have entered HAL. The entry itself stays behind, a name without pins: one
     # process can take one component away, and this one spends that on the dead one.

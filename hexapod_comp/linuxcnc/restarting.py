@@ -29,15 +29,6 @@ class CompensatorReset:
 
     Only a compensator that complains is asked: requests to one that is stopped get lost, and DDS then keeps back those
     that follow for seconds.
-
-    Parameters
-    ----------
-    node : MachineNode
-        Listens to the diagnostics, and calls.
-    status : BridgeStatus
-        Counts the requests.
-    options : dict
-        The node's parameter ``timeout``: silence that is normal, s.
     """
 
     def __init__(self, node: MachineNode, status: BridgeStatus, options: dict[str, Any]) -> None:

@@ -13,15 +13,7 @@ from ..ros.vital_signs import LATCHED_QOS
 
 
 class StopInput:
-    """Hears ``compensator/stopped`` and ``compensator/heartbeat``.
-
-    Parameters
-    ----------
-    node : MachineNode
-        Listens.
-    options : dict
-        Its parameter ``timeout``: without a heartbeat for longer, the compensator counts as stopped, s.
-    """
+    """Hears ``compensator/stopped`` and ``compensator/heartbeat``."""
 
     def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:
         self._stopped, self._beat_at, self._options = True, -math.inf, options

@@ -49,13 +49,7 @@ HEARD_WITHIN = 0.1
 
 
 class WatchedMachine:
-    """A machine whose struts are told, and whose tool is seen.
-
-    Parameters
-    ----------
-    machine : RealMachine
-        The truth.
-    """
+    """A machine whose struts are told, and whose tool is seen."""
 
     def __init__(self, machine: RealMachine) -> None:
         self.machine = machine
@@ -66,29 +60,7 @@ class WatchedMachine:
         self._work, self._platform_in_tool = geometry.work, geometry.tool.inverse()
 
     def look(self, struts: np.ndarray, command: Pose, tool_length: float = 0.0) -> tuple[Pose, np.ndarray]:
-        """Return where the tool is, as LinuxCNC's axes would put it, and its tip's error.
-
-        Parameters
-        ----------
-        struts : ndarray, shape (6,)
-            Lengths that the drives have gone to, m.
-        command : Pose
-            LinuxCNC's commanded axes, m.
-        tool_length : float
-            In force in LinuxCNC, m.
-
-        Returns
-        -------
-        true : Pose
-            Comparable with `command`.
-        error : ndarray, shape (3,)
-            True minus commanded tip, along the axes of ``work``, m.
-
-        Raises
-        ------
-        KinematicsError
-            The machine has no pose for these lengths.
-        """
+        """Return where the tool is, as LinuxCNC's axes would put it, and its tip's error."""
         up = np.array([0.0, 0.0, tool_length])
         commanded = Pose(command.position - up + command.rotation @ up, command.rotation)
         self._follow(struts, self._work @ commanded @ self._platform_in_tool)
@@ -106,24 +78,7 @@ class WatchedMachine:
 
 
 class MachineComponent:
-    """The HAL side: pins in, a :class:`WatchedMachine`, pins out.
-
-    Parameters
-    ----------
-    machine : RealMachine
-        The truth.
-    units : str
-        LinuxCNC's length unit, ``mm`` or ``inch``.
-    name : str
-        Name of the component.
-    hal : module, optional
-        LinuxCNC's ``hal``.
-
-    Raises
-    ------
-    HalError
-        There is no HAL, or it refuses the component.
-    """
+    """The HAL side: pins in, a :class:`WatchedMachine`, pins out."""
 
     def __init__(self, machine: RealMachine, units: str = "mm", name: str = "hexapod_machine", hal: Any = None):
         self._watched, self._metres = WatchedMachine(machine), METRES[units]

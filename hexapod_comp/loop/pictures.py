@@ -33,19 +33,7 @@ DRAWN_DEVIATION = 0.04
 def session_figure(
     result: SessionResult, rows: Sequence[ErrorRow], title: str, calibration: Calibration | None = None
 ) -> Figure:
-    """Show a witnessed run: the path with magnified deviation, errors at rest and along it, and all of it in figures.
-
-    Parameters
-    ----------
-    result : SessionResult
-        With at least one pose, in the work frame.
-    rows : sequence of ErrorRow
-        Its errors, with what was promised.
-    title : str
-        Machine and model.
-    calibration : Calibration, optional
-        Adds Mou & King's own measure.
-    """
+    """Show a witnessed run: the path with magnified deviation, errors at rest and along it, and their figures."""
     aligned = result.aligned()
     figure = Figure(figsize=(12, 8.4 if result.path else 5.0), layout="constrained")
     figure.suptitle(picture_text(title))

@@ -31,11 +31,6 @@ def reserve_domain() -> tuple[int, socket.socket]:
 
     The socket takes a port that belongs to the domain and that DDS leaves unused, so a second session
     on this machine goes elsewhere, and the system frees it even after a crash.
-
-    Raises
-    ------
-    RuntimeError
-        All domains are taken.
     """
     start = os.getpid() % len(DOMAINS)
     for domain in (*DOMAINS[start:], *DOMAINS[:start]):
@@ -87,19 +82,7 @@ class PrivateDomain:
 
 
 class NodeProcess:
-    """One node as an operating-system process; its output goes to a log file, and it ends with its parent.
-
-    Parameters
-    ----------
-    module : str
-        ``compensator`` or ``strut_drive``.
-    parameters : dict of str to object
-        ROS parameters.
-    remaps : mapping of str to str, optional
-        Topics under other names.
-    wrapper : sequence of str, optional
-        Command that runs the node and becomes it, such as ``nsenter``.
-    """
+    """One node as an operating-system process; its output goes to a log file, and it ends with its parent."""
 
     def __init__(
         self,

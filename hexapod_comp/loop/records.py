@@ -19,26 +19,16 @@ LATE_SHARE, WAITED_SHARE = 0.02, 0.2
 
 @dataclass
 class PoseRecord:
-    """What happened at one commanded pose; m, rotation matrices; all poses in one frame, ``base`` at first.
+    """What happened at one commanded pose; m, rotation matrices; all poses in one frame, ``base`` at first."""
 
-    Attributes
-    ----------
-    target : Pose
-        Commanded pose of the tool.
-    command, correction : ndarray, shape (6,)
-        Compensated strut commands and their correction, m.
-    estimate : Pose
-        Estimated pose of the tool with compensation.
-    true_without, true_with : Pose or None
-        Where the tool really was, when anybody can tell.
-    """
-
-    target: Pose
+    target: Pose  # commanded pose of the tool
+    # (6,): compensated strut commands and their correction, m
     command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))
+    # (6,): compensated strut commands and their correction, m
     correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))
-    estimate: Pose | None = None
-    true_without: Pose | None = None
-    true_with: Pose | None = None
+    estimate: Pose | None = None  # estimated pose of the tool with compensation
+    true_without: Pose | None = None  # where the tool really was, when anybody can tell
+    true_with: Pose | None = None  # where the tool really was, when anybody can tell
 
     def seen_from(self, frame: Pose) -> PoseRecord:
         """Return the same with its poses in another frame, whose own pose is given in the present one."""
@@ -56,21 +46,11 @@ class PoseRecord:
 
 @dataclass
 class Track:
-    """Where the tool really went along a path.
+    """Where the tool really went along a path."""
 
-    Attributes
-    ----------
-    positions : ndarray, shape (n, 3)
-        True tool positions on the way, m.
-    sent : ndarray of int, shape (n,)
-        How many poses of the path had been sent when each was seen.
-    feet : ndarray, shape (n, 3)
-        The nearest point of the commanded path to each, m: a late tool is no contour error.
-    """
-
-    positions: np.ndarray
-    sent: np.ndarray
-    feet: np.ndarray
+    positions: np.ndarray  # (n, 3): true tool positions on the way, m
+    sent: np.ndarray  # (n,) int: how many poses of the path had been sent when each was seen
+    feet: np.ndarray  # (n, 3): the nearest point of the commanded path to each, m: a late tool is no contour error
 
     @staticmethod
     def along(path: Path, positions: np.ndarray, sent: np.ndarray) -> Track | None:
@@ -85,22 +65,12 @@ class Track:
 
 @dataclass
 class PathRecord:
-    """What happened along a path.
+    """What happened along a path."""
 
-    Attributes
-    ----------
-    path : Path
-        Commanded poses, in ``base`` at first.
-    without, compensated : Track or None
-        The two passes; None where there was none, or nobody to tell where the tool was.
-    corrections : ndarray, shape (N, 6)
-        Corrections sent, m.
-    """
-
-    path: Path
-    without: Track | None
-    compensated: Track | None
-    corrections: np.ndarray
+    path: Path  # commanded poses, in ``base`` at first
+    without: Track | None  # the two passes; None where there was none, or nobody to tell where the tool was
+    compensated: Track | None  # the two passes; None where there was none, or nobody to tell where the tool was
+    corrections: np.ndarray  # (N, 6): corrections sent, m
 
     def seen_from(self, frame: Pose) -> PathRecord:
         """Return the same in another frame, whose own pose is given in the present one."""
@@ -122,28 +92,16 @@ class PathRecord:
 
 @dataclass
 class Answering:
-    """How fast the loop answered, and what kept it waiting.
+    """How fast the loop answered, and what kept it waiting."""
 
-    Attributes
-    ----------
-    latencies : ndarray
-        Command to answer of the compensated pass, s.
-    answered, late : int
-        Commands of the whole session that were answered, and those of which the answer came after the next was due.
-    longest : float
-        Longest time to an answer in the whole session, s.
-    elapsed : float
-        Length of the session, s.
-    waited : float
-        How long its processes waited for a processor, added up, s.
-    """
-
-    latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    latencies: np.ndarray = field(default_factory=lambda: np.zeros(0))  # command to answer of the compensated pass, s
+    # commands of the whole session that were answered, and those of which the answer came after the next was due
     answered: int = 0
+    # commands of the whole session that were answered, and those of which the answer came after the next was due
     late: int = 0
-    longest: float = 0.0
-    elapsed: float = 0.0
-    waited: float = 0.0
+    longest: float = 0.0  # longest time to an answer in the whole session, s
+    elapsed: float = 0.0  # length of the session, s
+    waited: float = 0.0  # how long its processes waited for a processor, added up, s
 
     @property
     def busy(self) -> bool:
@@ -153,32 +111,16 @@ class Answering:
 
 @dataclass
 class SessionResult:
-    """Everything that a session has seen.
+    """Everything that a session has seen."""
 
-    Attributes
-    ----------
-    poses : list of PoseRecord
-        The single poses.
-    path : PathRecord or None
-        The path.
-    answering : Answering
-        How fast the loop answered.
-    sent, lost, refused : int
-        Commands of the whole session.
-    refusals : dict of str to int
-        Refused commands by reason.
-    model : str
-        Model that the compensator ran.
-    """
-
-    poses: list[PoseRecord] = field(default_factory=list)
-    path: PathRecord | None = None
-    answering: Answering = field(default_factory=Answering)
-    sent: int = 0
-    lost: int = 0
-    refused: int = 0
-    refusals: dict[str, int] = field(default_factory=dict)
-    model: str = ""
+    poses: list[PoseRecord] = field(default_factory=list)  # the single poses
+    path: PathRecord | None = None  # the path
+    answering: Answering = field(default_factory=Answering)  # how fast the loop answered
+    sent: int = 0  # commands of the whole session
+    lost: int = 0  # commands of the whole session
+    refused: int = 0  # commands of the whole session
+    refusals: dict[str, int] = field(default_factory=dict)  # refused commands by reason
+    model: str = ""  # model that the compensator ran
 
     def seen_from(self, frame: Pose) -> SessionResult:
         """Return the same in another frame, whose own pose is given in the present one."""

@@ -18,26 +18,16 @@ AS_IT_IS, ALIGNED = "as it is", "datum aligned"
 
 @dataclass(frozen=True)
 class ErrorRow:
-    """The tool's error at rest or along a path, in one way of taking it.
+    """The tool's error at rest or along a path, in one way of taking it."""
 
-    Attributes
-    ----------
-    what, datum : str
-        ``at rest`` or ``path``; :data:`AS_IT_IS` or :data:`ALIGNED`.
-    count : int
-        Poses.
-    without, compensated : ndarray or None
-        Errors of the two passes, m: distances to the pose at rest, to the nearest place of the path along it.
-    promised : (float, float) or None
-        Between these the RMS is expected, m, with 95 %.
-    """
-
-    what: str
-    datum: str
-    count: int
+    what: str  # ``at rest`` or ``path``; :data:`AS_IT_IS` or :data:`ALIGNED`
+    datum: str  # ``at rest`` or ``path``; :data:`AS_IT_IS` or :data:`ALIGNED`
+    count: int  # poses
+    # errors of the two passes, m: distances to the pose at rest, to the nearest place of the path along it
     without: np.ndarray | None
+    # errors of the two passes, m: distances to the pose at rest, to the nearest place of the path along it
     compensated: np.ndarray
-    promised: tuple[float, float] | None = None
+    promised: tuple[float, float] | None = None  # between these the RMS is expected, m, with 95 %
 
     @property
     def removed(self) -> float | None:

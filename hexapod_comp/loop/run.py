@@ -50,13 +50,7 @@ def checked_rate(rate: float) -> float:
 def refuse_broken_limits(
     path: str, geometry: HexapodGeometry, model: MachineModel, rows: list[Row], poses: list[Pose]
 ) -> None:
-    """Check poses and the way between them before anything moves.
-
-    Raises
-    ------
-    InputFileError
-        A limit is broken; names the first pose and says how to see them all.
-    """
+    """Check poses and the way between them before anything moves."""
     breaches = check(geometry, model, poses).breaches
     if breaches:
         row = rows[breaches[0].row]
@@ -66,15 +60,7 @@ def refuse_broken_limits(
 
 @contextmanager
 def simulated(machine: str, model: MachineModel, truth: MachineModel) -> Iterator[Sequence[NodeProcess]]:
-    """Start compensator and strut drive as two processes in a ROS domain of their own.
-
-    Parameters
-    ----------
-    machine : str
-        The machine's file.
-    model, truth : MachineModel
-        What the compensator runs, and the hidden errors of the machine; both reach the nodes as files.
-    """
+    """Start compensator and strut drive as two processes in a ROS domain of their own."""
     geometry_file = str(config_file(machine, "geometry", beside=True).resolve())
     with tempfile.TemporaryDirectory(prefix="hexapod_comp_") as folder:
         model_file, truth_file = (f"{folder}/{name}.yaml" for name in ("model", "truth"))
@@ -105,11 +91,6 @@ def witnessed(
     """Run poses of the work frame and a path in ``base`` through the loop, with a progress bar.
 
     The result is in the work frame, as the user's file has it; the nodes are told, and tell, ``base``.
-
-    Raises
-    ------
-    NoAnswerError
-        A command was lost or refused; says when the computer was busy.
     """
     client = _client(namespace)
     try:
@@ -153,15 +134,7 @@ def _client(namespace: str) -> LoopClient:
 
 
 def complaints(result: SessionResult, rows: Sequence[ErrorRow]) -> list[str]:
-    """Return what was not as it should be, and whether a busy computer may be the cause; empty when all was well.
-
-    Parameters
-    ----------
-    result : SessionResult
-        A compared run.
-    rows : sequence of ErrorRow
-        Its errors. What a laser can see is judged: the errors with the datum aligned, where they are known.
-    """
+    """Return what was not as it should be, and whether a busy computer may be the cause; empty when all was well."""
     listed = []
     if result.lost:
         listed.append(f"{result.lost} commands were lost")

@@ -33,13 +33,7 @@ MOVE_FEED = 0.25
 def simulated_machine(
     compensator: dict[str, object], drive: dict[str, object]
 ) -> Iterator[tuple[NodeProcess, NodeProcess]]:
-    """Run compensator and strut drive as processes in a ROS domain of their own.
-
-    Raises
-    ------
-    HexapodError
-        On leaving, when one of them did not end by itself with exit code 0; carries its output.
-    """
+    """Run compensator and strut drive as processes in a ROS domain of their own."""
     with PrivateDomain():
         nodes = NodeProcess("compensator", compensator), NodeProcess("strut_drive", drive)
         try:
@@ -56,19 +50,7 @@ def simulated_machine(
 
 
 class Session:
-    """Drives a machine through poses and a path while watching it.
-
-    Parameters
-    ----------
-    client : LoopClient
-        Connected client.
-    geometry : HexapodGeometry
-        For moves that keep the limits.
-    rate : float
-        Commands per second, Hz.
-    progress : callable, optional
-        Called with a number of commands just sent.
-    """
+    """Drives a machine through poses and a path while watching it."""
 
     def __init__(
         self,
@@ -151,13 +133,7 @@ def _latencies(sent: Iterable[Sent]) -> np.ndarray:
 
 
 class Watch:
-    """How long the loop's processes work, and wait for a processor, from now on.
-
-    Parameters
-    ----------
-    nodes : sequence of NodeProcess
-        Those that are watched beside this process.
-    """
+    """How long the loop's processes work, and wait for a processor, from now on."""
 
     def __init__(self, nodes: Sequence[NodeProcess]) -> None:
         self._pids = [os.getpid(), *(node.pid for node in nodes)]
@@ -180,13 +156,7 @@ class Watch:
 
 
 def connect(client: LoopClient, nodes: Sequence[NodeProcess] = (), timeout: float = CONNECT_TIMEOUT) -> None:
-    """Wait until the loop answers.
-
-    Raises
-    ------
-    HexapodError
-        A process has ended, with its output, or nobody answers in time.
-    """
+    """Wait until the loop answers."""
 
     def ready() -> bool:
         for node in nodes:
@@ -208,21 +178,7 @@ def run_session(
     progress: Callable[[int], None] | None = None,
     announce: Callable[[str], None] = lambda _: None,
 ) -> SessionResult:
-    """Visit poses, then mill a path; first without compensation when `compare`, then with it.
-
-    Parameters
-    ----------
-    client, geometry : LoopClient, HexapodGeometry
-        Connected, and the machine commanded.
-    targets, path : sequence of Pose, Path or None
-        ``pose_tool_in_base``, and poses in ``base``.
-    rate : float
-        Commands per second, Hz.
-    compare : bool
-        Make the uncompensated pass.
-    progress, announce : callable, optional
-        Called with a number of commands just sent, and with a line about what happens now.
-    """
+    """Visit poses, then mill a path; first without compensation when `compare`, then with it."""
     session = Session(client, geometry, rate, progress)
     records = [PoseRecord(target) for target in targets]
     track_without = None

@@ -70,35 +70,19 @@ REST = 0.3
 
 @dataclass(frozen=True)
 class Calibration:
-    """A machine measured and fitted.
+    """A machine measured and fitted."""
 
-    Attributes
-    ----------
-    fit : ModelFit
-        Scheme joint on 5-D lines and diagonals.
-    lines, joint : PaperMetric
-        Mou & King's own measure of their 1-D scheme, and of `fit`.
-    """
-
-    fit: ModelFit
-    lines: PaperMetric
-    joint: PaperMetric
+    fit: ModelFit  # scheme joint on 5-D lines and diagonals
+    lines: PaperMetric  # mou & King's own measure of their 1-D scheme, and of `fit`
+    joint: PaperMetric  # mou & King's own measure of their 1-D scheme, and of `fit`
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where the demonstration happens.
+    """Where the demonstration happens."""
 
-    Attributes
-    ----------
-    box : ndarray, shape (2, 3)
-        Lowest and highest tool position that is measured, m in ``work``.
-    attitude : ndarray, shape (3, 3)
-        Of the tool in ``work``: level, or as at home where it cannot be level.
-    """
-
-    box: np.ndarray
-    attitude: np.ndarray
+    box: np.ndarray  # (2, 3): lowest and highest tool position that is measured, m in ``work``
+    attitude: np.ndarray  # (3, 3): of the tool in ``work``: level, or as at home where it cannot be level
 
 
 def demo_place(geometry: HexapodGeometry) -> Place:
@@ -125,19 +109,7 @@ def calibrate(
     seed: int,
     say: Callable[[str], object] = lambda text: None,
 ) -> Calibration:
-    """Measure a machine with virtual lasers, noise included, and fit it by both schemes.
-
-    Parameters
-    ----------
-    geometry, truth : HexapodGeometry, MachineModel
-        The machine and its hidden errors.
-    place : Place
-        Where it is measured.
-    seed : int
-        Of the noise.
-    say : callable, optional
-        Hears what goes on.
-    """
+    """Measure a machine with virtual lasers, noise included, and fit it by both schemes."""
     real, campaign = RealMachine(geometry, truth), demo_campaign(place)
     say("measuring with 5-D lasers")
     measured = measure(template(campaign, geometry, seed), campaign, real, seed)
@@ -228,15 +200,6 @@ def promises(fit: ModelFit, poses: Sequence[Pose], path: Path) -> tuple[tuple[fl
 
     As the fit's own expected tool error, at these very poses and with their own datum instead of the whole box's. Along
     the path only what is across it counts.
-
-    Parameters
-    ----------
-    fit : ModelFit
-        The fit.
-    poses : sequence of Pose
-        ``pose_tool_in_work``, approached one from the other, the first from home.
-    path : Path
-        Poses in ``base``.
     """
     geometry, space = fit.space.geometry, fit.space
     in_base = [geometry.work @ pose for pose in poses]

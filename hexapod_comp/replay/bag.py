@@ -76,21 +76,11 @@ IDEAL = IDEAL_SOURCE.sha256
 
 @dataclass(frozen=True)
 class Series:
-    """Messages of one topic, oldest first.
+    """Messages of one topic, oldest first."""
 
-    Attributes
-    ----------
-    stamps : ndarray of int64, shape (n,)
-        Their headers' stamps, ns.
-    times : ndarray of int64, shape (n,)
-        When the recorder got them, ns.
-    values : ndarray, shape (n, k)
-        Six struts, m; or position x, y, z, m.
-    """
-
-    stamps: np.ndarray
-    times: np.ndarray
-    values: np.ndarray
+    stamps: np.ndarray  # (n,) int64: their headers' stamps, ns
+    times: np.ndarray  # (n,) int64: when the recorder got them, ns
+    values: np.ndarray  # (n, k): six struts, m; or position x, y, z, m
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -459,15 +449,7 @@ def _lengths(message: Any, joints: Sequence[str]) -> tuple[float, ...] | None:
 
 
 class Files:
-    """Finds geometries and models by their hash: in the recording, and among files that the user names.
-
-    Parameters
-    ----------
-    recording : Recording
-        Carries its own, unless they were not recorded.
-    given : mapping of str to Source
-        More, by hash.
-    """
+    """Finds geometries and models by their hash: in the recording, and among files that the user names."""
 
     def __init__(self, recording: Recording, given: Mapping[str, Source]) -> None:
         self._path = recording.path

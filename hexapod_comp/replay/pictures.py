@@ -24,22 +24,7 @@ MOST_LABELS = 12
 
 
 def write_pictures(report: Report, geometry: HexapodGeometry | None, folder: str | Path) -> list[Path]:
-    """Write every picture that there is something for; return the files.
-
-    Parameters
-    ----------
-    report : Report
-        The replay.
-    geometry : HexapodGeometry or None
-        For the work frame; without it the tool is not drawn.
-    folder : str or Path
-        Made when it is missing.
-
-    Raises
-    ------
-    InputFileError
-        It cannot be written.
-    """
+    """Write every picture that there is something for; return the files."""
     figures = {"corrections": corrections_figure(report), "commands": commands_figure(report)}
     if len(report.recording.topics["strut_states"]):
         figures["following_error"] = following_figure(report)

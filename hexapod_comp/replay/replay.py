@@ -30,21 +30,11 @@ Progress = Callable[[int], object]
 
 @dataclass(frozen=True)
 class Event:
-    """An entry of the journal in its place.
+    """An entry of the journal in its place."""
 
-    Attributes
-    ----------
-    row : int
-        Number of the answer that it precedes.
-    time : int
-        When the recorder heard of it, ns: up to 50 ms later.
-    entry : Entry
-        What happened.
-    """
-
-    row: int
-    time: int
-    entry: Entry
+    row: int  # number of the answer that it precedes
+    time: int  # when the recorder heard of it, ns: up to 50 ms later
+    entry: Entry  # what happened
 
 
 @dataclass

@@ -35,29 +35,14 @@ LONGEST_GAP = 0.1
 
 @dataclass
 class Report:
-    """Everything that one replay has to tell.
+    """Everything that one replay has to tell."""
 
-    Attributes
-    ----------
-    recording : Recording
-        What was read.
-    replayed : Replay or None
-        With what was in use; None when geometry or model were not at hand.
-    other : Replay or None
-        With another model or geometry.
-    other_name : str
-        What that was.
-    tolerance : float
-        Differences up to this, m, are accepted.
-    work_frames : mapping of str to Pose or None
-        In ``base``, where the geometry is at hand: without them nobody can tell where the tool went.
-    """
-
-    recording: Recording
-    replayed: Replay | None
-    other: Replay | None = None
-    other_name: str = ""
-    tolerance: float = 0.0
+    recording: Recording  # what was read
+    replayed: Replay | None  # with what was in use; None when geometry or model were not at hand
+    other: Replay | None = None  # with another model or geometry
+    other_name: str = ""  # what that was
+    tolerance: float = 0.0  # differences up to this, m, are accepted
+    # in ``base``, where the geometry is at hand: without them nobody can tell where the tool went
     work_frames: Mapping[str, Pose] | None = None
 
     @property
@@ -283,15 +268,7 @@ def _refused(report: Report) -> Iterator[str]:
 
 
 def following_error(report: Report) -> tuple[np.ndarray, np.ndarray]:
-    """Return by how much the measured struts were off their commands.
-
-    Returns
-    -------
-    seconds : ndarray, shape (m,)
-        Since the first answer.
-    error : ndarray, shape (m, 6)
-        Measured minus commanded, m, the commands taken straight from one to the next.
-    """
+    """Return by how much the measured struts were off their commands."""
     states, when = report.recording.topics["strut_states"], report.seconds
     if len(when) < 2 or not len(states):
         return np.zeros(0), np.zeros((0, 6))

@@ -43,13 +43,7 @@ class UnpackingError(HexapodError):
 
 
 class Allowance:
-    """What a bag of a given size may still unpack to.
-
-    Parameters
-    ----------
-    size : int
-        Bytes of the bag's files.
-    """
+    """What a bag of a given size may still unpack to."""
 
     def __init__(self, size: int) -> None:
         self._size, self._taken = size, 0
