@@ -141,7 +141,7 @@ setup(
             f"strut_drive = {NAME}.ros:start_strut_drive",
             f"linuxcnc_bridge = {NAME}.linuxcnc:start_bridge",
             f"linuxcnc_machine = {NAME}.linuxcnc:start_machine",
-            f"hal_sweep = {NAME}.linuxcnc.hal_sweep:main",
+            f"hal_sweep = {NAME}.linuxcnc.hal:main",
         ],
     },
 )

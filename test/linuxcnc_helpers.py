@@ -290,8 +290,8 @@ class Linuxcnc:
         run = f"{sys.executable} -m hexapod_comp"
         edits = {
             "BRIDGE = linuxcnc_bridge": f"BRIDGE = {run}.linuxcnc.bridge",
-            "SWEEP = hal_sweep": f"SWEEP = {run}.linuxcnc.hal_sweep",
-            "MACHINE = linuxcnc_machine": f"MACHINE = {run}.linuxcnc.watch",
+            "SWEEP = hal_sweep": f"SWEEP = {run}.linuxcnc.hal",
+            "MACHINE = linuxcnc_machine": f"MACHINE = {run}.linuxcnc.machine",
             "HALFILE = machine.hal\n": "HALFILE = machine.hal\nHALFILE = recorder.hal\n",
             **changes,
         }

@@ -12,4 +12,4 @@ def start_bridge() -> int:
 
 def start_machine() -> int:
     """Run the executable ``linuxcnc_machine``."""
-    return start("hexapod_comp.linuxcnc.watch")
+    return start("hexapod_comp.linuxcnc.machine")

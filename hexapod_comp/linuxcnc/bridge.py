@@ -1,7 +1,7 @@
 """The LinuxCNC bridge: a HAL component on one side, a ROS node on the other.
 
 LinuxCNC's commanded axes go out as ``tool_pose_command``, its measured struts as ``strut_states``; the
-compensator's ``strut_corrections`` come back, pass a :class:`~hexapod_comp.linuxcnc.guard.CorrectionGuard`, and
+compensator's ``strut_corrections`` come back, pass a :class:`~hexapod_comp.linuxcnc.bridge.CorrectionGuard`, and
 stand on pins that LinuxCNC adds to its strut commands. Load it from a HAL file with
 ``loadusr -Wn hexapod_comp linuxcnc_bridge``; doc/linuxcnc.md lists pins and parameters.
 
@@ -15,27 +15,343 @@ import math
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from rclpy.task import Future
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool, UInt64
+from std_srvs.srv import Trigger
 
-from ..errors import CommandError
+from ..errors import CommandError, HexapodError
+from ..ros.arguments import Program
 from ..ros.command_source import CommandSource
-from ..ros.health import OK
+from ..ros.health import ERROR, OK, WARN, Flow, Refusals, seconds, status_prefix
 from ..ros.messages import StrutMessage, StrutReader
+from ..ros.parameters import read_table
 from ..ros.running import keep_discovery_local, run
-from ..ros.runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, STATE_QOS, MachineNode
+from ..ros.runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, STATE_QOS, MachineNode
 from ..ros.stamps import StampClock, StampGate, nanoseconds_of, stamp_of
-from .bridge_status import BridgeStatus
-from .guard import CorrectionGuard, GuardStatus
-from .hal import COUNTS, METRES, HalComponent, pose_from_axes
-from .parameters import AXES, CORRECTIONS, COUNTERS, FEEDBACK, FLAGS, PARAMETERS, PINS, PROGRAM, SWITCHES
-from .restarting import CompensatorReset
-from .stop_input import StopInput
+from ..ros.vital_signs import LATCHED_QOS
+from .hal import COUNTS, METRES, HalComponent, pins, pose_from_axes
+
+PARAMETERS = read_table("""
+autostart | true |  | start | configure and activate at the start
+component | hexapod_comp |  | start | name of the HAL component
+units | mm | mm, inch | start | LinuxCNC's length unit
+rate | 1000.0 | 10 to 2000 Hz | start | cycles per second
+states_rate | 200.0 | 1 to 2000 Hz | always | measured struts published per second at most
+frame_id | work |  | configure | frame_id of the commanded poses: the compensator's work_frame or base_frame
+allow_several_publishers | false |  | configure | obey though several nodes publish `strut_corrections`
+limit | 0.0005 | 1e-09 to 1 m | configure | a correction larger than this is never applied
+ramp_rate | 0.001 | 1e-06 to 1 m/s | always | largest speed of a correction (0.001 is 1 µm per ms)
+timeout | 0.1 | 0.001 to 3600 s | always | without an accepted correction for this long the compensator is lost
+on_loss | zero | zero, hold | configure | then ramp the corrections to `zero`, or `hold` them
+""")
+
+AXES = ("x", "y", "z", "a", "b", "c", "tool-offset")
+"""Commanded axes, and the tool length that LinuxCNC's kinematics take off them."""
+
+FEEDBACK = tuple(f"joint-fb.{n}" for n in range(6))
+SWITCHES = ("machine-on", "enable")
+CORRECTIONS = tuple(f"correction.{n}" for n in range(6))
+FLAGS = ("compensating", "heartbeat", "stopped")
+COUNTERS = ("updates", "rejected", "resets")
+
+PINS = (
+    *pins("in", "float", *AXES, *FEEDBACK),
+    *pins("in", "bit", *SWITCHES),
+    *pins("out", "float", *CORRECTIONS, "age", "largest"),
+    *pins("out", "bit", *FLAGS),
+    *pins("out", "s32", "status"),
+    *pins("out", "u32", *COUNTERS),
+)
+
+TOPICS = """
+in   strut_corrections   JointState: what the compensator adds to the struts, m
+     /diagnostics        DiagnosticArray: what the compensator complains of
+     compensator/stopped, compensator/heartbeat
+out  tool_pose_command   PoseStamped: LinuxCNC's commanded axes
+     strut_states        JointState: LinuxCNC's measured struts, m
+     /diagnostics
+ask  compensator/reset   Trigger, of the compensator
+HAL  hexapod_comp.x … correction.0 … status: doc/linuxcnc.md lists the pins
+"""
+
+PROGRAM = Program(
+    "linuxcnc_bridge",
+    "Connects LinuxCNC with the compensator; load it from a HAL file: loadusr -Wn hexapod_comp linuxcnc_bridge.",
+    PARAMETERS,
+    TOPICS,
+    "-p units:=inch",
+)
+
+LONGEST_STEP = 0.02
+"""Time that one update may ramp for, s: a process that was stopped for longer goes on, it does not catch up."""
+
+ON_LOSS = ("zero", "hold")
+"""What the output may do when corrections stop coming: ramp to zero, or stay where it is."""
+
+ZERO = (0.0,) * 6
+
+
+class GuardStatus(IntEnum):
+    """What the output is doing."""
+
+    OFF = 0
+    """Not enabled, at zero."""
+    RAMPING = 1
+    """On its way to the newest correction."""
+    COMPENSATING = 2
+    """At the newest correction."""
+    HOLDING = 3
+    """Corrections have stopped coming; it stays."""
+    RETURNING = 4
+    """On its way to zero: corrections have stopped coming, or it is not enabled."""
+    WAITING = 5
+    """Enabled, at zero: no corrections are coming, yet or any more."""
+
+
+class CorrectionGuard:
+    """Six corrections that follow what a compensator asks for, within a limit and along a ramp."""
+
+    def __init__(self, limit: float, ramp_rate: float, timeout: float, on_loss: str = "zero") -> None:
+        self.follow(limit, ramp_rate, timeout, on_loss)
+        self.output: list[float] = list(ZERO)  # the six corrections now, m; zero at first
+        self.status = GuardStatus.OFF  # what they are doing
+        self.accepted = self.rejected = 0  # corrections taken, and those too large or not finite, which were not
+        self._newest: list[float] = list(ZERO)
+        self._accepted_at = self._updated_at = -math.inf
+
+    def follow(self, limit: float, ramp_rate: float, timeout: float, on_loss: str) -> None:
+        """Go by other rules from now on; what has been accepted stays so. Arguments and errors as for the class."""
+        for name, value in (("limit", limit), ("ramp_rate", ramp_rate), ("timeout", timeout)):
+            if not 0.0 < value < math.inf:
+                raise HexapodError(f"{name} must be positive and finite, not {value!r}")
+        if on_loss not in ON_LOSS:
+            raise HexapodError(f"on_loss must be {' or '.join(ON_LOSS)}, not {on_loss!r}")
+        self._limit, self._ramp_rate, self._timeout = limit, ramp_rate, timeout
+        self._holds = on_loss == "hold"
+
+    def age(self, now: float) -> float:
+        """Return the time since the last accepted correction, s; infinite before the first."""
+        return now - self._accepted_at
+
+    def offer(self, correction: Sequence[float], now: float) -> None:
+        """Take a correction as what the output shall become."""
+        values = [float(value) for value in correction]
+        try:
+            self._check(values)
+        except CommandError:
+            self.rejected += 1
+            raise
+        self._newest, self._accepted_at = values, now
+        self.accepted += 1
+
+    def _check(self, values: list[float]) -> None:
+        if len(values) != 6:
+            raise CommandError("strut_count", f"six corrections are needed, not {len(values)}")
+        for number, value in enumerate(values, start=1):
+            if not math.isfinite(value):
+                raise CommandError("not_finite", f"strut {number}: a correction must be finite, not {value}")
+            if abs(value) > self._limit:
+                raise CommandError(
+                    "correction",
+                    f"strut {number}: correction {value * 1e6:.3f} µm is larger than ±{self._limit * 1e6:g} µm",
+                )
+
+    def update(self, now: float, enabled: bool) -> list[float]:
+        """Move the output on and return it."""
+        reach = self._ramp_rate * self._elapsed(now)
+        target, arrived = self._aim(now, enabled)
+        ways = [there - here for there, here in zip(target, self.output, strict=True)]
+        longest = max(abs(way) for way in ways)
+        if longest <= reach:
+            self.output, self.status = list(target), arrived
+            return self.output
+        share = reach / longest
+        self.output = [here + share * way for here, way in zip(self.output, ways, strict=True)]
+        self._name_motion(arrived, longest - reach)
+        return self.output
+
+    def _elapsed(self, now: float) -> float:
+        """Return the time that this update stands for, s: none for the first or when the clock went back."""
+        elapsed, self._updated_at = now - self._updated_at, now
+        if not 0.0 < elapsed < math.inf:
+            return 0.0
+        return min(elapsed, LONGEST_STEP)
+
+    def _aim(self, now: float, enabled: bool) -> tuple[Sequence[float], GuardStatus]:
+        """Return where the output shall go, and what it does once it is there."""
+        if not enabled:
+            return ZERO, GuardStatus.OFF
+        if not self.accepted:
+            return ZERO, GuardStatus.WAITING
+        if self.age(now) <= self._timeout:
+            return self._newest, GuardStatus.COMPENSATING
+        return (self.output, GuardStatus.HOLDING) if self._holds else (ZERO, GuardStatus.WAITING)
+
+    def _name_motion(self, arrived: GuardStatus, left: float) -> None:
+        """Set the status of an output that has not arrived; a target that moves on a little is not left by that."""
+        if arrived is not GuardStatus.COMPENSATING:
+            self.status = GuardStatus.RETURNING
+        elif self.status is not GuardStatus.COMPENSATING or left > self._ramp_rate * LONGEST_STEP:
+            self.status = GuardStatus.RAMPING
+
+
+TEXTS = {
+    GuardStatus.OFF: (OK, "off"),
+    GuardStatus.RAMPING: (OK, "running, corrections are ramping in"),
+    GuardStatus.COMPENSATING: (OK, "running"),
+    GuardStatus.HOLDING: (ERROR, "compensator lost, corrections hold"),
+    GuardStatus.RETURNING: (OK, "off, corrections are ramping out"),
+    GuardStatus.WAITING: (WARN, "waiting for the first correction"),
+}
+
+
+@dataclass
+class BridgeStatus:
+    """Counters of a bridge, and the status made of them."""
+
+    guard: CorrectionGuard  # between the compensator and the controller
+    # cycles of the loop, commands and measured struts published, corrections that came
+    cycles: Flow = field(default_factory=Flow)
+    # cycles of the loop, commands and measured struts published, corrections that came
+    sent: Flow = field(default_factory=Flow)
+    # cycles of the loop, commands and measured struts published, corrections that came
+    states: Flow = field(default_factory=Flow)
+    # cycles of the loop, commands and measured struts published, corrections that came
+    heard: Flow = field(default_factory=Flow)
+    refusals: Refusals = field(default_factory=Refusals)  # corrections and pins that were not used
+    bad_pins: Refusals = field(default_factory=Refusals)  # corrections and pins that were not used
+    machine_on: bool = False  # the controller's switches
+    enabled: bool = False  # the controller's switches
+    resets: int = 0  # how often the compensator was asked to start anew
+    latency: float = 0.0  # age of the last correction's command when it came, s
+
+    def judged(self, active: bool, now: float) -> tuple[bytes, str]:
+        """Return level and message of the diagnostics."""
+        status = self.guard.status
+        if not active:
+            return WARN, "not active"
+        if self.bad_pins.recent(now):
+            return ERROR, f"unusable pins: {self.bad_pins.last_reason}"
+        if self.refusals.recent(now):
+            return ERROR, f"refusing corrections: {self.refusals.last_reason}"
+        if not self.machine_on:
+            return OK, "machine off"
+        if self.enabled and self.guard.accepted and status is GuardStatus.WAITING:
+            return ERROR, "compensator lost, corrections are zero"
+        if self.enabled and status is GuardStatus.RETURNING:
+            return ERROR, "compensator lost, corrections are ramping out"
+        return TEXTS[status]
+
+    def values(self, compensated_by: str, now: float) -> dict[str, str]:
+        """Return everything else as key and value."""
+        return {
+            "status": self.guard.status.name.lower(),
+            "machine_on": str(self.machine_on).lower(),
+            "enabled": str(self.enabled).lower(),
+            "cycle_rate_hz": f"{self.cycles.rate(now):.1f}",
+            "command_rate_hz": f"{self.sent.rate(now):.1f}",
+            "correction_rate_hz": f"{self.heard.rate(now):.1f}",
+            "correction_age_s": seconds(self.guard.age(now)),
+            "latency_s": f"{self.latency:.6f}",
+            "largest_correction_m": f"{max(map(abs, self.guard.output)):.9f}",
+            "accepted": str(self.guard.accepted),
+            "resets": str(self.resets),
+            "compensated_by": compensated_by,
+            "last_refusal": self.refusals.last_text,
+            "last_bad_pins": self.bad_pins.last_text,
+            **self.refusals.values(),
+        }
+
+
+RESET_AFTER = 0.15
+"""A compensator that has been lost for so long is asked to start anew, s: it has forgotten its feedback by then."""
+
+RESET_PERIOD = 0.5
+"""The compensator is asked to start anew no more often than this, s."""
+
+COMPLAINT_COUNTS_FOR = 1.2
+"""The compensator's last diagnostics tell how it is for so long, s: it sends some every second."""
+
+
+class CompensatorReset:
+    """Calls ``compensator/reset`` when it helps.
+
+    Only a compensator that complains is asked: requests to one that is stopped get lost, and DDS then keeps back those
+    that follow for seconds.
+    """
+
+    def __init__(self, node: MachineNode, status: BridgeStatus, options: dict[str, Any]) -> None:
+        self._node, self._status, self._options = node, status, options
+        self._name = status_prefix(node.get_namespace(), "compensator")
+        self._asked_at = self._complained_at = -math.inf
+        self._in_vain = 0
+        self._question: Future | None = None
+        self._complaints = node.listen_to(DiagnosticArray, "/diagnostics", self._on_diagnostics, EVENT_QOS)
+        self._client = node.create_client(Trigger, "compensator/reset")
+
+    @property
+    def in_vain(self) -> bool:
+        """Whether it has been asked again, and still nothing was heard."""
+        return self._in_vain > 1
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._node.destroy_client(self._client)
+        self._node.destroy_subscription(self._complaints)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.level == ERROR and status.name.startswith(self._name):
+                self._complained_at = time.monotonic()
+
+    def ask(self, streaming_since: float, heard_at: float, now: float) -> None:
+        """Ask if nothing was heard for too long, though commands have been sent since a while; monotonic times, s."""
+        if heard_at > self._asked_at:
+            self._in_vain = 0
+        waited = now - max(streaming_since, heard_at)
+        if waited < self._options["timeout"] + RESET_AFTER or now - self._asked_at < RESET_PERIOD:
+            return
+        if self._complained_at < heard_at or now - self._complained_at > COMPLAINT_COUNTS_FOR:
+            return
+        self._asked_at = now
+        if not self._client.service_is_ready():
+            return
+        if self._question is not None:
+            self._client.remove_pending_request(self._question)
+        self._question = self._client.call_async(Trigger.Request())
+        self._status.resets += 1
+        self._in_vain += 1
+        self._node.warn_of("reset", "the compensator refuses every command; asked it to start anew")
+
+
+class StopInput:
+    """Hears ``compensator/stopped`` and ``compensator/heartbeat``."""
+
+    def __init__(self, node: MachineNode, options: dict[str, Any]) -> None:
+        self._stopped, self._beat_at, self._options = True, -math.inf, options
+        node.listen_to(Bool, "compensator/stopped", self._on_stopped, LATCHED_QOS)
+        node.listen_to(UInt64, "compensator/heartbeat", self._on_beat, EVENT_QOS)
+
+    def stopped(self, now: float) -> bool:
+        """Return whether it refuses commands, or is not heard, at the monotonic time `now`, s."""
+        return self._stopped or now - self._beat_at > self._options["timeout"]
+
+    def _on_stopped(self, message: Bool) -> None:
+        self._stopped = message.data
+
+    def _on_beat(self, _: UInt64) -> None:
+        self._beat_at = time.monotonic()
+
 
 GUARDED = ("limit", "ramp_rate", "timeout", "on_loss")
 """The guard's parameters."""

@@ -21,9 +21,15 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 
-from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
-from hexapod_comp.linuxcnc.guard import LONGEST_STEP, GuardStatus
-from hexapod_comp.linuxcnc.parameters import AXES, CORRECTIONS, FEEDBACK, SWITCHES
+from hexapod_comp.linuxcnc.bridge import (
+    AXES,
+    CORRECTIONS,
+    FEEDBACK,
+    LONGEST_STEP,
+    SWITCHES,
+    GuardStatus,
+    LinuxcncBridgeNode,
+)
 from hexapod_comp.machine.geometry import STRUT_NAMES
 
 MM = 1e-3

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hexapod_comp.errors import CommandError, HexapodError
-from hexapod_comp.linuxcnc.guard import LONGEST_STEP, CorrectionGuard, GuardStatus
+from hexapod_comp.linuxcnc.bridge import LONGEST_STEP, CorrectionGuard, GuardStatus
 
 LIMIT, RAMP, TIMEOUT = 500e-6, 1e-3, 0.1
 SLACK = 1e-15

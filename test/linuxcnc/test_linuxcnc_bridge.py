@@ -26,8 +26,7 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 
 from hexapod_comp.linuxcnc import hal as hal_component
-from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
-from hexapod_comp.linuxcnc.guard import LONGEST_STEP, GuardStatus
+from hexapod_comp.linuxcnc.bridge import LONGEST_STEP, GuardStatus, LinuxcncBridgeNode
 from hexapod_comp.linuxcnc.hal import HalComponent, HalError, load_module, pins, quaternion_from_axes
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.pose import Pose

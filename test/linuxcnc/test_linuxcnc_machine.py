@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.linuxcnc.hal_sweep import dead_components
-from hexapod_comp.linuxcnc.watch import MachineComponent, WatchedMachine, main
+from hexapod_comp.linuxcnc.hal import dead_components
+from hexapod_comp.linuxcnc.machine import MachineComponent, WatchedMachine, main
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.pose import Pose
