@@ -22,12 +22,11 @@ def run(args: argparse.Namespace) -> int:
     """Run the verb; 0 when the loop kept what the fit promised."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as for fit: its matrices are small
     from ..formats.csv import Row
-    from ..loop import run as loop
-    from ..loop import story
+    from ..loop import report, session, story
     from ..loop.report import error_rows, summary
     from ..machine.geometry import load_geometry
 
-    rate = loop.checked_rate(args.rate_hz)
+    rate = session.checked_rate(args.rate_hz)
     geometry = load_geometry(args.machine)
     truth, calibration = hidden_errors(args, geometry), None
     place = story.demo_place(geometry)
@@ -37,18 +36,18 @@ def run(args: argparse.Namespace) -> int:
         model = calibration.fit.model
     else:
         model = chosen_model(args, geometry, truth)
-    with common.ended_in_order(), loop.simulated(args.machine, model, truth) as nodes:
-        result = loop.witnessed(geometry, nodes, poses, path, rate, compare=True)
+    with common.ended_in_order(), session.simulated(args.machine, model, truth) as nodes:
+        result = session.witnessed(geometry, nodes, poses, path, rate, compare=True)
     rows = error_rows(result)
     if args.model in (TRUE, FITTED):
         promised = story.EXACT if calibration is None else story.promises(calibration.fit, poses, path)
         rows = story.with_promises(rows, promised, story.left_by_drives(geometry, truth, poses, path))
-    complaints = loop.complaints(result, rows)
+    complaints = report.complaints(result, rows)
     if args.json:
         named = [Row(0, str(n + 1)) for n in range(len(poses))]
         measured = None if calibration is None else story.as_json(calibration)
         known = {"machine": geometry.name, "truth": args.truth, "calibration": measured}
-        common.show({**known, **loop.as_json(named, result, rows), "complaints": complaints})
+        common.show({**known, **report.as_json(named, result, rows), "complaints": complaints})
     else:
         print(f"\n{summary(result, rows)}\n{story.REMARK}")
         print("\n".join(f"NOT AS IT SHOULD BE: {complaint}" for complaint in complaints) or "all as it should be")

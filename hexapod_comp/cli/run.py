@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 from . import common
 
 if TYPE_CHECKING:
-    from ..loop.records import SessionResult
-    from ..loop.report import ErrorRow
+    from ..loop.report import ErrorRow, SessionResult
     from ..loop.story import Calibration
     from ..machine.geometry import HexapodGeometry
     from ..machine.model import MachineModel
@@ -24,24 +23,24 @@ def run(args: argparse.Namespace) -> int:
     from contextlib import nullcontext
 
     from ..formats.csv import read_poses
-    from ..loop import run as loop
+    from ..loop import report, session
     from ..loop.report import busy_text, error_rows, pose_block, summary
     from ..machine.geometry import load_geometry
     from ..machine.model import MachineModel
 
-    rate = loop.checked_rate(args.rate_hz)
+    rate = session.checked_rate(args.rate_hz)
     geometry = load_geometry(args.machine)
     truth = hidden_errors(args, geometry)
     model = MachineModel(geometry.name) if args.attach else chosen_model(args, geometry, truth)
     rows, poses = read_poses(args.poses)
-    loop.refuse_broken_limits(args.poses, geometry, model, rows, poses)
-    started = nullcontext(()) if args.attach else loop.simulated(args.machine, model, truth)
+    session.refuse_broken_limits(args.poses, geometry, model, rows, poses)
+    started = nullcontext(()) if args.attach else session.simulated(args.machine, model, truth)
     compare = not (args.attach or args.no_compare)  # nobody switches a real machine's compensation off in passing
     with common.ended_in_order(), started as nodes:
-        result = loop.witnessed(geometry, nodes, poses, None, rate, compare, args.namespace)
+        result = session.witnessed(geometry, nodes, poses, None, rate, compare, args.namespace)
     errors, unanswered = error_rows(result), result.lost + result.refused
     if args.json:
-        common.show(loop.as_json(rows, result, errors))
+        common.show(report.as_json(rows, result, errors))
     else:
         for row, record in zip(rows, result.poses, strict=True):
             print(pose_block(f"pose {row.label}", record))

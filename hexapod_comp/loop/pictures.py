@@ -14,8 +14,7 @@ from matplotlib.patches import Patch
 
 from ..formats.figures import WITH, WITHOUT, picture_text
 from ..machine.arrays import rms
-from .records import PathRecord, PoseRecord, SessionResult, Track
-from .report import ErrorRow
+from .report import ErrorRow, PathRecord, PoseRecord, SessionResult, Track
 from .story import Calibration
 
 matplotlib.rcParams.update({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3})

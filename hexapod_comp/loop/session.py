@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 import os
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
+from datetime import date
 from typing import TYPE_CHECKING
 
 import numpy as np
+from tqdm import tqdm
 
-from ..errors import HexapodError, NoAnswerError
+from ..compensation.checks import check
+from ..errors import GeometryError, HexapodError, InputFileError, NoAnswerError
+from ..formats.csv import Row
+from ..formats.paths import config_file
+from ..formats.texts import CODES, own_terminal
 from ..machine.geometry import HexapodGeometry
+from ..machine.model import MachineModel
+from ..machine.model_file import save_model
 from ..machine.trajectory import Path, commanded_in_base, move
 from ..pose import Pose
 from .processes import NodeProcess, PrivateDomain, waited_for_processor
-from .records import Answering, PathRecord, PoseRecord, SessionResult, Track
+from .report import Answering, PathRecord, PoseRecord, SessionResult, Track, busy_text
 
 if TYPE_CHECKING:
     from ..ros.client import LoopClient, Sent
+
 
 CONNECT_TIMEOUT = 60.0
 """Longest wait for both nodes, s: they start in under three seconds, on a busy computer in twenty."""
@@ -209,3 +220,105 @@ def _count(client: LoopClient, result: SessionResult) -> None:
     for key, value in client.diagnostics.items():
         if key.startswith("refused."):
             result.refusals[key.removeprefix("refused.")] = int(value)
+
+
+RATES = (1.0, 1000.0)
+"""Commands per second that make sense over DDS from Python, Hz."""
+
+
+PATIENCE = {"following_error_limit": 0.02, "max_command_age": 5.0}
+"""What a simulated machine's compensator lets pass, m and s: drives and clocks are sound, but wait for a processor at
+times, and the usual 2 mm are 20 ms of that."""
+
+
+def checked_rate(rate: float) -> float:
+    """Return a command rate, Hz, or refuse it."""
+    if not RATES[0] <= rate <= RATES[1]:
+        raise GeometryError("--rate-hz", f"must lie in {RATES[0]:g}…{RATES[1]:g} Hz", rate)
+    return rate
+
+
+def refuse_broken_limits(
+    path: str, geometry: HexapodGeometry, model: MachineModel, rows: list[Row], poses: list[Pose]
+) -> None:
+    """Check poses and the way between them before anything moves."""
+    breaches = check(geometry, model, poses).breaches
+    if breaches:
+        row = rows[breaches[0].row]
+        problem = f"pose {row.label}: {breaches[0].error}; `hexapod_comp check` lists all {len(breaches)} breaches"
+        raise InputFileError(path, f"line {row.line}", problem)
+
+
+@contextmanager
+def simulated(machine: str, model: MachineModel, truth: MachineModel) -> Iterator[Sequence[NodeProcess]]:
+    """Start compensator and strut drive as two processes in a ROS domain of their own."""
+    geometry_file = str(config_file(machine, "geometry", beside=True).resolve())
+    with tempfile.TemporaryDirectory(prefix="hexapod_comp_") as folder:
+        model_file, truth_file = (f"{folder}/{name}.yaml" for name in ("model", "truth"))
+        save_model(_portable(model), model_file)
+        save_model(_portable(truth), truth_file)
+        with simulated_machine(
+            {"geometry_file": geometry_file, "model_file": model_file, **PATIENCE},
+            {"geometry_file": geometry_file, "truth_file": truth_file},
+        ) as nodes:
+            yield nodes
+
+
+def _portable(model: MachineModel) -> MachineModel:
+    """Return a model that can be written elsewhere: with a date, and without what lies beside its own file."""
+    origin = replace(model.origin, date=model.origin.date or date.today().isoformat(), posterior=None)
+    return replace(model, origin=origin)
+
+
+def witnessed(
+    geometry: HexapodGeometry,
+    nodes: Sequence[NodeProcess],
+    poses: list[Pose],
+    path: Path | None,
+    rate: float,
+    compare: bool,
+    namespace: str = "",
+) -> SessionResult:
+    """Run poses of the work frame and a path in ``base`` through the loop, with a progress bar.
+
+    The result is in the work frame, as the user's file has it; the nodes are told, and tell, ``base``.
+    """
+    client = _client(namespace)
+    try:
+        connect(client, nodes)
+        watch = Watch(nodes)
+        with _progress() as bar:
+            targets = [geometry.work @ pose for pose in poses]
+            try:
+                result = run_session(client, geometry, targets, path, rate, compare, bar.update, _announce)
+            except NoAnswerError as error:
+                busy = busy_text(watch.answering(client, rate))
+                raise NoAnswerError(f"{error}; {busy}" if busy else str(error)) from error
+        result.answering = watch.answering(client, rate, result.answering.latencies)
+        return result.seen_from(geometry.work)
+    finally:
+        client.close()
+
+
+def _announce(text: str) -> None:
+    """Say on stderr what happens now, without tearing the progress bar."""
+    tqdm.write(CODES.sub("", text), file=own_terminal())
+
+
+@contextmanager
+def _progress():
+    """A bar on a terminal, nothing elsewhere."""
+    with tqdm(unit=" commands", disable=None, leave=False, mininterval=0.5) as bar:
+        yield bar
+
+
+def _client(namespace: str) -> LoopClient:
+    """Return a client of the nodes, with a clear word where there is no ROS."""
+    try:
+        from ..ros.client import LoopClient
+    except ImportError as error:
+        raise HexapodError(
+            f"ROS 2 is needed for this ({error}): source a ROS 2 installation, or where there is none run "
+            "`pip install '.[ros]'` in the source tree (doc/install.md)"
+        ) from error
+    return LoopClient(namespace=namespace)

@@ -30,8 +30,7 @@ from ..virtual.instruments import measure
 from ..virtual.machine import StrutDrive
 from ..virtual.trial import without_datum
 from ..workspace.reach import machine_box
-from .records import PathRecord, PoseRecord, SessionResult, Track
-from .report import ALIGNED, ErrorRow, error_rows
+from .report import ALIGNED, ErrorRow, PathRecord, PoseRecord, SessionResult, Track, error_rows
 from .session import MOVE_FEED
 
 LONGEST_SIDE = 0.2

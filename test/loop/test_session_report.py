@@ -17,9 +17,21 @@ from strategies import paper_geometry
 from hexapod_comp.errors import NoAnswerError
 from hexapod_comp.formats.csv import Row
 from hexapod_comp.formats.json import plain
-from hexapod_comp.loop import run as loop
-from hexapod_comp.loop.records import Answering, PathRecord, PoseRecord, SessionResult, Track
-from hexapod_comp.loop.report import ALIGNED, AS_IT_IS, ErrorRow, busy_text, error_rows, error_table, pose_block
+from hexapod_comp.loop import report, session
+from hexapod_comp.loop.report import (
+    ALIGNED,
+    AS_IT_IS,
+    Answering,
+    ErrorRow,
+    PathRecord,
+    PoseRecord,
+    SessionResult,
+    Track,
+    busy_text,
+    error_rows,
+    error_table,
+    pose_block,
+)
 from hexapod_comp.machine.arrays import rms
 from hexapod_comp.machine.trajectory import circle
 from hexapod_comp.pose import Pose, rotation_from_angles
@@ -55,20 +67,19 @@ def result(monkeypatch: pytest.MonkeyPatch) -> SessionResult:
         yield SimpleNamespace(update=None)
 
     client = SimpleNamespace(close=lambda: None)
-    monkeypatch.setattr(
-        loop, "session", SimpleNamespace(connect=lambda *_: None, run_session=run_session, Watch=NoWatch)
-    )
-    monkeypatch.setattr(loop, "_client", lambda _: client)
-    monkeypatch.setattr(loop, "_progress", no_bar)
+    for name, stand_in in (("connect", lambda *_: None), ("run_session", run_session), ("Watch", NoWatch)):
+        monkeypatch.setattr(session, name, stand_in)
+    monkeypatch.setattr(session, "_client", lambda _: client)
+    monkeypatch.setattr(session, "_progress", no_bar)
     geometry = replace(paper_geometry(), work=TURNED_WORK, tool=TURNED_TOOL)
-    found = loop.witnessed(geometry, (), [GIVEN], None, 100.0, False)
+    found = session.witnessed(geometry, (), [GIVEN], None, 100.0, False)
     in_base = TURNED_WORK.position + TURNED_WORK.rotation @ GIVEN.position
     np.testing.assert_allclose(told[0].position, in_base, rtol=0, atol=1e-15)
     return found
 
 
 def test_json_says_the_frame_and_gives_back_the_users_own_numbers(result: SessionResult):
-    content = plain(loop.as_json([Row(2, "1")], result, []))
+    content = plain(report.as_json([Row(2, "1")], result, []))
     assert content["frame"] == "work"
     (pose,) = content["poses"]
     given = {"x_mm": 12.0, "y_mm": -34.0, "z_mm": 56.0, "alpha_deg": 1.0, "beta_deg": -2.0, "gamma_deg": 3.0}
@@ -147,7 +158,7 @@ def test_too_few_poses_are_not_aligned() -> None:
 
 def test_what_nobody_saw_has_no_rows() -> None:
     assert error_rows(SessionResult([PoseRecord(GIVEN)])) == []
-    assert loop.complaints(SessionResult(), []) == ["the true tool pose was not seen"]
+    assert report.complaints(SessionResult(), []) == ["the true tool pose was not seen"]
 
 
 # The verdict.
@@ -159,27 +170,27 @@ def row(left: float, before: float = 1e-4, promised: tuple[float, float] | None 
 
 def test_the_verdict_is_by_what_was_promised_with_the_datum_aligned() -> None:
     as_it_is = ErrorRow("at rest", AS_IT_IS, 4, np.full(4, 1e-4), np.full(4, 2e-4))
-    assert loop.complaints(SessionResult(), [row(2.9e-7), as_it_is]) == []
-    (said,) = loop.complaints(SessionResult(), [row(3.1e-7), as_it_is])
+    assert report.complaints(SessionResult(), [row(2.9e-7), as_it_is]) == []
+    (said,) = report.complaints(SessionResult(), [row(3.1e-7), as_it_is])
     assert said == "at rest, datum aligned: 0.310 µm RMS are left; at most 0.300 were promised"
-    (said,) = loop.complaints(SessionResult(), [row(2e-4, promised=None)])
+    (said,) = report.complaints(SessionResult(), [row(2e-4, promised=None)])
     assert said == "at rest, datum aligned: compensation does not reduce the error"
-    (said,) = loop.complaints(SessionResult(), [as_it_is])
+    (said,) = report.complaints(SessionResult(), [as_it_is])
     assert said == "at rest, as it is: compensation does not reduce the error"
 
 
 def test_a_busy_computer_is_named_as_the_cause_and_only_of_something() -> None:
     busy = SessionResult(lost=2, answering=Answering(answered=1000, late=40, longest=0.81, elapsed=60.0, waited=9.04))
-    lost, cause = loop.complaints(busy, [row(1e-7)])
+    lost, cause = report.complaints(busy, [row(1e-7)])
     assert lost == "2 commands were lost"
     assert cause.startswith(
         "the computer was busy: 40 of 1000 answers came after the next command was due, the longest"
     )
     assert "after 810 ms, and its processes waited 9.0 s in 60 s for a processor" in cause
     busy.lost = 0
-    assert loop.complaints(busy, [row(1e-7)]) == []
+    assert report.complaints(busy, [row(1e-7)]) == []
     idle = SessionResult(lost=2, answering=Answering(answered=1000, late=3, longest=0.02, elapsed=60.0, waited=1.0))
-    assert loop.complaints(idle, [row(1e-7)]) == ["2 commands were lost"]
+    assert report.complaints(idle, [row(1e-7)]) == ["2 commands were lost"]
     assert busy_text(idle.answering) == ""
 
 
@@ -193,7 +204,8 @@ def test_a_busy_computer_is_named_when_an_answer_does_not_come(monkeypatch: pyte
     def run_session(*_: object) -> SessionResult:
         raise NoAnswerError("no answer to a command within 5 s")
 
-    monkeypatch.setattr(loop, "session", SimpleNamespace(connect=lambda *_: None, run_session=run_session, Watch=Busy))
-    monkeypatch.setattr(loop, "_client", lambda _: SimpleNamespace(close=lambda: None))
+    for name, stand_in in (("connect", lambda *_: None), ("run_session", run_session), ("Watch", Busy)):
+        monkeypatch.setattr(session, name, stand_in)
+    monkeypatch.setattr(session, "_client", lambda _: SimpleNamespace(close=lambda: None))
     with pytest.raises(NoAnswerError, match="within 5 s; the computer was busy: 50 of 100"):
-        loop.witnessed(paper_geometry(), (), [GIVEN], None, 100.0, False)
+        session.witnessed(paper_geometry(), (), [GIVEN], None, 100.0, False)

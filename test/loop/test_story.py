@@ -20,8 +20,7 @@ from hexapod_comp import cli
 from hexapod_comp.compensation.checks import check
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.loop import story
-from hexapod_comp.loop.records import SessionResult
-from hexapod_comp.loop.report import ALIGNED, AS_IT_IS, ErrorRow
+from hexapod_comp.loop.report import ALIGNED, AS_IT_IS, ErrorRow, SessionResult
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.machine.model_file import load_model
@@ -180,7 +179,7 @@ def test_the_picture_of_a_run_needs_neither_path_nor_truth(tmp_path: Path) -> No
     """What nobody saw is not drawn, and nothing breaks: an attached machine tells no true pose."""
     from hexapod_comp.formats.figures import save
     from hexapod_comp.loop.pictures import session_figure
-    from hexapod_comp.loop.records import PoseRecord
+    from hexapod_comp.loop.report import PoseRecord
 
     save(session_figure(SessionResult([PoseRecord(Pose.identity())]), [], "nothing seen"), tmp_path / "run.png")
     assert (tmp_path / "run.png").stat().st_size > 1_000
