@@ -25,7 +25,7 @@ from ..formats.outputs import write_text
 from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import Structure, solve_pose
 from ..machine.model import MachineModel, RealMachine
-from ..machine.model_blocks import DIRECTIONS
+from ..machine.model_file import DIRECTIONS
 from ..machine.passes import Passes, at
 from ..measurements.readings import attitude_error
 from ..pose import Pose

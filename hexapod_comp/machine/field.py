@@ -10,8 +10,7 @@ dz; a field whose lines carry all six is evaluated by the same code. Families ad
 from __future__ import annotations
 
 import functools
-import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,9 +18,13 @@ import numpy as np
 from ..core import Struct
 from ..core.batch import field_at
 from ..errors import ModelError
+from .terms import settle, term
 
 COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")
 """Order of the six error components."""
+
+LARGEST = np.repeat([0.05, 0.1], 3)
+"""Of the components, anywhere on a line, m and rad: the three rotations count as small."""
 
 CROSS_AXES = ((1, 2), (0, 2), (0, 1))
 """The two axes across which the lines along x, y, z are arranged; also the order of their node indices."""
@@ -33,19 +36,17 @@ OUTSIDE_POLICIES = ("hold", "refuse")
 class GridField:
     """Error of the measured point over a box, forward and backward."""
 
-    # Increasing node coordinates along x, y, z in ``base``, m; at least two each. The box between the outermost nodes
-    # is the measured one
+    # Increasing nodes along x, y, z in ``base``, m, two at least each; the outermost bound the measured box
     grid: tuple[np.ndarray, np.ndarray, np.ndarray]
-    # Coefficients of the lines along x, y, z, shape (2, n, m, 6, K): direction (forward, backward), node index along
-    # each of the two cross axes, component, power of u, where u runs from −1 to 1 over the box along the line. Shape
-    # (2, n, m, 6, 0) when a family was not measured. m and rad
+    # Coefficients of the lines along x, y, z, (2, n, m, 6, K): direction (forward, backward), node along each of the
+    # two cross axes, component, power of u, which runs from −1 to 1 over the box; K = 0 where none was measured
     lines: tuple[np.ndarray, np.ndarray, np.ndarray]
-    probe: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,): the measured point in ``platform``, m
-    # ``hold`` keeps the value at the boundary of the box, ``refuse`` makes the compensator refuse
-    outside: str = "hold"
-    # How far the measured point must come back along an axis before its direction counts as reversed, m: above what the
-    # struts' backlash moves it along an axis that is told to stand still
-    reversal_threshold: float = 10e-6
+    probe: np.ndarray = term("field", "mm", "the measured point, in platform", (3,))
+    outside: str = "hold"  # the value at the boundary of the box, or ``refuse``
+    # Above what the struts' backlash moves the point along an axis that is told to stand still.
+    reversal_threshold: float = term(
+        "field", "um", "way back until an axis' direction counts as reversed", (), 10e-6, least=0.0
+    )
 
     def __post_init__(self) -> None:
         grid = tuple(np.array(nodes, dtype=float) for nodes in self.grid)
@@ -59,16 +60,11 @@ class GridField:
                 raise ModelError(f"field.lines_{axis}", f"must have shape {wanted} × powers, not {family.shape}")
             if not np.isfinite(family).all():
                 raise ModelError(f"field.lines_{axis}", "must be finite")
-        probe = np.array(self.probe, dtype=float)
-        if probe.shape != (3,) or not np.isfinite(probe).all():
-            raise ModelError("field.probe", "must be three finite numbers, m", probe.tolist())
         if self.outside not in OUTSIDE_POLICIES:
             raise ModelError("field.outside", f"must be one of {', '.join(OUTSIDE_POLICIES)}", self.outside)
-        if not (math.isfinite(self.reversal_threshold) and self.reversal_threshold >= 0.0):
-            raise ModelError("field.reversal_threshold", "must be finite and not negative, m", self.reversal_threshold)
         object.__setattr__(self, "grid", grid)
         object.__setattr__(self, "lines", lines)
-        object.__setattr__(self, "probe", probe)
+        settle(self)
 
     @property
     def box(self) -> np.ndarray:

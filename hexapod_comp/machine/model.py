@@ -25,13 +25,8 @@ from .geometry import HexapodGeometry
 from .kinematics import Structure, forward_error, over_chunks, strut_lengths
 from .region import Region
 from .struts import StrutErrors
-from .temperatures import AT_ONCE, HUMIDITY, MOST_TIME_CONSTANTS, PARTS, Lag, LateGrowth, Temperatures, late
-
-LARGEST_DEVIATION = 0.05
-"""Joint deviations above this, m, are a unit error, not a machine."""
-
-LARGEST_TURN = 0.1
-"""A base turned by more, rad, is a unit error, or another machine."""
+from .temperatures import AT_ONCE, EXPANSION, HUMIDITY, MOST_TIME_CONSTANTS, PARTS, Lag, LateGrowth, Temperatures, late
+from .terms import check_magnitudes, settle, term
 
 
 @dataclass(frozen=True)
@@ -128,40 +123,29 @@ class MachineModel:
 
     machine: str
     name: str = "ideal"
-    base_deviation: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((6, 3)))
-    platform_deviation: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((6, 3)))
-    base_axes_turn: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
+    base_deviation: np.ndarray = term("structure", "um", "real − nominal joints, in base", (6, 3), largest=0.05)
+    platform_deviation: np.ndarray = term("structure", "um", "the same, in platform", (6, 3), largest=0.05)
+    base_axes_turn: np.ndarray = term(
+        "structure",
+        "urad",
+        "rotation vector of the base's cardan axes, which turn with the whole base",
+        (3,),
+        largest=0.1,
+    )
     struts: StrutErrors = dataclasses.field(default_factory=StrutErrors)
     field: GridField = dataclasses.field(default_factory=no_field)
-    base_expansion: float = 0.0
-    platform_expansion: float = 0.0
+    base_expansion: float = term("thermal", "ppm_per_K", "of the base about its origin", (), largest=EXPANSION)
+    platform_expansion: float = term("thermal", "ppm_per_K", "of the platform", (), largest=EXPANSION)
     late_growth: LateGrowth = AT_ONCE
-    reversal_threshold: float = 0.2e-6
+    reversal_threshold: float = term(
+        "", "um", "way back until a strut's direction counts as reversed", (), default=0.2e-6, least=0.0
+    )
     region: Region | None = None
     origin: ModelOrigin = ModelOrigin()
 
     def __post_init__(self) -> None:
-        for name in ("base_deviation", "platform_deviation"):
-            array = np.array(getattr(self, name), dtype=float)
-            key = f"structure.{name}"
-            if array.shape != (6, 3) or not np.isfinite(array).all():
-                raise ModelError(key, "must be six finite triples, m", array.tolist())
-            if np.abs(array).max() > LARGEST_DEVIATION:
-                problem = f"must stay within ±{LARGEST_DEVIATION * 1e3:g} mm; is the unit right?"
-                raise ModelError(key, problem, float(np.abs(array).max()))
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
-        turn = np.array(self.base_axes_turn, dtype=float)
-        if turn.shape != (3,) or not np.abs(turn).max() <= LARGEST_TURN:
-            problem = f"must be three numbers within ±{LARGEST_TURN:g} rad; is the unit right?"
-            raise ModelError("structure.base_axes_turn", problem, turn.tolist())
-        turn.flags.writeable = False
-        object.__setattr__(self, "base_axes_turn", turn)
-        for name in ("base_expansion", "platform_expansion"):
-            if not math.isfinite(getattr(self, name)):
-                raise ModelError(f"thermal.{name}", "must be finite, 1/K", getattr(self, name))
-        if not (math.isfinite(self.reversal_threshold) and self.reversal_threshold >= 0.0):
-            raise ModelError("reversal_threshold", "must be finite and not negative, m", self.reversal_threshold)
+        settle(self)
+        check_magnitudes(self, "structure")
 
     @property
     def measured(self) -> Region | None:

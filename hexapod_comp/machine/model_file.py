@@ -1,93 +1,10 @@
 """Model files: the machine model as YAML, readable by people, refused when anything in it is in doubt.
 
-Keys end in their unit, as in geometry files (:data:`hexapod_comp.formats.schema.UNITS`); below stand the units that
-:func:`save_model` writes, reading takes any unit of the same kind. A value *per strut* is one number for
-all six or a list of six. Everything marked optional may be left out and is then zero or as stated::
+doc/model_file.md describes the format. Its terms are the rows of the model's own dataclasses (:mod:`.terms`); here
+stand provenance, and the blocks that are more than rows: harmonics, late growth, and the lines of a field.
 
-    format: hexapod_comp/model
-    version: 1
-    closed: true                      # optional: the last key is `end`; without it the file is refused as cut off
-    machine: paper                    # must be the geometry file's `machine`
-    name: after the crash             # shown in diagnostics
-    date: '2026-01-31'                # ISO 8601, date or date and time
-    sources:                          # every file that it was fitted to; [] for none
-    - file: laser_x.csv
-      sha256: 64 lower-case hexadecimal digits
-    region:                           # optional: where it was measured; by default where its field is
-      box_mm: [[-200, -200, 350], [200, 200, 550]]  # lowest, highest place of the measured point
-      point_mm: [0, 0, 0]             # optional: that point, in platform; its origin
-      position_mm: [0, 0, 0]          # optional: origin and axes of the box in base, as α, β, γ
-      rotation_deg: [0, 0, 0]
-                                      # in place of it, `valid_box_mm`: lowest, highest platform position in base
-    held_out_residual_um: 4.2         # optional: RMS tool error left on data not used for the fit
-    note: one line for people         # optional
-    posterior:                        # optional: how well the fit knows its parameters, in a file beside this one
-      file: crash.posterior.npz
-      sha256: 64 lower-case hexadecimal digits
-    datum:                            # optional: where the tool stays, as readings did not see where the machine stands
-      position_mm: [0, 0, 450]        # platform in base
-      rotation_deg: [0, 0, 0]         # α, β, γ; optional
-      held: 6                         # of the six ways to shift and turn the whole machine; 0: the readings saw all
-    reversal_threshold_um: 0.2        # optional (0.2): way back until a strut's direction counts as reversed
-
-    structure:                        # optional: real − nominal joint position
-      base_deviation_um:              # optional, 6×3, in base
-      platform_deviation_um:          # optional, 6×3, in platform
-      base_axes_turn_urad: [0, 0, 0]  # optional: rotation vector of the base's cardan axes, turned with the whole base
-
-    struts:                           # optional; L = (1 + g)(c + errors), see hexapod_comp.machine.struts
-      offset_um: 0.0                  # each of these optional and per strut
-      pitch_ppm: 0.0
-      reference_length_mm: 0.0        # command at which the pitch error is zero
-      backlash_um: 0.0                # lost motion on reversal
-      expansion_ppm_per_K: 0.0
-      moisture_ppm_per_percent: 0.0   # growth by relative humidity above 50 %: struts of carbon fibre
-      wave:                           # optional: cosine·cos(2πc/period) + sine·sin(2πc/period), per strut
-        cosine_um: 0.0
-        sine_um: 0.0
-        period_mm: 5.0                # required in this block: one turn of the screw
-        harmonics:                    # optional: the same several times a turn
-        - times: 2                    # 2, 3 or 4, each once
-          cosine_um: 0.0
-          sine_um: 0.0
-      map:                            # optional: natural cubic spline, end values held outside
-        knots_mm: [330, 600, 880]     # commands, increasing
-        values_um:                    # 6×n, one row per strut
-        backlash_um:                  # optional, 6×n: by how much the lost motion is larger there than backlash_um
-
-    thermal:                          # optional: bodies about their origins
-      base_expansion_ppm_per_K: 0.0
-      platform_expansion_ppm_per_K: 0.0
-      thermometer: base               # optional: this part's sensor stands for all; else each part has its own
-      time_constants_s: [1800, 7200]  # optional: how late parts follow, one or two, see machine.temperatures
-      late_struts_ppm_per_K:          # optional, 6 × time constants: what of a strut's growth comes so late
-      late_base_ppm_per_K: [0, 0]     # optional: the same of the base, and of the platform
-      late_platform_ppm_per_K: [0, 0]
-
-    field:                            # optional: interpolated error of the measured point, in base
-      grid_x_mm: [-200, 0, 200]       # increasing nodes; the outermost bound the measured box
-      grid_y_mm: [-200, 0, 200]
-      grid_z_mm: [350, 450, 550]
-      probe_mm: [0, 0, 0]             # optional: the measured point in platform
-      reversal_threshold_um: 10.0     # optional (10): way back until an axis' direction counts as reversed
-      outside: hold                   # optional: hold or refuse
-      lines:                          # [] for none
-      - axis: x                       # the line runs along this axis …
-        at: [0, 2]                    # … through these nodes of the other two (in the order x, y, z), from 0
-        direction: forward            # of motion along the axis: forward, backward or both
-        dx_um: [0.1, -3.0, 0.4]       # polynomial: constant, u, u², … with u from −1 to 1 over the box
-        rz_urad: [5.0]                # dx dy dz (lengths), rx ry rz (angles); one left out is zero
-
-    end: true                         # of a closed file: everything above has arrived
-
-What no machine has is refused as an error of units: joints more than 50 mm away, strut lengths more than 100 mm wrong,
-expansions above 1000 ppm/K or 1000 ppm per % of humidity; a field of more than 50 mm or 100 mrad anywhere on one of
-its lines.
-
-A family of lines (all along one axis) is whole or absent: every pair of nodes in both directions.
-
-Numbers are written with as many digits as bring back the very same float where the unit's factor allows
-it, and to one rounding (relative 2e-16) elsewhere; what was read from a file is written back unchanged.
+Numbers are written with as many digits as bring back the very same float where the unit's factor allows it, and to one
+rounding (relative 2e-16) elsewhere; what was read from a file is written back unchanged.
 """
 
 from __future__ import annotations
@@ -95,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from datetime import date, datetime
 from itertools import product
@@ -104,38 +22,36 @@ from typing import Any
 import numpy as np
 
 from ..core import MOST_HARMONICS
-from ..errors import InputFileError, ModelError
+from ..errors import ModelError
 from ..formats.files import read_text
 from ..formats.outputs import write_text
 from ..formats.paths import input_file
-from ..formats.schema import Section
+from ..formats.schema import PER_STRUT, Numbers, Section, complaints_about, in_unit
 from ..formats.yaml import block_text, parse_yaml
-from .field import CROSS_AXES, OUTSIDE_POLICIES, GridField, no_field
+from .field import COMPONENTS, CROSS_AXES, LARGEST, OUTSIDE_POLICIES, GridField, no_field
 from .geometry import HexapodGeometry
-from .magnitudes import check_magnitudes
 from .model import Datum, MachineModel, ModelOrigin
-from .model_blocks import (
-    COMPONENT_UNITS,
-    DIRECTIONS,
-    LATE_PARTS,
-    STRUT_TERMS,
-    datum_block,
-    field_block,
-    region_block,
-    structure_block,
-    struts_block,
-    thermal_block,
-    written,
-)
 from .region import Region
 from .struts import WAVE_PARTS, StrutErrors
 from .temperatures import PARTS, LateGrowth
+from .terms import check_magnitude, check_magnitudes, read_terms, table_text, write_terms
 
 MODEL_FORMAT = "hexapod_comp/model"
 MODEL_VERSION = 1
 
 IDEAL = "ideal"
 """What :func:`load_model` and parameters call the model of a machine without errors."""
+
+DIRECTIONS = ("forward", "backward")
+"""Order of the directions of motion in a field's arrays."""
+
+LATE: dict[str, Any] = {"late_struts": slice(0, 6), "late_base": 6, "late_platform": 7}
+"""Keys of late growth, and where they stand in its array."""
+
+WAVE, PERIOD, UM = Numbers("um", PER_STRUT), Numbers("mm", PER_STRUT), Numbers("um")
+
+LOOKED_AT = 33
+"""Points along each line of a field at which its polynomials are looked at."""
 
 ISO_8601 = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d(\.\d{3}(\d{3})?)?)?(Z|[+-]\d\d:\d\d)?)?")
 """The extended forms that every supported Python reads alike."""
@@ -150,7 +66,7 @@ Line = tuple[int, int, int]
 
 
 def load_model(path: str | Path, geometry: HexapodGeometry) -> MachineModel:
-    """Read a model file; the module's docstring describes the format.
+    """Read a model file; doc/model_file.md describes the format.
 
     Parameters
     ----------
@@ -175,29 +91,27 @@ def load_model(path: str | Path, geometry: HexapodGeometry) -> MachineModel:
 
 
 def parse_model(text: str, machine: str, name: str | Path = "model") -> MachineModel:
-    """Return the model of a model file's text."""
+    """Return the model of a model file's text for a machine; `name` is what messages call the file."""
     top = parse_yaml(text, name, MODEL_FORMAT, MODEL_VERSION)
     _refuse_cut_off(top)
     given = top.text("machine")
     if given != machine:
         raise top.error("machine", f"the model is for another machine, must be {machine!r}", given)
-    try:
-        values = {
-            "name": top.text("name"),
-            "origin": replace(_read_origin(top), text_sha256=text_sha256(text)),
-            **_read_scalars(top),
-            **_read_structure(top),
-            **_read_thermal(top),
-        }
-        if "struts" in top:
-            values["struts"] = _read_struts(top.section("struts"))
-        if "field" in top:
-            values["field"] = _read_field(top.section("field"))
+    with complaints_about(name):
+        origin = replace(_read_origin(top), text_sha256=text_sha256(text))
+        values: dict[str, Any] = {"name": top.text("name"), "origin": origin}
+        values |= {"region": _read_region(top)} | read_terms(MachineModel, top, "")
+        blocks = {"structure": _read_structure, "thermal": _read_thermal, "struts": _read_struts, "field": _read_field}
+        for key, read in blocks.items():
+            if key in top:
+                section = top.section(key)
+                values |= read(section)
+                section.finish()
         top.finish()
         model = MachineModel(machine, **values)
-        check_magnitudes(model)
-    except ModelError as error:
-        raise InputFileError(name, error.key, error.problem, error.value) from error
+        for part in (model, model.struts, model.late_growth):
+            check_magnitudes(part)
+        _check_lines(model.field)
     return model
 
 
@@ -228,32 +142,38 @@ def save_model(model: MachineModel, path: str | Path) -> None:
 
 def model_text(model: MachineModel) -> str:
     """Return the text that :func:`save_model` writes; equal models give equal texts."""
-    _check_origin(model.origin)
+    origin, region = model.origin, model.region
+    _check_origin(origin)
     content: dict[str, Any] = {"format": MODEL_FORMAT, "version": MODEL_VERSION, "closed": True}
-    content |= {"machine": model.machine, "name": model.name, "date": model.origin.date}
-    content["sources"] = [{"file": name, "sha256": digest} for name, digest in model.origin.sources]
-    if model.region is not None:
-        content["region"] = region_block(model.region)
-    if model.origin.held_out_residual is not None:
-        content["held_out_residual_um"] = written(model.origin.held_out_residual, "length", "um")
-    if model.origin.note:
-        content["note"] = model.origin.note
-    if model.origin.posterior is not None:
-        content["posterior"] = dict(zip(("file", "sha256"), model.origin.posterior, strict=True))
-    if model.origin.datum is not None:
-        content["datum"] = datum_block(model.origin.datum)
-    content["reversal_threshold_um"] = written(model.reversal_threshold, "length", "um")
+    content |= {"machine": model.machine, "name": model.name, "date": origin.date}
+    content["sources"] = [{"file": name, "sha256": digest} for name, digest in origin.sources]
+    if region is not None:
+        content["region"] = write_terms(region, "region")
+    if origin.held_out_residual is not None:
+        content |= [UM.write("held_out_residual", origin.held_out_residual)]
+    if origin.note:
+        content["note"] = origin.note
+    if origin.posterior is not None:
+        content["posterior"] = dict(zip(("file", "sha256"), origin.posterior, strict=True))
+    if origin.datum is not None:
+        place, angles = in_unit(origin.datum.position, "mm"), in_unit(origin.datum.angles, "deg")
+        content["datum"] = {"position_mm": place, "rotation_deg": angles, "held": origin.datum.held}
+    content |= write_terms(model, "", whole=True)
     blocks = {
-        "structure": structure_block(model),
-        "struts": struts_block(model.struts),
-        "thermal": thermal_block(model),
-        "field": field_block(model.field),
+        "structure": write_terms(model, "structure"),
+        "struts": _struts_block(model.struts),
+        "thermal": _thermal_block(model),
+        "field": _field_block(model.field),
     }
-    content |= {name: block for name, block in blocks.items() if block} | {"end": True}
-    return block_text(content)
+    return block_text(content | {name: block for name, block in blocks.items() if block} | {"end": True})
 
 
-# Reading
+def terms_text() -> str:
+    """Return the table of all terms, as doc/model_file.md has it."""
+    return table_text(MachineModel, StrutErrors, LateGrowth, GridField, Region)
+
+
+# Provenance
 
 
 def _refuse_cut_off(top: Section) -> None:
@@ -273,33 +193,25 @@ def _read_origin(top: Section) -> ModelOrigin:
     given = top.take("date")
     if isinstance(given, date):  # YAML makes one of an unquoted date
         given = given.isoformat()
-    residual = None
-    if top.quantity_key("held_out_residual", "length"):
-        residual = float(top.quantity("held_out_residual", "length"))
     sources = []
     for entry in top.sections("sources"):
         sources.append((entry.text("file"), entry.take("sha256")))
         entry.finish()
-    note = top.text("note") if "note" in top else ""
-    posterior = None
+    residual = UM.read(top, "held_out_residual", None)
+    note, posterior, datum = top.text("note") if "note" in top else "", None, None
     if "posterior" in top:
         section = top.section("posterior")
         posterior = section.text("file"), section.take("sha256")
         section.finish()
-    origin = ModelOrigin(given, tuple(sources), residual, note, posterior, _read_datum(top))
+    if "datum" in top:
+        section = top.section("datum")
+        position = section.quantity("position", "length", (3,))
+        angles = section.quantity("rotation", "angle", (3,), np.zeros(3))
+        datum = Datum(tuple(position.tolist()), tuple(angles.tolist()), section.take("held"))
+        section.finish()
+    origin = ModelOrigin(given, tuple(sources), residual, note, posterior, datum)
     _check_origin(origin)
     return origin
-
-
-def _read_datum(top: Section) -> Datum | None:
-    if "datum" not in top:
-        return None
-    section = top.section("datum")
-    position = section.quantity("position", "length", (3,))
-    angles = section.quantity("rotation", "angle", (3,), np.zeros(3))
-    datum = Datum(tuple(position.tolist()), tuple(angles.tolist()), section.take("held"))
-    section.finish()
-    return datum
 
 
 def _check_origin(origin: ModelOrigin) -> None:
@@ -310,90 +222,88 @@ def _check_origin(origin: ModelOrigin) -> None:
         datetime.fromisoformat(origin.date.replace("Z", "+00:00"))
     except (TypeError, ValueError) as error:
         raise ModelError("date", "must be ISO 8601, like 2026-01-31", origin.date) from error
-    for index, source in enumerate(origin.sources):
-        _check_hash(f"sources[{index}]", *source)
+    hashes = {f"sources[{index}]": source for index, source in enumerate(origin.sources)}
     if origin.posterior is not None:
-        _check_hash("posterior", *origin.posterior)
+        hashes["posterior"] = origin.posterior
         if Path(origin.posterior[0]).name != origin.posterior[0]:
             raise ModelError("posterior.file", "must be a file's name, without a folder", origin.posterior[0])
+    for key, (name, digest) in hashes.items():
+        if not (isinstance(digest, str) and SHA_256.fullmatch(digest)):
+            problem = f"must be the 64 lower-case hexadecimal digits of the SHA-256 of {name!r}"
+            raise ModelError(f"{key}.sha256", problem, digest)
     residual = origin.held_out_residual
     if residual is not None and not (math.isfinite(residual) and residual >= 0.0):
         raise ModelError("held_out_residual", "must be finite and not negative, m", residual)
 
 
-def _check_hash(key: str, name: str, digest: object) -> None:
-    if not (isinstance(digest, str) and SHA_256.fullmatch(digest)):
-        problem = f"must be the 64 lower-case hexadecimal digits of the SHA-256 of {name!r}"
-        raise ModelError(f"{key}.sha256", problem, digest)
-
-
-def _read_scalars(top: Section) -> dict[str, Any]:
-    """Return region and reversal threshold, where given."""
-    values: dict[str, Any] = {}
+def _read_region(top: Section) -> Region | None:
+    """Return where the model was measured; ``valid_box`` of older files holds platform positions in base."""
     if top.quantity_key("valid_box", "length"):
         box = top.quantity("valid_box", "length", (2, 3))
-        try:
-            values["region"] = Region(box)
-        except ModelError as error:
-            raise top.error("valid_box", error.problem, error.value) from error
         if "region" in top:
             raise top.error("region", "stands beside valid_box: only one can be true")
-    if "region" in top:
-        section, zero = top.section("region"), np.zeros(3)
-        box, point = section.quantity("box", "length", (2, 3)), section.quantity("point", "length", (3,), zero)
-        position, angles = (
-            section.quantity(*key, (3,), zero) for key in (("position", "length"), ("rotation", "angle"))
-        )
-        section.finish()
-        values["region"] = Region(box, point, position, angles)
-    if top.quantity_key("reversal_threshold", "length"):
-        values["reversal_threshold"] = float(top.quantity("reversal_threshold", "length"))
-    return values
-
-
-def _read_structure(top: Section) -> dict[str, Any]:
-    if "structure" not in top:
-        return {}
-    section = top.section("structure")
-    names = ("base_deviation", "platform_deviation")
-    values = {name: section.quantity(name, "length", (6, 3), np.zeros((6, 3))) for name in names}
-    values["base_axes_turn"] = section.quantity("base_axes_turn", "angle", (3,), np.zeros(3))
+        try:
+            return Region(box)
+        except ModelError as error:
+            raise top.error("valid_box", error.problem, error.value) from error
+    if "region" not in top:
+        return None
+    section = top.section("region")
+    region = Region(**read_terms(Region, section, "region"))
     section.finish()
-    return values
+    return region
 
 
-def _read_thermal(top: Section) -> dict[str, Any]:
-    if "thermal" not in top:
-        return {}
-    section = top.section("thermal")
-    names = ("base_expansion", "platform_expansion")
-    values: dict[str, Any] = {name: float(section.quantity(name, "expansion", (), 0.0)) for name in names}
+# Structure, thermal, struts
+
+
+def _read_structure(section: Section) -> dict[str, Any]:
+    return read_terms(MachineModel, section, "structure")
+
+
+def _read_thermal(section: Section) -> dict[str, Any]:
     thermometer = section.choice("thermometer", PARTS) if "thermometer" in section else ""
     constants = section.quantity("time_constants", "time", (None,), ())
-    shapes = zip(LATE_PARTS, ((6, len(constants)), (len(constants),), (len(constants),)), strict=True)
-    late = [section.quantity(name, "expansion", shape, np.zeros(shape)) for name, shape in shapes]
-    section.finish()
-    values["late_growth"] = LateGrowth(tuple(constants.tolist()), np.vstack(late), thermometer)
-    return values
+    late = np.zeros((len(PARTS), len(constants)))
+    for name, part in LATE.items():
+        none = np.zeros_like(late[part])
+        late[part] = section.quantity(name, "expansion", none.shape, none)
+    growth = LateGrowth(tuple(constants.tolist()), late, thermometer)
+    return read_terms(MachineModel, section, "thermal") | {"late_growth": growth}
 
 
-def _read_struts(section: Section) -> StrutErrors:
-    values = {name: section.per_strut(name, kind, 0.0) for name, (kind, _) in STRUT_TERMS.items()}
+def _thermal_block(model: MachineModel) -> dict[str, Any]:
+    block, growth = write_terms(model, "thermal"), model.late_growth
+    if growth.thermometer:
+        block["thermometer"] = growth.thermometer
+    if growth.time_constants:
+        block["time_constants_s"] = list(growth.time_constants)
+        late = {name: growth.expansion[part] for name, part in LATE.items()}
+        block |= {f"{name}_ppm_per_K": in_unit(rows, "ppm_per_K") for name, rows in late.items() if rows.any()}
+    return block
+
+
+def _read_struts(section: Section) -> dict[str, Any]:
+    values = read_terms(StrutErrors, section, "struts")
     if "wave" in section:
         values |= _read_wave(section.section("wave"))
     if "map" in section:
         length_map = section.section("map")
-        values["map_knots"] = length_map.quantity("knots", "length", (None,))
-        values["map_values"] = length_map.quantity("values", "length", (6, None))
-        values["map_backlash"] = length_map.quantity("backlash", "length", (6, None), np.zeros((6, 0)))
+        for key in ("knots", "values"):
+            if length_map.quantity_key(key, "length") is None:
+                length_map.quantity(key, "length")  # complains that it is missing
+        values |= read_terms(StrutErrors, length_map, "struts.map")
         length_map.finish()
-    section.finish()
-    return StrutErrors(**values)
+    return {"struts": StrutErrors(**values)}
 
 
 def _read_wave(section: Section) -> dict[str, np.ndarray]:
     """Return amplitudes, shape (6, harmonics), and periods, shape (6,), m."""
-    waves = {1: _amplitudes(section)}
+
+    def amplitudes(one: Section) -> np.ndarray:
+        return np.array([WAVE.read(one, name, np.zeros(6)) for name in WAVE_PARTS])
+
+    waves = {1: amplitudes(section)}
     period = section.per_strut("period", "length")
     for harmonic in section.sections("harmonics") if "harmonics" in section else ():
         times = harmonic.take("times")
@@ -401,80 +311,141 @@ def _read_wave(section: Section) -> dict[str, np.ndarray]:
             raise harmonic.error("times", f"must be a whole number, 2…{MOST_HARMONICS}", times)
         if times in waves:
             raise harmonic.error("times", "is given twice", times)
-        waves[times] = _amplitudes(harmonic)
+        waves[times] = amplitudes(harmonic)
         harmonic.finish()
     section.finish()
     every = np.stack([waves.get(n, np.zeros((2, 6))) for n in range(1, max(waves) + 1)], axis=2)
     return {"cosine": every[0], "sine": every[1], "period": period}
 
 
-def _amplitudes(section: Section) -> np.ndarray:
-    return np.array([section.per_strut(name, "length", 0.0) for name in WAVE_PARTS])
+def _struts_block(struts: StrutErrors) -> dict[str, Any]:
+    """Return the struts' own errors, those that are not zero."""
+    block = write_terms(struts, "struts")
+    if struts.cosine.any() or struts.sine.any() or (struts.period != StrutErrors().period).any():
+
+        def amplitudes(column: int) -> dict[str, Any]:
+            return dict(WAVE.write(name, getattr(struts, name)[:, column]) for name in WAVE_PARTS)
+
+        block["wave"] = {**amplitudes(0), **dict([PERIOD.write("period", struts.period)])}
+        columns = range(1, len(struts.harmonics))
+        used = [k for k in columns if struts.cosine[:, k].any() or struts.sine[:, k].any()]
+        if used:
+            block["wave"]["harmonics"] = [{"times": k + 1, **amplitudes(k)} for k in used]
+    if len(struts.map_knots):
+        block["map"] = write_terms(struts, "struts.map", whole=True)
+        if not struts.map_backlash.any():
+            del block["map"]["backlash_um"]
+    return block
 
 
-def _read_field(section: Section) -> GridField:
+# Field
+
+
+def _component(name: str) -> Numbers:
+    """Return how the polynomial of a component is written."""
+    return Numbers("um" if name.startswith("d") else "urad", (None,))
+
+
+def _read_field(section: Section) -> dict[str, Any]:
     grid = tuple(section.quantity(f"grid_{axis}", "length", (None,)) for axis in "xyz")
-    probe = section.quantity("probe", "length", (3,), np.zeros(3))
-    threshold = float(section.quantity("reversal_threshold", "length", (), no_field().reversal_threshold))
+    values = read_terms(GridField, section, "field")
     outside = section.choice("outside", OUTSIDE_POLICIES, "hold")
     families: dict[str, dict[Line, np.ndarray]] = {axis: {} for axis in "xyz"}
     for entry in section.sections("lines"):
         _read_line(entry, grid, families)
-    lines = [
-        _family_array(section, axis, families[axis], len(grid[first]), len(grid[second]))
-        for axis, (first, second) in zip("xyz", CROSS_AXES, strict=True)
-    ]
-    section.finish()
-    families_in_order = (lines[0], lines[1], lines[2])
-    return GridField((grid[0], grid[1], grid[2]), families_in_order, probe, outside, threshold)
+    lines = tuple(_family_array(section, axis, families[axis], [len(nodes) for nodes in grid]) for axis in "xyz")
+    return {"field": GridField(grid, lines, outside=outside, **values)}  # type: ignore[arg-type]
 
 
 def _read_line(entry: Section, grid: tuple[np.ndarray, ...], families: dict[str, dict[Line, np.ndarray]]) -> None:
     """Read one line of the field into its family, for one direction or both."""
     axis = entry.choice("axis", ("x", "y", "z"))
-    cross = CROSS_AXES["xyz".index(axis)]
-    first, second = _node_indices(entry, [len(grid[other]) for other in cross])
+    counts = [len(grid[other]) for other in CROSS_AXES["xyz".index(axis)]]
+    nodes = entry.take("at")
+    if not (
+        isinstance(nodes, list)
+        and len(nodes) == 2
+        and all(type(node) is int and 0 <= node < count for node, count in zip(nodes, counts, strict=True))
+    ):
+        raise entry.error("at", f"must be two node indices within 0…{counts[0] - 1} and 0…{counts[1] - 1}", nodes)
     direction = entry.choice("direction", (*DIRECTIONS, "both"))
-    rows = [entry.quantity(name, kind, (None,), ()) for name, (kind, _) in COMPONENT_UNITS.items()]
+    rows = [_component(name).read(entry, name, ()) for name in COMPONENTS]
     entry.finish()
     coefficients = np.zeros((6, max(len(row) for row in rows)))
     for component, row in enumerate(rows):
         coefficients[component, : len(row)] = row
     for index, name in enumerate(DIRECTIONS):
-        if direction not in (name, "both"):
-            continue
-        if (index, first, second) in families[axis]:
-            problem = f"the {name} line along {axis} through these nodes is given twice"
-            raise entry.error("at", problem, [first, second])
-        families[axis][index, first, second] = coefficients
+        if direction in (name, "both"):
+            line = index, nodes[0], nodes[1]
+            if line in families[axis]:
+                raise entry.error("at", f"the {name} line along {axis} through these nodes is given twice", nodes)
+            families[axis][line] = coefficients
 
 
-def _node_indices(entry: Section, counts: list[int]) -> tuple[int, int]:
-    indices = entry.take("at")
-    inside = (
-        isinstance(indices, list)
-        and len(indices) == 2
-        and all(type(index) is int and 0 <= index < count for index, count in zip(indices, counts, strict=True))
-    )
-    if not inside:
-        problem = f"must be two node indices within 0…{counts[0] - 1} and 0…{counts[1] - 1}"
-        raise entry.error("at", problem, indices)
-    return indices[0], indices[1]
-
-
-def _family_array(
-    section: Section, axis: str, family: dict[Line, np.ndarray], first_count: int, second_count: int
-) -> np.ndarray:
+def _family_array(section: Section, axis: str, family: dict[Line, np.ndarray], counts: list[int]) -> np.ndarray:
     """Return the family's coefficients, shape (2, n, m, 6, K); K = 0 for one that was not measured."""
+    first, second = (counts[other] for other in CROSS_AXES["xyz".index(axis)])
     if not family:
-        return np.zeros((2, first_count, second_count, 6, 0))
-    every = product(range(2), range(first_count), range(second_count))
+        return np.zeros((2, first, second, 6, 0))
+    every = product(range(2), range(first), range(second))
     missing = next((line for line in every if line not in family), None)
     if missing is not None:  # looked for before anything is allocated: node counts are the file's
         direction, *nodes = missing
         raise section.error("lines", f"the {DIRECTIONS[direction]} line along {axis} at {nodes} is missing")
     powers = max(coefficients.shape[1] for coefficients in family.values())
-    array = np.zeros((2, first_count, second_count, 6, powers))
+    array = np.zeros((2, first, second, 6, powers))
     for line, coefficients in family.items():
         array[line][:, : coefficients.shape[1]] = coefficients
     return array
+
+
+def _field_block(field: GridField) -> dict[str, Any]:
+    """Return the field, empty where leaving it out brings the same one back."""
+    nothing, terms = no_field(), write_terms(field, "field")
+    same_grid = all(np.array_equal(ours, theirs) for ours, theirs in zip(field.grid, nothing.grid, strict=True))
+    measured = any(family.shape[4] for family in field.lines)
+    if same_grid and not measured and not terms and field.outside == nothing.outside:
+        return {}
+    block: dict[str, Any] = {
+        f"grid_{axis}_mm": in_unit(nodes, "mm") for axis, nodes in zip("xyz", field.grid, strict=True)
+    }
+    block |= write_terms(field, "field", whole=True) | {"outside": field.outside}
+    families = zip("xyz", field.lines, strict=True)
+    block["lines"] = [line for axis, family in families for line in _family_lines(axis, family)]
+    return block
+
+
+def _family_lines(axis: str, family: np.ndarray) -> Iterator[dict[str, Any]]:
+    """Yield the family's lines, each with the components that any line of the family has.
+
+    Rows keep their full number of powers, and a family of zeros keeps one component, so that reading
+    brings back the same shape.
+    """
+    if not family.shape[4]:
+        return
+    components = np.flatnonzero(family.any(axis=(0, 1, 2, 4))).tolist() or ["xyz".index(axis)]
+    for first, second in np.ndindex(family.shape[1:3]):
+        forward, backward = family[:, first, second]
+        given = {"both": forward}
+        if not np.array_equal(forward, backward):
+            given = dict(zip(DIRECTIONS, (forward, backward), strict=True))
+        for direction, line in given.items():
+            rows = dict(_component(COMPONENTS[k]).write(COMPONENTS[k], line[k]) for k in components)
+            yield {"axis": axis, "at": [first, second], "direction": direction, **rows}
+
+
+def _check_lines(field: GridField) -> None:
+    """Refuse a field that is anywhere on one of its lines larger than any machine's."""
+    for axis, family in zip("xyz", field.lines, strict=True):
+        largest = np.zeros(6)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for u in np.linspace(-1.0, 1.0, LOOKED_AT):
+                value = np.zeros(family.shape[:4])
+                for power in reversed(range(family.shape[4])):
+                    value = value * u + family[..., power]
+                largest = np.maximum(largest, np.nan_to_num(np.abs(value), nan=math.inf).max(axis=(0, 1, 2)))
+        for component, found, allowed in zip(COMPONENTS, largest, LARGEST, strict=True):
+            unit = "mm" if component.startswith("d") else "mrad"
+            check_magnitude(
+                f"field.lines_{axis}.{component}", found, allowed, f"{allowed * 1e3:g} {unit} along every line"
+            )

@@ -6,7 +6,7 @@ does not matter, so that readings that are added can only make it larger.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass
 from functools import cached_property
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 from ..errors import ModelError
 from ..pose import Pose
 from .geometry import HexapodGeometry
+from .terms import settle, term
 
 ON_THE_FACE = 1e-9
 """A place that is further outside, m, is outside: files keep a picometre."""
@@ -27,13 +28,12 @@ PARALLEL = 1e-9
 class Region:
     """A box of places of a point of the platform."""
 
-    box: np.ndarray  # (2, 3): lowest and highest place, m along the axes of `frame`
-    # (3,): the point in ``platform``, m: by default its origin
-    point: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    # (3,): of the box's frame in ``base``, m and α, β, γ in rad: the work frame in which was measured, by default
-    # ``base``
-    position: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    angles: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    box: np.ndarray = term(
+        "region", "mm", "lowest and highest place of the measured point", (2, 3), MISSING, checked=False
+    )
+    point: np.ndarray = term("region", "mm", "that point, in platform", (3,))
+    position: np.ndarray = term("region", "mm", "origin of the box's axes in base: of the work frame measured in", (3,))
+    angles: np.ndarray = term("region", "deg", "their rotation, α, β, γ", (3,), key="rotation")
 
     @staticmethod
     def of(box: np.ndarray, point: np.ndarray, frame: Pose) -> Region:
@@ -47,16 +47,9 @@ class Region:
 
     def __post_init__(self) -> None:
         box = np.array(self.box, dtype=float)
-        if box.shape != (2, 3) or not (np.isfinite(box).all() and (box[0] < box[1]).all()):
+        if box.shape != (2, 3) or not (box[0] < box[1]).all():
             raise ModelError("region.box", "must be its lowest and its highest corner, m", box.tolist())
-        box.flags.writeable = False
-        object.__setattr__(self, "box", box)
-        for name in ("point", "position", "angles"):
-            array = np.array(getattr(self, name), dtype=float)
-            if array.shape != (3,) or not np.isfinite(array).all():
-                raise ModelError(f"region.{name}", "must be three finite numbers", array.tolist())
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
+        settle(self)
 
     def contains(self, positions: np.ndarray, rotations: np.ndarray, slack: float = ON_THE_FACE) -> np.ndarray:
         """Return whether the point is in the box, or out of it by no more than `slack`, m, at platform poses, (N,)."""

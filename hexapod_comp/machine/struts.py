@@ -11,7 +11,7 @@ the cardan joints force on the screw since home, and growth g, by heat and by hu
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +19,10 @@ import numpy as np
 from ..core import MOST_HARMONICS
 from ..core.batch import screw_twists
 from ..errors import ModelError
+from ..formats.schema import PER_STRUT
 from .geometry import HexapodGeometry
+from .temperatures import EXPANSION
+from .terms import settle, term
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
@@ -27,52 +30,65 @@ if TYPE_CHECKING:
 STEEPEST_ERROR = 0.2
 """Largest slope of the strut error against the command: below it, undoing the error is a contraction."""
 
+STRUT_LENGTH = 0.1
+"""Largest error of a strut's length, m: an encoder's zero is found within a hand's breadth."""
+
+MOISTURE = 0.1
+"""Largest growth from dry air to damp: three times that of nylon; carbon fibre in resin has some hundred ppm."""
+
+TINY = float(np.finfo(float).tiny)
+
 WAVE_PARTS, MAP_PARTS = ("cosine", "sine"), ("map_knots", "map_values", "map_backlash")
 
 
 @dataclass(frozen=True)
 class StrutErrors:
-    """Errors of the six struts; every array has shape (6,) unless it says otherwise, every default is zero."""
+    """Errors of the six struts: arrays of shape (6,), waves (6, harmonics), maps (6, knots)."""
 
-    offset: np.ndarray = field(default_factory=lambda: np.zeros(6))  # Length at a zero command error, m
-    pitch: np.ndarray = field(default_factory=lambda: np.zeros(6))  # Relative pitch error, m per m
-    # Command at which the pitch error is zero, m
-    reference_length: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    # (6, n): screw wave amplitudes, m: of the harmonics 1 to n per turn, n up to 4; of shape (6,), of the first alone.
-    # They are kept as (6, n)
-    cosine: np.ndarray = field(default_factory=lambda: np.zeros((6, 1)))
-    # (6,): screw wave amplitudes, m: of the harmonics 1 to n per turn, n up to 4; of shape (6,), of the first alone.
-    # They are kept as (6, n)
-    sine: np.ndarray = field(default_factory=lambda: np.zeros((6, 1)))
-    # Screw wave period, usually the lead, m; required above zero where an amplitude is not zero
-    period: np.ndarray = field(default_factory=lambda: np.full(6, 0.01))
-    backlash: np.ndarray = field(default_factory=lambda: np.zeros(6))  # Lost motion on reversal, m
-    expansion: np.ndarray = field(default_factory=lambda: np.zeros(6))  # Thermal expansion of the struts, 1/K
-    # Growth of the struts by the air's relative humidity, m/m from 0 to 1
-    moisture: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    # (n,): commands of the length map, m, increasing; empty for none
-    map_knots: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    # (6, n): length error at the knots, m; a natural cubic spline runs between, the end values hold outside
-    map_values: np.ndarray = field(default_factory=lambda: np.zeros((6, 0)))
-    # (6, n): by how much the lost motion on reversal is larger at the knots than `backlash`, m; in the same way. Left
-    # out, it is the same everywhere
-    map_backlash: np.ndarray = field(default_factory=lambda: np.zeros((6, 0)))
+    offset: np.ndarray = term("struts", "um", "length at a zero command error", largest=STRUT_LENGTH)
+    pitch: np.ndarray = term("struts", "ppm", "relative pitch error")
+    reference_length: np.ndarray = term("struts", "mm", "command at which the pitch error is zero")
+    backlash: np.ndarray = term("struts", "um", "lost motion on reversal", least=0.0, largest=STRUT_LENGTH)
+    expansion: np.ndarray = term("struts", "ppm_per_K", "thermal expansion", largest=EXPANSION)
+    moisture: np.ndarray = term(
+        "struts", "ppm_per_percent", "growth by relative humidity above 50 %: struts of carbon fibre", largest=MOISTURE
+    )
+    cosine: np.ndarray = term(
+        *("struts.wave", "um", "screw wave: cosine·cos(2πc/period)", PER_STRUT, np.zeros((6, 1))),
+        largest=STRUT_LENGTH,
+        checked=False,
+    )
+    sine: np.ndarray = term(
+        *("struts.wave", "um", "and sine·sin(2πc/period)", PER_STRUT, np.zeros((6, 1))),
+        largest=STRUT_LENGTH,
+        checked=False,
+    )
+    period: np.ndarray = term("struts.wave", "mm", "one turn of the screw", default=0.01, least=TINY)
+    map_knots: np.ndarray = term("struts.map", "mm", "commands, increasing", (None,), key="knots", checked=False)
+    map_values: np.ndarray = term(
+        "struts.map",
+        "um",
+        "length error there: a natural cubic spline, end values held outside",
+        (6, None),
+        key="values",
+        largest=STRUT_LENGTH,
+        checked=False,
+    )
+    map_backlash: np.ndarray = term(
+        "struts.map",
+        "um",
+        "by how much the lost motion is larger there than `backlash_um`",
+        (6, None),
+        key="backlash",
+        largest=STRUT_LENGTH,
+        checked=False,
+    )
 
     def __post_init__(self) -> None:
-        for entry in fields(self):
-            array = np.array(getattr(self, entry.name), dtype=float)
-            if not np.isfinite(array).all():
-                raise ModelError(f"struts.{entry.name}", "must be finite", array.tolist())
-            if entry.name in WAVE_PARTS and array.shape == (6,):
-                array = array[:, None]
-            if entry.name not in (*WAVE_PARTS, *MAP_PARTS) and array.shape != (6,):
-                raise ModelError(f"struts.{entry.name}", f"must have shape (6,), not {array.shape}")
-            array.flags.writeable = False
-            object.__setattr__(self, entry.name, array)
-        if (self.backlash < 0.0).any():
-            raise ModelError("struts.backlash", "must not be negative", self.backlash.tolist())
-        if (self.period <= 0.0).any():
-            raise ModelError("struts.period", "must be above zero", self.period.tolist())
+        for name in WAVE_PARTS:
+            if np.shape(getattr(self, name)) == (6,):
+                object.__setattr__(self, name, np.array(getattr(self, name), dtype=float)[:, None])
+        settle(self)
         self._settle_waves()
         self._check_map()
         slope = self._steepest()

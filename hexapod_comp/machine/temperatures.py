@@ -14,14 +14,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from ..errors import ModelError
-from .geometry import STRUT_NAMES
+from .limits import STRUT_NAMES
+from .terms import term
 
 PARTS = (*STRUT_NAMES, "base", "platform")
 """What has a temperature, in the order of every array of eight."""
@@ -36,17 +37,19 @@ REST = 3.0
 """After so many time constants a twentieth is left of what a first reading did not know."""
 
 
-def _nothing() -> np.ndarray:
-    return np.zeros((len(PARTS), 0))
+EXPANSION = 1e-3
+"""Largest expansion that a machine's part may have, 1/K: five times that of soft plastics."""
 
 
 @dataclass(frozen=True)
 class LateGrowth:
     """How the parts of a machine follow their thermometers."""
 
-    time_constants: tuple[float, ...] = ()  # τ_k, s, increasing; none, one or two
-    # (8, time constants): b_k of struts 1–6, base, platform, 1/K
-    expansion: np.ndarray = field(default_factory=_nothing)
+    # τ_k, a tuple; late growth has b_k of struts 1–6, base and platform as rows (8, time constants)
+    time_constants: tuple[float, ...] = term("thermal", "s", "how late parts follow: none, one or two", (None,))
+    expansion: np.ndarray = term(
+        "thermal", "ppm_per_K", "what of a part's growth comes so late", (8, None), key="late", largest=EXPANSION
+    )
     thermometer: str = ""  # The part whose sensor stands for all; empty: each part has its own
 
     def __post_init__(self) -> None:

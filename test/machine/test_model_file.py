@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import os
-from dataclasses import fields, is_dataclass, replace
+import re
+from dataclasses import dataclass, fields, is_dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,11 +16,13 @@ from hypothesis import strategies as st
 from strategies import UNEVEN_GRID, fixed, paper_geometry, random_field, random_model, seeds, skewed_geometry
 
 from hexapod_comp.errors import InputFileError, ModelError
+from hexapod_comp.formats.schema import Section
 from hexapod_comp.machine.field import CROSS_AXES, GridField
 from hexapod_comp.machine.model import MachineModel, ModelOrigin
-from hexapod_comp.machine.model_file import load_model, model_text, parse_model, save_model
+from hexapod_comp.machine.model_file import load_model, model_text, parse_model, save_model, terms_text
 from hexapod_comp.machine.region import Region
 from hexapod_comp.machine.struts import StrutErrors
+from hexapod_comp.machine.terms import check_magnitudes, read_terms, settle, table_text, term, write_terms
 
 PAPER, SKEWED = paper_geometry(), skewed_geometry()
 DIGEST = "0123456789abcdef" * 4
@@ -540,6 +544,55 @@ def test_marks_of_a_closed_file_belong_together(text, key, tmp_path):
     with pytest.raises(InputFileError) as caught:
         load_model(path, PAPER)
     assert caught.value.key == key
+
+
+# ---- what the documentation says ----
+
+DOC = Path(__file__).parents[2] / "doc" / "model_file.md"
+
+
+def test_the_documented_table_is_the_programs():
+    """Where it is not: put what `terms_text` returns under "All terms"."""
+    assert DOC.read_text(encoding="utf-8").endswith("\n\n" + terms_text())
+
+
+def test_the_documented_example_is_a_model():
+    """Every key of the example is known; numbers that a comment stands for are filled in."""
+    text = DOC.read_text(encoding="utf-8").split("```yaml\n")[1].split("```")[0]
+    text, zeros = text.replace("closed: true", "").replace("end: true", ""), str(np.zeros((6, 3)).tolist())
+    text = text.replace("64 lower-case hexadecimal digits", DIGEST)
+    for key in ("base_deviation_um:", "platform_deviation_um:", "values_um:", "    backlash_um:"):
+        text = re.sub(rf"{key} +#.*", f"{key} {zeros}", text)
+    text = re.sub(r"late_struts_ppm_per_K: +#.*", "late_struts_ppm_per_K: " + str(np.zeros((6, 2)).tolist()), text)
+    text = text.replace("at: [0, 2]", "at: [0, 0]")
+    with pytest.raises(InputFileError, match=r"the forward line along x at \[0, 1\] is missing"):  # one is shown of 18
+        parse_model(text, "paper")
+
+
+@dataclass(frozen=True)
+class Sagging:
+    """A model with a term that is a row, and nothing else."""
+
+    sag: np.ndarray = term("load", "um", "of each strut under 1 kN", least=0.0, largest=1e-3)
+
+    def __post_init__(self):
+        settle(self)
+
+
+def test_a_new_term_is_one_row():
+    """Read in any unit, per strut or once; written in its own; refused where no machine has it; and documented."""
+    section = Section("m.yaml", "load", {"sag_mm": 0.02})
+    sagging = Sagging(**read_terms(Sagging, section, "load"))
+    np.testing.assert_allclose(sagging.sag, np.full(6, 2e-5), rtol=1e-15)
+    assert write_terms(sagging, "load") == {"sag_um": 20.0}
+    assert write_terms(Sagging(), "load") == {}
+    with pytest.raises(ModelError, match=r"load.sag.*±1 mm.*unit.*0\.002"):
+        check_magnitudes(Sagging(np.full(6, 2e-3)))
+    with pytest.raises(ModelError, match=r"load.sag.*negative.*-1e-06"):
+        Sagging(np.full(6, -1e-6))
+    with pytest.raises(ModelError, match=r"load.sag.*\(6,\).*\(5,\)"):
+        Sagging(np.zeros(5))
+    assert "| load | `sag_um` | per strut | 0 | ≥ 0, ±1 mm | of each strut under 1 kN |" in table_text(Sagging)
 
 
 # ---- text, shipped name, ideal ----
