@@ -24,13 +24,12 @@ from pathlib import Path
 import numpy as np
 
 from hexapod_comp.calibration.candidates import MeasuringBox
+from hexapod_comp.calibration.design import Aim, Goal, Proposal, Times, propose, seen_by
+from hexapod_comp.calibration.design_report import verdict
 from hexapod_comp.calibration.estimator import physical_covariance
 from hexapod_comp.calibration.fit import fit_model
-from hexapod_comp.calibration.gains import Aim, seen_by
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import box_stations, expected_error
-from hexapod_comp.calibration.proposal import Goal, Proposal, Times, propose
-from hexapod_comp.calibration.proposal_report import verdict
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine

@@ -45,9 +45,9 @@ from hexapod_comp.calibration.check import (
     update_model,
     verify_model,
 )
-from hexapod_comp.calibration.check_plan import propose_check
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
+from hexapod_comp.calibration.follow_up import propose_check
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.posterior import FittedParameters
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry

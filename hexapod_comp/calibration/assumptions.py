@@ -83,6 +83,15 @@ class Assumptions:
     plausible_check: float = assumed(10.0, "", "χ² per number of check readings read rightly", "3 × noise")
     as_good_check: float = assumed(3.0, "", "χ² ratio to the best at which another is named", "1.7 × noise")
 
+    # Design of measurements (design.py, candidates.py)
+    faint: float = assumed(0.05, "σ", "directions that readings see by less are left out", "0.25 % of a variance")
+    least_reached: float = assumed(0.3, "", "share of the box in which the tool must tilt as wanted", "chosen")
+    tilts: tuple = assumed((10.0, 5.0, 2.0), "°", "tilts of scattered poses: the first within reach", "usual limits")
+    crash: float = assumed(20e-6, "m", "change of a strut that a proposed check is to name", "a light collision")
+    warmth: float = assumed(12e-6, "m/m", "growth of all struts that it is to name", "steel by a kelvin")
+    check_readings: int = assumed(12, "", "readings of a proposed check", "named 20 µm in 95 % (benchmarks.upkeep)")
+    machines_drawn: int = assumed(2000, "", "machines drawn for the percentile of the worst pose", "95 % to ± 0.5 %")
+
     def rows(self) -> list[tuple[str, str, str, str]]:
         """Return name, value with unit, meaning and source of every assumption."""
 

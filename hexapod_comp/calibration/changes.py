@@ -216,7 +216,7 @@ class Hypothesis:
         else:
             directions, gains, _ = np.linalg.svd(effect, full_matrices=False)
         felt = gains > ROUNDING * max(gains.max(initial=0.0), 1.0)
-        least = float(gains.min()) if felt.sum() == effect.shape[1] else 0.0
+        least = float(gains.min(initial=np.inf)) if felt.sum() == effect.shape[1] else 0.0
         return Hypothesis(change, directions[:, felt], gains[felt], least)
 
     def log_bayes_factors(self, z: np.ndarray) -> np.ndarray:

@@ -33,9 +33,9 @@ from .changes import (
 )
 from .datum import hold, unseen_part
 from .estimator import Estimation
+from .follow_up import Settling, settle
 from .mixups import misread
 from .posterior import ErrorPredictor, FittedParameters
-from .settling import Settling, settle
 
 VALID, NAMED, UNDECIDED, UNEXPLAINED = "valid", "named", "undecided", "unexplained"
 """Verdicts."""

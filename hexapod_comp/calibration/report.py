@@ -9,10 +9,10 @@ import numpy as np
 
 from ..formats.texts import aligned, number
 from ..measurements.readings import ANGULAR_KINDS, CHANNELS, SAME_ATTITUDE
+from .design import Plan
 from .estimator import SETTLED
 from .fit import ChannelFit, ModelFit, Outlier
 from .lead import ScrewLead
-from .plan import Plan
 from .posterior import BlockSight, Observability, ToolError, UnseenError, listed
 from .verdict import TILT
 from .warming import warming_json, warming_text

@@ -78,9 +78,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry) -> int:
     """Show what a model's calibration leaves, and which measurement would remove most of it."""
+    from ..calibration.design_report import measurement_rows, remaining_json, remaining_text
+    from ..calibration.follow_up import remaining
     from ..calibration.pictures import predicted_error_figure
     from ..calibration.posterior_file import load_posterior
-    from ..calibration.remaining import measurement_rows, remaining, remaining_json, remaining_text
     from ..errors import CommandError
     from ..machine.model import RealMachine
     from ..machine.model_file import load_model

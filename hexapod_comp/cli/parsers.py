@@ -393,7 +393,7 @@ def _verify(parser: argparse.ArgumentParser) -> None:
     _compensated(add)
     add("--propose", metavar="FILE", help="instead: write which readings to take, a tidy CSV file without values")
     add("--readings", type=int, metavar="N", help="how many of them (default 12)")
-    text = "what there is to take them with: linear, rotation (default both, as a 5-D laser)"
+    text = "what takes them: linear, straightness, rotation, tracker, tracker_6d (default linear,rotation)"
     add("--instruments", metavar="A,B", help=text)
     _json(add)
 

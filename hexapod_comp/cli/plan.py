@@ -10,7 +10,7 @@ from . import common
 from .fit import fit_settings
 
 if TYPE_CHECKING:
-    from ..calibration.proposal import Goal
+    from ..calibration.design import Goal
     from ..machine.geometry import HexapodGeometry
     from ..measurements.campaign import Campaign
 
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _judge(args: argparse.Namespace, geometry: HexapodGeometry) -> int:
     """Say what a campaign determines."""
-    from ..calibration.plan import plan
+    from ..calibration.design import plan
     from ..calibration.report import plan_json, plan_report
     from ..measurements.campaign import template
 
@@ -53,8 +53,8 @@ def _judge(args: argparse.Namespace, geometry: HexapodGeometry) -> int:
 def _propose(args: argparse.Namespace, geometry: HexapodGeometry) -> int:
     """Propose a campaign for a goal; 1 when it is not met."""
     from ..calibration.candidates import MeasuringBox
-    from ..calibration.proposal import propose
-    from ..calibration.proposal_report import proposal_json, proposal_report, remarks
+    from ..calibration.design import propose
+    from ..calibration.design_report import proposal_json, proposal_report, remarks
     from ..formats.outputs import write_text
     from ..measurements.campaign import campaign_text
 
@@ -87,7 +87,7 @@ def _goal(args: argparse.Namespace) -> Goal:
     """Return the goal that the options name."""
     import numpy as np
 
-    from ..calibration.proposal import TIMES, Goal, Times
+    from ..calibration.design import TIMES, Goal, Times
     from ..errors import CalibrationError
 
     times = dict(TIMES)

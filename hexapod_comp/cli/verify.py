@@ -44,19 +44,17 @@ def _refuse_what_does_not_fit(args: argparse.Namespace) -> None:
 
 def _propose(args: argparse.Namespace) -> int:
     """Write the check readings to take."""
-    from ..calibration.check_plan import READ_BY, USUAL, propose_check
-    from ..calibration.settling import described
+    from ..calibration.follow_up import places, propose_check
     from ..measurements.writing import write_measurements
 
     _, fitted = _known(args, args.model)
     with common.stage("choosing readings"):
-        readings = propose_check(
-            fitted,
-            USUAL if args.readings is None else args.readings,
-            tuple(READ_BY) if args.instruments is None else args.instruments.split(","),
-        )
+        wanted = {} if args.readings is None else {"readings": args.readings}
+        if args.instruments is not None:
+            wanted["instruments"] = args.instruments.split(",")
+        readings = propose_check(fitted, **wanted)
     write_measurements(readings, args.propose)
-    runs = [described(readings, (readings.run == run).nonzero()[0]) for run in dict.fromkeys(readings.run.tolist())]
+    runs = [(where, channels) for where, channels, _ in places(readings)]
     if args.json:
         common.show(
             {"runs": [{"where": where, "channels": channels} for where, channels in runs], "written": args.propose}

@@ -37,10 +37,10 @@ from hexapod_comp.calibration.check import (
     update_model,
     verify_model,
 )
-from hexapod_comp.calibration.check_plan import propose_check
 from hexapod_comp.calibration.check_report import verification_json, verification_report
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
+from hexapod_comp.calibration.follow_up import propose_check
 from hexapod_comp.calibration.posterior import FittedParameters
 from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.model import MachineModel, RealMachine, tool_move

@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import gmean
 
+from hexapod_comp.calibration.design import plan
 from hexapod_comp.calibration.estimator import DesignMatrix, Estimation, LinearProblem, Posterior, solve
 from hexapod_comp.calibration.parameters import TOLERANCES, FitSettings, ParameterSpace
-from hexapod_comp.calibration.plan import plan
 from hexapod_comp.calibration.posterior import (
     MACHINE_ERRORS,
     Observability,

@@ -1,7 +1,6 @@
 """Proposed campaigns: gains by plain linear algebra, expectations by another way, the limits of each machine."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import calibration_helpers as small
 import numpy as np
@@ -9,11 +8,9 @@ import pytest
 from foreign_machines import machines
 
 from hexapod_comp.calibration.candidates import MeasuringBox, candidates
-from hexapod_comp.calibration.gains import Selection
+from hexapod_comp.calibration.design import TIMES, ErrorLeft, Goal, Proposal, Times, plan, propose
+from hexapod_comp.calibration.design_report import proposal_report, verdict
 from hexapod_comp.calibration.parameters import FitSettings
-from hexapod_comp.calibration.plan import plan
-from hexapod_comp.calibration.proposal import TIMES, Goal, Proposal, Times, propose
-from hexapod_comp.calibration.proposal_report import proposal_report, verdict
 from hexapod_comp.cli.arguments import INSTRUMENTS
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import load_geometry
@@ -38,8 +35,7 @@ def test_gains_are_those_of_the_whole_matrices() -> None:
     seen = [rng.standard_normal((k, 9)) for k in (1, 3, 4, 2)]
     root = rng.standard_normal((9, 5))
     square = root @ root.T
-    aim = SimpleNamespace(root=root, errors=lambda c: {"level": float(np.sqrt((square * c).sum()))})
-    selection = Selection(seen, aim)
+    criterion = ErrorLeft(seen, square)
 
     def left(chosen: list[int]) -> float:
         rows = np.concatenate([np.zeros((0, 9)), *(seen[n] for n in chosen)])
@@ -48,11 +44,11 @@ def test_gains_are_those_of_the_whole_matrices() -> None:
     chosen: list[int] = []
     for n in (2, 0, 2):
         wanted = [left(chosen) - left([*chosen, k]) for k in range(4)]
-        np.testing.assert_allclose(selection.gains(), wanted, rtol=1e-9)
-        selection.take(n)
+        np.testing.assert_allclose(criterion.gains(), wanted, rtol=1e-9)
+        criterion.take(n)
         chosen.append(n)
-        assert selection.errors()["level"] ** 2 == pytest.approx(left(chosen), rel=1e-9)
-    assert selection.after_all()["level"] ** 2 == pytest.approx(left([0, 1, 2, 3]), rel=1e-9)
+        assert (square * criterion.covariance).sum() == pytest.approx(left(chosen), rel=1e-9)
+    assert (square * criterion.after_all()).sum() == pytest.approx(left([0, 1, 2, 3]), rel=1e-9)
 
 
 def test_a_goal_that_can_be_met() -> None:

@@ -11,9 +11,10 @@ import calibration_helpers as small
 import numpy as np
 import pytest
 
+from hexapod_comp.calibration.design import information
 from hexapod_comp.calibration.fit import fit_model
-from hexapod_comp.calibration.posterior import ErrorPredictor, FittedParameters
-from hexapod_comp.calibration.remaining import POINTS, Remaining, _rows, _tried, remaining
+from hexapod_comp.calibration.follow_up import Remaining, measurable, remaining
+from hexapod_comp.calibration.posterior import POINTS, ErrorPredictor, FittedParameters
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.passes import Poses
 from hexapod_comp.measurements.campaign import template
@@ -91,8 +92,8 @@ def test_known_and_measured_are_the_textbooks(lines: Fitted, result: Remaining) 
     shares = {share.name: share.left[1] for share in result.measurements}
     scale = np.sqrt(np.diag(sigma))
     information = np.linalg.inv(sigma / np.outer(scale, scale))
-    for name, _, normal in _tried(machine, parameters):
-        both = information + scale[:, None] * normal * scale
+    for name, _, rows in measurable(parameters):
+        both = information + scale[:, None] * (rows.T @ rows) * scale
         assert shares[name] == pytest.approx(rms(scale[:, None] * np.linalg.inv(both) * scale), rel=1e-3), name
 
 
@@ -107,7 +108,8 @@ def test_nothing_that_is_measured_makes_it_worse(result: Remaining) -> None:
 def test_readings_lose_what_their_instrument_does_not_know(lines: Fitted) -> None:
     """A laser's zero: an offset that is the same on all of a line's readings is not seen, so the rows' sum is zero."""
     readings = template(replace(small.campaign("1-D", 0), cycles=1), small.paper())
-    rows, cells = _rows(readings, lines[1])
+    parameters = lines[1]
+    rows, cells = information(parameters.space, readings, parameters.x)
     for run in range(len(readings.runs)):
-        of_run = rows[np.unique(cells[readings.run == run])]
+        of_run = rows[np.unique(cells.of_reading[readings.run == run])]
         assert np.abs(of_run.sum(axis=0)).max() < 1e-6 * np.abs(of_run).sum()

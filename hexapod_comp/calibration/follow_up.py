@@ -1,0 +1,311 @@
+"""What to read once there is a fit: for a check, to decide between explanations of one, and what remains unknown.
+
+The planner's criteria (:mod:`.design`) are here how clearly changes are told from each other (:class:`Detectability`),
+how far apart two explanations of readings are (:func:`settle`), and the tool error that is left after a fit
+(:func:`remaining`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import CalibrationError, InputFileError
+from ..machine.geometry import STRUT_NAMES
+from ..machine.model import RealMachine, measured_region
+from ..machine.passes import Poses
+from ..measurements.readings import ABSOLUTE_KINDS, BACKWARD, CHANNELS, KINDS, MeasurementSet
+from ..workspace.combined import NORMAL, covariance_factor, monte_carlo, root_sum_of_squares
+from .assumptions import ASSUMED
+from .changes import STRUT, TEMPERATURE, CheckReadings, Evidence, Explanation, possible_changes, widened
+from .design import ErrorLeft, Greedy, information, laid_out
+from .posterior import POINTS, ErrorPredictor, FittedParameters
+
+
+def places(readings: MeasurementSet) -> Iterator[tuple[str, tuple[str, ...], np.ndarray]]:
+    """Yield each line and each scattered pose of readings: where, which channels, and the readings' numbers."""
+    on_line = np.array([run.is_line for run in readings.runs])[readings.run]
+    key = np.where(on_line, -1 - readings.run, readings.station)
+    tips, _ = readings.geometry.tool_poses(readings.stations.positions, readings.stations.rotations)
+    for number in dict.fromkeys(key.tolist()):
+        members = np.flatnonzero(key == number)
+        run = readings.runs[readings.run[members[0]]]
+        at = [", ".join(f"{1e3 * v:.1f}" for v in tips[s] + 0.0) for s in dict.fromkeys(readings.station[members])]
+        where = f"{run.name}: {at[0]} – {at[-1]} mm" if run.is_line else f"pose {at[0]} mm"
+        yield where, tuple(dict.fromkeys(CHANNELS[c] for c in readings.channel[members])), members
+
+
+@dataclass(frozen=True)
+class Settling:
+    """Readings that would tell two explanations apart."""
+
+    name: str  # a line with its ends, or a pose
+    channels: tuple[str, ...]  # what to read there
+    readings: int
+    odds: float  # log of the odds to expect for the right explanation over the wrong one, whichever is right
+
+
+def settle(
+    fitted: FittedParameters, measured: MeasurementSet, explanations: tuple[Explanation, Explanation]
+) -> list[Settling]:
+    """Return the three readings that would tell two explanations of `measured` apart best, with its instruments."""
+    space, kinds = fitted.space, np.unique(measured.kind)
+    by_pose = np.isin(np.array(KINDS)[kinds], ABSOLUTE_KINDS)
+    sets = [laid_out(space, lines=2)] if not by_pose.all() else []
+    sets += [laid_out(space, poses=8, tilts=(*ASSUMED.tilts, 0.0))] if by_pose.any() else []
+    proposals = []
+    for readings, _ in sets:
+        readings = readings.select(np.isin(readings.kind, kinds) & (readings.direction != BACKWARD))
+        if not len(readings):
+            continue
+        rows, cells = information(space, readings, fitted.x)
+        rows = space.unwhitened(rows)
+        for where, channels, members in places(readings):
+            chosen = np.unique(cells.of_reading[members])
+            noise, a = np.diag(fitted.noise[cells.kind[chosen]] ** 2), rows[chosen]
+            difference = a @ (explanations[0].mean - explanations[1].mean)
+            first, second = (noise + a @ e.covariance @ a.T for e in explanations)
+            odds = min(_divergence(difference, first, second), _divergence(difference, second, first))
+            proposals.append(Settling(where, channels, len(chosen), odds))
+    return sorted(proposals, key=lambda p: -p.odds)[:3]
+
+
+def _divergence(difference: np.ndarray, right: np.ndarray, wrong: np.ndarray) -> float:
+    """Return the Kullback–Leibler divergence of two normal distributions."""
+    solved = np.linalg.solve(wrong, np.column_stack([right, difference]))
+    logs = np.linalg.slogdet(wrong)[1] - np.linalg.slogdet(right)[1]
+    return 0.5 * float(np.trace(solved[:, :-1]) - len(right) + difference @ solved[:, -1] + logs)
+
+
+READ_BY = {
+    "linear": ("linear",),
+    "straightness": ("straightness_x", "straightness_y", "straightness_z"),
+    "rotation": ("rotation_x", "rotation_y", "rotation_z"),
+    "tracker": ("position_x", "position_y", "position_z"),
+    "tracker_6d": ("position_x", "position_y", "position_z", "attitude_x", "attitude_y", "attitude_z"),
+}
+"""What each instrument of a check reads: on diagonals the displacement alone; of rotations pitch and yaw, no roll."""
+
+
+class Detectability:
+    """Criterion: how clearly a crash of each strut, and growth of all, would be told from all else, before any reading.
+
+    The log odds of the right change over all others, the sum over these of their inverses: what is told worst counts
+    most. Candidates are contrasts of readings, free of their zeros, whatever they will read.
+    """
+
+    def __init__(self, fitted: FittedParameters, readings: MeasurementSet, contrasts: Sequence[np.ndarray]) -> None:
+        wide = widened(fitted)
+        self.changes = possible_changes(wide.space, [block.name for block in fitted.space.blocks])
+        self.covariance, self.check, self.contrasts = wide.covariance, CheckReadings.of(wide, readings), contrasts
+        self.taken = np.zeros((0, len(readings)))
+        sizes = {(STRUT, name): ASSUMED.crash for name in STRUT_NAMES} | {(TEMPERATURE, "struts"): ASSUMED.warmth}
+        wanted = [c for c in self.changes if (c.family, c.name) in sizes and c.columns is not None]
+        self.wanted = [(c.family, c.name) for c in wanted]
+        self.moved = np.array([sizes[c.family, c.name] * c.columns[:, 0] for c in wanted if c.columns is not None])
+        self.now = self._value(self.taken)
+
+    def gains(self, allowed: np.ndarray) -> np.ndarray:
+        """Return by how much the log odds rise with each allowed candidate."""
+        tries = [
+            self._value(np.vstack([self.taken, rows])) if ok else self.now
+            for rows, ok in zip(self.contrasts, allowed, strict=True)
+        ]
+        return np.array(tries) - self.now
+
+    def take(self, n: int) -> None:
+        """Read a candidate."""
+        self.taken = np.vstack([self.taken, self.contrasts[n]])
+        self.now = self._value(self.taken)
+
+    def _value(self, contrasts: np.ndarray) -> float:
+        check = self.check.part(contrasts)
+        evidence = Evidence(check.covariance(self.covariance), check.effects(self.changes))
+        log_sum = np.logaddexp.reduce
+        weights = np.array([log_sum(w, axis=1) for w in evidence.log_weights(self.moved @ check.rows.T)])
+        seen = [(h.change.family, h.change.name) for h in evidence.hypotheses]
+        # Several struts at once are neither the right strut nor another one; any temperature is a temperature.
+        right = np.array([[a == b or a[0] == b[0] == TEMPERATURE for b in self.wanted] for a in seen])
+        wrong = np.array([[a[0] != b[0] or (a != b and a[1] in STRUT_NAMES) for b in self.wanted] for a in seen])
+        against = log_sum(np.where(wrong, weights, -np.inf), axis=0) - log_sum(
+            np.where(right, weights, -np.inf), axis=0
+        )
+        return -float(log_sum(against))
+
+
+def propose_check(
+    fitted: FittedParameters,
+    readings: int = ASSUMED.check_readings,
+    instruments: Sequence[str] = ("linear", "rotation"),
+) -> MeasurementSet:
+    """Return the check readings to take with some instruments of :data:`READ_BY`; values are not a number."""
+    for name in instruments:
+        if name not in READ_BY:
+            raise CalibrationError("instruments", f"must be of {', '.join(READ_BY)}, not {name!r}")
+    least, most = 6, 60  # as few tell next to nothing; as many are better laid out as a campaign
+    if not least <= readings <= most:
+        raise CalibrationError("readings", f"must be {least}…{most}, not {readings}")
+    channels = [CHANNELS.index(name) for instrument in instruments for name in READ_BY[instrument]]
+    with_lines, with_poses = (
+        any(name.startswith("tracker") == poses for name in instruments) for poses in (False, True)
+    )
+    tilts = (*ASSUMED.tilts, 0.0) if with_poses else (0.0,)
+    every, _ = laid_out(fitted.space, 2 * with_lines, 3, 12 * with_poses, tilts, "5-D")
+    every = every.select(np.isin(every.channel, channels) & (every.direction != BACKWARD))
+    candidates = _contrasts(every)
+    every = every.select(np.isin(np.arange(len(every)), np.concatenate([added for _, added, _ in candidates])))
+    contrasts, members, after = zip(*_contrasts(every), strict=True)  # of those that any of them reads
+    costs = np.array([float(len(added)) for added in members])
+    choice = Greedy(Detectability(fitted, every, contrasts), costs, after=np.array(after))
+    choice.extend(float(readings))
+    picked = every.select(np.isin(np.arange(len(every)), np.concatenate([members[n] for n in choice.picks])))
+    return picked.with_values(np.full(len(picked), np.nan))
+
+
+def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]]:
+    """Return candidates of a check: contrasts, (k, readings), the readings that they add, and which must come before.
+
+    Contrasts are orthonormal and free of the zero that a channel of a run has, and of the slope that a straightness
+    has besides: on lines the ends and then the middle, of a straightness all three at once. Poses have no zeros.
+    """
+    along, result = every.along(), []
+
+    def row(members: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        full = np.zeros((1, len(every)))
+        full[0, members] = weights / np.linalg.norm(weights)
+        return full
+
+    for where, _, members in places(every):
+        if where.startswith("pose "):
+            result.append((np.eye(len(every))[members], members, -1))
+            continue
+        for channel in np.unique(every.channel[members]):
+            ordered = members[every.channel[members] == channel]
+            ordered = ordered[np.argsort(along[ordered])]
+            three = ordered[[0, -1, len(ordered) // 2]]
+            if CHANNELS[channel].startswith("straightness"):
+                result.append((row(three, np.cross(np.ones(3), along[three])), three, -1))
+            else:
+                result.append((row(three[:2], np.array([1.0, -1.0])), three[:2], -1))
+                result.append((row(three, np.array([1.0, 1.0, -2.0])), three[2:], len(result) - 1))
+    return result
+
+
+# What a fit leaves
+
+
+@dataclass(frozen=True)
+class Left:
+    """What is left over some poses, the datum aligned."""
+
+    where: str
+    poses: int
+    rms: np.ndarray  # (2,): displacement, m, and standard deviation of the rotation about the worst axis, rad
+    worst: float  # the same displacement at the worst pose, m
+    at: np.ndarray  # (3,): the tool there, in `work`, m
+    most: float  # nineteen of twenty machines that the readings allow stay below this everywhere, m
+    standing: float  # RMS displacement with the datum as the machine stands, m
+
+
+@dataclass(frozen=True)
+class Share:
+    """What would be left if a block of parameters were known exactly, or one more measurement were made."""
+
+    name: str
+    count: int  # its parameters, or readings
+    left: np.ndarray  # (regions,): RMS displacement, m, in the order of Remaining.left
+
+
+@dataclass(frozen=True)
+class Remaining:
+    """What a calibration leaves."""
+
+    machine: RealMachine  # as calibrated
+    parameters: int  # how many the fit has
+    left: tuple[Left, ...]  # in the measured box with a level tool, and in the workspace
+    blocks: tuple[Share, ...]
+    measurements: tuple[Share, ...]  # the one that removes most from the workspace first
+
+
+def remaining(
+    machine: RealMachine,
+    fitted: FittedParameters,
+    workspace: Poses,
+    name: str = "workspace",
+    progress: Callable[[str], object] = lambda text: None,
+) -> Remaining:
+    """Return what is left of the tool's error after a calibration: in its box, and over platform poses in ``base``."""
+    space, predictor, rng = fitted.space, ErrorPredictor(machine, fitted), np.random.default_rng(7)
+    box = measured_region(machine.model)
+    in_box = box.poses(rng.uniform(box.box[0], box.box[1], (POINTS, 3)), space.level)
+    factor = covariance_factor(fitted.covariance)
+    left, squares = [], []
+    for where, poses in (("measured box, level tool", in_box), (name, workspace)):
+        progress(where)
+        part, square = _left(predictor, poses, factor, where)
+        left.append(part)
+        squares.append(square)
+
+    def shares(tried: list[tuple[str, int, np.ndarray]]) -> list[Share]:
+        """Return what is left after each of some measurements, (name, count, rows by x), by itself."""
+        gains = [ErrorLeft([rows @ factor for *_, rows in tried], square).gains() for square in squares]
+        after = np.sqrt(np.maximum([[np.trace(square)] for square in squares] - np.array(gains), 0.0))
+        return [Share(what, count, column) for (what, count, _), column in zip(tried, after.T, strict=True)]
+
+    # To know a block is to measure its parameters, far better than they are known.
+    deviations = np.linalg.norm(factor, axis=1)
+    known = np.diag(1e4 / np.where(deviations > 0.0, deviations, 1.0))
+    blocks = shares([(block.name, len(block.labels), known[block.part]) for block in space.blocks])
+    progress("measurements")
+    measurements = shares(list(measurable(fitted)))
+    measurements.sort(key=lambda share: share.left[-1])
+    return Remaining(machine, space.size, tuple(left), tuple(blocks), tuple(measurements))
+
+
+def _left(predictor: ErrorPredictor, poses: Poses, factor: np.ndarray, where: str) -> tuple[Left, np.ndarray]:
+    """Return what is left over some poses, and M, (p, p): its mean square is tr(M) of independent effects."""
+    tips, standing, slopes, given_up = predictor.slopes(poses)
+    reached = np.isfinite(slopes).all(axis=(1, 2))
+    tips, effects = tips[reached], np.swapaxes(slopes[reached] @ factor, 1, 2)
+    sizes = root_sum_of_squares(effects)
+    as_it_stands = np.concatenate([standing[reached] @ factor, given_up[reached, :, None]], axis=2)[:, :3]
+    drawn = monte_carlo(effects, ASSUMED.machines_drawn, percentiles=(95.0,), distribution=NORMAL)
+    worst = int(sizes[:, 0].argmax())
+    left = Left(
+        where=where,
+        poses=len(tips),
+        rms=np.sqrt((sizes**2).mean(axis=0)),
+        worst=float(sizes[worst, 0]),
+        at=tips[worst],
+        most=float(drawn.worst_values[0, 0]),
+        standing=float(np.sqrt((as_it_stands**2).sum(axis=(1, 2)).mean())),
+    )
+    return left, np.einsum("npc,nqc->pq", effects[..., :3], effects[..., :3], optimize=True) / len(tips)
+
+
+def measurable(fitted: FittedParameters) -> Iterator[tuple[str, int, np.ndarray]]:
+    """Yield measurements in a fit's box: name, count of readings, and rows by x, (cells, size), over the noise."""
+    space = fitted.space
+    lines, _ = laid_out(space, lines=3, readings=9)
+    rows, cells = information(space, lines, fitted.x)
+    rows = space.unwhitened(rows)
+    run = np.array([run.name.partition(" ")[0] for run in lines.runs])[lines.run]
+    channel = []
+    for axis, name in zip(run, (CHANNELS[index] for index in lines.channel), strict=True):
+        kind, _, about = name.partition("_")
+        turning = "roll" if about == axis else "pitch and yaw"
+        channel.append({"linear": "linear laser", "straightness": "straightness"}.get(kind, turning))
+    for axis, read in dict.fromkeys(zip(run.tolist(), channel, strict=True)):
+        members = (run == axis) & (np.array(channel) == read)
+        where = "body diagonals" if axis == "diagonal" else f"lines along {axis}"
+        yield f"{read}, {where}", int(members.sum()), rows[np.unique(cells.of_reading[members])]
+    poses = 20
+    for tilts in ((0.0,), ASSUMED.tilts):
+        try:
+            readings, tilt = laid_out(space, poses=poses, tilts=tilts)
+        except InputFileError:  # out of reach
+            continue
+        rows = space.unwhitened(information(space, readings, fitted.x)[0])
+        yield f"tracker, {poses} poses, {f'tilted up to {tilt:g}°' if tilt else 'level'}", len(readings), rows
