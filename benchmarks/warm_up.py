@@ -28,7 +28,7 @@ from benchmarks.calibration import CONFIG, LARGE, LEAD
 from benchmarks.promise import KNOWN, carelessness, hidden_of, truth_of
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings
-from hexapod_comp.calibration.warming import MEMBERS, SEEN_SHARE
+from hexapod_comp.calibration.thermal import MEMBERS, SEEN_SHARE
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.passes import Passes, random_passes

@@ -47,6 +47,14 @@ class Assumptions:
     seen: float = assumed(1.0, "σ", "change of all readings from which on a direction is observable", "one σ of noise")
     weak: float = assumed(5.0, "σ", "observable directions below are listed as weak", "known to a fifth")
 
+    # Thermal (thermal.py)
+    thermometer_bin: float = assumed(60.0, "s", "readings of a sensor within that count as one", "twice the filter")
+    rate_persistence: float = assumed(3600.0, "s", "how long the rate of a temperature persists", "machines and rooms")
+    clear_evidence: float = assumed(10.0, "", "log evidence that shows a time constant", "odds of 22,000 : 1")
+    known_expansion: float = assumed(20e-6, "1/K", "expansion that surprises in no material", "aluminium: 23e-6")
+    known_late: float = assumed(60e-6, "1/K", "what of it may come late", "a part much faster than its thermometer")
+    known_moisture: float = assumed(5e-4, "m/m", "swelling that surprises in no material", "polymers, dry to damp")
+
     # Changes of a machine since its fit (changes.py, check.py)
     prior_odds: tuple[float, ...] = assumed(
         (1.0, 1.0, 1.0, 0.125, 0.25, 0.5),

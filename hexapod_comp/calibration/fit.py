@@ -17,7 +17,6 @@ from ..measurements.readings import ANGULAR_KINDS, KINDS, FileLine, MeasurementS
 from ..pose import Pose
 from .assumptions import ASSUMED
 from .blocks import WAVES
-from .courses import with_courses
 from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
 from .estimator import HUBER, OUTLIER, Estimation, LinearProblem, Posterior, Solution, iterate, physical_covariance
 from .lead import ScrewLead, look_for_lead
@@ -26,8 +25,8 @@ from .parameters import FitSettings, ParameterSpace
 from .posterior import Allowed, Observability, ToolError, UnseenError, listed, observe, without_trace
 from .residuals import Residuals
 from .selection import Decision, select
+from .thermal import HeatSeen, TimeConstants, seek_time_constants, with_courses
 from .verdict import Verdict, judge
-from .warming import HeatSeen, TimeConstants, seek_time_constants
 
 LARGEST_NOISE = 0.02
 """A machine that leaves more than this of its readings, m or rad, is not the one that was measured."""

@@ -14,8 +14,8 @@ from .estimator import SETTLED
 from .fit import ChannelFit, ModelFit, Outlier
 from .lead import ScrewLead
 from .posterior import BlockSight, Observability, ToolError, UnseenError, listed
+from .thermal import warming_json, warming_text
 from .verdict import TILT
-from .warming import warming_json, warming_text
 
 MOST_LISTED, MOST_OF_RUN = 10, 3
 """Runs with outliers, and outliers of a run, beyond these are counted, not listed."""

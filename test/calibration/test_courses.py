@@ -9,8 +9,9 @@ from dataclasses import replace
 
 import calibration_helpers as small
 import numpy as np
+import pytest
 
-from hexapod_comp.calibration.courses import with_courses
+from hexapod_comp.calibration.thermal import with_courses
 from hexapod_comp.measurements.campaign import template
 from hexapod_comp.measurements.readings import MeasurementSet
 
@@ -67,6 +68,24 @@ def test_power_switched_on_while_it_is_read_shows() -> None:
     course = with_courses(read(times, true + noise())).stations.temperatures
     assert np.abs(course - true).max() < 0.06 + 3.0 * NOISE
     assert np.sqrt(((course - true) ** 2).mean()) < NOISE
+
+
+@pytest.mark.parametrize("step", [0.1, 0.5])
+@pytest.mark.parametrize(("every", "share"), [(200.0, 0.4), (600.0, 0.8)])
+def test_what_is_rounded_is_no_staircase(step: float, every: float, share: float) -> None:
+    """Without pauses, and in bursts. As read, a temperature stays still and then jumps by a step, within a burst too;
+    a course takes most of that off, and less where two thirds of it are pauses, in which it may do anything."""
+    times = every * (np.arange(COUNT) // 50) + 4.0 * (np.arange(COUNT) % 50)
+    true = warmed(times)[:, None] + 0.01 * np.arange(8)
+    rounded = np.round(true / step) * step
+    course = with_courses(read(times, rounded)).stations.temperatures
+    whole, within = ([], [])
+    for values in (rounded, course):
+        whole.append(np.sqrt(((values - true) ** 2).mean()))
+        bursts = np.array_split(values - true, COUNT // 50)
+        within.append(np.sqrt(np.mean([(burst[-1] - burst[0]) ** 2 for burst in bursts])))
+    assert whole[1] < share * whole[0]
+    assert within[1] < share * within[0]
 
 
 def test_the_order_of_rows_does_not_matter() -> None:

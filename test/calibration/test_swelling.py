@@ -16,7 +16,7 @@ from foreign_machines import machines
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.sensitivity import derivatives, predict
-from hexapod_comp.calibration.warming import warming_json, warming_text
+from hexapod_comp.calibration.thermal import warming_json, warming_text
 from hexapod_comp.errors import CalibrationError, InputFileError, ModelError
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine

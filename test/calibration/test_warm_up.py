@@ -9,7 +9,7 @@ import pytest
 
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.parameters import FitSettings
-from hexapod_comp.calibration.warming import warming_json, warming_text
+from hexapod_comp.calibration.thermal import warming_json, warming_text
 from hexapod_comp.errors import ModelError
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
@@ -81,6 +81,24 @@ def test_the_noise_of_sensors_is_not_taken_for_growth():
     for part, undisturbed in zip(noisy, known, strict=True):
         assert abs(part.expansion - undisturbed.expansion) < 3.0 * undisturbed.deviation, part
         assert part.deviation > 0.9 * undisturbed.deviation, part
+
+
+def test_thermometers_that_are_rounded_do_not_override_what_is_stated():
+    """Struts of 15 ppm/K, so stated, with displays of 0.1 K, while they warm by 1 K: they keep that to a tenth.
+
+    Taken as read, a stair of 0.1 K is 0.9 µm on a strut that does not move: that is said to grow by 1 ppm/K.
+    """
+    exact = measured(rise=1.0, parts=tuple(range(8)))
+    expansion = np.array([15e-6] * 6 + [11e-6, 14e-6])
+    model = MachineModel("paper", struts=StrutErrors(expansion=expansion[:6]), base_expansion=11e-6,
+                         platform_expansion=14e-6)  # fmt: skip
+    plan = Campaign(small.BOX, 0.2, 0.05, "5-D", 0, noise=(2e-7,) * len(KINDS))
+    read = measure(exact, plan, RealMachine(small.paper(), model), seed=4)
+    rounded = replace(read.stations, temperatures=read.stations.temperatures.round(1))
+    stated = dict(zip(("strut_expansion", "base_expansion", "platform_expansion"), expansion[5:].tolist(), strict=True))
+    found = fit_model(replace(read, stations=rounded), replace(SETTINGS, **stated)).model
+    np.testing.assert_allclose(found.struts.expansion, 15e-6, rtol=0.1)
+    np.testing.assert_allclose([found.base_expansion, found.platform_expansion], expansion[6:], rtol=0.1)
 
 
 def test_expansions_are_known_no_better_than_the_time_constant():

@@ -1,0 +1,478 @@
+"""Heat and humidity: what thermometers really went through, how late parts follow them, and what readings tell of it.
+
+**Courses.** Each run has a zero of its own, so a warm-up shows in how lines change from round to round. What a sensor
+adds differs from reading to reading, and within a run all channels together show that the tool did not move with it:
+growth then seems smaller than it is (Carroll et al. 2006, *Measurement Error in Nonlinear Models*, chapters 3 and 4:
+attenuation, and regression calibration, which is what is done here). So a temperature is a Gaussian process, the
+integral of a rate that persists for about an hour (an integrated Ornstein-Uhlenbeck process), read with noise. How fast
+it changes beside that noise is estimated for each sensor by restricted maximum likelihood. A sensor that is rounded to
+a step q reads a staircase: its bins are as long as a stair, and their noise is no less than that of rounding, q/√12.
+
+**Time constants.** For given ones the growth is linear in what is fitted. So each constant of a logarithmic grid, and
+each pair, is tried on what a fit without late parts leaves: its gain is by how much it raises the log evidence, all
+other parameters and the late parts' prior integrated out. A parabola through the best three refines it, and says how
+well it is known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from ..formats.texts import number
+from ..machine.temperatures import (
+    MOST_TIME_CONSTANTS,
+    PARTS,
+    REFERENCE_HUMIDITY,
+    REFERENCE_TEMPERATURE,
+    TIME_CONSTANT_RANGE,
+    LateGrowth,
+)
+from ..measurements.readings import KINDS, MeasurementSet
+from .assumptions import ASSUMED
+from .blocks.block import Linkage
+from .blocks.growth import growth_causes, growth_columns, growth_root
+from .estimator import Estimation, Posterior, Solution, physical_covariance, solve
+from .parameters import TOLERANCES, ParameterSpace
+from .sensitivity import predict
+
+SEEN_SHARE = 0.5
+"""A parameter is determined when more than this share of it comes from the readings."""
+
+MEMBERS = {"struts": slice(0, 6), "base": slice(6, 7), "platform": slice(7, 8)}
+"""Which of :data:`~hexapod_comp.machine.temperatures.PARTS` belong to each kind of part."""
+
+LEAST_KNOWN = {
+    "expansion": ASSUMED.known_expansion,
+    "late": ASSUMED.known_late,
+    "moisture": ASSUMED.known_moisture,
+}
+
+# Courses
+
+PACE, APART = 4.0, 128.0
+"""How long a reading takes, and a pause between runs, s, where nobody wrote down the times."""
+
+MOST_BINS = 400
+"""Longer records have longer bins: a course is solved for with dense matrices."""
+
+RATIOS = np.geomspace(1e-4, 1e10, 43)
+"""Variances of a rate, per persistence, over that of a bin's noise: from a constant to what the sensor reads."""
+
+
+def with_courses(measurements: MeasurementSet) -> MeasurementSet:
+    """Return readings whose stations have the courses of temperatures and humidity, instead of what sensors read.
+
+    Readings without times have a course for each run, at an even pace.
+    """
+    stations = measurements.stations
+    read = np.column_stack([stations.temperatures, stations.humidity])
+    live = np.flatnonzero(np.isfinite(read).all(axis=0) & (np.ptp(read, axis=0) > 0.0))
+    if not len(live):
+        return measurements
+    times, run_of = stations.times, np.zeros(len(stations), dtype=int)
+    if not np.isfinite(times).all():
+        run_of[measurements.station] = measurements.run
+        times = PACE * np.arange(len(stations)) + APART * run_of
+    order = np.argsort(times, kind="stable")
+    members = [order[run_of[order] == run] for run in np.unique(run_of)]
+    stairs = [_stairs(times[order], read[order, sensor]) for sensor in live]
+    for width in {width for width, _ in stairs}:
+        sensors = [n for n, stair in enumerate(stairs) if stair[0] == width]
+        rows = live[sensors]
+        courses = [_Course(times[part], read[part][:, rows], width) for part in members]
+        ratios = _ratios(courses, np.array([stairs[n][1] for n in sensors]))
+        for part, course in zip(members, courses, strict=True):
+            read[np.ix_(part, rows)] = course.at(times[part], ratios)
+    return replace(measurements, stations=replace(stations, temperatures=read[:, :-1], humidity=read[:, -1]))
+
+
+def _stairs(times: np.ndarray, values: np.ndarray) -> tuple[float, float]:
+    """Return the length of a sensor's bins, s, and the least variance of their noise by rounding.
+
+    Values that are all multiples of a step are rounded to it; a stair is the mean time of reading per step.
+    """
+    pauses = np.diff(times)
+    shortest = max(ASSUMED.thermometer_bin, float(pauses.sum()) / MOST_BINS)
+    steps = np.diff(np.unique(values))
+    step = float(steps.min())
+    if np.abs(steps / step - np.round(steps / step)).max() > 1e-3:
+        return shortest, 0.0
+    read = float(np.minimum(pauses, ASSUMED.thermometer_bin).sum())
+    stair = read / (1.0 + float(np.abs(np.diff(values)).sum()) / step)
+    return max(shortest, stair), step**2 / 12.0 * min(1.0, stair / shortest)
+
+
+class _Course:
+    """An unbroken record in bins: what is no constant, in directions in which the process and the noise are apart."""
+
+    def __init__(self, times: np.ndarray, values: np.ndarray, width: float) -> None:
+        bins = max(1, round(float(times[-1] - times[0]) / width))
+        edges = np.linspace(times[0], times[-1], bins + 1)[:-1]
+        starts = np.unique(np.searchsorted(times, edges))
+        count = np.diff(np.append(starts, len(times)))
+        self._at = np.add.reduceat(times, starts) / count
+        self._means = np.add.reduceat(values, starts) / count[:, None]
+        self._covariance = self._process(self._at)
+        away = np.linalg.qr(np.ones((len(count), 1)), mode="complete")[0][:, 1:]
+        variances, turned = np.linalg.eigh(away.T @ self._covariance @ away)
+        self.variances, self._directions = np.maximum(variances, 0.0), away @ turned
+        self.parts = self._directions.T @ self._means
+
+    def _process(self, times: np.ndarray) -> np.ndarray:
+        """Return the process' covariance between times and the bins, for a rate of variance 1 per persistence.
+
+        Of ∫r(u)du from the first bin on, with the rate's covariance e^−|u−v|: 2·min(s, t) + e^−s + e^−t − 1 − e^−|s−t|.
+        """
+        t, s = ((part - self._at[0]) / ASSUMED.rate_persistence for part in (times[:, None], self._at))
+        t, early = np.maximum(t, 0.0), np.minimum(t, 0.0)  # before the first bin's middle the rate goes on as there
+        whole = 2.0 * np.minimum(s, t) + np.exp(-s) + np.exp(-t) - 1.0 - np.exp(-np.abs(s - t))
+        return np.asarray(whole + early * -np.expm1(-s))
+
+    def at(self, times: np.ndarray, ratios: np.ndarray) -> np.ndarray:
+        """Return the most probable course at times, shape (n, sensors), for a ratio of each sensor."""
+        weights = self._directions @ (self.parts / (1.0 / ratios + self.variances[:, None]))
+        level = (self._means - self._covariance @ weights).mean(axis=0)
+        return np.asarray(level + self._process(times) @ weights)
+
+
+def _ratios(courses: list[_Course], least: np.ndarray) -> np.ndarray:
+    """Return the most probable of :data:`RATIOS` for each sensor; the noise is what it leaves, `least` at least."""
+    variances = np.concatenate([course.variances for course in courses])
+    parts = np.concatenate([course.parts for course in courses])
+    if not len(variances):
+        return np.full(len(least), RATIOS[0])
+    spread = 1.0 + np.outer(RATIOS, variances)
+    squares = (parts**2).T @ (1.0 / spread).T  # sensors, ratios
+    noise = np.maximum(squares / len(variances), np.maximum(least, np.finfo(float).tiny)[:, None])
+    minus_twice_log = len(variances) * np.log(noise) + squares / noise + np.log(spread).sum(axis=1)
+    return RATIOS[np.argmin(minus_twice_log, axis=1)]
+
+
+# Time constants
+
+
+@dataclass(frozen=True)
+class TimeConstants:
+    """Time constants, s, and the standard deviation of the logarithm of each."""
+
+    values: tuple[float, ...] = ()
+    deviations: tuple[float, ...] = ()
+
+
+def seek_time_constants(
+    measurements: MeasurementSet, space: ParameterSpace, progress: Callable[[str], object]
+) -> TimeConstants:
+    """Return the time constants that readings show beyond a fit without late parts; none where nothing tells."""
+    settings, times = space.settings, measurements.stations.times
+    if "late" not in settings.blocks or settings.time_constants is not None or not np.ptp(times) > 0.0:
+        return TimeConstants()
+    progress("seeking time constants")
+    grid = np.ptp(times) * np.geomspace(1.0 / 200.0, 2.0, 40)  # a sixth apart
+    grid = grid[(grid >= TIME_CONSTANT_RANGE[0]) & (grid <= TIME_CONSTANT_RANGE[1])]
+    if len(grid) < 3:
+        return TimeConstants()
+    estimation = Estimation(measurements, space)
+    scan = _Scan(estimation, grid, _tried(estimation))
+    best, gain = scan.best(1)
+    if gain < ASSUMED.clear_evidence:
+        return TimeConstants()
+    # A constant that is left out raises the noise, which hides a second one: once more with the noise that it leaves.
+    with_best = ParameterSpace(measurements, replace(settings, time_constants=tuple(grid[list(best)].tolist())))
+    tried = _tried(Estimation(measurements, with_best))
+    scan = _Scan(estimation, grid, replace(tried, tolerances=tried.tolerances[:-1]))
+    (best, gain), (pair, gain_of_pair) = scan.best(1), scan.best(MOST_TIME_CONSTANTS)
+    return scan.refined(pair if gain_of_pair > gain + ASSUMED.clear_evidence else best)
+
+
+def _tried(estimation: Estimation) -> Posterior:
+    """Return the fit linearised at the nominal machine."""
+    space = estimation.space
+    problem, _ = estimation.linearise(np.zeros(space.size), np.ones(len(estimation.measurements)))
+    return solve(space, problem, space.start_tolerances(), np.ones(len(KINDS)))
+
+
+def _per_growth(estimation: Estimation, x: np.ndarray) -> np.ndarray:
+    """Return what the relative growth of each part moves each cell by, shape (C, 8), m or rad."""
+    space, cells, stations = estimation.space, estimation.cells, estimation.measurements.stations
+    columns = growth_columns(Linkage(predict(space, x, stations), space.probe, stations))[cells.station]
+    return np.einsum("ci,cip->cp", cells.directions, columns)
+
+
+def _late_columns(estimation: Estimation, x: np.ndarray, constants: np.ndarray, size: float) -> np.ndarray:
+    """Return what late parts of a size, 1/K, move the cells by, (C, K·8), over the stated noise, free of zeros."""
+    behind = growth_causes(estimation.space.settings, estimation.measurements.stations, constants)
+    behind = behind[estimation.cells.station, :, 1:]
+    columns = (_per_growth(estimation, x)[:, :, None] * behind).transpose(0, 2, 1) @ (size * growth_root(1))
+    return estimation.free_of_nuisance(columns.reshape(len(columns), -1))
+
+
+class _Scan:
+    """What each time constant of a grid would explain of what a fit without late parts leaves."""
+
+    def __init__(self, estimation: Estimation, grid: np.ndarray, known: Posterior) -> None:
+        space, nominal = estimation.space, np.zeros(estimation.space.size)
+        problem, _ = estimation.linearise(nominal, np.ones(len(estimation.measurements)))
+        posterior = solve(space, problem, known.tolerances, known.noise, rounds=0)
+        over = 1.0 / posterior.noise[problem.kind]
+        columns = over[:, None] * _late_columns(estimation, nominal, grid, TOLERANCES["late"])
+        rows = problem.rows.using(posterior.used, over)
+        shared = rows.transposed_times(columns)
+        self._grid, self._normal = grid, columns.T @ columns - shared.T @ posterior.covariance @ shared
+        self._moment = columns.T @ (over * problem.target - rows.times(posterior.y))
+
+    def gain(self, chosen: Sequence[int]) -> float:
+        """Return by how much some constants of the grid raise the log evidence."""
+        parts = len(PARTS)
+        members = np.concatenate([np.arange(parts * n, parts * (n + 1)) for n in chosen])
+        matrix = np.eye(len(members)) + self._normal[np.ix_(members, members)]
+        moment = self._moment[members]
+        return float(0.5 * moment @ np.linalg.solve(matrix, moment) - 0.5 * np.linalg.slogdet(matrix)[1])
+
+    def best(self, count: int) -> tuple[tuple[int, ...], float]:
+        """Return so many constants of the grid that gain most, and what they gain."""
+        gains = {chosen: self.gain(chosen) for chosen in combinations(range(len(self._grid)), count)}
+        best = max(gains, key=gains.__getitem__)
+        return best, gains[best]
+
+    def refined(self, chosen: tuple[int, ...]) -> TimeConstants:
+        """Return the summits of parabolas through each constant's gain and its neighbours', the others kept.
+
+        Deviations are by all bends together: two constants that act alike are known the less.
+        """
+
+        def moved(ways: dict[int, int]) -> float:
+            return self.gain([n + ways.get(i, 0) for i, n in enumerate(chosen)])
+
+        step = np.log(self._grid[1] / self._grid[0])
+        values, deviations = self._grid[list(chosen)], np.full(len(chosen), math.inf)
+        inside = [i for i, n in enumerate(chosen) if 0 < n < len(self._grid) - 1 and not {n - 1, n + 1} & {*chosen}]
+        here, bends = self.gain(chosen), np.zeros((len(inside), len(inside)))
+        for a, i in enumerate(inside):
+            before, after = (moved({i: way}) for way in (-1, 1))
+            bends[a, a] = 2.0 * here - before - after
+            values[i] *= np.exp(step * 0.5 * (after - before) / bends[a, a])
+            for b, j in enumerate(inside[:a]):
+                ways = [(u, v, u * v) for u in (-1, 1) for v in (-1, 1)]
+                bends[a, b] = bends[b, a] = -0.25 * sum(w * moved({i: u, j: v}) for u, v, w in ways)
+        if (np.linalg.eigvalsh(bends) > 0.0).all():
+            deviations[inside] = step * np.sqrt(np.diag(np.linalg.inv(bends)))
+        return TimeConstants(tuple(values.tolist()), tuple(deviations.tolist()))
+
+
+# What a fit tells
+
+
+@dataclass(frozen=True)
+class PartGrowth:
+    """How one kind of part grows, 1/K."""
+
+    part: str  # struts (their mean), base or platform
+    stated: float
+    expansion: float
+    deviation: float
+    determined: float  # share of it that comes from the readings
+    late: tuple[float, ...]  # what of it comes late, by time constant
+
+
+@dataclass(frozen=True)
+class Swelling:
+    """What readings tell of the struts' growth by humidity, m/m from 0 to 1."""
+
+    change: float  # of the relative humidity
+    stated: float
+    moisture: float
+    deviation: float  # NaN where nothing was fitted
+    determined: float  # share of it that comes from the readings
+
+
+@dataclass(frozen=True)
+class HeatSeen:
+    """What readings tell of heat, and of humidity."""
+
+    changes: tuple[tuple[str, float], ...]  # of each thermometer that was read, K
+    thermometer: str  # the one that stands for all parts; empty: each has its own
+    parts: tuple[PartGrowth, ...]  # empty where no expansion was fitted
+    time_constants: TimeConstants
+    timed: bool  # whether the readings have times
+    swelling: Swelling | None  # None where struts do not swell
+
+    @staticmethod
+    def of(
+        measurements: MeasurementSet,
+        estimation: Estimation,
+        solution: Solution,
+        time_constants: TimeConstants,
+        factor: float,
+    ) -> HeatSeen:
+        """Return what a fit to readings tells; deviations are wider by a `factor`."""
+        space, stations = estimation.space, measurements.stations
+        read = (stations.temperatures != REFERENCE_TEMPERATURE).any(axis=0)
+        changes = zip(PARTS, np.ptp(stations.temperatures, axis=0).tolist(), read, strict=True)
+        growth = space.model(solution.x, with_field=False).late_growth
+        if growth.time_constants and not time_constants.values:  # given
+            time_constants = TimeConstants(growth.time_constants, (0.0,) * len(growth.time_constants))
+        known, block = _Known.of(estimation, solution, time_constants, factor), space.block("expansion")
+        return HeatSeen(
+            changes=tuple((name, change) for name, change, is_read in changes if is_read),
+            thermometer=space.settings.thermometer,
+            parts=() if block is None else tuple(_parts(space, solution, known, block.part.start, growth)),
+            time_constants=time_constants if growth.time_constants else TimeConstants(),
+            timed=bool(np.isfinite(stations.times).all()),
+            swelling=_swelling(measurements, space, solution, known) if space.swells else None,
+        )
+
+
+@dataclass(frozen=True)
+class _Known:
+    """How well growth is known: covariance of all parameters, SI, and what it would be without readings."""
+
+    covariance: np.ndarray
+    prior: np.ndarray
+
+    @staticmethod
+    def of(estimation: Estimation, solution: Solution, constants: TimeConstants, factor: float) -> _Known:
+        """Return the covariance of a fit, whose priors and time constants are themselves no more than estimates.
+
+        The size of a prior is estimated from hardly three numbers, which are themselves drawn to it: how far they may
+        be off is worked out with a prior that no material surprises. Time constants that differ by δ, in the logarithm,
+        move the readings by h·δ, and with them the parameters by −C·Rᵀ·h·δ. One thermometer for all whose late parts
+        nothing has shown may have some all the same, as far as the readings allow.
+        """
+        space, noise, problem = estimation.space, solution.posterior.noise, solution.problem
+        least = [LEAST_KNOWN.get(block.name, 0.0) for block in space.blocks]
+        posterior = solve(space, problem, np.maximum(solution.posterior.tolerances, least), noise, rounds=0)
+        covariance, over = physical_covariance(space, posterior), 1.0 / noise[problem.kind]
+        rows = problem.rows.using(posterior.used, over)
+        for deviation, effect in zip(constants.deviations, _effects(estimation, solution.x, constants), strict=False):
+            moved = space.physical(posterior.covariance @ rows.transposed_times(over * effect))
+            covariance += min(deviation, 1.0) ** 2 * np.outer(moved, moved)
+        times = estimation.measurements.stations.times
+        if space.settings.thermometer and space.block("late") is None and np.ptp(times) > 0.0:
+            constants_unseen = np.ptp(times) * np.array([0.1, 0.5])
+            columns = over[:, None] * _late_columns(estimation, solution.x, constants_unseen, LEAST_KNOWN["late"])
+            shared = rows.transposed_times(columns)
+            moved = posterior.covariance @ shared
+            left = np.eye(len(shared[0])) + columns.T @ columns - shared.T @ moved
+            covariance += space.physical(space.physical(moved @ np.linalg.solve(left, moved.T)).T)
+        return _Known(factor**2 * covariance, space.prior_covariance(posterior.tolerances))
+
+    def of_mean(self, members: slice) -> tuple[float, float]:
+        """Return the standard deviation of the mean of some parameters, and its share that comes from readings."""
+        variance, prior = (float(matrix[members, members].mean()) for matrix in (self.covariance, self.prior))
+        return math.sqrt(variance), max(0.0, 1.0 - variance / prior)
+
+
+def _effects(estimation: Estimation, x: np.ndarray, constants: TimeConstants) -> Iterator[np.ndarray]:
+    """Yield how the logarithm of each time constant moves the cells, (C,), over their stated noise, free of zeros."""
+    space, stations, step = estimation.space, estimation.measurements.stations, 0.02
+    block = space.block("late")
+    if block is None:
+        return
+    growth, per_growth = x[block.part].reshape(len(PARTS), -1), _per_growth(estimation, x)
+    for k, value in enumerate(constants.values):
+        shorter, longer = (
+            growth_causes(space.settings, stations, [value * math.exp(way)])[:, :, 1] for way in (-step, step)
+        )
+        later = ((longer - shorter) / (2.0 * step))[estimation.cells.station]
+        yield estimation.free_of_nuisance((per_growth * later) @ growth[:, k : k + 1])[:, 0]
+
+
+def _parts(
+    space: ParameterSpace, solution: Solution, known: _Known, start: int, growth: LateGrowth
+) -> Iterator[PartGrowth]:
+    """Yield how each kind of part grows; the expansions stand in the parameters from `start` on."""
+    for name, members in MEMBERS.items():
+        where = slice(start + members.start, start + members.stop)
+        stated = float(space.stated_expansion[members].mean())
+        late = tuple(growth.expansion[members].mean(axis=0).tolist())
+        yield PartGrowth(name, stated, stated + float(solution.x[where].mean()), *known.of_mean(where), late)
+
+
+def _swelling(measurements: MeasurementSet, space: ParameterSpace, solution: Solution, known: _Known) -> Swelling:
+    humidity = np.nan_to_num(measurements.stations.humidity, nan=REFERENCE_HUMIDITY)
+    change, stated, block = float(np.ptp(humidity)), space.settings.strut_moisture or 0.0, space.block("moisture")
+    if block is None:
+        return Swelling(change, stated, stated, math.nan, 0.0)
+    return Swelling(change, stated, stated + float(solution.x[block.part][0]), *known.of_mean(block.part))
+
+
+NOT_DETERMINED = "; these readings do not determine it"
+
+
+def warming_text(warming: HeatSeen) -> str:
+    """Return what readings tell of heat and humidity, for people; empty where neither was read."""
+    return "\n".join([*_heat_lines(warming), *_swelling_lines(warming.swelling)])
+
+
+def _heat_lines(warming: HeatSeen) -> Iterator[str]:
+    if not warming.changes:
+        return
+    listed = ", ".join(f"{name} {change:.2f} K" for name, change in warming.changes)
+    whose = f"; {warming.thermometer} stands for all parts" if warming.thermometer else ""
+    yield f"heat; change of each thermometer: {listed}{whose}"
+    if not warming.parts:
+        least = f"temperatures changed by less than {ASSUMED.least_warming:g} K, or growth explains nothing"
+        yield f"  expansion is not determined: {least}; what was stated stays"
+    constants = warming.time_constants
+    for p in warming.parts:
+        late = zip(p.late, constants.values, strict=True)
+        listed = "".join(f", {1e6 * value:+.1f} of it late by {number(constant, 0)} s" for value, constant in late)
+        grows = f"{1e6 * p.expansion:.2f} ± {1e6 * p.deviation:.2f} ppm/K (stated {1e6 * p.stated:g})"
+        yield f"  {p.part}: {grows}{listed}{'' if p.determined > SEEN_SHARE else NOT_DETERMINED}"
+    for value, deviation in zip(constants.values, constants.deviations, strict=True):
+        low, high = (number(value * math.exp(2.0 * way * min(deviation, 1.0)), 0) for way in (-1, 1))
+        known = "given" if deviation == 0.0 else f"{low}…{high} s with 95 %" if deviation < 1.0 else "hardly determined"
+        yield f"  time constant {number(value, 0)} s ({known})"
+    if warming.parts and not warming.timed:
+        yield "  the readings have no times (time_s): how late parts follow their thermometers is not known"
+
+
+def _swelling_lines(swelling: Swelling | None) -> Iterator[str]:
+    if swelling is None:
+        return
+    head = f"humidity; changed by {100.0 * swelling.change:.1f} %: struts grow by {1e4 * swelling.moisture:.2f}"
+    stated = f"ppm per % (stated {1e4 * swelling.stated:g})"
+    if math.isnan(swelling.deviation):
+        least = f"it changed by less than {100.0 * ASSUMED.least_damping:g} %, or growth explains nothing"
+        yield f"{head} {stated}, as stated: {least}"
+    else:
+        unsure = "" if swelling.determined > SEEN_SHARE else NOT_DETERMINED
+        yield f"{head} ± {1e4 * swelling.deviation:.2f} {stated}{unsure}"
+
+
+def warming_json(warming: HeatSeen) -> dict:
+    """Return what readings tell of heat as plain numbers; units are in the keys."""
+    constants, swelling = warming.time_constants, warming.swelling
+    parts = [
+        {
+            "part": p.part,
+            "stated_per_K": p.stated,
+            "expansion_per_K": p.expansion,
+            "standard_error_per_K": p.deviation,
+            "determined": p.determined,
+            "late_per_K": p.late,
+        }
+        for p in warming.parts
+    ]
+    swells = None
+    if swelling is not None:
+        swells = {
+            "humidity_change": swelling.change,
+            "stated": swelling.stated,
+            "moisture": swelling.moisture,
+            "standard_error": None if math.isnan(swelling.deviation) else swelling.deviation,
+            "determined": swelling.determined,
+        }
+    return {
+        "changes_K": dict(warming.changes),
+        "thermometer": warming.thermometer or None,
+        "parts": parts,
+        "time_constants_s": constants.values,
+        "time_constants_relative_error": constants.deviations,
+        "swelling": swells,
+    }
