@@ -20,16 +20,10 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dpstrf, dtrtrs
 
 from ..errors import CalibrationError, KinematicsError, ModelError
 from ..measurements.readings import KINDS, LEAST_NOISE, MeasurementSet, refuse_absurd
+from .assumptions import ASSUMED
 from .observations import Cells, Nuisance, of_zero
 from .parameters import ParameterSpace
 from .sensitivity import Prediction, Slopes, predict
-
-FEW = 8
-"""Fewer cells of a group are kept as they are."""
-
-FAINT = 1e-11
-"""What moves cells by less than this variance, of their noise's, does not count."""
-
 
 Given = TypeVar("Given")
 Result = TypeVar("Result")
@@ -42,33 +36,15 @@ def at_once(work: Callable[[Given], Result], items: Iterable[Given]) -> list[Res
 
 
 class Alike(NamedTuple):
-    """Cells that the same parameters move.
+    """Cells that the same parameters move."""
 
-    Attributes
-    ----------
-    cells : ndarray of int, shape (n,)
-        Which.
-    columns : ndarray of int, shape (m,)
-        These parameters, ascending.
-    values : ndarray, shape (n, m)
-        Derivatives.
-    """
-
-    cells: np.ndarray
-    columns: np.ndarray
-    values: np.ndarray
+    cells: np.ndarray  # (n,): Which
+    columns: np.ndarray  # (m,): These parameters, ascending
+    values: np.ndarray  # (n, m): Derivatives
 
 
 class DesignMatrix:
-    """A matrix of a row for each cell and a column for each parameter.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Cells and parameters.
-    parts : sequence of Alike
-        Each cell stands in one of them.
-    """
+    """A matrix of a row for each cell and a column for each parameter."""
 
     def __init__(self, shape: tuple[int, int], parts: Sequence[Alike]) -> None:
         self.shape, self.parts = shape, tuple(parts)
@@ -145,23 +121,16 @@ class DesignMatrix:
 
         Cells of a group that the same parameters move are turned, orthogonally, so that a few of them have all that
         parameters do: some twenty along a line, however densely it was read. The others are left out.
-
-        Parameters
-        ----------
-        target : ndarray, shape (C,)
-            What the rows explain.
-        group : ndarray of int, shape (C,)
-            Of each cell.
-        draws : ndarray, shape (size, D)
-            Parameters as they may be, over √D.
         """
 
         def few_of(part: Alike) -> list[np.ndarray]:
             order = np.argsort(group[part.cells], kind="stable")
             pieces = np.split(order, np.flatnonzero(np.diff(group[part.cells[order]])) + 1)
-            few = np.concatenate([np.zeros(0, dtype=int), *(piece for piece in pieces if len(piece) < FEW)])
+            few = np.concatenate(
+                [np.zeros(0, dtype=int), *(piece for piece in pieces if len(piece) < ASSUMED.few_cells)]
+            )
             listed = [(part.values[few], target[part.cells[few]], group[part.cells[few]])]
-            for piece in (piece for piece in pieces if len(piece) >= FEW):
+            for piece in (piece for piece in pieces if len(piece) >= ASSUMED.few_cells):
                 cells = part.cells[piece]
                 rows, along = _moved(part.values[in_a_row(piece)], target[cells], draws[part.columns])
                 listed.append((rows, along, np.full(len(along), group[cells[0]])))
@@ -192,7 +161,7 @@ def _moved(values: np.ndarray, target: np.ndarray, draws: np.ndarray) -> tuple[n
     A pivoted Cholesky factor tells which draws are enough; all cells are kept where none are.
     """
     shown = values @ draws
-    _, pivots, rank, _ = dpstrf((shown.T @ shown).T, tol=FAINT, overwrite_a=1)
+    _, pivots, rank, _ = dpstrf((shown.T @ shown).T, tol=ASSUMED.faint, overwrite_a=1)
     if rank >= min(shown.shape):
         return values, target
     basis = np.linalg.qr(shown[:, pivots[:rank] - 1])[0].T
@@ -214,129 +183,46 @@ def _alike(first: np.ndarray, second: np.ndarray) -> Iterator[tuple[tuple[int, i
         yield divmod(pair, many), np.flatnonzero(group == n)
 
 
-SCALE_ROUNDS = 12
-"""Rounds of estimating tolerances and noise for one linearisation."""
-
-SCALE_SETTLED = 1e-6
-"""The rounds stop when no tolerance and no noise changes by more than this share."""
-
-LONGEST_STRIDE = 16.0
-"""An extrapolation goes no further than so many rounds squared would."""
-
-LEAP = np.log(10.0)
-"""It changes no tolerance and no noise by more than this logarithm: rounds that still gain speed lead nowhere."""
-
-HYPER = 0.1
-"""How many parameters the first guess of a tolerance is worth."""
-
-LARGEST_TOLERANCE = {"structure": 5e-3}
-"""No machine is built worse than this, m; a misfit that grows the tolerance further has another cause."""
-
-LEAST_FREEDOM = 10.0
-"""Noise is estimated from at least so many readings beyond those that the parameters use up."""
-
-DRAWS, SEED = 160, 5
-"""Draws of the parameters that show what they do along a line."""
-
-TOGETHER = 1000
-"""Rows of small folds that are looked at together."""
-
-
 class Condensed(NamedTuple):
-    """The cells of a linear problem, each fold's and kind's in as few rows as its parameters can be told by.
+    """The cells of a linear problem, each fold's and kind's in as few rows as its parameters can be told by."""
 
-    Attributes
-    ----------
-    target : ndarray, shape (K,)
-        In place of the cells' targets.
-    rows : DesignMatrix, shape (K, size)
-        In place of theirs.
-    cell, first : ndarray of int, shape (K,) and (C,)
-        The first cell of the fold and kind that a row, or a cell, belongs to.
-    rest : ndarray, shape (folds, kinds)
-        Squares of what of the cells' targets no parameter moves.
-    """
-
-    target: np.ndarray
-    rows: DesignMatrix
-    cell: np.ndarray
-    first: np.ndarray
-    rest: np.ndarray
+    target: np.ndarray  # (K,): In place of the cells' targets
+    rows: DesignMatrix  # (K, size): In place of theirs
+    cell: np.ndarray  # (K,) and (C,): The first cell of the fold and kind that a row, or a cell, belongs to
+    first: np.ndarray  # (K,) and (C,): The first cell of the fold and kind that a row, or a cell, belongs to
 
 
 @dataclass(frozen=True)
 class LinearProblem:
-    """The fit linearised at one parameter vector x = root·y, free of what instruments do not know.
+    """The fit linearised at one parameter vector x = root·y, free of what instruments do not know."""
 
-    Attributes
-    ----------
-    target : ndarray, shape (C,)
-        Cells' values that the parameters explain, over their standard deviation at unit noise factors.
-    rows : DesignMatrix, shape (C, size)
-        Their derivatives by y, alike.
-    kind, fold : ndarray of int, shape (C,)
-        As in :class:`Cells`.
-    normal : ndarray, shape (kinds, size, size)
-        rowsᵀ·rows of each kind.
-    moment : ndarray, shape (kinds, size)
-        rowsᵀ·target of each kind.
-    square : ndarray, shape (kinds,)
-        Sum of squared targets, the scatter of readings about their cell's mean included.
-    freedom : ndarray, shape (kinds,)
-        Readings minus unknowns projected out.
-    least_noise : ndarray, shape (kinds,)
-        Smallest noise factors that an instrument can have.
-    per_length : ndarray, shape (C, 6)
-        Derivatives by the struts' lengths, scaled as the rows, with what instruments do not know still in them.
-    unknowns : tuple of Nuisance
-        What that is.
-    """
-
+    # (C,): Cells' values that the parameters explain, over their standard deviation at unit noise factors
     target: np.ndarray
-    rows: DesignMatrix
-    kind: np.ndarray
-    fold: np.ndarray
-    normal: np.ndarray
-    moment: np.ndarray
-    square: np.ndarray
-    freedom: np.ndarray
-    least_noise: np.ndarray
+    rows: DesignMatrix  # (C, size): Their derivatives by y, alike
+    kind: np.ndarray  # (C,): As in :class:`Cells`
+    fold: np.ndarray  # (C,): As in :class:`Cells`
+    normal: np.ndarray  # (kinds, size, size): rowsᵀ·rows of each kind
+    moment: np.ndarray  # (kinds, size): rowsᵀ·target of each kind
+    square: np.ndarray  # (kinds,): Sum of squared targets, the scatter of readings about their cell's mean included
+    freedom: np.ndarray  # (kinds,): Readings minus unknowns projected out
+    least_noise: np.ndarray  # (kinds,): Smallest noise factors that an instrument can have
+    # (C, 6): Derivatives by the struts' lengths, scaled as the rows, with what instruments do not know still in them
     per_length: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
-    unknowns: tuple[Nuisance, ...] = ()
+    unknowns: tuple[Nuisance, ...] = ()  # What that is
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """What a linear problem says about the parameters y that it uses.
+    """What a linear problem says about the parameters y that it uses."""
 
-    Attributes
-    ----------
-    used : ndarray of int, shape (n,)
-        Which parameters; the others' blocks are out.
-    y : ndarray, shape (n,)
-        The most probable ones.
-    covariance : ndarray, shape (n, n)
-        Theirs.
-    tolerances : ndarray, shape (blocks,)
-        Size of each block's prior; zero: the block is out.
-    noise : ndarray, shape (kinds,)
-        Factor on the standard deviation of each kind's readings.
-    determined : ndarray, shape (n,)
-        Share of each parameter that comes from the data; the rest comes from the prior.
-    spread : ndarray, shape (n,)
-        The prior's standard deviation of each y.
-    log_determinant : float
-        Logarithm of the determinant of the precision of y over that.
-    """
-
-    used: np.ndarray
-    y: np.ndarray
-    covariance: np.ndarray
-    tolerances: np.ndarray
-    noise: np.ndarray
-    determined: np.ndarray
-    spread: np.ndarray
-    log_determinant: float
+    used: np.ndarray  # (n,): Which parameters; the others' blocks are out
+    y: np.ndarray  # (n,): The most probable ones
+    covariance: np.ndarray  # (n, n): Theirs
+    tolerances: np.ndarray  # (blocks,): Size of each block's prior; zero: the block is out
+    noise: np.ndarray  # (kinds,): Factor on the standard deviation of each kind's readings
+    determined: np.ndarray  # (n,): Share of each parameter that comes from the data; the rest comes from the prior
+    spread: np.ndarray  # (n,): The prior's standard deviation of each y
+    log_determinant: float  # Logarithm of the determinant of the precision of y over that
 
 
 def solve(
@@ -344,26 +230,10 @@ def solve(
     problem: LinearProblem,
     tolerances: np.ndarray,
     noise: np.ndarray,
-    rounds: int = SCALE_ROUNDS,
+    rounds: int = ASSUMED.rounds,
     silent: np.ndarray | None = None,
 ) -> Posterior:
-    """Return the posterior of a linear problem; tolerances and noise factors are estimated with it.
-
-    Parameters
-    ----------
-    space : ParameterSpace
-        Blocks and their priors' shapes.
-    problem : LinearProblem
-        The data.
-    tolerances : ndarray, shape (blocks,)
-        To start from; a block with zero is left out.
-    noise : ndarray, shape (kinds,)
-        To start from.
-    rounds : int
-        Fixed-point rounds; 0 takes tolerances and noise as they are.
-    silent : ndarray of int, optional
-        Parameters of which the readings say nothing: they are left out.
-    """
+    """Return the posterior of a linear problem; tolerances and noise factors are estimated with it."""
     used = np.setdiff1d(np.flatnonzero(space.spread(tolerances)), [] if silent is None else silent)
     kinds = np.unique(problem.kind)
     normal, moment = problem.normal[np.ix_(kinds, used, used)], problem.moment[np.ix_(kinds, used)]
@@ -380,7 +250,7 @@ def solve(
             noise, tolerances = _noise(problem, kinds, normal, moment, posterior), _tolerances(space, posterior, z)
             scales.append(np.concatenate([tolerances, noise]))
             ratio = scales[-1][scales[-1] > 0.0] / scales[-2][scales[-1] > 0.0]
-            if np.abs(np.log(ratio)).max() < SCALE_SETTLED:
+            if np.abs(np.log(ratio)).max() < ASSUMED.rounds_settled:
                 break
             if len(scales) == 3:
                 scales = [_extrapolated(*scales)]
@@ -391,26 +261,20 @@ def _extrapolated(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> n
     """Return where three rounds of a fixed point that converge slowly lead, in logarithms (SQUAREM).
 
     Varadhan, Roland (2008), Scandinavian Journal of Statistics 35, 335: first − 2·a·r + a²·v, with r and v first and
-    second differences and a = −|r|/|v|, no shorter than a round and at most :data:`LONGEST_STRIDE` of them.
+    second differences and a = −|r|/|v|, no shorter than a round and at most ``longest_stride`` of them.
     """
     live = third > 0.0
     logs = np.log(np.stack([first[live], second[live], third[live]]))
     step, bend = logs[1] - logs[0], logs[2] - 2.0 * logs[1] + logs[0]
-    stride = float(np.clip(np.linalg.norm(step) / max(float(np.linalg.norm(bend)), 1e-12), 1.0, LONGEST_STRIDE))
+    stride = float(np.clip(np.linalg.norm(step) / max(float(np.linalg.norm(bend)), 1e-12), 1.0, ASSUMED.longest_stride))
     result = third.copy()
     led = logs[0] + 2.0 * stride * step + stride**2 * bend
-    result[live] = np.exp(np.clip(led, logs[2] - LEAP, logs[2] + LEAP))
+    result[live] = np.exp(np.clip(led, logs[2] - ASSUMED.leap, logs[2] + ASSUMED.leap))
     return result
 
 
 def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the inverse of a positive definite matrix, which is overwritten, and the logarithm of its determinant.
-
-    Raises
-    ------
-    CalibrationError
-        It is not, to rounding: readings outweigh the priors more than 1e16 times.
-    """
+    """Return the inverse of a positive definite matrix, which is overwritten, and the logarithm of its determinant."""
     factor, failed = dpotrf(matrix.T, lower=1, overwrite_a=1)
     if failed:
         problem = "are too few to tell noise from the machine's errors, or their uncertainty is below any instrument's"
@@ -430,7 +294,7 @@ def _noise(
     for k, information, sums in zip(kinds, normal, moment, strict=True):
         rest = problem.square[k] - 2.0 * y @ sums + y @ information @ y
         freedom = problem.freedom[k] - np.vdot(posterior.covariance, information) / result[k] ** 2
-        if freedom > LEAST_FREEDOM and rest > 0.0:
+        if freedom > ASSUMED.least_freedom and rest > 0.0:
             result[k] = np.sqrt(rest / freedom)
     return np.maximum(result, problem.least_noise)
 
@@ -444,9 +308,14 @@ def _tolerances(space: ParameterSpace, posterior: Posterior, z: np.ndarray) -> n
     for n, block in enumerate(space.blocks):
         members = (posterior.used >= block.part.start) & (posterior.used < block.part.stop)
         if members.any():
-            first = HYPER * (start[n] / result[n]) ** 2
-            factor = np.sqrt((z[members] @ z[members] + first) / (posterior.determined[members].sum() + HYPER))
-            result[n] = min(result[n] * np.clip(factor, 0.1, 10.0), LARGEST_TOLERANCE.get(block.name, np.inf))
+            first = ASSUMED.hyperprior * (start[n] / result[n]) ** 2
+            factor = np.sqrt(
+                (z[members] @ z[members] + first) / (posterior.determined[members].sum() + ASSUMED.hyperprior)
+            )
+            result[n] = min(
+                result[n] * np.clip(factor, 0.1, 10.0),
+                ASSUMED.largest_structure if block.name == "structure" else np.inf,
+            )
     return result
 
 
@@ -467,15 +336,12 @@ def condense(problem: LinearProblem, posterior: Posterior) -> Condensed:
     group = problem.fold * len(problem.freedom) + problem.kind
     _, cells, member = np.unique(group, return_index=True, return_inverse=True)
     first = cells[member.ravel()]
-    draws = np.zeros((problem.rows.shape[1], DRAWS))
-    z = np.random.default_rng(SEED).standard_normal((len(posterior.used), DRAWS)) / np.sqrt(DRAWS)
+    draws = np.zeros((problem.rows.shape[1], ASSUMED.draws))
+    z = np.random.default_rng(5).standard_normal((len(posterior.used), ASSUMED.draws)) / np.sqrt(ASSUMED.draws)
     root = np.linalg.cholesky(whitened_precision(problem, posterior))
     draws[posterior.used] = posterior.spread[:, None] * dtrtrs(root, z, lower=1, trans=1)[0]
     rows, target, cell = problem.rows.condensed(problem.target, first, draws / posterior.noise[problem.kind].min())
-    shape = int(problem.fold.max()) + 1, len(problem.freedom)
-    rest = np.bincount(group, problem.target**2, shape[0] * shape[1])
-    rest -= np.bincount(group[cell], target**2, len(rest))
-    return Condensed(target, rows, cell, first, np.maximum(rest, 0.0).reshape(shape))
+    return Condensed(target, rows, cell, first)
 
 
 def held_out(problem: LinearProblem, condensed: Condensed, posterior: Posterior) -> np.ndarray:
@@ -484,20 +350,12 @@ def held_out(problem: LinearProblem, condensed: Condensed, posterior: Posterior)
     return _errors(problem.rows, problem.target, problem.fold, solved) / posterior.noise[problem.kind]
 
 
-def held_out_squares(problem: LinearProblem, condensed: Condensed, posterior: Posterior) -> np.ndarray:
-    """Return the sums of squares of :func:`held_out` by fold and kind, over the stated noise, shape (folds, kinds)."""
-    squares, (fold, kind) = condensed.rest.copy(), (each[condensed.cell] for each in (problem.fold, problem.kind))
-    errors = _errors(condensed.rows, condensed.target, fold, _solved_without(problem, condensed, posterior))
-    np.add.at(squares, (fold, kind), errors**2)
-    return squares
-
-
 def _errors(rows: DesignMatrix, target: np.ndarray, fold: np.ndarray, solved: np.ndarray) -> np.ndarray:
     """Return what is left of targets at each fold's own answer (folds, size)."""
     result = target.copy()
     for part in rows.parts:
-        for first in range(0, len(part.cells), TOGETHER):
-            cells, values = part.cells[first : first + TOGETHER], part.values[first : first + TOGETHER]
+        for first in range(0, len(part.cells), ASSUMED.together):
+            cells, values = part.cells[first : first + ASSUMED.together], part.values[first : first + ASSUMED.together]
             result[cells] -= np.einsum("ci,ci->c", values, solved[np.ix_(fold[cells], part.columns)])
     return result
 
@@ -509,7 +367,7 @@ def _solved_without(problem: LinearProblem, condensed: Condensed, posterior: Pos
     or by −(C⁻¹ − Rᵀ·R)⁻¹·Rᵀ·r: a matrix of the rows' size, where they are few, or of the parameters'.
     """
     used, spread, fold = posterior.used, posterior.spread, problem.fold[condensed.cell]
-    solved, small = np.zeros((len(condensed.rest), problem.rows.shape[1])), len(used) // 2
+    solved, small = np.zeros((int(problem.fold.max()) + 1, problem.rows.shape[1])), len(used) // 2
     # It is not needed where no fold is large.
     precision = whitened_precision(problem, posterior) if np.bincount(fold).max() > small else np.zeros((0, 0))
 
@@ -542,7 +400,7 @@ def _whole_folds(fold: np.ndarray, small: int) -> Iterator[tuple[np.ndarray, lis
     first = 0
     for n, (start, end) in enumerate(pairwise(ends), 1):
         last = n == len(ends) - 1
-        if last or end - ends[first] >= TOGETHER or max(end - start, ends[n + 1] - end) > small:
+        if last or end - ends[first] >= ASSUMED.together or max(end - start, ends[n + 1] - end) > small:
             yield order[ends[first] : end], [e - ends[first] for e in ends[first : n + 1]]
             first = n
 
@@ -567,30 +425,11 @@ def physical_covariance(space: ParameterSpace, posterior: Posterior) -> np.ndarr
     return space.physical(space.physical(posterior.covariance).T)
 
 
-STEPS = 20
-"""Most Gauss–Newton steps; a handful is enough for deviations of a tenth of a millimetre."""
-
-SLOW, LEAST_SHARE = 0.7, 0.3
-"""A step whose change is not below so much of the last one's is shortened by half, to this share at least:
-tolerances and parameters that wait for each other could otherwise swing for ever."""
-
-SETTLED = 1e-2
-"""The fit stops when no parameter moves by more than this share of its standard deviation."""
-
-HUBER = 2.5
-"""Residuals beyond so many standard deviations lose weight in proportion."""
-
 MEDIAN_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over the median of its absolute values."""
 
-CHUNK = 512
-"""Cells whose derivatives are worked out together: a processor's cache holds them."""
-
 ROUNDING = 1e-12
 """A direction whose component is below this does not have it: frames turned by right angles are right to rounding."""
-
-OUTLIER = 5.0
-"""Residuals beyond so many standard deviations are listed."""
 
 
 class _Group(NamedTuple):
@@ -602,22 +441,7 @@ class _Group(NamedTuple):
 
 
 class Estimation:
-    """Readings against parameters.
-
-    Parameters
-    ----------
-    measurements : MeasurementSet
-        The readings.
-    space : ParameterSpace
-        The parameters.
-    alone : bool
-        Nothing else is known of the machine: the readings must be enough.
-
-    Raises
-    ------
-    CalibrationError
-        Readings that no machine's error can have, or fewer than unknowns: nothing would be determined.
-    """
+    """Readings against parameters."""
 
     def __init__(self, measurements: MeasurementSet, space: ParameterSpace, alone: bool = True) -> None:
         refuse_absurd(measurements)
@@ -639,22 +463,7 @@ class Estimation:
     def linearise(
         self, x: np.ndarray, reading_weights: np.ndarray, prediction: Prediction | None = None
     ) -> tuple[LinearProblem, np.ndarray]:
-        """Return the linear problem at a parameter vector, and each reading's residual there, m or rad.
-
-        Parameters
-        ----------
-        x : ndarray, shape (size,)
-            Parameters, SI.
-        reading_weights : ndarray, shape (N,)
-            Trust in each reading, 0…1.
-        prediction : Prediction, optional
-            What the machine of these parameters does, if that is known.
-
-        Raises
-        ------
-        CalibrationError
-            No machine is like that, or it cannot take one of the poses.
-        """
+        """Return the linear problem at a parameter vector, and each reading's residual there, m or rad."""
         c, m = self.cells, self.measurements
         weights = reading_weights / self.uncertainty**2
         total = np.bincount(c.of_reading, weights)
@@ -690,8 +499,8 @@ class Estimation:
         def rows_of(group: _Group) -> Alike:
             columns = slopes.columns(group.components)
             rows = np.empty((len(group.cells), len(columns)))
-            for first in range(0, len(rows), CHUNK):
-                part, cells = rows[first : first + CHUNK], group.cells[first : first + CHUNK]
+            for first in range(0, len(rows), ASSUMED.chunk):
+                part, cells = rows[first : first + ASSUMED.chunk], group.cells[first : first + ASSUMED.chunk]
                 slopes.write(part, c.station[cells], directions[cells], group.components)
                 moved[cells] = part @ y[columns]
             return Alike(group.cells, columns, rows)
@@ -723,13 +532,7 @@ class Estimation:
         return scale, self._unknowns(self.cells.directions.copy(), np.zeros((len(scale), 6)), values, scale)[1]
 
     def _predicted(self, x: np.ndarray) -> Prediction:
-        """Return what the machine of a parameter vector does.
-
-        Raises
-        ------
-        CalibrationError
-            No machine is like that, or it cannot take one of the poses.
-        """
+        """Return what the machine of a parameter vector does."""
         try:
             return predict(self.space, x, self.measurements.stations)
         except (ModelError, KinematicsError) as error:
@@ -787,7 +590,7 @@ class Estimation:
         weights = np.ones(len(size))
         for k in np.unique(self.measurements.kind):
             members = self.measurements.kind == k
-            cut = HUBER * MEDIAN_TO_SIGMA * np.median(size[members])
+            cut = ASSUMED.huber * MEDIAN_TO_SIGMA * np.median(size[members])
             if cut > 0.0:
                 weights[members] = np.minimum(1.0, cut / np.maximum(size[members], cut))
         return weights
@@ -795,31 +598,15 @@ class Estimation:
 
 @dataclass(frozen=True)
 class Solution:
-    """A settled fit.
+    """A settled fit."""
 
-    Attributes
-    ----------
-    problem : LinearProblem
-        Linearised at the answer.
-    posterior : Posterior
-        The answer.
-    x : ndarray, shape (size,)
-        Its parameters, SI.
-    residuals, weights : ndarray, shape (N,)
-        Of each reading, m or rad; and the trust it got, 0…1.
-    steps : int
-        Gauss–Newton steps.
-    change : float
-        Largest change of a parameter in the last one, in its standard deviation.
-    """
-
-    problem: LinearProblem
-    posterior: Posterior
-    x: np.ndarray
-    residuals: np.ndarray
-    weights: np.ndarray
-    steps: int
-    change: float
+    problem: LinearProblem  # Linearised at the answer
+    posterior: Posterior  # The answer
+    x: np.ndarray  # (size,): Its parameters, SI
+    residuals: np.ndarray  # (N,): Of each reading, m or rad; and the trust it got, 0…1
+    weights: np.ndarray  # (N,): Of each reading, m or rad; and the trust it got, 0…1
+    steps: int  # Gauss–Newton steps
+    change: float  # Largest change of a parameter in the last one, in its standard deviation
 
     @cached_property
     def condensed(self) -> Condensed:
@@ -839,31 +626,27 @@ def iterate(
     noise: np.ndarray,
     progress: Callable[[str], object],
 ) -> Solution:
-    """Run Gauss–Newton steps until the parameters settle, from the nominal machine or from an answer.
-
-    Raises
-    ------
-    CalibrationError
-        They do not.
-    """
+    """Run Gauss–Newton steps until the parameters settle, from the nominal machine or from an answer."""
     weights, robust = np.ones(len(estimation.measurements)), estimation.space.settings.robust
     share, last = 1.0, np.inf
     all_alike = 0 if x.any() else 1  # steps whose residuals are the machine's errors: they weigh no reading
-    for step in range(1, STEPS + 1):
+    for step in range(1, ASSUMED.steps + 1):
         problem, residuals = estimation.linearise(x, weights)
         posterior = solve(estimation.space, problem, tolerances, noise)
         tolerances, noise = posterior.tolerances, posterior.noise
         change, block = _change(estimation.space.physical(posterior.y) - x, estimation.space, posterior)
         progress(f"step {step}: largest change {change:.2g} standard deviations")
-        if step > all_alike + (2 if robust else 1) and change > SLOW * last:  # the first with weights may change more
-            share = max(LEAST_SHARE, 0.5 * share)
+        if step > all_alike + (2 if robust else 1) and change > ASSUMED.slow * last:
+            share = max(ASSUMED.least_share, 0.5 * share)
         x, last = x + share * (estimation.space.physical(posterior.y) - x), change
-        if (change < SETTLED and (step > all_alike + 1 or not robust)) or step == STEPS:
+        if (change < ASSUMED.settled and (step > all_alike + 1 or not robust)) or step == ASSUMED.steps:
             break
         if robust and step > all_alike:
             weights = estimation.robust_weights(residuals)
     if change > 1.0:
-        moving = f"did not settle within {STEPS} steps: {block} still changes by {change:.2g} standard deviations"
+        moving = (
+            f"did not settle within {ASSUMED.steps} steps: {block} still changes by {change:.2g} standard deviations"
+        )
         raise CalibrationError("fit", f"{moving}; are all blocks allowed, and is it measured in enough places?")
     return Solution(problem, posterior, x, residuals, weights, step, change)
 

@@ -18,7 +18,7 @@ from ..pose import Pose
 from .assumptions import ASSUMED
 from .blocks import WAVES
 from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
-from .estimator import HUBER, OUTLIER, Estimation, LinearProblem, Posterior, Solution, iterate, physical_covariance
+from .estimator import Estimation, LinearProblem, Posterior, Solution, iterate, physical_covariance
 from .lead import ScrewLead, look_for_lead
 from .mixups import SWAPPED, mixups, swapped_directions
 from .parameters import FitSettings, ParameterSpace
@@ -309,7 +309,9 @@ def _choose(
     if not any(d.kept for d in decisions):  # too few runs to leave one out, or none that shows anything: from the start
         start = _Start(space, 0.0 * y, space.start_tolerances(), np.ones(len(KINDS)))
     answer = _solve(measurements, decisions, settings, start, progress)
-    if answer[-1].weights.min() < HUBER / OUTLIER:  # the choice was made with readings that turned out to be wrong
+    if (
+        answer[-1].weights.min() < ASSUMED.huber / ASSUMED.outlier
+    ):  # the choice was made with readings that turned out to be wrong
         start = _Start.of(answer[0], answer[-1])
         x, _, noise = _carried_over(start, space)
         problem, _ = everything.linearise(x, answer[-1].weights)
@@ -478,7 +480,7 @@ def _outliers(estimation: Estimation, solution: Solution) -> list[Outlier]:
     m = estimation.measurements
     sigmas = solution.residuals / (estimation.uncertainty * solution.posterior.noise[m.kind])
     worst = np.argsort(-np.abs(sigmas))
-    far = worst[np.abs(sigmas[worst]) > OUTLIER]
+    far = worst[np.abs(sigmas[worst]) > ASSUMED.outlier]
     return [
         Outlier(m.sources[i], int(m.channel[i]), float(solution.residuals[i]), float(sigmas[i]), m.runs[m.run[i]].name)
         for i in far

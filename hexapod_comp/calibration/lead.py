@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core import MOST_HARMONICS
+from .assumptions import ASSUMED
 from .blocks import WAVES
-from .estimator import HUBER, MEDIAN_TO_SIGMA, Estimation, LinearProblem, Posterior, at_once, solve
+from .estimator import MEDIAN_TO_SIGMA, Estimation, LinearProblem, Posterior, at_once, solve
 
 SHORTEST, LONGEST = 1e-3, 30e-3
 """Periods that are looked for, m. Above, a wave is as smooth as what a length map is for."""
@@ -189,7 +190,7 @@ class _Rest:
         y = np.zeros(problem.rows.shape[1])
         y[posterior.used] = posterior.y
         left = over_noise * (problem.target - problem.rows.times(y))
-        cut = HUBER * MEDIAN_TO_SIGMA * np.median(np.abs(left))
+        cut = ASSUMED.huber * MEDIAN_TO_SIGMA * np.median(np.abs(left))
         self.left = np.clip(left, -cut, cut)
         self.gains = over_noise[:, None] * problem.per_length
         self.commands = estimation.measurements.stations.commands[estimation.cells.station]

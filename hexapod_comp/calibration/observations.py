@@ -35,21 +35,12 @@ ROUNDS, SETTLED = 20, 1e-10
 
 
 class Nuisance(NamedTuple):
-    """What one channel of one run does not know, in units of the standard deviation of its cells.
+    """What one channel of one run does not know, in units of the standard deviation of its cells."""
 
-    Attributes
-    ----------
-    members : ndarray of int, shape (n,)
-        Its cells.
-    basis : ndarray, shape (n, k)
-        Orthonormal directions of the cells' values that the unknown moves.
-    share : ndarray, shape (k,)
-        How much of each is explained by the unknown, 0…1; the rest is left for the machine. 1: nothing else is known
-        of it.
-    """
-
-    members: np.ndarray
-    basis: np.ndarray
+    members: np.ndarray  # (n,): Its cells
+    basis: np.ndarray  # (n, k): Orthonormal directions of the cells' values that the unknown moves
+    # (k,): How much of each is explained by the unknown, 0…1; the rest is left for the machine. 1: nothing else is
+    # known of it
     share: np.ndarray
 
     def explained(self, values: np.ndarray) -> np.ndarray:
@@ -69,17 +60,7 @@ class Nuisance(NamedTuple):
 
 
 def of_zero(members: np.ndarray, scale: np.ndarray, along: np.ndarray | None = None) -> Nuisance:
-    """Return an unknown zero, and the slope along a line.
-
-    Parameters
-    ----------
-    members : ndarray of int, shape (n,)
-        Cells.
-    scale : ndarray, shape (n,)
-        One over their standard deviations.
-    along : ndarray, shape (n,), optional
-        Their coordinates along the line, m, where its slope is unknown too.
-    """
+    """Return an unknown zero, and the slope along a line."""
     columns = [scale / np.linalg.norm(scale)]
     if along is not None:
         slope = scale * (along - along.mean())
@@ -90,25 +71,15 @@ def of_zero(members: np.ndarray, scale: np.ndarray, along: np.ndarray | None = N
 
 @dataclass(frozen=True)
 class Lengths:
-    """The lengths of one run.
+    """The lengths of one run."""
 
-    Attributes
-    ----------
-    name : str
-        Of the run.
-    members : ndarray of int, shape (n,)
-        Cells.
-    points, centres : ndarray, shape (n, 3)
-        Commanded place of the measured point, and from where its length is read, as far as known, m in ``base``.
-    known_zero : bool
-        Whether the lengths are known as a whole.
-    """
-
-    name: str
-    members: np.ndarray
+    name: str  # Of the run
+    members: np.ndarray  # (n,): Cells
+    # (n, 3): Commanded place of the measured point, and from where its length is read, as far as known, m in ``base``
     points: np.ndarray
+    # (n, 3): Commanded place of the measured point, and from where its length is read, as far as known, m in ``base``
     centres: np.ndarray
-    known_zero: bool
+    known_zero: bool  # Whether the lengths are known as a whole
 
     @property
     def count(self) -> int:
@@ -127,25 +98,6 @@ class Lengths:
 
         What is left of the lengths counts as their noise where it is more: far from the answer a circle's centre would
         otherwise leave its plane, where it hardly matters, to explain what the machine does.
-
-        Parameters
-        ----------
-        displacement : ndarray, shape (n, 3)
-            Of the measured point, m in ``base``.
-        value, scale : ndarray, shape (n,)
-            Lengths read minus those commanded, m, and one over their standard deviations.
-
-        Returns
-        -------
-        expected, directions : ndarray, shape (n,) and (n, 3)
-            Change of length but for its zero, m; and unit vectors along which the point's displacement changes it.
-        unknowns : list of Nuisance
-            The zero (without any direction where it is known), and the body's place.
-
-        Raises
-        ------
-        CalibrationError
-            The body is far from its place in the file.
         """
         zero = of_zero(self.members, scale)
         if self.known_zero:
@@ -198,32 +150,17 @@ class Lengths:
 
 @dataclass(frozen=True)
 class Cells:
-    """Readings of one channel at one station are one cell: they differ by noise only.
+    """Readings of one channel at one station are one cell: they differ by noise only."""
 
-    Attributes
-    ----------
-    of_reading : ndarray of int, shape (N,)
-        Cell of each reading.
-    first : ndarray of int, shape (C,)
-        First reading of each cell.
-    station, channel, kind, group : ndarray of int, shape (C,)
-        Of each cell; a group is one channel of one run, whose unknowns its cells share.
-    directions : ndarray, shape (C, 6)
-        w of each cell; of a length, from its centre's place in the file.
-    along : ndarray, shape (C,)
-        Commanded coordinate along the line, m.
-    fold : ndarray of int, shape (C,)
-        What is left out together in cross-validation: a line's run, a ball bar's circle, or a scattered pose.
-    """
-
-    of_reading: np.ndarray
-    first: np.ndarray
-    station: np.ndarray
-    channel: np.ndarray
-    kind: np.ndarray
-    group: np.ndarray
-    directions: np.ndarray
-    along: np.ndarray
+    of_reading: np.ndarray  # (N,): Cell of each reading
+    first: np.ndarray  # (C,): First reading of each cell
+    station: np.ndarray  # (C,): Of each cell; a group is one channel of one run, whose unknowns its cells share
+    channel: np.ndarray  # (C,): Of each cell; a group is one channel of one run, whose unknowns its cells share
+    kind: np.ndarray  # (C,): Of each cell; a group is one channel of one run, whose unknowns its cells share
+    group: np.ndarray  # (C,): Of each cell; a group is one channel of one run, whose unknowns its cells share
+    directions: np.ndarray  # (C, 6): w of each cell; of a length, from its centre's place in the file
+    along: np.ndarray  # (C,): Commanded coordinate along the line, m
+    # (C,): What is left out together in cross-validation: a line's run, a ball bar's circle, or a scattered pose
     fold: np.ndarray
 
     @staticmethod

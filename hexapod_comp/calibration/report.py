@@ -9,8 +9,8 @@ import numpy as np
 
 from ..formats.texts import aligned, number
 from ..measurements.readings import ANGULAR_KINDS, CHANNELS, SAME_ATTITUDE
+from .assumptions import ASSUMED
 from .design import Plan
-from .estimator import SETTLED
 from .fit import ChannelFit, ModelFit, Outlier
 from .lead import ScrewLead
 from .posterior import BlockSight, Observability, ToolError, UnseenError, listed
@@ -63,7 +63,7 @@ def _notes(fit: ModelFit) -> Iterator[str]:
 def _headline(fit: ModelFit) -> str:
     m = fit.measurements
     kept = ", ".join(block.name for block in fit.space.blocks)
-    settled = "settled after" if fit.solution.change < SETTLED else "NOT settled after"
+    settled = "settled after" if fit.solution.change < ASSUMED.settled else "NOT settled after"
     return (
         f"machine {m.geometry.name}: {len(m)} readings of {len(m.runs)} runs at {len(m.stations)} stations\n"
         f"scheme joint: {fit.space.size} parameters ({kept}), {settled} {fit.solution.steps} steps"
@@ -143,19 +143,9 @@ def _chi_square_tables(fit: ModelFit) -> Iterator[str]:
 
 
 def _decision_table(fit: ModelFit) -> str:
-    header = ("block", "kept", "gain", "±", "", "evidence")
-    rows = [
-        (
-            d.block,
-            "yes" if d.kept else "no",
-            *(number(100.0 * v, 2) for v in (d.gain, d.uncertainty)),
-            "%",
-            number(d.evidence, 1),
-        )
-        for d in fit.decisions
-    ]
-    head = "blocks; gain: how much less squared error at held-out readings; evidence: log of how much likelier all are"
-    return head + "\n" + aligned(header, rows)
+    rows = [(d.block, "yes" if d.kept else "no", number(d.evidence, 1)) for d in fit.decisions]
+    head = "blocks; evidence: log of how many times likelier the readings are with the block than without it"
+    return head + "\n" + aligned(("block", "kept", "evidence"), rows)
 
 
 def observability_text(seen: Observability, unseen_errors: tuple[UnseenError, ...]) -> str:
@@ -228,7 +218,7 @@ def as_json(fit: ModelFit) -> dict:
         "channels": [_channel_json(c) for c in fit.channels],
         **_expected_json(fit.level, fit.tilted, fit.observability, fit.unseen_errors),
         "datum": fit.held.as_json(),
-        "settled": fit.solution.change < SETTLED,
+        "settled": fit.solution.change < ASSUMED.settled,
         "doubts": (*fit.verdict.refusals, *fit.verdict.doubts),
         "unexplained": fit.verdict.unexplained.as_json(),
         "chi_squares": [vars(c) for c in fit.verdict.chi_squares],

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..measurements.readings import ANGULAR_KINDS, DEFAULT_UNCERTAINTY, KINDS, MeasurementSet
-from .estimator import SETTLED, Estimation, Solution, physical_covariance
+from .assumptions import ASSUMED
+from .estimator import Estimation, Solution, physical_covariance
 from .misfit import ChiSquare, chi_squares, held_by_priors, stated_scale, unexplained
 from .parameters import FitSettings, ParameterSpace
 from .posterior import Allowed, ToolError, expected_error
@@ -146,7 +147,7 @@ def _held(residuals: Residuals) -> str:
 
 def _unsettled(solution: Solution) -> str:
     """Return a remark on parameters that still moved when the steps were used up; empty if none did."""
-    if solution.change < SETTLED:
+    if solution.change < ASSUMED.settled:
         return ""
     moved = f"a parameter still moves by {solution.change:.2g} standard deviations"
     return f"the fit has not settled: after {solution.steps} steps {moved}"

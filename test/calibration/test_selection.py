@@ -1,5 +1,6 @@
 """Choice of blocks: evidence as a dense normal distribution has it; what few readings keep, and what they let go."""
 
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,8 +8,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from hexapod_comp.calibration.estimator import Alike, DesignMatrix, LinearProblem, log_evidence, solve
-from hexapod_comp.calibration.parameters import Block
-from hexapod_comp.calibration.selection import select
+from hexapod_comp.calibration.selection import log_bayes_factor, select
 
 SIZES = {"structure": 3, "map": 12}
 FOLDS, CELLS = 8, 3
@@ -17,10 +17,7 @@ FOLDS, CELLS = 8, 3
 def two_blocks() -> SimpleNamespace:
     """Return a space of a structure and a map, both of tolerance 1, as far as a linear problem asks it."""
     ends = np.cumsum([0, *SIZES.values()]).tolist()
-    blocks = [
-        Block(name, slice(a, b), np.eye(b - a), ("",) * (b - a), "m")
-        for name, a, b in zip(SIZES, ends[:-1], ends[1:], strict=True)
-    ]
+    blocks = [SimpleNamespace(name=name, part=slice(a, b)) for name, (a, b) in zip(SIZES, pairwise(ends), strict=True)]
     return SimpleNamespace(
         blocks=blocks,
         spread=lambda tolerances: np.repeat(tolerances, list(SIZES.values())),
@@ -55,6 +52,17 @@ def test_evidence_is_that_of_the_readings_distribution() -> None:
         covariance = (rows * np.repeat(tolerances, list(SIZES.values())) ** 2) @ rows.T + noise**2 * np.eye(len(rows))
         dense.append(multivariate_normal(np.zeros(len(rows)), covariance).logpdf(problem.target))
     assert ours[0] - ours[1] == pytest.approx(dense[0] - dense[1], rel=1e-9)
+
+
+def test_savage_dickey_is_the_ratio_of_evidences() -> None:
+    """log p(readings) with the map less without, as scipy's normal density of covariance A·T²·Aᵀ + noise² has them."""
+    space, problem, noise = two_blocks(), drawn(np.random.default_rng(3), 0.2), 0.3
+    rows, dense = problem.rows.dense(), []
+    for tolerances in ((1.0, 0.4), (1.0, 0.0)):
+        covariance = (rows * np.repeat(tolerances, list(SIZES.values())) ** 2) @ rows.T + noise**2 * np.eye(len(rows))
+        dense.append(multivariate_normal(np.zeros(len(rows)), covariance).logpdf(problem.target))
+    posterior = solve(space, problem, np.array([1.0, 0.4]), np.array([noise]), rounds=0)
+    assert log_bayes_factor(space, posterior, "map") == pytest.approx(dense[0] - dense[1], rel=1e-9)
 
 
 def test_few_readings_keep_what_is_there_and_let_go_what_is_not() -> None:
