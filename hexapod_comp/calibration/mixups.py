@@ -32,6 +32,7 @@ from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_K
 from ..pose import angles_from_rotation
 from ..virtual.instruments import compensated
 from .assumptions import ASSUMED
+from .blocks import EXPECTED
 from .estimator import (
     Estimation,
     LinearProblem,
@@ -40,7 +41,6 @@ from .estimator import (
     whitened_precision,
 )
 from .parameters import FitSettings, ParameterSpace
-from .selection import EXPECTED
 from .sensitivity import Prediction, predict
 
 FAMILIES = ("x lines", "y lines", "z lines", "other lines", "other runs")

@@ -32,3 +32,6 @@ WAVES = {wave.name: wave.times for wave in (Wave, Wave2, Wave3, Wave4)}
 """Blocks of the screw waves, and how often a turn each repeats."""
 
 HARMONICS = tuple(name for name, times in WAVES.items() if times > 1)
+
+EXPECTED = ("pitch", "wave", "backlash", "expansion", "moisture", "late")
+"""Errors that every screw has, and growth; of a length map, wear or a field nobody knows beforehand."""
