@@ -35,7 +35,7 @@ class Assumptions:
     least_freedom: float = assumed(10.0, "", "readings beyond parameters for a noise", "its own error is then 22 %")
     chunk: int = assumed(512, "", "cells whose derivatives are worked out together", "a processor's cache")
     few_cells: int = assumed(8, "", "fewer cells of a group are not condensed", "nothing is gained")
-    faint: float = assumed(1e-11, "", "variance over the noise's that does not count", "rounding")
+    negligible: float = assumed(1e-11, "", "variance over the noise's that does not count", "rounding")
     draws: int = assumed(160, "", "draws that show what parameters do along a line", "a line has some twenty ways")
     together: int = assumed(1000, "", "rows of small folds left out together", "a processor's cache")
 

@@ -161,7 +161,7 @@ def _moved(values: np.ndarray, target: np.ndarray, draws: np.ndarray) -> tuple[n
     A pivoted Cholesky factor tells which draws are enough; all cells are kept where none are.
     """
     shown = values @ draws
-    _, pivots, rank, _ = dpstrf((shown.T @ shown).T, tol=ASSUMED.faint, overwrite_a=1)
+    _, pivots, rank, _ = dpstrf((shown.T @ shown).T, tol=ASSUMED.negligible, overwrite_a=1)
     if rank >= min(shown.shape):
         return values, target
     basis = np.linalg.qr(shown[:, pivots[:rank] - 1])[0].T
