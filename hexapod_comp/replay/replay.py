@@ -83,6 +83,16 @@ class Replay:
         """Replayed minus recorded corrections, shape (n, 6), m."""
         return self.lengths[:, 1] - self.commands["lengths"][:, 1]
 
+    @property
+    def different(self) -> np.ndarray:
+        """Rows of the answers that differ."""
+        return np.flatnonzero(self.outcome == DIFFERENT)
+
+    @property
+    def largest_difference(self) -> float:
+        """Of the corrections that differ, m; those of commands that are refused now do not count."""
+        return float(np.nanmax(np.abs(self.difference[self.different]), initial=0.0))
+
 
 def replay_recording(
     recording: Recording,

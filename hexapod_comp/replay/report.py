@@ -82,9 +82,8 @@ class Report:
         replayed = self.replayed
         if replayed is None or (replayed.identical and not replayed.states_differ):
             return True
-        rows = replayed.outcome == DIFFERENT
-        worst = np.abs(replayed.difference[rows]).max(initial=0.0)
-        return bool(self.tolerance > 0.0 and worst <= self.tolerance and not np.isnan(worst))
+        worst = np.abs(replayed.difference[replayed.different]).max(initial=0.0)  # NaN where one is refused now
+        return bool(self.tolerance > 0.0 and worst <= self.tolerance)
 
 
 def since(stamps: np.ndarray, origin: np.ndarray) -> np.ndarray:
@@ -94,11 +93,11 @@ def since(stamps: np.ndarray, origin: np.ndarray) -> np.ndarray:
 
 def text(report: Report) -> str:
     """Return the report."""
-    lines = [*_heading(report), *_verdict(report), *_difference(report), *_other(report)]
-    return "\n".join([*lines, *_figures(report), *_refused(report), *(f"note: {n}" for n in report.recording.notes)])
+    lines = [*_run_text(report), *_replay_text(report), *_other_text(report), *_figures(report), *_refused_text(report)]
+    return "\n".join([*lines, *(f"note: {note}" for note in report.recording.notes)])
 
 
-def _heading(report: Report) -> Iterator[str]:
+def _run_text(report: Report) -> Iterator[str]:
     recording, stamps = report.recording, report.recording.commands["stamp"]
     machine, model = (printable(one["name"]) for one in (recording.first.geometry, recording.first.model))
     yield f"{recording.path}: {printable(recording.node)}, machine {machine}, model {model}"
@@ -110,17 +109,16 @@ def _heading(report: Report) -> Iterator[str]:
     )
 
 
-def _verdict(report: Report) -> Iterator[str]:
+def _replay_text(report: Report) -> Iterator[str]:
+    """Yield what came of the replay, and where and how it first differs."""
     replayed = report.replayed
     if replayed is None:
         yield "not replayed as it was: geometry and model that were in use are not at hand"
         return
-    counts = Counter(replayed.outcome.tolist())
-    compared = counts[IDENTICAL] + counts[DIFFERENT]
-    word = "identical bit for bit" if not counts[DIFFERENT] else f"{counts[IDENTICAL]} identical bit for bit"
-    yield f"replayed {compared} of {len(replayed.commands)} answers: {word}" + (
-        f", {counts[DIFFERENT]} different" if counts[DIFFERENT] else ""
-    )
+    counts, count = Counter(replayed.outcome.tolist()), len(replayed.commands)
+    same, different = counts[IDENTICAL], counts[DIFFERENT]
+    found = f"{same} identical bit for bit, {different} different" if different else "identical bit for bit"
+    yield f"replayed {same + different} of {count} answers: {found}"
     if replayed.lost:
         yield f"the recorder has lost answers that the journal counts: {replayed.lost}"
     if counts[LOST]:
@@ -130,35 +128,29 @@ def _verdict(report: Report) -> Iterator[str]:
     changes = Counter(event.entry.what for event in replayed.changes)
     listed = ", ".join(f"{count} × {what}" for what, count in sorted(changes.items())) or "none"
     yield f"changes between commands: {listed}; {len(report.recording.pages)} pages of the journal"
-
-
-def _difference(report: Report) -> Iterator[str]:
-    replayed = report.replayed
-    if replayed is None or not (replayed.outcome == DIFFERENT).any():
-        if replayed is not None and replayed.states_differ:
-            place = _place(report, replayed.states_differ[0])
-            yield f"answers agree, but the compensator's state is another first before {place}"
+    if replayed.states_differ and not different:
+        place = _place(report, replayed.states_differ[0])
+        yield f"answers agree, but the compensator's state is another first before {place}"
+    if not different:
         return
-    rows = np.flatnonzero(replayed.outcome == DIFFERENT)
-    row = int(rows[0])
-    yield f"first difference: {_place(report, row)}: {_first(replayed, row)}"
-    difference = np.abs(replayed.difference[rows])
-    worst = np.nanmax(difference, initial=0.0)
-    yield f"largest difference {worst * 1e6:.9g} µm" + (
-        f", accepted up to {report.tolerance * 1e6:g} µm" if report.same else ""
-    )
-    yield from _versions(report, worst)
-
-
-def _first(replayed: Replay, row: int) -> str:
-    """Say how the first different answer differs."""
+    row, worst = int(replayed.different[0]), replayed.largest_difference
     if row in replayed.refused_now:
-        return f"the replay refuses the command ({replayed.refused_now[row]})"
-    recorded, now = replayed.commands["lengths"][row], replayed.lengths[row]
-    places = ((kind, n) for kind in (1, 0) for n in range(6))
-    kind, n = next(place for place in places if recorded[place].tobytes() != now[place].tobytes())
-    was, is_now = (float(one[kind, n]) * 1e6 for one in (recorded, now))
-    return f"strut_{n + 1}, {('command', 'correction')[kind]} recorded {was!r} µm, replayed {is_now!r} µm"
+        how = f"the replay refuses the command ({replayed.refused_now[row]})"
+    else:
+        recorded, now = replayed.commands["lengths"][row], replayed.lengths[row]
+        places = ((kind, n) for kind in (1, 0) for n in range(6))
+        kind, n = next(place for place in places if recorded[place].tobytes() != now[place].tobytes())
+        was, is_now = (float(one[kind, n]) * 1e6 for one in (recorded, now))
+        how = f"strut_{n + 1}, {('command', 'correction')[kind]} recorded {was!r} µm, replayed {is_now!r} µm"
+    yield f"first difference: {_place(report, row)}: {how}"
+    accepted = f", accepted up to {report.tolerance * 1e6:g} µm" if report.same else ""
+    yield f"largest difference {worst * 1e6:.9g} µm{accepted}"
+    then, here = report.recording.first.made_with, made_with()
+    unlike = [
+        f"{key} {printable(then[key])}, here {here[key]}" for key in here if then.get(key, here[key]) != here[key]
+    ]
+    if unlike:
+        yield f"{'it is of the size of rounding; ' if worst < ROUNDING else ''}recorded with {'; '.join(unlike)}"
 
 
 def _place(report: Report, row: int) -> str:
@@ -168,20 +160,7 @@ def _place(report: Report, row: int) -> str:
     return f"answer {row + 1} (stamp {stamp // 10**9}.{stamp % 10**9:09d}, {report.seconds[row]:.3f} s)"
 
 
-def _versions(report: Report, worst: float) -> Iterator[str]:
-    """Say what this machine does not have in common with the one that was recorded."""
-    recorded, here = report.recording.first.made_with, made_with()
-    differing = [
-        f"{key} {printable(recorded[key])}, here {here[key]}"
-        for key in here
-        if key in recorded and recorded[key] != here[key]
-    ]
-    if differing:
-        size = "it is of the size of rounding; " if worst < ROUNDING else ""
-        yield f"{size}recorded with {'; '.join(differing)}"
-
-
-def _other(report: Report) -> Iterator[str]:
+def _other_text(report: Report) -> Iterator[str]:
     other = report.other
     if other is None:
         return
@@ -190,11 +169,8 @@ def _other(report: Report) -> Iterator[str]:
     yield f"with {report.other_name}: {seen} answers; corrections differ from the recorded ones by"
     if seen:
         # The recorded ones may ramp at their ends; what follows is what a machinist would see on the struts.
-        rows = [
-            [f"strut_{n + 1}", f"{_rms(column):.3f}", f"{np.nanmax(column) * 1e6:.3f}"]
-            for n, column in enumerate(difference.T)
-        ]
-        yield aligned(["", "RMS_um", "max_um"], rows)
+        sizes = [(f"{_rms(column):.3f}", f"{np.nanmax(column) * 1e6:.3f}") for column in difference.T]
+        yield aligned(["", "RMS_um", "max_um"], [[f"strut_{n + 1}", *size] for n, size in enumerate(sizes)])
     if other.refused_now:
         row, why = next(iter(other.refused_now.items()))
         yield f"  it refuses {len(other.refused_now)} commands, first {_place(report, row)}: {why}"
@@ -206,27 +182,20 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _figures(report: Report) -> Iterator[str]:
+    def size(distances: np.ndarray) -> str:
+        return f"{_rms(distances):.2f}/{np.abs(distances).max() * 1e6:.2f}"
+
     corrections = report.strut_corrections
     if np.isfinite(corrections).any():
-        largest = int(np.nanargmax(np.abs(corrections)))
-        row, strut = divmod(largest, 6)
-        value = corrections[row, strut] * 1e6
-        yield f"largest correction {value:.3f} µm, strut_{strut + 1}, {_place(report, row)}"
+        row, strut = divmod(int(np.nanargmax(np.abs(corrections))), 6)
+        yield f"largest correction {corrections[row, strut] * 1e6:.3f} µm, strut_{strut + 1}, {_place(report, row)}"
     _, error = following_error(report)
     if len(error):
-        shown = " ".join(f"{_rms(column):.2f}/{np.abs(column).max() * 1e6:.2f}" for column in error.T)
+        shown = " ".join(map(size, error.T))
         yield f"following error (measured − commanded, drives' lag included), RMS/largest µm per strut: {shown}"
-
-    yield from (_tool_text(name, raw, aligned) for name, raw, aligned in tool_distances(report))
-
-
-def _tool_text(name: str, raw: np.ndarray, left: np.ndarray | None) -> str:
-    sizes = [f"as it is {_size(raw)}", *([] if left is None else [f"datum aligned {_size(left)}"])]
-    return f"distance of {name} to the commanded path, RMS/largest µm: {', '.join(sizes)}"
-
-
-def _size(distances: np.ndarray) -> str:
-    return f"{_rms(distances):.2f}/{distances.max() * 1e6:.2f}"
+    for name, raw, left in tool_distances(report):
+        shown = f"as it is {size(raw)}" + ("" if left is None else f", datum aligned {size(left)}")
+        yield f"distance of {name} to the commanded path, RMS/largest µm: {shown}"
 
 
 def tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
@@ -254,7 +223,7 @@ def tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray
         yield name, raw, left
 
 
-def _refused(report: Report) -> Iterator[str]:
+def _refused_text(report: Report) -> Iterator[str]:
     if not report.refusals:
         return
     unnamed = report.refusals - len(report.refused)
@@ -291,28 +260,32 @@ def tool_positions(recording: Recording, work_frames: Mapping[str, Pose]) -> np.
 
 def rows_of(report: Report) -> list[dict[str, Any]]:
     """Return one CSV row per answer: stamps, commands (mm), corrections (µm) recorded, replayed and with the other."""
-    stamps, replayed, other = report.recording.commands["stamp"], report.replayed, report.other
-    rows = []
-    for n, (stamp, time) in enumerate(zip(stamps.tolist(), report.seconds.tolist(), strict=True)):
+    replayed, other = report.replayed, report.other
+    corrections = {"recorded": report.strut_corrections}
+    if replayed is not None:
+        corrections["replayed"] = replayed.lengths[:, 1]
+    if other is not None:
+        corrections["other"] = other.lengths[:, 1]
+    rows, stamps = [], report.recording.commands["stamp"].tolist()
+    for n, (stamp, time) in enumerate(zip(stamps, report.seconds.tolist(), strict=True)):
         row: dict[str, Any] = {"stamp_ns": stamp, "time_s": time}
         row |= {f"L{i + 1}_mm": v * 1e3 for i, v in enumerate(report.strut_commands[n].tolist())}
-        row |= _micrometres("recorded", report.strut_corrections[n])
-        if replayed is not None:
-            row |= _micrometres("replayed", replayed.lengths[n, 1])
-            row["outcome"] = OUTCOMES[int(replayed.outcome[n])]
-        if other is not None:
-            row |= _micrometres("other", other.lengths[n, 1])
+        for name, values in corrections.items():
+            row |= {f"{name}_L{i + 1}_um": v * 1e6 for i, v in enumerate(values[n].tolist())}
+            if replayed is not None and name == "replayed":
+                row["outcome"] = OUTCOMES[int(replayed.outcome[n])]
         rows.append(row)
     return rows
 
 
-def _micrometres(name: str, corrections: np.ndarray) -> dict[str, float]:
-    return {f"{name}_L{i + 1}_um": v * 1e6 for i, v in enumerate(corrections.tolist())}
-
-
 def as_json(report: Report) -> dict[str, Any]:
     """Return the report as plain data; lengths in m."""
+
+    def size(distances: np.ndarray | None) -> dict[str, float] | None:
+        return None if distances is None else {"rms_m": _rms(distances) * 1e-6, "max_m": float(distances.max())}
+
     recording, replayed, other = report.recording, report.replayed, report.other
+    distances = {name: (size(raw), size(left)) for name, raw, left in tool_distances(report)}
     content: dict[str, Any] = {
         "bag": recording.path,
         "node": recording.node,
@@ -326,57 +299,44 @@ def as_json(report: Report) -> dict[str, Any]:
         "made_with": recording.first.made_with,
         "refused": report.refusals,
         "notes": recording.notes,
-        "distance_to_path": {name: _distance_json(raw, left) for name, raw, left in tool_distances(report)},
+        "distance_to_path": {n: {"as_it_is": raw, "datum_aligned": left} for n, (raw, left) in distances.items()},
     }
     if replayed is not None:
         content |= _replay_json(replayed)
     if other is not None:
-        difference = np.abs(other.difference)
         content["other"] = {
             "name": report.other_name,
-            "largest_difference_m": np.nanmax(difference, axis=0, initial=0.0),
+            "largest_difference_m": np.nanmax(np.abs(other.difference), axis=0, initial=0.0),
             "refused": len(other.refused_now),
         }
     return content
 
 
-def _distance_json(raw: np.ndarray, left: np.ndarray | None) -> dict[str, Any]:
-    def size(distances: np.ndarray | None) -> dict[str, float] | None:
-        return None if distances is None else {"rms_m": _rms(distances) * 1e-6, "max_m": float(distances.max())}
-
-    return {"as_it_is": size(raw), "datum_aligned": size(left)}
-
-
 def _replay_json(replayed: Replay) -> dict[str, Any]:
-    different = np.flatnonzero(replayed.outcome == DIFFERENT)
-    counts = Counter(replayed.outcome.tolist())
-    first = None
-    if len(different):
-        row = int(different[0])
+    def before(row: int) -> int | None:
+        """Return the stamp of the answer that an event precedes; None after the last."""
+        return int(replayed.commands["stamp"][row]) if row < len(replayed.commands) else None
+
+    counts, first = Counter(replayed.outcome.tolist()), None
+    if len(replayed.different):
+        row = int(replayed.different[0])
         first = {
-            "stamp_ns": _stamp(replayed, row),
+            "stamp_ns": before(row),
             "recorded_correction_m": replayed.commands["lengths"][row, 1],
             "replayed_correction_m": replayed.lengths[row, 1],
             "refused_now": replayed.refused_now.get(row),
         }
+    changes = [{"before_stamp_ns": before(e.row), "what": e.entry.what, **e.entry.values} for e in replayed.changes]
+    refusals = [
+        {"before_stamp_ns": before(event.row), "stamp_ns": values["stamp"]} | {k: values[k] for k in ("reason", "text")}
+        for event in replayed.refused
+        for values in (event.entry.values,)
+    ]
     return {
         "outcomes": {name: counts[outcome] for outcome, name in OUTCOMES.items()},
         "first_difference": first,
-        "largest_difference_m": np.nanmax(np.abs(replayed.difference[different]), initial=0.0),
+        "largest_difference_m": replayed.largest_difference,
         "states_differ": len(replayed.states_differ),
-        "changes": [
-            {"before_stamp_ns": _stamp(replayed, event.row), "what": event.entry.what, **event.entry.values}
-            for event in replayed.changes
-        ],
-        "refusals": [
-            {"before_stamp_ns": _stamp(replayed, event.row), "stamp_ns": values["stamp"]}
-            | {key: values[key] for key in ("reason", "text")}
-            for event in replayed.refused
-            for values in (event.entry.values,)
-        ],
+        "changes": changes,
+        "refusals": refusals,
     }
-
-
-def _stamp(replayed: Replay, row: int) -> int | None:
-    """Return the stamp of the answer that an event precedes; None after the last."""
-    return int(replayed.commands["stamp"][row]) if row < len(replayed.commands) else None

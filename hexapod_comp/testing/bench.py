@@ -83,19 +83,12 @@ LOG_LINE = re.compile(r"\[\w+\] \[[\d.]+\] \[[\w.]+\]: (.*)")
 
 @dataclass
 class Answer:
-    """What came back for one command.
+    """What came back for one command."""
 
-    Attributes
-    ----------
-    command, correction : JointState
-        The two messages with the command's stamp.
-    sent_at, answered_at : float
-        Monotonic times just before sending and just after both had come, s: the node handled it between.
-    """
-
-    command: JointState
-    correction: JointState
-    sent_at: float
+    command: JointState  # the two messages with the command's stamp
+    correction: JointState  # the two messages with the command's stamp
+    sent_at: float  # monotonic times just before sending and just after both had come, s: the node handled it between
+    # monotonic times just before sending and just after both had come, s: the node handled it between
     answered_at: float
 
     @property
@@ -110,18 +103,7 @@ class Answer:
 
 
 class Bench:
-    """Nodes under test on one executor in a private context, and a witness that sees and sends everything.
-
-    Parameters
-    ----------
-    context : Context
-        Private context.
-    capture : CaptureFixture, optional
-        pytest's ``capfd``, for :meth:`logged`: what is logged is read where it is written, on stderr. (Fast DDS
-        sometimes delivers only the first message of /rosout to a reader in the same process.)
-    namespace : str
-        Of the witness and of the nodes.
-    """
+    """Nodes under test on one executor in a private context, and a witness that sees and sends everything."""
 
     def __init__(
         self,
@@ -213,13 +195,7 @@ class Bench:
     # ---- time ----
 
     def until(self, condition: Callable[[], object], what: str = "", timeout: float = 10.0) -> None:
-        """Handle messages until a condition holds; the timeout is for a computer under load.
-
-        Raises
-        ------
-        TimeoutError
-            It does not; names `what`.
-        """
+        """Handle messages until a condition holds; the timeout is for a computer under load."""
         spin_until(self.executor, condition, timeout, what)
 
     def barrier(self) -> None:
@@ -274,13 +250,7 @@ class Bench:
         return self.call(SetParameters, f"{node}/set_parameters", request).results[0]
 
     def fault(self, name: str, value: object) -> None:
-        """Let the drive go wrong by one of its parameters ``fault_…``: ``fault("stuck_strut", 3)``.
-
-        Raises
-        ------
-        ValueError
-            The drive does not take it; says why.
-        """
+        """Let the drive go wrong by one of its parameters ``fault_…``: ``fault("stuck_strut", 3)``."""
         answer = self.set_parameter("strut_drive", f"fault_{name}", value)
         if not answer.successful:
             raise ValueError(answer.reason)
@@ -439,13 +409,7 @@ def _has_lifecycle(node: Node) -> bool:
 
 
 def spin_until(executor: Executor, condition: Callable[[], object], timeout: float = 5.0, what: str = "") -> None:
-    """Spin until `condition()` holds.
-
-    Raises
-    ------
-    TimeoutError
-        It does not within `timeout` s; names `what`.
-    """
+    """Spin until `condition()` holds."""
     end = time.monotonic() + timeout
     while not condition():
         if time.monotonic() > end:
