@@ -1,49 +1,15 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * What is left of each limit along poses, and what limits them. limits.c asks the same and stops at the first limit that is
- * broken; a test holds the two together.
+ * What is left of each limit along poses, and what limits them.
  */
 #include "core.h"
-
-static void nearest_struts(const double base[6][3], const six_struts *now, const hc_limits *limits, hc_quantities *found)
-{
-    double ends[6][3];
-    int i, j, k;
-    strut_ends(base, now, ends);
-    for (i = 0; i < 6; i++) {
-        for (j = 0; j < i; j++) {
-            const int pair[2] = {i, j};
-            double distance;
-            if (!(limits->apart[i][j] > 0.0)) {
-                continue;
-            }
-            distance = segment_distance(base[i], ends[i], base[j], ends[j]);
-            for (k = 0; k < 2; k++) {
-                if (distance < found->distances[pair[k]] || distance != distance) {
-                    found->distances[pair[k]] = distance;
-                    found->nearest[pair[k]] = pair[1 - k];
-                }
-            }
-        }
-    }
-}
 
 /* All limited quantities of a pose but its lengths. */
 static void examine(const double base[6][3], const hc_pose *pose, const six_struts *now, const hc_limits *limits,
                     hc_quantities *found)
 {
-    int i;
-    for (i = 0; i < 6; i++) {
-        double cosines[2];
-        joint_cosines(pose, now, limits, i, cosines);
-        found->cosines[0][i] = cosines[0];
-        found->cosines[1][i] = cosines[1];
-        found->distances[i] = HUGE_VAL;
-        found->nearest[i] = -1.0;
-    }
-    if (limits->clearance > 0.0) {
-        nearest_struts(base, now, limits, found);
-    }
+    joint_cosines(pose, now, limits, found->cosines);
+    nearest_struts(base, now, limits, found->distances, found->nearest);
     found->condition = condition_at(base, pose, now, limits->characteristic_length, &found->sign);
 }
 

@@ -56,76 +56,55 @@ static double segment_distance(const double a[3], const double b[3], const doubl
     return sqrt(square);
 }
 
-/* Platform joints in `base`. */
-static void strut_ends(const double base[6][3], const six_struts *now, double ends[6][3])
+/* Cosines of the struts' angles to the neutral directions of their joints, at the base and at the platform. */
+static void joint_cosines(const hc_pose *pose, const six_struts *now, const hc_limits *limits, double cosines[2][6])
 {
-    int i;
+    int i, k;
     for (i = 0; i < 6; i++) {
-        store(add(row_of(base[i]), now->strut[i]), ends[i]);
+        const vec s = now->strut[i];
+        double at_platform = 0.0;
+        for (k = 0; k < 3; k++) {
+            const double along = pose->rotation[0][k] * s.x + pose->rotation[1][k] * s.y + pose->rotation[2][k] * s.z;
+            at_platform += along * limits->cone_axes[1][i][k];
+        }
+        cosines[0][i] = dot(s, row_of(limits->cone_axes[0][i])) / now->length[i];
+        cosines[1][i] = at_platform / now->length[i];
     }
 }
 
-static finding check_clearance(const double base[6][3], const six_struts *now, const hc_limits *limits)
+/* The distance of each strut to the nearest other one that counts, and which that is; infinite and -1 where none does. */
+static void nearest_struts(const double base[6][3], const six_struts *now, const hc_limits *limits, double distances[6],
+                           double nearest[6])
 {
     double ends[6][3];
-    int i, j;
-    strut_ends(base, now, ends);
+    int i, j, k;
     for (i = 0; i < 6; i++) {
-        finding f = found(HC_CLEARANCE, -1, HUGE_VAL);
-        f.other = i;
-        for (j = 0; j < i; j++) {
-            if (limits->apart[i][j] > 0.0) {
-                const double distance = segment_distance(base[i], ends[i], base[j], ends[j]);
-                if (distance < f.value || distance != distance) {
-                    f.value = distance;
-                    f.strut = j;
+        store(add(row_of(base[i]), now->strut[i]), ends[i]);
+        distances[i] = HUGE_VAL;
+        nearest[i] = -1.0;
+        for (j = 0; j < i && limits->clearance > 0.0; j++) {
+            const int pair[2] = {i, j};
+            double distance;
+            if (!(limits->apart[i][j] > 0.0)) {
+                continue;
+            }
+            distance = segment_distance(base[i], ends[i], base[j], ends[j]);
+            for (k = 0; k < 2; k++) {
+                if (distance < distances[pair[k]] || distance != distance) {
+                    distances[pair[k]] = distance;
+                    nearest[pair[k]] = pair[1 - k];
                 }
             }
         }
-        if (!(f.value >= limits->clearance)) {
-            return f;
-        }
     }
-    return found(HC_OK, -1, 0.0);
 }
 
-/* Cosines of a strut's angles to the neutral directions of its joints, at the base and at the platform. */
-static void joint_cosines(const hc_pose *pose, const six_struts *now, const hc_limits *limits, int i, double cosines[2])
-{
-    const vec s = now->strut[i];
-    double at_platform = 0.0;
-    int k;
-    for (k = 0; k < 3; k++) {
-        const double along = pose->rotation[0][k] * s.x + pose->rotation[1][k] * s.y + pose->rotation[2][k] * s.z;
-        at_platform += along * limits->cone_axes[1][i][k];
-    }
-    cosines[0] = dot(s, row_of(limits->cone_axes[0][i])) / now->length[i];
-    cosines[1] = at_platform / now->length[i];
-}
-
-static finding check_joints(const double base[6][3], const hc_pose *pose, const six_struts *now,
-                            const hc_limits *limits)
-{
-    int i, body;
-    for (i = 0; i < 6; i++) {
-        double cosines[2];
-        joint_cosines(pose, now, limits, i, cosines);
-        for (body = 0; body < 2; body++) {
-            if (!(cosines[body] >= limits->cone_cosines[body][i])) {
-                return found(body ? HC_PLATFORM_CONE : HC_BASE_CONE, i, arc_cosine(held(cosines[body], -1.0, 1.0)));
-            }
-        }
-    }
-    return limits->clearance > 0.0 ? check_clearance(base, now, limits) : found(HC_OK, -1, 0.0);
-}
-
-/* `now` are the struts at the pose: whoever asks has needed them already */
+/* The first limit that a pose and its lengths break. `now` are the struts at the pose: whoever asks has needed them already. */
 static finding check_stage(const double base[6][3], const hc_pose *pose, const six_struts *now,
                            const double lengths[6], const hc_limits *limits, double *condition)
 {
-    finding f;
-    double sign;
-    int i;
+    double cosines[2][6], distances[6], nearest[6], sign;
+    int i, body;
     *condition = NAN;
     for (i = 0; i < 6; i++) {
         if (!finite_number(lengths[i])) {
@@ -138,15 +117,28 @@ static finding check_stage(const double base[6][3], const hc_pose *pose, const s
             return found(HC_STROKE_LONG, i, lengths[i]);
         }
     }
-    f = check_joints(base, pose, now, limits);
-    if (f.status != HC_OK) {
-        return f;
+    joint_cosines(pose, now, limits, cosines);
+    for (i = 0; i < 6; i++) {
+        for (body = 0; body < 2; body++) {
+            const double cosine = cosines[body][i];
+            if (!(cosine >= limits->cone_cosines[body][i])) {
+                return found(body ? HC_PLATFORM_CONE : HC_BASE_CONE, i, arc_cosine(held(cosine, -1.0, 1.0)));
+            }
+        }
+    }
+    nearest_struts(base, now, limits, distances, nearest);
+    for (i = 0; i < 6; i++) {
+        if (!(distances[i] >= limits->clearance)) {
+            finding f = found(HC_CLEARANCE, i, distances[i]);
+            f.other = (int)nearest[i];
+            return f;
+        }
     }
     *condition = condition_at(base, pose, now, limits->characteristic_length, &sign);
     if (!(*condition <= limits->condition)) {
         return found(HC_CONDITION, -1, *condition);
     }
-    return sign == limits->home_sign ? f : found(HC_ASSEMBLY, -1, sign);
+    return sign == limits->home_sign ? found(HC_OK, -1, 0.0) : found(HC_ASSEMBLY, -1, sign);
 }
 
 /* A NaN in `previous` means that there is none. */
