@@ -140,8 +140,7 @@ def small(value: float) -> str:
 
 # --- What is printed: the shipped files table1.csv to table5.csv of Song, Mou & King -----------------------------
 
-SIGNIFICANT = 6
-"""Digits of their numbers. Zeros at the end are left out in print: 5 stands for 5.00000."""
+SIGNIFICANT = 6  # Digits of their numbers. Zeros at the end are left out in print: 5 stands for 5.00000
 
 
 @cache

@@ -23,11 +23,8 @@ MACHINE, BUDGET = "positioning_unit", "error_budget"
 TILTS = tuple(np.radians([-4.0, 0.0, 4.0]).tolist())
 """About x and y, rad, over which the machine's workspace is classified."""
 
-COMPARED = 20
-"""Random poses at which the iteration is compared to the exact solution."""
-
-PASSIVE = 1e-3
-"""The paper's bound of what the passive legs move, over the travel of the active one."""
+COMPARED = 20  # Random poses at which the iteration is compared to the exact solution
+PASSIVE = 1e-3  # The paper's bound of what the passive legs move, over the travel of the active one
 
 OVER_WHAT = "over which poses and struts each row was taken is not printed."
 

@@ -20,14 +20,12 @@ A, B, D = 300.0, 572.0, 243.0
 S3 = np.sqrt(3.0)
 TOP = np.array([[np.cos(angle), np.sin(angle), 0.0] for angle in np.radians([60.0, 180.0, -60.0])]) * A / S3
 
-MENDS = ("Xp3", "4", "Yp3")
-"""What the second of the three combined equations needs."""
+MENDS = ("Xp3", "4", "Yp3")  # What the second of the three combined equations needs
 
 SIGNS = np.array([[1, 1, 1]] * 2 + [[-1, 1, 1]] + [[-1, -1, 1]] * 2 + [[1, -1, 1]], dtype=float)
 """Of δX_B, δY_B and δZ_B as they are printed."""
 
-DEVIATION = 0.01
-"""Error of a joint's coordinate with which formulas of the real structure are tried, mm."""
+DEVIATION = 0.01  # Error of a joint's coordinate with which formulas of the real structure are tried, mm
 
 
 class Case(NamedTuple):

@@ -33,17 +33,10 @@ LINE_Y = 4 * INCH
 """Where the line along x of Figures 3 and 4 stands, m: a measured one, off the middle, where mirrored struts would
 have the same curve."""
 
-TRUTH = "paper_machine"
-"""The virtual machine that is measured: a shipped model."""
-
-SAMPLES = 81
-"""Points along the line of Figures 3 and 4."""
-
-CLEAR = 20e-6
-"""Change of the readings along a line beside which 1 µm, or µrad, of noise is little, m or rad."""
-
-POINT = np.array([0.07, -0.03, 0.42])
-"""The tool position at which the chain of Figure 5 is followed, m."""
+TRUTH = "paper_machine"  # The virtual machine that is measured: a shipped model
+SAMPLES = 81  # Points along the line of Figures 3 and 4
+CLEAR = 20e-6  # Change of the readings along a line beside which 1 µm, or µrad, of noise is little, m or rad
+POINT = np.array([0.07, -0.03, 0.42])  # The tool position at which the chain of Figure 5 is followed, m
 
 
 @dataclass(frozen=True)

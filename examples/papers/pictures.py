@@ -9,8 +9,7 @@ from hexapod_comp.formats.figures import WITH, WITHOUT
 from hexapod_comp.machine.geometry import HexapodGeometry
 from hexapod_comp.machine.pictures import machine_figure
 
-BINS = np.arange(-40.5, 41.0, 1.0)
-"""Edges of a histogram of changes of length, µm."""
+BINS = np.arange(-40.5, 41.0, 1.0)  # Edges of a histogram of changes of length, µm
 
 
 def configuration_figure(geometry: HexapodGeometry) -> Figure:

@@ -48,8 +48,7 @@ POSES = (*angles_deg("α", "β", "γ"), *lengths_mm("X", "Y", "Z"))
 IDEAL_MM, REAL_MM = 1e-5, 1e-4
 """The consistency that they state: about 0.01 µm for the ideal structure, about 0.1 µm for the real one."""
 
-BOUND = 10e-6
-"""Of every error of the real structure, m."""
+BOUND = 10e-6  # Of every error of the real structure, m
 
 BOUNDS = ImperfectionBounds(joint=BOUND, strut_offset=BOUND)
 
@@ -59,8 +58,7 @@ RANDOM_POSES, REAL_POSES = 1000, 200
 RANDOM_BOX, RANDOM_TILT = np.array([[-0.2032, -0.2032, 0.35], [0.2032, 0.2032, 0.5532]]), np.radians(10.0)
 """Where: the box that Mou & King measured, m, with angles up to the largest of Table 1, rad."""
 
-DRAWS = 200_000
-"""Machines drawn for a probability."""
+DRAWS = 200_000  # Machines drawn for a probability
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ import numpy as np
 from ..errors import ModelError
 from ..machine.model import MachineModel
 
-PROVENANCE = ("machine", "name", "origin", "region")
-"""Fields that move no tool."""
+PROVENANCE = ("machine", "name", "origin", "region")  # Fields that move no tool
 
 C = frozenset(
     {

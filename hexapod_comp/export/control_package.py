@@ -22,15 +22,13 @@ from .robot_description import urdf
 TEMPLATES = Path(__file__).parent / "ros2_control"
 """The package's files; ``@NAME@`` stands for what differs from machine to machine."""
 
-CHAINED = "compensation"
-"""Name of the controller in ``within.yaml``: ahead of the joints that it offers."""
+CHAINED = "compensation"  # Name of the controller in ``within.yaml``: ahead of the joints that it offers
 
 TOLERANCE = 0.75
 """Of the largest step between two commands: a goal that lags by more is aborted. What the controller then holds, where
 the struts are, must still be within a step of the last command that was not refused."""
 
-LAG = 0.02
-"""Of drives, s, for the speed at which a trajectory comes to the tolerance by lag alone."""
+LAG = 0.02  # Of drives, s, for the speed at which a trajectory comes to the tolerance by lag alone
 
 
 def write_ros2_control(

@@ -29,16 +29,11 @@ from ..machine.model import RealMachine
 from ..machine.passes import Passes
 from .carried import AT_20_DEGC, refuse_unknown
 
-MOST_POINTS = 256
-"""EMCMOT_COMP_SIZE."""
-OUTER_POINTS = 12
-"""Most points spent on each end of a stroke that level poses of the box do not need."""
-MARGIN = 0.003
-"""Fine points go this far beyond the lengths needed, m: there the coarse part's misfit has died away."""
-FOLD = np.deg2rad(5.0)
-"""Cardan axes this near to a right angle, rad, are refused together with a screw lead."""
-SAMPLES = 16
-"""Samples of the strut's errors between two points of its table."""
+MOST_POINTS = 256  # EMCMOT_COMP_SIZE
+OUTER_POINTS = 12  # Most points spent on each end of a stroke that level poses of the box do not need
+MARGIN = 0.003  # Fine points go this far beyond the lengths needed, m: there the coarse part's misfit has died away
+FOLD = np.deg2rad(5.0)  # Cardan axes this near to a right angle, rad, are refused together with a screw lead
+SAMPLES = 16  # Samples of the strut's errors between two points of its table
 
 
 @dataclass(frozen=True)

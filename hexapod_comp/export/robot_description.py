@@ -23,8 +23,7 @@ PLATFORM_JOINTS = ("platform_x", "platform_y", "platform_z", "platform_beta", "p
 
 _AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 0], [1, 0, 0], [0, 0, 1]], dtype=float)
 
-STRUT_RADIUS, JOINT_RADIUS, PLATE = 0.01, 0.018, 0.01
-"""What is drawn, m: struts, joints, and the platform's thickness."""
+STRUT_RADIUS, JOINT_RADIUS, PLATE = 0.01, 0.018, 0.01  # What is drawn, m: struts, joints, and the platform's thickness
 
 HARDWARE = (
     ("joint_commands_topic", "strut_setpoints"),
@@ -54,8 +53,7 @@ Without a limit of force, a `ctrl` that nobody has set, 0, would throw the platf
 TIMESTEP, TIED = 1e-3, {"solref": "0.002 1", "solimp": "0.9999 0.9999 0.001"}
 """MuJoCo's step, s; struts' ends are tied as fast as that allows (two steps), and gravity parts them by 0.1 µm."""
 
-LOOSE = 1e3
-"""Limit of effort and speed of joints that no motor moves; readers of URDF want one."""
+LOOSE = 1e3  # Limit of effort and speed of joints that no motor moves; readers of URDF want one
 
 
 def joint_positions(
@@ -208,8 +206,7 @@ def _control(robot: ET.Element, joint_names: Sequence[str]) -> None:
             ET.SubElement(joint, "state_interface", name=state)
 
 
-Shape = tuple[str, dict[str, str], np.ndarray]
-"""Kind, sizes and middle of what is drawn."""
+Shape = tuple[str, dict[str, str], np.ndarray]  # Kind, sizes and middle of what is drawn
 
 
 def _ball(middle: np.ndarray) -> Shape:

@@ -47,8 +47,7 @@ COLUMNS = (
 )
 """Header of the file."""
 
-MOST_ROWS = 200_000
-"""A finer grid is refused: it would not be a table for a controller."""
+MOST_ROWS = 200_000  # A finer grid is refused: it would not be a table for a controller
 
 WAVE_STEPS = 4.0
 """A screw wave with fewer steps of the grid than this to its period is left out: the grid would see noise."""
@@ -56,8 +55,7 @@ WAVE_STEPS = 4.0
 EDGE = 0.1e-3
 """Nodes on the boundary of the field's box count as inside, though errors move the measured point out by µm."""
 
-SAME_NODE = 1e-9
-"""Coordinates of a file that differ by less than this, m, are one node."""
+SAME_NODE = 1e-9  # Coordinates of a file that differ by less than this, m, are one node
 
 
 @dataclass(frozen=True)

@@ -23,12 +23,10 @@ from ..virtual.trial import ToolErrors, Trial
 WARMER, DAMPER = dict.fromkeys(PARTS, REFERENCE_TEMPERATURE + 1.0), {HUMIDITY: REFERENCE_HUMIDITY + 0.1}
 """Readings of a machine that is 1 K warmer, and of one in damper air."""
 
-DIAGONAL = np.ones(3)
-"""Direction of travel, forward; backward is its opposite."""
+DIAGONAL = np.ones(3)  # Direction of travel, forward; backward is its opposite
 
 
-CommandsOf = Callable[[Passes], np.ndarray]
-"""Returns the strut commands, shape (N, 6), m, that are sent for N passes."""
+CommandsOf = Callable[[Passes], np.ndarray]  # Returns the strut commands, shape (N, 6), m, that are sent for N passes
 
 
 @dataclass(frozen=True)

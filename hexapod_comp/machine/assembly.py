@@ -158,8 +158,7 @@ def _roots(values: np.ndarray, bound: float) -> np.ndarray:
     return np.angle(roots[np.abs(roots) > 0.9])
 
 
-NEAR = 0.01
-"""Triangles closer than this, relative to the sum of the sides, may be copies of one multiple root."""
+NEAR = 0.01  # Triangles closer than this, relative to the sum of the sides, may be copies of one multiple root
 
 
 def closed_triangles(
@@ -209,8 +208,7 @@ def _settled(circles: np.ndarray, sides: np.ndarray, starts: np.ndarray) -> tupl
     return angles, points, errors
 
 
-CLOSURE = 1e-12
-"""Largest error of a strut length or of a platform side in a mode, relative to the longest strut."""
+CLOSURE = 1e-12  # Largest error of a strut length or of a platform side in a mode, relative to the longest strut
 
 DISTINCT = 1e-6
 """Modes whose platform joints all lie closer than this, relative to the longest strut, are one double mode:
@@ -220,23 +218,18 @@ PAIR_GAP = 0.02
 """Largest distance of two platform joints that count as one, relative to the characteristic length; enough
 for deviations of 1 mm on a machine with a 300 mm platform."""
 
-EXACT_GAP = 1e-13
-"""Pairs closer than this, relative to the characteristic length, coincide to rounding."""
+EXACT_GAP = 1e-13  # Pairs closer than this, relative to the characteristic length, coincide to rounding
 
 NEARLY_CLOSED = 20.0
 """Modes of the pairs' midpoints that fail to close by up to this many gaps are tried on a real structure."""
 
-MOST_MODES = 16
-"""A 6-3 machine has at most sixteen modes unless it can move with all struts locked."""
+MOST_MODES = 16  # A 6-3 machine has at most sixteen modes unless it can move with all struts locked
 
 MOST_GENERAL_MODES = 40
 """A 6-6 machine has at most forty modes (Raghavan 1993) unless it can move with all struts locked."""
 
-ORIENTATIONS = 2000
-"""Attitudes from which the modes of a machine that is not 6-3 are sought, two positions each."""
-
-AMBIGUITY = 1.2
-"""A cold start is refused when the second-nearest candidate is within this factor of the nearest."""
+ORIENTATIONS = 2000  # Attitudes from which the modes of a machine that is not 6-3 are sought, two positions each
+AMBIGUITY = 1.2  # A cold start is refused when the second-nearest candidate is within this factor of the nearest
 
 
 def assembly_modes(structure: Structure, lengths: np.ndarray) -> list[Pose]:

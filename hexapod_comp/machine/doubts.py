@@ -13,17 +13,13 @@ from ..core.batch import screw_twists
 if TYPE_CHECKING:
     from .geometry import HexapodGeometry
 
-COINCIDENT = 1e-6
-"""Bodies whose middles are nearer than this, m, say nothing of how they face each other."""
+COINCIDENT = 1e-6  # Bodies whose middles are nearer than this, m, say nothing of how they face each other
 
 LEAST_GAIN = 0.01
 """Share of the struts' squared lengths, seen along the machine's axis, that another order of joints must save."""
 
-MOST_TURN = np.radians(45.0)
-"""Turn of the platform against the base at home beyond which it is worth a question, rad."""
-
-USUAL_RADII = (0.01, 5.0)
-"""Of base and platform, m: outside, a unit may be wrong."""
+MOST_TURN = np.radians(45.0)  # Turn of the platform against the base at home beyond which it is worth a question, rad
+USUAL_RADII = (0.01, 5.0)  # Of base and platform, m: outside, a unit may be wrong
 
 
 def doubts(geometry: HexapodGeometry) -> tuple[str, ...]:

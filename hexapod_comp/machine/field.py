@@ -20,8 +20,7 @@ from ..core.batch import field_at
 from ..errors import ModelError
 from .terms import settle, term
 
-COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")
-"""Order of the six error components."""
+COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")  # Order of the six error components
 
 LARGEST = np.repeat([0.05, 0.1], 3)
 """Of the components, anywhere on a line, m and rad: the three rotations count as small."""

@@ -31,14 +31,9 @@ from .limits import Limits, frozen_array
 BASE, WORK, TOOL = "base", "work", "tool"
 """Frames that every machine has: its base, and the work frame and the tool that are used unless others are named."""
 
-MOST = 100
-"""Tools, and work frames, of one machine."""
-
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
-"""They become ``frame_id`` in messages and links of a URDF."""
-
-TAKEN = re.compile("base|work|platform|tool|world|(platform|strut)_.*")
-"""What the package calls other frames."""
+MOST = 100  # Tools, and work frames, of one machine
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # They become ``frame_id`` in messages and links of a URDF
+TAKEN = re.compile("base|work|platform|tool|world|(platform|strut)_.*")  # What the package calls other frames
 
 
 def read_pose(parent: Section, key: str) -> Pose:
@@ -95,11 +90,8 @@ JOINTS_TIMES = {25.4: "in inches", 1.0 / 25.4: "in mm, not inches", 10.0: "in cm
 GEOMETRY_FORMAT = "hexapod_comp/geometry"
 GEOMETRY_VERSION = 1
 
-COINCIDENT = 1e-6
-"""Joints closer than this, m, are one."""
-
-LONGEST_AXIS = 1e9
-"""Largest component of an axis: only its direction counts, and the square of a huge one overflows."""
+COINCIDENT = 1e-6  # Joints closer than this, m, are one
+LONGEST_AXIS = 1e9  # Largest component of an axis: only its direction counts, and the square of a huge one overflows
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,7 @@ ALONE = 0.01
 SLICE = 1e-3
 """Work on a slice of a batch, s: long beside taking the next one, short beside waiting for somebody's last one."""
 
-FIRST_SLICE = 256
-"""Poses in a batch's first slice; each of the next has twice as many until one takes its time."""
+FIRST_SLICE = 256  # Poses in a batch's first slice; each of the next has twice as many until one takes its time
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,7 @@ import numpy as np
 from ..core import Status, Struct
 from ..errors import GeometryError, KinematicsError, LimitError, NotFiniteError, TooEarlyError
 
-STRUT_NAMES = tuple(f"strut_{i}" for i in range(1, 7))
-"""Names of the six struts, in order, as they stand in messages."""
+STRUT_NAMES = tuple(f"strut_{i}" for i in range(1, 7))  # Names of the six struts, in order, as they stand in messages
 
 REASONS = (
     "",

@@ -155,8 +155,7 @@ class MachineModel:
         return self.region
 
 
-FOLLOWED = 9
-"""Three axes of the measured point, then six struts."""
+FOLLOWED = 9  # Three axes of the measured point, then six struts
 
 
 DIRECTIONS = {"forward": 1.0, "midway": 0.0, "backward": -1.0}
@@ -457,11 +456,8 @@ def measured_region(model: MachineModel) -> Region:
     return region
 
 
-ROUNDS = 10
-"""Field and turning screws see a moved machine a little otherwise: each round leaves less than a thousandth."""
-
-SETTLED = 1e-12
-"""The tool is not moved when it is by less, m and rad."""
+ROUNDS = 10  # Field and turning screws see a moved machine a little otherwise: each round leaves less than a thousandth
+SETTLED = 1e-12  # The tool is not moved when it is by less, m and rad
 
 
 def tool_move(geometry: HexapodGeometry, model: MachineModel, pose: Pose) -> np.ndarray:

@@ -39,19 +39,15 @@ from .terms import check_magnitude, check_magnitudes, read_terms, table_text, wr
 MODEL_FORMAT = "hexapod_comp/model"
 MODEL_VERSION = 1
 
-IDEAL = "ideal"
-"""What :func:`load_model` and parameters call the model of a machine without errors."""
-
-DIRECTIONS = ("forward", "backward")
-"""Order of the directions of motion in a field's arrays."""
+IDEAL = "ideal"  # What :func:`load_model` and parameters call the model of a machine without errors
+DIRECTIONS = ("forward", "backward")  # Order of the directions of motion in a field's arrays
 
 LATE: dict[str, Any] = {"late_struts": slice(0, 6), "late_base": 6, "late_platform": 7}
 """Keys of late growth, and where they stand in its array."""
 
 WAVE, PERIOD, UM = Numbers("um", PER_STRUT), Numbers("mm", PER_STRUT), Numbers("um")
 
-LOOKED_AT = 33
-"""Points along each line of a field at which its polynomials are looked at."""
+LOOKED_AT = 33  # Points along each line of a field at which its polynomials are looked at
 
 ISO_8601 = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d(\.\d{3}(\d{3})?)?)?(Z|[+-]\d\d:\d\d)?)?")
 """The extended forms that every supported Python reads alike."""

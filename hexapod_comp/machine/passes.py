@@ -15,11 +15,8 @@ from ..pose import rotation_from_angles
 from .geometry import HexapodGeometry
 from .kinematics import Structure, strut_lengths_batch
 
-LEAST_SPEED = 1e-9
-"""Below this share of the speed of travel an axis or a strut stands still."""
-
-BOTH_WAYS = (1.0, -1.0)
-"""Forward, backward."""
+LEAST_SPEED = 1e-9  # Below this share of the speed of travel an axis or a strut stands still
+BOTH_WAYS = (1.0, -1.0)  # Forward, backward
 
 Poses = tuple[np.ndarray, np.ndarray]
 """Positions, shape (N, 3), m, and rotations, shape (N, 3, 3), of ``pose_platform_in_base``."""

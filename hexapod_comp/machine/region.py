@@ -17,11 +17,8 @@ from ..pose import Pose
 from .geometry import HexapodGeometry
 from .terms import settle, term
 
-ON_THE_FACE = 1e-9
-"""A place that is further outside, m, is outside: files keep a picometre."""
-
-PARALLEL = 1e-9
-"""Directions whose components differ by less are parallel."""
+ON_THE_FACE = 1e-9  # A place that is further outside, m, is outside: files keep a picometre
+PARALLEL = 1e-9  # Directions whose components differ by less are parallel
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 STEEPEST_ERROR = 0.2
 """Largest slope of the strut error against the command: below it, undoing the error is a contraction."""
 
-STRUT_LENGTH = 0.1
-"""Largest error of a strut's length, m: an encoder's zero is found within a hand's breadth."""
+STRUT_LENGTH = 0.1  # Largest error of a strut's length, m: an encoder's zero is found within a hand's breadth
 
 MOISTURE = 0.1
 """Largest growth from dry air to damp: three times that of nylon; carbon fibre in resin has some hundred ppm."""

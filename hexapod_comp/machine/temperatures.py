@@ -24,21 +24,13 @@ from ..errors import ModelError
 from .limits import STRUT_NAMES
 from .terms import term
 
-PARTS = (*STRUT_NAMES, "base", "platform")
-"""What has a temperature, in the order of every array of eight."""
-
-MOST_TIME_CONSTANTS = 2
-"""A machine that warms shows a fast and a slow one; more cannot be told apart."""
-
-TIME_CONSTANT_RANGE = (10.0, 1e6)
-"""Time constants outside this, s, are a sensor's noise, or a building's seasons."""
-
-REST = 3.0
-"""After so many time constants a twentieth is left of what a first reading did not know."""
+PARTS = (*STRUT_NAMES, "base", "platform")  # What has a temperature, in the order of every array of eight
+MOST_TIME_CONSTANTS = 2  # A machine that warms shows a fast and a slow one; more cannot be told apart
+TIME_CONSTANT_RANGE = (10.0, 1e6)  # Time constants outside this, s, are a sensor's noise, or a building's seasons
+REST = 3.0  # After so many time constants a twentieth is left of what a first reading did not know
 
 
-EXPANSION = 1e-3
-"""Largest expansion that a machine's part may have, 1/K: five times that of soft plastics."""
+EXPANSION = 1e-3  # Largest expansion that a machine's part may have, 1/K: five times that of soft plastics
 
 
 @dataclass(frozen=True)
@@ -74,8 +66,7 @@ class LateGrowth:
         return PARTS.index(self.thermometer) if self.thermometer else part
 
 
-AT_ONCE = LateGrowth()
-"""Every part has a thermometer of its own and follows it at once."""
+AT_ONCE = LateGrowth()  # Every part has a thermometer of its own and follows it at once
 
 
 @dataclass
@@ -118,17 +109,10 @@ def late(times: np.ndarray, values: np.ndarray, time_constants: Sequence[float] 
     return result
 
 
-REFERENCE_TEMPERATURE = 20.0
-"""Temperature at which geometry and model hold, °C (ISO 1)."""
-
-TEMPERATURE_RANGE = (-40.0, 120.0)
-"""Sensor readings outside this, °C, are not a machine shop's."""
-
-HUMIDITY = "humidity"
-"""Name of the air's relative humidity among a machine's readings."""
-
-REFERENCE_HUMIDITY = 0.5
-"""Relative humidity at which geometry and model hold, a fraction."""
+REFERENCE_TEMPERATURE = 20.0  # Temperature at which geometry and model hold, °C (ISO 1)
+TEMPERATURE_RANGE = (-40.0, 120.0)  # Sensor readings outside this, °C, are not a machine shop's
+HUMIDITY = "humidity"  # Name of the air's relative humidity among a machine's readings
+REFERENCE_HUMIDITY = 0.5  # Relative humidity at which geometry and model hold, a fraction
 
 HUMIDITY_RANGE = (0.01, 1.0)
 """Relative humidity outside this is not a machine shop's: percent for a fraction, a fraction for percent, or a broken

@@ -12,23 +12,15 @@ from ..pose import Pose, best_motion, rotation_angle
 from .geometry import HexapodGeometry
 from .kinematics import Structure, strut_lengths_batch
 
-SHARE_OF_LIMIT = 0.8
-"""Moves use this much of the allowed strut speed and step, leaving room for the corrections."""
-
-PEAK_OF_QUINTIC = 1.875
-"""Largest slope of the quintic 10t³ − 15t⁴ + 6t⁵."""
-
-BEND_OF_QUINTIC = 10.0 / 3.0**0.5
-"""Its largest second derivative."""
-
-TRACK_WINDOW = 25
-"""How many commands the tool may lag behind the newest one; at 250 Hz a tenth of a second."""
+SHARE_OF_LIMIT = 0.8  # Moves use this much of the allowed strut speed and step, leaving room for the corrections
+PEAK_OF_QUINTIC = 1.875  # Largest slope of the quintic 10t³ − 15t⁴ + 6t⁵
+BEND_OF_QUINTIC = 10.0 / 3.0**0.5  # Its largest second derivative
+TRACK_WINDOW = 25  # How many commands the tool may lag behind the newest one; at 250 Hz a tenth of a second
 
 MOST_ALIGNED, ALIGNING_STEPS, SETTLED = 5000, 200, 1e-9
 """Points by which a track is aligned; steps of that, each a motion onto the nearest places; last step, m and rad."""
 
-COARSE = 20
-"""Sections of a move over which the struts' slopes are taken."""
+COARSE = 20  # Sections of a move over which the struts' slopes are taken
 
 
 @dataclass(frozen=True)

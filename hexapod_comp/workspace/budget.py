@@ -22,13 +22,11 @@ from ..machine.geometry import HexapodGeometry, first_of_same
 BUDGET_FORMAT = "hexapod_comp/error_budget"
 BUDGET_VERSION = 1
 
-LENGTH, BASE_JOINT, PLATFORM_JOINT, TOOL = range(4)
-"""What a single error moves."""
+LENGTH, BASE_JOINT, PLATFORM_JOINT, TOOL = range(4)  # What a single error moves
 
 AXES = ("x", "y", "z")
 
-LARGEST = 0.1
-"""An error as large is a wrong unit; m, or relative."""
+LARGEST = 0.1  # An error as large is a wrong unit; m, or relative
 
 
 @dataclass(frozen=True)
@@ -62,8 +60,7 @@ class SingleErrors:
         return SingleErrors(self.kind, self.part, self.struts, vector, self.kinds, self.labels)
 
 
-Row = tuple[int, np.ndarray, tuple[float, ...], str]
-"""Part, struts (6,), vector and label of one single error."""
+Row = tuple[int, np.ndarray, tuple[float, ...], str]  # Part, struts (6,), vector and label of one single error
 
 
 @dataclass(frozen=True)
@@ -77,8 +74,7 @@ class SourceType:
     make: Callable[[float, np.ndarray], Iterable[Row]]
 
 
-EACH = np.eye(6, dtype=bool)
-"""Every strut for itself."""
+EACH = np.eye(6, dtype=bool)  # Every strut for itself
 
 
 def _lengths(coefficient: int, factor: float = 1.0) -> Callable[[float, np.ndarray], Iterable[Row]]:

@@ -18,20 +18,11 @@ from scipy.stats import binom
 from ..errors import CalibrationError, ModelError
 from .budget import SingleErrors
 
-DISPLACEMENT, ROTATION = 0, 1
-"""Columns of every result."""
-
-RSS, WORST_CASE = "rss", "worst_case"
-"""How an allocation adds the errors up."""
-
-UNIFORM, NORMAL = "uniform", "normal"
-"""Distributions of u: uniform within ±1, or normal with a standard deviation of 1."""
-
-CHUNK = 512
-"""Poses handled together: bounds the memory of all combinations of signs."""
-
-LARGEST_FACTOR = 1e9
-"""A source that may grow by more has no effect that counts."""
+DISPLACEMENT, ROTATION = 0, 1  # Columns of every result
+RSS, WORST_CASE = "rss", "worst_case"  # How an allocation adds the errors up
+UNIFORM, NORMAL = "uniform", "normal"  # Distributions of u: uniform within ±1, or normal with a standard deviation of 1
+CHUNK = 512  # Poses handled together: bounds the memory of all combinations of signs
+LARGEST_FACTOR = 1e9  # A source that may grow by more has no effect that counts
 
 
 def worst_case(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:

@@ -20,17 +20,290 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import ForwardBatch, Structure, jacobian_batch, over_chunks, solve_poses, strut_lengths
 from .budget import BASE_JOINT, LENGTH, PLATFORM_JOINT, TOOL, SingleErrors
 
-STEP = 1e-5
-"""Travel of the active leg per step, m (v. Daake et al.: 0.01 mm)."""
+EXACT, LINEAR, ITERATION = "exact", "linear", "iteration"
+METHODS = (EXACT, LINEAR, ITERATION)
 
-TOLERANCE = 1e-9
-"""ε: legs that are off by more, m, are corrected."""
+BLOCK = 4096  # Poses handled together: long beside what an error costs once, small enough for a processor's own memory
 
-VIRTUAL = 1e-7
-"""Virtual displacement, m and rad: small beside any curvature, large beside rounding."""
 
-MOST_CORRECTIONS = 20
-"""A step that needs more leads nowhere."""
+@dataclass(frozen=True)
+class Extremes:
+    """Largest and smallest effect of each error type, and where they happen.
+
+    Columns: largest and smallest translation, largest and smallest rotation.
+    """
+
+    errors: SingleErrors  # The E errors of K types
+    values: np.ndarray  # (K, 4): m, m, rad, rad; NaN for a type without any effect to be had
+    at_pose: np.ndarray  # (K, 4): number of the pose; −1 for none
+    at_error: np.ndarray  # (K, 4): which single error
+    positions: np.ndarray  # (K, 4, 3): that pose, ``pose_platform_in_base``, m
+    rotations: np.ndarray  # (K, 4, 3, 3): that pose, ``pose_platform_in_base``, m
+    failed: np.ndarray  # (K,): effects without a certified solution: they are left out and counted
+    poses: int  # How many poses were looked at
+
+
+_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])  # of the columns of Extremes: what is largest then is what is wanted
+
+
+def effect_vectors(
+    geometry: HexapodGeometry,
+    errors: SingleErrors,
+    positions: np.ndarray,
+    rotations: np.ndarray,
+    method: str = EXACT,
+    threads: int | None = None,
+) -> np.ndarray:
+    """Return displacement of the tool, m, and rotation vector, rad, by every error at every pose, shape (N, E, 6).
+
+    Actual minus nominal, along the axes of the work frame; NaN where a pose, or the machine with the error, cannot be.
+    """
+    return _of_each(geometry, errors, positions, rotations, method, threads, 6, lambda vectors: vectors)
+
+
+def effects(
+    geometry: HexapodGeometry,
+    errors: SingleErrors,
+    positions: np.ndarray,
+    rotations: np.ndarray,
+    method: str = EXACT,
+    threads: int | None = None,
+) -> np.ndarray:
+    """Return the size of every error's effect at every pose, shape (N, E, 2): m and rad (v. Daake et al., Results)."""
+    return _of_each(geometry, errors, positions, rotations, method, threads, 2, _sizes)
+
+
+def _of_each(
+    geometry: HexapodGeometry,
+    errors: SingleErrors,
+    positions: np.ndarray,
+    rotations: np.ndarray,
+    method: str,
+    threads: int | None,
+    width: int,
+    wanted: Callable[[np.ndarray], np.ndarray],
+) -> np.ndarray:
+    """Return what is wanted of every error's effects, shape (N, E, width)."""
+    positions, rotations = _poses(positions, rotations)
+    each, result = _way(method), np.empty((len(positions), len(errors), width))
+
+    def run(rows: slice) -> None:
+        for e, vectors in enumerate(each(geometry, errors, positions[rows], rotations[rows])):
+            result[rows, e] = wanted(vectors).T
+
+    over_chunks(run, len(positions), threads, BLOCK)
+    return result
+
+
+def extremes(
+    geometry: HexapodGeometry,
+    errors: SingleErrors,
+    positions: np.ndarray,
+    rotations: np.ndarray,
+    method: str = EXACT,
+    first: int = 0,
+    threads: int | None = None,
+) -> Extremes:
+    """Return the largest and smallest effects of each error type over some poses (v. Daake et al., Table 1).
+
+    Of more poses than memory takes, hand over one part after the other and join the results with :func:`merged`:
+    they are the same to the last bit however the poses are parted. `first` is the number of the first pose.
+    """
+    positions, rotations = _poses(positions, rotations)
+    each, parts = _way(method), {}
+
+    def run(rows: slice) -> None:
+        poses = positions[rows], rotations[rows]
+        parts[rows.start] = _extremes(errors, each(geometry, errors, *poses), *poses, first + rows.start)
+
+    over_chunks(run, len(positions), threads, BLOCK)
+    if not parts:
+        nowhere = np.full((1, 3), np.nan), np.full((1, 3, 3), np.nan)
+        return replace(_extremes(errors, (), *nowhere, first), poses=0)
+    return merged(parts[start] for start in sorted(parts))
+
+
+def _extremes(
+    errors: SingleErrors, vectors: Iterable[np.ndarray], positions: np.ndarray, rotations: np.ndarray, first: int
+) -> Extremes:
+    """Return the extremes of a few poses; of equal effects the first pose's first error."""
+    best, at = np.full((len(errors), 4), -np.inf), np.zeros((len(errors), 4), int)
+    count = len(errors.kinds)
+    failed, error = np.zeros(count, int), np.full((count, 4), -1)
+    for e, vector in enumerate(vectors):
+        signed = _SIGNS[:, None] * _sizes(vector)[[0, 0, 1, 1]]
+        missing = np.isnan(signed).any(axis=0)
+        signed[:, missing] = -np.inf
+        at[e] = signed.argmax(axis=1)
+        best[e] = signed[range(4), at[e]]
+        failed[errors.kind[e]] += missing.sum()
+    for kind, column in np.ndindex(count, 4):
+        members = np.flatnonzero((errors.kind == kind) & np.isfinite(best[:, column]))
+        if len(members):
+            error[kind, column] = members[np.lexsort((at[members, column], -best[members, column]))[0]]
+    found, columns = error >= 0, np.arange(4)
+    pose, nan = at[error, columns], np.nan
+    return Extremes(
+        errors=errors,
+        values=np.where(found, best[error, columns] * _SIGNS, nan),
+        at_pose=np.where(found, pose + first, -1),
+        at_error=error,
+        positions=np.where(found[..., None], positions[pose], nan),
+        rotations=np.where(found[..., None, None], rotations[pose], nan),
+        failed=failed,
+        poses=len(positions),
+    )
+
+
+def merged(parts: Iterable[Extremes]) -> Extremes:
+    """Return the extremes over several parts of a set of poses, given in order; of equal ones the first part's."""
+    result: Extremes | None = None
+    for b in parts:
+        if result is None:
+            result = b
+            continue
+        a = result
+        take_b = (b.values * _SIGNS > a.values * _SIGNS) | (np.isnan(a.values) & ~np.isnan(b.values))
+        result = replace(
+            a,
+            values=np.where(take_b, b.values, a.values),
+            at_pose=np.where(take_b, b.at_pose, a.at_pose),
+            at_error=np.where(take_b, b.at_error, a.at_error),
+            positions=np.where(take_b[..., None], b.positions, a.positions),
+            rotations=np.where(take_b[..., None, None], b.rotations, a.rotations),
+            failed=a.failed + b.failed,
+            poses=a.poses + b.poses,
+        )
+    if result is None:
+        raise KinematicsError("no poses to look at: the workspace is empty", 0)
+    return result
+
+
+def _exact(
+    geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray
+) -> Iterator[np.ndarray]:
+    """Yield the effects of one error after the other by forward kinematics, shape (6, N)."""
+    structure = Structure.of(geometry)
+    home = strut_lengths(structure, geometry.home)
+    lengths, start = _nominal(structure, positions, rotations)
+    before, axes = (start.positions, start.rotations), np.array(geometry.work.rotation)
+    for part, struts, vector in zip(errors.part, errors.struts, errors.vector, strict=True):
+        if part == TOOL:
+            yield _tool_shift(geometry, rotations, start.ok, vector)
+            continue
+        commanded, base, platform = lengths.copy(), np.zeros((6, 3)), np.zeros((6, 3))
+        if part == LENGTH:
+            commanded[:, struts] += _stretch(vector, lengths[:, struts], home[struts])
+        else:
+            (base if part == BASE_JOINT else platform)[struts] = vector
+        after = solve_poses(structure.moved(base, platform), commanded, before, threads=1)
+        motions = np.empty((6, len(lengths)))
+        batch.motions(*before, after.positions, after.rotations, geometry.tool.position, axes, motions)
+        yield motions
+
+
+def _linear(
+    geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray
+) -> Iterator[np.ndarray]:
+    """Yield the effects of one error after the other by the inverse Jacobian, shape (6, N)."""
+    structure = Structure.of(geometry)
+    home = strut_lengths(structure, geometry.home)
+    lengths, start = _nominal(structure, positions, rotations)
+    rows = jacobian_batch(structure, start.positions, start.rotations)
+    in_platform = np.einsum("nij,nki->nkj", start.rotations, rows[..., :3])
+    per_length = _per_length(geometry, rows, start)
+    for part, struts, vector in zip(errors.part, errors.struts, errors.vector, strict=True):
+        if part == TOOL:
+            yield _tool_shift(geometry, rotations, start.ok, vector)
+            continue
+        if part == LENGTH:
+            change = _stretch(vector, lengths[:, struts], home[struts])
+        elif part == BASE_JOINT:
+            change = rows[:, struts, :3] @ vector
+        else:
+            change = -in_platform[:, struts] @ vector
+        yield np.einsum("skn,ns->kn", per_length[struts], change)
+
+
+def _iterated(
+    geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray
+) -> Iterator[np.ndarray]:
+    """Yield the effects of one error after the other by v. Daake et al.'s iteration, shape (6, N)."""
+    certified = _nominal(Structure.of(geometry), positions, rotations)[1].ok
+    for error in range(len(errors)):
+        vectors = np.full((6, len(positions)), np.nan)
+        walked = tangential_effects(geometry, errors, error, positions[certified], rotations[certified])
+        vectors[:, certified] = walked.vectors.T
+        yield vectors
+
+
+def _way(method: str) -> Callable[..., Iterator[np.ndarray]]:
+    """Return what yields the effects by a method."""
+    if method not in METHODS:
+        raise KinematicsError(f"method must be one of {', '.join(METHODS)}, not {method!r}", method)
+    return {EXACT: _exact, LINEAR: _linear, ITERATION: _iterated}[method]
+
+
+def _nominal(structure: Structure, positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, ForwardBatch]:
+    """Return the nominal lengths (N, 6), and the poses that they give: certified, NaN where they cannot be."""
+    lengths = np.empty((len(positions), 6))
+    batch.strut_lengths(*structure.joints, positions, rotations, lengths)
+    return lengths, solve_poses(structure, lengths, (positions, rotations), threads=1)
+
+
+def _stretch(coefficients: np.ndarray, lengths: np.ndarray, home: np.ndarray) -> np.ndarray:
+    """Return struts' length errors at their lengths, shape (N, struts), m: a + b·(L − L_home) + c·L."""
+    a, b, c = coefficients
+    return a + b * (lengths - home) + c * lengths
+
+
+def _tool_shift(
+    geometry: HexapodGeometry, rotations: np.ndarray, certified: np.ndarray, offset: np.ndarray
+) -> np.ndarray:
+    """Return the effects of a wrong tool, shape (6, N): its offset along the axes of the work frame."""
+    vectors = np.zeros((6, len(rotations)))
+    vectors[:3] = np.einsum("ik,ni->kn", geometry.work.rotation, np.einsum("nij,j->ni", rotations, offset))
+    vectors[:, ~certified] = np.nan
+    return vectors
+
+
+def _per_length(geometry: HexapodGeometry, rows: np.ndarray, start: ForwardBatch) -> np.ndarray:
+    """Return displacement of the tool and turn per length of each strut, shape (6 struts, 6, N), in the work frame."""
+    inverse = np.full((len(rows), 6, 6), np.nan)
+    inverse[start.ok] = np.linalg.inv(rows[start.ok])
+    columns = inverse.transpose(0, 2, 1)
+    lever = np.einsum("nij,j->ni", start.rotations, geometry.tool.position)
+    shift, turn = columns[..., :3] + np.cross(columns[..., 3:], lever[:, None]), columns[..., 3:]
+    return np.concatenate([np.einsum("ik,nsi->skn", geometry.work.rotation, part) for part in (shift, turn)], axis=1)
+
+
+def _sizes(vectors: np.ndarray) -> np.ndarray:
+    """Return displacements and largest rotations about an axis, (6, N) → (2, N)."""
+    x, y, z = vectors[:3]
+    a, b, c = np.abs(vectors[3:])
+    return np.stack([np.sqrt(x * x + y * y + z * z), np.maximum(np.maximum(a, b), c)])
+
+
+def _poses(positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return poses as the core takes them: contiguous, a single rotation (3, 3) for all of them spread."""
+    positions = np.ascontiguousarray(positions, dtype=float)
+    rotations = np.asarray(rotations, dtype=float)
+    if rotations.shape == (3, 3):
+        rotations = np.broadcast_to(rotations, (len(positions), 3, 3))
+    if positions.ndim != 2 or positions.shape[1] != 3 or rotations.shape != (len(positions), 3, 3):
+        problem = f"poses must have shapes (N, 3) and (N, 3, 3), not {positions.shape} and {rotations.shape}"
+        raise KinematicsError(problem, positions.shape)
+    return positions, np.array(rotations, order="C")
+
+
+# The iteration of v. Daake et al. (chapter 1), a check and a yardstick that shares nothing with the core: tangents to
+# the motion that one active leg causes are followed in small steps. Each needs the motion relations of all legs, which
+# virtual displacements of the tool give through the inverse kinematics alone.
+
+STEP = 1e-5  # Travel of the active leg per step, m (v. Daake et al.: 0.01 mm)
+TOLERANCE = 1e-9  # ε: legs that are off by more, m, are corrected
+VIRTUAL = 1e-7  # Virtual displacement, m and rad: small beside any curvature, large beside rounding
+MOST_CORRECTIONS = 20  # A step that needs more leads nowhere
 
 
 @dataclass(frozen=True)
@@ -180,292 +453,3 @@ def _correct(state: _State, target: np.ndarray, tolerance: float) -> np.ndarray:
         off[poses] = target[poses] - some.lengths()
         counts[poses] += 1
     return counts
-
-
-EXACT, LINEAR, ITERATION = "exact", "linear", "iteration"
-METHODS = (EXACT, LINEAR, ITERATION)
-
-BLOCK = 4096
-"""Poses handled together: long beside what an error costs once, small enough for a processor's own memory."""
-
-
-@dataclass(frozen=True)
-class Extremes:
-    """Largest and smallest effect of each error type, and where they happen.
-
-    Columns: largest and smallest translation, largest and smallest rotation.
-    """
-
-    errors: SingleErrors  # The E errors of K types
-    values: np.ndarray  # (K, 4): m, m, rad, rad; NaN for a type without any effect to be had
-    at_pose: np.ndarray  # (K, 4): number of the pose; −1 for none
-    at_error: np.ndarray  # (K, 4): which single error
-    positions: np.ndarray  # (K, 4, 3): that pose, ``pose_platform_in_base``, m
-    rotations: np.ndarray  # (K, 4, 3, 3): that pose, ``pose_platform_in_base``, m
-    failed: np.ndarray  # (K,): effects without a certified solution: they are left out and counted
-    poses: int  # How many poses were looked at
-
-
-def effect_vectors(
-    geometry: HexapodGeometry,
-    errors: SingleErrors,
-    positions: np.ndarray,
-    rotations: np.ndarray,
-    method: str = EXACT,
-    threads: int | None = None,
-) -> np.ndarray:
-    """Return what every error does to the tool at every pose, with its direction."""
-    positions, rotations = _poses(positions, rotations)
-    each = _way(method)
-    vectors = np.empty((len(positions), len(errors), 6))
-
-    def run(rows: slice) -> None:
-        for e, vector in enumerate(each(geometry, errors, positions[rows], rotations[rows])):
-            vectors[rows, e] = vector.T
-
-    over_chunks(run, len(positions), threads, BLOCK)
-    return vectors
-
-
-def effects(
-    geometry: HexapodGeometry,
-    errors: SingleErrors,
-    positions: np.ndarray,
-    rotations: np.ndarray,
-    method: str = EXACT,
-    threads: int | None = None,
-) -> np.ndarray:
-    """Return the size of every error's effect at every pose, shape (N, E, 2): m and rad (v. Daake et al., Results).
-
-    Arguments and errors as for :func:`effect_vectors`.
-    """
-    positions, rotations = _poses(positions, rotations)
-    each = _way(method)
-    sizes = np.empty((len(positions), len(errors), 2))
-
-    def run(rows: slice) -> None:
-        for e, vector in enumerate(each(geometry, errors, positions[rows], rotations[rows])):
-            sizes[rows, e] = _sizes(vector).T
-
-    over_chunks(run, len(positions), threads, BLOCK)
-    return sizes
-
-
-def extremes(
-    geometry: HexapodGeometry,
-    errors: SingleErrors,
-    positions: np.ndarray,
-    rotations: np.ndarray,
-    method: str = EXACT,
-    first: int = 0,
-    threads: int | None = None,
-) -> Extremes:
-    """Return the largest and smallest effects of each error type over some poses (v. Daake et al., Table 1).
-
-    Of more poses than memory takes, hand over one part after the other and join the results with :func:`merged`:
-    they are the same to the last bit however the poses are parted.
-    """
-    positions, rotations = _poses(positions, rotations)
-    each = _way(method)
-    of_slice: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
-
-    def run(rows: slice) -> None:
-        vectors = each(geometry, errors, positions[rows], rotations[rows])
-        best, at, failed = _best_of_errors(errors, vectors)
-        of_slice[rows.start] = best, at + rows.start, failed
-
-    over_chunks(run, len(positions), threads, BLOCK)
-    slices = [of_slice[start] for start in sorted(of_slice)]
-    best, at_pose, at_error = _best_of_kinds(errors, slices)
-    exists = np.isfinite(best)
-    return Extremes(
-        errors=errors,
-        values=np.where(exists, best * _SIGNS, np.nan),
-        at_pose=np.where(exists, at_pose + first, -1),
-        at_error=np.where(exists, at_error, -1),
-        positions=_picked(positions, at_pose, exists),
-        rotations=_picked(rotations, at_pose, exists),
-        failed=sum((part[2] for part in slices), np.zeros(len(errors.kinds), int)),
-        poses=len(positions),
-    )
-
-
-def _best_of_errors(errors: SingleErrors, vectors: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return each error's four extremes over some poses, (E, 4), where they are, and the failures by type."""
-    best, at = np.empty((len(errors), 4)), np.empty((len(errors), 4), int)
-    failed = np.zeros(len(errors.kinds), int)
-    for e, vector in enumerate(vectors):
-        signed = _SIGNS[:, None] * _sizes(vector)[[0, 0, 1, 1]]
-        missing = np.isnan(signed).any(axis=0)
-        signed[:, missing] = -np.inf
-        at[e] = signed.argmax(axis=1)
-        best[e] = signed[range(4), at[e]]
-        failed[errors.kind[e]] += missing.sum()
-    return best, at, failed
-
-
-def merged(parts: Iterable[Extremes]) -> Extremes:
-    """Return the extremes over several parts of a set of poses, given in the order of their poses."""
-    result: Extremes | None = None
-    for part in parts:
-        result = part if result is None else _merged_pair(result, part)
-    if result is None:
-        raise KinematicsError("no poses to look at: the workspace is empty", 0)
-    return result
-
-
-def _merged_pair(a: Extremes, b: Extremes) -> Extremes:
-    """Return the extremes over two parts; equal ones are a's."""
-    higher = b.values * _SIGNS > a.values * _SIGNS
-    take_b = higher | (np.isnan(a.values) & ~np.isnan(b.values))
-    return replace(
-        a,
-        values=np.where(take_b, b.values, a.values),
-        at_pose=np.where(take_b, b.at_pose, a.at_pose),
-        at_error=np.where(take_b, b.at_error, a.at_error),
-        positions=np.where(take_b[..., None], b.positions, a.positions),
-        rotations=np.where(take_b[..., None, None], b.rotations, a.rotations),
-        failed=a.failed + b.failed,
-        poses=a.poses + b.poses,
-    )
-
-
-_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])
-
-
-def _best_of_kinds(
-    errors: SingleErrors, slices: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return best values, (K, 4), −∞ for none, with pose and error; of equals the first pose's first error."""
-    types, count = len(errors.kinds), len(errors)
-    kind = np.concatenate([np.arange(types), np.tile(errors.kind, len(slices))])
-    error = np.concatenate([np.full(types, -1), np.tile(np.arange(count), len(slices))])
-    best = np.concatenate([np.full((types, 4), -np.inf), *(part[0] for part in slices)])
-    pose = np.concatenate([np.full((types, 4), -1), *(part[1] for part in slices)])
-    order = np.stack([np.lexsort((pose[:, k], -best[:, k], kind)) for k in range(4)], axis=1)
-    chosen = order[np.searchsorted(kind[order[:, 0]], np.arange(types))]
-    return np.take_along_axis(best, chosen, 0), np.take_along_axis(pose, chosen, 0), error[chosen]
-
-
-def _picked(rows: np.ndarray, at: np.ndarray, exists: np.ndarray) -> np.ndarray:
-    """Return the rows at some indices, NaN where nothing was found."""
-    picked = np.full((*at.shape, *rows.shape[1:]), np.nan)
-    picked[exists] = rows[at[exists]]
-    return picked
-
-
-def _exact(
-    geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray
-) -> Iterator[np.ndarray]:
-    """Yield the effects of one error after the other by forward kinematics, shape (6, N)."""
-    structure = Structure.of(geometry)
-    home = strut_lengths(structure, geometry.home)
-    lengths, start = _nominal(structure, positions, rotations)
-    before, axes = (start.positions, start.rotations), np.array(geometry.work.rotation)
-    for part, struts, vector in zip(errors.part, errors.struts, errors.vector, strict=True):
-        if part == TOOL:
-            yield _tool_shift(geometry, rotations, start.ok, vector)
-            continue
-        commanded, base, platform = lengths.copy(), np.zeros((6, 3)), np.zeros((6, 3))
-        if part == LENGTH:
-            commanded[:, struts] += _stretch(vector, lengths[:, struts], home[struts])
-        else:
-            (base if part == BASE_JOINT else platform)[struts] = vector
-        after = solve_poses(structure.moved(base, platform), commanded, before, threads=1)
-        motions = np.empty((6, len(lengths)))
-        batch.motions(*before, after.positions, after.rotations, geometry.tool.position, axes, motions)
-        yield motions
-
-
-def _linear(
-    geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray
-) -> Iterator[np.ndarray]:
-    """Yield the effects of one error after the other by the inverse Jacobian, shape (6, N)."""
-    structure = Structure.of(geometry)
-    home = strut_lengths(structure, geometry.home)
-    lengths, start = _nominal(structure, positions, rotations)
-    rows = jacobian_batch(structure, start.positions, start.rotations)
-    in_platform = np.einsum("nij,nki->nkj", start.rotations, rows[..., :3])
-    per_length = _per_length(geometry, rows, start)
-    for part, struts, vector in zip(errors.part, errors.struts, errors.vector, strict=True):
-        if part == TOOL:
-            yield _tool_shift(geometry, rotations, start.ok, vector)
-            continue
-        if part == LENGTH:
-            change = _stretch(vector, lengths[:, struts], home[struts])
-        elif part == BASE_JOINT:
-            change = rows[:, struts, :3] @ vector
-        else:
-            change = -in_platform[:, struts] @ vector
-        yield np.einsum("skn,ns->kn", per_length[struts], change)
-
-
-def _iterated(
-    geometry: HexapodGeometry, errors: SingleErrors, positions: np.ndarray, rotations: np.ndarray
-) -> Iterator[np.ndarray]:
-    """Yield the effects of one error after the other by v. Daake et al.'s iteration, shape (6, N)."""
-    certified = _nominal(Structure.of(geometry), positions, rotations)[1].ok
-    for error in range(len(errors)):
-        vectors = np.full((6, len(positions)), np.nan)
-        walked = tangential_effects(geometry, errors, error, positions[certified], rotations[certified])
-        vectors[:, certified] = walked.vectors.T
-        yield vectors
-
-
-def _way(method: str) -> Callable[..., Iterator[np.ndarray]]:
-    """Return what yields the effects by a method."""
-    if method not in METHODS:
-        raise KinematicsError(f"method must be one of {', '.join(METHODS)}, not {method!r}", method)
-    return {EXACT: _exact, LINEAR: _linear, ITERATION: _iterated}[method]
-
-
-def _nominal(structure: Structure, positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, ForwardBatch]:
-    """Return the nominal lengths (N, 6), and the poses that they give: certified, NaN where they cannot be."""
-    lengths = np.empty((len(positions), 6))
-    batch.strut_lengths(*structure.joints, positions, rotations, lengths)
-    return lengths, solve_poses(structure, lengths, (positions, rotations), threads=1)
-
-
-def _stretch(coefficients: np.ndarray, lengths: np.ndarray, home: np.ndarray) -> np.ndarray:
-    """Return struts' length errors at their lengths, shape (N, struts), m: a + b·(L − L_home) + c·L."""
-    a, b, c = coefficients
-    return a + b * (lengths - home) + c * lengths
-
-
-def _tool_shift(
-    geometry: HexapodGeometry, rotations: np.ndarray, certified: np.ndarray, offset: np.ndarray
-) -> np.ndarray:
-    """Return the effects of a wrong tool, shape (6, N): its offset along the axes of the work frame."""
-    vectors = np.zeros((6, len(rotations)))
-    vectors[:3] = np.einsum("ik,ni->kn", geometry.work.rotation, np.einsum("nij,j->ni", rotations, offset))
-    vectors[:, ~certified] = np.nan
-    return vectors
-
-
-def _per_length(geometry: HexapodGeometry, rows: np.ndarray, start: ForwardBatch) -> np.ndarray:
-    """Return displacement of the tool and turn per length of each strut, shape (6 struts, 6, N), in the work frame."""
-    inverse = np.full((len(rows), 6, 6), np.nan)
-    inverse[start.ok] = np.linalg.inv(rows[start.ok])
-    columns = inverse.transpose(0, 2, 1)
-    lever = np.einsum("nij,j->ni", start.rotations, geometry.tool.position)
-    shift, turn = columns[..., :3] + np.cross(columns[..., 3:], lever[:, None]), columns[..., 3:]
-    return np.concatenate([np.einsum("ik,nsi->skn", geometry.work.rotation, part) for part in (shift, turn)], axis=1)
-
-
-def _sizes(vectors: np.ndarray) -> np.ndarray:
-    """Return displacements and largest rotations about an axis, (6, N) → (2, N)."""
-    x, y, z = vectors[:3]
-    a, b, c = np.abs(vectors[3:])
-    return np.stack([np.sqrt(x * x + y * y + z * z), np.maximum(np.maximum(a, b), c)])
-
-
-def _poses(positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return poses as the core takes them: contiguous, a single rotation (3, 3) for all of them spread."""
-    positions = np.ascontiguousarray(positions, dtype=float)
-    rotations = np.asarray(rotations, dtype=float)
-    if rotations.shape == (3, 3):
-        rotations = np.broadcast_to(rotations, (len(positions), 3, 3))
-    if positions.ndim != 2 or positions.shape[1] != 3 or rotations.shape != (len(positions), 3, 3):
-        problem = f"poses must have shapes (N, 3) and (N, 3, 3), not {positions.shape} and {rotations.shape}"
-        raise KinematicsError(problem, positions.shape)
-    return positions, np.array(rotations, order="C")

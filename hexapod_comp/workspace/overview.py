@@ -26,14 +26,9 @@ from .reach import (
     reach,
 )
 
-MOST_TILT = np.radians(90.0)
-"""Beyond this no tilt is looked for, rad."""
-
-TILT_STEPS = 361
-"""Steps from zero to there."""
-
-TURN = np.radians(5.0)
-"""By which a tool turns about x, y or z, rad."""
+MOST_TILT = np.radians(90.0)  # Beyond this no tilt is looked for, rad
+TILT_STEPS = 361  # Steps from zero to there
+TURN = np.radians(5.0)  # By which a tool turns about x, y or z, rad
 
 
 @dataclass(frozen=True)

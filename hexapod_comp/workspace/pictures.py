@@ -32,14 +32,12 @@ from .reach import FINDINGS
 from .shells import ROTATION, TRANSLATION, Layer, Quantity, shell
 from .study import RINGS, SECTORS
 
-COLOURS = "viridis"
-"""Colour map of effects: even steps for the eye, also in grey and to the colour-blind."""
+COLOURS = "viridis"  # Colour map of effects: even steps for the eye, also in grey and to the colour-blind
 
 CAUSE_COLOURS = ("#ffffff", "#20639b", "#c1432e", "#e3a72f", "#3c8d5a", "#7b4ea3", "#444444", "#d77fb3", "#000000")
 """Of the findings, in their order."""
 
-VIEW_AZIMUTH, VIEW_ELEVATION = -60.0, 20.0
-"""Where the eye stands, degrees."""
+VIEW_AZIMUTH, VIEW_ELEVATION = -60.0, 20.0  # Where the eye stands, degrees
 
 BOX = "#d77f00"
 """Colour of the largest box."""

@@ -42,8 +42,7 @@ SEARCH_CELLS = (24, 48, 96)
 CELLS = (4, 200)
 """Cells along the longest edge that may be asked for: eight million poses are some ten seconds, and half a gigabyte."""
 
-HALVINGS = 24
-"""Of a grid cell: a boundary is found to a fraction of a nanometre."""
+HALVINGS = 24  # Of a grid cell: a boundary is found to a fraction of a nanometre
 
 
 class Examiner:
@@ -312,17 +311,13 @@ def _empty(rotation: np.ndarray, problem: str) -> GeometryError:
     return GeometryError("limits", f"the workspace is empty at the orientation ({angles})°: {problem}")
 
 
-BOX_CELLS = 30
-"""Of the reach's grid along its longest edge; a face is then moved to where the limit really stands."""
-
-FACE_HALVINGS = 10
-"""Of a grid cell, for each face: a thousandth of it."""
+BOX_CELLS = 30  # Of the reach's grid along its longest edge; a face is then moved to where the limit really stands
+FACE_HALVINGS = 10  # Of a grid cell, for each face: a thousandth of it
 
 ROOM = 0.01
 """Share of its sides by which the box stays away from the limits on each side: compensation moves struts too."""
 
-EDGE_SAMPLES = 15
-"""Points along each edge of a box that is examined."""
+EDGE_SAMPLES = 15  # Points along each edge of a box that is examined
 
 FACES = ("−x", "+x", "−y", "+y", "−z", "+z")
 

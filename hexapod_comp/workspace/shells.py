@@ -52,8 +52,7 @@ ROTATION = Quantity("rotation of the tool, largest of three", "m°", 1e3 * 180.0
 SAMPLES = 96
 """Points along a ray at which gaps are looked for: one smaller than a hundredth of the reach can stay unseen."""
 
-LEAST_RINGS, LEAST_SECTORS = 5, 8
-"""A coarser mesh is no picture of a body."""
+LEAST_RINGS, LEAST_SECTORS = 5, 8  # A coarser mesh is no picture of a body
 
 
 @dataclass(frozen=True)

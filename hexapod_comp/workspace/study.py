@@ -23,8 +23,7 @@ from .ranking import RankingRow, beside, ranked, ranking_rows, ranking_text
 from .reach import Reach, poses_at, reach
 from .shells import Shell, shell
 
-EACH = ("alone", "only", "without", "equal")
-"""What an allocation says of each type."""
+EACH = ("alone", "only", "without", "equal")  # What an allocation says of each type
 
 
 def report(study: Study, names: Sequence[str]) -> str:
@@ -136,11 +135,8 @@ def as_json(study: Study) -> dict[str, Any]:
     }
 
 
-WAIT = 10
-"""For a cluster to answer, s."""
-
-PART = 65_536
-"""Poses per part: some seconds of work, and a few megabytes to send."""
+WAIT = 10  # For a cluster to answer, s
+PART = 65_536  # Poses per part: some seconds of work, and a few megabytes to send
 
 
 @dataclass(frozen=True)
@@ -230,20 +226,11 @@ def _on_cluster(parts: Iterable[Part], scheduler: str) -> Iterator[Extremes]:
             yield future.result()
 
 
-COMBINED_POSES = 500
-"""Random poses of the workspace at which budgets are combined."""
-
-WAYS = (RSS, WORST_CASE)
-"""How errors add up where tolerances are allocated."""
-
-DRAWS = 4000
-"""Machines of the Monte Carlo."""
-
-LAYERS = (0.4, 0.7, 1.0)
-"""Nested shells, as shares of the way from the centre to the boundary."""
-
-RINGS, SECTORS = 19, 36
-"""Mesh of a shell."""
+COMBINED_POSES = 500  # Random poses of the workspace at which budgets are combined
+WAYS = (RSS, WORST_CASE)  # How errors add up where tolerances are allocated
+DRAWS = 4000  # Machines of the Monte Carlo
+LAYERS = (0.4, 0.7, 1.0)  # Nested shells, as shares of the way from the centre to the boundary
+RINGS, SECTORS = 19, 36  # Mesh of a shell
 
 
 @dataclass(frozen=True)

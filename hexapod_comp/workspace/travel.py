@@ -19,11 +19,8 @@ from ..pose import Pose
 
 COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")
 
-STEPS = 500
-"""Into so many steps the longest strut is divided; what is narrower than one may be stepped over."""
-
-TURN_STEP, LONGEST_TURN = math.radians(0.5), math.pi
-"""The same for turns, rad, and how far they are followed."""
+STEPS = 500  # Into so many steps the longest strut is divided; what is narrower than one may be stepped over
+TURN_STEP, LONGEST_TURN = math.radians(0.5), math.pi  # The same for turns, rad, and how far they are followed
 
 
 @dataclass(frozen=True)
