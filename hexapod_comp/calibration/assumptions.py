@@ -66,6 +66,16 @@ class Assumptions:
     seen: float = assumed(1.0, "σ", "change of all readings from which on a direction is observable", "one σ of noise")
     weak: float = assumed(5.0, "σ", "observable directions below are listed as weak", "known to a fifth")
 
+    # Lead (lead.py)
+    shortest_period: float = assumed(1e-3, "m", "shortest period that is looked for", "no screw repeats faster")
+    longest_period: float = assumed(30e-3, "m", "longest", "above, a wave is as smooth as what a length map is for")
+    wave_amplitude: float = assumed(10e-6, "m", "prior of amplitudes while periods are compared", "loose")
+    lead_odds: float = assumed(25.0, "", "log odds that show a period, against none and any other", "look-elsewhere")
+    lead_freedom: float = assumed(200.0, "", "fewest readings beyond the parameters that show one", "a wave has 12")
+    lead_readings: int = assumed(5000, "", "readings in which it is looked for first", "plenty; time")
+    lead_agrees: float = assumed(6.0, "σ", "a given or a round lead agrees within", "misfits of other terms")
+    lead_close: float = assumed(5e-3, "", "share of a lead by which another agrees too", "no screws are nearer")
+
     # Thermal (thermal.py)
     thermometer_bin: float = assumed(60.0, "s", "readings of a sensor within that count as one", "twice the filter")
     rate_persistence: float = assumed(3600.0, "s", "how long the rate of a temperature persists", "machines and rooms")

@@ -24,22 +24,11 @@ from .sensitivity import carried
 
 @dataclass(frozen=True)
 class HeldDatum:
-    """A datum and what is held there.
+    """A datum, and which part of the tool's displacement, m, and rotation, rad, in ``base``, is held at zero there."""
 
-    Attributes
-    ----------
-    pose : Pose
-        ``pose_platform_in_base``.
-    part : ndarray, shape (6, 6)
-        Which part of the tool's displacement, m, and rotation, rad, in ``base``, is held at zero: a projection.
-    given_up : ndarray, shape (6,)
-        The tool's displacement and rotation there, by which the priors alone would have moved it: the held part of
-        it is no longer in the model.
-    """
-
-    pose: Pose
-    part: np.ndarray
-    given_up: np.ndarray
+    pose: Pose  # pose_platform_in_base
+    part: np.ndarray  # (6, 6), a projection
+    given_up: np.ndarray  # (6,), by how much the priors alone would move the tool: the held part is not in the model
 
     @property
     def held(self) -> int:
@@ -52,14 +41,9 @@ class HeldDatum:
         return Datum.at(self.pose, self.held)
 
     def moved(self, arms: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """Return by how much holding moved the whole machine, at places beside the datum, shape (N, 6), m and rad.
+        """Return by how much holding moved the machine at places that are arms (N, 3), m, beside the tool there.
 
-        Parameters
-        ----------
-        arms : ndarray, shape (N, 3)
-            From the tool at the datum to the places, m.
-        axes : ndarray, shape (3, 3)
-            In ``base``: all is along and about its columns.
+        Shape (N, 6), m and rad, along and about the columns of `axes`, (3, 3) in ``base``.
         """
         there = np.kron(np.eye(2), axes).T @ self.part @ self.given_up
         return carried(np.tile(there[:, None], (len(arms), 1, 1)), arms)[:, :, 0]
@@ -68,16 +52,12 @@ class HeldDatum:
         """Return what is held and why, for people."""
         lengths = np.linalg.norm(self.given_up[:3]) * 1e6, np.linalg.norm(self.given_up[3:]) * 1e6
         moved = "{:.2f} µm and {:.2f} µrad".format(*lengths)
-        if not self.held:
-            text = "The readings show where the machine stands as a whole; the model moves the tool there by " + moved
-        elif self.held == len(self.part):
-            text = "The readings do not show where the machine stands as a whole, so it stays where it is: there the "
-            text += f"model moves the tool by nothing. Not held, it would move it by {moved}"
-        else:
-            text = (
-                f"Of six ways to shift and turn the whole machine the readings do not show {self.held}; in these the "
-            )
-            text += f"model moves the tool there by nothing. Not held, it would move it by {moved}"
+        of_six = f"Of six ways to shift and turn the whole machine the readings do not show {self.held}; in these the"
+        text = {
+            0: f"The readings show where the machine stands as a whole; the model moves the tool there by {moved}",
+            len(self.part): "The readings do not show where the machine stands as a whole, so it stays where it is: "
+            f"there the model moves the tool by nothing. Not held, it would move it by {moved}",
+        }.get(self.held, f"{of_six} model moves the tool there by nothing. Not held, it would move it by {moved}")
         return f"datum: {self.datum}\n  {text}."
 
     def as_json(self) -> dict[str, Any]:
@@ -92,13 +72,7 @@ class HeldDatum:
 
 
 def refuse_unreachable(geometry: HexapodGeometry, pose: Pose) -> None:
-    """Refuse a datum, ``pose_platform_in_base``, where the machine cannot be.
-
-    Raises
-    ------
-    CalibrationError
-        A limit of the machine forbids the pose.
-    """
+    """Refuse a datum, ``pose_platform_in_base``, that a limit of the machine forbids."""
     refusal = geometry.refusal(pose.position, pose.rotation, strut_lengths(Structure.of(geometry), pose))
     if refusal is not None:
         raise CalibrationError("datum", f"is a pose that the machine cannot take: {refusal}")
@@ -107,21 +81,9 @@ def refuse_unreachable(geometry: HexapodGeometry, pose: Pose) -> None:
 def hold(
     geometry: HexapodGeometry, model: MachineModel, pose: Pose, part: np.ndarray
 ) -> tuple[MachineModel, HeldDatum]:
-    """Return a model that holds the tool at a pose, in a model file's digits, and what is held.
+    """Return a model that holds a part of the tool's error at a pose, in a model file's digits, and what is held.
 
-    Parameters
-    ----------
-    geometry, model : HexapodGeometry, MachineModel
-        The machine as fitted.
-    pose : Pose
-        ``pose_platform_in_base``.
-    part : ndarray, shape (6, 6)
-        As in :class:`HeldDatum`.
-
-    Raises
-    ------
-    CalibrationError
-        A limit of the machine forbids the pose.
+    A pose that a limit of the machine forbids is refused.
     """
     refuse_unreachable(geometry, pose)
     given_up = tool_move(geometry, model, pose)
@@ -136,24 +98,10 @@ def unseen_part(
 ) -> np.ndarray:
     """Return which part of the tool's error at a pose is a motion of the whole machine that readings do not show.
 
-    Parameters
-    ----------
-    estimation : Estimation
-        The readings and what their instruments do not know.
-    tolerance : float
-        Of the structure, m.
-    noise : ndarray, shape (kinds,)
-        Factor on the stated standard deviation of each kind's readings.
-    pose : Pose
-        ``pose_platform_in_base``.
-    before : ndarray, shape (6, 6), optional
-        The part at this pose that earlier readings did not show either; all of it by default.
-
-    Returns
-    -------
-    ndarray, shape (6, 6)
-        A projection of displacement, m, and rotation, rad, in ``base``. Rotations weigh as displacements at the
-        machine's characteristic length.
+    A motion is seen when one of the structure's `tolerance`, m, changes the readings, free of what their instruments do
+    not know (zeros, a beam's direction, a tracker's frame), by more than their `noise`, factors on what is stated.
+    `before` is the part that earlier readings did not show either. The result, (6, 6), projects displacement, m, and
+    rotation, rad, in ``base``; rotations weigh as displacements at the machine's characteristic length.
     """
     measurements, cells = estimation.measurements, estimation.cells
     geometry = measurements.geometry

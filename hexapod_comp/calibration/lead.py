@@ -8,6 +8,7 @@ readings speak for it, and against every other one, by far more than noise would
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,45 +17,10 @@ from .assumptions import ASSUMED
 from .blocks import WAVES
 from .estimator import MEDIAN_TO_SIGMA, Estimation, LinearProblem, Posterior, at_once, solve
 
-SHORTEST, LONGEST = 1e-3, 30e-3
-"""Periods that are looked for, m. Above, a wave is as smooth as what a length map is for."""
+SHORTEST, LONGEST = ASSUMED.shortest_period, ASSUMED.longest_period
 
-STEPS_OF_PERIOD = 32
-"""Steps of the transforms' grid to the shortest period: 0.3 % of a wave of that is lost."""
-
-OVERSAMPLED = 4
-"""Points of the spectrum to the width of a line, 1 over the span of the commands."""
-
-AMPLITUDE = 10e-6
-"""Prior of the amplitudes while periods are compared, m: loose."""
-
-RIVALS = 4
-"""Other lines of the spectrum that must be ruled out, the strongest."""
-
-SURE = 25.0
-"""By this natural logarithm of their odds the readings must prefer a period to none, and to any other."""
-
-LEAST_FREEDOM = 200.0
-"""Fewer readings beyond those that the parameters use up show no period."""
-
-REFINEMENTS = 4
-"""Gauss–Newton steps of a period."""
-
-PROMISING = 3.0
-"""Lines of so many times the spectrum's median may belong to the strongest one: of noise, one in a thousand does."""
-
-PLENTY = 5_000
-"""A period is looked for in so many readings, at random, and in all only where these do not show it."""
-
-SCALE_ROUNDS = 5
-"""Rounds of estimating tolerances and noise without waves."""
-
-AGREES = 6.0
-"""A given lead, or a round one, agrees with the one shown within so many standard errors."""
-
-CLOSE = 5e-3
-"""Share of a lead by which another one agrees all the same: no two kinds of screws are as near, and with few readings a
-turn the standard error is too small."""
+GRID_STEP = SHORTEST / 32.0
+"""Of the transforms, m: 0.3 % of a wave of the shortest period is lost."""
 
 ROUND = (0.5e-3, 0.025 * 0.0254)
 """Screws are made with leads that are whole multiples of one of these, m."""
@@ -62,31 +28,19 @@ ROUND = (0.5e-3, 0.025 * 0.0254)
 
 @dataclass(frozen=True)
 class ScrewLead:
-    """What is known of the screws' lead.
+    """What is known of the screws' lead."""
 
-    Attributes
-    ----------
-    given : float or None
-        By the settings or the geometry, m.
-    shown : float or None
-        The period that the readings show, m; None: they show none.
-    error : float
-        Its standard error, m.
-    odds : float
-        Natural logarithm of the odds by which they prefer it to any other period and to none.
-    """
-
-    given: float | None
-    shown: float | None
-    error: float
-    odds: float
+    given: float | None  # by the settings or the geometry, m
+    shown: float | None  # the period that the readings show, m; None: they show none
+    error: float  # its standard error, m
+    odds: float  # log odds by which they prefer it to any other period and to none
 
     @property
     def used(self) -> float | None:
         """The period to be fitted, m: the given one; else the one shown, or the round number that it stands for."""
         if self.given is not None or self.shown is None:
             return self.given
-        within = AGREES * self.error
+        within = ASSUMED.lead_agrees * self.error
         round_ones = [step * round(self.shown / step) for step in ROUND if within < 0.1 * step]
         near = [lead for lead in round_ones if abs(lead - self.shown) < within]
         return near[0] if near else self.shown
@@ -97,7 +51,7 @@ class ScrewLead:
         if self.given is None or self.shown is None:
             return True
         misses = [abs(self.given / n - self.shown) for n in range(1, MOST_HARMONICS + 1)]
-        return min(misses) < max(AGREES * self.error, CLOSE * self.shown)
+        return min(misses) < max(ASSUMED.lead_agrees * self.error, ASSUMED.lead_close * self.shown)
 
     def __str__(self) -> str:
         given = "" if self.given is None else f"{self.given * 1e3:.6g} mm given"
@@ -110,31 +64,26 @@ class ScrewLead:
 
 
 def look_for_lead(estimation: Estimation, problem: LinearProblem) -> ScrewLead:
-    """Return what readings show of the screws' lead, beside what is given.
+    """Return what readings show of the screws' lead, beside what is given; `problem` is at the nominal machine.
 
-    Parameters
-    ----------
-    estimation : Estimation
-        The readings, and all parameters that may explain them.
-    problem : LinearProblem
-        Linearised at the nominal machine.
+    Where readings are plenty a random part is tried first.
     """
     space, measurements = estimation.space, estimation.measurements
     given = float(space.periods[0]) if np.isfinite(space.periods).all() else None
     odds = 0.0
-    if len(measurements) > PLENTY:
+    if len(measurements) > ASSUMED.lead_readings:
         some = np.zeros(len(measurements), dtype=bool)
-        some[np.random.default_rng(0).choice(len(measurements), PLENTY, replace=False)] = True
+        some[np.random.default_rng(0).choice(len(measurements), ASSUMED.lead_readings, replace=False)] = True
         few = Estimation(measurements.select(some), space, alone=False)
-        odds, best, posterior = _strongest(few, few.linearise(np.zeros(space.size), np.ones(PLENTY))[0])
-    if odds < SURE:
+        odds, best, posterior = _strongest(few, few.linearise(np.zeros(space.size), np.ones(ASSUMED.lead_readings))[0])
+    if odds < ASSUMED.lead_odds:
         odds, best, posterior = _strongest(estimation, problem)
-    if best is None or odds < SURE:
+    if best is None or odds < ASSUMED.lead_odds:
         return ScrewLead(given, None, np.inf, odds)
     # So far the waves counted as noise, which let the priors weigh too much.
     quiet = solve(space, problem, posterior.tolerances, posterior.noise * best.noise, rounds=0)
     rest = _Rest(estimation, problem, quiet)
-    if rest.freedom >= LEAST_FREEDOM:  # few readings leave a quiet fit nothing to tell its noise by
+    if rest.freedom >= ASSUMED.lead_freedom:  # few readings leave a quiet fit nothing to tell its noise by
         best = rest.line(best.frequency)
     if not np.isfinite(best.error):
         return ScrewLead(given, None, np.inf, odds)
@@ -145,9 +94,9 @@ def _strongest(estimation: Estimation, problem: LinearProblem) -> tuple[float, L
     """Return the odds of the period that readings speak for most, that period, and the fit without waves."""
     space = estimation.space
     tolerances = np.where([b.name in WAVES for b in space.blocks], 0.0, space.start_tolerances())
-    posterior = solve(space, problem, tolerances, np.ones(problem.normal.shape[0]), SCALE_ROUNDS)
+    posterior = solve(space, problem, tolerances, np.ones(problem.normal.shape[0]), 5)
     rest = _Rest(estimation, problem, posterior)
-    if rest.freedom < LEAST_FREEDOM:
+    if rest.freedom < ASSUMED.lead_freedom:
         return 0.0, None, posterior
     spectrum = rest.spectrum()
     best = _fundamental(rest, spectrum)
@@ -155,34 +104,17 @@ def _strongest(estimation: Estimation, problem: LinearProblem) -> tuple[float, L
     return min([best.odds, *(best.odds - other.odds for other in others)]), best, posterior
 
 
-@dataclass(frozen=True)
-class Line:
-    """A frequency of the errors and its harmonics: 1/m, its standard error, and the log odds against no such errors.
+class Line(NamedTuple):
+    """A frequency of the errors and its harmonics."""
 
-    `noise` is what it leaves, over what all else had left.
-    """
-
-    frequency: float
-    error: float
-    odds: float
-    noise: float
+    frequency: float  # 1/m
+    error: float  # its standard error
+    odds: float  # log odds against no such errors
+    noise: float  # what it leaves, over what all else had left
 
 
 class _Rest:
-    """What a fit without screw waves leaves of the readings, and how the six lengths move them.
-
-    Attributes
-    ----------
-    left, gains : ndarray, shape (C,) and (C, 6)
-        Residuals of the cells, and their derivatives by the lengths of the struts, over the noise; extreme residuals
-        are cut off.
-    commands : ndarray, shape (C, 6)
-        Of the struts, m.
-    frequencies : ndarray
-        Of the spectrum, 1/m.
-    span : float
-        Of the commands, m.
-    """
+    """What a fit without screw waves leaves of the readings, and how the six lengths move them, over the noise."""
 
     def __init__(self, estimation: Estimation, problem: LinearProblem, posterior: Posterior) -> None:
         over_noise = 1.0 / posterior.noise[problem.kind]
@@ -197,9 +129,8 @@ class _Rest:
         self.span = float(np.ptp(self.commands, axis=0).max())
         self.square = float(self.left @ self.left)
         self.freedom = float(problem.freedom.sum() - posterior.determined.sum())
-        self._step = SHORTEST / STEPS_OF_PERIOD
-        self._size = 2 ** int(np.ceil(np.log2(OVERSAMPLED * self.span / self._step + 1.0)))
-        every = np.arange(self._size // 2 + 1) / (self._size * self._step)
+        self._size = 2 ** int(np.ceil(np.log2(4.0 * self.span / GRID_STEP + 1.0)))
+        every = np.arange(self._size // 2 + 1) / (self._size * GRID_STEP)
         self._searched = (every >= 1.0 / LONGEST) & (every <= 1.0 / SHORTEST)
         self.frequencies = every[self._searched]
 
@@ -207,7 +138,7 @@ class _Rest:
         """Return by how much a wave of each frequency lowers the squares, were struts and readings independent."""
         power = np.zeros(len(self.frequencies))
         for gain, commands in zip(self.gains.T, self.commands.T, strict=True):
-            bins = ((commands - commands.min()) / self._step).round().astype(int)
+            bins = ((commands - commands.min()) / GRID_STEP).round().astype(int)
             line = np.fft.rfft(np.bincount(bins, gain * self.left, self._size), self._size)[self._searched]
             power += np.abs(line) ** 2 / max(0.5 * gain @ gain, np.finfo(float).tiny)
         return power
@@ -217,7 +148,7 @@ class _Rest:
         harmonics = int(np.clip(1.0 / (SHORTEST * frequency), 1, harmonics))
         parameters = 12 * harmonics + 1
         half_width, start = 0.5 / self.span, frequency
-        for _ in range(REFINEMENTS):
+        for _ in range(4):
             less, step, deviation = self._step_to(frequency, harmonics)
             noise = np.sqrt(max(self.square - less, 1e-6 * self.square) / (self.freedom - parameters))
             error = noise * deviation
@@ -274,7 +205,7 @@ class _Rest:
         """
         precision = columns.T @ columns - shared.T @ self._posterior.covariance @ shared
         tight = len(precision) - loose
-        precision[np.diag_indices(tight)] += AMPLITUDE**-2
+        precision[np.diag_indices(tight)] += ASSUMED.wave_amplitude**-2
         covariance = np.linalg.pinv(precision, hermitian=True)
         moment = columns.T @ self.left
         factors = covariance @ moment
@@ -305,10 +236,10 @@ def _fundamental(rest: _Rest, spectrum: np.ndarray) -> Line:
     for n in range(2, MOST_HARMONICS + 1):
         others = np.array([m * strongest / n for m in range(1, MOST_HARMONICS + 1) if m % n])
         at = np.searchsorted(rest.frequencies, others[others <= rest.frequencies[-1]])
-        stands_out = spectrum[np.minimum(at, len(spectrum) - 1)].max() > PROMISING * np.median(spectrum)
+        stands_out = spectrum[np.minimum(at, len(spectrum) - 1)].max() > 3.0 * np.median(spectrum)
         if strongest / n >= 1.0 / LONGEST and stands_out:
             lines.append(rest.line(strongest / n))
-    return next(line for line in lines if line.odds > max(other.odds for other in lines) - SURE)
+    return next(line for line in lines if line.odds > max(other.odds for other in lines) - ASSUMED.lead_odds)
 
 
 def _rivals(frequencies: np.ndarray, spectrum: np.ndarray, best: float, span: float) -> np.ndarray:
@@ -317,4 +248,4 @@ def _rivals(frequencies: np.ndarray, spectrum: np.ndarray, best: float, span: fl
     turns = frequencies[peaks] / best
     apart = np.abs(turns - np.maximum(np.round(turns), 1.0)) * best * span > 1.5
     others = peaks[apart]
-    return frequencies[others[np.argsort(-spectrum[others])][:RIVALS]]
+    return frequencies[others[np.argsort(-spectrum[others])][:4]]
