@@ -38,32 +38,29 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import date as calendar
 from itertools import product
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.polynomial import Legendre, Polynomial, legendre
 
 from ..errors import CalibrationError
 from ..machine.arrays import rms
-from ..machine.field import CROSS_AXES, GridField
-from ..machine.model import MachineModel, ModelOrigin
-from ..measurements.readings import AXES, KINDS, LEAST_NOISE, MeasurementSet, refuse_unmoved
+from ..machine.field import COMPONENTS, CROSS_AXES, GridField
+from ..machine.kinematics import Structure, strut_lengths_batch
+from ..machine.model import MachineModel, ModelOrigin, RealMachine
+from ..machine.region import Region
+from ..machine.temperatures import REFERENCE_TEMPERATURE
+from ..measurements.readings import AXES, CHANNELS, KINDS, LEAST_NOISE, LEAST_TRAVEL, MeasurementSet, refuse_unmoved
 from ..pose import Pose
+from ..virtual.instruments import station_errors
+from .assumptions import ASSUMED
 from .datum import HeldDatum, hold
-from .grid_readings import (
-    Readings,
-    check_complete,
-    datum_of,
-    distinct,
-    grid_of,
-    grid_readings,
-    line_name,
-    nearest_nodes,
-    region_of,
-)
 
 OrderRule = Literal["adjusted-r2", "aicc"] | int
 """How the order of a polynomial is chosen, or the order itself."""
+
+COMPENSATED, FOLLOWED = 10e-6, 0.1e-6
+"""Commands further off the nominal lengths than this, m, are a compensation's; than that, worth a remark."""
 
 POINTS_PER_COEFFICIENT = 3
 """A line of 17 points gets at most 5 coefficients, one of 9 gets 3: no more than the readings can carry."""
@@ -81,47 +78,20 @@ DIRECTIONS = (1, -1)
 
 @dataclass(frozen=True)
 class LineFit:
-    """One polynomial and how well it fits.
+    """One polynomial and how well it fits."""
 
-    Attributes
-    ----------
-    name : str
-        Of the line, or of the lines that share the polynomial.
-    axis : int
-        Along which it runs.
-    nodes : tuple of (int, int)
-        Node indices across, in the order of :data:`hexapod_comp.machine.field.CROSS_AXES`, of every line that it
-        stands for.
-    component : int
-        Index into :data:`hexapod_comp.machine.field.COMPONENTS`.
-    direction : int
-        1, −1, or 0 for a line that was read in one direction, or in none, and stands for both.
-    coordinates, values : ndarray, shape (n,)
-        Along the axis, m in ``base``, and the mean readings after the datum and what other families say have
-        been taken off, m or rad.
-    coefficients : ndarray, shape (order + 1,)
-        Powers of u, which runs from −1 to 1 over the box.
-    r2, adjusted_r2 : float
-        Coefficient of determination, and adjusted for the coefficients spent.
-    residual_std : float
-        Standard deviation of the residuals with n − order − 1 degrees of freedom, m or rad.
-    repeat_std : float
-        Standard deviation of one reading about its mean over the repeated ones, pooled over the line; NaN
-        where nothing was repeated.
-    """
-
-    name: str
-    axis: int
-    nodes: tuple[tuple[int, int], ...]
-    component: int
-    direction: int
-    coordinates: np.ndarray
-    values: np.ndarray
-    coefficients: np.ndarray
+    name: str  # of the line, or of the lines that share the polynomial
+    axis: int  # along which it runs
+    nodes: tuple[tuple[int, int], ...]  # indices across, in the order of CROSS_AXES, of each line that it stands for
+    component: int  # index into machine.field.COMPONENTS
+    direction: int  # 1, -1, or 0 for a line that was read in one direction, or in none, and stands for both
+    coordinates: np.ndarray  # (n,), along the axis, m in base
+    values: np.ndarray  # (n,), mean readings less the datum and what other families say, m or rad
+    coefficients: np.ndarray  # (order + 1,), powers of u, which runs from -1 to 1 over the box
     r2: float
     adjusted_r2: float
-    residual_std: float
-    repeat_std: float
+    residual_std: float  # with n - order - 1 degrees of freedom, m or rad
+    repeat_std: float  # of one reading about its mean over the repeated ones; NaN where nothing was repeated
 
     @property
     def order(self) -> int:
@@ -131,28 +101,13 @@ class LineFit:
 
 @dataclass(frozen=True)
 class LinesFit:
-    """What scheme ``lines`` makes of a machine's readings.
+    """What scheme ``lines`` makes of a machine's readings."""
 
-    Attributes
-    ----------
-    model : MachineModel
-        The field; struts are nominal, and so is the structure, but for the whole base where holding the datum moves it.
-    lines : tuple of LineFit
-        Every polynomial.
-    notes : tuple of str
-        What was odd, left out or assumed.
-    held : HeldDatum
-        Where the tool is held.
-    misfit : str
-        Why the model is not to be trusted: readings that scatter more than :data:`MISFIT` allows when repeated, or
-        lie further off their polynomials than :data:`LINES_MISFIT`; empty if none does.
-    """
-
-    model: MachineModel
+    model: MachineModel  # the field; the rest is nominal, but for the base where holding the datum moves it
     lines: tuple[LineFit, ...]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # what was odd, left out or assumed
     held: HeldDatum
-    misfit: str = ""
+    misfit: str = ""  # why the model is not to be trusted: repeats that scatter, or readings far off their polynomials
 
 
 def fit_lines(
@@ -186,11 +141,11 @@ def fit_lines(
         than a straight line needs, lines at different attitudes, a work frame turned against ``base``.
     """
     _check_order(order)
-    readings, notes = grid_readings(measurements)
-    grid = grid_of(readings)
-    readings = readings._replace(node=nearest_nodes(readings.point, grid))
-    check_complete(readings, grid)
-    zero, remark = datum_of(measurements, grid)
+    readings, notes = _grid_readings(measurements)
+    grid = _grid_of(readings)
+    readings = readings._replace(node=_nearest_nodes(readings.point, grid))
+    _check_complete(readings, grid)
+    zero, remark = _datum_of(measurements, grid)
     notes += remark
     field, fits = _fit_families(readings, GridField(grid, _no_lines(grid), probe=measurements.probe), order, zero)
     notes += _fit_notes(fits, order)
@@ -201,7 +156,7 @@ def fit_lines(
         machine=measurements.geometry.name,
         name=name or f"lines, {'5-D' if (readings.component >= 3).any() else '1-D'}",
         field=field,
-        region=region_of(measurements, grid),
+        region=_region_of(measurements, grid),
         origin=ModelOrigin(date or calendar.today().isoformat(), measurements.files, None, _origin_note(order)),
     )
     notes = list(dict.fromkeys((*measurements.notes, *notes)))
@@ -253,6 +208,173 @@ def _origin_note(order: OrderRule) -> str:
     )
 
 
+# Readings on the grid
+
+
+class Readings(NamedTuple):
+    """Readings on grid lines; every array has one entry a reading."""
+
+    axis: np.ndarray  # of the line
+    component: np.ndarray
+    direction: np.ndarray
+    run: np.ndarray
+    cycle: np.ndarray
+    point: np.ndarray  # (N, 3), commanded place of the measured point in base, m
+    node: np.ndarray  # (N, 3), nearest node along each axis; along the line itself without meaning
+    value: np.ndarray  # m or rad
+    sloping: np.ndarray  # whether the beam's slope is unknown
+
+    def select(self, mask: np.ndarray) -> Readings:
+        """Return those in a mask or at indices."""
+        return Readings(*(array[mask] for array in self))
+
+
+def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
+    """Return the readings on lines parallel to an axis, and remarks on all that was left out."""
+    m = measurements
+    axis_of_run = np.array([-1 if run.base_axis is None else run.base_axis for run in m.runs])
+    axis = axis_of_run[m.run]
+    notes = []
+    others = [m.runs[r].name for r in np.unique(m.run[axis < 0])]
+    if others:
+        what = "not parallel to an axis of base; scheme lines has no use for them"
+        notes.append(f"{len(others)} runs are {what} (first: {others[0]})")
+    if (axis < 0).all():
+        raise CalibrationError("grid lines", "there are none: no run is parallel to an axis of base")
+    component = _components(m, axis >= 0)
+    along_itself = (component == axis) & (m.channel != CHANNELS.index("linear"))
+    if along_itself.any():
+        notes.append("straightness along the line itself was left out")
+    kept = np.flatnonzero((axis >= 0) & ~along_itself)
+    axis, station = axis[kept], m.station[kept]
+    rotations = m.stations.rotations[station]
+    if np.abs(rotations - rotations[0]).max() > 1e-9:
+        raise CalibrationError("grid lines", "must all be read at one attitude of the platform: the field has none")
+    low, high = m.stations.temperatures[station].min(), m.stations.temperatures[station].max()
+    if max(REFERENCE_TEMPERATURE - low, high - REFERENCE_TEMPERATURE) > ASSUMED.least_warming:
+        notes.append(f"read at {low:.1f} to {high:.1f} °C; scheme lines takes the growth for an error at 20 °C")
+    notes += _command_note(m, np.unique(station))
+    direction = m.stations.sense[station, axis].astype(int)
+    node = np.zeros((len(kept), 3), dtype=int)
+    value = _of_the_model(m)[kept] * np.sign(m.directions()[kept, component[kept]])
+    sloping = m.kind[kept] == KINDS.index("straightness")
+    point = m.points()[station]
+    return Readings(axis, component[kept], direction, m.run[kept], m.cycle[kept], point, node, value, sloping), notes
+
+
+def _of_the_model(measurements: MeasurementSet) -> np.ndarray:
+    """Return readings without what the turning of the screws does to them, shape (N,), m or rad.
+
+    Where the geometry has a lead, whoever applies the model undoes that anyway: in the field it would count twice.
+    """
+    m = measurements
+    if not m.geometry.screw_lead.any():
+        return m.value
+    turning = station_errors(m, RealMachine(m.geometry, MachineModel(m.geometry.name)))
+    return m.value - (m.directions() * turning[m.station]).sum(axis=1)
+
+
+def _components(measurements: MeasurementSet, wanted: np.ndarray) -> np.ndarray:
+    """Return which of the six components each reading is of, shape (N,), −1 where a mask does not want it."""
+    weights = np.abs(measurements.directions())
+    turned = wanted & (weights.max(axis=1) < 1.0 - 1e-9)
+    if turned.any():
+        run = measurements.runs[measurements.run[turned.argmax()]]
+        turned_by = np.degrees(np.arccos(np.clip(weights[turned.argmax()].max(), -1.0, 1.0)))
+        problem = f"is read across axes that are turned against those of base by {turned_by:.3g}°"
+        raise CalibrationError(
+            f"run {run.name}", f"{problem}; scheme lines needs a work frame parallel to base, scheme joint does not"
+        )
+    return np.where(wanted, weights.argmax(axis=1), -1)
+
+
+def _command_note(measurements: MeasurementSet, stations: np.ndarray) -> list[str]:
+    """Return a remark on commands that were not quite nominal; refuse a machine that was compensated."""
+    there, nominal = measurements.stations, Structure.of(measurements.geometry)
+    lengths = strut_lengths_batch(nominal, there.positions[stations], there.rotations[stations])
+    most = float(np.abs(there.commands[stations] - lengths).max())
+    if most > COMPENSATED:
+        problem = f"were read under strut commands up to {most * 1e6:.1f} µm off the nominal lengths: compensated?"
+        raise CalibrationError("grid lines", f"{problem} Scheme lines needs the machine as it is")
+    if most <= FOLLOWED:
+        return []
+    return [f"strut commands are up to {most * 1e6:.2f} µm off the nominal lengths, and are taken for nominal"]
+
+
+def _distinct(values: np.ndarray) -> np.ndarray:
+    """Return values, in order, of which no two are the same place."""
+    ordered = np.unique(values)
+    return ordered[np.append(True, np.diff(ordered) > LEAST_TRAVEL)]
+
+
+def _grid_of(readings: Readings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the nodes along x, y, z, m: where the lines stand, or how far they go where none crosses."""
+    grid = []
+    for axis, name in enumerate(AXES):
+        along = readings.point[readings.axis == axis, axis]
+        across = readings.point[readings.axis != axis, axis]
+        nodes = _distinct(across) if len(across) else np.array([along.min(), along.max()])
+        if len(nodes) < 2:
+            raise CalibrationError("grid", f"lines stand at one {name} only ({nodes[0] * 1e3:g} mm); two are needed")
+        grid.append(nodes)
+    return grid[0], grid[1], grid[2]
+
+
+def _nearest_nodes(points: np.ndarray, grid: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the index of the node nearest to each point along each axis, shape (N, 3)."""
+    columns = [np.abs(points[:, axis, None] - nodes).argmin(axis=1) for axis, nodes in enumerate(grid)]
+    return np.stack(columns, axis=1)
+
+
+def _line_name(grid: Sequence[np.ndarray], axis: int, node: Sequence[int]) -> str:
+    places = zip(CROSS_AXES[axis], node, strict=True)
+    return f"{AXES[axis]} line at " + ", ".join(f"{AXES[a]} {grid[a][n] * 1e3:.1f}" for a, n in places) + " mm"
+
+
+def _check_complete(readings: Readings, grid: Sequence[np.ndarray]) -> None:
+    """Refuse a family of which a line, a channel of a line, or a line's end is missing."""
+    for axis in np.unique(readings.axis):
+        family = readings.select(readings.axis == axis)
+        every = set(product(*(range(len(grid[a])) for a in CROSS_AXES[axis])))
+        for component in np.unique(family.component):
+            rows = family.component == component
+            there = {(int(i), int(j)) for i, j in family.node[rows][:, CROSS_AXES[axis]]}
+            if every - there:
+                first = _line_name(grid, axis, min(every - there))
+                what = f"{COMPONENTS[component]} on the {first}"
+                missing = f"of {len(every)} lines of the rectangular grid {len(every - there)} were not measured"
+                raise CalibrationError(what, f"is missing; {missing}")
+        _check_ends(family, int(axis), grid)
+
+
+def _check_ends(family: Readings, axis: int, grid: Sequence[np.ndarray]) -> None:
+    """Refuse a line that ends within the grid: a polynomial says nothing beyond its readings."""
+    low, high = grid[axis][0], grid[axis][-1]
+    for node in sorted({(int(i), int(j)) for i, j in family.node[:, CROSS_AXES[axis]]}):
+        on_line = (family.node[:, CROSS_AXES[axis]] == node).all(axis=1)
+        reach = family.point[on_line, axis]
+        if reach.min() > low + LEAST_TRAVEL or reach.max() < high - LEAST_TRAVEL:
+            problem = f"is read from {reach.min() * 1e3:.1f} to {reach.max() * 1e3:.1f} mm"
+            wanted = f"the grid reaches from {low * 1e3:.1f} to {high * 1e3:.1f} mm"
+            raise CalibrationError(_line_name(grid, axis, node), f"{problem}, but {wanted}")
+
+
+def _datum_of(measurements: MeasurementSet, grid: Sequence[np.ndarray]) -> tuple[np.ndarray, list[str]]:
+    """Return where each line is zero, shape (3,), m in ``base``: home's place of the measured point."""
+    home = measurements.geometry.home
+    point = home.position + home.rotation @ measurements.probe
+    datum = np.array([min(max(p, nodes[0]), nodes[-1]) for p, nodes in zip(point, grid, strict=True)])
+    beyond = [name for name, p, d in zip(AXES, point, datum, strict=True) if abs(p - d) > LEAST_TRAVEL]
+    if not beyond:
+        return datum, []
+    return datum, [f"home lies outside the box along {', '.join(beyond)}: lines are zero at the end next to it"]
+
+
+def _region_of(measurements: MeasurementSet, grid: Sequence[np.ndarray]) -> Region:
+    """Return the places of the measured point that the grid covers."""
+    return Region(np.array([[nodes[0] for nodes in grid], [nodes[-1] for nodes in grid]]), measurements.probe)
+
+
 # From readings to polynomials
 
 
@@ -281,21 +403,7 @@ def _fit_families(
 def _fit_family(
     readings: Readings, component: int, axis: int, field: GridField, order: OrderRule, datum: np.ndarray
 ) -> list[LineFit]:
-    """Return the polynomials of the lines along an axis for one component.
-
-    Parameters
-    ----------
-    readings : Readings
-        All of the component.
-    component, axis : int
-        Which.
-    field : GridField
-        What the families before this one say.
-    order : str or int
-        As :func:`fit_lines` has it.
-    datum : ndarray, shape (3,)
-        Where lines are zero, m.
-    """
+    """Return the polynomials of the lines along an axis for one component; `field` has the families before this one."""
     family = readings.select(readings.axis == axis)
     first = _priority(component, readings)[0]
     # Lines of which the first family has predicted everything that differs between them share what is left.
@@ -303,7 +411,7 @@ def _fit_family(
     family = family._replace(value=family.value - _predicted(field, family, component))
     fits = []
     for nodes, group in _groups(family, axis, field.grid, shared):
-        name = line_name(field.grid, axis, nodes[0])
+        name = _line_name(field.grid, axis, nodes[0])
         if len(nodes) > 1:
             name += f" and {len(nodes) - 1} beside it along {AXES[first]}"
         fits += _fit_line(group, name, nodes, field.grid[axis], order, datum[axis])
@@ -374,7 +482,7 @@ def _fit_line(
     fits = []
     for way, (mean, repeat) in means.items():
         read = np.isfinite(mean)
-        line = _regress(_parameter(place[read], along), mean[read], order, name)
+        line = _regress(_parameter(place[read], along), mean[read], order, name, float(along[-1] - along[0]))
         fits.append(LineFit(name, axis, nodes, component, way, place[read], mean[read], *line, repeat))
     if not group.sloping.any():
         fits = _zeroed(fits, float(_parameter(np.array(datum), along)))
@@ -387,8 +495,8 @@ def _parameter(coordinate: np.ndarray, along: np.ndarray) -> np.ndarray:
 
 
 def _places(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distinct places on a line, and each reading's index among them."""
-    places = distinct(coordinates)
+    """Return the _distinct places on a line, and each reading's index among them."""
+    places = _distinct(coordinates)
     return places, np.abs(coordinates[:, None] - places).argmin(axis=1)
 
 
@@ -401,7 +509,7 @@ def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> n
     runs, run = np.unique(group.run, return_inverse=True)
     if len(runs) == 1:
         return group.value
-    powers = max(1, len(distinct(u)) // POINTS_PER_COEFFICIENT)
+    powers = max(1, len(_distinct(u)) // POINTS_PER_COEFFICIENT)
     shape = legendre.legvander(u, powers - 1)
     smooth = np.concatenate([shape * (group.direction == way)[:, None] for way in ways], axis=1)
     unknown = (run[:, None] == np.arange(len(runs))).astype(float)
@@ -449,14 +557,18 @@ def _zeroed(fits: list[LineFit], u: float) -> list[LineFit]:
     return shifted
 
 
-def _regress(u: np.ndarray, values: np.ndarray, order: OrderRule, name: str) -> tuple[np.ndarray, float, float, float]:
+def _regress(
+    u: np.ndarray, values: np.ndarray, order: OrderRule, name: str, reach: float
+) -> tuple[np.ndarray, float, float, float]:
     """Return coefficients in powers of u, R², adjusted R² and the standard deviation of the residuals.
 
     Legendre's polynomials keep the regression well conditioned (Mou & King have powers of x: the same functions).
     """
     count = len(u)
     if count < FEWEST_POINTS:
-        raise CalibrationError(name, f"has {count} points in a direction; {FEWEST_POINTS} are needed")
+        span = f"{count} points in a direction, over {1e3 * reach:.4g} mm"
+        wanted = f"{FEWEST_POINTS} are needed: one every {1e3 * reach / (FEWEST_POINTS - 1):.4g} mm or closer"
+        raise CalibrationError(name, f"has {span}; {wanted} (step_mm of a campaign)")
     most = count // POINTS_PER_COEFFICIENT - 1
     orders = [min(order, most)] if isinstance(order, int) else range(most + 1)
     candidates = [_polynomial(u, values, k) for k in orders]
