@@ -342,7 +342,8 @@ def test_families_may_be_missing_whole(quiet, linear_truth):
 
 def test_too_few_points(geometry):
     coarse = replace(QUIET, cell=0.1016, step=0.1016)
-    with pytest.raises(CalibrationError, match="has 5 points in a direction, over 406.4 mm; 6 are needed: one every 81.28 mm"):
+    wanted = r"has 5 points in a direction, over 406\.4 mm; 6 are needed: one every 81\.28 mm"
+    with pytest.raises(CalibrationError, match=wanted):
         fit_lines(template(coarse, geometry))
 
 
