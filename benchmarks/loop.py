@@ -29,9 +29,8 @@ from sensor_msgs.msg import JointState
 
 from hexapod_comp.loop.processes import PrivateDomain
 from hexapod_comp.pose import Pose
-from hexapod_comp.ros.messages import pose_message
-from hexapod_comp.ros.runtime import COMMAND_QOS
-from hexapod_comp.ros.stamps import nanoseconds_of
+from hexapod_comp.ros.base import COMMAND_QOS
+from hexapod_comp.ros.messages import nanoseconds_of, pose_message
 
 RATES = (250.0, 500.0, 1000.0, 0.0)
 """Commands per second; 0 is flat out: the next one leaves when the last was answered."""

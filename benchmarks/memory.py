@@ -23,7 +23,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState, Temperature
 
 from hexapod_comp.loop.processes import NodeProcess, PrivateDomain
-from hexapod_comp.ros.ros_session import RosSession
+from hexapod_comp.ros.process import RosSession
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -18,7 +18,7 @@ from functools import partial
 import numpy as np
 
 from hexapod_comp.formats.texts import aligned
-from hexapod_comp.ros.middleware import avoid_shared_memory
+from hexapod_comp.ros import avoid_shared_memory
 
 from . import cannot_run
 from .faults import visible

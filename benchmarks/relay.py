@@ -16,11 +16,10 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
-from hexapod_comp.ros.arguments import Program
+from hexapod_comp.ros.base import COMMAND_QOS, STATE_QOS, MachineNode
 from hexapod_comp.ros.messages import StrutMessage
-from hexapod_comp.ros.parameters import read_table
-from hexapod_comp.ros.running import run
-from hexapod_comp.ros.runtime import COMMAND_QOS, STATE_QOS, MachineNode
+from hexapod_comp.ros.parameters import Program, read_table
+from hexapod_comp.ros.process import run
 
 STAMP = slice(4, 12)
 """Where a message's stamp stands among its bytes."""

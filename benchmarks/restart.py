@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.pose import Pose
-from hexapod_comp.ros.running import keep_discovery_local
+from hexapod_comp.ros import keep_discovery_local
 from hexapod_comp.testing.bench import BEST_EFFORT, Bench
 
 AT = Pose([0.0004, -0.0003, 0.4006], np.eye(3))

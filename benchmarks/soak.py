@@ -35,10 +35,9 @@ from std_msgs.msg import UInt64
 
 from hexapod_comp.loop.processes import PrivateDomain, waited_for_processor
 from hexapod_comp.pose import Pose
-from hexapod_comp.ros.messages import pose_message
-from hexapod_comp.ros.running import SPIN_PERIOD
-from hexapod_comp.ros.runtime import COMMAND_QOS, EVENT_QOS
-from hexapod_comp.ros.stamps import nanoseconds_of
+from hexapod_comp.ros.base import COMMAND_QOS, EVENT_QOS
+from hexapod_comp.ros.messages import nanoseconds_of, pose_message
+from hexapod_comp.ros.process import SPIN_PERIOD
 
 NODES = ("compensator", "strut_drive")
 

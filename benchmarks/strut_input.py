@@ -29,7 +29,7 @@ from tqdm import tqdm
 from hexapod_comp.compensation.compensator import NO_SHIFT, Compensator
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
-from hexapod_comp.ros.command_inputs import StrutInput
+from hexapod_comp.ros.interface import StrutInput
 from hexapod_comp.virtual.named import find_model
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))

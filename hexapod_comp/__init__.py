@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from .compensation.checks import CheckResult as CheckResult
     from .compensation.checks import check as check
     from .compensation.compensator import Compensator as Compensator
-    from .compensation.state import Correction as Correction
+    from .compensation.compensator import Correction as Correction
     from .errors import HexapodError as HexapodError
     from .formats.csv import read_poses as read_poses
     from .formats.json import json_text as json_text
@@ -65,8 +65,7 @@ _HOMES = {
     "calibration.report": ("fit_report",),
     "calibration.check": ("Verification", "update_model", "verify_model"),
     "compensation.checks": ("CheckResult", "check"),
-    "compensation.compensator": ("Compensator",),
-    "compensation.state": ("Correction",),
+    "compensation.compensator": ("Compensator", "Correction"),
     "errors": ("HexapodError",),
     "formats.csv": ("read_poses",),
     "formats.json": ("json_text",),

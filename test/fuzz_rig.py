@@ -26,8 +26,8 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from hexapod_comp.machine.geometry import STRUT_NAMES
-from hexapod_comp.ros.running import autostart
-from hexapod_comp.ros.runtime import MachineNode
+from hexapod_comp.ros.base import MachineNode
+from hexapod_comp.ros.process import autostart
 
 HOME_LENGTHS = closed_form_lengths(HOME)
 LEGAL = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP, Transition.TRANSITION_ACTIVATE)

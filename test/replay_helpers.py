@@ -15,9 +15,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.compensation.compensator import Compensator, pack_pose
 from hexapod_comp.compensation.journal import SNAPSHOT_PERIOD, Journal, Source, sources_text, time_of
-from hexapod_comp.compensation.state import pack_pose
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.pose import Pose

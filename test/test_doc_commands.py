@@ -29,8 +29,8 @@ from hexapod_comp.cli.parsers import make_parser
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.linuxcnc import parameters as linuxcnc_bridge
 from hexapod_comp.ros import compensator_parameters, strut_drive_parameters
-from hexapod_comp.ros.health import ERROR
 from hexapod_comp.ros.parameters import Taken
+from hexapod_comp.ros.status import ERROR
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "doc").glob("*.md"))]

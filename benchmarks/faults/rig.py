@@ -34,9 +34,9 @@ from hexapod_comp.formats.paths import config_file
 from hexapod_comp.loop.processes import NodeProcess, PrivateDomain
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.pose import Pose
+from hexapod_comp.ros.base import COMMAND_QOS, NEWEST_QOS, STATE_QOS
 from hexapod_comp.ros.client import LISTENER_QOS, TRACK_QOS
 from hexapod_comp.ros.messages import message_pose, pose_message
-from hexapod_comp.ros.runtime import COMMAND_QOS, NEWEST_QOS, STATE_QOS
 
 from .controller import Controller, Mode
 from .logdisk import LogDisk

@@ -154,7 +154,7 @@ def _figures(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...]) ->
 
 def _publish(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...]) -> None:
     """Keep shells on a latched topic, for RViz and Foxglove, until Ctrl-C."""
-    from ..ros.shell_markers import TOPIC, show_shells
+    from ..viewer.shells import TOPIC, show_shells
     from ..workspace.shells import TRANSLATION, Layer
     from ..workspace.study import mesh_effects
 

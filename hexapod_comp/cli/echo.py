@@ -16,10 +16,9 @@ HZ_PERIOD = 1.0
 def run(args: argparse.Namespace) -> int:
     """Run the verb until Ctrl-C, --count or --seconds; 0 when a message has come."""
     from ..formats.json import json_text
-    from ..ros import heard_signals
+    from ..ros import heard_signals, keep_discovery_local
     from ..ros.echo import DISCOVERY_TIME, Echo, EchoedMessage, published_topics
-    from ..ros.ros_session import QUIET, RosSession
-    from ..ros.running import SPIN_PERIOD, keep_discovery_local
+    from ..ros.process import QUIET, SPIN_PERIOD, RosSession
 
     keep_discovery_local()
     signals = heard_signals()

@@ -10,8 +10,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the verb until Ctrl-C."""
     from ..machine.geometry import load_geometry
     from ..ros import heard_signals
-    from ..ros.page import WatchPage
-    from ..ros.watching import watch
+    from ..viewer.page import WatchPage, watch
 
     geometry = load_geometry(args.machine)
     page = WatchPage(geometry, args.host, args.port)

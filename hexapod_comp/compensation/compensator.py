@@ -2,30 +2,164 @@
 
 Data flow of one command: tool pose in the work frame → platform pose in ``base`` → nominal lengths; → model
 run backwards → corrections → ramp → commands → limits on nominal and on compensated values → `Correction`.
-A refused command leaves the compensator exactly as it was.
+A refused command leaves the compensator exactly as it was. All of it is the core's (``compensation.c``): this module
+holds the core's state, names its parts for snapshots, and says in words what the core refuses.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
 from typing import Any
 
 import numpy as np
 
-from ..core import Status, Struct, ffi, lib
+from ..core import QUATERNION_NORM_TOLERANCE, Status, Struct, ffi, lib
 from ..core.batch import backwards, given, solve_linear
-from ..errors import HexapodError, ModelError, NotConvergedError, NotFiniteError, PoseError
-from ..machine.geometry import TOOL, HexapodGeometry
+from ..errors import (
+    HexapodError,
+    LimitError,
+    ModelError,
+    NotConvergedError,
+    NotFiniteError,
+    OutsideFieldError,
+    PoseError,
+)
+from ..machine.field import GridField
+from ..machine.geometry import STRUT_NAMES, TOOL, HexapodGeometry, pose_text
 from ..machine.kinematics import forward_error, jacobian
 from ..machine.model import MachineModel, MotionState, RealMachine, core_model, write_temperatures
-from ..machine.temperatures import HUMIDITY, PARTS, Lag, Temperatures, check_part
+from ..machine.temperatures import HUMIDITY, Lag, Temperatures, check_part
+from ..machine.temperatures import PARTS as MEASURED_PARTS
 from ..pose import Pose
-from .findings import pose_of, refusal
-from .state import PLACES, Correction, named_parts, pack_pose, read_parts
 
 DEFAULT_RAMP_RATE = 1e-3
 """How fast a change of model, temperature or enabling moves a strut, m/s."""
+
+SAME_PLACE = 1e-5
+"""Nominal lengths that differ by no more, m, are the same place: what a controller's decimals round; the core's."""
+
+PARTS = {
+    "motion_low": 9,
+    "motion_sense": 9,
+    "nominal": 6,
+    "correction": 6,
+    "command": 6,
+    "ramp": 6,
+    "time": 1,
+    "platform_position": 3,
+    "platform_rotation": 9,
+    "model_position": 3,
+    "model_rotation": 9,
+    "enabled": 1,
+    "changed": 1,
+    "resumes": 1,
+    "ramp_rate": 1,
+    "received": 1,
+    "published": 1,
+    "ahead_by_stamp": 6,
+    "ahead_by_receipt": 6,
+    "smooth_speed": 6,
+}
+"""Parts of a snapshot, and how many numbers each is: the members of ``hc_last``, and the ramp's rate. A recording holds
+them under these names, so a new meaning needs a new name."""
+
+PLACES = ("platform_", "model_")
+"""Beginnings of the names of parts that are poses."""
+
+BESIDE_NUMBERS = ("temperatures", "lags", "tool")
+"""What a compensator's snapshot holds beside the numbers of its state."""
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Everything about one compensated command.
+
+    Attributes
+    ----------
+    tool : str
+        Name of the tool in use.
+    tool_pose : Pose
+        Commanded ``pose_tool_in_work``.
+    platform_pose : Pose
+        The same as ``pose_platform_in_base``.
+    model_pose : Pose
+        Pose q with q ∘ E(q) = platform_pose, for which the real structure's lengths were taken.
+    sense : ndarray, shape (9,)
+        Directions of motion used: x, y, z of the measured point, six struts.
+    temperatures : dict of str to float
+        Readings used, °C; parts without one are at 20 °C. ``humidity``, a fraction, is 0.5 without one.
+    nominal : ndarray, shape (6,)
+        Strut lengths of the nominal machine, m.
+    correction : ndarray, shape (6,)
+        command − nominal, m.
+    command : ndarray, shape (6,)
+        What the struts are told, m.
+    predicted_error : ndarray, shape (6,)
+        Displacement (m) and rotation (rad) of the tool along the axes of ``base`` that nominal lengths
+        would leave, to first order in the corrections: J⁻¹ times minus the model's correction.
+    condition : float
+        Condition number of the nominal pose.
+    enabled : bool
+        Compensation was on.
+    ramping : bool
+        A change of model, temperature or enabling has not been fully taken up yet.
+    outside_field : bool
+        The field's value was held at the boundary of its box.
+    outside_box : bool
+        The command is outside the region in which the model was measured.
+    """
+
+    tool: str
+    tool_pose: Pose
+    platform_pose: Pose
+    model_pose: Pose
+    sense: np.ndarray
+    temperatures: dict[str, float]
+    nominal: np.ndarray
+    correction: np.ndarray
+    command: np.ndarray
+    predicted_error: np.ndarray
+    condition: float
+    enabled: bool
+    ramping: bool
+    outside_field: bool
+    outside_box: bool
+
+
+class Phase(Enum):
+    """What the next command starts from; :data:`TRANSITIONS` says what leads from one to another."""
+
+    FIRST = "no command yet, or none since a reset: it may be one step from where the struts are known to be"
+    RESUMED = "at measured struts, of which it takes over what the machine may have corrected; then it ramps"
+    NEW_TOOL = "another tool was taken: it must be where the struts are"
+    RAMPING = "at the last command, while a change is taken up along the ramp"
+    RUNNING = "at the last command"
+
+
+TRANSITIONS = {
+    Phase.FIRST: {"reset": Phase.FIRST, "reset to struts": Phase.RESUMED, "tool": Phase.FIRST, "change": Phase.FIRST,
+                  "command": Phase.RUNNING, "ramped": Phase.RAMPING},
+    Phase.RESUMED: {"reset": Phase.FIRST, "reset to struts": Phase.RESUMED, "tool": Phase.RESUMED,
+                    "change": Phase.RESUMED, "command": Phase.RUNNING, "ramped": Phase.RAMPING},
+    Phase.NEW_TOOL: {"reset": Phase.FIRST, "reset to struts": Phase.RESUMED, "tool": Phase.NEW_TOOL,
+                     "change": Phase.NEW_TOOL, "command": Phase.RUNNING, "ramped": Phase.RAMPING},
+    Phase.RAMPING: {"reset": Phase.FIRST, "reset to struts": Phase.RESUMED, "tool": Phase.NEW_TOOL,
+                    "change": Phase.RAMPING, "command": Phase.RUNNING, "ramped": Phase.RAMPING},
+    Phase.RUNNING: {"reset": Phase.FIRST, "reset to struts": Phase.RESUMED, "tool": Phase.NEW_TOOL,
+                    "change": Phase.RAMPING, "command": Phase.RUNNING, "ramped": Phase.RAMPING},
+}  # fmt: skip
+"""What each event makes of each phase. ``change``: of model, temperature, humidity, or the switch; ``command``: an
+accepted one with which all is taken up; ``ramped``: one after which something is still to be taken up. A refused
+command changes nothing. doc/states.md shows this table, and tests hold the core to it."""
+
+
+def pack_pose(pose: Pose) -> Struct:
+    """Return a pose as the core takes it."""
+    return Struct("hc_pose", {"position": pose.position, "rotation": pose.rotation})
+
 
 NO_SHIFT = pack_pose(Pose.identity())
 """Frame of poses that are in ``base`` already."""
@@ -86,6 +220,7 @@ class Compensator:
         self._machine: RealMachine | None = None
         self._parts = parts = named_parts(self._state)
         self.command, self.nominal, self.correction = (parts[name] for name in ("command", "nominal", "correction"))
+        self.command_at, self.correction_at = self._at.last.command, self._at.last.correction  # the same, for C
         self.motion = MotionState(parts["motion_low"], parts["motion_sense"])
         self._tool_pose = np.frombuffer(ffi.buffer(ffi.addressof(self._estimated.tool)), dtype=float)
 
@@ -100,6 +235,15 @@ class Compensator:
         return bool(self._parts["ramp"].any() or self._at.last.changed)
 
     @property
+    def phase(self) -> Phase:
+        """What the next command starts from."""
+        if self._at.last.resumes:
+            return Phase.RESUMED if self._at.last.resumes == lib.HC_FROM_MEASURED else Phase.NEW_TOOL
+        if math.isnan(self._at.last.nominal[0]):
+            return Phase.FIRST
+        return Phase.RAMPING if self.ramping else Phase.RUNNING
+
+    @property
     def enabled(self) -> bool:
         """Whether it compensates."""
         return bool(self._at.last.enabled)
@@ -108,11 +252,11 @@ class Compensator:
     def temperatures(self) -> Temperatures:
         """Readings in use, and how far late parts are behind them."""
         view = self._state.view
-        values = {name: float(view["temperatures"][n]) for n, name in enumerate(PARTS) if name in self._sensed}
+        values = {name: float(view["temperatures"][n]) for n, name in enumerate(MEASURED_PARTS) if name in self._sensed}
         if HUMIDITY in self._sensed:
             values[HUMIDITY] = float(view["humidity"])
         late, lags = range(self._constants.at.late.count), {}
-        for n, name in enumerate(PARTS):
+        for n, name in enumerate(MEASURED_PARTS):
             if late and not math.isnan(view["began"][n]):
                 behind = [float(view["behind"][n][k]) for k in late]
                 lags[name] = Lag(float(view["began"][n]), float(view["newest"][n]), behind)
@@ -168,7 +312,7 @@ class Compensator:
             Unknown name, a value outside the allowed range, or no time where it is needed.
         """
         check_part(name)
-        if lib.hc_set_temperature(self._at, PARTS.index(name), value, time):
+        if lib.hc_set_temperature(self._at, MEASURED_PARTS.index(name), value, time):
             Temperatures().set(name, value)  # raises for a value out of range, and else it is the time
             raise ModelError(f"time of the temperature of {name}", "must be finite, s: the model has time constants")
         self._sensed.add(name)
@@ -261,7 +405,7 @@ class Compensator:
         """Return what, beside geometry and model, decides the next answer, by name.
 
         ``temperatures``, °C by name, and ``humidity`` among them, ``lags`` of what follows them late, ``tool``, and
-        each of :data:`~hexapod_comp.compensation.state.PARTS`: a list of numbers, matrices by rows.
+        each of :data:`PARTS`: a list of numbers, matrices by rows.
         """
         parts = {name: np.ravel(part).astype(float).tolist() for name, part in self._parts.items()}
         return {**parts, **self.temperatures.snapshot(), "tool": self.geometry.tool_name}
@@ -306,7 +450,7 @@ class Compensator:
             known, then the time of receipt counts.
         frame : Struct, optional
             Frame of the commanded pose seen from ``base``, packed by
-            :func:`~hexapod_comp.compensation.state.pack_pose`; the geometry's work frame by default.
+            :func:`pack_pose`; the geometry's work frame by default.
         received : float, optional
             When the command came, s, on a clock that nobody sets; NaN: not known, the speed is then limited by
             `time` alone.
@@ -435,3 +579,85 @@ class Compensator:
         if backwards(self._state, *given_pose, low, sense, *unused, commands) == Status.NOT_CONVERGED:
             raise NotConvergedError("the error field is too steep to be undone at this pose")
         return commands - self.nominal
+
+
+def named_parts(state: Struct) -> dict[str, np.ndarray]:
+    """Return the parts of a compensator's state by their names in a snapshot, each in the state's memory."""
+    last = state.view["last"]
+    parts = {}
+    for name in PARTS:
+        body, _, part = name.partition("_")
+        if name == "ramp_rate":
+            parts[name] = state.view[name]
+        else:
+            parts[name] = last[body][part] if body in ("platform", "model") else last[name]
+    return parts
+
+
+def read_parts(snapshot: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return the numbers of a compensator's snapshot by name.
+
+    Raises
+    ------
+    ModelError
+        A name is missing or unknown, or has not as many numbers as it should.
+    """
+    for name in sorted({*PARTS} ^ ({*snapshot} - {*BESIDE_NUMBERS})):
+        raise ModelError(f"snapshot.{name}", "is missing" if name in PARTS else "is unknown to this release")
+    parts = {name: np.asarray(snapshot[name], dtype=float) for name in PARTS}
+    for name, size in PARTS.items():
+        if parts[name].shape != (size,):
+            raise ModelError(f"snapshot.{name}", f"must be {size} numbers", parts[name].size)
+    return parts
+
+
+def refusal(
+    answer: Any,
+    geometry: HexapodGeometry,
+    model: MachineModel,
+    numbers: Sequence[float] = (),
+    stands: Pose | None = None,
+) -> HexapodError:
+    """Return what the core found wrong with a command, its numbers if it was given so, as an error in words; `stands`:
+    ``pose_platform_in_base`` of the last command."""
+    status = answer.status
+    if status == Status.QUATERNION or (status == Status.NOT_FINITE and answer.strut < 0):
+        return _pose_error(status, numbers)
+    if status == Status.NOT_CONVERGED:
+        return NotConvergedError("the error field is too steep to be undone at this pose")
+    if status == Status.OUTSIDE_FIELD:
+        return _outside_error(pose_of(answer.platform), model.field)
+    if status == Status.TOOL_CHANGED:
+        return _tool_error(answer.strut, answer.value, geometry, stands or geometry.home)
+    return geometry.limits.error(status, answer.strut, answer.compensated, answer.value)
+
+
+def pose_of(pose: Any) -> Pose:
+    """Return an ``hc_pose`` as a pose."""
+    numbers = np.frombuffer(ffi.buffer(ffi.addressof(pose)), dtype=float)
+    return Pose(numbers[:3], numbers[3:].reshape(3, 3))
+
+
+def _tool_error(strut: int, way: float, geometry: HexapodGeometry, stands: Pose) -> LimitError:
+    problem = (
+        f"since the change to tool {geometry.tool_name!r} no command was where the struts are: "
+        f"{STRUT_NAMES[strut]} would move by {way * 1e3:.4f} mm, allowed {SAME_PLACE * 1e3:g} mm; in "
+        f"{geometry.work_name} the tool is at {pose_text(geometry.tool_pose(stands))}"
+    )
+    return LimitError("tool_changed", problem, way, SAME_PLACE, strut, "nominal")
+
+
+def _pose_error(status: int, numbers: Sequence[float]) -> PoseError:
+    if status == Status.NOT_FINITE:
+        return PoseError("pose must be finite", list(numbers), "not_finite")
+    norm = math.hypot(*numbers[3:])
+    problem = f"quaternion must have norm 1 within {QUATERNION_NORM_TOLERANCE:g}, not {norm:.6g}"
+    return PoseError(problem, list(numbers[3:]), "quaternion")
+
+
+def _outside_error(platform: Pose, field: GridField) -> OutsideFieldError:
+    box = field.box * 1e3
+    point = (platform.position + platform.rotation @ field.probe) * 1e3
+    low, high = (", ".join(f"{v:g}" for v in corner) for corner in box)
+    problem = f"the measured point ({point[0]:.3f}, {point[1]:.3f}, {point[2]:.3f}) mm is outside the field's box"
+    return OutsideFieldError(f"{problem} ({low})…({high}) mm, in base", point, box)

@@ -35,8 +35,7 @@ from ..formats.json import json_content
 from ..machine.geometry import BASE, STRUT_NAMES, TOOL, WORK, HexapodGeometry, parse_geometry
 from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL, parse_model
-from .compensator import Compensator
-from .state import BESIDE_NUMBERS
+from .compensator import BESIDE_NUMBERS, Compensator
 
 FORMAT = 5
 """Version of pages."""

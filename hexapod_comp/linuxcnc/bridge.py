@@ -30,15 +30,13 @@ from std_msgs.msg import Bool, UInt64
 from std_srvs.srv import Trigger
 
 from ..errors import CommandError, HexapodError
-from ..ros.arguments import Program
-from ..ros.command_source import CommandSource
-from ..ros.health import ERROR, OK, WARN, Flow, Refusals, seconds, status_prefix
-from ..ros.messages import StrutMessage, StrutReader
-from ..ros.parameters import read_table
-from ..ros.running import keep_discovery_local, run
-from ..ros.runtime import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, STATE_QOS, MachineNode
-from ..ros.stamps import StampClock, StampGate, nanoseconds_of, stamp_of
-from ..ros.vital_signs import LATCHED_QOS
+from ..compensation.guards import Sample, StampClock, StampGate
+from ..ros import keep_discovery_local
+from ..ros.base import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, LATCHED_QOS, STATE_QOS, MachineNode
+from ..ros.messages import StrutMessage, StrutReader, stamp_of
+from ..ros.parameters import Program, read_table
+from ..ros.process import run
+from ..ros.status import ERROR, OK, WARN, Flow, Refusals, seconds, status_prefix
 from .hal import COUNTS, METRES, HalComponent, pins, pose_from_axes
 
 PARAMETERS = read_table("""
@@ -417,8 +415,7 @@ class LinuxcncBridgeNode(MachineNode):
         self._states_pub = self.publish_on(JointState, "strut_states", STATE_QOS)
         self.speak_for(self._options["component"])
         self._subscription = self.obey(JointState, "strut_corrections", self._on_correction, self._look_at_publishers)
-        topic, count = self._subscription.topic_name, self._subscription.get_publisher_count
-        self._source = CommandSource(self, topic, count, self._options["allow_several_publishers"])
+        self._source = self.sender_of(self._subscription, self._options["allow_several_publishers"])
         self._check = self.every(CHECK_PERIOD, self._check_state)
         self._reset = CompensatorReset(self, self._status, self._options)
 
@@ -555,26 +552,22 @@ class LinuxcncBridgeNode(MachineNode):
         self._source.look(time.monotonic())
 
     def _on_correction(self, data: bytes, number: int | None) -> None:
-        now = time.monotonic()
-        self._heard.tick(now)
-        self._source.hear(number, now)
+        sample = Sample(time.monotonic())
+        self._heard.tick(sample.now)
+        self._source.hear(number, sample.now)
         try:
-            if self._source.problem:
-                raise CommandError(self._source.reason, self._source.problem)
-            stamp = nanoseconds_of(self._reader.take(data).header.stamp)
-            self._check_stamp(stamp, now)
-            self._guard.offer(self._reader.lengths.tolist(), now)
-            self._stamps.accept(stamp, now)
+            self._source.check(sample)
+            self._reader.sample(data, sample)
+            if not sample.stamp:
+                raise CommandError("stamp_past", "it has no stamp, and answers no command of ours")
+            self._stamps.max_age = self._options["timeout"]  # its stamp is ours, and comes from this clock
+            self._stamps.check(sample)
+            self._status.latency = sample.age
+            self._guard.offer(sample.values or (), sample.now)
+            self._stamps.accept(sample)
         except CommandError as error:
-            self._refusals.add(error.reason, str(error), now)
+            self._refusals.add(error.reason, str(error), sample.now)
             self.warn_of(error.reason, f"correction refused ({error.reason}): {error}")
-
-    def _check_stamp(self, stamp: int, now: float) -> None:
-        """Refuse a correction of a command that is long past: its stamp is ours, and comes from this clock."""
-        if not stamp:
-            raise CommandError("stamp_past", "it has no stamp, and answers no command of ours")
-        self._stamps.max_age = self._options["timeout"]
-        self._status.latency = self._stamps.check(stamp, now)
 
     # ---- state ----
 

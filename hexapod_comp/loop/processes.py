@@ -13,8 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 
-from ..ros.children import end_with_parent
-from ..ros.middleware import avoid_shared_memory
+from ..ros import avoid_shared_memory, end_with_parent
 
 # DDS derives its UDP ports from the domain: 7400 + 250 · domain + offset. Offsets 0 and 1 are multicast,
 # participants take 10, 11, 12, …; nobody uses 2 to 9, and domains above 101 reach into the ephemeral ports.

@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ..compensation.compensator import Compensator
+from ..compensation.compensator import BESIDE_NUMBERS, PLACES, Compensator, pack_pose
 from ..compensation.journal import Entry, Page, Snapshot, time_of
-from ..compensation.state import BESIDE_NUMBERS, PLACES, pack_pose
 from ..errors import FrameError, HexapodError
 from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import os
 import signal
@@ -9,16 +10,16 @@ import sys
 from collections.abc import Callable
 from types import FrameType
 
+PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+"""Where Fast DDS looks for a user's profile: up to version 2 (ROS 2 Jazzy), and from version 3."""
+
+_LIBC = ctypes.CDLL(None)  # at once: end_with_parent runs between fork and exec
+
 
 def start(module: str) -> int:
     """Run a program's module; without the compiled core it ends with one line that says how to build it.
 
     A signal while the module is loaded ends the process at once: there is nothing yet to put in order.
-
-    Parameters
-    ----------
-    module : str
-        Full name of a module with a function ``main``.
     """
     _at_the_end(lambda *_: os._exit(0))
     try:
@@ -62,6 +63,32 @@ def open_streams() -> None:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
+
+
+def avoid_shared_memory() -> None:
+    """Let Fast DDS receive by UDP only, unless the user has a profile of their own.
+
+    A process killed while it holds a lock in the shared memory of another stalls that other for seconds.
+    The environment of this process, and so of its children, is changed, before ROS is initialised in it.
+    """
+    from ..formats.paths import config_folder
+
+    if not any(os.environ.get(name) for name in PROFILE_VARIABLES):
+        os.environ[PROFILE_VARIABLES[0]] = str(config_folder() / "fastdds.xml")
+        # Without it ROS overrules what a profile says of memory.
+        os.environ.setdefault("RMW_FASTRTPS_USE_QOS_FROM_XML", "1")
+
+
+def keep_discovery_local() -> None:
+    """Keep discovery to this machine, and out of shared memory, unless the user's environment says otherwise."""
+    avoid_shared_memory()
+    if "ROS_STATIC_PEERS" not in os.environ:
+        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+def end_with_parent(number: signal.Signals = signal.SIGTERM) -> None:
+    """Ask Linux to send this process a signal when its parent dies, however it dies."""
+    _LIBC.prctl(1, number)  # PR_SET_PDEATHSIG
 
 
 def start_compensator() -> int:

@@ -16,11 +16,10 @@ from std_srvs.srv import SetBool
 from ..errors import NoAnswerError
 from ..machine.trajectory import Path
 from ..pose import Pose
-from .health import status_prefix
-from .messages import StrutReader, message_pose, pose_message
-from .ros_session import RosSession
-from .runtime import COMMAND_QOS, EVENT_QOS, NEWEST_QOS
-from .stamps import nanoseconds_of
+from .base import COMMAND_QOS, EVENT_QOS, NEWEST_QOS
+from .messages import StrutReader, message_pose, nanoseconds_of, pose_message
+from .process import RosSession
+from .status import status_prefix
 
 LISTENER_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
 """Answers are all kept until they are read: a witness must not lose any."""
@@ -33,39 +32,19 @@ ANSWER_TIMEOUT = 5.0
 
 @dataclass
 class Sent:
-    """One command on its way.
+    """One command on its way."""
 
-    Attributes
-    ----------
-    sent_at, answered_at : float
-        Monotonic times, s; NaN while unanswered.
-    refused : str
-        How many commands the compensator had refused before, as it says itself.
-    command, correction : ndarray, shape (6,)
-        The answer, m.
-    too_old : str
-        How many of the refused ones had waited for too long.
-    """
-
-    sent_at: float
+    sent_at: float  # monotonic times, s; NaN while unanswered
     refused: str
     too_old: str
     message: PoseStamped
-    answered_at: float = float("nan")
-    command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))
-    correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))
+    answered_at: float = float("nan")  # monotonic times, s; NaN while unanswered
+    command: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # shape (6,): The answer, m
+    correction: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))  # shape (6,): The answer, m
 
 
 class LoopClient:
-    """Commands the compensator and listens to everything around it.
-
-    Parameters
-    ----------
-    frame_id : str
-        Frame of the commanded poses.
-    namespace : str
-        Where the machine's nodes are.
-    """
+    """Commands the compensator and listens to everything around it."""
 
     def __init__(self, frame_id: str = "base", namespace: str = "") -> None:
         self._session = RosSession("hexapod_comp_client", namespace)
@@ -143,13 +122,7 @@ class LoopClient:
         return message_pose(self._estimate)
 
     def spin_until(self, condition: Callable[[], bool], timeout: float, what: str) -> None:
-        """Handle messages until a condition holds.
-
-        Raises
-        ------
-        NoAnswerError
-            It does not within `timeout` seconds; names `what`.
-        """
+        """Handle messages until a condition holds."""
         end = time.monotonic() + timeout
         while not condition():
             left = end - time.monotonic()
@@ -206,11 +179,6 @@ class LoopClient:
 
         A pose that a busy computer handed over too late is sent again, with a new stamp: the machine waits where it is,
         and the next pose on a path would be too far from there.
-
-        Raises
-        ------
-        NoAnswerError
-            The command was lost, or refused, with the compensator's reason and what it says is to be done.
         """
         end = entry.sent_at + timeout
         while not _answered(entry):
@@ -243,18 +211,6 @@ class LoopClient:
 
         A command waits for the answer to the one before, so that a stall of any process delays the path
         instead of making it jump.
-
-        Parameters
-        ----------
-        path : Path
-            Poses and rate.
-        each : callable, optional
-            Called with the index after every pose sent.
-
-        Raises
-        ------
-        NoAnswerError
-            A command was lost or refused; the path ends there.
         """
         entries: list[Sent] = []
         self.track = []

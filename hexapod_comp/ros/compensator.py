@@ -1,46 +1,96 @@
 """The compensator node: tool pose commands in, compensated strut commands and pose estimates out.
 
-It holds no mathematics: it converts, calls :class:`~hexapod_comp.compensation.compensator.Compensator`, publishes, and
-reports what it refused. Run it with ``ros2 run hexapod_comp compensator`` or
+It holds no mathematics. A command is read, passes the guards, goes through the core, is published, written into the
+journal and added to the track of the struts: :meth:`CompensatorNode._take`. A reading passes its own guards, and is
+estimated and published: :meth:`CompensatorNode._take_states`. Run it with ``ros2 run hexapod_comp compensator`` or
 ``python -m hexapod_comp.ros.compensator``; doc/nodes.md lists topics, services and parameters.
 """
 
 from __future__ import annotations
 
+import math
 import sys
 import time
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
+import numpy as np
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
 
-from ..compensation.compensator import Compensator
-from ..compensation.journal import time_of
-from ..compensation.state import pack_pose
-from ..errors import CommandError, HexapodError, TooEarlyError, shorten
-from .command_inputs import command_input
-from .command_source import CommandSource, OwnTopic
-from .compensator_outputs import CompensatorOutputs
-from .compensator_parameters import PARAMETERS, PROGRAM
-from .compensator_status import ADVICE, OTHERWISE, CompensatorStatus
-from .feedback import Feedback
-from .health import WARN, seconds
-from .journal import JournalTopics
-from .machine_files import MachineFiles
-from .operating import OperatorServices
-from .pacing import Pacing
-from .reloading import ReloadService
-from .running import keep_discovery_local, run
-from .runtime import ACKNOWLEDGED_WITHIN, MachineNode
-from .stamps import stamp_of
-from .tools import ToolChoice, frame_ids
-from .travel import TravelReports
-
-CHECK_PERIOD = 0.05
-"""How often the node looks whether its state has changed, s."""
+from ..compensation.compensator import Compensator, pack_pose
+from ..compensation.guards import Guard, OneSender, Sample
+from ..compensation.thermal import Thermometers
+from ..core import Struct
+from ..errors import CommandError, HexapodError, LimitError, TooEarlyError, shorten
+from ..machine.temperatures import HUMIDITY, check_part
+from . import keep_discovery_local
+from .base import (
+    ACKNOWLEDGED_WITHIN,
+    CHECK_PERIOD,
+    COMMAND_QOS,
+    NEWEST_QOS,
+    SENSOR_QOS,
+    MachineNode,
+)
+from .interface import (
+    PARAMETERS,
+    PROGRAM,
+    JournalTopics,
+    MachineFiles,
+    Outputs,
+    command_input,
+    frame_ids,
+    temperature_rules,
+)
+from .messages import StrutBytes, StrutReader, period, read_message
+from .process import run
+from .rclpy_compat import Alarm
+from .requests import Requests
+from .status import ADVICE, OTHERWISE, WARN, CompensatorStatus, seconds
 
 ESTIMATE_PERIOD = 0.02
 """How often the pose is estimated from the node's own commands while there is no feedback, s."""
+
+JITTER = 0.02
+"""A wait of a command up to this, s, is nothing to speak of, nor is an alarm that rings so late."""
+
+
+class Standing(Guard):
+    """Refuses commands in a frame that the machine has not, and while one of the standing guards has a problem."""
+
+    def __init__(self, frames: dict[str, Struct], status: CompensatorStatus) -> None:
+        self._frames, self._status = frames, status
+
+    def check(self, sample: Sample) -> None:
+        """Raise a CommandError: ``frame_id``, or the reason of a guard that stops the machine."""
+        if sample.frame_id not in self._frames:
+            allowed = ", ".join(self._frames)
+            raise CommandError("frame_id", f"frame_id must be one of {allowed}, not {shorten(sample.frame_id)}")
+        for guard in self._status.standing:
+            if guard.problem:
+                raise CommandError(guard.reason, guard.problem)
+
+
+class Start(Guard):
+    """Lets the first command begin where the struts are known to be, and asks for readings where these are required."""
+
+    def __init__(self, compensator: Compensator, status: CompensatorStatus) -> None:
+        self._compensator, self._status = compensator, status
+
+    def check(self, sample: Sample) -> None:
+        """Raise a CommandError, ``no_feedback``; else the core knows where the struts stand."""
+        status, now = self._status, sample.now
+        if not (status.fresh_start or status.options["require_feedback"]):
+            return
+        fed = status.fed(now)
+        if status.options["require_feedback"] and not fed:
+            since = f"for {seconds(status.feedback.age(now))} s" if status.feedback.count else "yet"
+            raise CommandError("no_feedback", f"no strut_states {since}")
+        if status.fresh_start:
+            self._compensator.reset(status.track.start(now, fed))
 
 
 class CompensatorNode(MachineNode):
@@ -49,12 +99,10 @@ class CompensatorNode(MachineNode):
     def __init__(self, **options: Any) -> None:
         super().__init__("compensator", PARAMETERS, **options)
         self._files = MachineFiles(self._options)
-        self._status = status = CompensatorStatus(self._options, self.clock)
-        self._stamps = status.command_stamps
-        self._commands, self._following, self._last_known = status.commands, status.following, status.last_known
-        self._fresh_start = self._looks_closer = True
+        self._status = CompensatorStatus(self._options, self.clock)
+        self._stamps, self._track, self._flow = self._status.command_stamps, self._status.track, self._status.commands
         self._logged_problem = ""
-        self._unestimated: int | None = None
+        self._unestimated = 0  # stamp of an answer whose pose was not estimated yet, ns
         self._compensator: Compensator | None = None
 
     @property
@@ -85,18 +133,19 @@ class CompensatorNode(MachineNode):
         try:
             with self.all_or_nothing():
                 self._open_topics(ids)
-                self._journal = JournalTopics(self, self.compensator, self._files.sources, self._options, ids)
         except Exception:
             self._compensator = None  # else the end would say goodbye on topics that there are not
             raise
-        what = f"{geometry.name!r} with {self._files.described(self.compensator.model)}"
-        self.get_logger().info(f"configured machine {what} in {time.perf_counter() - began:.2f} s")
+        what = "the ideal model, which corrects nothing (parameter model_file)"
+        what = what if self._files.ideal else f"model {self.compensator.model.name!r}"
+        took = time.perf_counter() - began
+        self.get_logger().info(f"configured machine {geometry.name!r} with {what} in {took:.2f} s")
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start to take commands; of those that came before none is replayed."""
         self._forget()
-        self._last_known.begin(time.monotonic())
+        self._track.begin(time.monotonic())
         self._active = True
         self.get_logger().info("ready")
         return super().on_activate(state)
@@ -104,9 +153,11 @@ class CompensatorNode(MachineNode):
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close topics and forget the machine."""
         self._active = False
-        self._journal.close(time.monotonic())
+        self._journal.finish(time.monotonic())
         self._forget()
-        self._close_topics()
+        self.close_ends(*self._ends)
+        for part in (self._requests, self._pacing, self._outputs, self._journal):
+            part.close()
         self._compensator = None
         return super().on_cleanup(state)
 
@@ -114,9 +165,8 @@ class CompensatorNode(MachineNode):
         """Take what has been set while the node runs; the rest is looked up where it is needed."""
         self._status.take_parameters()
         if self._compensator is not None:
-            self._feedback.take_parameters()
+            self._thermometers.follow(*temperature_rules(self._options))
             self._compensator.set_ramp_rate(self._options["ramp_rate"])
-            self._look_closer()
 
     def say_goodbye(self) -> None:
         """Publish a last status and wait until it has arrived."""
@@ -124,142 +174,96 @@ class CompensatorNode(MachineNode):
             return
         self._active = False
         self._check_state()
-        self._journal.close(time.monotonic())
-        self._diagnostics_pub.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+        self._journal.finish(time.monotonic())
+        for publisher in (self._diagnostics_pub, self._commands):
+            publisher.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
         self._outputs.wait()
 
     def _open_topics(self, ids: dict[str, str]) -> None:
-        self.speak_for(self.compensator.geometry.name)
-        self._outputs = outputs = CompensatorOutputs(self, self.compensator, self._options, self._files)
-        inputs = (self.compensator, self._status, self._options)
-        self._feedback = Feedback(self, *inputs, outputs.measured, self._look_at_publishers)
-        self._input = asked = command_input(self.compensator, self._options)
-        self._subscription = commands = self.obey(asked.kind, asked.topic, self._on_command, self._look_at_publishers)
-        allowed = self._options["allow_several_publishers"]
-        self._pacing = Pacing(self, self._options, self._take, self._refuse_waiting)
-        self._status.watch(
-            CommandSource(self, commands.topic_name, commands.get_publisher_count, allowed),
-            OwnTopic(self, outputs.command_topic, allowed),
-            self._pacing,
+        compensator, options, names = self.compensator, self._options, self._options["joint_names"]
+        self.speak_for(compensator.geometry.name)
+        deadline, several = options["command_timeout"], options["allow_several_publishers"]
+        self._commands = self.publish_on(JointState, "strut_commands", COMMAND_QOS, deadline)
+        self._corrections = self.publish_on(JointState, "strut_corrections", COMMAND_QOS, deadline)
+        self._command_out, self._correction_out = StrutBytes(names=names), StrutBytes(names=names)
+        self._fastest = compensator.geometry.limits.speed
+        self._outputs = Outputs(self, compensator, options, self._commands.topic_name)
+        self._input = asked = command_input(compensator, options)
+        heard = self.obey(asked.kind, asked.topic, self._on_command, self._look_at_publishers)
+        states = self.obey(JointState, "strut_states", self._on_states, self._look_at_publishers, qos=NEWEST_QOS)
+        self._reader = StrutReader(names)
+        self._ends: list[Any] = [self._commands, self._corrections, heard, states]
+        self._thermometers = Thermometers(*temperature_rules(options))
+        sensing: dict[str, OneSender] = {}
+        sensors = (
+            ("temperatures", Temperature, self._take_temperature),
+            (HUMIDITY, RelativeHumidity, self._take_humidity),
         )
-        self._hear = self._status.source.hear
-        self._reload = ReloadService(self, self._files, self.compensator, self._status.failed_reloads)
-        self._operator = OperatorServices(self, self.compensator, self._status, self._forget)
-        self._tools = ToolChoice(self, self.compensator, self._status)
-        self._travel = TravelReports(self, self.compensator, self._status, ids)
-        self._timers_open = [
-            self.every(CHECK_PERIOD, self._check_state),
-            self.every(ESTIMATE_PERIOD, self._estimate_from_commands),
-        ]
-        self._marking = self.at_rate("marker_rate", self._publish_markers)
+        for topic, kind, take in sensors:
+            callback = partial(self._on_sensor, topic, kind, take)
+            sensor = self.obey(kind, topic, callback, self._look_at_publishers, qos=SENSOR_QOS)
+            self._ends.append(sensor)
+            sensing[topic] = self.sender_of(sensor, several or options["allow_several_thermometers"])
+        self._source, self._measuring = self.sender_of(heard, several), self.sender_of(states, several)
+        own = self.sender_of(self._commands, several)
+        status = self._status
+        status.configure(compensator, self._thermometers, self._source, own, self._measuring, sensing)
+        self._command_guards: tuple[Guard, ...] = (
+            Standing(self._frames, status),
+            Start(compensator, status),
+            self._stamps,
+        )
+        self._pacing = Pacing(self, self._take, self._refuse_waiting)
+        self._requests = Requests(
+            self, compensator, status, self._files, ids, self._forget, lambda: self._outputs.answered
+        )
+        self._journal = JournalTopics(self, compensator, self._files.sources, ids)
+        self._ends.append(self.every(CHECK_PERIOD, self._check_state))
+        self._ends.append(self.every(ESTIMATE_PERIOD, self._estimate_from_commands))
 
-    def _close_topics(self) -> None:
-        for timer in self._timers_open:
-            self.destroy_timer(timer)
-        self._marking.close()
-        self.destroy_subscription(self._subscription)
-        services = self._reload, self._operator, self._tools, self._travel
-        for part in (*services, self._pacing, self._feedback, self._outputs):
-            part.close()
-        for publisher in self._journal.publishers:
-            self.destroy_publisher(publisher)
-
-    # ---- messages in ----
+    # ---- a command ----
 
     def _on_command(self, data: bytes, number: int | None) -> None:
         if not self._active:
             return
         now = time.monotonic()
-        if self._hear(number, now):
-            self._look_closer()
-        self._pacing.command(data, now)
+        self._source.hear(number, now)
+        if self._pacing.waiting:
+            self._pacing.add(data, now)
+        elif (wait := self._take(data, now)) > 0.0:
+            self._pacing.begin(data, now, wait)
 
     def _take(self, data: bytes, now: float) -> float:
-        """Answer or refuse a command at the monotonic time `now`, s; return how long it must wait instead, s."""
-        stamp = 0
+        """Answer or refuse a command that came, or whose turn it is, now; return how long it must wait instead, s."""
+        sample, compensator, status = Sample(now), self.compensator, self._status
         try:
-            stamp, frame_id, numbers = self._input.read(data)
-            if numbers is None:
+            self._input.read(data, sample)
+            if sample.values is None:
                 return 0.0
-            frame = self._frames.get(frame_id)
-            if frame is None or self._looks_closer:
-                self._examine(frame_id, now)
-            self._stamps.check(stamp, now)
-            when = stamp or self.get_clock().now().nanoseconds  # zero means now
-            self.compensator.step(numbers, time_of(stamp, bool(stamp)), frame, now)
+            for guard in self._command_guards:
+                guard.check(sample)
+            stamp = sample.stamp
+            made = stamp * 1e-9 if stamp else math.nan
+            compensator.step(sample.values, made, self._frames[sample.frame_id], now)
         except TooEarlyError as error:
             return error.wait
         except HexapodError as error:
-            self._refuse(stamp, error, now)
+            self._refuse(sample.stamp, error, now)
             return 0.0
-        self._outputs.command(when)
-        self.compensator.published(out := time.monotonic())
-        self._journal.answered(when, frame_id, numbers, (now, out), bool(stamp))
-        if self._fresh_start:
-            self._fresh_start = False
-            self._look_closer()
-        self._stamps.accept(stamp, now)
-        self._status.answered(self.compensator.command, frame_id, when, now)
+        when, outputs = stamp or self.get_clock().now().nanoseconds, self._outputs  # zero means now
+        speed_over, outputs.answered = period(outputs.answered, when), when
+        self._commands.publish(self._command_out.made(compensator.command_at, when, speed_over, self._fastest))
+        self._corrections.publish(self._correction_out.made(compensator.correction_at, when))
+        outputs.array()
+        compensator.published(out := time.monotonic())
+        self._journal.answered(when, sample.frame_id, sample.values, (now, out), bool(stamp))
+        self._stamps.accept(sample)
+        self._track.tell(compensator.command.tolist(), now)
+        self._flow.count += 1
+        self._flow.last = now
+        status.fresh_start, status.last_answered, status.frame_id = False, when, sample.frame_id
         self._unestimated = when
         return 0.0
-
-    def _examine(self, frame_id: str, now: float) -> None:
-        """Refuse an unknown frame, while a guard has a problem, or missing feedback; start from what there is."""
-        if frame_id not in self._frames:
-            allowed = ", ".join(self._frames)
-            raise CommandError("frame_id", f"frame_id must be one of {allowed}, not {shorten(frame_id)}")
-        guard = self._status.problem()
-        if guard is not None:
-            raise CommandError(guard.reason, guard.problem)
-        fed = self._status.fed(now)
-        if self._options["require_feedback"] and not fed:
-            feedback = self._status.feedback
-            since = f"for {seconds(feedback.age(now))} s" if feedback.count else "yet"
-            raise CommandError("no_feedback", f"no strut_states {since}")
-        if self._fresh_start:
-            self.compensator.reset(self._last_known.struts(now, fed))
-
-    def _look_closer(self) -> None:
-        """Find out whether the next commands must be examined."""
-        required = self._fresh_start or self._options["require_feedback"]
-        self._looks_closer = required or self._status.problem() is not None
-
-    def _look_at_publishers(self) -> None:
-        """Look who publishes what only one may: now and then, and when somebody comes or goes."""
-        self._status.look(time.monotonic())
-        self._look_closer()
-
-    # ---- messages out ----
-
-    def _estimate_from_commands(self) -> None:
-        """Without feedback, estimate the pose from the newest command, at a rate that leaves the loop alone."""
-        stamp, self._unestimated = self._unestimated, None
-        if stamp is None or not self._active or self._status.fed(time.monotonic()):
-            return
-        try:
-            pose = self.compensator.estimate(self.compensator.command)
-            self._outputs.estimate(pose, stamp_of(stamp))
-        except HexapodError as error:
-            self._status.bad_feedback.add(error.reason, str(error), time.monotonic())
-            self.warn_of("estimate " + error.reason, f"no pose estimate: {error}")
-
-    def _publish_markers(self) -> None:
-        if self._active:
-            self._outputs.show(corrects=not self._fresh_start)
-
-    # ---- state ----
-
-    def _forget(self) -> None:
-        """Forget the last command, but not where it has sent the struts."""
-        if not self._fresh_start:
-            self._last_known.tell(self.compensator.command, self._commands.last)
-        self.compensator.reset()
-        self._pacing.clear()
-        self._unestimated = None
-        self._fresh_start = self._looks_closer = True
-        self._outputs.forget()
-        self._stamps.forget()
-        self._following.forget()
 
     def _refuse_waiting(self, data: bytes, error: HexapodError, now: float) -> None:
         self._refuse(self._input.stamp(data), error, now)
@@ -267,30 +271,197 @@ class CompensatorNode(MachineNode):
     def _refuse(self, stamp: int, error: HexapodError, now: float) -> None:
         self._journal.refused(stamp, error.reason, str(error))
         self._status.refusals.add(error.reason, str(error), now)
-        self._outputs.signs.stop(True)
+        self._outputs.stop(True)
         self.warn_of(error.reason, f"command refused ({error.reason}): {error}; {ADVICE.get(error.reason, OTHERWISE)}")
 
-    def _check_state(self) -> None:
-        self._look_at_publishers()
-        now = time.monotonic()
-        self._status.log_space.look()
-        self._look_closer()
-        self._tell_problem()
-        self._status.prediction_problem = self._outputs.prediction_problem
-        self._reload.look()
-        self._travel.look(now)
-        self._journal.tick(now)
-        self._outputs.signs.stop(not self._active or self._status.stops(now))
-        level, text = self._status.judged(self.compensator, now) if self._active else (WARN, "not active")
-        self.tell(level, text, lambda: self._status.values(self.compensator, self._fresh_start, now))
+    # ---- a reading ----
 
-    def _tell_problem(self) -> None:
-        """Log what stops the machine, once."""
-        guard = self._status.problem()
+    def _on_states(self, data: bytes, number: int | None) -> None:
+        now = time.monotonic()
+        try:
+            self._take_states(data, number, now)
+        except HexapodError as error:
+            self._ignore("feedback " + error.reason, error.reason, f"strut_states ignored: {error}", str(error), now)
+
+    def _take_states(self, data: bytes, number: int | None, now: float) -> None:
+        """Take measured struts, also while the node is inactive: a start must begin where they are."""
+        sample, track = Sample(now), self._track
+        self._hear(self._measuring, number, sample)
+        self._reader.sample(data, sample)
+        self._status.reading_stamps.check(sample)
+        struts = sample.values or ()
+        track.check_stroke(struts)
+        # Before what cannot be is left aside: then the strut or its encoder is broken, and even one reading is said.
+        if self._active and track.follow(struts, now - sample.age):
+            self._status.bad_feedback.add(track.reason, track.problem, now)
+        track.check_jump(sample)
+        pose = self.compensator.estimate(np.array(struts))
+        track.accept(sample)
+        self._status.reading_stamps.accept(sample)
+        self._status.feedback.tick(now)
+        if self._active:
+            self._outputs.estimate(pose, sample.stamp)
+            self._outputs.nominal(sample.stamp, track.mean)
+
+    def _hear(self, sender: OneSender, number: int | None, sample: Sample) -> None:
+        """Refuse a reading while it is not clear whose it is."""
+        if sender.hear(number, sample.now):
+            self._look_at_publishers()
+        sender.check(sample)
+
+    def _on_sensor(
+        self, topic: str, kind: type, take: Callable[[Any, float], None], data: bytes, number: int | None
+    ) -> None:
+        # Dated by arrival: sensors need not stamp, clocks may be set, and what a transport delays a drift does not
+        # notice.
+        now, what = time.monotonic(), topic.removesuffix("s")
+        try:
+            self._hear(self._status.sensing[topic], number, Sample(now))
+            take(read_message(data, kind), now)
+        except CommandError as error:
+            self._ignore(topic, error.reason, f"{what} ignored: {error}", str(error), now)
+        except HexapodError as error:
+            self._ignore(what, what, f"{what} ignored: {error}", str(error), now)
+
+    def _take_temperature(self, message: Temperature, now: float) -> None:
+        name = message.header.frame_id
+        check_part(name)
+        self.compensator.set_temperature(name, self._thermometers.take(name, message.temperature, now), now)
+
+    def _take_humidity(self, message: RelativeHumidity, now: float) -> None:
+        self.compensator.set_humidity(self._thermometers.take(HUMIDITY, message.relative_humidity, now), now)
+
+    def _ignore(self, cause: str, reason: str, warning: str, text: str, now: float) -> None:
+        """Count and log what was not usable."""
+        if self._active:
+            self._status.bad_feedback.add(reason, text, now)
+            self.warn_of(cause, warning)
+
+    def _estimate_from_commands(self) -> None:
+        """Without feedback, estimate the pose from the newest command, at a rate that leaves the loop alone."""
+        stamp, self._unestimated = self._unestimated, 0
+        if not stamp or not self._active or self._status.fed(time.monotonic()):
+            return
+        try:
+            self._outputs.estimate(self.compensator.estimate(self.compensator.command), stamp)
+        except HexapodError as error:
+            self._status.bad_feedback.add(error.reason, str(error), time.monotonic())
+            self.warn_of("estimate " + error.reason, f"no pose estimate: {error}")
+
+    # ---- state ----
+
+    def _forget(self) -> None:
+        """Forget the last command, but not where it has sent the struts."""
+        self.compensator.reset()
+        for part in (self._track, self._stamps, self._pacing):
+            part.reset()
+        self._unestimated = self._outputs.answered = 0  # the velocity of the next command is zero
+        self._status.fresh_start = True
+
+    def _look_at_publishers(self) -> None:
+        """Look who publishes what only one may: now and then, and when somebody comes or goes."""
+        self._status.look(time.monotonic())
+
+    def _check_state(self) -> None:
+        now, status = time.monotonic(), self._status
+        status.look(now)
+        status.log_space.look()
+        guard = status.problem()
         problem = guard.problem if guard is not None and self._active else ""
         if problem and problem != self._logged_problem:
             self.get_logger().error(f"refusing commands: {problem}")
         self._logged_problem = problem
+        self._requests.look(now)
+        self._journal.tick(now)
+        self._outputs.stop(not self._active or status.stops(now))
+        level, text = status.judged(now) if self._active else (WARN, "not active")
+        self.tell(level, text, lambda: status.values(now))
+
+
+class Pacing:
+    """Commands that come sooner than the struts may go there, bunched on their way or in a burst after a pause: they
+    wait, in their order, for up to the parameter ``catch_up_within``, s.
+
+    All that wait are refused when one has waited longer; while the node itself stood still, none has waited for the
+    struts. 0: only the newest waits, and those that it replaces are dropped.
+    """
+
+    def __init__(
+        self,
+        node: CompensatorNode,
+        take: Callable[[bytes, float], float],
+        refuse: Callable[[bytes, HexapodError, float], None],
+    ) -> None:
+        self._node, self._status, self._take, self._refuse = node, node._status, take, refuse
+        self.waiting: deque[tuple[float, bytes]] = deque()
+        self._due = self._stood_still = 0.0
+        self._alarm = Alarm(node, node.guard.around("go_on", self._go_on))
+
+    @property
+    def _longest(self) -> float:
+        return float(self._status.options["catch_up_within"])
+
+    def begin(self, message: bytes, now: float, wait: float) -> None:
+        """Let a command wait, s, that came too early."""
+        self._wait_in_line(message, now)
+        self._wait_for_struts(now, wait)
+
+    def add(self, message: bytes, now: float) -> None:
+        """Let a command wait behind others."""
+        if not self._longest:
+            self._status.dropped += len(self.waiting)
+            self.waiting.clear()
+            self._status.behind.note(now)
+        elif len(self.waiting) == COMMAND_QOS.depth:
+            self._refuse_all(now)
+        self._wait_in_line(message, now)
+
+    def reset(self) -> None:
+        """Forget what waits."""
+        self.waiting.clear()
+
+    def close(self) -> None:
+        """Forget what waits, and take nothing any more."""
+        self.reset()
+        self._alarm.close()
+
+    def _wait_in_line(self, message: bytes, now: float) -> None:
+        self.waiting.append((now - self._stood_still, message))  # when it came, without the time the node stood still
+        self._status.waited += 1
+
+    def _wait_for_struts(self, now: float, wait: float) -> None:
+        self._due = now + wait
+        self._alarm.set(wait)
+
+    def _age(self, came: float, now: float) -> float:
+        return now - self._stood_still - came
+
+    def _go_on(self) -> None:
+        """Take what waits, as far as the struts may go by now."""
+        if (late := time.monotonic() - self._due) > JITTER:
+            self._stood_still += late
+        if not self._node.active:
+            self.waiting.clear()
+        while self.waiting:
+            now = time.monotonic()
+            came, message = self.waiting[0]
+            if 0.0 < self._longest < self._age(came, now):
+                self._refuse_all(now)
+                return
+            if (wait := self._take(message, now)) > 0.0:
+                self._wait_for_struts(now, wait)
+                return
+            if self._age(came, now) > JITTER:
+                self._status.behind.note(now)
+            if self.waiting:  # else what was taken has cleared it
+                self.waiting.popleft()
+
+    def _refuse_all(self, now: float) -> None:
+        waited = self._age(self.waiting[0][0], now)
+        text = f"commands come faster than the struts may move: {waited:.3f} s behind, allowed {self._longest:g} s"
+        while self.waiting:
+            error = LimitError("speed", text, waited, self._longest, None, "compensated")
+            self._refuse(self.waiting.popleft()[1], error, now)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

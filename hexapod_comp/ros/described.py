@@ -18,8 +18,8 @@ import yaml
 from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import String
 
-from .middleware import avoid_shared_memory
-from .vital_signs import LATCHED_QOS
+from . import avoid_shared_memory
+from .base import LATCHED_QOS
 
 TOPIC = "robot_description"
 

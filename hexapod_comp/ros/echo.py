@@ -23,7 +23,7 @@ from std_msgs.msg import Float64MultiArray
 from ..errors import HexapodError, printable
 from ..machine.geometry import STRUT_NAMES
 from ..pose import Pose
-from .stamps import nanoseconds_of
+from .messages import nanoseconds_of
 
 DISCOVERY_TIME = 3.0
 """How long a topic may take to be discovered, s; Fast DDS needs 0.1 to 1 s."""
@@ -144,27 +144,13 @@ def _plain_rows(prefix: str, value: Any) -> Iterator[MessageField]:
 
 
 class EchoedMessage(NamedTuple):
-    """One message.
+    """One message."""
 
-    Attributes
-    ----------
-    topic : str
-        Full name.
-    rows : list of MessageField
-        What it holds.
-    stamp : float
-        Of its header, s since 1970; NaN where it has none.
-    age : float
-        From that stamp to its receipt, s; NaN likewise.
-    rate : float
-        Of the last messages, Hz; NaN for the first one.
-    """
-
-    topic: str
+    topic: str  # full name
     rows: list[MessageField]
-    stamp: float
+    stamp: float  # of its header, s since 1970; NaN where it has none
     age: float
-    rate: float
+    rate: float  # of the last messages, Hz; NaN for the first one
 
     def text(self) -> str:
         """Return it for people: a line with rate and age, then a line for each number."""
@@ -189,24 +175,7 @@ def _shown(row: MessageField) -> str:
 
 
 class Echo:
-    """Subscribes to one topic, whatever its type, with the QoS that its publishers offer.
-
-    Parameters
-    ----------
-    node : Node
-        Subscribes, in the namespace that relative names are resolved in.
-    spin_once : callable
-        Handles the node's events for so many seconds.
-    topic : str
-        Name of the topic.
-    receive : callable
-        Called with each message, a :class:`EchoedMessage`.
-
-    Raises
-    ------
-    HexapodError
-        Nobody publishes it within :data:`DISCOVERY_TIME`, or its type is not installed here.
-    """
+    """Subscribes to one topic, whatever its type, with the QoS that its publishers offer."""
 
     def __init__(
         self, node: Node, spin_once: Callable[[float], None], topic: str, receive: Callable[[EchoedMessage], None]

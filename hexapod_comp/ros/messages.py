@@ -1,15 +1,25 @@
-"""ROS messages to core types and back; the only module beside ``nodes`` that knows ROS."""
+"""ROS messages to numbers and back.
+
+rclpy builds a Python object for every part of a message that comes, and looks at every element of one that goes; that
+takes longer than a compensation. So commands, struts and pose estimates are read and written as the bytes that go over
+the wire: CDR (OMG DDS-RTPS 9.4.2, 10.2), four bytes that tell the encoding, then the fields in order, each at a
+multiple of its size. Where the layout is not the usual one, rclpy's own conversion is used.
+"""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 
+from ..compensation.guards import Sample
+from ..core import ffi, lib
 from ..core.batch import quaternion_of, write_lengths
 from ..errors import CommandError
 from ..machine.geometry import STRUT_NAMES
@@ -18,21 +28,56 @@ from ..pose import Pose
 LARGEST_MESSAGE = 1 << 18
 """Longer messages are refused unread, byte: a thousand times ours. Read, they would fill many times their size."""
 
+LARGEST_LENGTH = 1e150
+"""The squares of larger numbers, m, overflow; whether a strut can be so long is a question for limits."""
+
+SHORTEST_PERIOD, LONGEST_PERIOD = 1e-4, 1.0
+"""Two commands count as no closer than the one when a speed is made of them, s; further apart than the other there is
+no speed between them."""
+
+LITTLE_ENDIAN = b"\x00\x01"
+"""How plain CDR with the lowest byte first begins."""
+
+_START, _STAMP, _COUNT = struct.Struct("<iII"), struct.Struct("<iI"), struct.Struct("<I")
+_SIX, _SEVEN = struct.Struct("<6d"), struct.Struct("<7d")
+_START_AT, _FRAME_AT = 4, 16
+_SECOND = 1_000_000_000
+_NONE = _COUNT.pack(0)
+_MARK = _STAMP.pack(0x01020304, 0x05060708)
+
+
+def nanoseconds_of(stamp: Time) -> int:
+    """Return a stamp as nanoseconds."""
+    return stamp.sec * _SECOND + stamp.nanosec
+
+
+def stamp_of(nanoseconds: int) -> Time:
+    """Return nanoseconds as a stamp."""
+    sec, nanosec = divmod(nanoseconds, _SECOND)
+    return Time(sec=sec, nanosec=nanosec)
+
+
+def period(since: int, until: int) -> float:
+    """Return the time between two stamps, ns, over which a strut's speed is taken, s; 0: it has none.
+
+    It depends on the stamps alone, so that a recorded run answers the same when it is replayed.
+    """
+    seconds = (until - since) * 1e-9
+    return max(seconds, SHORTEST_PERIOD) if 0.0 < seconds <= LONGEST_PERIOD else 0.0
+
 
 def read_message(data: bytes, kind: type) -> Any:
-    """Return the message of a type that a subscription got as bytes.
-
-    Raises
-    ------
-    CommandError
-        ``message``: it is too long, or none of this type.
-    """
+    """Return the message of a type that a subscription got as bytes; a CommandError, ``message``, where it is too long
+    or none of this type."""
     if len(data) > LARGEST_MESSAGE:
         raise CommandError("message", f"a message must not have more than {LARGEST_MESSAGE} bytes, not {len(data)}")
     try:
         return deserialize_message(data, kind)
     except (RuntimeError, ValueError) as error:  # the middleware's, or a text that is not UTF-8
         raise CommandError("message", f"the message cannot be read: {error}") from error
+
+
+# ---- poses ----
 
 
 def pose_numbers(message: PoseStamped) -> tuple[float, float, float, float, float, float, float]:
@@ -57,35 +102,71 @@ def pose_message(pose: Pose, frame_id: str) -> PoseStamped:
 
 
 def message_pose(message: PoseStamped) -> Pose:
-    """Return a message's pose.
-
-    Raises
-    ------
-    PoseError
-        Not finite, or the quaternion's norm is not 1.
-    """
+    """Return a message's pose; a PoseError where it is not finite, or the quaternion's norm is not 1."""
     numbers = pose_numbers(message)
     return Pose.from_quaternion(np.array(numbers[:3]), np.array(numbers[3:]))
 
 
+def command_stamp(stamp: Time) -> int:
+    """Return a command's stamp, ns; a CommandError, ``message``, where it is no time: with the largest seconds it would
+    not fit into an answer's stamp."""
+    if stamp.nanosec >= _SECOND:
+        raise CommandError("message", f"nanosec of the stamp must be below {_SECOND}, not {stamp.nanosec}")
+    return nanoseconds_of(stamp)
+
+
+def read_pose(data: bytes, sample: Sample) -> None:
+    """Read a serialised PoseStamped into a sample: stamp, frame, x, y, z (m) and the quaternion x, y, z, w; a
+    CommandError, ``message``, where it is none, or its stamp no time."""
+    if data[:2] == LITTLE_ENDIAN and _FRAME_AT + _SEVEN.size <= len(data) <= LARGEST_MESSAGE:
+        seconds, nanoseconds, length = _START.unpack_from(data, _START_AT)
+        end = _FRAME_AT + length
+        numbers_at = end + (_START_AT - end) % 8  # alignment counts from behind the four bytes
+        fits = numbers_at + _SEVEN.size == len(data) and nanoseconds < _SECOND
+        if fits and (not length or data[end - 1] == 0):
+            sample.frame_id = data[_FRAME_AT : end - 1].decode(errors="replace")
+            sample.stamp, sample.values = seconds * _SECOND + nanoseconds, _SEVEN.unpack_from(data, numbers_at)
+            return
+    message = read_message(data, PoseStamped)
+    sample.stamp, sample.frame_id = command_stamp(message.header.stamp), message.header.frame_id
+    sample.values = pose_numbers(message)
+
+
+class PoseBytes:
+    """A PoseStamped as bytes, written in place, to be published again and again."""
+
+    def __init__(self, frame_id: str) -> None:
+        self._message = PoseStamped()
+        self._message.header.frame_id = frame_id
+        self._message.header.stamp.sec, self._message.header.stamp.nanosec = _STAMP.unpack(_MARK)
+        marks = tuple(float(n) for n in range(1, 8))
+        p, q = self._message.pose.position, self._message.pose.orientation
+        p.x, p.y, p.z, q.x, q.y, q.z, q.w = marks
+        data, wanted = serialize_message(self._message), (_MARK, _SEVEN.pack(*marks))
+        self._known = data[:2] == LITTLE_ENDIAN and all(data.count(part) == 1 for part in wanted)
+        self._bytes = bytearray(data)
+        self._stamp_at, self._numbers_at = (data.find(part) for part in wanted)
+        self._quaternion = ffi.new("double[4]")
+
+    def made(self, pose: np.ndarray, stamp: int) -> bytes | PoseStamped:
+        """Return what to publish: position, m, and rotation matrix by rows, shape (12,), with a stamp in ns."""
+        if not self._known:
+            write_pose(self._message, pose[:3], pose[3:].reshape((3, 3)))
+            self._message.header.stamp = stamp_of(stamp)
+            return self._message
+        lib.hc_quaternion(ffi.from_buffer("double[9]", pose[3:]), self._quaternion)
+        _STAMP.pack_into(self._bytes, self._stamp_at, *divmod(stamp, _SECOND))
+        _SEVEN.pack_into(self._bytes, self._numbers_at, *pose[:3].tolist(), *self._quaternion)
+        return bytes(self._bytes)
+
+
+# ---- struts ----
+
+
 class StrutMessage:
-    """A JointState of the six struts whose numbers are written in place, to be published again and again.
+    """A JointState of the six struts whose numbers, m and m/s, are written in place, to be published again and again.
 
     The velocity field is filled too: an empty one makes bags that some readers refuse.
-
-    Parameters
-    ----------
-    frame_id : str, optional
-        Of the header.
-    names : sequence of str, optional
-        The struts' joint names.
-
-    Attributes
-    ----------
-    message : JointState
-        The message.
-    position, velocity : ndarray, shape (6,)
-        Views of the message's numbers, m and m/s.
     """
 
     def __init__(self, frame_id: str = "", names: Sequence[str] = STRUT_NAMES) -> None:
@@ -99,28 +180,76 @@ class StrutMessage:
         write_lengths(lengths, period, np.inf, self.position, self.velocity)
 
 
-LARGEST_LENGTH = 1e150
-"""The squares of larger numbers, m, overflow; whether a strut can be so long is a question for limits."""
+class StrutBytes:
+    """The same as bytes. Where each number stands is learnt from what the middleware's own serialiser has written."""
+
+    def __init__(self, frame_id: str = "", names: Sequence[str] = STRUT_NAMES) -> None:
+        self.stamp = 0  # of the message last made, ns; 0 before
+        self._plain: StrutMessage | None = None
+        marks = np.arange(1.0, 13.0)
+        sample = JointState(name=list(names), position=marks[:6].tolist(), velocity=marks[6:].tolist())
+        sample.header.frame_id = frame_id
+        sample.header.stamp.sec, sample.header.stamp.nanosec = _STAMP.unpack(_MARK)
+        data = serialize_message(sample)
+        wanted = (_MARK, marks[:6].tobytes(), marks[6:].tobytes())
+        if data[:2] != LITTLE_ENDIAN or any(data.count(part) != 1 for part in wanted):
+            self._plain = StrutMessage(frame_id, names)
+            self.position, self.velocity = self._plain.position, self._plain.velocity
+        else:
+            self._stamp_at, position, velocity = (data.index(part) for part in wanted)
+            data = data[: velocity + 48 + 4]  # behind the efforts, none, the serialiser leaves bytes that mean nothing
+            spare = -position % 8  # in front, so that numpy finds the numbers at multiples of eight
+            whole = np.empty(spare + len(data), np.uint8)
+            self._bytes = whole[spare:]
+            self._bytes[:] = np.frombuffer(data, np.uint8)
+            self.position = self._bytes[position : position + 48].view(float)
+            self.velocity = self._bytes[velocity : velocity + 48].view(float)
+            self.position[:], self.velocity[:] = 0.0, 0.0
+        self._at = ffi.from_buffer("double[6]", self.position), ffi.from_buffer("double[6]", self.velocity)
+
+    def made(self, lengths: Any, stamp: int, period: float = 0.0, fastest: float = np.inf) -> bytes | JointState:
+        """Return what to publish, with a stamp in ns; bytes, or a message where the layout is not known.
+
+        `lengths`: six, m, as the core takes them (``double[6]``); velocities are their change since the last ones over
+        `period` s; 0: at rest. Stamps jitter, and velocities that are larger than `fastest`, m/s, are none: then all
+        are smaller in proportion.
+        """
+        lib.hc_write_lengths(lengths, period, fastest, *self._at)
+        self.stamp = stamp
+        if self._plain is not None:
+            self._plain.message.header.stamp = stamp_of(stamp)
+            return self._plain.message
+        _STAMP.pack_into(self._bytes.data, self._stamp_at, *divmod(stamp, _SECOND))
+        return self._bytes.tobytes()
 
 
 class StrutReader:
-    """Picks the six struts out of JointState messages by name; other joints beside them do not matter.
-
-    Parameters
-    ----------
-    names : sequence of str, optional
-        The struts' joint names, in strut order.
-
-    Attributes
-    ----------
-    lengths : ndarray, shape (6,)
-        Lengths last read, in strut order, m.
-    """
+    """Picks the six struts, by their joint names, out of JointState messages; other joints do not matter."""
 
     def __init__(self, names: Sequence[str] = STRUT_NAMES) -> None:
-        self.lengths = np.zeros(6)
+        self.lengths = np.zeros(6)  # last read, in strut order, m
         self._struts, self._names = names, list[str]()
-        self._order = np.arange(6)
+        self._order: Sequence[int] = range(6)
+        self._shape: tuple[int, bytes, int, bytes, int] = (0, b"", 0, b"", 0)  # of the last message: see _learn
+
+    def sample(self, data: bytes, sample: Sample) -> None:
+        """Read a message that came as bytes into a sample: stamp and lengths, a tuple in strut order.
+
+        A message that differs from the last one in stamp and numbers alone is read where they stood there. Errors are
+        those of :func:`read_message` and :meth:`read`.
+        """
+        size, head, at, velocities, efforts = self._shape
+        known = len(data) == size and data[:4] == head[:4] and data[12:at] == head[4:]
+        if known and data[at + 48 : at + 52] == velocities and data[efforts : efforts + 4] == _NONE:
+            seconds, nanoseconds = _STAMP.unpack_from(data, _START_AT)
+            numbers = _SIX.unpack_from(data, at)
+            values = numbers if self._order == range(6) else tuple(numbers[n] for n in self._order)
+            self.check(values)
+            sample.stamp, sample.values = seconds * _SECOND + nanoseconds, values
+            return
+        message = self.take(data)
+        sample.stamp, sample.values = nanoseconds_of(message.header.stamp), tuple(self.lengths.tolist())
+        self._learn(data, message)
 
     def take(self, data: bytes) -> JointState:
         """Read a message that came as bytes, and return it; errors as :func:`read_message` and :meth:`read`."""
@@ -129,53 +258,52 @@ class StrutReader:
         return message
 
     def read(self, message: JointState) -> None:
-        """Read a message.
-
-        Raises
-        ------
-        CommandError
-            ``strut_names``, ``strut_count`` or ``not_finite``; the lengths last read stay.
-        """
-        self.keep(self.pick(message))
-
-    def keep(self, lengths: np.ndarray) -> None:
-        """Take lengths as those last read.
-
-        Raises
-        ------
-        CommandError
-            ``not_finite``; the lengths last read stay.
-        """
-        if not all(abs(length) < LARGEST_LENGTH for length in lengths.tolist()):
-            allowed = f"finite and below {LARGEST_LENGTH:g} m"
-            raise CommandError("not_finite", f"strut lengths must be {allowed}, not {lengths.tolist()}")
+        """Read a message; a CommandError, ``strut_names``, ``strut_count`` or ``not_finite``, leaves the lengths last
+        read."""
+        lengths = self.pick(message)
+        self.check(lengths.tolist())
         self.lengths[:] = lengths
 
     def pick(self, message: JointState) -> np.ndarray:
-        """Return a message's six lengths in strut order, whatever their values.
-
-        Raises
-        ------
-        CommandError
-            ``strut_names`` or ``strut_count``.
-        """
+        """Return a message's six lengths in strut order, whatever their values; errors ``strut_names`` and
+        ``strut_count``."""
         if not self._names or message.name != self._names:
-            self._order = strut_order(message.name, self._struts)
+            order = strut_order(message.name, self._struts).tolist()
+            self._order = range(6) if order == [0, 1, 2, 3, 4, 5] else order
             self._names = list(message.name)
         joints, positions = len(message.name), len(message.position)
         if joints != positions:
             raise CommandError("strut_count", f"each of {joints} names needs a position, there are {positions}")
-        return np.frombuffer(message.position, dtype=float)[self._order]
+        return np.frombuffer(message.position, dtype=float)[np.asarray(self._order)]
+
+    def check(self, lengths: Sequence[float]) -> None:
+        """Refuse lengths, m, that are no lengths: ``not_finite``."""
+        if not sum(map(abs, lengths)) < LARGEST_LENGTH:
+            allowed = f"finite and below {LARGEST_LENGTH:g} m"
+            raise CommandError("not_finite", f"strut lengths must be {allowed}, not {list(lengths)}")
+
+    def _learn(self, data: bytes, message: JointState) -> None:
+        """Remember how a message that was read is laid out: its size, what stands before the positions, where these
+        stand, the count of velocities behind them, and that of efforts, none, at the end."""
+        self._shape = (0, b"", 0, b"", 0)
+        if len(message.position) != 6 or len(message.velocity) not in (0, 6) or len(message.effort):
+            return
+        rest = data[12:]
+        positions, velocities = message.position.tobytes(), message.velocity.tobytes()
+        at = 12 + rest.find(positions)
+        # Behind the positions: count of velocities, at the next multiple of eight these, count of efforts.
+        behind = at + 52 + (4 + 48 if velocities else 0)
+        counts = data[at + 48 : at + 52]
+        usual = data[:2] == LITTLE_ENDIAN and rest.count(positions) == 1 and data[behind : behind + 4] == _NONE
+        usual = usual and counts == _COUNT.pack(len(message.velocity))
+        usual = usual and (at - 4) % 8 == 0 and data[at - 8 : at].find(_COUNT.pack(6)) >= 0
+        if usual and (not velocities or data[at + 56 : at + 104] == velocities):
+            self._shape = (len(data), data[:4] + data[12:at], at, counts, behind)
 
 
 def strut_order(names: Sequence[str], struts: Sequence[str] = STRUT_NAMES) -> np.ndarray:
-    """Return where each of the six struts stands in a list of names.
-
-    Raises
-    ------
-    CommandError
-        ``strut_names``: one is missing, or there twice.
-    """
+    """Return where each of the six struts stands in a list of names; a CommandError, ``strut_names``, where one is
+    missing, or there twice."""
     places_of: dict[str, list[int]] = {name: [] for name in struts}
     for place, name in enumerate(names):
         if name in places_of:

@@ -1,9 +1,12 @@
-"""Parameters of a node: its table, from which all else follows, and the values in force."""
+"""Parameters of a node: its table, from which declaration, check, help and pages follow, and the values in force."""
 
 from __future__ import annotations
 
+import argparse
 import difflib
 import re
+import sys
+import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -14,8 +17,11 @@ import yaml
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.lifecycle import LifecycleNode
 from rclpy.parameter import Parameter as RosParameter
+from rclpy.utilities import remove_ros_args
 
-from ..errors import HexapodError, shorten
+from ..errors import LONGEST_TEXT, HexapodError, printable, shorten
+from ..formats.texts import run_with_plain_streams
+from .rclpy_compat import lifecycle_state, overrides
 
 USE_SIM_TIME = "use_sim_time"
 
@@ -40,28 +46,15 @@ RANGE = re.compile(r"(\S+) to (\S+) ?(\S*)")
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of a node: a row of its table.
+    """One parameter of a node: a row of its table."""
 
-    Parameters
-    ----------
-    name : str
-        Its name.
-    default : bool, int, float, str or list of str
-        Default, which also fixes the type; an int is accepted for a float. A list holds as many different names.
-    allowed : str
-        A number's range and unit, ``0 to 1 m``; choices, ``zero, hold``; ``not`` and the name of the parameter from
-        which it must differ; empty: any value of the type.
-    taken : Taken
-        When a value counts. One that counts at configure may be set while the node is not configured.
-    meaning : str
-        What it means.
-    """
-
-    name: str
+    name: str  # its name
     default: bool | int | float | str | list[str]
+    # a number's range and unit, ``0 to 1 m``; choices, ``zero, hold``; ``not`` and the name of the parameter
+    # from which it must differ; empty: any value of the type
     allowed: str
     taken: Taken
-    meaning: str
+    meaning: str  # what it means
 
     @property
     def range(self) -> tuple[float, float] | None:
@@ -99,13 +92,7 @@ class Parameter:
         return result
 
     def checked(self, value: Any) -> Any:
-        """Return `value` as the parameter's type, or refuse it.
-
-        Raises
-        ------
-        ParameterError
-            Wrong type or out of range; an int is taken for a float.
-        """
+        """Return `value` as the parameter's type, or refuse it."""
         wanted: Any = type(self.default)
         if wanted is list:
             return self._checked_names(value)
@@ -134,14 +121,7 @@ class Parameter:
 
 
 def read_table(text: str) -> tuple[Parameter, ...]:
-    """Return the parameters that a table declares.
-
-    Parameters
-    ----------
-    text : str
-        One parameter a line, its cells between bars: name, default as YAML, what is allowed, when it is taken (a name
-        of :class:`Taken`), meaning. An indented line goes on with the one before.
-    """
+    """Return the parameters that a table declares."""
     rows = re.sub(r"\n\s+", " ", text.strip()).splitlines()
     cells = ([cell.strip() for cell in row.split("|")] for row in rows)
     return tuple(
@@ -160,22 +140,7 @@ def shown(value: bool | int | float | str | list[str]) -> str:
 
 
 class Parameters(dict[str, Any]):
-    """The values of a node's parameters, by name, checked; where they may change they are always those in force.
-
-    Parameters
-    ----------
-    node : LifecycleNode
-        Declares them.
-    table : sequence of Parameter
-        All of them.
-    changed : callable
-        Called with the names after some have been set while the node runs, be it to the same values.
-
-    Raises
-    ------
-    ParameterError
-        Wrong type or out of range; names parameter, value and what is allowed.
-    """
+    """The values of a node's parameters, by name, checked; where they may change they are always those in force."""
 
     def __init__(
         self, node: LifecycleNode, table: Sequence[Parameter], changed: Callable[[set[str]], None] = lambda names: None
@@ -198,7 +163,7 @@ class Parameters(dict[str, Any]):
     def _warn_of_strangers(self) -> None:
         """Warn of overrides that no declared parameter takes: most likely misspelt."""
         declared = set(self._node.get_parameters_by_prefix(""))
-        for name in getattr(self._node, "_parameter_overrides", {}):
+        for name in overrides(self._node):
             if name not in declared and not name.startswith("qos_overrides."):
                 near = difflib.get_close_matches(name, declared, 1)
                 hint = f"; did you mean {near[0]}?" if near else ""
@@ -230,9 +195,9 @@ class Parameters(dict[str, Any]):
 
     def _check_now(self, parameter: Parameter) -> None:
         """Refuse a change that would have no effect before the node is configured again."""
-        machine = self._node._state_machine
-        if parameter.taken is Taken.CONFIGURE and machine.current_state[1] != "unconfigured":
-            problem = f"is taken at configure, and the node is {machine.current_state[1]}; set it after a cleanup"
+        state = lifecycle_state(self._node)[1]
+        if parameter.taken is Taken.CONFIGURE and state != "unconfigured":
+            problem = f"is taken at configure, and the node is {state}; set it after a cleanup"
             raise parameter.refusal(problem)
 
     def _check_clock(self, parameter: RosParameter) -> None:
@@ -246,3 +211,82 @@ class Parameters(dict[str, Any]):
         if taken := self._known(parameters):  # ROS also declares parameters of its own
             self.update(taken)
             self._changed(set(taken))
+
+
+# ---- the program ----
+
+
+ROS_ARGUMENTS, END_OF_ROS_ARGUMENTS = "--ros-args", "--"
+
+USAGE_ERROR = 2
+
+WIDTH = 118
+"""Of the help, characters."""
+
+
+@dataclass(frozen=True)
+class Program:
+    """A node as a program."""
+
+    name: str  # of the executable
+    summary: str
+    parameters: Sequence[Parameter]  # its ROS parameters
+    topics: str = ""
+    example: str = "-p autostart:=false"  # what stands behind ``--ros-args`` in the example
+
+    def refusal(self, arguments: Sequence[str]) -> int | None:
+        """Return the exit code of a program that must not start with these arguments, having said why; else None.
+
+        0 after ``--help``, 2 where an argument is not understood. What follows ``--ros-args`` is ROS's to read.
+        rcl itself would take a stray ``name:=value`` for a rename, and leave everything else unread.
+        """
+        return run_with_plain_streams(lambda: self._refusal(arguments))
+
+    def _refusal(self, arguments: Sequence[str]) -> int | None:
+        parser = argparse.ArgumentParser(
+            self.name,
+            usage=f"{self.name} [-h] [--ros-args -p NAME:=VALUE … -r TOPIC:=OTHER … --params-file FILE …]",
+            description=self.summary,
+            epilog=self._epilog(),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+        try:
+            _, strange = parser.parse_known_args(outside_ros(arguments))
+            if strange:
+                shown = printable(" ".join(strange), LONGEST_TEXT)
+                parser.error(
+                    f"arguments not understood: {shown}. Parameters follow --ros-args: "
+                    f"{self.name} {ROS_ARGUMENTS} {self.example}"
+                )
+            remove_ros_args(list(arguments))
+        except RuntimeError as error:
+            parser.print_usage(sys.stderr)
+            text = f"{self.name}: error: ROS arguments not understood: {error}"
+            print(printable(text, LONGEST_TEXT), file=sys.stderr)
+            return USAGE_ERROR
+        except SystemExit as leaving:
+            return leaving.code if isinstance(leaving.code, int) else USAGE_ERROR
+        return None
+
+    def _epilog(self) -> str:
+        lines = ["parameters (-p NAME:=VALUE behind --ros-args; default in brackets):"]
+        for parameter in self.parameters:
+            text = f"{parameter.name}  [{shown(parameter.default)}]  {parameter.described()}"
+            lines += textwrap.wrap(text, WIDTH, initial_indent="  ", subsequent_indent="      ")
+        topics = ["", "topics and services:", *textwrap.indent(self.topics.strip(), "  ").splitlines()]
+        example = ["", f"example: {self.name} {ROS_ARGUMENTS} {self.example}"]
+        return "\n".join([*lines, *(topics if self.topics else ()), *example])
+
+
+def outside_ros(arguments: Sequence[str]) -> list[str]:
+    """Return the arguments that do not stand between ``--ros-args`` and ``--`` or the end."""
+    left, inside = [], False
+    for argument in arguments:
+        if argument == ROS_ARGUMENTS:
+            inside = True
+        elif inside:
+            inside = argument != END_OF_ROS_ARGUMENTS
+        else:
+            left.append(argument)
+    return left

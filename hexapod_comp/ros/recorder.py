@@ -17,8 +17,7 @@ from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
 from std_msgs.msg import String
 
 from ..errors import HexapodError, InputFileError
-from .ros_session import QUIET, RosSession
-from .running import SPIN_PERIOD
+from .process import QUIET, SPIN_PERIOD, RosSession
 
 COMPENSATOR = "compensator"
 
@@ -51,27 +50,7 @@ LOOK_PERIOD = 1.0
 
 
 class BagWriter:
-    """Writes messages into a bag, which is whole at its end also where the disk gets full.
-
-    Parameters
-    ----------
-    folder : str or Path
-        For the bag; must not be there yet.
-
-    Raises
-    ------
-    HexapodError
-        rosbags is not installed.
-    InputFileError
-        The folder is there already, or cannot be made.
-
-    Attributes
-    ----------
-    counts : dict of str to int
-        Messages of each topic.
-    problem : str
-        Why nothing more is written; empty while all is well.
-    """
+    """Writes messages into a bag, which is whole at its end also where the disk gets full."""
 
     def __init__(self, folder: str | Path) -> None:
         self.counts: dict[str, int] = {}
@@ -124,20 +103,7 @@ class BagWriter:
 
 
 class _File:
-    """The bag's file: where the disk is full, what was kept free is given back, and writing goes on to close it.
-
-    Parameters
-    ----------
-    file : file object
-        Taken over.
-    reserve : Path
-        File that keeps room.
-
-    Attributes
-    ----------
-    full : str
-        Why the reserve was given back; empty before.
-    """
+    """The bag's file: where the disk is full, what was kept free is given back, and writing goes on to close it."""
 
     def __init__(self, file: Any, reserve: Path) -> None:
         file.flush()
@@ -196,20 +162,7 @@ class _File:
 
 
 class BagRecorder:
-    """Hears a machine's topics and writes them.
-
-    Parameters
-    ----------
-    folder : str or Path
-        For the bag; must not be there yet.
-    namespace : str
-        Where the machine's nodes are.
-
-    Raises
-    ------
-    HexapodError, InputFileError
-        As :class:`BagWriter`.
-    """
+    """Hears a machine's topics and writes them."""
 
     def __init__(self, folder: str | Path, namespace: str = "") -> None:
         self._bag = BagWriter(folder)

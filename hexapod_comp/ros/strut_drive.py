@@ -13,30 +13,71 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 
+from ..compensation.guards import Guard, Sample, StampGate, StrutSteps
 from ..errors import CommandError, HexapodError, KinematicsError
 from ..formats.paths import config_file
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry, load_geometry
 from ..machine.model import MachineModel, RealMachine
 from ..virtual.machine import DriveParameters, Faults, StrutDrive
 from ..virtual.named import RANDOM, find_model, is_word
-from .command_source import CommandSource
-from .health import ERROR, OK, WARN, Flow, Refusals, joined, seconds
-from .log_space import LogSpace
+from . import keep_discovery_local
+from .base import ACKNOWLEDGED_WITHIN, CHECK_PERIOD, STATE_QOS, MachineNode
 from .messages import StrutMessage, StrutReader, write_pose
-from .order import NoStep
-from .running import keep_discovery_local, run
-from .runtime import ACKNOWLEDGED_WITHIN, STATE_QOS, MachineNode
-from .stamps import StampGate, nanoseconds_of
-from .strut_drive_parameters import PARAMETERS, PROGRAM
+from .parameters import Program, read_table
+from .process import run
+from .status import ERROR, OK, WARN, Flow, LogSpace, Refusals, joined, seconds
 
 LONGEST_PAUSE = 0.25
 """After a longer pause (a stopped process), the machine has moved on by no more than this, s."""
 
-CHECK_PERIOD = 0.05
+PARAMETERS = read_table("""
+autostart | true |  | start | configure and activate at the start
+geometry_file | paper.yaml |  | configure | geometry file: a path or the name of a shipped one
+truth_file | paper_machine.yaml |  | configure | hidden truth: a model file, `ideal` for none, `random` for one drawn
+    from truth_seed, or `random:SEED`
+truth_seed | 1 | 0 to 2147483647 | configure | seed of a random truth
+noise_seed | 0 | 0 to 2147483647 | configure | seed of the noise
+base_frame | base |  | configure | frame_id of the true tool pose
+joint_names | [strut_1, strut_2, strut_3, strut_4, strut_5, strut_6] |  | configure | the struts' names in JointState
+    messages, in strut order
+command_timeout | 0.1 | 0 to 3600 s | always | without a command for this long diagnostics warn; 0 = off
+command_validity | 0.0 | 0 to 3600 s | always | commands stamped earlier than this are refused; 0 = off
+allow_several_publishers | false |  | configure | obey though several nodes publish strut commands
+rate | 500.0 | 1 to 2000 Hz | configure | readings published per second
+step | 1.0e-7 | 0 to 0.001 m | configure | length of one motor step; 0 = none
+lag | 0.005 | 0.001 to 1 s | configure | time by which the drives follow a moving command
+max_speed | 0.0 | 0 to 10 m/s | configure | largest motor speed; 0 = the geometry's limit
+max_acceleration | 10.0 | 0.001 to 1e4 m/s² | configure | largest motor acceleration
+encoder_resolution | 1.0e-7 | 0 to 0.001 m | configure | length of one encoder count; 0 = none
+encoder_noise | 5.0e-8 | 0 to 0.001 m | configure | standard deviation of an encoder reading
+tracker_noise | 0.0 | 0 to 0.001 m | configure | standard deviation of the true pose's coordinates
+fault_stuck_strut | 0 | 0 to 6 | always | strut 1 to 6 that does not move; 0 = none
+fault_encoder_lost | 0 | 0 to 6 | always | strut 1 to 6 whose encoder reads NaN; 0 = none
+fault_feedback_delay | 0.0 | 0 to 10 s | always | age of readings when they are published
+fault_feedback_drop | 0.0 | 0 to 1 | always | share of readings that are never published
+fault_jump_strut | 1 | 1 to 6 | always | strut 1 to 6 that fault_jump knocks away
+fault_jump | 0.0 | -0.1 to 0.1 m | always | distance of a knock; each setting knocks once
+""")
+
+TOPICS = """
+in   strut_commands   JointState: strut lengths, m
+out  strut_states     JointState: what the encoders read, m
+     tool_pose_true   PoseStamped: where the tool really is, in base
+     /diagnostics
+"""
+
+PROGRAM = Program(
+    "strut_drive",
+    "Simulates six strut drives and a machine with hidden errors on them.",
+    PARAMETERS,
+    TOPICS,
+    "-p truth_file:=random -p truth_seed:=3",
+)
 
 
 class StrutDriveNode(MachineNode):
@@ -79,13 +120,14 @@ class StrutDriveNode(MachineNode):
             self._drive = None  # else the end would say goodbye on topics that there are not
             raise
         self._stamps = StampGate("command", self.clock, options["command_validity"], future=False)
-        self._no_step, self._log_space = NoStep(geometry), LogSpace()
+        self._steps, self._log_space = StrutSteps(geometry.limits.step, geometry.limits.speed), LogSpace()
+        self._command_guards: tuple[Guard, ...] = (self._source, self._stamps, self._steps)
         self.get_logger().info(f"configured machine {geometry.name!r} with hidden truth {machine.model.name!r}")
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start to move, from where the struts stand, and to measure."""
-        self._no_step.start(self.drive.motor_lengths())
+        self._steps.reset(self.drive.motor_lengths().tolist())
         self._last_run = time.monotonic()
         self._active = True
         self.get_logger().info("ready")
@@ -94,11 +136,7 @@ class StrutDriveNode(MachineNode):
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close topics and forget the machine."""
         self._active = False
-        for timer in self._own_timers:
-            self.destroy_timer(timer)
-        self.destroy_subscription(self._subscription)
-        for publisher in (self._states_pub, self._true_pub):
-            self.destroy_publisher(publisher)
+        self.close_ends(*self._own_timers, self._subscription, self._states_pub, self._true_pub)
         self._drive = None
         return super().on_cleanup(state)
 
@@ -126,8 +164,7 @@ class StrutDriveNode(MachineNode):
         self._true_pub = self.publish_on(PoseStamped, "tool_pose_true", STATE_QOS)
         self.speak_for(self.drive.machine.geometry.name)
         self._subscription = self.obey(JointState, "strut_commands", self._on_commands, self._look_at_publishers)
-        topic, count = self._subscription.topic_name, self._subscription.get_publisher_count
-        self._source = CommandSource(self, topic, count, self._options["allow_several_publishers"])
+        self._source = self.sender_of(self._subscription, self._options["allow_several_publishers"])
         self._own_timers = [
             self.every(1.0 / self._options["rate"], self._run),
             self.every(CHECK_PERIOD, self._check_state),
@@ -163,26 +200,20 @@ class StrutDriveNode(MachineNode):
     def _on_commands(self, data: bytes, number: int | None) -> None:
         if not self._active:
             return
-        now = time.monotonic()
-        self._source.hear(number, now)
+        sample = Sample(time.monotonic())
+        self._source.hear(number, sample.now)
         try:
-            if self._source.problem:
-                raise CommandError(self._source.reason, self._source.problem)
-            self._obey_commands(data, now)
+            self._reader.sample(data, sample)
+            for guard in self._command_guards:
+                guard.check(sample)
         except HexapodError as error:
-            self._refusals.add(error.reason, str(error), now)
+            self._refusals.add(error.reason, str(error), sample.now)
             self.warn_of(error.reason, f"command refused ({error.reason}): {error}")
             return
-        self._commands.tick(now)
-
-    def _obey_commands(self, data: bytes, now: float) -> None:
-        """Take commands that are six lengths, in order, and no step from the last ones."""
-        stamp, lengths = nanoseconds_of(self._reader.take(data).header.stamp), self._reader.lengths
-        self._stamps.check(stamp, now)
-        self._no_step.check(lengths, now)
-        self.drive.set_command(lengths)
-        self._stamps.accept(stamp, now)
-        self._no_step.passed(lengths, now)
+        self.drive.set_command(np.array(sample.values))
+        for guard in self._command_guards:
+            guard.accept(sample)
+        self._commands.tick(sample.now)
 
     def _run(self) -> None:
         if not self._active:
@@ -221,7 +252,7 @@ class StrutDriveNode(MachineNode):
             yield ERROR, f"refusing commands: {self._source.reason}: {self._source.problem}"
         if reasons := self._refusals.reasons(now, self._source.reason if self._source.problem else ""):
             yield ERROR, f"refusing commands: {reasons}"
-        missing = self._source.sequence.missing(now)
+        missing = self._source.missing(now)
         if self._commands.count and 0.0 < self._options["command_timeout"] < self._commands.age(now):
             yield WARN, "no new command"
         elif missing:
@@ -241,7 +272,7 @@ class StrutDriveNode(MachineNode):
         return {
             "commanded_by": ", ".join(self._source.names),
             "commands": str(self._commands.count),
-            "commands_missed": str(self._source.sequence.missed),
+            "commands_missed": str(self._source.missed),
             "command_rate_hz": f"{self._commands.rate(now):.1f}",
             "command_age_s": seconds(self._commands.age(now)),
             "clock_set_back": str(self.clock.set_back),

@@ -38,9 +38,9 @@ from ..machine.geometry import STRUT_NAMES, load_geometry
 from ..machine.model_file import save_model
 from ..pose import Pose
 from ..ros.compensator import CompensatorNode
-from ..ros.health import status_prefix
 from ..ros.messages import message_pose, pose_message
-from ..ros.running import autostart
+from ..ros.process import autostart
+from ..ros.status import status_prefix
 from ..ros.strut_drive import StrutDriveNode
 from ..virtual.named import find_model, is_random
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..compensation.findings import refusal
-from ..compensation.state import pack_pose
+from ..compensation.compensator import pack_pose, refusal
 from ..core import Status, Struct
 from ..core.batch import go
 from ..errors import HexapodError

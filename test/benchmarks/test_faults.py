@@ -24,7 +24,7 @@ from benchmarks.faults.record import Happened, Record, Sent, Status, Struts
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.visible import VISIBLE
 from benchmarks.faults.wire import Corrupt, Delay, Drop, Duplicate, Reorder, Wire
-from hexapod_comp.ros.log_space import LogSpace
+from hexapod_comp.ros.status import LogSpace
 
 LIMITS = Limits(np.tile([0.33, 0.88], (6, 1)), 2e-3, 2e-3, 0.25)
 

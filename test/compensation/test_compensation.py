@@ -19,8 +19,7 @@ from strategies import (
     skewed_geometry,
 )
 
-from hexapod_comp.compensation.compensator import Compensator
-from hexapod_comp.compensation.state import Correction, pack_pose
+from hexapod_comp.compensation.compensator import Compensator, Correction, pack_pose
 from hexapod_comp.core import LONGEST_RAMP_STEP
 from hexapod_comp.errors import HexapodError, LimitError, ModelError, NotFiniteError, OutsideFieldError
 from hexapod_comp.machine.field import GridField

@@ -30,9 +30,9 @@ from hexapod_comp.linuxcnc.bridge import LONGEST_STEP, GuardStatus, LinuxcncBrid
 from hexapod_comp.linuxcnc.hal import HalComponent, HalError, load_module, pins, quaternion_from_axes
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.pose import Pose
-from hexapod_comp.ros.health import ERROR, OK, WARN
 from hexapod_comp.ros.parameters import ParameterError
-from hexapod_comp.ros.running import autostart
+from hexapod_comp.ros.process import autostart
+from hexapod_comp.ros.status import ERROR, OK, WARN
 
 NODE = "linuxcnc_bridge"
 

@@ -22,9 +22,9 @@ from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.trajectory import Path, move
 from hexapod_comp.pose import Pose
-from hexapod_comp.ros import health
-from hexapod_comp.ros.health import ERROR, OK
+from hexapod_comp.compensation import guards
 from hexapod_comp.ros.messages import message_pose
+from hexapod_comp.ros.status import ERROR, OK
 from hexapod_comp.virtual.machine import DriveParameters, StrutDrive
 
 STEP = 0.1e-6
@@ -157,7 +157,7 @@ def test_with_the_papers_lines_the_loop_shows_what_the_core_predicts(bench, geom
 
 def test_lost_encoder_is_said_and_the_loop_goes_on(bench, monkeypatch):
     """A NaN among the readings: none is used, the estimate comes from the commands, the tool goes on."""
-    monkeypatch.setattr(health, "SHOWN_FOR", 0.2)
+    monkeypatch.setattr(guards, "SHOWN_FOR", 0.2)
     loop(bench, model_file=TRUE_MODEL, command_timeout=0.0)
     bench.ask(HOME)
     drive = next(node for node in bench.nodes if node.get_name() == "strut_drive")

@@ -21,10 +21,10 @@ from hexapod_comp.errors import NoAnswerError, printable
 from hexapod_comp.loop.processes import NodeProcess
 from hexapod_comp.loop.session import connect
 from hexapod_comp.pose import Pose
-from hexapod_comp.ros.arguments import outside_ros
+from hexapod_comp.ros import PROFILE_VARIABLES, avoid_shared_memory
 from hexapod_comp.ros.client import LISTENER_QOS, LoopClient, Sent
-from hexapod_comp.ros.compensator_parameters import PROGRAM as COMPENSATOR
-from hexapod_comp.ros.middleware import PROFILE_VARIABLES, avoid_shared_memory
+from hexapod_comp.ros.interface import PROGRAM as COMPENSATOR
+from hexapod_comp.ros.parameters import outside_ros
 
 STOP_WITHIN = 2.0
 """From the signal to the end of the process, s."""

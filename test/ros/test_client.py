@@ -11,8 +11,8 @@ from node_helpers import HOME
 
 from hexapod_comp.errors import NoAnswerError
 from hexapod_comp.ros.client import LoopClient, Sent
-from hexapod_comp.ros.compensator_status import ADVICE, OTHERWISE
 from hexapod_comp.ros.messages import pose_message
+from hexapod_comp.ros.status import ADVICE, OTHERWISE
 
 
 class StandIn(LoopClient):

@@ -41,10 +41,10 @@ from hexapod_comp.pose import Pose
 from hexapod_comp.ros import compensator as compensator_module
 from hexapod_comp.ros import health, running, runtime, stamps
 from hexapod_comp.ros.compensator import CompensatorNode
-from hexapod_comp.ros.health import ERROR, OK, WARN, Flow, HealthReport, Refusals
 from hexapod_comp.ros.messages import message_pose, pose_message
 from hexapod_comp.ros.parameters import ParameterError
-from hexapod_comp.ros.runtime import Throttle
+from hexapod_comp.ros.rclpy_compat import Throttle
+from hexapod_comp.ros.status import ERROR, OK, WARN, Flow, HealthReport, Refusals
 
 STEP_BACK = (0.0002, 0.0001, -0.0003)
 """A small move, m, that no limit forbids."""
@@ -61,7 +61,7 @@ ROUNDING = 1e-12
 @pytest.fixture
 def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a refusal colour the status for 0.2 s instead of 1 s, so that tests of the recovery are short."""
-    monkeypatch.setattr(health, "SHOWN_FOR", 0.2)
+    monkeypatch.setattr(guards, "SHOWN_FOR", 0.2)
 
 
 def values_of(bench: Bench, key: str, value: str) -> dict[str, str]:

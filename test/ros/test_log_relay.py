@@ -8,7 +8,7 @@ import sys
 
 SCRIPT = """
 import os, sys, time
-from hexapod_comp.ros.log_relay import LogRelay
+from hexapod_comp.ros.process import LogRelay
 
 def write(stream, text):
     try:

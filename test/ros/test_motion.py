@@ -16,14 +16,13 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
+from hexapod_comp.compensation.track import FOLLOWED_WITHIN, Recent, Standing
 from hexapod_comp.machine.geometry import STRUT_NAMES
-from hexapod_comp.ros import health
+from hexapod_comp.compensation import guards
 from hexapod_comp.ros.compensator import CHECK_PERIOD, CompensatorNode
-from hexapod_comp.ros.following import FOLLOWED_WITHIN, Recent, Standing
-from hexapod_comp.ros.health import ERROR, OK, WARN
-from hexapod_comp.ros.messages import pose_message
+from hexapod_comp.ros.messages import nanoseconds_of, pose_message, stamp_of
 from hexapod_comp.ros.parameters import USE_SIM_TIME
-from hexapod_comp.ros.stamps import nanoseconds_of, stamp_of
+from hexapod_comp.ros.status import ERROR, OK, WARN
 
 SPEED = 0.25
 """Largest strut speed of the bench's machine, m/s."""
@@ -32,7 +31,7 @@ SPEED = 0.25
 @pytest.fixture(autouse=True)
 def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """What colours a status for a second does so for 0.3 s."""
-    monkeypatch.setattr(health, "SHOWN_FOR", 0.3)
+    monkeypatch.setattr(guards, "SHOWN_FOR", 0.3)
 
 
 def risen(bench: Bench, millimetres: float, seconds: float | None = None):

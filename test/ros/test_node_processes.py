@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from hexapod_comp.ros.running import ENDED_WITHIN
+from hexapod_comp.ros.process import ENDED_WITHIN
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -35,8 +35,8 @@ def script(text: str, folder: Path) -> subprocess.Popen[str]:
 HANGING = """
 import ctypes, sys, threading
 from hexapod_comp.ros import running
-from hexapod_comp.ros.arguments import Program
-from hexapod_comp.ros.runtime import MachineNode
+from hexapod_comp.ros.parameters import Program
+from hexapod_comp.ros.base import MachineNode
 
 running.ENDED_WITHIN = 0.5
 

@@ -9,11 +9,10 @@ from rclpy.duration import Duration
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
 
+from hexapod_comp.compensation.guards import NoStep
 from hexapod_comp.errors import LimitError
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
-from hexapod_comp.ros.health import ERROR, WARN
-from hexapod_comp.ros.log_space import LogSpace
-from hexapod_comp.ros.order import NoStep
+from hexapod_comp.ros.status import ERROR, WARN, LogSpace
 
 
 @pytest.mark.parametrize(

@@ -24,8 +24,8 @@ from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros import predicted_error
-from hexapod_comp.ros.health import WARN
-from hexapod_comp.ros.predicted_error import PredictedErrorTopics, PredictionError, PredictionProcess, error_message
+from hexapod_comp.ros.requests import PredictedErrorTopics, PredictionError, PredictionProcess, error_message
+from hexapod_comp.ros.status import WARN
 
 STANDING, ALIGNED = "compensator/predicted_error", "compensator/predicted_error_aligned"
 UM = 1e-6

@@ -21,12 +21,12 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
 from strategies import paper_geometry
 
+from hexapod_comp.compensation.guards import StampClock, StampGate
+from hexapod_comp.compensation.track import NoJump
 from hexapod_comp.errors import CommandError, LimitError
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.ros import command_source
-from hexapod_comp.ros.health import ERROR, OK, WARN
-from hexapod_comp.ros.plausible import NoJump
-from hexapod_comp.ros.stamps import StampClock, StampGate
+from hexapod_comp.ros.status import ERROR, OK, WARN
 
 AT_HOME = closed_form_lengths(HOME)
 SECOND = 1_000_000_000

@@ -23,8 +23,8 @@ from hexapod_comp.errors import InputFileError
 from hexapod_comp.formats.files import read_text
 from hexapod_comp.formats.paths import confined_opener
 from hexapod_comp.ros import model_loading
-from hexapod_comp.ros.health import WARN
-from hexapod_comp.ros.model_loading import Loading, LoadingError, ModelName
+from hexapod_comp.ros.status import WARN
+from hexapod_comp.ros.worker import Loading, LoadingError, ModelName
 
 ROUNDING = 1e-12
 

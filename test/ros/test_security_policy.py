@@ -29,10 +29,9 @@ from hexapod_comp.formats.paths import config_file
 from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.ros.client import LoopClient
+from hexapod_comp.ros.process import QUIET, RosSession, autostart
 from hexapod_comp.ros.recorder import BagRecorder
-from hexapod_comp.ros.ros_session import QUIET, RosSession
-from hexapod_comp.ros.running import autostart
-from hexapod_comp.ros.watching import Watcher
+from hexapod_comp.viewer.page import Watcher
 
 PACKAGE = Path(__file__).resolve().parents[2] / "hexapod_comp"
 

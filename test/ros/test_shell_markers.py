@@ -9,8 +9,8 @@ from test_workspace_pictures import RINGS, SECTORS, layers, mesh
 from visualization_msgs.msg import Marker, MarkerArray
 
 from hexapod_comp.errors import GeometryError
-from hexapod_comp.ros.shell_markers import SHELL_QOS, TOPIC, publish_shells, shell_markers, triangles
 from hexapod_comp.testing.bench import spin_until
+from hexapod_comp.viewer.shells import SHELL_QOS, TOPIC, publish_shells, shell_markers, triangles
 from hexapod_comp.workspace.shells import TRANSLATION, Layer
 
 STAMP = Time(sec=7)

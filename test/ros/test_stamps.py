@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+from hexapod_comp.compensation.guards import FORGET_ORDER_AFTER, StampClock, StampGate
 from hexapod_comp.errors import CommandError
-from hexapod_comp.ros.stamps import FORGET_ORDER_AFTER, StampClock, StampGate
 
 SECOND, MS = 1_000_000_000, 1_000_000
 

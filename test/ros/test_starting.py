@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from node_helpers import HOME, closed_form_lengths, near
 
+from hexapod_comp.compensation.track import LastKnown, Recent, Standing
 from hexapod_comp.errors import CommandError
-from hexapod_comp.ros import health
-from hexapod_comp.ros.following import LastKnown, Recent, Standing
-from hexapod_comp.ros.health import ERROR, OK, WARN
+from hexapod_comp.compensation import guards
+from hexapod_comp.ros.status import ERROR, OK, WARN
 
 ROUNDING = 1e-12
 
@@ -22,7 +22,7 @@ ROUNDING = 1e-12
 @pytest.fixture(autouse=True)
 def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """A refusal colours the status for 0.3 s."""
-    monkeypatch.setattr(health, "SHOWN_FOR", 0.3)
+    monkeypatch.setattr(guards, "SHOWN_FOR", 0.3)
 
 
 NEVER = {"start_without_feedback_after": 0.0}

@@ -22,15 +22,14 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
+from hexapod_comp.compensation.guards import CommandSource, Sequence
+from hexapod_comp.compensation.track import Following
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.ros import command_source, health
-from hexapod_comp.ros.command_source import CommandSource, Sequence
 from hexapod_comp.ros.compensator import CHECK_PERIOD, CompensatorNode
-from hexapod_comp.ros.following import Following
-from hexapod_comp.ros.health import ERROR, OK, WARN
-from hexapod_comp.ros.messages import pose_message
+from hexapod_comp.ros.messages import period, pose_message
 from hexapod_comp.ros.parameters import ParameterError
-from hexapod_comp.ros.stamps import period
+from hexapod_comp.ros.status import ERROR, OK, WARN
 from hexapod_comp.ros.strut_drive import StrutDriveNode
 
 DRIVE = "strut_drive"
@@ -42,7 +41,7 @@ ROUNDING = 1e-12
 @pytest.fixture(autouse=True)
 def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """What colours a status for one or two seconds does so for 0.3 s."""
-    monkeypatch.setattr(health, "SHOWN_FOR", 0.3)
+    monkeypatch.setattr(guards, "SHOWN_FOR", 0.3)
     monkeypatch.setattr(command_source, "SPEAKERS_HELD", 0.3)
 
 
@@ -715,7 +714,7 @@ def test_shipped_models_survive_the_way_through_the_loading_process():
     """Every number bit for bit, by the saved text of both."""
     from hexapod_comp.machine.geometry import load_geometry
     from hexapod_comp.machine.model_file import load_model
-    from hexapod_comp.ros.model_loading import model_json, model_of
+    from hexapod_comp.ros.worker import model_json, model_of
 
     geometry = load_geometry(CONFIG / "paper.yaml")
     for name in ("paper_machine.yaml", "paper_lines_model.yaml"):

@@ -30,10 +30,10 @@ from sensor_msgs.msg import JointState, Temperature
 from hexapod_comp.errors import LONGEST_TEXT, CommandError, HexapodError, printable, shorten
 from hexapod_comp.linuxcnc.bridge import LinuxcncBridgeNode
 from hexapod_comp.machine.geometry import STRUT_NAMES
-from hexapod_comp.ros.guarding import CallbackGuard
-from hexapod_comp.ros.health import ERROR
-from hexapod_comp.ros.machine_files import MachineFiles
+from hexapod_comp.ros.base import CallbackGuard
+from hexapod_comp.ros.interface import MachineFiles
 from hexapod_comp.ros.messages import pose_message
+from hexapod_comp.ros.status import ERROR
 
 NAMELESS = Path(__file__).parents[1] / "nameless.py"
 

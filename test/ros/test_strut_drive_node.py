@@ -17,9 +17,9 @@ from sensor_msgs.msg import JointState
 
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.pose import Pose
-from hexapod_comp.ros.health import ERROR, OK, WARN
 from hexapod_comp.ros.messages import message_pose
 from hexapod_comp.ros.parameters import ParameterError
+from hexapod_comp.ros.status import ERROR, OK, WARN
 from hexapod_comp.ros.strut_drive import StrutDriveNode
 
 NODE = "strut_drive"

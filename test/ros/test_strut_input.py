@@ -24,10 +24,10 @@ from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.errors import CommandError, KinematicsError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
-from hexapod_comp.ros.command_inputs import STRUTS, StrutInput
 from hexapod_comp.ros.compensator import CompensatorNode
-from hexapod_comp.ros.health import ERROR, OK, WARN
+from hexapod_comp.ros.interface import STRUTS, StrutInput
 from hexapod_comp.ros.parameters import ParameterError
+from hexapod_comp.ros.status import ERROR, OK, WARN
 from hexapod_comp.virtual.named import find_model
 
 POSES = 400

@@ -13,8 +13,8 @@ import rclpy
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 
-from hexapod_comp.ros.callbacks import Ticker
 from hexapod_comp.ros.compensator import CompensatorNode
+from hexapod_comp.ros.rclpy_compat import Ticker
 
 
 @pytest.fixture

@@ -19,8 +19,8 @@ from std_srvs.srv import Trigger
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.pose import Pose
-from hexapod_comp.ros.health import ERROR, WARN
 from hexapod_comp.ros.messages import message_pose
+from hexapod_comp.ros.status import ERROR, WARN
 from hexapod_comp.workspace.travel import travel
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)

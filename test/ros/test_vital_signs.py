@@ -15,15 +15,15 @@ from rclpy.time import Time
 from sensor_msgs.msg import JointState, TimeReference
 from std_msgs.msg import Bool, UInt64
 
-from hexapod_comp.ros import health
-from hexapod_comp.ros.health import ERROR, OK, WARN
-from hexapod_comp.ros.vital_signs import LATCHED_QOS
+from hexapod_comp.compensation import guards
+from hexapod_comp.ros.base import LATCHED_QOS
+from hexapod_comp.ros.status import ERROR, OK, WARN
 
 
 @pytest.fixture(autouse=True)
 def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """A refusal colours the status for 0.3 s."""
-    monkeypatch.setattr(health, "SHOWN_FOR", 0.3)
+    monkeypatch.setattr(guards, "SHOWN_FOR", 0.3)
 
 
 def hear(bench: Bench, kind: type, topic: str, qos: QoSProfile = RELIABLE, **options: Any) -> list[Any]:

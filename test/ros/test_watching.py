@@ -22,10 +22,9 @@ from hexapod_comp.cli import main
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.pose import Pose
-from hexapod_comp.ros import watching
-from hexapod_comp.ros.page import WatchPage, same_site, strut_colours, strut_ends, words
-from hexapod_comp.ros.ros_session import QUIET
-from hexapod_comp.ros.watching import View, Watcher
+from hexapod_comp.viewer import page as watching
+from hexapod_comp.ros.process import QUIET
+from hexapod_comp.viewer.page import View, Watcher, WatchPage, same_site, strut_colours, strut_ends, words
 
 OFFSETS = np.array([-100.0, -50.0, 0.0, 50.0, 100.0, 200.0])
 """Of the struts, µm: actual = command + offset, so the corrections are −offset."""

@@ -20,8 +20,14 @@ from strategies import fixed
 from hexapod_comp.errors import CommandError
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.ros import messages, wire
-from hexapod_comp.ros.messages import LARGEST_MESSAGE, StrutMessage, StrutReader, read_message
-from hexapod_comp.ros.wire import StrutBytes, read_pose_bytes
+from hexapod_comp.ros.messages import (
+    LARGEST_MESSAGE,
+    StrutBytes,
+    StrutMessage,
+    StrutReader,
+    read_message,
+    read_pose_bytes,
+)
 
 NUMBERS = st.lists(st.floats(), min_size=7, max_size=7)
 NAMES = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=40)

@@ -16,9 +16,9 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ..errors import GeometryError
+from ..ros import keep_discovery_local
 from ..workspace.pictures import shades
 from ..workspace.shells import Layer, Quantity
-from .running import keep_discovery_local
 
 SHELL_QOS = QoSProfile(
     depth=1,
@@ -38,24 +38,7 @@ OPACITY = (1.0, 0.35)
 
 
 def shell_markers(layers: Sequence[Layer], quantity: Quantity, title: str, frame_id: str, stamp: Time) -> MarkerArray:
-    """Return shells as triangles coloured from the smallest to the largest value, and a text that names both.
-
-    Parameters
-    ----------
-    layers : sequence of Layer
-        From inside to outside, in the frame `frame_id`.
-    quantity : Quantity
-        Of the values.
-    title : str
-        First line of the text.
-    frame_id, stamp
-        Header of the markers: the name of the work frame.
-
-    Raises
-    ------
-    GeometryError
-        No layer, or values that are not finite.
-    """
+    """Return shells as triangles coloured from the smallest to the largest value, and a text that names both."""
     values = np.concatenate([layer.values.ravel() for layer in layers]) if layers else np.array([np.nan])
     if not np.isfinite(values).all():
         raise GeometryError("layers", "must be at least one, with finite values")
@@ -81,13 +64,7 @@ def publish_shells(node: Node, markers: MarkerArray, topic: str = TOPIC) -> Publ
 
 
 def show_shells(layers: Sequence[Layer], quantity: Quantity, title: str, frame_id: str = "work") -> None:
-    """Publish shells from a node of its own until Ctrl-C.
-
-    Parameters
-    ----------
-    layers, quantity, title, frame_id
-        As for :func:`shell_markers`.
-    """
+    """Publish shells from a node of its own until Ctrl-C."""
     keep_discovery_local()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:

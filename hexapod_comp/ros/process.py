@@ -1,39 +1,55 @@
-"""How a node's process runs: its arguments, the spin loop, signals, its end."""
+"""A node's process: its spin loop, signals, end, and a log that cannot hold it up; and a session for other programs."""
 
 from __future__ import annotations
 
-import ctypes
+import contextlib
 import faulthandler
+import fcntl
 import functools
 import gc
 import os
 import signal
+import stat
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from typing import TextIO
+from types import TracebackType
+from typing import Any, TextIO
 
 import rclpy
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
 from rclpy.signals import SignalHandlerOptions
 
 from ..errors import LONGEST_TEXT, HexapodError, printable
-from . import heard_signals, open_streams
-from .arguments import Program
-from .log_relay import LogRelay
-from .middleware import avoid_shared_memory
-from .runtime import MachineNode
+from . import avoid_shared_memory, heard_signals, open_streams
+from .base import MachineNode
+from .parameters import Program
 
 SPIN_PERIOD = 0.1
 """Longest wait of one spin, s: how soon a signal is noticed (EventsExecutor.spin itself never returns)."""
 
-
-M_MMAP_THRESHOLD, LARGEST_KEPT = -3, 1 << 20
-"""Parameter of glibc's ``mallopt``; blocks from this size on, byte, go back to the system when they are freed."""
-
 ENDED_WITHIN = 4.0
 """What the end of a process may take from its signal on, s; usually it is a fraction of a second."""
+
+STREAMS = (1, 2)
+"""stdout and stderr: RCUTILS_LOGGING_USE_STDOUT decides where ROS writes."""
+
+BUFFER_SIZE = 1 << 20
+"""Of the log's pipe, byte: some thousands of lines. Linux allows everybody this much."""
+
+LEAVING_WITHIN = 0.5
+"""How long the end of a process waits for its last lines to be taken, s."""
+
+QUIET: dict[str, Any] = {
+    "start_parameter_services": False,
+    "enable_rosout": False,
+    "parameter_overrides": [RosParameter("start_type_description_service", value=False)],
+}
+"""Options of a node that publishes nothing and offers nothing."""
 
 
 def autostart(node: LifecycleNode, heard: Sequence[int] = ()) -> bool:
@@ -44,13 +60,6 @@ def autostart(node: LifecycleNode, heard: Sequence[int] = ()) -> bool:
         if step() != TransitionCallbackReturn.SUCCESS:
             return False
     return True
-
-
-def keep_discovery_local() -> None:
-    """Keep discovery to this machine, and out of shared memory, unless the user's environment says otherwise."""
-    avoid_shared_memory()
-    if "ROS_STATIC_PEERS" not in os.environ:
-        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
 def discovery() -> str:
@@ -71,27 +80,12 @@ def run(
 
     Signals are only noted, since rclpy's own handling loses the last message and exits non-zero on a
     second Ctrl-C, which ``ros2 launch`` sends.
-
-    Parameters
-    ----------
-    make_node : callable
-        Makes the node, once ROS runs.
-    program : Program
-        What its arguments may be.
-    argv : sequence of str, optional
-        Arguments after the program's name; those of this process by default.
-
-    Returns
-    -------
-    int
-        0 after a signal or ``--help``, 1 when the node could not start, 2 where an argument is not understood.
     """
     arguments = sys.argv[1:] if argv is None else list(argv)
     refusal = program.refusal(arguments)
     if refusal is not None:
         return refusal
     open_streams()
-    give_blocks_back()
     heard = heard_signals()
     with _own_stderr() as stderr:
         with LogRelay():
@@ -105,15 +99,6 @@ def run(
         faulthandler.cancel_dump_traceback_later()
         signal.setitimer(signal.ITIMER_REAL, 0.0)
     return code
-
-
-def give_blocks_back() -> None:
-    """Let large blocks go back to the system as soon as they are freed, where the C library is glibc.
-
-    Left alone, its threshold grows with the largest block that was ever freed, and long messages leave holes.
-    """
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, LARGEST_KEPT)
 
 
 def _own_stderr() -> TextIO:
@@ -151,7 +136,8 @@ def _run_until(
         ending.callback(_end_within, ENDED_WITHIN, stderr)
         if node.wants_autostart and node.unconfigured and not autostart(node, heard):
             return 1
-        # What is loaded by now stays; the collector need not look at it again while the machine moves.
+        # What is loaded by now stays; the collector need not look at it again while the machine moves: 190,000 objects,
+        # in which a full collection takes 60 ms.
         gc.collect()
         gc.freeze()
         while not heard and rclpy.ok():
@@ -168,3 +154,94 @@ def _end_within(seconds: float, stderr: TextIO) -> None:
     faulthandler.dump_traceback_later(seconds, exit=True, file=stderr)
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.setitimer(signal.ITIMER_REAL, seconds + 1.0)
+
+
+# ---- the log ----
+
+
+class LogRelay:
+    """Context manager: writing to stdout and stderr never waits, and what nobody takes in time is lost.
+
+    ROS writes its log to stderr from within the call, with Python's lock held. A terminal stopped with Ctrl-S, or a
+    pipe that nobody reads, would then stop the machine's loop for as long as it likes. Here a thread stands between:
+    the loop writes into a pipe of this process, and what does not fit into it any more is lost instead of waited for.
+    """
+
+    def __enter__(self) -> LogRelay:
+        self._relays = [_Relay(stream) for stream in STREAMS if _may_block(stream)]
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for relay in self._relays:
+            relay.close()
+
+
+def _may_block(stream: int) -> bool:
+    """Return whether writing can wait for somebody: a terminal, a pipe or a socket, but not a file."""
+    try:
+        return not stat.S_ISREG(os.fstat(stream).st_mode)
+    except OSError:  # closed
+        return False
+
+
+class _Relay:
+    """One stream and the thread that empties the pipe put in its place."""
+
+    def __init__(self, stream: int) -> None:
+        self._stream, self._real = stream, os.dup(stream)
+        self._source, sink = os.pipe()
+        with contextlib.suppress(OSError):  # a system with a lower limit keeps its own size
+            fcntl.fcntl(sink, fcntl.F_SETPIPE_SZ, BUFFER_SIZE)
+        os.set_blocking(sink, False)
+        os.dup2(sink, stream)
+        os.close(sink)
+        self._thread = threading.Thread(target=self._carry, name=f"log of stream {stream}", daemon=True)
+        self._thread.start()
+
+    def _carry(self) -> None:
+        """Hand on what was written, until the last writer has gone; go on emptying when the reader has gone."""
+        while data := os.read(self._source, 1 << 16):
+            with contextlib.suppress(OSError):
+                while data:
+                    data = data[os.write(self._real, data) :]
+
+    def close(self) -> None:
+        """Put the stream back and wait a little for what is on its way."""
+        os.dup2(self._real, self._stream)
+        self._thread.join(LEAVING_WITHIN)
+
+
+# ---- other programs ----
+
+
+class RosSession:
+    """A private context of ROS with an executor and one node: for programs that talk to nodes; signals are theirs."""
+
+    def __init__(self, name: str, namespace: str = "", **options: Any) -> None:
+        open_streams()
+        avoid_shared_memory()
+        self._context = rclpy.Context()
+        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self.node: Node = rclpy.create_node(name, namespace=namespace, context=self._context, **options)
+        self._executor = EventsExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def __enter__(self) -> RosSession:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def spin_once(self, timeout: float) -> None:
+        """Handle what has come, or the first to come within so many seconds."""
+        self._executor.spin_once(timeout_sec=timeout)
+
+    def close(self) -> None:
+        """Leave ROS."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self._context)

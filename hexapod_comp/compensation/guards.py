@@ -1,0 +1,445 @@
+"""What every message passes before it moves a strut: one sender, a stamp that fits, no faster than the struts can.
+
+No ROS here: node, drive and LinuxCNC bridge use the same guards, and tests drive them by a clock of their own. Times
+named `now` are monotonic, s; stamps are integers, ns.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from operator import sub
+from typing import NamedTuple
+
+from ..errors import CommandError, LimitError
+from ..machine.limits import STRUT_NAMES
+
+SHOWN_FOR = 1.0
+"""What has happened colours a node's status for this long, s."""
+
+FORGET_ORDER_AFTER = 0.5
+"""After a pause this long, s, stamps may start again earlier: the sender or its clock was restarted."""
+
+STEP_TOLERANCE = 2_000_000
+"""A change between system and monotonic clock up to this, ns, is no step."""
+
+SLEW = 1e-3
+"""A clock may be corrected at this rate without being set (NTP's own limit is half of it)."""
+
+READ_WITHIN = 200_000
+"""Two clocks read further apart than this, ns, are read again: the processor was elsewhere in between."""
+
+IN_FLIGHT = 0.5
+"""For this long after a step of the clock, s, messages that were stamped before it may still arrive."""
+
+EARLY = 2_000_000
+"""No message is from the future by more than this, ns, or than its sender's messages are, where it stamps ahead."""
+
+LEAD_SHRINKS = 1e6
+"""How fast it is forgotten how far a sender stamps ahead, ns/s: clocks drift apart by a tenth of that."""
+
+RUN, RUN_LASTS = 3, 0.02
+"""This many messages that are in order among themselves and arrive over this time, s, were not overtaken: their
+sender's clock was set back. What was held up on its way arrives at once."""
+
+BUNCHED_WITHIN = 0.1
+"""Commands that were held up on their way for up to this time, s, may come all at once."""
+
+SPEAKERS_WITHIN = 1.0
+"""A sender that returns this long after another has taken over is not a predecessor that was stopped, s."""
+
+SPEAKERS_HELD = 2.0
+"""Two that sent in turn count as two for this long after the last turn, s."""
+
+UNKNOWN_NAME = "_NODE_NAME_UNKNOWN_"
+"""What rmw calls a publisher whose node it has not heard of: found a moment ago, or not a ROS node."""
+
+
+class Sample:
+    """One message on its way past the guards."""
+
+    __slots__ = ("age", "frame_id", "now", "stamp", "values")
+
+    def __init__(self, now: float, stamp: int = 0, values: tuple[float, ...] | None = None, frame_id: str = "") -> None:
+        self.now, self.stamp, self.values, self.frame_id = now, stamp, values, frame_id
+        self.age = 0.0  # s by its stamp, which its StampGate finds out
+
+
+class Guard:
+    """One question to each sample: `check` refuses it, `accept` remembers one that has passed all guards, `reset`
+    forgets. While there is a `problem` every sample is refused; one that is `latched` stays until it is released."""
+
+    reason = ""  # under which refusals are counted
+    latched = False
+    problem = ""
+
+    def check(self, sample: Sample) -> None:
+        """Raise a HexapodError that says why the sample is refused."""
+        if self.problem:
+            raise CommandError(self.reason, self.problem)
+
+    def accept(self, sample: Sample) -> None:
+        """Remember a sample that all guards have passed."""
+
+    def reset(self) -> None:
+        """Forget all samples; a latched problem stays."""
+
+
+class Lately:
+    """Whether something has happened of late: within :data:`SHOWN_FOR`, or since this was asked before.
+
+    So a node that is asked now and then shows everything at least once, however long it stood still in between.
+    """
+
+    def __init__(self) -> None:
+        self._at = self._asked = self._before = -math.inf
+
+    def note(self, now: float) -> None:
+        """It happens now."""
+        self._at = now
+
+    def holds(self, now: float) -> bool:
+        """Return whether it has happened of late; the same as often as one asks at the same time."""
+        if now > self._asked:
+            self._before, self._asked = self._asked, now
+        return now - self._at < SHOWN_FOR or self._at > self._before
+
+
+# ---- speed ----
+
+
+class Excess(NamedTuple):
+    """What breaks a :class:`RateLimit`."""
+
+    which: int  # of the values
+    moved: float
+    allowed: float
+    elapsed: float  # s
+    in_turn: bool  # many in turn are too fast, each of which might be
+
+
+class RateLimit:
+    """Values that move no faster than `rate` from the last accepted ones, but for a way that they may make `at_once`.
+
+    With `bunched`, s, many in turn may be no faster either, but for `at_once` and the way of a bunch that was held up
+    for that time: a leaky bucket. Before the first values nothing is known, and all pass.
+    """
+
+    def __init__(self, at_once: float, rate: float, bunched: float = math.inf) -> None:
+        self.at_once, self.rate, self.bunched = at_once, rate, bunched
+        self.reset()
+
+    def reset(self, standing: Sequence[float] | None = None) -> None:
+        """Forget the last values, or begin where things stand: then time alone gives no right to any way."""
+        self.last, self.at = standing, math.inf
+        self._ahead: Sequence[float] = () if standing is None else (0.0,) * len(standing)
+
+    def excess(self, values: Sequence[float], now: float, elapsed: float = -math.inf) -> Excess | None:
+        """Return what moves too far, if any; `elapsed` counts where it is longer than the time since the last."""
+        if self.last is None:
+            return None
+        elapsed = max(elapsed, now - self.at, 0.0)
+        moved, allowed = list(map(abs, map(sub, values, self.last))), self.at_once + self.rate * elapsed
+        if max(moved) > allowed or sum(moved) != sum(moved):  # NaN is found by the sum alone
+            worst = max(range(len(moved)), key=lambda n: math.inf if math.isnan(moved[n]) else moved[n])
+            return Excess(worst, moved[worst], allowed, elapsed, False)
+        if self.bunched < math.inf:
+            ahead, allowed = self._ahead_of(moved, elapsed), self.at_once + self.rate * self.bunched
+            if max(ahead) > allowed:
+                worst = ahead.index(max(ahead))
+                return Excess(worst, ahead[worst], allowed, elapsed, True)
+        return None
+
+    def accept(self, values: Sequence[float], now: float) -> None:
+        """Take values as the last good ones."""
+        if self.bunched < math.inf:
+            last = values if self.last is None else self.last
+            self._ahead = self._ahead or (0.0,) * len(values)
+            self._ahead = self._ahead_of(list(map(abs, map(sub, values, last))), max(0.0, now - self.at))
+        self.last, self.at = values, now
+
+    def _ahead_of(self, moved: list[float], elapsed: float) -> list[float]:
+        way = self.rate * elapsed
+        return [max(ahead + step - way, 0.0) for ahead, step in zip(self._ahead, moved, strict=True)]
+
+
+class StrutSteps(Guard):
+    """Refuses strut commands further from the last ones than a machine's `step` (m) and `speed` (m/s) allow.
+
+    `reset` says where the struts stand: the first command must be within a step of that.
+    """
+
+    def __init__(self, step: float, speed: float) -> None:
+        self._limit = RateLimit(step, speed, BUNCHED_WITHIN)
+
+    def check(self, sample: Sample) -> None:
+        """Raise a LimitError, ``step`` or ``speed``."""
+        excess = self._limit.excess(sample.values or (), sample.now)
+        if excess is None:
+            return
+        which, moved, allowed = STRUT_NAMES[excess.which], f"{excess.moved * 1e3:.4g} mm", excess.allowed
+        text = f"{which} would step by {moved}, allowed {allowed * 1e3:.4g} mm"
+        if excess.in_turn:
+            text = f"{which} would be {moved} ahead of {self._limit.rate * 1e3:g} mm/s, allowed {allowed * 1e3:.4g} mm"
+        reason = "speed" if excess.in_turn else "step"
+        raise LimitError(reason, text, excess.moved, allowed, excess.which, "commanded")
+
+    def accept(self, sample: Sample) -> None:
+        """The struts are told to go there."""
+        self._limit.accept(tuple(sample.values or ()), sample.now)
+
+    def reset(self, standing: Sequence[float] | None = None) -> None:
+        """Begin where the struts stand, six lengths, m; None: not known, any first command passes."""
+        self._limit.reset(standing)
+
+
+# ---- stamps ----
+
+
+class StampClock:
+    """The clock by which stamps are judged, and when it was set: found by the monotonic clock, which nobody sets.
+
+    `simulated` reads simulated time, ns, which is set only when it falls; None: the system's clock. (ROS reads the
+    system's too, but takes ten times as long.)
+    """
+
+    def __init__(
+        self,
+        simulated: Callable[[], int] | None = None,
+        system: Callable[[], int] = time.time_ns,
+        steady: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._simulated, self.system, self.steady = simulated, system, steady
+        self._at, self._offset, self._last, self.shift = steady(), 0, 0, 0
+        self.set_back = self.set_forward = self.last_step = 0  # how often it was set, and the newest step, ns
+        self.steps: list[tuple[int, int]] = []  # monotonic time, ns, of the newest, and the shift in force until then
+        self.read()
+        self.shift = self.set_back = self.set_forward = 0  # the shift is the sum of all steps, ns
+        self.steps.clear()
+
+    def read(self) -> int:
+        """Return the time, ns; take notice where it was set since the last time."""
+        steady = self.steady
+        if self._simulated is not None:
+            now, clock = steady(), self._simulated()
+            if clock < self._last:
+                self._was_set(clock - self._last, now)
+            self._last = clock
+            return clock
+        for _ in range(3):
+            now, clock = steady(), self.system()
+            if (apart := steady() - now) <= READ_WITHIN:
+                break
+        step = clock - now - self._offset
+        if abs(step) > STEP_TOLERANCE + apart + SLEW * (now - self._at):
+            self._was_set(step, now)
+            self._offset, self._at = clock - now, now
+        elif apart <= READ_WITHIN:
+            self._offset, self._at = clock - now, now
+        return clock
+
+    def before(self) -> list[int]:
+        """Return the shifts that were in force before the newest steps, while messages stamped then may arrive."""
+        since = self.steady() - round(IN_FLIGHT * 1e9)
+        self.steps = [entry for entry in self.steps if entry[0] >= since]
+        return [shift for _, shift in self.steps]
+
+    def _was_set(self, step: int, now: int) -> None:
+        self.steps.append((now, self.shift))
+        self.shift += step
+        self.last_step = step
+        self.set_back += step < 0
+        self.set_forward += step > 0
+
+
+class StampGate(Guard):
+    """Lets one sender's messages pass by their stamps: none too old or from the future, none overtaken.
+
+    Sender and node may share a clock that is set, back or forward, while messages are on their way. Then a stamp may
+    be one of the old setting or of the new one, unless that would put the message into the future, further than its
+    sender stamps ahead: messages come late, but none comes before it was sent. It is the one that follows closest on
+    the last message's. So a step of the clock shuts nothing out, and lets no overtaken message pass. A sender whose
+    clock is set while the node's is not shows itself by a run of messages in order.
+
+    `max_age`, s, is the allowed difference to the clock, 0: any; with `future` stamps from the future are refused as
+    old ones are; `capped`: a stamp from the future counts as now in the order of stamps, so that it does not shut out
+    those that follow. A zero stamp tells nothing and passes, unless `required`.
+    """
+
+    def __init__(
+        self, what: str, clock: StampClock, max_age: float = 0.0, future: bool = True, capped: bool = False
+    ) -> None:
+        self._what, self._clock, self.max_age = what, clock, max_age
+        self._future, self._capped = future, capped
+        self.sender_set_back = 0  # how often the sender's clock alone was found set back
+        self._now = self._age = self._made = 0
+        self._shift = self._checked_shift = clock.shift
+        self._run, self._run_since, self._run_made = 0, 0.0, 0
+        self._then = -math.inf
+        self._lead = 0  # how far the sender stamps ahead, ns
+
+    def check(self, sample: Sample) -> None:
+        """Raise a CommandError, ``stamp_past``, ``stamp_future`` or ``stamp_order``; write the sample's age, s."""
+        stamp, now, clock = sample.stamp, sample.now, self._clock
+        if not stamp:
+            return
+        self._now = clock.read()
+        ordered = now - self._then < FORGET_ORDER_AFTER
+        # A sender that has not followed a step has a clock of its own: its order goes on by that.
+        self._age, self._checked_shift = self._now - stamp, self._shift if ordered else clock.shift
+        if clock.steps:
+            self._find_setting(stamp, clock.before())
+        age = self._age * 1e-9
+        if self.max_age:
+            if age > self.max_age or (self._future and -age > self.max_age):
+                reason, word = ("stamp_past", "old") if age > 0.0 else ("stamp_future", "in the future")
+                text = f"{self._what} is stamped {abs(age):.3f} s {word}, allowed {self.max_age:g} s"
+                raise CommandError(reason, text)
+            sample.age = max(age, 0.0)
+        made = stamp - self._checked_shift
+        if ordered and made < self._made and not self._is_run(made, now):
+            late = (self._made - made) * 1e-6
+            raise CommandError("stamp_order", f"{self._what} is stamped {late:.1f} ms earlier than the one before")
+
+    def accept(self, sample: Sample) -> None:
+        """Remember the stamp that was just checked as that of the last message accepted."""
+        self._run = 0
+        if not sample.stamp:
+            return
+        elapsed = min(max(0.0, sample.now - self._then), FORGET_ORDER_AFTER)
+        self._lead = max(-self._age, self._lead - round(LEAD_SHRINKS * elapsed), 0)
+        self._shift, self._then = self._checked_shift, sample.now
+        self._made = sample.stamp - self._shift
+        if self._capped:
+            self._made = min(self._made, self._now - self._clock.shift)
+
+    def reset(self) -> None:
+        """Forget the order: the next stamp may be any."""
+        self._then, self._lead, self._run = -math.inf, 0, 0
+
+    def _find_setting(self, stamp: int, before: list[int]) -> None:
+        """Find out by which setting of a clock that was set of late a stamp was made, and how old it is then, ns."""
+        if not before:
+            return
+        age, shift = self._age, self._clock.shift
+        ages = {age - shift + one: one for one in {shift, self._checked_shift, *before}}
+        possible = {age: one for age, one in ages.items() if age >= -self._lead - EARLY}
+        self._age = min(possible, default=max(ages))
+        # The stamp that follows closest on the last one's: what waited while the node stood still comes in turn.
+        made = sorted((stamp - one, one) for one in possible.values() or ages.values())
+        self._checked_shift = next((one for when, one in made if when >= self._made), made[-1][1])
+
+    def _is_run(self, made: int, now: float) -> bool:
+        """Return whether messages with earlier stamps come in such a way that their sender's clock was set back."""
+        if not self._run or made < self._run_made:
+            self._run, self._run_since = 0, now
+        self._run, self._run_made = self._run + 1, made
+        if self._run < RUN or now - self._run_since < RUN_LASTS - 1e-6:
+            return False
+        self.sender_set_back += 1
+        return True
+
+
+# ---- senders ----
+
+
+class OneSender(Guard):
+    """Only one node may publish on a topic of commands or of readings, and no message goes missing unseen.
+
+    The graph tells the publishers' names, but keeps a node that was killed for as long as its own lease (20 s by
+    default): two of one name may be one and its ghost. How long that is, its own DDS profile says, not ours, so a
+    shorter lease in config/fastdds.xml would not help against any controller but our own programs, and would lose
+    these on a busy computer. Sequence numbers tell ghosts apart: every publisher counts its messages from 1, and only
+    the living send. A second node of this node's `own` name on a topic that it publishes is not seen: it may be this
+    one's predecessor that was killed; who listens finds out.
+
+    `count` returns how many publishers there are, cheap; `names` their full names, each once, and why they cannot be
+    told, empty where they can: who cannot tell who commands must not obey. Where several are `allowed` they are named
+    all the same.
+    """
+
+    def __init__(
+        self,
+        topic: str,
+        count: Callable[[], int],
+        names: Callable[[], tuple[tuple[str, ...], str]],
+        allowed: bool,
+        own: str = "",
+    ) -> None:
+        self.topic, self._count_now, self._look_up, self._allowed, self._own = topic, count, names, allowed, own
+        self._count = -1
+        self.names: tuple[str, ...] = ()  # of the others, where one is its own
+        self._unknown = ""
+        self.missed = 0  # messages that were sent and never handled: overtaken in a queue, or lost by the network
+        self._counted = True  # whether the middleware counts messages at all
+        self._turned_at = self._changed_at = -math.inf
+        self._last = self._other = 0
+        self._misses = Lately()
+
+    @property
+    def reason(self) -> str:  # type: ignore[override]
+        """Name under which refusals are counted."""
+        return "unknown_publisher" if self._unknown else "several_publishers"
+
+    def look(self, now: float) -> None:
+        """Look who publishes: at the names only when they may have changed, or when they matter."""
+        count = self._count_now()
+        if count != self._count or count > 1 or self._unknown or UNKNOWN_NAME in self.names:
+            self._count = count
+            names, self._unknown = self._look_up() if count else ((), "")
+            self.names = tuple(name for name in names if name != self._own)
+        if count > 1 or self.problem or self._unknown or (self._own and self.names):
+            self._judge(now)
+
+    def hear(self, number: int | None, now: float) -> bool:
+        """Take a message's sequence number, None where none are counted; return whether it showed a second sender."""
+        if number is not None and number == self._last + 1:
+            self._last = number
+            return False
+        counted, self._counted = self._counted, number is not None
+        if self._in_turn(number, now) or (counted and not self._counted):
+            self._judge(now)
+            return bool(self.problem)
+        return False
+
+    def missing(self, now: float) -> bool:
+        """Return whether messages have gone missing of late."""
+        return self._misses.holds(now)
+
+    def _in_turn(self, number: int | None, now: float) -> bool:
+        """Return whether a number that does not follow the last one shows that two send in turn."""
+        last, self._last = self._last, number or 0
+        if number is None or not last:
+            return False
+        back = number <= last
+        returned = now - self._changed_at < SPEAKERS_WITHIN and (back or last < self._other < number)
+        lost = number - 1 - (self._other if returned else last)
+        if lost > 0 and (returned or not back):
+            self.missed += lost
+            self._misses.note(now)
+        if returned:
+            self._turned_at = now
+        if back or returned:
+            self._other, self._changed_at = last, now
+        return returned
+
+    def _judge(self, now: float) -> None:
+        names, both = ", ".join(self.names), ", ".join(self.names) or UNKNOWN_NAME
+        self.problem = ""
+        if self._allowed:
+            return
+        if self._own:
+            if others := names or self._unknown:
+                self.problem = f"{self.topic} is also published by {others}"
+        elif self._unknown:
+            self.problem = f"who publishes {self.topic} cannot be told: {self._unknown}"
+        elif len(self.names) > 1:
+            self.problem = f"several publishers of {self.topic}: {names}"
+        elif self._count > 1 and now - self._turned_at < SPEAKERS_HELD:
+            self.problem = f"two publishers of {self.topic} speak in turn, both called {both}"
+        elif self._count > 1 and not self._counted:
+            self.problem = (
+                f"two publishers of {self.topic} are called {both}; whether both speak cannot be told, as this "
+                "middleware (RMW) does not count messages"
+            )

@@ -1,0 +1,204 @@
+"""Where the struts are: one record of what they were told and what was measured, which every question is put to."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from operator import sub
+
+import numpy as np
+
+from ..errors import CommandError, LimitError
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry
+from .guards import Guard, RateLimit, Sample
+
+KEPT = 512
+"""Commands and readings remembered: half a second at 1 kHz."""
+
+FOLLOWED_WITHIN = 0.1
+"""A drive follows and tells within this time, s: a strut is right where any command of that time wants it."""
+
+STANDS_WITHIN = 50e-6
+"""A strut that moves by no more than this in that time stands, m: encoders and servos are never quite still."""
+
+AVERAGED_OVER = 0.5
+"""Readings of a machine at rest are averaged over this time, s: ten at least of a slow drive, at 20 Hz."""
+
+NOISE = 2e-6
+"""Readings that differ by no more than this, m, are of one place: encoders read to 0.1 µm, servos hold to 1 µm."""
+
+FASTER = 2.0
+"""Struts may have moved so many times faster than they may be commanded: jogged by hand, or pulled back."""
+
+Struts = Sequence[float]
+
+
+class StrutTrack(Guard):
+    """Commanded and measured struts of the last half second, and the last of each, six lengths, m.
+
+    It answers: can a machine stand so (`check_stroke`, `check_jump`); do the struts go where they are told (`follow`; a
+    problem is latched until `release`, and refuses commands); do they stand (`moving`); where does a start begin
+    (`start`).
+
+    Drives lag, and readings are on their way for a while, so a reading is compared with all that was commanded since
+    :data:`FOLLOWED_WITHIN` before it was made: it must lie between the least and the most of it, or within `limit`, m
+    (0: any). Once it does not, the machine is stopped until somebody has looked, as on servo drives and in LinuxCNC: a
+    strut that comes back by itself has all the same been where nobody told it to be.
+
+    A controller streams on while a compensator restarts, and DDS may let it be heard before the drive is. So "no
+    reading yet" does not mean that the struts may be sent anywhere: a start waits for one, unless nothing has become
+    known for `anywhere_after`, s, since the activation (0: for ever), on a machine without feedback.
+    """
+
+    reason = "following_error"
+    latched = True
+
+    def __init__(
+        self, geometry: HexapodGeometry | None = None, limit: float = 0.0, anywhere_after: float = 0.0
+    ) -> None:
+        self.limit, self.anywhere_after, self._began = limit, anywhere_after, math.inf
+        self._told: deque[tuple[float, Struts]] = deque(maxlen=KEPT)
+        self._read: deque[tuple[float, Struts]] = deque(maxlen=KEPT)
+        self._read_made, self._read_stamp = -math.inf, 0
+        self._left: tuple[float, Struts] = (-math.inf, ())  # the last command before all of them were forgotten
+        self.watch(geometry)
+
+    def watch(self, geometry: HexapodGeometry | None) -> None:
+        """Go by a machine's strokes, with the largest correction to spare at either end, step and speed."""
+        self._low, self._high = (-math.inf,) * 6, (math.inf,) * 6
+        self._jumps = RateLimit(math.inf, 0.0)
+        if geometry is not None:
+            limits = geometry.limits
+            self._low = tuple((limits.stroke[:, 0] - limits.correction).tolist())
+            self._high = tuple((limits.stroke[:, 1] + limits.correction).tolist())
+            self._jumps = RateLimit(limits.step, FASTER * limits.speed)
+
+    # ---- what comes ----
+
+    def tell(self, command: Struts, now: float) -> None:
+        """Add a command that was published."""
+        self._told.append((now, command))
+
+    def check_jump(self, sample: Sample) -> None:
+        """Raise a LimitError, ``jump``, for measured struts further from the last ones than a machine can have moved.
+
+        A strut that has really jumped is believed when so much time has passed, by stamps or by arrival, whichever is
+        longer, that it may have got there: transports delay.
+        """
+        struts, now = sample.values or (), sample.now
+        excess = self._jumps.excess(struts, now, self._by_stamp(sample.stamp))
+        if excess is not None:
+            moved, allowed = f"{excess.moved * 1e3:.3f} mm", f"{excess.allowed * 1e3:.3f} mm"
+            text = f"{STRUT_NAMES[excess.which]} has jumped by {moved}, in {excess.elapsed:.3f} s it can have moved "
+            raise LimitError("jump", text + allowed, excess.moved, excess.allowed, excess.which, "measured")
+
+    def check_stroke(self, struts: Struts) -> None:
+        """Raise a LimitError, ``stroke``, for measured struts, m, that no machine can have."""
+        short, long = list(map(sub, self._low, struts)), list(map(sub, struts, self._high))
+        if max(short) <= 0.0 and max(long) <= 0.0:
+            return
+        beyond = [max(pair) for pair in zip(short, long, strict=True)]
+        strut = beyond.index(max(beyond))
+        length, low, high = struts[strut], self._low[strut], self._high[strut]
+        text = f"{STRUT_NAMES[strut]} cannot be {length * 1e3:.3f} mm long, only {low * 1e3:g}…{high * 1e3:g} mm"
+        raise LimitError("stroke", text, length, low if length < low else high, strut, "measured")
+
+    def accept(self, sample: Sample) -> None:
+        """Add a good reading, which was made `age` before it came."""
+        struts = sample.values or ()
+        self._jumps.accept(struts, sample.now)
+        self._read.append((sample.now, struts))
+        self._read_made, self._read_stamp = sample.now - sample.age, sample.stamp
+
+    def follow(self, measured: Struts, made: float) -> bool:
+        """Hold measured struts that were made at a monotonic time, s, against their commands; return whether a
+        following error is found for the first time, which is the problem from then on."""
+        if self.problem or not (self._told and self.limit):
+            return False
+        if max(map(abs, map(sub, measured, self._told[-1][1]))) <= self.limit:  # as they nearly always are
+            return False
+        low, high = _range(self._told, made - FOLLOWED_WITHIN)
+        off = np.maximum(low - measured, measured - high)
+        strut = int(off.argmax())
+        if off[strut] <= self.limit:
+            return False
+        self.problem = (
+            f"{STRUT_NAMES[strut]} is at {measured[strut] * 1e3:.3f} mm, {off[strut] * 1e3:.3f} mm from its "
+            f"command, allowed {self.limit * 1e3:g} mm; until ~/reset"
+        )
+        return True
+
+    def release(self) -> None:
+        """Take a following error as settled."""
+        self.problem = ""
+
+    def reset(self) -> None:
+        """No command is in force any more; where the last one has sent the struts is remembered."""
+        if self._told:
+            self._left = self._told[-1]
+        self._told.clear()
+
+    def begin(self, now: float) -> None:
+        """The node is activated."""
+        self._began = now
+
+    # ---- what is asked ----
+
+    def moving(self, now: float) -> str:
+        """Return which strut was told, or measured, to go how far in the last :data:`FOLLOWED_WITHIN`, in words; empty
+        when all stand."""
+        for recent, how in ((self._told, "was told to go"), (self._read, "went")):
+            if recent:
+                low, high = _range(recent, now - FOLLOWED_WITHIN)
+                strut = int((high - low).argmax())
+                if (way := float(high[strut] - low[strut])) > STANDS_WITHIN:
+                    return f"{STRUT_NAMES[strut]} {how} {way * 1e3:.3f} mm in the last {FOLLOWED_WITHIN:g} s"
+        return ""
+
+    def mean(self) -> np.ndarray:
+        """Return where struts at rest are: the mean of the readings of the last :data:`AVERAGED_OVER`, shape (6,), m;
+        while any of them is further than :data:`NOISE` from another, the newest."""
+        since = self._read[-1][0] - AVERAGED_OVER
+        rows = np.array([struts for at, struts in self._read if at >= since])
+        return rows.mean(axis=0) if (np.ptp(rows, axis=0) <= NOISE).all() else rows[-1]
+
+    def waits(self, now: float) -> bool:
+        """Return whether a start must wait until something is known."""
+        unknown = not self._read and not self._left[1]
+        return unknown and not 0.0 < self.anywhere_after <= now - self._began
+
+    def start(self, now: float, fresh: bool) -> np.ndarray | None:
+        """Return where the struts stand when the next command is the first: as measured, or else as told last.
+
+        While readings come, `fresh`, the last one counts, lag and all; otherwise it counts only when it was made so
+        long after the last command that the struts had got there. None: nobody knows and the start may be anywhere.
+
+        Raises
+        ------
+        CommandError
+            ``no_feedback``: nothing is known, and the start must wait.
+        """
+        if self.waits(now):
+            hint = "a machine without feedback needs start_without_feedback_after"
+            if self.anywhere_after:
+                hint = f"from {self.anywhere_after:g} s after the start on the first command may be anywhere"
+            raise CommandError("no_feedback", f"no strut_states yet: where the struts stand is not known; {hint}")
+        told_at, told = self._left
+        if self._read and self._read_made >= told_at + (-FOLLOWED_WITHIN if fresh else FOLLOWED_WITHIN):
+            return self.mean()
+        return np.array(told) if told else None
+
+    def _by_stamp(self, stamp: int) -> float:
+        """Return the time since the last reading by the stamps of both, s; −∞ where one has none."""
+        return (stamp - self._read_stamp) * 1e-9 if stamp and self._read_stamp else -math.inf
+
+
+def _range(recent: deque[tuple[float, Struts]], since: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the most since a monotonic time, s, with what was in force then; each of shape (6,), m."""
+    rows = []
+    for at, struts in reversed(recent):
+        rows.append(struts)
+        if at < since:
+            break
+    return np.min(rows, axis=0), np.max(rows, axis=0)

@@ -1,0 +1,401 @@
+"""What the package's lifecycle nodes have in common: topics, timers and services under one guard, log, diagnostics."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import State
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.service import Service
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
+
+from ..compensation.guards import OneSender, StampClock
+from ..errors import LONGEST_TEXT, CommandError, printable
+from .messages import read_message
+from .parameters import Parameter, Parameters
+from .rclpy_compat import (
+    Alarm,
+    PlainLogger,
+    Throttle,
+    described,
+    end_lifecycle,
+    lifecycle_state,
+    numbered,
+    possible_only,
+    publishers,
+)
+from .status import ERROR, HealthReport, Refusals, joined
+
+_LAST, _RELIABLE, _BEST_EFFORT = HistoryPolicy.KEEP_LAST, ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+
+COMMAND_QOS = QoSProfile(depth=100, history=_LAST, reliability=_RELIABLE)
+"""Commands: each must arrive. A hundred wait while a busy processor pauses for 0.1 s at 1 kHz, or a cable repeats."""
+
+STATE_QOS = QoSProfile(depth=1, history=_LAST, reliability=_RELIABLE)
+"""Publishers of states: the newest only, to reliable listeners too. Who subscribes without a thought is one."""
+
+NEWEST_QOS = QoSProfile(depth=1, history=_LAST, reliability=_BEST_EFFORT)
+"""Subscriptions of states, however published: only the newest counts, and an old one is not worth repeating."""
+
+SENSOR_QOS = QoSProfile(depth=10, history=_LAST, reliability=_BEST_EFFORT)
+"""Subscriptions of sensors, however they publish."""
+
+EVENT_QOS = QoSProfile(depth=10, history=_LAST, reliability=_RELIABLE)
+"""Rare messages, each of which counts: diagnostics, markers."""
+
+LATCHED_QOS = QoSProfile(depth=1, history=_LAST, reliability=_RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+"""A state that who comes late must know too."""
+
+OVERRIDES = QoSOverridingOptions(
+    (
+        QoSPolicyKind.HISTORY,
+        QoSPolicyKind.DEPTH,
+        QoSPolicyKind.RELIABILITY,
+        QoSPolicyKind.DEADLINE,
+        QoSPolicyKind.LIFESPAN,
+    )
+)
+"""What of a topic's QoS a user may override by parameters; subscriptions have no lifespan."""
+
+TRANSITIONS = ("on_configure", "on_activate", "on_deactivate", "on_cleanup", "on_shutdown")
+
+CHECK_PERIOD = 0.05
+"""How often a node looks whether its state has changed, s."""
+
+ACKNOWLEDGED_WITHIN = Duration(seconds=0.4)
+"""How long the last message waits to be acknowledged: that may take DDS 3 s, and the dead never do it."""
+
+
+class CallbackGuard:
+    """The one guard around everything that ROS calls in a node: it catches what a callback raises, and counts it.
+
+    A message, a timer, an event or a request must not end a running machine's node, whoever sent it and whatever is
+    wrong with it or with us. What is caught here was foreseen nowhere else, so it is an error for a second. A service
+    also answers: anybody may ask for a transition that is not allowed now, and rclpy raises then.
+    """
+
+    def __init__(self, warn: Callable[[str, str], None], complain: Callable[[str, str], None]) -> None:
+        self._warn, self._complain = warn, complain  # log with a cause, for throttling
+        self._caught, self._requests = Refusals(), Refusals()
+        self.request = ""  # name of the service that answers at this moment; empty between requests
+
+    def caught(self, what: str, error: Exception) -> None:
+        """Count and log what a callback has raised."""
+        text = printable(f"{what}: {described(error)}", LONGEST_TEXT)
+        self._caught.add(what, text, time.monotonic())
+        self._complain(what, f"error in a callback, the node goes on: {text}")
+
+    def around(self, what: str, callback: Callable[..., Any], otherwise: Any = None) -> Callable[..., Any]:
+        """Return a callback that never raises; it returns `otherwise` instead."""
+
+        @functools.wraps(callback)  # rclpy asks callbacks how many arguments they take
+        def guarded(*arguments: Any, **keywords: Any) -> Any:
+            try:
+                return callback(*arguments, **keywords)
+            except Exception as error:  # of any kind: that is what the guard is for
+                self.caught(what, error)
+                return otherwise
+
+        return guarded
+
+    def answering(self, name: str, kind: Any, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        """Return a service's callback that refuses a request where the one it has would raise."""
+
+        def answer(request: Any, response: Any) -> Any:
+            self.request = name
+            try:
+                return callback(request, response)
+            except Exception as error:  # rclpy's own errors, Python's where it does not check: of many kinds
+                text = printable(str(error), LONGEST_TEXT)
+                self._requests.add(name, text, time.monotonic())
+                self._warn(name, f"{name} refused: {text}")
+                return _refusal(kind, request, text)
+            finally:
+                self.request = ""
+
+        return answer
+
+    def findings(self, now: float) -> Iterator[tuple[bytes, str]]:
+        """Yield what diagnostics have to say."""
+        if reasons := self._caught.reasons(now):
+            yield ERROR, f"error in a callback: {reasons}"
+
+    def values(self) -> dict[str, str]:
+        """Return the counters as key and value."""
+        return {
+            "callback_errors": str(self._caught.total),
+            "last_callback_error": self._caught.last_text,
+            "refused_requests": str(self._requests.total),
+        }
+
+
+def _refusal(kind: Any, request: Any, reason: str) -> Any:
+    """Return the response of a service type that says no: what is not filled in is false or empty."""
+    response = kind.Response()
+    if isinstance(response, SetParameters.Response):
+        response.results = [SetParametersResult(reason=reason) for _ in request.parameters]
+    elif hasattr(response, "message"):
+        response.message = reason
+    return response
+
+
+class MachineNode(LifecycleNode):
+    """A lifecycle node with a table of parameters. Whatever ROS calls here, it calls through a :class:`CallbackGuard`.
+
+    Topics have a QoS that a user may override by parameters. rclpy writes the overrides into the profile that it is
+    given, so every topic gets a copy of its own. A ParameterError says which parameter's value is not allowed.
+    """
+
+    def __init__(self, name: str, table: Sequence[Parameter] = (), **options: Any) -> None:
+        self._active = False
+        self._throttle = Throttle()
+        self.guard = CallbackGuard(self.warn_of, self.complain_of)
+        for change in TRANSITIONS:  # rclpy would swallow what they raise, and say nothing
+            setattr(self, change, self.guard.around(change, getattr(self, change), TransitionCallbackReturn.ERROR))
+        super().__init__(name, **options)
+        self._logger = PlainLogger(self.get_logger().name, lambda: bool(self.guard.request))
+        for service in self.services:  # the lifecycle's are not made by create_service
+            callback = service.callback
+            callback = possible_only(self, callback) if service.srv_type is ChangeState else callback
+            service.callback = self.guard.answering(service.srv_name, service.srv_type, callback)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", EVENT_QOS)
+        self.speak_for("")
+        self._tickers: dict[str, Alarm] = {}
+        self._options = Parameters(self, table, self._on_parameters)
+        self.clock = StampClock(self.simulated_time())
+        self._steps_logged = 0
+        self.wants_autostart = bool(self._options.get("autostart", True))
+
+    # ---- the lifecycle ----
+
+    @property
+    def unconfigured(self) -> bool:
+        """Whether the node may be configured."""
+        return lifecycle_state(self)[0] == State.PRIMARY_STATE_UNCONFIGURED
+
+    @property
+    def active(self) -> bool:
+        """Whether the node acts."""
+        return self._active
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop acting; the struts keep their last command."""
+        self._active = False
+        return super().on_deactivate(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop acting for good: say so, then close what is open, so that nothing more is published."""
+        self.say_goodbye()
+        if state.state_id != State.PRIMARY_STATE_UNCONFIGURED:
+            self.on_cleanup(state)
+        return super().on_shutdown(state)
+
+    def say_goodbye(self) -> None:
+        """Publish what must still be said before the node ends."""
+
+    def destroy_node(self) -> None:
+        """Leave ROS at once, lifecycle services included."""
+        for ticker in self._tickers.values():
+            ticker.close()
+        super().destroy_node()
+        end_lifecycle(self)
+
+    @contextmanager
+    def all_or_nothing(self) -> Iterator[None]:
+        """Close what is opened in this block where it raises, so that the node is as it was before."""
+        kinds: tuple[tuple[str, Callable[[Any], Any]], ...] = (
+            ("timers", self.destroy_timer),
+            ("subscriptions", self.destroy_subscription),
+            ("services", self.destroy_service),
+            ("clients", self.destroy_client),
+            ("publishers", self.destroy_publisher),
+        )
+        before = {kind: list(getattr(self, kind)) for kind, _ in kinds}
+        try:
+            yield
+        except BaseException:
+            for kind, destroy in kinds:
+                for entity in [entity for entity in getattr(self, kind) if entity not in before[kind]]:
+                    destroy(entity)
+            raise
+
+    def close_ends(self, *ends: Publisher | Subscription | Service | Timer | None) -> None:
+        """Destroy publishers, subscriptions, services and timers of this node."""
+        kinds: tuple[tuple[type, Callable[[Any], Any]], ...] = (
+            (Publisher, self.destroy_publisher),
+            (Subscription, self.destroy_subscription),
+            (Service, self.destroy_service),
+            (Timer, self.destroy_timer),
+        )
+        for end in ends:
+            for kind, destroy in kinds:
+                if isinstance(end, kind):
+                    destroy(end)
+
+    # ---- parameters and time ----
+
+    def _on_parameters(self, names: set[str]) -> None:
+        for name in names & self._tickers.keys():
+            self._tickers[name].set_rate(self._options[name])
+        self.on_parameters(names)
+
+    def on_parameters(self, names: set[str]) -> None:
+        """Take what has been set while the node runs; called at other times too, with no names."""
+
+    def simulated_time(self) -> Callable[[], int] | None:
+        """Return what reads the simulated time, ns; None where the time is the system's."""
+        simulated = bool(self.get_parameter("use_sim_time").value)
+        return (lambda: int(self.get_clock().now().nanoseconds)) if simulated else None
+
+    def every(self, period: float, callback: Callable[[], None]) -> Timer:
+        """Return a timer on a clock that nobody can set: the node's own stops for as long as it is set back.
+
+        Its period stays, and it is never reset: see :class:`~.rclpy_compat.Alarm`.
+        """
+        return self.create_timer(period, callback, clock=self._steady)
+
+    def at_rate(self, name: str, callback: Callable[[], None]) -> Alarm:
+        """Return what calls back as many times a second as a parameter says, also when that is set anew; 0: never."""
+        self._tickers[name] = ticker = Alarm(self, self.guard.around(name, callback), self._options[name])
+        return ticker
+
+    # ---- topics and services ----
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[..., Any], *arguments: Any, **options: Any
+    ) -> Subscription:
+        """Return a subscription whose callback is guarded."""
+        guarded = self.guard.around(topic, callback)
+        return super().create_subscription(msg_type, topic, guarded, *arguments, **options)
+
+    def create_timer(
+        self, timer_period_sec: float, callback: Callable[..., Any], *arguments: Any, **options: Any
+    ) -> Timer:
+        """Return a timer whose callback is guarded."""
+        guarded = self.guard.around(getattr(callback, "__name__", "timer").strip("_"), callback)
+        return super().create_timer(timer_period_sec, guarded, *arguments, **options)
+
+    def create_service(
+        self, srv_type: Any, srv_name: str, callback: Callable[..., Any], *arguments: Any, **options: Any
+    ) -> Service:
+        """Return a service that refuses a request where its callback raises."""
+        guarded = self.guard.answering(srv_name, srv_type, callback)
+        return super().create_service(srv_type, srv_name, guarded, *arguments, **options)
+
+    def publish_on(self, message_type: type, topic: str, qos: QoSProfile, deadline: float = 0.0) -> Publisher:
+        """Return a publisher; it offers to publish every `deadline` s at least, 0: it offers nothing."""
+        qos = copy.copy(qos)
+        qos.deadline = Duration(seconds=deadline)
+        return self.create_publisher(message_type, topic, qos, qos_overriding_options=OVERRIDES)
+
+    def listen_to(
+        self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
+    ) -> Subscription:
+        """Return a subscription of what anybody may say; what cannot be read, or is too long, is left aside."""
+
+        def hear(data: bytes) -> None:
+            try:
+                message = read_message(data, message_type)
+            except CommandError:
+                return
+            callback(message)
+
+        qos = copy.copy(qos)
+        return self.create_subscription(message_type, topic, hear, qos, qos_overriding_options=OVERRIDES, raw=True)
+
+    def obey(
+        self,
+        message_type: type,
+        topic: str,
+        callback: Callable[[bytes, int | None], None],
+        matched: Callable[[], None],
+        qos: QoSProfile = COMMAND_QOS,
+    ) -> Subscription:
+        """Return a subscription of what only one node may say: see :meth:`sender_of`.
+
+        Its callback gets the message's bytes, so that it need not read what is too long, and its sequence number;
+        `matched` is called when a publisher comes or goes, where the middleware tells (who wants to be sure also looks
+        now and then).
+        """
+        make = functools.partial(
+            super().create_subscription,
+            message_type,
+            topic,
+            numbered(callback, functools.partial(self.guard.caught, topic)),
+            copy.copy(qos),
+            qos_overriding_options=OVERRIDES,
+            raw=True,
+        )
+
+        def on_matched(_: Any) -> None:
+            if subscription in self.subscriptions:  # told of a subscription that has been closed meanwhile
+                matched()
+
+        try:
+            guarded = self.guard.around(f"matching of {topic}", on_matched)
+            subscription = make(event_callbacks=SubscriptionEventCallbacks(matched=guarded))
+        except UnsupportedEventTypeError:
+            subscription = make()
+        return subscription
+
+    def sender_of(self, end: Subscription | Publisher, allowed: bool) -> OneSender:
+        """Return the guard of a topic that one node may publish: of what this node hears, or says itself."""
+        topic, names = end.topic_name, functools.partial(publishers, self, end.topic_name)
+        if isinstance(end, Subscription):
+            return OneSender(topic, end.get_publisher_count, names, allowed)
+        own = self.get_fully_qualified_name()
+        return OneSender(topic, functools.partial(self.count_publishers, topic), names, allowed, own)
+
+    # ---- log and diagnostics ----
+
+    def warn_of(self, cause: str, text: str) -> None:
+        """Log a warning, once per cause and second."""
+        if (line := self._throttle.allow(cause, text)) is not None:
+            self.get_logger().warning(line, throttled=True)
+
+    def complain_of(self, cause: str, text: str) -> None:
+        """Log an error, once per cause and second."""
+        if (line := self._throttle.allow(cause, text)) is not None:
+            self.get_logger().error(line, throttled=True)
+
+    def note(self, cause: str, text: str) -> None:
+        """Log what was done, once per cause and second."""
+        if (line := self._throttle.allow(f"note {cause}", text)) is not None:
+            self.get_logger().info(line)
+
+    def speak_for(self, what: str) -> None:
+        """Name the machine or component that this node serves from now on in its status: within its namespace, so that
+        two of a kind are told apart. The status's name stays: an aggregator would wait for the old one for ever."""
+        self.hardware_id = f"{self.get_namespace()}/{what}".strip("/")
+        self._report = HealthReport(f"{self.get_fully_qualified_name()[1:]}: state", self.hardware_id)
+
+    def tell(self, level: bytes, text: str, values: Callable[[], dict[str, str]]) -> None:
+        """Publish level, text and values when they are due, with what the guard has caught; log steps of the clock."""
+        now = time.monotonic()
+        self.clock.read()
+        if (steps := self.clock.set_back + self.clock.set_forward) != self._steps_logged:
+            self._steps_logged = steps
+            step = self.clock.last_step * 1e-9
+            self.warn_of("clock", f"the clock was set {'back' if step < 0 else 'forward'} by {abs(step):.3f} s")
+        level, text = joined([*self.guard.findings(now), (level, text)])
+        if self._report.due(level, text, now):
+            stamp = self.get_clock().now().to_msg()
+            everything = {**values(), **self.guard.values()}
+            self._diagnostics_pub.publish(self._report.message(level, text, everything, stamp))

@@ -1,0 +1,395 @@
+"""What is asked of a compensator beside commands: a reset, the switch, another model or tool, how far the tool may go,
+what its error would be. Who may have called is logged."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.parameter import Parameter
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from ..compensation.compensator import Compensator
+from ..compensation.guards import Sample
+from ..compensation.journal import IDEAL_SOURCE
+from ..errors import CommandError, HexapodError
+from ..machine.geometry import WORK, pose_text
+from ..machine.model import MachineModel
+from ..pose import Pose
+from ..workspace.travel import Travel, travel_text
+from .base import EVENT_QOS, LATCHED_QOS, MachineNode
+from .interface import MachineFiles
+from .messages import read_message, stamp_of
+from .rclpy_compat import LateAnswer, callers
+from .status import ERROR, OK, CompensatorStatus, status_of
+from .worker import Job, Worker, WorkerError
+
+LOADED_WITHIN = 30.0
+"""A model file that takes longer to read is given up, s; the shipped ones take one second, nearly all of it imports."""
+
+PREDICTION_PERIOD = 0.2
+"""How often a predicted error is asked for and published, s."""
+
+TRY_AGAIN_AFTER = (2.0, 60.0)
+"""A prediction that failed is tried again after this long, s: the first time, and at most, as the wait doubles."""
+
+TRAVEL_PERIOD = 1.0
+"""Between two messages of ``~/travel``, s."""
+
+LONGEST_REASON = 200
+"""Characters of what stands in the tool's way."""
+
+
+class Requests:
+    """Services and topics of a configured compensator on which something is asked of it.
+
+    `forget` forgets the last command; `newest` returns its stamp, ns.
+    """
+
+    def __init__(
+        self,
+        node: MachineNode,
+        compensator: Compensator,
+        status: CompensatorStatus,
+        files: MachineFiles,
+        ids: dict[str, str],
+        forget: Callable[[], None],
+        newest: Callable[[], int],
+    ) -> None:
+        self._node, self._compensator, self._status, self._files = node, compensator, status, files
+        self._forget = forget
+        self._worker = Worker()
+        self._enable = node.create_service(SetBool, "~/enable_compensation", self._on_enable)
+        self._reset = node.create_service(Trigger, "~/reset", self._on_reset)
+        self._reload = LateAnswer(node.create_service(Trigger, "~/reload_model", self._on_reload))
+        self._loading = False
+        self._tools = ToolChoice(node, compensator, status)
+        self._travel = TravelReports(node, compensator, status, ids, self._worker)
+        self._predicted = PredictedError(node, compensator, status, files, self._worker, ids[WORK], newest)
+
+    def look(self, now: float) -> None:
+        """Hand on what the worker has done, and ask for what is due."""
+        self._worker.look(now)
+        self._travel.look(now)
+        self._predicted.look(now)
+
+    def close(self) -> None:
+        """Destroy services and topics, leave no request without an answer, and end the worker."""
+        self._reload.answer(Trigger.Response(success=False, message="the old model stays: the node was cleaned up"))
+        for part in (self._tools, self._travel, self._predicted, self._worker):
+            part.close()
+        self._node.close_ends(self._enable, self._reset, self._reload.service)
+
+    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._compensator.enable(request.data)
+        response.success = True
+        response.message = f"compensation ramps {'in' if request.data else 'out'}"
+        self._node.note("enable", f"{response.message}: asked for by {callers(self._node, self._enable)}")
+        return response
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Forget the last command and a following error, if the machine stands."""
+        who = callers(self._node, self._reset)
+        if moving := self._status.track.moving(time.monotonic()):
+            response.message = f"refused while the machine moves: {moving}"
+            self._status.refused_resets.add("moving", response.message, time.monotonic())
+            self._node.warn_of("reset", f"reset {response.message}; asked for by {who}")
+            return response
+        self._forget()
+        self._status.track.release()
+        response.success = True
+        response.message = "the next command may be one allowed step from where the struts were known to be last"
+        self._node.note("reset", f"reset: asked for by {who}")
+        return response
+
+    # ---- the model ----
+
+    def _on_reload(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response | None:
+        self._node.note("reload", f"reload: asked for by {callers(self._node, self._reload.service)}")
+        if self._loading:
+            return Trigger.Response(success=False, message="the model is being loaded already")
+        self._loading, machine = True, self._compensator.geometry.name
+        if self._files.ideal:
+            return self._take_model((MachineModel(machine), IDEAL_SOURCE))
+        name, place, folder = self._files.model_place()
+        late = f"{name}: could not be read within {LOADED_WITHIN:g} s; is the disk or the network behind it there?"
+        arguments = name, place, folder, machine
+        self._worker.ask(Job("load_model", arguments, self._loaded, self._not_loaded, LOADED_WITHIN, late))
+        return None
+
+    def _loaded(self, found: tuple[MachineModel, Any]) -> None:
+        self._reload.answer(self._take_model(found))
+
+    def _not_loaded(self, error: HexapodError) -> None:
+        self._reload.answer(self._keep_model(error))
+
+    def _take_model(self, found: tuple[MachineModel, Any]) -> Trigger.Response:
+        self._loading = False
+        sources = self._files.sources
+        before = sources["model"]
+        model, sources["model"] = found  # the source first: the journal notes it with the change
+        try:
+            self._compensator.set_model(model)
+        except HexapodError as error:
+            sources["model"] = before
+            return self._keep_model(error)
+        return Trigger.Response(success=True, message=f"model {model.name!r} ramps in")
+
+    def _keep_model(self, error: HexapodError) -> Trigger.Response:
+        self._loading = False
+        self._status.failed_reloads.add(error.reason, str(error), time.monotonic())
+        self._node.get_logger().warning(f"the old model stays: {error}")
+        return Trigger.Response(success=False, message=f"the old model stays: {error}")
+
+
+class ToolChoice:
+    """The tool in use: the parameter ``tool`` and the topic ``select_tool`` choose it, ``~/tool`` says which it is.
+
+    The topic is for controllers: it sets the parameter. Only one node may publish on it, and only a machine that stands
+    takes another tool.
+    """
+
+    def __init__(self, node: MachineNode, compensator: Compensator, status: CompensatorStatus) -> None:
+        self._node, self._compensator, self._status = node, compensator, status
+        self._selected = node.obey(String, "select_tool", self._on_message, self._look_at_publishers)
+        several = bool(node.get_parameter("allow_several_publishers").value)
+        self._sender = status.sensing["select_tool"] = node.sender_of(self._selected, several)
+        self._publisher = node.create_publisher(String, "~/tool", LATCHED_QOS)
+        node.add_on_set_parameters_callback(self._judge)
+        node.add_post_set_parameters_callback(self._take)
+        self._publish()
+
+    def close(self) -> None:
+        """Take no more tools."""
+        self._node.remove_on_set_parameters_callback(self._judge)
+        self._node.remove_post_set_parameters_callback(self._take)
+        self._status.sensing.pop("select_tool", None)
+        self._node.close_ends(self._selected, self._publisher)
+
+    def _judge(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Refuse a tool that there is not, and any while the machine moves."""
+        geometry = self._compensator.geometry
+        try:
+            for name in _tools(parameters):
+                if not isinstance(name, str):
+                    raise CommandError("tool", f"must be str, not {name!r}")
+                geometry.using(tool=name)
+                moving = self._status.track.moving(time.monotonic())
+                if moving and name != geometry.tool_name:
+                    raise CommandError("tool", f"stays {geometry.tool_name!r} while the machine moves: {moving}")
+        except HexapodError as error:
+            return SetParametersResult(successful=False, reason=f"parameter tool: {error}")
+        return SetParametersResult(successful=True)
+
+    def _take(self, parameters: list[Parameter]) -> None:
+        for name in _tools(parameters):
+            if name != self._compensator.geometry.tool_name:
+                self._compensator.set_tool(name)
+                self._node.note("tool", f"tool {name!r}: the next command must be where the struts are")
+                self._publish()
+
+    def _look_at_publishers(self) -> None:
+        self._sender.look(time.monotonic())
+
+    def _on_message(self, data: bytes, number: int | None) -> None:
+        now = time.monotonic()
+        self._sender.look(now)  # who has just come may have spoken already
+        self._sender.hear(number, now)
+        try:
+            self._sender.check(Sample(now))
+            self._select(read_message(data, String).data)
+        except CommandError as error:
+            self._status.refused_tools.add(error.reason, str(error), now)
+            self._node.warn_of("tool", f"select_tool refused: {error}")
+
+    def _select(self, name: str) -> None:
+        """Take a tool as the parameter would; where the commander's is refused, its next command must be where the
+        struts are: commands for the tool that it did not get may follow. Whoever else asks in vain stops nothing."""
+        result = self._node.set_parameters([Parameter("tool", value=name)])[0]
+        if result.successful:
+            return
+        commands = set(self._sender.names) <= set(self._status.source.names)
+        if commands and not self._status.track.moving(time.monotonic()):
+            self._compensator.set_tool(self._compensator.geometry.tool_name)
+        raise CommandError("tool", result.reason)
+
+    def _publish(self) -> None:
+        self._publisher.publish(String(data=self._compensator.geometry.tool_name))
+
+
+def _tools(parameters: list[Parameter]) -> list:
+    return [parameter.value for parameter in parameters if parameter.name == "tool"]
+
+
+class TravelReports:
+    """``~/travel``, once a second while somebody subscribes, and ``~/get_travel``: how far the tool may go from where
+    the machine was sent last, or before the first command was measured last."""
+
+    def __init__(
+        self,
+        node: MachineNode,
+        compensator: Compensator,
+        status: CompensatorStatus,
+        frame_ids: dict[str, str],
+        worker: Worker,
+    ) -> None:
+        self._node, self._compensator, self._status, self._worker = node, compensator, status, worker
+        self._names = {frame_id: name for name, frame_id in frame_ids.items()}
+        self._default = frame_ids[WORK]
+        self._publisher = node.create_publisher(DiagnosticStatus, "~/travel", EVENT_QOS)
+        self._late = LateAnswer(node.create_service(Trigger, "~/get_travel", self._on_request))
+        self._busy = self._asked = False
+        self._due = 0.0
+
+    def close(self) -> None:
+        """Stop, and leave no request without an answer."""
+        self._answer(False, "the node was cleaned up")
+        self._node.close_ends(self._late.service, self._publisher)
+
+    def look(self, now: float) -> None:
+        """Begin anew when it is due."""
+        if not self._busy and now >= self._due and self._publisher.get_subscription_count():
+            self._due = now + TRAVEL_PERIOD
+            try:
+                self._begin()
+            except CommandError as error:
+                self._tell(ERROR, str(error), ())
+
+    def _on_request(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response | None:
+        if self._asked and self._busy:
+            raise CommandError("busy", "it is being worked out already")
+        if not self._busy:
+            self._begin()
+        self._asked = True
+        return None
+
+    def _begin(self) -> None:
+        compensator, frame_id = self._compensator, self._status.frame_id
+        if frame_id not in self._names:  # before the first command
+            frame_id = self._default
+        if np.isfinite(compensator.nominal).all():
+            platform = compensator.platform
+        elif self._status.feedback.count:
+            platform = Pose(*compensator.platform_estimate)
+        else:
+            raise CommandError("no_feedback", "no command and no strut_states yet: where the machine is is not known")
+        geometry = compensator.geometry.using(work=self._names[frame_id])
+        pose = geometry.tool_pose(platform)
+        where = f"tool {geometry.tool_name} in {frame_id} at {pose_text(pose)}"
+        arguments = geometry, compensator.model, compensator.temperatures, pose, compensator.enabled
+        self._busy = True
+        self._worker.ask(Job("find_travel", arguments, partial(self._found, where), partial(self._failed, where)))
+
+    def _found(self, where: str, ways: tuple[Travel, ...]) -> None:
+        self._busy = False
+        self._tell(OK, where, ways)
+
+    def _failed(self, where: str, error: WorkerError) -> None:
+        self._busy = False
+        self._tell(ERROR, f"{where}: {error}", ())
+
+    def _tell(self, level: bytes, text: str, ways: tuple[Travel, ...]) -> None:
+        self._answer(level == OK, "\n".join(filter(None, (text, travel_text(ways)))))
+        if self._publisher.get_subscription_count():
+            values = {one.key: f"{one.shown:.6f}" for one in ways}
+            values |= {f"{one.way} stops at": str(one.error or "") for one in ways}
+            name = f"{self._node.get_fully_qualified_name()[1:]}: travel"
+            self._publisher.publish(status_of(name, self._node.hardware_id, level, text, values, LONGEST_REASON))
+
+    def _answer(self, success: bool, text: str) -> None:
+        if self._asked:
+            self._asked = False
+            self._late.answer(Trigger.Response(success=success, message=text))
+
+
+class PredictedError:
+    """``~/predicted_error`` and ``~/predicted_error_aligned``: what the tool's error would be at the last command
+    without compensation, see :class:`..calibration.posterior.ErrorPredictor`; only while somebody listens."""
+
+    def __init__(
+        self,
+        node: MachineNode,
+        compensator: Compensator,
+        status: CompensatorStatus,
+        files: MachineFiles,
+        worker: Worker,
+        frame: str,
+        newest: Callable[[], int],
+    ) -> None:
+        self._node, self._compensator, self._status, self._files = node, compensator, status, files
+        self._worker, self._frame, self._newest = worker, frame, newest
+        self._topics = {
+            "standing": node.create_publisher(PoseWithCovarianceStamped, "~/predicted_error", EVENT_QOS),
+            "aligned": node.create_publisher(PoseWithCovarianceStamped, "~/predicted_error_aligned", EVENT_QOS),
+        }
+        self._busy, self._asked_for, self._due = False, 0, 0.0
+        self._source: Any = None
+        self._wait = TRY_AGAIN_AFTER[0]
+
+    def close(self) -> None:
+        """Destroy the topics."""
+        self._status.prediction_problem = ""
+        self._node.close_ends(*self._topics.values())
+
+    def look(self, now: float) -> None:
+        """Ask for the newest pose, while somebody listens."""
+        wanted = any(publisher.get_subscription_count() for publisher in self._topics.values())
+        if not wanted or self._source is not self._files.sources["model"]:
+            self._source, self._status.prediction_problem = self._files.sources["model"], ""
+            self._wait, self._due = TRY_AGAIN_AFTER[0], min(self._due, now)
+        if not wanted or self._busy or now < self._due or not np.isfinite(self._compensator.nominal).all():
+            return
+        compensator, sources = self._compensator, self._files.sources
+        self._busy, self._asked_for, self._due = True, self._newest(), now + PREDICTION_PERIOD
+        asked = {
+            "position": compensator.platform.position.tolist(),
+            "rotation": compensator.platform.rotation.tolist(),
+            "sense": compensator.motion.sense.tolist(),
+            "tool": compensator.geometry.tool_name,
+            **compensator.temperatures.snapshot(),
+        }
+        key = f"{sources['geometry'].sha256} {sources['model'].name} {sources['model'].sha256}"
+        made_of = sources["geometry"], sources["model"], self._files.model_folder
+        self._worker.ask(Job("predict", (key, made_of, asked), self._publish, self._failed))
+
+    def _publish(self, result: dict[str, Any]) -> None:
+        """Publish both errors; of a pose that the machine with its errors cannot take there is none."""
+        self._busy, self._wait, self._status.prediction_problem = False, TRY_AGAIN_AFTER[0], ""
+        for name, publisher in self._topics.items():
+            error = result[name]
+            if error is not None and all(map(math.isfinite, error["values"])):
+                publisher.publish(error_message(error["values"], error["covariance"], self._frame, self._asked_for))
+
+    def _failed(self, error: WorkerError) -> None:
+        self._busy, self._due = False, time.monotonic() + self._wait
+        self._status.prediction_problem = f"no predicted error: {error}"
+        self._node.warn_of("predicted error", f"{self._status.prediction_problem}; tried again in {self._wait:g} s")
+        self._wait = min(2.0 * self._wait, TRY_AGAIN_AFTER[1])
+
+
+def error_message(
+    values: list[float], covariance: list[float] | None, frame: str, stamp: int
+) -> PoseWithCovarianceStamped:
+    """Return an error as a message: where the tool would be and how it would stand, seen from where it should.
+
+    `values`: displacement, m, and rotation vector, rad; `covariance`: its 36 numbers, row by row; None: not known,
+    which is NaN in the message, never zero; `stamp`: the command's, ns.
+    """
+    message = PoseWithCovarianceStamped()
+    message.header.frame_id, message.header.stamp = frame, stamp_of(stamp)
+    position, orientation = message.pose.pose.position, message.pose.pose.orientation
+    position.x, position.y, position.z = values[:3]
+    half = 0.5 * math.hypot(*values[3:])
+    share = 0.5 * math.sin(half) / half if half > 0.0 else 0.5
+    orientation.x, orientation.y, orientation.z = (share * turn for turn in values[3:])
+    orientation.w = math.cos(half)
+    message.pose.covariance = [math.nan] * 36 if covariance is None else covariance
+    return message
