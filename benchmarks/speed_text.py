@@ -90,7 +90,7 @@ messages of the same size, and nothing in between. Both are processes of their o
 Latency is from just before a pose is published to the callback with its strut commands. Ratios: medians over the
 bouts, quartiles in brackets. Bars: rate ≥ {rate} ×, median latency ≤ {median} ×, 99th percentile ≤ {p99} ×. A ratio
 below 1 does not mean that thinking takes no time: the relay handles messages as rclpy does it, the compensator
-[reads and writes their bytes](../hexapod_comp/ros/wire.py), which saves more than a compensation takes.
+[reads and writes their bytes](../hexapod_comp/ros/messages.py), which saves more than a compensation takes.
 
 """
 

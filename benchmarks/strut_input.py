@@ -27,6 +27,7 @@ from sensor_msgs.msg import JointState
 from tqdm import tqdm
 
 from hexapod_comp.compensation.compensator import NO_SHIFT, Compensator
+from hexapod_comp.compensation.guards import Sample
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.ros.interface import StrutInput
@@ -86,7 +87,12 @@ def difference(machine: Machine, count: int, seed: int, folder: Path) -> Differe
     geometry = load_geometry(machine.write(folder / f"{machine.name}.yaml"))
     model = find_model(f"random:{seed}", geometry)
     by_pose, by_struts = (Compensator(geometry, model) for _ in range(2))
-    read = StrutInput(by_struts, list(STRUT_NAMES), "base").read
+    given = StrutInput(by_struts, list(STRUT_NAMES), "base")
+
+    def read(data: bytes) -> tuple[float, ...]:
+        given.read(data, sample := Sample(0.0))
+        return sample.values or ()
+
     tips, tools = walk(machine, count, np.random.default_rng(seed))
     lengths = machine.lengths(*machine.platform_poses(tips, tools.as_matrix()))
     taken = refused = unlike = 0
@@ -94,7 +100,7 @@ def difference(machine: Machine, count: int, seed: int, folder: Path) -> Differe
     for tip, tool, length in zip(tips, tools.as_quat(), lengths, strict=True):
         data = serialize_message(JointState(name=list(STRUT_NAMES), position=length.tolist()))
         wanted = _answer(lambda tip=tip, tool=tool: by_pose.step((*tip, *tool), math.nan))
-        got = _answer(lambda data=data: by_struts.step(read(data)[2], math.nan, NO_SHIFT))
+        got = _answer(lambda data=data: by_struts.step(read(data), math.nan, NO_SHIFT))
         if isinstance(wanted, str) or isinstance(got, str):
             same = isinstance(wanted, str) and isinstance(got, str) and wanted == got
             refused, unlike = refused + same, unlike + (not same)

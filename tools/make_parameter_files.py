@@ -16,14 +16,14 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from hexapod_comp.linuxcnc import parameters as linuxcnc_bridge  # noqa: E402
-from hexapod_comp.ros import compensator_parameters, strut_drive_parameters  # noqa: E402
+from hexapod_comp.ros import interface, strut_drive  # noqa: E402
 from hexapod_comp.ros.parameters import Parameter, shown  # noqa: E402
 
 PAGE, FILE = ROOT / "doc" / "parameters.md", ROOT / "config" / "parameters.yaml"
 
 TABLES = {
-    "compensator": compensator_parameters.PARAMETERS,
-    "strut_drive": strut_drive_parameters.PARAMETERS,
+    "compensator": interface.PARAMETERS,
+    "strut_drive": strut_drive.PARAMETERS,
     "linuxcnc_bridge": linuxcnc_bridge.PARAMETERS,
 }
 

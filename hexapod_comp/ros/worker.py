@@ -26,6 +26,9 @@ from ..errors import HexapodError
 NICENESS = 10
 """Commands come first."""
 
+IDLE_AFTER = 10.0
+"""Without a job for this long the process is ended, s: it holds a hundred megabytes; a new one takes a second."""
+
 PACKAGE_ROOT = Path(__file__).resolve().parents[2]
 """Where the process runs: Python also imports from the folder it runs in, which must not be just any."""
 
@@ -56,6 +59,7 @@ class Worker:
         self._waiting: deque[Job] = deque()
         self._running: Job | None = None
         self._helper: _Helper | None = None
+        self._done_at = 0.0
 
     @property
     def pid(self) -> int | None:
@@ -72,6 +76,8 @@ class Worker:
         """Hand on what has been done, and give up what takes too long."""
         job, helper = self._running, self._helper
         if job is None or helper is None:
+            if helper is not None and now - self._done_at > IDLE_AFTER:
+                self._end(kill=False)
             return
         try:
             answer = helper.answers.get_nowait()
@@ -91,7 +97,7 @@ class Worker:
         self._running = None
 
     def _settle(self, job: Job, answer: Any) -> None:
-        self._running = None
+        self._running, self._done_at = None, time.monotonic()
         self._next()
         if isinstance(answer, WorkerError):
             job.failed(answer)

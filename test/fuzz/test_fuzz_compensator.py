@@ -145,11 +145,11 @@ class CompensatorRig(Rig):
         """Check that the node still lives: reset, with struts at home, it answers home, and 0.1 mm beside it."""
         self.activate()
         status = self.node._status  # as if they had stood for a while: a reset in motion is refused
-        status.following.commands.clear()
-        status.standing._readings.clear()
+        status.track._told.clear()
+        status.track._read.clear()
         assert self.serve("reset", Trigger.Request()).success
         self.last = None
-        self.node._feedback._jumps._at -= 10.0  # and struts that were elsewhere had had the time to come back
+        status.track._jumps.at -= 10.0  # and struts that were elsewhere had had the time to come back
         self.deliver("strut_states", struts(("struts", list(STRUT_NAMES), HOME_LENGTHS.tolist(), [0.0] * 6, 0.0)))
         for move in ([0.0, 0.0, 0.0], [1e-4, 0.0, 0.0]):
             self.pose(("pose", move, [], "base", 0.0))

@@ -16,13 +16,13 @@ from helpers import central_difference, moved, table_poses, twist_between
 from node_helpers import CONFIG, HOME, Bench, closed_form_lengths
 from rclpy.parameter import Parameter
 
+from hexapod_comp.compensation import guards
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.machine.trajectory import Path, move
 from hexapod_comp.pose import Pose
-from hexapod_comp.compensation import guards
 from hexapod_comp.ros.messages import message_pose
 from hexapod_comp.ros.status import ERROR, OK
 from hexapod_comp.virtual.machine import DriveParameters, StrutDrive

@@ -34,12 +34,14 @@ from node_helpers import (
 from rcl_interfaces.srv import DescribeParameters
 from rclpy.qos import HistoryPolicy, ReliabilityPolicy
 
+from hexapod_comp.compensation import guards
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.pose import Pose
 from hexapod_comp.ros import compensator as compensator_module
-from hexapod_comp.ros import health, running, runtime, stamps
+from hexapod_comp.ros import keep_discovery_local, rclpy_compat
+from hexapod_comp.ros import status as status_module
 from hexapod_comp.ros.compensator import CompensatorNode
 from hexapod_comp.ros.messages import message_pose, pose_message
 from hexapod_comp.ros.parameters import ParameterError
@@ -329,7 +331,7 @@ def test_stamps_may_be_off_and_any(bench):
 
 def test_after_a_pause_stamps_may_start_earlier(bench, monkeypatch):
     """The sender or its clock was restarted; the pause is half a second, here 0.1 s."""
-    monkeypatch.setattr(stamps, "FORGET_ORDER_AFTER", 0.1)
+    monkeypatch.setattr(guards, "FORGET_ORDER_AFTER", 0.1)
     bench.compensator(max_command_age=0.0, command_timeout=0.15)
     bench.ask(HOME)
     bench.until_status(WARN, "no new command")
@@ -970,7 +972,7 @@ def test_stale_commands_are_said(bench):
 
 def test_log_lets_one_line_per_cause_and_second_through(monkeypatch):
     clock = iter([0.0, 0.4, 0.5, 0.9, 1.1, 1.6])
-    monkeypatch.setattr(runtime.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(rclpy_compat.time, "monotonic", lambda: next(clock))
     throttle = Throttle()
     causes = ["nan", "nan", "step", "nan", "nan", "step"]
     assert [throttle.passes(cause) for cause in causes] == [0, None, 0, None, 2, 0]
@@ -998,7 +1000,7 @@ def test_what_happened_while_a_node_stood_still_is_said_once():
 
 def test_rate_and_age_of_a_flow(monkeypatch):
     """250 events in the 2 s since it was made: 125 a second."""
-    monkeypatch.setattr(health.time, "monotonic", lambda: 10.0)
+    monkeypatch.setattr(status_module.time, "monotonic", lambda: 10.0)
     flow = Flow()
     assert flow.age(11.0) == math.inf
     for n in range(250):
@@ -1145,7 +1147,7 @@ def test_discovery_stays_on_this_machine_unless_told_otherwise(monkeypatch, envi
         monkeypatch.delenv(name, raising=False)
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    running.keep_discovery_local()
+    keep_discovery_local()
     assert os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") == found
     monkeypatch.delenv("ROS_AUTOMATIC_DISCOVERY_RANGE", raising=False)
 

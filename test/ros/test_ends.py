@@ -10,8 +10,8 @@ import pytest
 from rclpy.context import Context
 
 from hexapod_comp.linuxcnc import bridge as bridge_module
+from hexapod_comp.ros import base, heard_signals
 from hexapod_comp.ros import compensator as compensator_module
-from hexapod_comp.ros import heard_signals
 from hexapod_comp.ros import strut_drive as drive_module
 
 
@@ -52,13 +52,13 @@ def test_a_hang_up_ends_a_node_as_other_signals_do_unless_it_is_ignored() -> Non
 
 @pytest.mark.parametrize(
     ("module", "part"),
-    [(compensator_module, "TravelReports"), (compensator_module, "JournalTopics"), (drive_module, "CommandSource")],
+    [(compensator_module, "Requests"), (compensator_module, "JournalTopics"), (base.MachineNode, "sender_of")],
 )
 def test_a_topic_that_cannot_be_opened_is_said_and_leaves_nothing_open(
     module, part: str, ros_context: Context, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """The node's goodbye had hidden the reason behind an AttributeError. It may be configured once more."""
-    kind = module.CompensatorNode if module is compensator_module else module.StrutDriveNode
+    kind = drive_module.StrutDriveNode if part == "sender_of" else compensator_module.CompensatorNode
     node = kind(context=ros_context)
     before = [len(list(ends)) for ends in (node.publishers, node.subscriptions, node.services, node.timers)]
 

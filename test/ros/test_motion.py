@@ -16,9 +16,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
-from hexapod_comp.compensation.track import FOLLOWED_WITHIN, Recent, Standing
-from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.compensation import guards
+from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.ros.compensator import CHECK_PERIOD, CompensatorNode
 from hexapod_comp.ros.messages import nanoseconds_of, pose_message, stamp_of
 from hexapod_comp.ros.parameters import USE_SIM_TIME
@@ -141,7 +140,7 @@ def test_a_node_that_stood_still_blames_no_commands(bench):
     """
     node = bench.compensator(catch_up_within=1.0, max_command_age=0.0)
     burst(bench, 20)
-    bench.until(lambda: node._pacing.waited, "that one waits")
+    bench.until(lambda: node._status.waited, "that one waits")
     time.sleep(1.5)
     bench.until(lambda: bench.values().get("commands") == "21", "all of them")
     assert bench.values()["refused"] == "0"
@@ -264,22 +263,6 @@ def test_a_reset_is_refused_while_the_machine_moves(bench):
         bench.feed(last.lengths + lift)
     bench.barrier()
     assert "went 2." in bench.trigger("reset").message, "and the 0.2 mm that it has not followed"
-
-
-def test_what_counts_as_moving():
-    """More than 50 µm in 0.1 s, told or measured; what was long ago does not count."""
-    commands = Recent()
-    standing = Standing(commands)
-    assert standing.moving(1.0) == ""
-    for n in range(100):
-        commands.note(np.full(6, 0.5) + 1e-6 * n * (np.arange(6) == 2), 1.0 + 1e-3 * n)
-    assert standing.moving(1.04) == "strut_3 was told to go 0.099 mm in the last 0.1 s"
-    assert standing.moving(1.1 + FOLLOWED_WITHIN) == ""
-    standing.measure(np.full(6, 0.5), 2.0)
-    standing.measure(np.full(6, 0.5) + 49e-6, 2.05)
-    assert standing.moving(2.05) == ""
-    standing.measure(np.full(6, 0.5) - 2e-6, 2.06)
-    assert standing.moving(2.06) == "strut_1 went 0.051 mm in the last 0.1 s"
 
 
 def test_a_following_error_outlives_deactivation(bench):

@@ -34,11 +34,11 @@ def script(text: str, folder: Path) -> subprocess.Popen[str]:
 
 HANGING = """
 import ctypes, sys, threading
-from hexapod_comp.ros import running
+from hexapod_comp.ros import process
 from hexapod_comp.ros.parameters import Program
 from hexapod_comp.ros.base import MachineNode
 
-running.ENDED_WITHIN = 0.5
+process.ENDED_WITHIN = 0.5
 
 class Hanging(MachineNode):
     wants_autostart = False
@@ -55,7 +55,7 @@ class Hanging(MachineNode):
         super().destroy_node()
 
 sys.argv[:] = ["hanging"]
-sys.exit(running.run(Hanging, Program("hanging", "Hangs.", ())))
+sys.exit(process.run(Hanging, Program("hanging", "Hangs.", ())))
 """
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import calibration_helpers as small
@@ -23,23 +24,14 @@ from hexapod_comp.machine.kinematics import Structure, strut_lengths
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.pose import Pose
-from hexapod_comp.ros import predicted_error
-from hexapod_comp.ros.requests import PredictedErrorTopics, PredictionError, PredictionProcess, error_message
+from hexapod_comp.ros import requests, worker
+from hexapod_comp.ros.requests import PredictedError, error_message
 from hexapod_comp.ros.status import WARN
 
 STANDING, ALIGNED = "compensator/predicted_error", "compensator/predicted_error_aligned"
 UM = 1e-6
 STARTED = 60.0
 """The process imports for a second on a free processor, s."""
-
-
-@pytest.fixture
-def started(monkeypatch: pytest.MonkeyPatch) -> list[PredictionProcess]:
-    """Return the processes that nodes start."""
-    found: list[PredictionProcess] = []
-    real = predicted_error.PredictionProcess
-    monkeypatch.setattr(predicted_error, "PredictionProcess", lambda setup: found.append(real(setup)) or found[-1])
-    return found
 
 
 def listen(bench: Bench, *topics: str) -> None:
@@ -91,40 +83,39 @@ def test_without_a_fit_the_covariance_is_nan_never_zero(bench):
     np.testing.assert_allclose([q.x, q.y, q.z, q.w], turn, atol=1e-12)
 
 
-def test_nothing_is_worked_out_while_nobody_listens(bench, started, tmp_path):
-    """No process at all, until somebody subscribes; and it goes when they leave."""
+def test_nothing_is_worked_out_while_nobody_listens(bench, tmp_path, monkeypatch):
+    """No process at all, until somebody subscribes; and it goes a while after they have left."""
+    monkeypatch.setattr(worker, "IDLE_AFTER", 0.5)
     node = bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
     bench.ask(small.paper().home)
-    looks = []
-    predicted = node._outputs._predicted
-    node.create_timer(0.05, lambda: looks.append(None))
-    bench.until(lambda: len(looks) > 10, "half a second")
-    assert not started
+    beside = node._requests._worker
+    node._requests.look(1e12)
+    assert beside.pid is None
     subscription = bench.witness.create_subscription(
         PoseWithCovarianceStamped, STANDING, bench.seen[STANDING].append, RELIABLE
     )
     bench.until(lambda: bench.seen[STANDING], "predicted error", STARTED)
-    assert len(started) == 1
-    process = started[0]._process
-    assert process is not None
+    process = beside._helper.process
     bench.witness.destroy_subscription(subscription)
     bench.until(lambda: process.poll() is not None, "the end of the process")
-    assert predicted._process is None
+    assert beside.pid is None
 
 
-def test_a_process_that_dies_is_said_and_started_anew(bench, started, tmp_path, monkeypatch):
-    monkeypatch.setattr(predicted_error, "TRY_AGAIN_AFTER", (0.3, 60.0))
-    bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
+def test_a_process_that_dies_is_said_and_started_anew(bench, tmp_path, monkeypatch):
+    monkeypatch.setattr(requests, "TRY_AGAIN_AFTER", (0.3, 60.0))
+    node = bench.compensator(model_file=str(small.fitted_model(tmp_path)), ramp_rate=1.0)
     bench.ask(small.paper().home)
     listen(bench, STANDING)
     bench.until(lambda: bench.seen[STANDING], "predicted error", STARTED)
-    os.kill(started[0]._process.pid, 9)  # type: ignore[union-attr]
-    bench.until(lambda: "no predicted error: the process that predicts" in bench.message(), "the warning")
+    first = node._requests._worker.pid
+    bench.until(lambda: node._requests._predicted._busy, "that it is at work")
+    os.kill(first, 9)
+    bench.until(lambda: "no predicted error: the process beside the node" in bench.message(), "the warning", STARTED)
     assert bench.status().level == WARN
     bench.ask(small.paper().home)
     before = len(bench.seen[STANDING])
     bench.until(lambda: len(bench.seen[STANDING]) > before, "predicted errors again", STARTED)
-    assert len(started) == 2
+    assert node._requests._worker.pid != first
     bench.until(lambda: "no predicted error" not in bench.message(), "the end of the warning")
 
 
@@ -132,33 +123,25 @@ def test_a_process_that_fails_every_time_is_tried_less_and_less_often(monkeypatc
     """Truth: the waits double from 2 s to 60 s; a stand-in for the process fails at once."""
     began = []
 
-    class Failing:
-        busy = True
+    def ask(job):
+        began.append(now)
+        job.failed(worker.WorkerError("it cannot"))
 
-        def __init__(self, setup):
-            began.append(now)
-
-        def result(self):
-            raise PredictionError("it cannot")
-
-        def close(self):
-            pass
-
-    node, publisher = MagicMock(), MagicMock()
-    node.create_publisher.return_value = publisher
-    publisher.get_subscription_count.return_value = 1
-    monkeypatch.setattr(predicted_error, "PredictionProcess", Failing)
-    monkeypatch.setattr(predicted_error.time, "monotonic", lambda: now)
-    compensator, files = MagicMock(nominal=np.zeros(6)), MagicMock(sources={"model": object()})
-    topics = PredictedErrorTopics(node, compensator, files, "work", lambda: 0)
+    node, status = MagicMock(), SimpleNamespace(prediction_problem="")
+    listeners = node.create_publisher.return_value.get_subscription_count
+    listeners.return_value = 1
+    monkeypatch.setattr(requests.time, "monotonic", lambda: now)
+    sources = {"geometry": MagicMock(), "model": MagicMock()}
+    beside, files = SimpleNamespace(ask=ask), MagicMock(sources=sources)
+    topics = PredictedError(node, MagicMock(nominal=np.zeros(6)), status, files, beside, "work", lambda: 0)
     for tick in range(1000):
         now = 100.0 + 0.2 * tick
-        topics._look()
-        assert topics.problem == "no predicted error: it cannot"
+        topics.look(now)
+        assert status.prediction_problem == "no predicted error: it cannot"
     np.testing.assert_allclose(np.diff(began), [2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0], atol=0.21)
-    publisher.get_subscription_count.return_value = 0
-    topics._look()
-    assert topics.problem == ""
+    listeners.return_value = 0
+    topics.look(now)
+    assert status.prediction_problem == ""
 
 
 def test_a_new_model_is_predicted_with(bench, tmp_path):

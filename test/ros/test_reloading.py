@@ -22,9 +22,8 @@ from hexapod_comp.compensation.journal import LARGEST_SOURCE, Source
 from hexapod_comp.errors import InputFileError
 from hexapod_comp.formats.files import read_text
 from hexapod_comp.formats.paths import confined_opener
-from hexapod_comp.ros import model_loading
 from hexapod_comp.ros.status import WARN
-from hexapod_comp.ros.worker import Loading, LoadingError, ModelName
+from hexapod_comp.ros.worker import Job, Worker
 
 ROUNDING = 1e-12
 
@@ -116,20 +115,32 @@ def test_the_node_itself_does_not_touch_the_file(bench, tmp_path, monkeypatch):
     assert response.success, response.message
 
 
+def outcome(name: str, arguments: tuple, within: float = 60.0) -> list:
+    """Have a worker do a job, and return its result or its error."""
+    beside, found = Worker(), []
+    beside.ask(Job(name, arguments, found.append, found.append, within, f"could not be read within {within:g} s"))
+    end = time.monotonic() + 60.0
+    while not found and time.monotonic() < end:
+        beside.look(time.monotonic())
+        time.sleep(0.01)
+    beside.close()
+    return found
+
+
 def test_a_file_that_is_never_read_is_given_up_in_time(tmp_path, monkeypatch):
     never = tmp_path / "never"
     never.write_text("#!/bin/sh\necho $$ > ${0}.pid\nexec sleep 60\n")
     never.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(never))
-    monkeypatch.setattr(model_loading, "LOADED_WITHIN", 0.5)
     began = time.monotonic()
-    loading = Loading(ModelName("model.yaml", str(tmp_path), tmp_path), "paper")
-    loading._thread.join(10.0)
+    (error,) = outcome("load_model", ("model.yaml", str(tmp_path), tmp_path, "paper"), 0.5)
+    assert str(error) == "could not be read within 0.5 s"
     assert time.monotonic() - began < 5.0
-    with pytest.raises(LoadingError, match=r"model\.yaml: could not be read within 0\.5 s"):
-        loading.result()
+    process = int((tmp_path / "never.pid").read_text())
+    while time.monotonic() - began < 5.0 and Path(f"/proc/{process}").exists():
+        time.sleep(0.01)
     with pytest.raises(ProcessLookupError):
-        os.kill(int((tmp_path / "never.pid").read_text()), 0)
+        os.kill(process, 0)
 
 
 def test_what_becomes_a_pipe_after_the_look_at_its_name_is_refused(tmp_path):
@@ -157,9 +168,7 @@ def test_the_loading_process_hands_back_what_it_has_read(tmp_path, padding):
     text = (CONFIG / "paper_machine.yaml").read_text(encoding="utf-8") + f"# {'é' * padding}\n"
     path = tmp_path / "model.yaml"
     path.write_text(text, encoding="utf-8")
-    loading = Loading(ModelName("model.yaml", str(tmp_path), Path()), "paper")
-    loading._thread.join(60.0)
-    model, source = loading.result()
+    ((model, source),) = outcome("load_model", ("model.yaml", str(tmp_path), Path(), "paper"))
     assert model.name == "virtual machine"
     whole = Source.of(str(path), text)
     assert (source.name, source.sha256) == (whole.name, whole.sha256)

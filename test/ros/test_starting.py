@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 from node_helpers import HOME, closed_form_lengths, near
 
-from hexapod_comp.compensation.track import LastKnown, Recent, Standing
-from hexapod_comp.errors import CommandError
 from hexapod_comp.compensation import guards
 from hexapod_comp.ros.status import ERROR, OK, WARN
 
@@ -48,63 +46,6 @@ def test_without_feedback_the_first_command_may_be_anywhere(bench):
     bench.compensator(start_without_feedback_after=0.01)
     bench.until_status(OK, "waiting for the first command")
     bench.ask(near(HOME, (0.05, 0.05, 0.05), 10.0))
-
-
-def test_a_wait_for_feedback_has_an_end_where_a_parameter_says_so():
-    """By a clock of its own: 2 s after the start, not before it; a single reading ends it for good."""
-    known = LastKnown(2.0)
-    with pytest.raises(CommandError, match="from 2 s after the start on"):
-        known.struts(100.0, fresh=False)
-    known.begin(100.0)
-    assert known.waits(101.999)
-    with pytest.raises(CommandError, match="no strut_states yet"):
-        known.struts(101.999, fresh=False)
-    assert not known.waits(102.0)
-    assert known.struts(102.0, fresh=False) is None
-    known.measure(np.full(6, 0.5), 110.0)
-    known.begin(120.0)
-    assert not known.waits(120.0)
-    np.testing.assert_array_equal(known.struts(999.0, fresh=False), 0.5)
-    with pytest.raises(CommandError, match="needs start_without_feedback_after"):
-        LastKnown(0.0).struts(1e9, fresh=False)
-
-
-def test_a_start_from_struts_at_rest_is_from_the_mean_of_their_readings():
-    """Truth: 0.5 m, read 200 times with a noise of 0.1 µm; then a strut goes 10 µm away, and the newest counts."""
-    rng, standing = np.random.default_rng(3), Standing(Recent())
-    known = LastKnown(average=standing.mean)
-
-    def read(struts: np.ndarray, at: float) -> None:
-        known.measure(struts, at)
-        standing.measure(struts, at)
-
-    for n in range(200):
-        read(0.5 + rng.normal(0.0, 1e-7, 6), 7.0 + 0.002 * n)
-    np.testing.assert_allclose(known.struts(8.0, fresh=True), 0.5, atol=5e-8)
-    assert np.abs(known.struts(8.0, fresh=True) - 0.5).max() < 3e-8, "0.1 µm / √200 is 7 nm"
-    away = 0.5 + 1e-5 * (np.arange(6) == 2)
-    read(away, 7.4)
-    np.testing.assert_array_equal(known.struts(8.0, fresh=True), away)
-    read(away, 9.0)  # what came before is past
-    np.testing.assert_array_equal(known.struts(9.0, fresh=True), away)
-
-
-@pytest.mark.parametrize(
-    ("measured_at", "fresh", "wanted"),
-    [
-        (9.89, True, "told"),  # readings of a minute may count as fresh, but the struts have been sent elsewhere since
-        (9.91, True, "measured"),
-        (10.05, False, "told"),  # the drive may have lagged still when it was last heard
-        (10.11, False, "measured"),  # it was there, or somebody has moved it since
-    ],
-)
-def test_what_is_known_last_counts(measured_at, fresh, wanted):
-    """A drive follows and tells within 0.1 s; the last command was at 10 s."""
-    known = LastKnown(0.0)
-    known.tell(np.full(6, 0.4), 10.0)
-    np.testing.assert_array_equal(known.struts(11.0, fresh), 0.4)
-    known.measure(np.full(6, 0.5), measured_at)
-    np.testing.assert_array_equal(known.struts(11.0, fresh), 0.4 if wanted == "told" else 0.5)
 
 
 @pytest.mark.parametrize("feedback", ["never", "stale"])

@@ -10,7 +10,6 @@ import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,10 +21,8 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
-from hexapod_comp.compensation.guards import CommandSource, Sequence
-from hexapod_comp.compensation.track import Following
+from hexapod_comp.compensation import guards
 from hexapod_comp.machine.geometry import STRUT_NAMES
-from hexapod_comp.ros import command_source, health
 from hexapod_comp.ros.compensator import CHECK_PERIOD, CompensatorNode
 from hexapod_comp.ros.messages import period, pose_message
 from hexapod_comp.ros.parameters import ParameterError
@@ -42,7 +39,7 @@ ROUNDING = 1e-12
 def short_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """What colours a status for one or two seconds does so for 0.3 s."""
     monkeypatch.setattr(guards, "SHOWN_FOR", 0.3)
-    monkeypatch.setattr(command_source, "SPEAKERS_HELD", 0.3)
+    monkeypatch.setattr(guards, "SPEAKERS_HELD", 0.3)
 
 
 @pytest.fixture
@@ -388,76 +385,6 @@ def test_twins_that_both_send_strut_commands_are_refused(bench, twin):
     assert values["last_refusal"].startswith("two publishers of /strut_commands speak in turn")
 
 
-class Graph:
-    """Stands for the node: DDS would have to be stopped between two of its messages to see this over topics."""
-
-    def __init__(self, *names: str) -> None:
-        self.names = names
-
-    def get_publishers_info_by_topic(self, topic: str) -> list[SimpleNamespace]:
-        return [SimpleNamespace(node_name=name, node_namespace="/left") for name in self.names]
-
-
-def test_unnamed_counts_as_another():
-    """What DDS has found but not yet named, or never will: not a ROS node."""
-    graph = Graph("controller", command_source.UNKNOWN_NAME)
-    source = CommandSource(graph, "/left/commands", lambda: len(graph.names), allowed=False)
-    source.look(0.0)
-    assert source.problem == "several publishers of /left/commands: /left/controller, _NODE_NAME_UNKNOWN_"
-    graph.names = ("controller", "controller")
-    source.look(0.1)
-    assert (source.problem, source.names) == ("", ("/left/controller",))
-    graph.names = (command_source.UNKNOWN_NAME,)
-    source.look(0.2)
-    assert not source.problem, "alone, it is the one who commands"
-    graph.names = ()
-    source.look(0.3)
-    assert source.names == ()
-
-
-NUMBERS = {
-    "one publisher": ([1, 2, 3, 4], 0, False),
-    "joined late": ([70, 71, 72], 0, False),
-    "three missed": ([1, 2, 6, 7], 3, False),
-    "restarted": ([500, 501, 1, 2, 3], 0, False),
-    "restarted, one missed": ([500, 1, 3, 4], 1, False),
-    "two that began together": ([1, 1, 2, 2, 3, 3], 0, True),
-    "an old and a new one": ([500, 1, 501, 2, 502], 0, True),
-    "a fast and a slow one": ([500, 1, 2, 3, 4, 501, 5, 6, 7], 0, True),
-    "both miss": ([500, 1, 503, 3], 3, True),
-}
-
-
-@pytest.mark.parametrize("case", NUMBERS)
-def test_sequence_numbers_tell(case):
-    """Counted by hand."""
-    numbers, missed, two = NUMBERS[case]
-    sequence = Sequence()
-    found = [sequence.hear(number, 0.01 * n) for n, number in enumerate(numbers)]
-    assert (sequence.missed, any(found), sequence.two_speak(0.1)) == (missed, two, two)
-
-
-def test_two_of_one_name_are_refused_where_the_middleware_does_not_count():
-    """As rmw_cyclonedds: whether one is the other's ghost cannot be told; one alone is obeyed."""
-    end = SimpleNamespace(node_name="controller", node_namespace="/")
-    for publishers, number, refused in ((1, None, False), (2, None, True), (2, 1, False)):
-        node = SimpleNamespace(get_publishers_info_by_topic=lambda topic, n=publishers: [end] * n)
-        source = CommandSource(node, "/tool_pose_command", lambda n=publishers: n, False)
-        source.look(0.0)
-        assert not source.problem
-        assert source.hear(number, 0.01) is refused
-        assert ("does not count" in source.problem) is refused
-        source.look(10.0)
-        assert bool(source.problem) is refused
-        assert not source.hear(number, 10.1)
-
-
-def test_middleware_without_sequence_numbers_tells_nothing():
-    sequence = Sequence()
-    assert not any(sequence.hear(None, 0.01 * n) for n in range(5))
-    assert sequence.missed == 0
-
-
 # ---- feedback ----
 
 
@@ -536,25 +463,6 @@ def test_following_error_may_be_switched_off(bench):
     bench.estimate(bench.feed(closed_form_lengths(near(HOME, (0.0, 0.0, 0.05)))))
     bench.ask(HOME)
     bench.until_status(OK, "running")
-
-
-def test_lag_is_no_following_error():
-    """At 0.1 m/s a strut is 5 mm behind after 50 ms: right, since that was commanded in the last 0.1 s."""
-    following = Following(1e-3)
-    for n in range(200):
-        following.note(np.full(6, 0.5 + 1e-4 * n), 1e-3 * n)
-    now = 0.2
-    for behind, wrong in ((0.0, False), (5e-3, False), (10e-3, False), (12e-3, True), (-2e-3, True)):
-        following.check(np.full(6, 0.5199 - behind), now)
-        assert bool(following.problem) == wrong, behind
-        following.check(np.full(6, 0.5199), now)
-        assert bool(following.problem) == wrong, "what has happened stays"
-        following.release()
-    following.check(np.full(6, 0.5199), now)
-    assert not following.problem
-    following.forget()
-    following.check(np.zeros(6), now)
-    assert not following.problem, "nothing is in force"
 
 
 # ---- restarts ----

@@ -21,6 +21,7 @@ from std_msgs.msg import Float64MultiArray
 from benchmarks.strut_input import difference
 from hexapod_comp.cli import main
 from hexapod_comp.compensation.compensator import Compensator
+from hexapod_comp.compensation.guards import Sample
 from hexapod_comp.errors import CommandError, KinematicsError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import STRUT_NAMES, load_geometry
@@ -49,7 +50,11 @@ def test_lengths_and_the_pose_they_belong_to_are_answered_alike(name: str, tmp_p
 
 
 def test_who_cannot_be_told_is_refused_with_the_reason(paper: Compensator):
-    read = StrutInput(paper, STRUT_NAMES, "base").read
+    given = StrutInput(paper, STRUT_NAMES, "base")
+
+    def read(data: bytes) -> None:
+        given.read(data, Sample(0.0))
+
     at_home = closed_form_lengths(HOME)
     with pytest.raises(CommandError, match="strut_6 missing"):
         read(serialize_message(setpoints(at_home[:5], STRUT_NAMES[:5])))

@@ -14,7 +14,7 @@ from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 
 from hexapod_comp.ros.compensator import CompensatorNode
-from hexapod_comp.ros.rclpy_compat import Ticker
+from hexapod_comp.ros.rclpy_compat import Alarm
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def test_a_flood_of_rates_moves_neither_ticks_nor_timers(executor, ros_context):
     node = rclpy.create_node("ticking", context=ros_context)
     executor.add_node(node)
     ticks, checks = [], []
-    ticker = Ticker(node, lambda: ticks.append(time.monotonic()), 100.0)
+    ticker = Alarm(node, lambda: ticks.append(time.monotonic()), 100.0)
     node.create_timer(0.05, lambda: checks.append(time.monotonic()))
     began, rates = time.monotonic(), iter(np.random.default_rng(1).uniform(90.0, 110.0, 10_000))
     spin(executor, 0.5, lambda: ticker.set_rate(next(rates)))
@@ -52,7 +52,7 @@ def test_a_rate_of_zero_rests_and_another_goes_on_from_the_last_tick(executor, r
     node = rclpy.create_node("ticking", context=ros_context)
     executor.add_node(node)
     ticks = []
-    ticker = Ticker(node, lambda: ticks.append(time.monotonic()), 0.0)
+    ticker = Alarm(node, lambda: ticks.append(time.monotonic()), 0.0)
     spin(executor, 0.03)
     assert not ticks
     ticker.set_rate(1000.0)

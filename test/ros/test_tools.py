@@ -229,8 +229,8 @@ def test_nothing_is_worked_out_while_nobody_listens(bench: Bench, machine: Machi
     started(bench, file)
     bench.ask(at_home(machine), "work")
     node = bench.nodes[0]
-    node._travel.look(1e12)
-    assert node._travel._work is None
+    node._requests.look(1e12)
+    assert node._requests._worker.pid is None
 
 
 def test_a_clean_up_answers_who_waits(bench: Bench, machine: Machine, file: str) -> None:

@@ -22,8 +22,8 @@ from hexapod_comp.cli import main
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.pose import Pose
-from hexapod_comp.viewer import page as watching
 from hexapod_comp.ros.process import QUIET
+from hexapod_comp.viewer import page as watching
 from hexapod_comp.viewer.page import View, Watcher, WatchPage, same_site, strut_colours, strut_ends, words
 
 OFFSETS = np.array([-100.0, -50.0, 0.0, 50.0, 100.0, 200.0])

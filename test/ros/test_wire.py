@@ -17,17 +17,32 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from strategies import fixed
 
+from hexapod_comp.compensation.guards import Sample
+from hexapod_comp.core import ffi
 from hexapod_comp.errors import CommandError
 from hexapod_comp.machine.geometry import STRUT_NAMES
-from hexapod_comp.ros import messages, wire
+from hexapod_comp.ros import messages
 from hexapod_comp.ros.messages import (
     LARGEST_MESSAGE,
     StrutBytes,
     StrutMessage,
     StrutReader,
     read_message,
-    read_pose_bytes,
+    read_pose,
 )
+
+
+def read_pose_bytes(data: bytes) -> tuple:
+    """Return stamp, frame and numbers of a pose's bytes."""
+    sample = Sample(0.0)
+    read_pose(data, sample)
+    return sample.stamp, sample.frame_id, sample.values
+
+
+def made(out: StrutBytes, lengths, stamp: int = 0, period: float = 0.0):
+    """Return struts as they are published."""
+    return out.made(ffi.from_buffer("double[6]", np.array(lengths, dtype=float)), stamp, period)
+
 
 NUMBERS = st.lists(st.floats(), min_size=7, max_size=7)
 NAMES = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=40)
@@ -71,7 +86,7 @@ def test_a_stamp_that_is_no_time_is_refused(nanosec):
 
 
 def test_usual_bytes_are_read_without_a_message(monkeypatch):
-    monkeypatch.setattr(wire, "read_message", None)
+    monkeypatch.setattr(messages, "read_message", None)
     for name in ("", "b", "base", "a_frame_id_of_19_xx"):
         assert read_pose_bytes(serialize_message(pose(1, 2, name, [0.5] * 7)))[1:] == (name, (0.5,) * 7)
 
@@ -129,11 +144,10 @@ def test_a_message_cut_short_is_refused(cut):
 def test_struts_are_what_a_message_would_be(lengths, stamp, frame_id):
     out, message = StrutBytes(frame_id), StrutMessage(frame_id)
     for period in (0.0, 1e-3):
-        out.write(np.array(lengths), period)
+        data = made(out, lengths, stamp, period)
         message.write(np.array(lengths), period)
         lengths = [2.0 * length for length in lengths]
     message.message.header.stamp.sec, message.message.header.stamp.nanosec = divmod(stamp, 10**9)
-    data = out.stamped(stamp)
     assert isinstance(data, bytes)
     assert deserialize_message(data, JointState) == message.message
     assert out.stamp == stamp
@@ -144,15 +158,94 @@ def test_struts_are_what_a_message_would_be(lengths, stamp, frame_id):
 def test_struts_are_as_long_as_their_fields():
     """Counted by CDR's rules, without the bytes that the serialiser leaves behind: readers of bags refuse those."""
     stamp_and_frame, names, numbers = 8 + 4 + 1 + 3, 4 + 6 * (4 + len("strut_1") + 1), (4 + 48) + (4 + 4 + 48)
-    assert len(StrutBytes().stamped(0)) == 4 + stamp_and_frame + names + numbers + 4
+    assert len(made(StrutBytes(), np.zeros(6))) == 4 + stamp_and_frame + names + numbers + 4
 
 
 def test_an_unknown_layout_falls_back_to_messages(monkeypatch):
-    monkeypatch.setattr(wire, "serialize_message", lambda message: b"\x00\x00" + bytes(300))
+    monkeypatch.setattr(messages, "serialize_message", lambda message: b"\x00\x00" + bytes(300))
     out = StrutBytes("base")
-    out.write(np.arange(6.0))
-    found = out.stamped(5 * 10**9 + 6)
+    found = made(out, np.arange(6.0), 5 * 10**9 + 6)
     assert isinstance(found, JointState)
     assert (found.header.stamp.sec, found.header.stamp.nanosec) == (5, 6)
     assert list(found.position) == list(range(6))
     assert found.name == list(STRUT_NAMES)
+
+
+# ---- struts that come again and again ----
+
+
+def struts(numbers, sec: int = 1, names=STRUT_NAMES, velocity=(), effort=(), frame_id: str = "") -> bytes:
+    message = JointState(name=list(names), position=list(numbers), velocity=list(velocity), effort=list(effort))
+    message.header.stamp.sec, message.header.stamp.nanosec, message.header.frame_id = sec, 5, frame_id
+    return bytes(serialize_message(message))
+
+
+def read_struts(reader: StrutReader, data: bytes) -> tuple:
+    sample = Sample(0.0)
+    reader.sample(data, sample)
+    return sample.stamp, sample.values
+
+
+def outcome(reader: StrutReader, data: bytes) -> object:
+    try:
+        return repr(read_struts(reader, data))
+    except CommandError as error:
+        return error.reason
+
+
+@fixed
+@given(
+    st.lists(st.lists(st.floats(-10, 10), min_size=6, max_size=6), min_size=2, max_size=5),
+    st.permutations(list(STRUT_NAMES)),
+    st.booleans(),
+    NAMES,
+)
+def test_struts_of_a_known_layout_are_those_that_rclpy_reads(rows, names, fast, frame_id):
+    reader = StrutReader()
+    for n, row in enumerate(rows):
+        data = struts(row, n + 1, names, [0.25] * 6 if fast else (), frame_id=frame_id)
+        message = deserialize_message(data, JointState)
+        wanted = tuple(dict(zip(message.name, message.position, strict=True))[name] for name in STRUT_NAMES)
+        assert read_struts(reader, data) == ((n + 1) * 10**9 + 5, wanted)
+
+
+def test_a_known_layout_is_read_without_a_message(monkeypatch):
+    reader = StrutReader()
+    read_struts(reader, struts([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], velocity=[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]))
+    monkeypatch.setattr(messages, "read_message", None)
+    numbers = [0.6, 0.5, 0.4, 0.3, 0.2, 0.1]
+    assert read_struts(reader, struts(numbers, 9, velocity=[0.0] * 6)) == (9 * 10**9 + 5, tuple(numbers))
+
+
+@fixed
+@given(st.integers(0, 255), st.integers(0, 255), st.integers(0, 255))
+def test_whatever_byte_is_changed_a_reader_that_knows_the_layout_says_what_a_new_one_says(at, value, cut):
+    usual = struts([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], velocity=[1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    knows = StrutReader()
+    read_struts(knows, usual)
+    data = bytearray(usual)
+    data[at % len(data)] = value
+    changed = bytes(data) if cut > 60 else bytes(data[: len(data) - cut])
+    assert outcome(knows, changed) == outcome(StrutReader(), changed)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e151])
+def test_a_known_layout_does_not_let_numbers_pass_that_are_none(value):
+    reader = StrutReader()
+    for numbers, wanted in (([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], None), ([0.1, 0.2, value, 0.4, 0.5, 0.6], "not_finite")):
+        found = outcome(reader, struts(numbers))
+        assert found == wanted or wanted is None
+
+
+@fixed
+@given(st.lists(st.floats(-10, 10), min_size=3, max_size=3), st.floats(-3, 3), st.integers(0, 2**31 * 10**9 - 1))
+def test_a_pose_is_published_as_a_message_would_be(position, turn, stamp):
+    out, message = messages.PoseBytes("base"), PoseStamped()
+    rotation = np.array(
+        [[math.cos(turn), -math.sin(turn), 0.0], [math.sin(turn), math.cos(turn), 0.0], [0.0, 0.0, 1.0]]
+    )
+    messages.write_pose(message, np.array(position), rotation)
+    message.header.stamp, message.header.frame_id = messages.stamp_of(stamp), "base"
+    data = out.made(np.concatenate([position, rotation.ravel()]), stamp)
+    assert isinstance(data, bytes)
+    assert deserialize_message(data, PoseStamped) == message

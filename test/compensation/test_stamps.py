@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from hexapod_comp.compensation.guards import FORGET_ORDER_AFTER, StampClock, StampGate
+from hexapod_comp.compensation.guards import FORGET_ORDER_AFTER, Sample, StampClock, StampGate
 from hexapod_comp.errors import CommandError
 
 SECOND, MS = 1_000_000_000, 1_000_000
@@ -34,6 +34,13 @@ class TestClock:
     @property
     def now(self) -> float:
         return self.steady * 1e-9
+
+
+def checked(gate: StampGate, stamp: int, now: float) -> float:
+    """Let a gate check a stamp; return how old it says the message is, s."""
+    sample = Sample(now, stamp)
+    gate.check(sample)
+    return sample.age
 
 
 @dataclass
@@ -75,12 +82,12 @@ def stream(
         clock.steady = began + round(arrival * SECOND)
         clock.ahead = 5 * 10**17 + round((step if arrival >= step_at else 0.0) * SECOND)
         try:
-            gate.check(stamp, clock.now)
+            checked(gate, stamp, clock.now)
         except CommandError as error:
             if k > newest:
                 result.refused[error.reason] = result.refused.get(error.reason, 0) + 1
             continue
-        gate.accept(stamp, clock.now)
+        gate.accept(Sample(clock.now, stamp))
         result.overtaken += k < newest
         newest, result.longest_gap, last = max(k, newest), max(result.longest_gap, arrival - last), arrival
     return result
@@ -119,8 +126,8 @@ def test_a_sender_whose_clock_alone_is_set_back_is_heard_after_a_run_of_20_ms(st
         clock.steady += 2 * MS
         stamp = clock.system() + (round(step * SECOND) if k >= 200 else 0)
         try:
-            gate.check(stamp, clock.now)
-            gate.accept(stamp, clock.now)
+            checked(gate, stamp, clock.now)
+            gate.accept(Sample(clock.now, stamp))
         except CommandError as error:
             refused.append((k, error.reason))
     assert refused == [(200 + n, "stamp_order") for n in range(10)]
@@ -131,13 +138,13 @@ def test_what_was_held_up_and_comes_at_once_is_no_clock_that_was_set():
     """Fifty commands of 50 ms ago, in order, within a millisecond: none is obeyed."""
     clock = TestClock()
     gate = StampGate("command", clock.watch)
-    gate.check(clock.system(), clock.now)
-    gate.accept(clock.system(), clock.now)
+    checked(gate, clock.system(), clock.now)
+    gate.accept(Sample(clock.now, clock.system()))
     start = clock.system() - 50 * MS
     for k in range(50):
         clock.steady += MS // 50
         with pytest.raises(CommandError, match="ms earlier than the one before"):
-            gate.check(start + k * MS, clock.now)
+            checked(gate, start + k * MS, clock.now)
 
 
 @pytest.mark.parametrize("step", [-2.0, -0.3, 0.3, 2.0])
@@ -147,16 +154,16 @@ def test_a_step_while_the_node_stands_still_splits_what_waits_where_it_was_made(
     gate = StampGate("command", clock.watch, 0.5)
     for _ in range(100):
         clock.steady += MS
-        gate.check(clock.system(), clock.now)
-        gate.accept(clock.system(), clock.now)
+        checked(gate, clock.system(), clock.now)
+        gate.accept(Sample(clock.now, clock.system()))
     waiting = []
     for k in range(400):
         clock.steady += MS
         clock.ahead += round(step * SECOND) if k == 200 else 0
         waiting.append(clock.system())
     for stamp in waiting:
-        gate.check(stamp, clock.now)
-        gate.accept(stamp, clock.now)
+        checked(gate, stamp, clock.now)
+        gate.accept(Sample(clock.now, stamp))
 
 
 @pytest.mark.parametrize("step", [-3600.0, -0.3, 0.3, 3600.0])
@@ -167,8 +174,8 @@ def test_a_command_that_is_faster_than_the_only_one_before_is_read_by_the_new_se
     for late in (20 * MS, MS):
         stamp = clock.system()
         clock.steady += late
-        assert gate.check(stamp, clock.now) == pytest.approx(late * 1e-9)
-        gate.accept(stamp, clock.now)
+        assert checked(gate, stamp, clock.now) == pytest.approx(late * 1e-9)
+        gate.accept(Sample(clock.now, stamp))
         clock.ahead += round(step * SECOND)
         clock.steady += 50 * MS
 
@@ -220,16 +227,16 @@ def test_what_is_in_order(later, pause, passes):
     clock = TestClock()
     gate = StampGate("command", clock.watch)
     stamp = clock.system()
-    gate.check(stamp, clock.now)
-    gate.accept(stamp, clock.now)
-    gate.check(0, clock.now)  # says nothing
-    gate.accept(0, clock.now)
+    checked(gate, stamp, clock.now)
+    gate.accept(Sample(clock.now, stamp))
+    checked(gate, 0, clock.now)  # says nothing
+    gate.accept(Sample(clock.now, 0))
     clock.steady += pause * MS
     if passes:
-        gate.check(stamp + later, clock.now)
+        checked(gate, stamp + later, clock.now)
         return
     with pytest.raises(CommandError, match=f"command is stamped {-later / MS:.1f} ms earlier") as caught:
-        gate.check(stamp + later, clock.now)
+        checked(gate, stamp + later, clock.now)
     assert caught.value.reason == "stamp_order"
 
 
@@ -237,11 +244,11 @@ def test_the_drive_refuses_old_commands_only_and_by_the_clock_in_force():
     """`future=False`; and a clock set forward by 2 s makes no command on its way too old."""
     clock = TestClock()
     gate = StampGate("command", clock.watch, 0.1, future=False)
-    gate.check(clock.system() + 3600 * SECOND, clock.now)
+    checked(gate, clock.system() + 3600 * SECOND, clock.now)
     with pytest.raises(CommandError, match=r"command is stamped 0\.101 s old, allowed 0\.1 s") as caught:
-        gate.check(clock.system() - 101 * MS, clock.now)
+        checked(gate, clock.system() - 101 * MS, clock.now)
     assert caught.value.reason == "stamp_past"
     stamp = clock.system()
     clock.ahead += 2 * SECOND
     clock.steady += MS
-    assert gate.check(stamp, clock.now) == pytest.approx(1e-3)
+    assert checked(gate, stamp, clock.now) == pytest.approx(1e-3)
