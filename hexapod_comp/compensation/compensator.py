@@ -483,12 +483,12 @@ class Compensator:
         """
         lib.hc_published(self._at, time)
 
-    def estimate(self, struts: np.ndarray) -> np.ndarray:
+    def estimate(self, struts: np.ndarray | tuple[float, ...]) -> np.ndarray:
         """Return where the tool is when the struts read `struts`, through the model.
 
         Parameters
         ----------
-        struts : ndarray, shape (6,)
+        struts : ndarray, shape (6,), or tuple of six float
             Encoder readings, or commands, m.
 
         Returns
@@ -502,7 +502,8 @@ class Compensator:
         KinematicsError
             There is no such pose; the next estimate starts from the last good one.
         """
-        status = lib.hc_estimate(self._at, given("struts", struts, 6), self._estimated)
+        at = struts if isinstance(struts, tuple) and len(struts) == 6 else given("struts", np.asarray(struts), 6)
+        status = lib.hc_estimate(self._at, at, self._estimated)
         if status:
             raise forward_error(status, self._estimated.condition, self.geometry.limits.condition)
         return self._tool_pose

@@ -16,9 +16,9 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-import numpy as np
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from sensor_msgs.msg import JointState, RelativeHumidity, Temperature
+from std_msgs.msg import Float64MultiArray
 
 from ..compensation.compensator import Compensator, pack_pose
 from ..compensation.guards import Guard, OneSender, Sample
@@ -187,12 +187,15 @@ class CompensatorNode(MachineNode):
         self._corrections = self.publish_on(JointState, "strut_corrections", COMMAND_QOS, deadline)
         self._command_out, self._correction_out = StrutBytes(names=names), StrutBytes(names=names)
         self._fastest = compensator.geometry.limits.speed
+        self._array, self._array_out = None, Float64MultiArray(data=[0.0] * 6)
+        if options["publish_array"]:
+            self._array = self.publish_on(Float64MultiArray, "strut_commands_array", COMMAND_QOS, deadline)
         self._outputs = Outputs(self, compensator, options, self._commands.topic_name)
         self._input = asked = command_input(compensator, options)
         heard = self.obey(asked.kind, asked.topic, self._on_command, self._look_at_publishers)
         states = self.obey(JointState, "strut_states", self._on_states, self._look_at_publishers, qos=NEWEST_QOS)
         self._reader = StrutReader(names)
-        self._ends: list[Any] = [self._commands, self._corrections, heard, states]
+        self._ends: list[Any] = [self._commands, self._corrections, self._array, heard, states]
         self._thermometers = Thermometers(*temperature_rules(options))
         sensing: dict[str, OneSender] = {}
         sensors = (
@@ -254,7 +257,9 @@ class CompensatorNode(MachineNode):
         speed_over, outputs.answered = period(outputs.answered, when), when
         self._commands.publish(self._command_out.made(compensator.command_at, when, speed_over, self._fastest))
         self._corrections.publish(self._correction_out.made(compensator.correction_at, when))
-        outputs.array()
+        if self._array is not None:
+            self._array_out.data = compensator.command.tolist()
+            self._array.publish(self._array_out)
         compensator.published(out := time.monotonic())
         self._journal.answered(when, sample.frame_id, sample.values, (now, out), bool(stamp))
         self._stamps.accept(sample)
@@ -295,10 +300,12 @@ class CompensatorNode(MachineNode):
         if self._active and track.follow(struts, now - sample.age):
             self._status.bad_feedback.add(track.reason, track.problem, now)
         track.check_jump(sample)
-        pose = self.compensator.estimate(np.array(struts))
+        pose = self.compensator.estimate(struts)
         track.accept(sample)
         self._status.reading_stamps.accept(sample)
-        self._status.feedback.tick(now)
+        feedback = self._status.feedback
+        feedback.count += 1
+        feedback.last = now
         if self._active:
             self._outputs.estimate(pose, sample.stamp)
             self._outputs.nominal(sample.stamp, track.mean)

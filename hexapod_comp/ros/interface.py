@@ -17,7 +17,7 @@ from geometry_msgs.msg import Point, PoseStamped
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState, TimeReference
-from std_msgs.msg import Bool, ColorRGBA, Float64MultiArray, String, UInt64
+from std_msgs.msg import Bool, ColorRGBA, String, UInt64
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ..compensation.compensator import DEFAULT_RAMP_RATE, Compensator
@@ -34,7 +34,7 @@ from ..machine.kinematics import Structure, forward_error, solve_poses, strut_le
 from ..machine.model import MachineModel
 from ..machine.model_file import IDEAL
 from ..pose import Pose
-from .base import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, LATCHED_QOS, STATE_QOS, MachineNode
+from .base import ACKNOWLEDGED_WITHIN, EVENT_QOS, LATCHED_QOS, STATE_QOS, MachineNode
 from .messages import PoseBytes, StrutBytes, StrutReader, command_stamp, period, read_message, read_pose, stamp_of
 from .parameters import ParameterError, Program, read_table
 
@@ -325,7 +325,7 @@ class Outputs:
         self._heartbeats = node.create_publisher(UInt64, "~/heartbeat", EVENT_QOS)
         self._validities = node.create_publisher(TimeReference, "~/validity", EVENT_QOS)
         self._stops = node.create_publisher(Bool, "~/stopped", LATCHED_QOS)
-        self._joints = self._description = self._nominal = self._array = None
+        self._joints = self._description = self._nominal = None
         below = options["command_input"] == STRUTS
         if options["publish_description"]:
             self._joints = node.create_publisher(JointState, "joint_states", EVENT_QOS)
@@ -333,23 +333,12 @@ class Outputs:
             self._description.publish(String(data=urdf(compensator.geometry, self._names, ros2_control=below)))
         if below:
             self._nominal = node.publish_on(JointState, "nominal_strut_states", STATE_QOS)
-        if options["publish_array"]:
-            deadline = options["command_timeout"]
-            self._array = node.publish_on(Float64MultiArray, "strut_commands_array", COMMAND_QOS, deadline)
-        self._array_out = Float64MultiArray(data=[0.0] * 6)
-        self._array_view = np.frombuffer(self._array_out.data, dtype=float)
         self._nominal_out, self._estimate_out = StrutBytes(names=self._names), PoseBytes(self._frame)
         self._beat, self._validity = UInt64(), TimeReference(source=command_topic)
         self._stopped: bool | None = None
         self._stop_said = 0.0
         self.stop(True)
         self._tickers = node.at_rate("heartbeat_rate", self._beats), node.at_rate("marker_rate", self._show)
-
-    def array(self) -> None:
-        """Publish the command as an array, where a parameter asks for it."""
-        if self._array is not None:
-            self._array_view[:] = self._compensator.command
-            self._array.publish(self._array_out)
 
     def estimate(self, pose: np.ndarray, stamp: int) -> None:
         """Publish a tool pose, shape (12,): position, m, and rotation matrix, row by row."""
@@ -380,7 +369,7 @@ class Outputs:
         for ticker in self._tickers:
             ticker.close()
         always = self._estimates, self._markers, self._heartbeats, self._validities, self._stops
-        self._node.close_ends(*always, self._joints, self._description, self._nominal, self._array)
+        self._node.close_ends(*always, self._joints, self._description, self._nominal)
 
     def _beats(self) -> None:
         self._beat.data = (self._beat.data + 1) % 2**64
