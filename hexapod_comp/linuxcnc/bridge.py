@@ -29,8 +29,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, UInt64
 from std_srvs.srv import Trigger
 
-from ..errors import CommandError, HexapodError
 from ..compensation.guards import Sample, StampClock, StampGate
+from ..errors import CommandError, HexapodError
 from ..ros import keep_discovery_local
 from ..ros.base import ACKNOWLEDGED_WITHIN, COMMAND_QOS, EVENT_QOS, LATCHED_QOS, STATE_QOS, MachineNode
 from ..ros.messages import StrutMessage, StrutReader, stamp_of

@@ -184,19 +184,23 @@ class MachineFiles:
         """Whether the model is the ideal one, which has no file."""
         return bool(self._options["model_file"] == IDEAL)
 
-    @property
-    def model_folder(self) -> Path | None:
-        """Where a model may be read, with all below it, beside the shipped ones."""
-        return self._folders["model"]
+    def made_of(self) -> dict[str, Any]:
+        """Return what another process needs to make geometry and model of the same texts, for JSON."""
+        folder = self._folders["model"]
+        return {
+            **{name: vars(source) for name, source in self.sources.items()},
+            "folder": None if folder is None else str(folder),
+        }
 
-    def model_place(self) -> tuple[str, str, Path | None]:
+    def model_place(self) -> tuple[str, str, str | None]:
         """Return name, the folder that relative paths start from (where it was deleted, only absolute ones are found),
         and the folder in which it must be: nothing of it is looked at here."""
         try:
             place = os.getcwd()
         except FileNotFoundError:
             place = os.sep
-        return self._options["model_file"], place, self.model_folder
+        folder = self._folders["model"]
+        return self._options["model_file"], place, None if folder is None else str(folder)
 
     def geometry(self) -> HexapodGeometry:
         """Read the geometry."""

@@ -24,13 +24,12 @@ from ..errors import CommandError, HexapodError
 from ..machine.geometry import WORK, pose_text
 from ..machine.model import MachineModel
 from ..pose import Pose
-from ..workspace.travel import Travel, travel_text
 from .base import EVENT_QOS, LATCHED_QOS, MachineNode
 from .interface import MachineFiles
 from .messages import read_message, stamp_of
 from .rclpy_compat import LateAnswer, callers
 from .status import ERROR, OK, CompensatorStatus, status_of
-from .worker import Job, Worker, WorkerError
+from .worker import Job, Worker, WorkerError, loaded_model
 
 LOADED_WITHIN = 30.0
 """A model file that takes longer to read is given up, s; the shipped ones take one second, nearly all of it imports."""
@@ -72,7 +71,7 @@ class Requests:
         self._reload = LateAnswer(node.create_service(Trigger, "~/reload_model", self._on_reload))
         self._loading = False
         self._tools = ToolChoice(node, compensator, status)
-        self._travel = TravelReports(node, compensator, status, ids, self._worker)
+        self._travel = TravelReports(node, compensator, status, files, ids, self._worker)
         self._predicted = PredictedError(node, compensator, status, files, self._worker, ids[WORK], newest)
 
     def look(self, now: float) -> None:
@@ -121,8 +120,9 @@ class Requests:
             return self._take_model((MachineModel(machine), IDEAL_SOURCE))
         name, place, folder = self._files.model_place()
         late = f"{name}: could not be read within {LOADED_WITHIN:g} s; is the disk or the network behind it there?"
-        arguments = name, place, folder, machine
-        self._worker.ask(Job("load_model", arguments, self._loaded, self._not_loaded, LOADED_WITHIN, late))
+        arguments = {"name": name, "place": place, "folder": folder, "machine": machine}
+        job = Job("load_model", arguments, self._loaded, self._not_loaded, None, loaded_model, LOADED_WITHIN, late)
+        self._worker.ask(job)
         return None
 
     def _loaded(self, found: tuple[MachineModel, Any]) -> None:
@@ -238,10 +238,12 @@ class TravelReports:
         node: MachineNode,
         compensator: Compensator,
         status: CompensatorStatus,
+        files: MachineFiles,
         frame_ids: dict[str, str],
         worker: Worker,
     ) -> None:
         self._node, self._compensator, self._status, self._worker = node, compensator, status, worker
+        self._files = files
         self._names = {frame_id: name for name, frame_id in frame_ids.items()}
         self._default = frame_ids[WORK]
         self._publisher = node.create_publisher(DiagnosticStatus, "~/travel", EVENT_QOS)
@@ -261,7 +263,7 @@ class TravelReports:
             try:
                 self._begin()
             except CommandError as error:
-                self._tell(ERROR, str(error), ())
+                self._tell(ERROR, str(error), {})
 
     def _on_request(self, _: Trigger.Request, __: Trigger.Response) -> Trigger.Response | None:
         if self._asked and self._busy:
@@ -284,23 +286,29 @@ class TravelReports:
         geometry = compensator.geometry.using(work=self._names[frame_id])
         pose = geometry.tool_pose(platform)
         where = f"tool {geometry.tool_name} in {frame_id} at {pose_text(pose)}"
-        arguments = geometry, compensator.model, compensator.temperatures, pose, compensator.enabled
+        arguments = {
+            "position": pose.position.tolist(),
+            "rotation": pose.rotation.tolist(),
+            "tool": geometry.tool_name,
+            "work": geometry.work_name,
+            "warmth": list(compensator.temperatures.snapshot().values()),
+            "enabled": compensator.enabled,
+        }
         self._busy = True
-        self._worker.ask(Job("find_travel", arguments, partial(self._found, where), partial(self._failed, where)))
+        found, failed = partial(self._found, where), partial(self._failed, where)
+        self._worker.ask(Job("travel", arguments, found, failed, self._files.made_of()))
 
-    def _found(self, where: str, ways: tuple[Travel, ...]) -> None:
+    def _found(self, where: str, answer: dict[str, Any]) -> None:
         self._busy = False
-        self._tell(OK, where, ways)
+        self._tell(OK, where, answer["values"], answer["text"])
 
     def _failed(self, where: str, error: WorkerError) -> None:
         self._busy = False
-        self._tell(ERROR, f"{where}: {error}", ())
+        self._tell(ERROR, f"{where}: {error}", {})
 
-    def _tell(self, level: bytes, text: str, ways: tuple[Travel, ...]) -> None:
-        self._answer(level == OK, "\n".join(filter(None, (text, travel_text(ways)))))
+    def _tell(self, level: bytes, text: str, values: dict[str, str], table: str = "") -> None:
+        self._answer(level == OK, "\n".join(filter(None, (text, table))))
         if self._publisher.get_subscription_count():
-            values = {one.key: f"{one.shown:.6f}" for one in ways}
-            values |= {f"{one.way} stops at": str(one.error or "") for one in ways}
             name = f"{self._node.get_fully_qualified_name()[1:]}: travel"
             self._publisher.publish(status_of(name, self._node.hardware_id, level, text, values, LONGEST_REASON))
 
@@ -347,25 +355,23 @@ class PredictedError:
             self._wait, self._due = TRY_AGAIN_AFTER[0], min(self._due, now)
         if not wanted or self._busy or now < self._due or not np.isfinite(self._compensator.nominal).all():
             return
-        compensator, sources = self._compensator, self._files.sources
+        compensator = self._compensator
         self._busy, self._asked_for, self._due = True, self._newest(), now + PREDICTION_PERIOD
         asked = {
             "position": compensator.platform.position.tolist(),
             "rotation": compensator.platform.rotation.tolist(),
             "sense": compensator.motion.sense.tolist(),
             "tool": compensator.geometry.tool_name,
-            **compensator.temperatures.snapshot(),
+            "warmth": list(compensator.temperatures.snapshot().values()),
         }
-        key = f"{sources['geometry'].sha256} {sources['model'].name} {sources['model'].sha256}"
-        made_of = sources["geometry"], sources["model"], self._files.model_folder
-        self._worker.ask(Job("predict", (key, made_of, asked), self._publish, self._failed))
+        self._worker.ask(Job("predict", asked, self._publish, self._failed, self._files.made_of()))
 
     def _publish(self, result: dict[str, Any]) -> None:
         """Publish both errors; of a pose that the machine with its errors cannot take there is none."""
         self._busy, self._wait, self._status.prediction_problem = False, TRY_AGAIN_AFTER[0], ""
         for name, publisher in self._topics.items():
             error = result[name]
-            if error is not None and all(map(math.isfinite, error["values"])):
+            if error is not None and None not in error["values"]:
                 publisher.publish(error_message(error["values"], error["covariance"], self._frame, self._asked_for))
 
     def _failed(self, error: WorkerError) -> None:

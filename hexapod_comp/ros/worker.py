@@ -2,14 +2,14 @@
 
 Parsing YAML keeps Python's lock for tens of milliseconds, derivatives for as long, and a file on a dead network mount
 is waited for without end: meanwhile no command would be answered. So the node asks a process, which it starts when it
-first needs it: ``python -m hexapod_comp.ros.worker``. A job and its answer are each one pickle on its stdin and stdout;
-jobs are done in turn. It ends with its input, so that it never outlives the node.
+first needs it: ``python -m hexapod_comp.ros.worker``. A job and its answer are a line of JSON each, on its stdin and
+stdout; jobs are done in turn. It ends with its input, so that it never outlives the node.
 """
 
 from __future__ import annotations
 
+import json
 import os
-import pickle
 import subprocess
 import sys
 import threading
@@ -21,7 +21,18 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
+import numpy as np
+
+from ..compensation.journal import LARGEST_SOURCE, Source
 from ..errors import HexapodError
+from ..formats.json import json_text
+from ..formats.paths import confined_file, confined_opener
+from ..machine.field import GridField
+from ..machine.model import Datum, MachineModel, ModelOrigin, RealMachine
+from ..machine.region import Region
+from ..machine.struts import StrutErrors
+from ..machine.temperatures import LateGrowth, Temperatures
+from ..pose import Pose
 
 NICENESS = 10
 """Commands come first."""
@@ -41,12 +52,14 @@ class WorkerError(HexapodError):
 
 @dataclass
 class Job:
-    """What is asked: a function of this module and its arguments."""
+    """What is asked: one of :data:`TASKS`, and its arguments, for JSON."""
 
     task: str
-    arguments: tuple[Any, ...]
+    arguments: dict[str, Any]
     done: Callable[[Any], None]  # called with the result, from Worker.look
     failed: Callable[[WorkerError], None]
+    machine: dict[str, Any] | None = None  # which one, as Machine takes it
+    read: Callable[[Any], Any] = lambda answer: answer  # makes the result of the answer, in a thread of its own
     within: float = float("inf")  # s, from its beginning; then the process is given up
     late: str = ""  # what is said then
     began: float = float("inf")
@@ -62,10 +75,9 @@ class Worker:
         self._done_at = 0.0
 
     @property
-    def pid(self) -> int | None:
-        """Process id; None before it was started."""
-        process = None if self._helper is None else self._helper.process
-        return None if process is None else process.pid
+    def process(self) -> subprocess.Popen[str] | None:
+        """The process; None before it was started, and after it was ended."""
+        return None if self._helper is None else self._helper.process
 
     def ask(self, job: Job) -> None:
         """Have a job done."""
@@ -73,9 +85,9 @@ class Worker:
         self._next()
 
     def look(self, now: float) -> None:
-        """Hand on what has been done, and give up what takes too long."""
+        """Hand on what has been done, give up what takes too long, and end what has nothing to do."""
         job, helper = self._running, self._helper
-        if job is None or helper is None:
+        if helper is None or job is None:
             if helper is not None and now - self._done_at > IDLE_AFTER:
                 self._end(kill=False)
             return
@@ -86,7 +98,7 @@ class Worker:
                 self._end(kill=True)
                 self._settle(job, WorkerError(job.late))
             return
-        if isinstance(answer, WorkerError) and answer.reason == "ended":
+        if helper.ended:
             self._end(kill=False)
         self._settle(job, answer)
 
@@ -107,14 +119,10 @@ class Worker:
     def _next(self) -> None:
         if self._running is None and self._waiting:
             self._running = job = self._waiting.popleft()
-            if (
-                self._helper is not None
-                and self._helper.process is not None
-                and self._helper.process.poll() is not None
-            ):
+            if self.process is not None and self.process.poll() is not None:
                 self._end(kill=False)  # it was killed while it had nothing to do
             self._helper, job.began = self._helper or _Helper(), time.monotonic()
-            self._helper.jobs.put((job.task, job.arguments))
+            self._helper.jobs.put(job)
 
     def _end(self, kill: bool) -> None:
         helper, self._helper = self._helper, None
@@ -128,125 +136,166 @@ class _Helper:
     """A process, and the thread that talks with it, which keeps no lock while it waits."""
 
     def __init__(self) -> None:
-        self.jobs: SimpleQueue[Any] = SimpleQueue()
+        self.jobs: SimpleQueue[Job | None] = SimpleQueue()
         self.answers: SimpleQueue[Any] = SimpleQueue()
-        self.process: subprocess.Popen[bytes] | None = None
+        self.process: subprocess.Popen[str] | None = None
+        self.ended = False
+        self._machine: dict[str, Any] | None = None  # that it knows already
         threading.Thread(target=self._run, name="worker", daemon=True).start()
 
     def _run(self) -> None:
         command, pipe = [sys.executable, "-m", __name__], subprocess.PIPE
-        alone = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # the other cores are the loop's
-        error = WorkerError("the process beside the node ended")
+        alone = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONUTF8": "1"}  # the other cores are the loop's
+        problem = "the process beside the node ended"
         try:
             with subprocess.Popen(
-                command, cwd=PACKAGE_ROOT, env=alone, stdin=pipe, stdout=pipe, start_new_session=True
-            ) as process:  # of a session of its own, so that Ctrl-C does not interrupt it: its input ends with the node
-                self.process = process
+                command, cwd=PACKAGE_ROOT, env=alone, stdin=pipe, stdout=pipe, encoding="utf-8", start_new_session=True
+            ) as self.process:  # of a session of its own, so that Ctrl-C does not interrupt it
                 while (job := self.jobs.get()) is not None:
-                    pickle.dump(job, process.stdin)  # type: ignore[arg-type]
-                    process.stdin.flush()  # type: ignore[union-attr]
-                    self.answers.put(pickle.load(process.stdout))  # type: ignore[arg-type]
-        except (OSError, EOFError, pickle.PickleError) as caught:
-            if not isinstance(caught, (EOFError, BrokenPipeError)):
-                error = WorkerError(f"the process beside the node failed: {caught}")
-        error.reason = "ended"
-        self.answers.put(error)
+                    if (answer := self._talk(job)) is None:
+                        break
+                    self.answers.put(answer)
+        except (OSError, ValueError) as error:
+            if not isinstance(error, BrokenPipeError):
+                problem = f"the process beside the node failed: {error}"
+        self.ended = True
+        self.answers.put(WorkerError(problem))
+
+    def _talk(self, job: Job) -> Any:
+        """Return the result of a job, or its error; None where the process has ended."""
+        into, out = self.process.stdin, self.process.stdout  # type: ignore[union-attr]
+        machine = None if job.machine == self._machine else job.machine
+        self._machine = job.machine or self._machine
+        into.write(json.dumps({"task": job.task, "machine": machine, "asked": job.arguments}) + "\n")  # type: ignore[union-attr]
+        into.flush()  # type: ignore[union-attr]
+        if not (line := out.readline()):  # type: ignore[union-attr]
+            return None
+        answer = json.loads(line)
+        if "problem" in answer:
+            return WorkerError(answer["problem"])
+        try:
+            return job.read(answer)
+        except HexapodError as error:
+            return WorkerError(str(error))
+
+
+def model_json(model: MachineModel) -> str:
+    """Return a model as JSON; its numbers come back bit for bit."""
+    return json_text(model, indent=None)
+
+
+def model_of(data: dict[str, Any]) -> MachineModel:
+    """Return the model of a :func:`model_json`; a ModelError where its numbers cannot describe a machine."""
+    field, origin = data["field"], data["origin"]
+    origin["sources"] = tuple(tuple(source) for source in origin["sources"])
+    origin["posterior"] = None if origin["posterior"] is None else tuple(origin["posterior"])
+    origin["datum"] = None if origin["datum"] is None else Datum(**origin["datum"])
+    data["late_growth"] = LateGrowth(**data["late_growth"])
+    data["struts"] = StrutErrors(**data["struts"])
+    data["field"] = GridField(**{**field, "grid": tuple(field["grid"]), "lines": tuple(field["lines"])})
+    data["origin"] = ModelOrigin(**origin)
+    data["region"] = None if data["region"] is None else Region(**data["region"])
+    return MachineModel(**data)
+
+
+def loaded_model(answer: dict[str, Any]) -> tuple[MachineModel, Source]:
+    """Return what :func:`load_model` has found."""
+    return model_of(answer["model"]), Source(**answer["source"])
 
 
 # ---- the process ----
 
 
-def load_model(name: str, place: str, folder: Path | None, machine: str) -> tuple[Any, Any]:
+def load_model(name: str, place: str, folder: str | None, machine: str) -> dict[str, Any]:
     """Find and read a machine's model file, relative to a place, in a folder; return the model and its source, without
     the text where that is too long for the journal."""
-    from ..compensation.journal import LARGEST_SOURCE, Source
-    from ..formats.paths import confined_file, confined_opener
-
     os.chdir(place)
-    source = Source.read(confined_file(name, folder, "model"), confined_opener(folder))
+    inside = None if folder is None else Path(folder)
+    source = Source.read(confined_file(name, inside, "model"), confined_opener(inside))
     model = source.model(machine)
-    return model, Source(source.name, source.text if len(source.text or "") <= LARGEST_SOURCE else None, source.sha256)
+    text = source.text if len(source.text or "") <= LARGEST_SOURCE else None
+    return {"source": {"name": source.name, "text": text, "sha256": source.sha256}, "model": model}
 
 
-class Predicting:
-    """Predictors of one model, made anew when tool or temperature change."""
+class Machine:
+    """A machine and its model, made of the texts in use: what else is needed of them is made when it is."""
 
-    def __init__(self, geometry: Any, model: Any, folder: Path | None) -> None:
-        """Take geometry and model as the :class:`Source` of each, and the folder from which files may be read."""
-        from ..calibration.posterior_file import load_posterior
-        from ..formats.paths import confined_opener
-
-        self.geometry = geometry.geometry()
-        self.model = model.model(self.geometry.name)
-        opener = confined_opener(folder)
-        self.fitted, self.unknown = load_posterior(self.model, self.geometry, model.name, opener)
+    def __init__(self, geometry: dict[str, Any], model: dict[str, Any], folder: str | None) -> None:
+        self._opener = confined_opener(None if folder is None else Path(folder))
+        self._source = Source(**model)
+        if self._source.text is None:  # it was too long to be kept
+            again = Source.read(self._source.name, self._opener)
+            if again.sha256 != self._source.sha256:
+                raise WorkerError(f"{self._source.name}: has changed since it was loaded")
+            self._source = again
+        self.geometry = Source(**geometry).geometry()
+        self.model = self._source.model(self.geometry.name)
+        self._fitted: Any = None
         self._at: Any = None
 
-    def result(self, asked: dict[str, Any]) -> dict[str, Any]:
-        """Return the errors at a pose: ``position``, ``rotation``, ``sense``, ``tool``, ``temperatures``, ``lags``."""
-        import numpy as np
-
+    def predict(self, position: list, rotation: list, sense: list, tool: str, warmth: list[dict]) -> dict[str, Any]:
+        """Return the errors at a pose; `warmth`: temperatures, and how far what follows them late is behind."""
         from ..calibration.posterior import ErrorPredictor
-        from ..machine.model import RealMachine
-        from ..machine.temperatures import Temperatures
+        from ..calibration.posterior_file import load_posterior
 
-        at = asked["tool"], asked["temperatures"], asked["lags"]
-        if at != self._at:
-            temperatures = Temperatures.restored(*at[1:], len(self.model.late_growth.time_constants))
-            machine = RealMachine(self.geometry.using(tool=at[0]), self.model, temperatures)
-            self._predictor, self._at = ErrorPredictor(machine, self.fitted), at
-        pose = np.array([asked["position"]]), np.array([asked["rotation"]])
-        found = zip(("standing", "aligned"), self._predictor.predict(pose, np.array([asked["sense"]])), strict=True)
-        result: dict[str, Any] = {"unknown": self.unknown}
-        for name, one in found:
-            covariance = None if one is None or one.covariance is None else one.covariance[0].ravel().tolist()
-            result[name] = None if one is None else {"values": one.values[0].tolist(), "covariance": covariance}
+        if self._fitted is None:
+            self._fitted = load_posterior(self.model, self.geometry, self._source.name, self._opener)
+        if (tool, warmth) != self._at:
+            machine = RealMachine(self.geometry.using(tool=tool), self.model, self._restored(warmth))
+            self._predictor, self._at = ErrorPredictor(machine, self._fitted[0]), (tool, warmth)
+        errors = self._predictor.predict((np.array([position]), np.array([rotation])), np.array([sense]))
+        result: dict[str, Any] = {"unknown": self._fitted[1]}
+        for name, error in zip(("standing", "aligned"), errors, strict=True):
+            covariance = None if error is None or error.covariance is None else error.covariance[0].ravel()
+            result[name] = None if error is None else {"values": error.values[0], "covariance": covariance}
         return result
 
+    def travel(
+        self, position: list, rotation: list, tool: str, work: str, warmth: list[dict], enabled: bool
+    ) -> dict[str, Any]:
+        """Return how far a tool may go from a pose in a frame: a text, and values by their keys."""
+        from ..workspace.travel import travel, travel_text
 
-_predicting: dict[str, Predicting] = {}
+        geometry = self.geometry.using(tool, work)
+        machine = RealMachine(geometry, self.model, self._restored(warmth))
+        ways = travel(machine, Pose(np.array(position), np.array(rotation)), geometry.work, enabled)
+        stops = {f"{one.way} stops at": str(one.error or "") for one in ways}
+        return {"text": travel_text(ways), "values": {**{one.key: f"{one.shown:.6f}" for one in ways}, **stops}}
 
-
-def predict(key: str, sources: tuple[Any, Any, Path | None], asked: dict[str, Any]) -> dict[str, Any]:
-    """Return what :class:`Predicting` says of a pose; another `key` names other sources."""
-    if key not in _predicting:
-        _predicting.clear()
-        _predicting[key] = Predicting(*sources)
-    return _predicting[key].result(asked)
-
-
-def find_travel(geometry: Any, model: Any, temperatures: Any, pose: Any, enabled: bool) -> Any:
-    """Return how far the tool may go from a pose."""
-    from ..machine.model import RealMachine
-    from ..workspace.travel import travel
-
-    return travel(RealMachine(geometry, model, temperatures), pose, geometry.work, enabled)
+    def _restored(self, warmth: list[dict]) -> Temperatures:
+        values, lags = warmth
+        return Temperatures.restored(values, lags, len(self.model.late_growth.time_constants))
 
 
-TASKS: dict[str, Callable[..., Any]] = {task.__name__: task for task in (load_model, predict, find_travel)}
+TASKS = ("load_model", "predict", "travel")
 
 
 def main() -> int:
     """Answer until the input ends."""
     os.nice(NICENESS)
-    jobs, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what a library prints is no answer
-    while True:
+    made_of: dict[str, Any] | None = None
+    machine: Machine | None = None
+    for line in sys.stdin:
+        job = json.loads(line)
+        task, given, asked = job["task"], job["machine"], job["asked"]
+        if given is not None:
+            made_of, machine = given, None
         try:
-            task, arguments = pickle.load(jobs)
-        except EOFError:
-            return 0
-        try:
-            answer = TASKS[task](*arguments)
+            if task == TASKS[0]:
+                answer = load_model(**asked)
+            else:
+                machine = machine or Machine(**(made_of or {}))
+                answer = getattr(machine, TASKS[TASKS.index(task)])(**asked)
         except (HexapodError, OSError) as error:
-            answer = WorkerError(str(error))
+            answer = {"problem": str(error)}
         except Exception as error:  # else the process would end, and nobody know why
-            answer = WorkerError(f"{task}: {type(error).__name__}: {error}")
-        pickle.dump(answer, answers)
+            answer = {"problem": f"{task}: {type(error).__name__}: {error}"}
+        answers.write(json_text(answer, indent=None).replace("\n", " ") + "\n")
         answers.flush()
+    return 0
 
 
 if __name__ == "__main__":
-    from hexapod_comp.ros import worker  # under this name, by which the other end knows what is pickled
-
-    sys.exit(worker.main())
+    sys.exit(main())

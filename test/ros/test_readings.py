@@ -21,7 +21,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
 
 from hexapod_comp.compensation import guards
-from hexapod_comp.compensation.guards import StampClock, StampGate
+from hexapod_comp.compensation.guards import Sample, StampClock, StampGate
 from hexapod_comp.errors import CommandError
 from hexapod_comp.machine.geometry import STRUT_NAMES
 from hexapod_comp.ros.status import ERROR, OK, WARN
@@ -160,16 +160,17 @@ def test_the_age_of_readings_need_not_matter(bench):
 @pytest.mark.parametrize("capped", [True, False])
 def test_a_stamp_ahead_counts_as_now_where_it_must_not_shut_out(capped):
     """Of readings, not of commands: there the order matters more."""
-    check = StampGate("reading", StampClock(lambda: 100 * SECOND), 0.5, capped=capped)
-    check.check(100 * SECOND + 400_000_000, 1.0)
-    check.accept(100 * SECOND + 400_000_000, 1.0)
+    gate = StampGate("reading", StampClock(lambda: 100 * SECOND), 0.5, capped=capped)
+    ahead = Sample(1.0, 100 * SECOND + 400_000_000)
+    gate.check(ahead)
+    gate.accept(ahead)
     if capped:
-        check.check(100 * SECOND, 1.0)
+        gate.check(Sample(1.0, 100 * SECOND))
         with pytest.raises(CommandError, match="ms earlier than the one before"):
-            check.check(100 * SECOND - 1, 1.0)
+            gate.check(Sample(1.0, 100 * SECOND - 1))
     else:
         with pytest.raises(CommandError, match="ms earlier than the one before"):
-            check.check(100 * SECOND, 1.0)
+            gate.check(Sample(1.0, 100 * SECOND))
 
 
 # ---- what was measured ----

@@ -23,7 +23,7 @@ from hexapod_comp.errors import InputFileError
 from hexapod_comp.formats.files import read_text
 from hexapod_comp.formats.paths import confined_opener
 from hexapod_comp.ros.status import WARN
-from hexapod_comp.ros.worker import Job, Worker
+from hexapod_comp.ros.worker import Job, Worker, loaded_model
 
 ROUNDING = 1e-12
 
@@ -115,10 +115,25 @@ def test_the_node_itself_does_not_touch_the_file(bench, tmp_path, monkeypatch):
     assert response.success, response.message
 
 
-def outcome(name: str, arguments: tuple, within: float = 60.0) -> list:
+def wanted(place: Path, folder: Path) -> dict:
+    return {"name": "model.yaml", "place": str(place), "folder": str(folder), "machine": "paper"}
+
+
+def outcome(name: str, arguments: dict, within: float = 60.0) -> list:
     """Have a worker do a job, and return its result or its error."""
     beside, found = Worker(), []
-    beside.ask(Job(name, arguments, found.append, found.append, within, f"could not be read within {within:g} s"))
+    beside.ask(
+        Job(
+            name,
+            arguments,
+            found.append,
+            found.append,
+            None,
+            loaded_model,
+            within,
+            f"could not be read in {within:g} s",
+        )
+    )
     end = time.monotonic() + 60.0
     while not found and time.monotonic() < end:
         beside.look(time.monotonic())
@@ -133,8 +148,8 @@ def test_a_file_that_is_never_read_is_given_up_in_time(tmp_path, monkeypatch):
     never.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(never))
     began = time.monotonic()
-    (error,) = outcome("load_model", ("model.yaml", str(tmp_path), tmp_path, "paper"), 0.5)
-    assert str(error) == "could not be read within 0.5 s"
+    (error,) = outcome("load_model", wanted(tmp_path, tmp_path), 0.5)
+    assert str(error) == "could not be read in 0.5 s"
     assert time.monotonic() - began < 5.0
     process = int((tmp_path / "never.pid").read_text())
     while time.monotonic() - began < 5.0 and Path(f"/proc/{process}").exists():
@@ -168,7 +183,7 @@ def test_the_loading_process_hands_back_what_it_has_read(tmp_path, padding):
     text = (CONFIG / "paper_machine.yaml").read_text(encoding="utf-8") + f"# {'é' * padding}\n"
     path = tmp_path / "model.yaml"
     path.write_text(text, encoding="utf-8")
-    ((model, source),) = outcome("load_model", ("model.yaml", str(tmp_path), Path(), "paper"))
+    ((model, source),) = outcome("load_model", wanted(tmp_path, Path()))
     assert model.name == "virtual machine"
     whole = Source.of(str(path), text)
     assert (source.name, source.sha256) == (whole.name, whole.sha256)

@@ -230,7 +230,7 @@ def test_nothing_is_worked_out_while_nobody_listens(bench: Bench, machine: Machi
     bench.ask(at_home(machine), "work")
     node = bench.nodes[0]
     node._requests.look(1e12)
-    assert node._requests._worker.pid is None
+    assert node._requests._worker.process is None
 
 
 def test_a_clean_up_answers_who_waits(bench: Bench, machine: Machine, file: str) -> None:
