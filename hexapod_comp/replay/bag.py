@@ -1,4 +1,4 @@
-"""Reading a recorded run: one machine's topics out of a bag, as plain arrays. Only this module knows ``rosbags``.
+"""Reading a recorded run: one machine's topics out of a bag, as plain arrays. ``rosbags`` deserialises the messages.
 
 A bag is a folder with ``metadata.yaml`` as ``ros2 bag record`` writes it, or a bare ``.mcap`` or ``.db3`` file. Of
 its topics a replay needs the compensator's journal alone; ``compensator/files`` spares the user the search for geometry
@@ -8,33 +8,25 @@ left alone, whatever their types.
 
 from __future__ import annotations
 
-import itertools
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from ..compensation.journal import IDEAL_SOURCE, ROLES, JournalError, Page, Snapshot, Source, read_page, read_sources
 from ..errors import HexapodError, InputFileError, printable
-from ..formats.files import read_text
+from ..formats.files import MEGABYTE, read_text
 from ..formats.schema import Section
 from ..formats.yaml import yaml_content
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.model import MachineModel
-from .unpacking import (
-    MOST_METADATA,
-    MOST_NODES,
-    Allowance,
-    UnpackingError,
-    bounded,
-    refuse_overlapping_chunks,
-    refuse_too_much_at_once,
-)
+from .storage import Allowance, Message, UnpackingError, cut_off, messages, refuse_too_much_at_once, zstd_stream
 
 POSE, STRUTS, TEXT = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState", "std_msgs/msg/String"
 
@@ -55,8 +47,9 @@ METADATA = "metadata.yaml"
 
 STORAGE = (".mcap", ".db3")
 
-MCAP_END = b"\x89MCAP0\r\n"
-"""Last bytes of an MCAP file that was closed."""
+MOST_METADATA, MOST_NODES = 4 * MEGABYTE, 100_000
+"""Bytes and YAML nodes of a bag's metadata: a topic has some fifty nodes, and so have ten of the files that a long
+recording is split into."""
 
 CUT_OFF = (
     "it has no end, as when the recorder is killed; `mcap recover FILE --output NEW.mcap` makes a whole file of it"
@@ -157,88 +150,56 @@ def read_recording(
         No bag, damaged, of an earlier version, without journal, several machines or no such one; or it
         unpacks to more than its size makes believable.
     """
-    _rosbags()
-    with ExitStack() as stack:
-        files, notes = _files(Path(path))
-        size = _size(files)
-        _refuse_odd_metadata(path, files)
-        stack.enter_context(bounded(Allowance(size)))
-        readers = _open(Path(path), files, stack)
-        connections = [c for reader in readers for c in reader.connections]
-        node = _choose(path, connections, namespace)
-        wanted = _wanted(path, connections, node)
+    path, store = Path(path), _typestore()
+    files, packing, notes = _files(path)
+    inside = [one for file in {path, *files} for one in (file.iterdir() if file.is_dir() else [file])]
+    for one in inside:
+        if one.exists() and not (one.is_file() or one.is_dir()):  # opening a FIFO would wait without end
+            raise InputFileError(one, "", "is not a regular file; a bag holds nothing else")
+    size = sum(file.stat().st_size for file in inside if file.is_file())
+    with TemporaryDirectory(prefix="hexapod_comp_") as folder:
+        if packing == "file":
+            files = [_unpacked_file(path, file, Path(folder), Allowance(size)) for file in files]
+        counts, texts = Counter[tuple[str, str]](), list[Message]()
+        kept = Allowance(size)
+        for message in _messages(path, files, packing, Allowance(size)):
+            counts[message.topic, message.kind] += 1
+            if message.topic.endswith((JOURNAL, FILES)):
+                kept.take(len(message.raw))
+                texts.append(message)
+        if not counts:
+            raise InputFileError(path, "", "is a bag without messages")
+        node = _choose(path, counts, namespace)
+        wanted = _wanted(path, counts, node)
         collected = _Collected(path, node, Allowance(size))
-        for reader, named in itertools.product(readers, (True, False)):  # the journal first: it names the struts
-            chosen = [c for c in reader.connections if c.topic in wanted and (wanted[c.topic] in TOPICS) != named]
-            for topic, time, message, length in _messages(path, reader, chosen):
-                collected.take(wanted[topic], time, message, length)
+        others = (m for m in _messages(path, files, packing, Allowance(size)) if wanted.get(m.topic) in TOPICS)
+        for part in ((m for m in texts if m.topic in wanted), others):  # the journal first: it names the struts
+            for message in part:
+                key = f"{message.topic} at {message.time} ns"
+                content = _deserialized(path, key, store, message)
+                collected.take(wanted[message.topic], message.time, content, len(message.raw))
                 progress(1)
-    heard = sum(c.msgcount for c in connections if c.topic == f"{_namespace(node)}/{COMMANDS}")
+    heard = counts[f"{_namespace(node)}/{COMMANDS}", POSE]
     return collected.recording(notes, heard)
 
 
-def _rosbags() -> Any:
-    """Return the modules of rosbags, with a clear word where it is missing."""
+def _typestore() -> Any:
+    """Return rosbags' message types, with a clear word where it is missing.
+
+    These types have been the same since they exist: the definitions in the bag, if any, are not needed.
+    """
     try:
-        from rosbags import rosbag2, typesys
+        from rosbags import typesys
     except ImportError as error:
         raise HexapodError(
             f"reading bags needs rosbags ({error}): pip install rosbags, "
             "or on a ROS machine the rosdep key python3-rosbags-pip"
         ) from error
-    return rosbag2, typesys
+    return typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
 
 
-def _open(path: Path, files: list[Path], stack: ExitStack) -> list[Any]:
-    """Open all files of a bag; return their readers."""
-    rosbag2, _ = _rosbags()
-    readers = []
-    for file in files:
-        try:
-            readers.append(stack.enter_context(rosbag2.Reader(file)))
-            refuse_overlapping_chunks(readers[-1])
-        except InputFileError:
-            raise
-        except Exception as error:
-            raise _unreadable(path, file, "", error) from error
-    if not any(reader.message_count for reader in readers):
-        raise InputFileError(path, "", "is a bag without messages")
-    return readers
-
-
-def _size(files: list[Path]) -> int:
-    """Return the bytes of a bag's files; refuse those that are no files: opening a FIFO would wait without end."""
-    inside = [one for file in files for one in (file.iterdir() if file.is_dir() else [file])]
-    for file in inside:
-        if file.exists() and not (file.is_file() or file.is_dir()):
-            raise InputFileError(file, "", "is not a regular file; a bag holds nothing else")
-    return sum(file.stat().st_size for file in inside if file.is_file())
-
-
-def _refuse_odd_metadata(path: str | Path, files: list[Path]) -> None:
-    """Raise where ``metadata.yaml`` is too large, or does not hold what ``rosbags`` and this module take from it."""
-    for folder in files:
-        if not folder.is_dir():
-            continue
-        file = folder / METADATA
-        top = Section(file, "", yaml_content(read_text(file, most=MOST_METADATA), file, MOST_NODES))
-        about = top.section("rosbag2_bagfile_information")
-        for key, kind, what in (("files", list, "a list"), ("custom_data", dict, "a mapping")):
-            given = about.take(key) if key in about else None
-            if given is not None and not isinstance(given, kind):
-                raise about.error(key, f"must be {what}", given)
-        paths = about.take("relative_file_paths")
-        if not isinstance(paths, list) or not all(isinstance(name, str) for name in paths):
-            raise about.error("relative_file_paths", "must be a list of names", paths)
-        for topic in about.sections("topics_with_message_count"):
-            if not 0 <= topic.integer("message_count", 0) < 1 << 63:
-                raise topic.error("message_count", "must be a number of messages")
-            names = topic.section("topic_metadata")
-            names.text("name"), names.text("type")
-
-
-def _files(path: Path) -> tuple[list[Path], list[str]]:
-    """Return what is to be opened: the folder, or its single files where ``metadata.yaml`` is missing."""
+def _files(path: Path) -> tuple[list[Path], str, list[str]]:
+    """Return a bag's files, how they are packed (``file``, ``message``), and notes."""
     if path.name == METADATA:
         path = path.parent
     if not path.exists():
@@ -246,45 +207,90 @@ def _files(path: Path) -> tuple[list[Path], list[str]]:
     if not path.is_dir():
         if path.suffix not in STORAGE or not path.is_file():
             raise InputFileError(path, "", "must be a bag: a folder with metadata.yaml, a .mcap or a .db3 file")
-        return [path], []
-    if (path / METADATA).exists():
-        return [path], []
-    files = sorted(file for file in path.iterdir() if file.suffix in STORAGE)
-    if not files:
-        raise InputFileError(path, "", "is no bag: it has neither metadata.yaml nor a .mcap or .db3 file")
-    return files, ["metadata.yaml is missing, as when the recorder is killed; all files of the folder were read"]
+        return [path], "", []
+    file = path / METADATA
+    if not file.exists():
+        files = sorted(one for one in path.iterdir() if one.suffix in STORAGE)
+        if not files:
+            raise InputFileError(path, "", "is no bag: it has neither metadata.yaml nor a .mcap or .db3 file")
+        return (
+            files,
+            "",
+            ["metadata.yaml is missing, as when the recorder is killed; all files of the folder were read"],
+        )
+    top = Section(file, "", yaml_content(read_text(file, most=MOST_METADATA), file, MOST_NODES))
+    about = top.section("rosbag2_bagfile_information")
+    names = about.take("relative_file_paths")
+    if not isinstance(names, list) or not all(isinstance(name, str) and Path(name).name for name in names):
+        raise about.error("relative_file_paths", "must be a list of names", names)
+    files = [path / Path(name).name for name in names]
+    for one in files:
+        if not one.exists():
+            raise about.error("relative_file_paths", f"there is no file {one.name}")
+    packing, by = (about.take(key) if key in about else "" for key in ("compression_mode", "compression_format"))
+    packing = str(packing or "").lower()
+    if packing in ("file", "message") and by != "zstd":
+        raise about.error("compression_format", "must be zstd", by)
+    return files, packing, []
 
 
-def _unreadable(path: str | Path, file: Path, key: str, error: Exception) -> InputFileError:
-    """Return the error for what the library raises on damaged bytes.
+def _unpacked_file(path: Path, file: Path, folder: Path, allowance: Allowance) -> Path:
+    """Return a file of a bag that is packed as a whole, unpacked into a folder."""
+    target = folder / file.stem
+    try:
+        with zstd_stream(file) as stream, open(target, "wb") as unpacked:
+            unpacked.writelines(allowance.blocks(stream))
+    except Exception as error:
+        raise _unreadable(path, file, error) from error
+    return target
 
-    That is whatever its parts happen to raise: struct.error, KeyError, AssertionError, errors of three
-    decompressors and of two databases; hence ``except Exception`` where it is called.
+
+def _messages(path: Path, files: list[Path], packing: str, allowance: Allowance) -> Iterator[Message]:
+    """Yield the messages of all files of a bag, each as it was sent."""
+    for file in files:
+        try:
+            for message in messages(file, allowance):
+                refuse_too_much_at_once(len(message.raw), "a message")
+                if packing == "message":
+                    message = message._replace(raw=allowance.unpacked(zstd_stream(message.raw)))
+                yield message
+            if cut_off(file):
+                raise ValueError("its last record is missing")
+        except Exception as error:
+            raise _unreadable(path, file, error) from error
+
+
+def _unreadable(path: Path, file: Path | None, error: Exception, key: str = "") -> InputFileError:
+    """Return the error for what is raised on damaged bytes.
+
+    That is whatever the parts of a file happen to raise: struct.error, KeyError, errors of two decompressors and of a
+    database, of rosbags; hence ``except Exception`` where it is called.
     """
     if isinstance(error, UnpackingError):
         return InputFileError(path, key, str(error))
     text = " ".join(str(part) for part in error.args) or type(error).__name__
     problem = f"cannot be read as a bag: {printable(text)}"
-    if any(_cut_off(one) for one in (file, *file.glob("*.mcap"))):
-        problem += f"; {CUT_OFF}"
-    return InputFileError(path, key, problem)
+    return InputFileError(path, key, f"{problem}; {CUT_OFF}" if file is not None and cut_off(file) else problem)
 
 
-def _cut_off(file: Path) -> bool:
-    """Return whether a file is an MCAP file that was never closed."""
-    if file.suffix != ".mcap" or not file.is_file():
-        return False
-    with open(file, "rb") as stream:
-        stream.seek(max(0, file.stat().st_size - len(MCAP_END)))
-        return stream.read() != MCAP_END
+def _deserialized(path: Path, key: str, store: Any, message: Message) -> Any:
+    """Return a message's content; rclpy's serialize_message leaves four bytes behind some, which rosbags refuses."""
+    try:
+        try:
+            return store.deserialize_cdr(message.raw, message.kind)
+        except Exception:
+            if len(message.raw) <= SPARE:
+                raise
+            return store.deserialize_cdr(message.raw[:-SPARE], message.kind)
+    except Exception as error:
+        raise _unreadable(path, None, error, key) from error
 
 
-def _choose(path: str | Path, connections: Iterable[Any], namespace: str | None) -> str:
+def _choose(path: Path, topics: Collection[tuple[str, str]], namespace: str | None) -> str:
     """Return the full name of the compensator meant."""
-    connections = list(connections)
-    journals = [c for c in connections if c.topic.endswith(JOURNAL)]
-    journals = [c for c in journals if c.msgtype == TEXT] or journals  # others have journals too
-    nodes = sorted({c.topic.removesuffix(JOURNAL) for c in journals})
+    journals = [(topic, kind) for topic, kind in topics if topic.endswith(JOURNAL)]
+    journals = [one for one in journals if one[1] == TEXT] or journals  # others have journals too
+    nodes = sorted({topic.removesuffix(JOURNAL) for topic, _ in journals})
     if namespace is not None:
         wanted = "/" + namespace.strip("/")
         here = [node for node in nodes if _namespace(node) == wanted.rstrip("/")]
@@ -293,9 +299,9 @@ def _choose(path: str | Path, connections: Iterable[Any], namespace: str | None)
     if len(here) == 1:
         return here[0]
     if not nodes:
-        topics = ", ".join(sorted({c.topic for c in connections})) or "none"
+        listed = ", ".join(sorted({topic for topic, _ in topics}))
         problem = f"holds no journal of a compensator, without which nothing can be replayed; {RECORD}"
-        raise InputFileError(path, "", f"{problem}. Its topics: {printable(topics, 500)}")
+        raise InputFileError(path, "", f"{problem}. Its topics: {printable(listed, 500)}")
     names = ", ".join(_namespace(node) or "/" for node in nodes)
     problem = "holds several machines; choose one with --namespace" if here else f"has no machine in {namespace}"
     raise InputFileError(path, "", f"{problem}: {names}")
@@ -305,49 +311,15 @@ def _namespace(node: str) -> str:
     return node.rpartition("/")[0]
 
 
-def _wanted(path: str | Path, connections: Iterable[Any], node: str) -> dict[str, str]:
+def _wanted(path: Path, topics: Collection[tuple[str, str]], node: str) -> dict[str, str]:
     """Return what the topics to be read are called here; refuse wrong types."""
     names = {f"{_namespace(node)}/{name}": (name, kind) for name, kind in TOPICS.items()}
     names |= {node + JOURNAL: (JOURNAL, TEXT), node + FILES: (FILES, TEXT)}
-    for connection in connections:
-        kind = names.get(connection.topic, ("", connection.msgtype))[1]
-        if connection.msgtype != kind:
-            raise InputFileError(path, connection.topic, f"must be of type {kind}", connection.msgtype)
+    for topic, found in topics:
+        kind = names.get(topic, ("", found))[1]
+        if found != kind:
+            raise InputFileError(path, topic, f"must be of type {kind}", found)
     return {topic: name for topic, (name, _) in names.items()}
-
-
-def _messages(path: str | Path, reader: Any, connections: list[Any]) -> Iterator[tuple[str, int, Any, int]]:
-    """Yield topic, the recorder's time (ns), message and its length (bytes) of some connections."""
-    if not connections:
-        return
-    _, typesys = _rosbags()
-    # These types have been the same since they exist: the definitions in the bag, if any, are not needed.
-    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
-    messages = reader.messages(connections)
-    while True:
-        key = ""
-        try:
-            connection, time, raw = next(messages)
-            key = f"{connection.topic} at {time} ns"
-            refuse_too_much_at_once(len(raw), "a message")
-            message = _deserialized(store, raw, connection.msgtype)
-        except StopIteration:
-            return
-        except Exception as error:
-            raise _unreadable(path, reader.path, key, error) from error
-        yield connection.topic, time, message, len(raw)
-
-
-def _deserialized(store: Any, raw: bytes, kind: str) -> Any:
-    """Return a message; rclpy's serialize_message leaves four bytes behind some, which the library refuses."""
-    try:
-        return store.deserialize_cdr(raw, kind)
-    except Exception:
-        try:
-            return store.deserialize_cdr(raw[:-SPARE], kind)
-        except Exception:
-            pass
-        raise
 
 
 class _Columns:

@@ -27,7 +27,7 @@ from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.replay.bag import FILES, JOURNAL, Files, _Collected, read_recording
 from hexapod_comp.replay.replay import replay_recording, what_if
 from hexapod_comp.replay.report import Report, as_json, rows_of, text
-from hexapod_comp.replay.unpacking import Allowance
+from hexapod_comp.replay.storage import Allowance
 
 VALUES = [[], {}, None, "x", 1e308, {"a": [1.0]}]
 
@@ -112,8 +112,7 @@ def test_references_inside_of_a_texts_yaml(bag: Path) -> None:
     for topic in tree["rosbag2_bagfile_information"]["topics_with_message_count"]:
         topic["topic_metadata"]["offered_qos_profiles"] = ALIASES
     file.write_text(yaml.safe_dump(tree))
-    with pytest.raises(InputFileError, match=r"reference \*a is not understood"):
-        read_recording(bag)
+    assert len(read_recording(bag).commands)  # what replay does not need is not read
 
 
 @pytest.mark.parametrize("place", ["metadata.yaml", "run.mcap", "more.mcap", "alone.mcap"])

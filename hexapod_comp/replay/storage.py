@@ -1,0 +1,203 @@
+"""The files of a bag, MCAP and SQLite: no more is unpacked than a recording of their size can hold.
+
+Ninety kilobytes can unpack to gigabytes. Every block is counted before the next one is unpacked. MCAP:
+https://mcap.dev/spec, of which records, chunks and both compressions are read, not the index; SQLite's tables are
+read as they stand in the file.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sqlite3
+import struct
+import sys
+from collections.abc import Callable, Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+from zlib import crc32
+
+from ..errors import HexapodError
+from ..formats.files import MEGABYTE
+
+AT_ONCE = 128 * MEGABYTE
+"""Most bytes of one record, message or chunk; recorders make chunks of one to four MB."""
+
+FREE, RATIO = 256 * MEGABYTE, 100
+"""A bag may unpack to this many bytes, and to this many more for each of its own. A machine that stands still, the
+same lengths a thousand times a second, unpacks to thirty times the bag."""
+
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+"""First and last bytes of an MCAP file; a recorder that is killed does not write the last ones."""
+
+SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 3, 4, 5, 6, 15
+"""Kinds of MCAP records that are read."""
+
+KINDS = range(1, 16)
+"""All kinds that there are."""
+
+LATEST = 1 << 63
+
+EXPANDING = """SELECT name FROM sqlite_master WHERE type = 'view' OR sql LIKE 'create virtual%'
+UNION SELECT m.name FROM sqlite_master m, pragma_table_xinfo(m.name) x WHERE m.type = 'table' AND x.hidden > 1"""
+"""Views, virtual tables and computed columns: they give rows that no file holds; no recorder writes any."""
+
+
+class UnpackingError(HexapodError):
+    """A bag that unpacks to more than its size makes believable."""
+
+    reason = "too_large"
+
+
+class Message(NamedTuple):
+    """A message as it was recorded."""
+
+    topic: str
+    kind: str
+    time: int  # of the recorder, ns
+    raw: bytes
+
+
+class Allowance:
+    """What a bag of a given size, bytes, may still unpack to."""
+
+    def __init__(self, size: int) -> None:
+        self._size, self._taken = size, 0
+
+    def take(self, count: int) -> None:
+        """Count bytes; raise UnpackingError when they are too many."""
+        self._taken += count
+        most = FREE + RATIO * self._size
+        if self._taken > most:
+            raise UnpackingError(
+                f"unpacks to more than {most / MEGABYTE:.0f} MB, which is more than a recording of {self._size} bytes "
+                f"can hold (allowed are {FREE // MEGABYTE} MB and {RATIO} times its size)"
+            )
+
+    def blocks(self, stream: BinaryIO) -> Iterator[bytes]:
+        """Yield what a packed stream holds, block by block."""
+        while block := stream.read(MEGABYTE):
+            self.take(len(block))
+            yield block
+
+    def unpacked(self, stream: BinaryIO) -> bytes:
+        """Return what a packed chunk or message holds."""
+        content = bytearray()
+        for block in self.blocks(stream):
+            content += block
+            refuse_too_much_at_once(len(content), "a message or chunk")
+        return bytes(content)
+
+
+def refuse_too_much_at_once(size: int, what: str) -> None:
+    """Raise UnpackingError for what cannot be held in memory at one time."""
+    if size > AT_ONCE:
+        raise UnpackingError(f"{what} unpacks to more than the allowed {AT_ONCE // MEGABYTE} MB")
+
+
+def zstd_stream(packed: bytes | Path) -> BinaryIO:
+    """Return a stream of what was packed by Zstandard, as bytes or in a file."""
+    zstd = importlib.import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
+    return zstd.ZstdFile(BytesIO(packed) if isinstance(packed, bytes) else packed)
+
+
+def messages(file: Path, allowance: Allowance) -> Iterator[Message]:
+    """Yield all messages of a file; raises whatever its parts happen to raise on damaged bytes."""
+    yield from _sqlite(file) if file.suffix == ".db3" else _mcap(file, allowance)
+
+
+def _sqlite(file: Path) -> Iterator[Message]:
+    database = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True)
+    try:
+        for (name,) in database.execute(EXPANDING):
+            raise UnpackingError(f"table {name!r} computes what it seems to hold; a recording's tables do not")
+        rows = database.execute("SELECT id, name, type FROM topics WHERE serialization_format = 'cdr'")
+        topics = {number: (str(name), str(kind)) for number, name, kind in rows}
+        for number, time, raw in database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp"):
+            if number in topics:
+                if not (isinstance(time, int) and isinstance(raw, bytes)):
+                    raise ValueError("a row of its messages has no time or no bytes")
+                yield Message(*topics[number], time, raw)
+    finally:
+        database.close()
+
+
+class _Records:
+    """MCAP records, read one after the other."""
+
+    def __init__(self, allowance: Allowance) -> None:
+        self._allowance = allowance
+        self._schemas: dict[int, str] = {}
+        self._channels: dict[int, tuple[str, str]] = {}
+
+    def of(self, stream: BinaryIO) -> Iterator[Message]:
+        """Yield the messages of a stream of records, and of the chunks in it."""
+        while len(head := stream.read(9)) == 9:
+            kind, length = struct.unpack("<BQ", head)
+            if kind not in KINDS:
+                raise ValueError(f"holds a record of an unknown kind, {kind}")
+            refuse_too_much_at_once(length, "a record")
+            if len(body := stream.read(length)) < length:
+                raise ValueError("ends within a record")
+            if kind == MESSAGE:
+                number, _, time = struct.unpack_from("<HIQ", body)
+                if time >= LATEST:
+                    raise ValueError(f"has a message of the time {time} ns")
+                if number in self._channels:
+                    yield Message(*self._channels[number], time, body[22:])
+            elif kind == CHUNK:
+                yield from self.of(BytesIO(self._chunk(body)))
+            elif kind == SCHEMA:
+                (number,) = struct.unpack_from("<H", body)
+                self._schemas[number] = _text(body, 2)[0]
+            elif kind == CHANNEL:
+                number, schema = struct.unpack_from("<HH", body)
+                topic, at = _text(body, 4)
+                if _text(body, at)[0] == "cdr":
+                    self._channels[number] = topic, self._schemas[schema]
+            elif kind == DATA_END:
+                return
+        if head:
+            raise ValueError("ends within a record")
+
+    def _chunk(self, body: bytes) -> bytes:
+        *_, size, checksum = struct.unpack_from("<QQQI", body)
+        packing, at = _text(body, 28)
+        (length,) = struct.unpack_from("<Q", body, at)
+        records = body[at + 8 : at + 8 + length]
+        if packing:
+            records = self._allowance.unpacked(UNPACK[packing](records))
+        if len(records) != size or (checksum and crc32(records) != checksum):
+            raise ValueError("holds a chunk that is damaged")
+        return records
+
+
+def _text(body: bytes, at: int) -> tuple[str, int]:
+    """Return the text that begins somewhere in a record, and where it ends."""
+    (length,) = struct.unpack_from("<I", body, at)
+    return body[at + 4 : at + 4 + length].decode(), at + 4 + length
+
+
+def _lz4(packed: bytes) -> Any:
+    from lz4.frame import LZ4FrameFile
+
+    return LZ4FrameFile(BytesIO(packed))
+
+
+UNPACK: dict[str, Callable[[bytes], Any]] = {"zstd": zstd_stream, "lz4": _lz4}
+
+
+def _mcap(file: Path, allowance: Allowance) -> Iterator[Message]:
+    with open(file, "rb") as stream:
+        if (head := stream.read(len(MCAP_MAGIC))) != MCAP_MAGIC:
+            raise ValueError("is no MCAP file" if head else "seems to be empty")
+        yield from _Records(allowance).of(stream)
+
+
+def cut_off(file: Path) -> bool:
+    """Return whether a file is an MCAP file that was never closed."""
+    if file.suffix != ".mcap" or not file.is_file():
+        return False
+    with open(file, "rb") as stream:
+        stream.seek(max(0, file.stat().st_size - len(MCAP_MAGIC)))
+        return stream.read() != MCAP_MAGIC
