@@ -6,50 +6,41 @@ import argparse
 import math
 import sys
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from ..errors import CommandError, HexapodError, InputFileError
+from ..formats.paths import input_file
+from ..formats.schema import complaints_about
+from ..machine.geometry import HexapodGeometry, load_geometry
+from ..machine.model import RealMachine
+from ..machine.model_file import load_model
+from ..workspace.budget import load_budget
+from ..workspace.ranking import beside, ranking_rows
+from ..workspace.reach import orientations, reaches
+from ..workspace.shells import TRANSLATION, Layer, Shell
+from ..workspace.study import COMBINED_POSES, Study, as_json, classify, mesh_effects, random_poses, report, shells_of
 from . import common
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from ..machine.geometry import HexapodGeometry
-    from ..workspace.budget import Budget
-    from ..workspace.shells import Shell
-    from ..workspace.study import Study
-
-
-OF_A_BUDGET = {
-    "budget": "error_budget.yaml",
-    "method": "exact",
-    "separate_joints": False,
-    "compare": None,
-    "allow_um": None,
-    "workers": 1,
-    "scheduler": None,
-    "no_page": False,
-    "publish": False,
-}
-"""Options that say something of a budget, and what they are when nobody gives them."""
-
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
-    from ..machine.geometry import load_geometry
-    from ..workspace.ranking import beside, ranking_rows
-    from ..workspace.reach import orientations, reaches
-    from ..workspace.study import as_json, classify, report, shells_of
-
     geometry = load_geometry(args.machine)
     if args.clearance_mm is not None:
         geometry = replace(geometry, limits=replace(geometry.limits, clearance=args.clearance_mm * 1e-3))
     if args.model is not None:
         return _after_calibration(args, geometry)
-    budget = _budget(args.budget, geometry)
+    path = input_file(args.budget, "error_budget")
+    budget = load_budget(path)
+    with complaints_about(path):  # what does not fit the machine is refused before the work starts
+        budget.single_errors(geometry)
     turned = orientations(geometry, (args.tilt_deg, args.tilt_deg, (0.0,)))
     reached = reaches(geometry, turned, args.cells)
-    names = _names(args.tilt_deg)
+    names = tuple(f"α {math.degrees(a):g}°, β {math.degrees(b):g}°" for a, b in product(args.tilt_deg, args.tilt_deg))
     with common.progress_bar(sum(int(one.within.sum()) for one in reached), " poses") as bar:
         study = classify(
             geometry,
@@ -82,16 +73,7 @@ def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry) -> i
     from ..calibration.follow_up import remaining
     from ..calibration.pictures import predicted_error_figure
     from ..calibration.posterior_file import load_posterior
-    from ..errors import CommandError
-    from ..machine.model import RealMachine
-    from ..machine.model_file import load_model
-    from ..workspace.reach import orientations, reaches
-    from ..workspace.study import COMBINED_POSES, random_poses
 
-    for name, unused in OF_A_BUDGET.items():
-        if getattr(args, name) != unused:
-            problem = f"--{name.replace('_', '-')} has no meaning with --model, which takes the place of a budget"
-            raise CommandError("usage", problem)
     model = load_model(args.model, geometry)
     fitted, unknown = load_posterior(model, geometry, args.model)
     if fitted is None:
@@ -108,38 +90,16 @@ def _after_calibration(args: argparse.Namespace, geometry: HexapodGeometry) -> i
     return 0
 
 
-def _budget(file: str, geometry: HexapodGeometry) -> Budget:
-    """Return the budget of a file; what does not fit the machine is refused before the work starts."""
-    from ..errors import InputFileError, ModelError
-    from ..formats.paths import input_file
-    from ..workspace.budget import load_budget
-
-    path = input_file(file, "error_budget")
-    budget = load_budget(path)
-    try:
-        budget.single_errors(geometry)
-    except ModelError as error:
-        raise InputFileError(path, error.key, error.problem, error.value) from error
-    return budget
-
-
-def _names(tilts: tuple[float, ...]) -> tuple[str, ...]:
-    """Return the names of every combination of tilts about x and y, in their order."""
-    from itertools import product
-
-    return tuple(f"α {math.degrees(a):g}°, β {math.degrees(b):g}°" for a, b in product(tilts, tilts))
-
-
 def _figures(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...]) -> dict[str, Figure]:
     """Draw the pictures: of the orientation in the middle of the list."""
     from ..workspace.pictures import RankedRow, causes_figure, ranking_figure, shells_figure
-    from ..workspace.shells import TRANSLATION, Layer
-    from ..workspace.study import mesh_effects
 
     middle = len(bodies) // 2
     body, where, machine = bodies[middle], names[middle], study.geometry.name
+    ranked = [(row.title, [float(figure) for figure in row.figures()]) for row in study.rows]
+    bars = [RankedRow(title, (f[1], f[0]), (f[3], f[2])) for title, f in ranked]
     figures = {
-        "ranking.png": ranking_figure([_bar(row, RankedRow) for row in study.rows], f"{machine}: errors by effect"),
+        "ranking.png": ranking_figure(bars, f"{machine}: errors by effect"),
         "causes.png": causes_figure(study.geometry, body.points, body.findings, f"{machine}, {where}"),
     }
     points, values = mesh_effects(study, body)
@@ -155,8 +115,6 @@ def _figures(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...]) ->
 def _publish(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...]) -> None:
     """Keep shells on a latched topic, for RViz and Foxglove, until Ctrl-C."""
     from ..viewer.shells import TOPIC, show_shells
-    from ..workspace.shells import TRANSLATION, Layer
-    from ..workspace.study import mesh_effects
 
     middle = len(bodies) // 2
     points, values = mesh_effects(study, bodies[middle])
@@ -167,15 +125,8 @@ def _publish(study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...]) ->
     show_shells(layers, TRANSLATION, f"{kind}, {study.errors.labels[error]}, {names[middle]}")
 
 
-def _bar(row: Any, kind: Any) -> Any:
-    """Return a ranked row as a bar pair."""
-    figures = row.figures()
-    return kind(row.title, (float(figures[1]), float(figures[0])), (float(figures[3]), float(figures[2])))
-
-
 def _page(args: argparse.Namespace, study: Study, bodies: tuple[Shell, ...], names: tuple[str, ...]) -> None:
     """Write the interactive page, or say what it needs."""
-    from ..errors import HexapodError, InputFileError
     from ..workspace.page import page_data, write_page
 
     path = Path(args.pictures) / "page.html"

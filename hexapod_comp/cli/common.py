@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import math
 import os
 import signal
 import sys
@@ -13,24 +12,25 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from ..formats.texts import CODES, number, own_terminal
+import numpy as np
+
+from ..formats.csv import Row
+from ..formats.json import json_text
+from ..formats.outputs import write_text
+from ..formats.texts import CODES, own_terminal
+from ..machine.geometry import HexapodGeometry, load_geometry
+from ..machine.model import MachineModel
+from ..pose import rotation_from_angles
+from .table import Table
 
 if TYPE_CHECKING:
-    import numpy as np
     from matplotlib.figure import Figure
 
-    from ..formats.csv import Row
-    from ..machine.geometry import HexapodGeometry
-    from ..machine.model import MachineModel
     from ..measurements.campaign import Campaign
-
-DECIMALS = {"mm": 9, "deg": 9, "um": 6, "urad": 6}
-"""Digits after the point in CSV files: a picometre, and less than that at the platform's edge."""
 
 
 def load_machine(args: argparse.Namespace) -> tuple[HexapodGeometry, MachineModel]:
     """Return the geometry, with the tool and the work frame, and the model that the options name."""
-    from ..machine.geometry import load_geometry
     from ..virtual.named import find_model
 
     geometry = load_geometry(args.machine).using(getattr(args, "tool", None), getattr(args, "work", None))
@@ -75,15 +75,8 @@ def machine_title(geometry: HexapodGeometry, model: MachineModel) -> str:
     return f"machine {geometry.name}" + (f", model {model.name}" if model.name != "ideal" else "")
 
 
-def one_row(
-    argument: tuple[tuple[float, ...], tuple[float, ...]],
-) -> tuple[list[Row], np.ndarray, np.ndarray]:
+def one_row(argument: tuple[tuple[float, ...], tuple[float, ...]]) -> tuple[list[Row], np.ndarray, np.ndarray]:
     """Return a pose given on the command line as a list of one: rows, positions, rotations."""
-    import numpy as np
-
-    from ..formats.csv import Row
-    from ..pose import rotation_from_angles
-
     position, angles = argument
     return [Row(0, "1")], np.array([position]), rotation_from_angles(np.array([angles]))
 
@@ -93,42 +86,27 @@ def where(row: Row) -> str:
     return f"line {row.line} (row {row.label})" if row.line else "the pose"
 
 
-def csv_text(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Return rows of equal columns as CSV; the digits of a number follow from its column's unit."""
-    from ..formats.csv import csv_text
-
-    rows = list(rows)
-    decimals = [DECIMALS.get(name.rpartition("_")[2], 6) for name in rows[0]]
-    cells = ([_cell(*pair) for pair in zip(row.values(), decimals, strict=True)] for row in rows)
-    return csv_text([list(rows[0]), *cells])
-
-
-def _cell(value: Any, digits: int) -> Any:
-    if not isinstance(value, float):
-        return value
-    return number(value, digits) if math.isfinite(value) else ""
-
-
 def show(result: Any) -> None:
     """Print a report, which may end with a line break or not; what is no text is printed as JSON."""
-    if not isinstance(result, str):
-        from ..formats.json import json_text
-
-        result = json_text(result)
-    print(result, end="" if result.endswith("\n") else "\n")
+    text = result if isinstance(result, str) else json_text(result)
+    print(text, end="" if text.endswith("\n") else "\n")
 
 
 def write_table(args: argparse.Namespace, rows: Iterable[Mapping[str, Any]]) -> None:
     """Write rows to the CSV file that ``--out`` names, if it names one."""
-    from ..formats.outputs import write_text
-
     if args.out is not None:
-        write_text(args.out, csv_text(rows))
+        write_text(args.out, Table(list(rows)).csv())
 
 
 def mention(args: argparse.Namespace, text: str) -> None:
     """Print what was written where; beside JSON that is no part of the result."""
     print(text, file=sys.stderr if args.json else sys.stdout)
+
+
+def say_notes(notes: Iterable[str]) -> None:
+    """Say on stderr what a reader of files found odd."""
+    for note in notes:
+        print(f"hexapod_comp: note: {note}", file=sys.stderr)
 
 
 def save_pictures(args: argparse.Namespace, pictures: Callable[[], Mapping[str, Figure]]) -> None:
@@ -173,12 +151,6 @@ def progress_bar(total: int, unit: str) -> Any:
     from tqdm import tqdm
 
     return tqdm(total=total, unit=unit, delay=1.0, disable=None, leave=False, file=own_terminal())
-
-
-def say_notes(notes: Iterable[str]) -> None:
-    """Say on stderr what a reader of files found odd."""
-    for note in notes:
-        print(f"hexapod_comp: note: {note}", file=sys.stderr)
 
 
 @contextlib.contextmanager

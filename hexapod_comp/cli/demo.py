@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import argparse
 import os
-from typing import TYPE_CHECKING
 
+from ..formats.csv import Row
+from ..loop import report, session, story
+from ..loop.report import error_rows, summary
+from ..loop.story import Calibration, Place, calibrate, calibration_text
+from ..machine.geometry import HexapodGeometry, load_geometry
+from ..machine.model import MachineModel
 from . import common
 from .run import TRUE, chosen_model, draw, hidden_errors
-
-if TYPE_CHECKING:
-    from ..loop.story import Calibration, Place
-    from ..machine.geometry import HexapodGeometry
-    from ..machine.model import MachineModel
 
 FITTED = "fit"
 """The model that is yet to be made, of readings."""
@@ -21,10 +21,6 @@ FITTED = "fit"
 def run(args: argparse.Namespace) -> int:
     """Run the verb; 0 when the loop kept what the fit promised."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as for fit: its matrices are small
-    from ..formats.csv import Row
-    from ..loop import report, session, story
-    from ..loop.report import error_rows, summary
-    from ..machine.geometry import load_geometry
 
     rate = session.checked_rate(args.rate_hz)
     geometry = load_geometry(args.machine)
@@ -57,8 +53,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _calibration(args: argparse.Namespace, geometry: HexapodGeometry, truth: MachineModel, place: Place) -> Calibration:
     """Measure and fit the machine, and say what came of it before the loop starts."""
-    from ..loop.story import calibrate, calibration_text
-
     with common.stage_line() as say:
         calibration = calibrate(geometry, truth, place, args.seed, say)
     if not args.json:

@@ -7,6 +7,7 @@ import math
 import sys
 import time
 
+from ..formats.json import json_text
 from . import common
 
 HZ_PERIOD = 1.0
@@ -15,7 +16,6 @@ HZ_PERIOD = 1.0
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb until Ctrl-C, --count or --seconds; 0 when a message has come."""
-    from ..formats.json import json_text
     from ..ros import heard_signals, keep_discovery_local
     from ..ros.echo import DISCOVERY_TIME, Echo, EchoedMessage, published_topics
     from ..ros.process import QUIET, SPIN_PERIOD, RosSession

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from ..export.worth import Comparison, ExportCheck, ExportTrial, Size
 from ..formats import texts
+from ..formats.outputs import write_text
+from ..formats.paths import input_file
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry
+from ..machine.model import MachineModel, commanded_box
+from ..machine.model_file import IDEAL, model_text
+from ..virtual.named import is_random
 from . import common
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from ..export.worth import Comparison, ExportCheck, ExportTrial, Size
-    from ..machine.geometry import HexapodGeometry
-    from ..machine.model import MachineModel
 
 HARMLESS = 10e-9
 """An error that grows by less than this, m, has not grown: the files' digits and LinuxCNC's floats count for more."""
@@ -24,16 +25,6 @@ HARMLESS = 10e-9
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
-    import numpy as np
-
-    from ..errors import InputFileError
-    from ..export.worth import ExportTrial
-    from ..machine.model import commanded_box
-
-    wanted = (args.linuxcnc, args.table, args.c_folder, args.ros2_control, args.urdf, args.mjcf)
-    if all(place is None for place in wanted):
-        names = "--linuxcnc, --table, --c, --ros2-control, --urdf, --mjcf"
-        raise InputFileError("export", names, "at least one is needed")
     geometry, model = common.load_machine(args)
     exact = _descriptions(args, geometry) + _c(args, geometry, model)
     if args.linuxcnc is None and args.table is None:
@@ -63,8 +54,6 @@ def run(args: argparse.Namespace) -> int:
 def _descriptions(args: argparse.Namespace, geometry: HexapodGeometry) -> list[str]:
     """Write what robot programs want to know of the machine; return the files."""
     from ..export.robot_description import mjcf, urdf
-    from ..formats.outputs import write_text
-    from ..machine.geometry import STRUT_NAMES
 
     written = [(file, form) for file, form in ((args.urdf, urdf), (args.mjcf, mjcf)) if file is not None]
     for file, form in written:
@@ -79,10 +68,6 @@ def _c(args: argparse.Namespace, geometry: HexapodGeometry, model: MachineModel)
     from ..compensation.journal import IDEAL_SOURCE, Source
     from ..export.c_code import write_c
     from ..export.control_package import write_ros2_control
-    from ..formats.paths import input_file
-    from ..machine.geometry import STRUT_NAMES
-    from ..machine.model_file import IDEAL, model_text
-    from ..virtual.named import is_random
 
     machine = Source.read(input_file(args.machine))
     if args.model == IDEAL:
@@ -159,8 +144,8 @@ def _table(args: argparse.Namespace, trial: ExportTrial, box: np.ndarray) -> lis
     return [("table, struts", by_struts, left_out), ("table, poses", by_poses, [*left_out, *backlash])]
 
 
-def _size(size: Size, factor: float = 1e6, unit: str = "µm") -> str:
-    return f"{size.rms * factor:.3f} {unit} RMS, {size.largest * factor:.3f} at most"
+def _size(size: Size) -> str:
+    return f"{size.rms * 1e6:.3f} µm RMS, {size.largest * 1e6:.3f} at most"
 
 
 def _report(
@@ -174,11 +159,17 @@ def _report(
     )
     for name, check, notes in checks:
         lines.append(f"  {name}, level tool: {_change(check.level)}")
-        if check.tilted is None:
-            lines.append(f"  {name}, tool tilted by {args.tilt_deg:g}°: no such pose is within the machine's limits")
-        else:
-            lines.append(f"  {name}, tool tilted by {args.tilt_deg:g}°: {_change(check.tilted)}")
-        lines += [f"    not carried: {note}" for note in [*notes, *_growth(check)]]
+        tilted = "no such pose is within the machine's limits" if check.tilted is None else _change(check.tilted)
+        lines.append(f"  {name}, tool tilted by {args.tilt_deg:g}°: {tilted}")
+        heat, damp = check.per_kelvin, check.per_humidity
+        moved = (
+            "(the model has none)"
+            if heat is None
+            else f": 1 K on struts, base and platform moves the tool by {_size(heat)}"
+        )
+        left_out = [*notes, f"thermal growth{' ' * (heat is None)}{moved}"]
+        left_out += [] if damp is None else [f"growth of the struts by humidity: 10 % moves the tool by {_size(damp)}"]
+        lines += [f"    not carried: {note}" for note in left_out]
     return "\n".join(lines)
 
 
@@ -190,16 +181,6 @@ def _change(comparison: Comparison) -> str:
         text += f" ({texts.number(100.0 * abs(1.0 - c / a), 1)} % {'more' if c > a + HARMLESS * 1e6 else 'less'})"
     turned = f"{comparison.before_rotation.rms * 1e6:.2f} → {comparison.after_rotation.rms * 1e6:.2f} µrad RMS"
     return f"{text}, {b:.3f} → {d:.3f} µm at most, {turned}"
-
-
-def _growth(check: ExportCheck) -> Iterator[str]:
-    """Yield what is not carried of heat, and of humidity where that acts."""
-    if check.per_kelvin is None:
-        yield "thermal growth (the model has none)"
-    else:
-        yield f"thermal growth: 1 K on struts, base and platform moves the tool by {_size(check.per_kelvin)}"
-    if check.per_humidity is not None:
-        yield f"growth of the struts by humidity: 10 % moves the tool by {_size(check.per_humidity)}"
 
 
 def _as_json(
@@ -219,14 +200,9 @@ def _as_json(
                 "export": name,
                 "level": _numbers(check.level),
                 "tilted": None if check.tilted is None else _numbers(check.tilted),
-                "field_rms_um": check.field.rms * 1e6,
-                "field_max_um": check.field.largest * 1e6,
-                "per_kelvin_rms_um": None if check.per_kelvin is None else check.per_kelvin.rms * 1e6,
-                "per_kelvin_max_um": None if check.per_kelvin is None else check.per_kelvin.largest * 1e6,
-                "per_10_percent_humidity_rms_um": None if check.per_humidity is None else check.per_humidity.rms * 1e6,
-                "per_10_percent_humidity_max_um": None
-                if check.per_humidity is None
-                else check.per_humidity.largest * 1e6,
+                **_sizes("field", check.field),
+                **_sizes("per_kelvin", check.per_kelvin),
+                **_sizes("per_10_percent_humidity", check.per_humidity),
                 "not_carried": notes,
             }
             for name, check, notes in checks
@@ -234,10 +210,15 @@ def _as_json(
     }
 
 
-def _numbers(comparison: Comparison) -> dict[str, float]:
-    numbers: dict[str, float] = {"passes": comparison.passes}
+def _sizes(name: str, size: Size | None, unit: str = "um") -> dict[str, float | None]:
+    """Return RMS and largest of an error in millionths of its unit, by names that end in it."""
+    sizes = (None, None) if size is None else (size.rms * 1e6, size.largest * 1e6)
+    return dict(zip((f"{name}_rms_{unit}", f"{name}_max_{unit}"), sizes, strict=True))
+
+
+def _numbers(comparison: Comparison) -> dict[str, Any]:
+    numbers: dict[str, Any] = {"passes": comparison.passes}
     for name in ("before", "after"):
-        moved, turned = getattr(comparison, name), getattr(comparison, f"{name}_rotation")
-        numbers |= {f"{name}_rms_um": moved.rms * 1e6, f"{name}_max_um": moved.largest * 1e6}
-        numbers |= {f"{name}_rms_urad": turned.rms * 1e6, f"{name}_max_urad": turned.largest * 1e6}
+        numbers |= _sizes(name, getattr(comparison, name))
+        numbers |= _sizes(name, getattr(comparison, f"{name}_rotation"), "urad")
     return numbers

@@ -1,28 +1,42 @@
-"""``hexapod_comp fit``: from measurements to a model of the machine."""
+"""``hexapod_comp fit``: from measurements to a model of the machine; with ``--update``, a model renewed from few."""
 
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from ..calibration import lines_report
+from ..calibration.blocks import HARMONICS
+from ..calibration.evaluation import Worth, worth
+from ..calibration.fit import ModelFit, fit_model
+from ..calibration.lines import fit_lines
+from ..calibration.parameters import TOLERANCES, FitSettings
+from ..calibration.posterior import FittedParameters
+from ..calibration.posterior_file import SUFFIX, save_with_posterior
+from ..calibration.report import as_json, fit_report
+from ..compensation.checks import check
+from ..errors import CalibrationError, CommandError
+from ..formats.outputs import write_text
+from ..formats.paths import input_file
+from ..formats.texts import number
+from ..machine.geometry import load_geometry
+from ..machine.model import MachineModel, RealMachine
+from ..machine.region import region_json, region_text
+from ..measurements.files import read_measurements
+from ..measurements.readings import MeasurementSet, spans
+from ..measurements.standards import judge, standards_json, standards_text
+from ..pose import Pose
+from ..virtual.named import find_model
 from . import common
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from ..calibration.certificate import Details
-    from ..calibration.evaluation import Worth
-    from ..calibration.fit import ModelFit
-    from ..calibration.parameters import FitSettings
-    from ..calibration.posterior import FittedParameters
-    from ..machine.model import MachineModel, RealMachine
-    from ..measurements.readings import MeasurementSet
-    from ..pose import Pose
 
 REFUSED = "NOT WRITTEN: this model is not to be trusted"
 FORCED = "WRITTEN BY FORCE: this model is not to be trusted"
@@ -30,64 +44,48 @@ FORCED = "WRITTEN BY FORCE: this model is not to be trusted"
 
 ADVICE = "Do units, lead, geometry and the instrument's uncertainty fit?"
 
-
 OF_THE_MODEL = ("correction", "assembly", "not_converged")
 """Limits that a model breaks by itself; others, such as the stroke's end, a measured pose may be next to."""
 
+IN_SI = {
+    "lead_mm": ("lead", 1e-3),
+    "field_degree": ("field_degree", 1),
+    "moisture_ppm": ("strut_moisture", 1e-4),
+    "scale_ppm": ("scale", 1e-6),
+    "alignment_mrad": ("alignment", 1e-3),
+    "thermometer": ("thermometer", 1),
+    "time_constants_s": ("time_constants", 1),
+}
+"""What options are called among the settings of a fit, and their units."""
+
 
 def fit_settings(args: argparse.Namespace) -> FitSettings:
-    """Return what the options say about a fit of scheme joint."""
-    from ..calibration.parameters import TOLERANCES, FitSettings
-
+    """Return what the options say about a fit of scheme joint; raises ModelError on an unknown block."""
     given: dict[str, Any] = {}
     if args.blocks is not None:
         named = [name.strip() for name in args.blocks.split(",") if name.strip()]
-        given["blocks"] = tuple(b for name in named for b in _blocks_called(name))
-    if args.lead_mm is not None:
-        given["lead"] = args.lead_mm * 1e-3
-    if args.field_degree is not None:
-        given["field_degree"] = args.field_degree
+        several = {"field": ("field displacement", "field rotation", "field reversal"), "harmonics": HARMONICS}
+        given["blocks"] = tuple(block for name in named for block in several.get(name, (name,)))
+    for option, (name, unit) in IN_SI.items():
+        if getattr(args, option, None) is not None:
+            value = getattr(args, option)
+            given[name] = value * unit if isinstance(value, float) else value
     if args.expansion_ppm is not None:
         given |= dict(zip(("strut_expansion", "base_expansion", "platform_expansion"), args.expansion_ppm, strict=True))
-    if args.moisture_ppm is not None:
-        given["strut_moisture"] = args.moisture_ppm * 1e-4
-    if args.thermometer is not None:
-        given["thermometer"] = args.thermometer
-    if args.time_constants_s is not None:
-        given["time_constants"] = args.time_constants_s
     if args.tolerance_um is not None:
         given["tolerances"] = tuple({**TOLERANCES, "structure": args.tolerance_um * 1e-6}.items())
-    for name, option, unit in (("scale", "scale_ppm", 1e-6), ("alignment", "alignment_mrad", 1e-3)):
-        if getattr(args, option, None) is not None:
-            given[name] = getattr(args, option) * unit
     robust = not getattr(args, "not_robust", False)
     return FitSettings(shared_platform_joints=not args.separate_joints, robust=robust, **given)
 
 
-def _blocks_called(name: str) -> tuple[str, ...]:
-    from ..calibration.blocks import HARMONICS
-
-    several = {"field": ("field displacement", "field rotation", "field reversal"), "harmonics": HARMONICS}
-    return several.get(name, (name,))
-
-
 def run(args: argparse.Namespace) -> int:
     """Run the verb; 1 when the readings do not bear the model out."""
-    # One fit's matrices are too small for the threads of NumPy's BLAS, which on busy cores wait for each other. It
-    # reads this when it is loaded, and nothing has loaded it yet.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if args.update is not None:
-        from .renewal import renew
+        return _renew(args)
+    if args.details is not None:
+        from ..calibration.certificate import load_details
 
-        return renew(args)
-    from ..errors import CalibrationError
-    from ..machine.geometry import load_geometry
-    from ..machine.model import RealMachine
-    from ..measurements.files import read_measurements
-    from ..virtual.named import find_model
-
-    _refuse_options_of_the_other_scheme(args)
-    _details(args)  # what is wrong there is better said before a long fit
+        load_details(args.details)  # what is wrong there is better said before a long fit
     geometry = load_geometry(args.machine)
     truth = None if args.truth is None else RealMachine(geometry, find_model(args.truth, geometry))
     settings = fit_settings(args)
@@ -101,134 +99,26 @@ def run(args: argparse.Namespace) -> int:
     if beyond := beyond_limits(measured, result.model):
         result = replace(result, misfit="; ".join(filter(None, (result.misfit, beyond))))
     if result.misfit and not args.force:
-        _refuse(args, result)
+        content = {**result.content(), "misfit": result.misfit, "written": None} if args.json else None
+        common.show(content or f"{REFUSED}: {result.misfit}. {ADVICE}\n\n{result.text}")
+        print("hexapod_comp: error: nothing was written; the report says why, --force writes it", file=sys.stderr)
         return 1
     with common.stage("trying the model on the virtual machine"):
-        worth = _worth(truth, result, measured)
-    _write(args, result, measured, worth)
+        tried = None if truth is None else _worth(truth, result, measured)
+    _write(args, result, measured, tried)
     return 0
 
 
-def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
-    """Return which poses, of those measured, the compensator would refuse with a model; empty if none."""
-    import numpy as np
-
-    from ..compensation.checks import check
-    from ..formats.texts import number
-
-    geometry, stations = measured.geometry, measured.stations
-    places = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(12)
-    chosen = np.unique(places, axis=0, return_index=True)[1]
-    poses = geometry.tool_poses(stations.positions[chosen], stations.rotations[chosen])
-    breaches = [b for b in check(geometry, model, poses, "poses").breaches if b.limit in OF_THE_MODEL]
-    if not breaches:
-        return ""
-    at = ", ".join(number(1e3 * v, 1) for v in poses[0][breaches[0].row])
-    count = len({breach.row for breach in breaches})
-    problem = f"with it the compensator would refuse {count} of the {len(chosen)} poses that were measured"
-    return f"{problem}, first at {at} mm, tool in work: {breaches[0].error}"
-
-
-def _refuse(args: argparse.Namespace, result: _Result) -> None:
-    """Show a model that is not written."""
-    if args.json:
-        common.show({**result.content(), "misfit": result.misfit, "written": None})
-    else:
-        common.show(f"{REFUSED}: {result.misfit}. {ADVICE}\n\n{result.text}")
-    print("hexapod_comp: error: nothing was written; the report says why, --force writes it", file=sys.stderr)
-
-
-def _write(args: argparse.Namespace, result: _Result, measured: MeasurementSet, worth: Worth | None) -> None:
-    """Write the model and what else was asked for, and show it."""
-    from ..calibration.lines_report import worth_json, worth_text
-    from ..calibration.posterior_file import save_with_posterior
-    from ..formats.outputs import write_text
-    from ..machine.region import region_json
-    from ..measurements.standards import judge, standards_json, standards_text
-
-    judged = judge(measured)
-    parts = [result.text, _region(result, measured) + "\n"]
-    parts += [standards_text(judged) + "\n"] if judged else []
-    parts += [worth_text(worth) + "\n"] if worth else []
-    text = "\n".join(parts)
-    if result.misfit:
-        text = f"{FORCED}: {result.misfit}. {ADVICE}\n\n{text}"
-    beside = save_with_posterior(result.saved, result.fitted, args.out)
-    if args.json:
-        more = {"standards": standards_json(judged), "worth": worth_json(worth) if worth else None}
-        files = {"written": args.out, "written_beside": beside}
-        more["measured_box"] = region_json(result.model.measured, measured.geometry)
-        common.show({**result.content(), **more, "misfit": result.misfit, **files})
-    else:
-        print(f"{text}\nmodel: {args.out}")
-        print("".join(f"its parameters' covariance, to be kept beside it: {path}\n" for path in beside), end="")
-    if args.report is not None:
-        write_text(args.report, text)
-    if args.certificate is not None and result.fit is not None:
-        with common.stage("writing the certificate"):
-            _write_certificate(args, result, result.fit, beside, text)
-        common.mention(args, f"certificate: {args.certificate}")
-    common.save_pictures(args, result.pictures)
-
-
-def _region(result: _Result, measured: MeasurementSet) -> str:
-    """Return where the model was measured."""
-    from ..machine.region import region_text
-
-    return region_text(result.model.measured, measured.geometry)
-
-
-def _details(args: argparse.Namespace) -> Details | None:
-    """Return what the details file says, if there is one."""
-    if args.details is None:
-        return None
-    from ..calibration.certificate import load_details
-    from ..errors import CalibrationError
-
-    if args.certificate is None:
-        raise CalibrationError("--details", "is what a certificate says: --certificate is missing")
-    return load_details(args.details)
-
-
-def _write_certificate(
-    args: argparse.Namespace, result: _Result, fit: ModelFit, beside: list[Path], report: str
-) -> None:
-    """Write the certificate of a model that has been written."""
-    from ..calibration.certificate import Filed, certificate_text
-    from ..formats.outputs import write_text
-
-    filed = Filed(result.model.name, (Path(args.out), *beside), report)
-    write_text(args.certificate, certificate_text(fit, filed, _details(args)))
-
-
-def _refuse_options_of_the_other_scheme(args: argparse.Namespace) -> None:
-    """Raise on an option that the scheme would not listen to."""
-    from ..errors import CalibrationError
-
-    heat = ("expansion_ppm", "moisture_ppm", "thermometer", "time_constants_s")
-    of_joint = ("lead_mm", "blocks", "tolerance_um", "field_degree", "scale_ppm", "alignment_mrad", *heat)
-    if args.compensated:
-        raise CalibrationError("--compensated", "is for check readings, of verify or of fit --update")
-    others = (
-        ("order", "every_line")
-        if args.scheme == "joint"
-        else (*of_joint, "separate_joints", "not_robust", "certificate")
-    )
-    for name in others:
-        if getattr(args, name) not in (None, False):
-            raise CalibrationError(f"--{name.replace('_', '-')}", f"has no meaning for scheme {args.scheme}")
-
-
 @dataclass(frozen=True)
-class _Result:
-    """What a scheme gives: the model, its report as text and for JSON, its pictures, and what it knows how well."""
+class Fitted:
+    """What a scheme gives."""
 
     model: MachineModel
-    text: str
-    content: Callable[[], dict[str, Any]]
+    text: str  # its report
+    content: Callable[[], dict[str, Any]]  # the same for JSON
     pictures: Callable[[], dict[str, Figure]]
     misfit: str
-    fitted: FittedParameters | None = None
+    fitted: FittedParameters | None = None  # how well parameters are known, and the fit, of scheme joint
     fit: ModelFit | None = None
 
     @property
@@ -242,21 +132,13 @@ class _Result:
 
 def _datum(args: argparse.Namespace, measured: MeasurementSet) -> Pose | None:
     """Return the platform's pose in base at the datum, None for home."""
-    from ..pose import Pose
-
     return None if args.datum is None else measured.geometry.platform_pose(Pose.from_angles(*args.datum))
 
 
-def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSettings) -> _Result:
+def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSettings) -> Fitted:
     """Fit with scheme joint."""
-    from ..calibration.fit import fit_model
-    from ..calibration.posterior import FittedParameters
-    from ..calibration.report import as_json, fit_report
-    from ..machine.model import RealMachine
-
     with common.stage_line() as say:
         fit = fit_model(measured, settings, say, _datum(args, measured))
-
     fitted = FittedParameters.of(fit)
 
     def pictures() -> dict[str, Figure]:
@@ -271,15 +153,11 @@ def _joint(args: argparse.Namespace, measured: MeasurementSet, settings: FitSett
         return made
 
     model = fit.model if args.name is None else replace(fit.model, name=args.name)
-    return _Result(model, fit_report(fit), lambda: as_json(fit), pictures, fit.misfit, fitted, fit)
+    return Fitted(model, fit_report(fit), lambda: as_json(fit), pictures, fit.misfit, fitted, fit)
 
 
-def _lines(args: argparse.Namespace, measured: MeasurementSet) -> _Result:
+def _lines(args: argparse.Namespace, measured: MeasurementSet) -> Fitted:
     """Fit with scheme lines."""
-    from ..calibration.lines import fit_lines
-    from ..calibration.lines_report import as_json, report
-    from ..machine.model import RealMachine
-
     fit = fit_lines(measured, args.order or "adjusted-r2", name=args.name or "", datum=_datum(args, measured))
 
     def pictures() -> dict[str, Figure]:
@@ -289,18 +167,27 @@ def _lines(args: argparse.Namespace, measured: MeasurementSet) -> _Result:
         predicted = predicted_error_figure(RealMachine(measured.geometry, fit.model), None)
         return {"lines.png": fitted_lines_figure(fit), "strut_errors.png": of_struts, "predicted_error.png": predicted}
 
-    text = report(fit, every_line=args.every_line)
-    return _Result(fit.model, text, lambda: as_json(fit), pictures, fit.misfit)
+    text = lines_report.report(fit, every_line=args.every_line)
+    return Fitted(fit.model, text, lambda: lines_report.as_json(fit), pictures, fit.misfit)
 
 
-def _worth(truth: RealMachine | None, result: _Result, measured: MeasurementSet) -> Worth | None:
-    """Return what the model is worth on the virtual machine that was measured, if that is known."""
-    from ..calibration.evaluation import worth
-    from ..errors import CalibrationError
-    from ..measurements.readings import spans
+def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
+    """Return which poses, of those measured, the compensator would refuse with a model; empty if none."""
+    geometry, stations = measured.geometry, measured.stations
+    places = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(12)
+    chosen = np.unique(places, axis=0, return_index=True)[1]
+    poses = geometry.tool_poses(stations.positions[chosen], stations.rotations[chosen])
+    breaches = [b for b in check(geometry, model, poses, "poses").breaches if b.limit in OF_THE_MODEL]
+    if not breaches:
+        return ""
+    at = ", ".join(number(1e3 * v, 1) for v in poses[0][breaches[0].row])
+    count = len({breach.row for breach in breaches})
+    problem = f"with it the compensator would refuse {count} of the {len(chosen)} poses that were measured"
+    return f"{problem}, first at {at} mm, tool in work: {breaches[0].error}"
 
-    if truth is None:
-        return None
+
+def _worth(truth: RealMachine, result: Fitted, measured: MeasurementSet) -> Worth:
+    """Return what the model is worth on the virtual machine that was measured."""
     box, geometry = measured.tool_box(), measured.geometry
     if not spans(box):
         raise CalibrationError("--truth", "the readings span no box in which the model could be judged")
@@ -308,3 +195,68 @@ def _worth(truth: RealMachine | None, result: _Result, measured: MeasurementSet)
     tool = None if result.fit is None else result.fit.level
     promised = None if tool is None else (tool.low, tool.high)
     return replace(worth(truth, result.model, box, level=level), promised=promised)
+
+
+def _write(args: argparse.Namespace, result: Fitted, measured: MeasurementSet, tried: Worth | None) -> None:
+    """Write the model and what else was asked for, and show it."""
+    judged = judge(measured)
+    parts = [result.text, region_text(result.model.measured, measured.geometry) + "\n"]
+    parts += [standards_text(judged) + "\n"] if judged else []
+    parts += [lines_report.worth_text(tried) + "\n"] if tried else []
+    text = "\n".join(parts)
+    if result.misfit:
+        text = f"{FORCED}: {result.misfit}. {ADVICE}\n\n{text}"
+    beside = save_with_posterior(result.saved, result.fitted, args.out)
+    if args.json:
+        more = {"standards": standards_json(judged), "worth": lines_report.worth_json(tried) if tried else None}
+        more["measured_box"] = region_json(result.model.measured, measured.geometry)
+        files = {"misfit": result.misfit, "written": args.out, "written_beside": beside}
+        common.show({**result.content(), **more, **files})
+    else:
+        print(f"{text}\nmodel: {args.out}\n{_listed(beside)}", end="")
+    if args.report is not None:
+        write_text(args.report, text)
+    if args.certificate is not None and result.fit is not None:
+        from ..calibration.certificate import Filed, certificate_text, load_details
+
+        with common.stage("writing the certificate"):
+            filed = Filed(result.model.name, (Path(args.out), *beside), text)
+            details = None if args.details is None else load_details(args.details)
+            write_text(args.certificate, certificate_text(result.fit, filed, details))
+        common.mention(args, f"certificate: {args.certificate}")
+    common.save_pictures(args, result.pictures)
+
+
+def _listed(beside: list[Path]) -> str:
+    return "".join(f"its parameters' covariance, to be kept beside it: {path}\n" for path in beside)
+
+
+def _renew(args: argparse.Namespace) -> int:
+    """Write a model renewed from few readings; 1 when they cannot renew it."""
+    from ..calibration.check import refusal, update_model
+    from ..calibration.check_report import update_report, verification_json, verification_report
+    from .verify import checked
+
+    old, new = input_file(args.update), Path(args.out)
+    if new.resolve().with_name(new.stem + SUFFIX) == old.resolve().with_name(old.stem + SUFFIX):
+        raise CommandError("--out", f"{new} would replace what the fit of {old} knows; write to another name")
+    model, fitted, measured, verification = checked(args, args.update)
+    text, content = verification_report(verification), verification_json(verification)
+    reason = refusal(verification)
+    if reason and not args.force:
+        common.show({**content, "refused": reason, "written": None} if args.json else text)
+        print(f"hexapod_comp: error: nothing was written: {reason} (--force renews all the same)", file=sys.stderr)
+        return 1
+    update = update_model(model, fitted, measured, verification)
+    model, origin = update.model, update.model.origin
+    if reason:
+        model = replace(model, origin=replace(origin, note=f"FORCED: {reason}. {origin.note}"))
+    if args.name is not None:
+        model = replace(model, name=args.name)
+    beside = save_with_posterior(model, update.fitted, args.out)
+    text = f"{text}\n{update_report(update, args.out)}{_listed(beside)}"
+    files = {"written": args.out, "written_beside": beside}
+    common.show({**content, "chi_square_after": update.chi_square, **files} if args.json else text)
+    if args.report is not None:
+        write_text(args.report, text)
+    return 0

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from ..compensation.checks import CheckResult, check
+from ..errors import CommandError, NotConvergedError, NotFiniteError
 from ..formats import texts
-from . import arguments, common
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from ..calibration.posterior import PredictedError
-    from ..compensation.checks import CheckResult
-    from ..formats.csv import Row
-    from ..machine.geometry import HexapodGeometry
-    from ..machine.model import MachineModel, RealMachine
-    from ..machine.passes import Poses
-
+from ..formats.csv import LENGTH_COLUMNS, PREDICTED_ERRORS, Row, length_values, pose_values, read_pose_arrays
+from ..machine.geometry import STRUT_NAMES, HexapodGeometry
+from ..machine.model import DIRECTIONS, FOLLOWED, MachineModel, RealMachine
+from ..machine.passes import Passes
+from ..machine.region import region_text
+from ..pose import Pose, rotation_from_angles
+from . import common
+from .table import Table
+from .verbs import POSE_OPTIONS
 
 MOST_NOTES = 10
 """Broken limits named on stderr."""
@@ -28,40 +28,16 @@ MOST_STEPS = 100_000
 """Poses on a line, each way."""
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the verb."""
-    from ..compensation.checks import check
-    from ..machine.model import RealMachine
-
-    _refuse_several(args)
-    geometry, model = common.load_machine(args)
-    targets = _targets(args, geometry)
-    with common.progress_bar(len(targets.rows), " poses") as bar:
-        given = targets.positions, targets.rotations
-        result = check(geometry, model, given, "poses", progress=bar.update, senses=targets.senses)
-    _refuse_lengthless(result, targets)
-    predicted = None
-    if args.model != "ideal":
-        platforms = geometry.platform_poses(*given)
-        predicted = _Predicted.of(RealMachine(geometry, model), args.model, platforms, targets.senses)
-        _mention_outside(geometry, model, int(result.outside_box.sum()), len(targets.rows))
-    _show(args, geometry, model, targets, result, predicted)
-    common.say_notes(f"{targets.where(breach.row)}: {breach.error}" for breach in result.breaches[:MOST_NOTES])
-    if len(result.breaches) > MOST_NOTES:
-        common.say_notes([f"{len(result.breaches) - MOST_NOTES} more limits are broken; see check"])
-    return 0
-
-
 @dataclass(frozen=True)
-class _Targets:
+class Targets:
     """Tool poses, each with its directions of motion."""
 
     rows: list[Row]  # where each comes from
-    positions: np.ndarray  # (N, 3), (N, 3, 3): ``pose_tool_in_work``, m
-    rotations: np.ndarray  # (N, 3), (N, 3, 3)
-    senses: np.ndarray  # (N, 9): of axes and struts
+    positions: np.ndarray  # (N, 3) and (N, 3, 3): pose_tool_in_work, m
+    rotations: np.ndarray
+    senses: np.ndarray  # (N, 9), of axes and struts
     directions: list[str]  # what they are called
-    along: np.ndarray | None = None  # (N,), or None: way from the start of a line, m
+    along: np.ndarray | None = None  # way from the start of a line, (N,), m
 
     def where(self, n: int) -> str:
         """Say which pose one is, for messages."""
@@ -69,105 +45,69 @@ class _Targets:
             return common.where(self.rows[n])
         return f"{texts.number(float(self.along[n]) * 1e3, 3)} mm along the line, {self.directions[n]}"
 
-    def columns(self, n: int) -> dict[str, Any]:
-        """Return what a row of the output says of where a pose of a line is."""
-        from ..formats.csv import pose_values
-        from ..pose import Pose
 
-        if self.along is None:
-            return {}
-        pose = Pose(self.positions[n], self.rotations[n])
-        return {"along_mm": float(self.along[n]) * 1e3, **pose_values(pose)}
+def run(args: argparse.Namespace) -> int:
+    """Run the verb."""
+    geometry, model = common.load_machine(args)
+    targets = _line(args, geometry) if args.line is not None else _poses(args)
+    with common.progress_bar(len(targets.rows), " poses") as bar:
+        poses = targets.positions, targets.rotations
+        result = check(geometry, model, poses, "poses", progress=bar.update, senses=targets.senses)
+    _refuse_lengthless(result, targets)
+    predicted = None
+    if args.model != "ideal":
+        predicted = Predicted(RealMachine(geometry, model), args.model, geometry.platform_poses(*poses), targets.senses)
+        if outside := int(result.outside_box.sum()):
+            lie = "the pose lies" if len(targets.rows) == 1 else f"{outside} of {len(targets.rows)} poses lie"
+            text = f"{lie} outside the box in which the model was measured; the predicted error there is extrapolated"
+            common.say_notes([f"{text} ({region_text(model.measured, geometry)})"])
+    _show(args, geometry, model, targets, result.lengths, predicted)
+    common.say_notes(f"{targets.where(breach.row)}: {breach.error}" for breach in result.breaches[:MOST_NOTES])
+    if len(result.breaches) > MOST_NOTES:
+        common.say_notes([f"{len(result.breaches) - MOST_NOTES} more limits are broken; see check"])
+    return 0
 
 
-def _refuse_several(args: argparse.Namespace) -> None:
-    """Raise unless poses are given in exactly one way."""
-    from ..errors import CommandError
-
-    by_number = any(getattr(args, name) is not None for name in arguments.POSE_OPTIONS)
-    if (args.poses is not None) + (args.pose is not None) + (args.line is not None) + by_number != 1:
-        problem = "give a CSV file of poses, or --pose, or --x-mm --y-mm --z-mm, or --line; exactly one of the four"
-        raise CommandError("usage", problem)
-    if args.line is not None and args.direction is not None:
-        raise CommandError("usage", "--line gives both directions; --direction goes with poses")
-
-
-def _targets(args: argparse.Namespace, geometry: HexapodGeometry) -> _Targets:
-    """Return the poses that the options give or name, each with its direction."""
-    import numpy as np
-
-    from ..formats.csv import read_pose_arrays
-    from ..machine.model import DIRECTIONS, FOLLOWED
-
-    if args.line is not None:
-        start, end, angles = args.line
-        return _line(geometry, start, end, angles, args.step_mm * 1e-3)
-    with common.stage(f"reading {args.poses}"):
-        rows, positions, rotations = _given_pose(args) if args.poses is None else read_pose_arrays(args.poses)
+def _poses(args: argparse.Namespace) -> Targets:
+    """Return the poses of the file, or the one that the options give, in one direction."""
+    if args.poses is not None:
+        with common.stage(f"reading {args.poses}"):
+            rows, positions, rotations = read_pose_arrays(args.poses)
+    elif args.pose is not None:
+        rows, positions, rotations = common.one_row(args.pose)
+    else:
+        numbers = [getattr(args, name[2:].replace("-", "_")) or 0.0 for name in POSE_OPTIONS]
+        place, angles = tuple(1e-3 * v for v in numbers[:3]), tuple(np.radians(numbers[3:]))
+        rows, positions, rotations = common.one_row((place, angles))
     direction = args.direction or "midway"
     senses = np.full((len(rows), FOLLOWED), DIRECTIONS[direction])
-    return _Targets(rows, positions, rotations, senses, [direction] * len(rows))
+    return Targets(rows, positions, rotations, senses, [direction] * len(rows))
 
 
-def _line(
-    geometry: HexapodGeometry,
-    start: tuple[float, ...],
-    end: tuple[float, ...],
-    angles: tuple[float, ...],
-    step: float,
-) -> _Targets:
+def _line(args: argparse.Namespace, geometry: HexapodGeometry) -> Targets:
     """Return the poses along a straight line of the tool, forward and then, in the same order, backward.
 
     Each axis and each strut has the direction of its own motion; one that stands still has none.
     """
-    import numpy as np
-
-    from ..errors import CommandError
-    from ..formats.csv import Row
-    from ..machine.passes import Passes
-    from ..pose import rotation_from_angles
-
-    way = np.array(end) - np.array(start)
+    start, end, angles = args.line
+    way, step = np.array(end) - np.array(start), args.step_mm * 1e-3
     length = float(np.linalg.norm(way))
     if length > step * MOST_STEPS:
         least = f"{length / MOST_STEPS * 1e3:g} or more on a line of {length * 1e3:g} mm"
-        problem = f"--step-mm: must be {least}, not {step * 1e3:g}"
-        raise CommandError("usage", problem)
-    whole = int(length / step * (1.0 + 1e-9))
-    along = step * np.arange(whole + 1)
+        raise CommandError("usage", f"--step-mm: must be {least}, not {step * 1e3:g}")
+    along = step * np.arange(int(length / step * (1.0 + 1e-9)) + 1)
     along = np.append(along, length) if length - along[-1] > 1e-6 * step else np.append(along[:-1], length)
     positions = np.array(start) + along[:, None] * (way / length)
     rotations = np.tile(rotation_from_angles(np.array([angles])), (len(along), 1, 1))
-    senses = Passes.of_tool(geometry, positions, rotations, np.tile(way / length, (len(along), 1))).both_ways().senses()
-    return _Targets(
-        [Row(0, str(n + 1)) for n in range(2 * len(along))],
-        np.tile(positions, (2, 1)),
-        np.tile(rotations, (2, 1, 1)),
-        senses,
-        ["forward"] * len(along) + ["backward"] * len(along),
-        np.tile(along, 2),
-    )
+    passes = Passes.of_tool(geometry, positions, rotations, np.tile(way / length, (len(along), 1)))
+    rows = [Row(0, str(n + 1)) for n in range(2 * len(along))]
+    directions = ["forward"] * len(along) + ["backward"] * len(along)
+    both = np.tile(positions, (2, 1)), np.tile(rotations, (2, 1, 1)), passes.both_ways().senses()
+    return Targets(rows, *both, directions, np.tile(along, 2))
 
 
-def _given_pose(args: argparse.Namespace) -> tuple[list[Row], np.ndarray, np.ndarray]:
-    """Return the pose given by options."""
-    from ..errors import CommandError
-
-    if args.pose is not None:
-        return common.one_row(args.pose)
-    single = [getattr(args, name) for name in arguments.POSE_OPTIONS]
-    missing = [name for name, value in zip(arguments.POSE_OPTIONS[:3], single, strict=False) if value is None]
-    if missing:
-        raise CommandError("usage", f"--{missing[0].replace('_', '-')} is missing")
-    return common.one_row(arguments.pose(",".join(repr(value or 0.0) for value in single)))
-
-
-def _refuse_lengthless(result: CheckResult, targets: _Targets) -> None:
+def _refuse_lengthless(result: CheckResult, targets: Targets) -> None:
     """Raise where there are no commands to give: the model cannot be undone at a pose."""
-    import numpy as np
-
-    from ..errors import NotConvergedError, NotFiniteError
-
     if np.isfinite(result.lengths).all():
         return
     row = int((~np.isfinite(result.lengths)).any(axis=(1, 2)).argmax())
@@ -177,147 +117,101 @@ def _refuse_lengthless(result: CheckResult, targets: _Targets) -> None:
     raise NotFiniteError(f"{targets.where(row)}: strut lengths are not finite")
 
 
-@dataclass(frozen=True)
-class _Predicted:
+class Predicted:
     """What the tool would do without compensation: as the machine stands, and with the datum aligned."""
 
-    standing: PredictedError
-    aligned: PredictedError | None
-    unknown: str
-    unseen: int  # ways of the whole machine to shift and turn that readings did not show
+    def __init__(self, machine: RealMachine, file: str, poses: Any, senses: np.ndarray) -> None:
+        from ..calibration.posterior import COMPONENTS, ErrorPredictor
+        from ..calibration.posterior_file import load_posterior  # slow to import, and needed with a model only
 
-    @staticmethod
-    def of(machine: RealMachine, model_file: str, poses: Poses, senses: np.ndarray) -> _Predicted:
-        """Predict for platform poses; what the model file says of its fit is read."""
-        from ..calibration.posterior import ErrorPredictor
-        from ..calibration.posterior_file import load_posterior
-
-        fitted, unknown = load_posterior(machine.model, machine.geometry, model_file)
-        standing, aligned = ErrorPredictor(machine, fitted).predict(poses, senses)
+        fitted, self.unknown = load_posterior(machine.model, machine.geometry, file)
         held = None if fitted is None else fitted.held
-        return _Predicted(standing, aligned, unknown, 0 if held is None else held.held)
+        self.unseen = 0 if held is None else held.held  # of 6 ways in which readings did not show where it stands
+        parts = ErrorPredictor(machine, fitted).predict(poses, senses)
+        self._numbers = [
+            n for part in parts for n in ((None, None) if part is None else (part.values, part.deviations))
+        ]
+        self._components = COMPONENTS
 
     def columns(self, row: int) -> dict[str, Any]:
         """Return one row's errors and their standard deviations, units in the names."""
-        from ..calibration.posterior import COMPONENTS
-        from ..formats.csv import PREDICTED_ERRORS
-
-        numbers = [part for predicted in (self.standing, self.aligned) for part in _parts(predicted)]
         columns: dict[str, Any] = {}
-        for name, values in zip(PREDICTED_ERRORS, numbers, strict=True):
-            for n, component in enumerate(COMPONENTS):
+        for name, values in zip(PREDICTED_ERRORS, self._numbers, strict=True):
+            for n, component in enumerate(self._components):
                 key = f"{name.format(component)}_{'urad' if component[0] == 'r' else 'um'}"
                 columns[key] = None if values is None else float(values[row, n]) * 1e6
         return columns
 
     def text(self, direction: str) -> str:
         """Return the first pose's errors as a table for people."""
-        from ..calibration.posterior import COMPONENTS
-
         cells = ["not known" if value is None else texts.number(value, 2) for value in self.columns(0).values()]
         rows = zip(*(cells[start : start + 6] for start in range(0, 24, 6)), strict=True)
-        body = [[c, *row, "µrad" if c[0] == "r" else "µm"] for c, row in zip(COMPONENTS, rows, strict=True)]
-        header = ["in work", "as it stands", "±", "datum aligned", "±", ""]
-        title = (
-            "predicted error of the tool without compensation, actual − commanded, along and about the axes of work;\n"
-        )
-        title += "direction of motion not known: midway" if direction == "midway" else _moved(direction)
-        title += "; ± is one standard deviation"
-        title += f", not known: {self.unknown}" if self.unknown else " of the fit"
+        named = zip(self._components, rows, strict=True)
+        body = [[name, *row, "µrad" if name[0] == "r" else "µm"] for name, row in named]
+        title = "predicted error of the tool without compensation, actual − commanded, along and about the axes of work"
+        title += ";\ndirection of motion not known: midway" if direction == "midway" else f";\n{_moved(direction)}"
+        title += f"; ± is one standard deviation{f', not known: {self.unknown}' if self.unknown else ' of the fit'}"
         if self.unseen:
             title += (
                 f";\nin {self.unseen} of 6 ways the readings did not show where the machine stands as a whole: there "
+                "the error as it stands is zero at the\nheld datum, and ± has the tolerance of the structure"
             )
-            title += "the error as it stands is zero at the\nheld datum, and ± has the tolerance of the structure"
-        return f"{title}\n{texts.aligned(header, body)}\n"
+        return f"{title}\n{texts.aligned(['in work', 'as it stands', '±', 'datum aligned', '±', ''], body)}\n"
 
 
 def _moved(direction: str) -> str:
     return f"all axes and struts moved {direction}"
 
 
-def _parts(predicted: PredictedError | None) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Return values and standard deviations, None for what is not known."""
-    return (None, None) if predicted is None else (predicted.values, predicted.deviations)
-
-
-def _mention_outside(geometry: HexapodGeometry, model: MachineModel, outside: int, count: int) -> None:
-    """Say on stderr that predictions go beyond what was measured."""
-    from ..machine.region import region_text
-
-    if outside:
-        poses = "the pose lies" if count == 1 else f"{outside} of {count} poses lie"
-        text = f"{poses} outside the box in which the model was measured; the predicted error there is extrapolated"
-        print(f"hexapod_comp: note: {text} ({region_text(model.measured, geometry)})", file=sys.stderr)
-
-
 def _show(
     args: argparse.Namespace,
     geometry: HexapodGeometry,
     model: MachineModel,
-    targets: _Targets,
-    result: CheckResult,
-    predicted: _Predicted | None,
+    targets: Targets,
+    lengths: np.ndarray,
+    predicted: Predicted | None,
 ) -> None:
-    """Write the CSV file; print JSON or, where no file was written, CSV or a table of one pose.
-
-    Also an ideal machine's commands are not its lengths where screws turn with the joints.
-    """
-    with_model = predicted is not None or targets.along is not None or bool(geometry.screw_lead.any())
-    table = [_columns(targets, n, result.lengths[n], with_model) for n in range(len(targets.rows))]
+    """Write the CSV file; print JSON or, where no file was written, CSV or a table of one pose."""
+    # Also an ideal machine's commands are not its lengths where screws turn with the joints.
+    corrected = predicted is not None or bool(geometry.screw_lead.any())
+    rows = [_row(targets, n, lengths[n], corrected or args.line is not None) for n in range(len(targets.rows))]
     if predicted is not None:
-        table = [{**columns, **predicted.columns(n)} for n, columns in enumerate(table)]
-    common.write_table(args, table)
+        rows = [{**columns, **predicted.columns(n)} for n, columns in enumerate(rows)]
+    common.write_table(args, rows)
+    one = args.poses is None and args.line is None
     if args.json:
         content: dict[str, Any] = {"machine": geometry.name, "model": model.name, **common.frames(geometry)}
         if predicted is not None:
             content |= {"error_frame": geometry.work_name, "error_sd_not_known": predicted.unknown or None}
-        common.show({**content, "rows": table})
+        common.show({**content, "rows": rows})
         return
-    one = args.poses is None and args.line is None
     if args.out is not None or not one:
         common.mention_default(args, geometry)
-    if args.out is None:
-        direction = targets.directions[0]
-        common.show(
-            _one_pose(geometry, model, result.lengths[0], predicted, direction) if one else common.csv_text(table)
-        )
+    if args.out is None and not one:
+        common.show(Table(rows).csv())
+    elif args.out is None:
+        (nominal, command), direction = lengths[0] * 1e3, targets.directions[0]
+        columns = {"nominal_mm": nominal}
+        columns |= {"command_mm": command, "correction_um": (command - nominal) * 1e3} if corrected else {}
+        struts = [{"strut": n, **dict(zip(columns, v, strict=True))}
+                  for n, *v in zip(STRUT_NAMES, *(c.tolist() for c in columns.values()), strict=True)]  # fmt: skip
+        title = f"{common.machine_title(geometry, model)}: strut lengths for a pose of {common.whose(geometry)}"
+        title += "" if direction == "midway" else f", {_moved(direction)}"
+        errors = f"\n{predicted.text(direction)}" if predicted is not None else ""
+        common.show(f"{title}\n{Table(struts).text()}\n{errors}")
 
 
-def _columns(targets: _Targets, n: int, lengths: np.ndarray, with_model: bool) -> dict[str, Any]:
+def _row(targets: Targets, n: int, lengths: np.ndarray, with_model: bool) -> dict[str, Any]:
     """Return one row of the output: label, commands and, with a model, direction, nominal lengths and corrections."""
-    from ..formats.csv import LENGTH_COLUMNS, length_values
-
     nominal, command = lengths
     columns: dict[str, Any] = {"sequence": targets.rows[n].label}
     columns |= {"direction": targets.directions[n]} if with_model else {}
-    columns |= {**targets.columns(n), **length_values(command if with_model else nominal)}
+    if targets.along is not None:
+        columns["along_mm"] = float(targets.along[n]) * 1e3
+        columns |= pose_values(Pose(targets.positions[n], targets.rotations[n]))
+    columns |= length_values(command if with_model else nominal)
     if with_model:
         columns |= {f"nominal_{name}": value for name, value in length_values(nominal).items()}
-        corrections = (command - nominal) * 1e6
-        columns |= {
-            f"correction_{name}_um": float(value) for name, value in zip(LENGTH_COLUMNS, corrections, strict=True)
-        }
+        corrections = zip(LENGTH_COLUMNS, ((command - nominal) * 1e6).tolist(), strict=True)
+        columns |= {f"correction_{name}_um": value for name, value in corrections}
     return columns
-
-
-def _one_pose(
-    geometry: HexapodGeometry, model: MachineModel, lengths: np.ndarray, predicted: _Predicted | None, direction: str
-) -> str:
-    """Return one pose's lengths, and with a model the error that they take out, as tables for people."""
-    from ..machine.geometry import STRUT_NAMES
-
-    nominal, command = lengths
-    header, columns = ["strut", "nominal_mm"], [nominal * 1e3]
-    if predicted is not None or geometry.screw_lead.any():
-        header += ["command_mm", "correction_um"]
-        columns += [command * 1e3, (command - nominal) * 1e6]
-    digits = [6, 6, 3]
-    body = [
-        [name, *(texts.number(float(c[i]), d) for c, d in zip(columns, digits, strict=False))]
-        for i, name in enumerate(STRUT_NAMES)
-    ]
-    title = common.machine_title(geometry, model) + f": strut lengths for a pose of {common.whose(geometry)}"
-    title += "" if direction == "midway" else f", {_moved(direction)}"
-    errors = f"\n{predicted.text(direction)}" if predicted is not None else ""
-    return f"{title}\n{texts.aligned(header, body)}\n{errors}"

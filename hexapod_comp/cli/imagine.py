@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from ..calibration.evaluation import HeldOut, held_out
+from ..errors import GeometryError
+from ..formats import texts
+from ..machine.geometry import HexapodGeometry, load_geometry
+from ..machine.model import MachineModel, RealMachine
+from ..machine.model_file import save_model
+from ..virtual.imperfections import ImperfectionBounds, largest_errors
+from ..virtual.named import imagine, usual_bounds
+from ..workspace.reach import machine_box
 from . import common
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from ..calibration.evaluation import HeldOut
-    from ..machine.geometry import HexapodGeometry
-    from ..machine.model import MachineModel
-    from ..virtual.imperfections import ImperfectionBounds
 
 IN_SI = {
     "joints_um": ("joint", 1e-6),
@@ -36,14 +39,6 @@ IN_SI = {
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
-    from ..calibration.evaluation import held_out
-    from ..errors import GeometryError
-    from ..machine.geometry import load_geometry
-    from ..machine.model import RealMachine
-    from ..machine.model_file import save_model
-    from ..virtual.named import imagine
-    from ..workspace.reach import machine_box
-
     geometry = load_geometry(args.machine)
     model = imagine(geometry, args.seed, _bounds(args, geometry), args.name or "")
     save_model(model, args.out)
@@ -54,20 +49,12 @@ def run(args: argparse.Namespace) -> int:
     except GeometryError as error:
         common.say_notes([f"what the tool does is not shown: {error}"])
     drawn = _drawn(model)
-    if args.json:
-        common.show(_as_json(args, model, drawn, box, error_of_tool))
-    else:
-        common.show(_report(args, model, drawn, box, error_of_tool))
+    common.show((_as_json if args.json else _report)(args, model, drawn, box, error_of_tool))
     return 0
 
 
 def _bounds(args: argparse.Namespace, geometry: HexapodGeometry) -> ImperfectionBounds:
     """Return the bounds that the options give; the usual ones where they give none."""
-    import numpy as np
-
-    from ..virtual.named import usual_bounds
-    from ..workspace.reach import machine_box
-
     given: dict[str, Any] = {"shared_platform_joints": not args.separate_joints}
     for option, (name, unit) in IN_SI.items():
         value = getattr(args, option)
@@ -75,25 +62,15 @@ def _bounds(args: argparse.Namespace, geometry: HexapodGeometry) -> Imperfection
             given[name] = tuple(unit * v for v in value) if isinstance(value, tuple) else unit * value
     if args.field_um or args.field_urad:
         box, attitude, _ = machine_box(geometry)
-        given["field_box"] = _platform_box(geometry, box if args.box is None else np.array(args.box), attitude)
+        box = box if args.box is None else np.array(args.box)
+        corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)  # of the tool in work
+        positions, _ = geometry.platform_poses(corners, np.tile(attitude, (len(corners), 1, 1)))
+        given["field_box"] = np.array([positions.min(axis=0), positions.max(axis=0)])
     return usual_bounds(geometry, **given)
-
-
-def _platform_box(geometry: HexapodGeometry, box: np.ndarray, attitude: np.ndarray) -> np.ndarray:
-    """Return the lowest and highest platform position in ``base`` of a tool in a box of ``work``, shape (2, 3), m."""
-    import numpy as np
-
-    corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)
-    positions, _ = geometry.platform_poses(corners, np.tile(attitude, (len(corners), 1, 1)))
-    return np.array([positions.min(axis=0), positions.max(axis=0)])
 
 
 def _drawn(model: MachineModel) -> list[tuple[str, float, str]]:
     """Return name, largest value and unit of each error that the machine has."""
-    import numpy as np
-
-    from ..virtual.imperfections import largest_errors
-
     struts, size = model.struts, np.abs
     bodies = np.array([model.base_expansion, model.platform_expansion])
     of_field = largest_errors(model.field) if any(family.size for family in model.field.lines) else np.zeros(6)
@@ -123,7 +100,6 @@ def _report(
     error: HeldOut | None,
 ) -> str:
     """Say what was drawn, what the tool makes of it, and where it went."""
-    from ..formats import texts
 
     units = {"um": "µm", "urad": "µrad", "ppm_per_k": "ppm/K"}
     lines = [f"machine {model.machine}, seed {args.seed}: model {model.name}"]

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import argparse
 
+from ..errors import CalibrationError
+from ..machine.geometry import load_geometry
+from ..measurements.files import read_measurements
+from ..measurements.standards import every_target, judge, standards_json, standards_text
 from . import common
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
-    from ..errors import CalibrationError
-    from ..machine.geometry import load_geometry
-    from ..measurements.files import read_measurements
-    from ..measurements.standards import every_target, judge, standards_json, standards_text
-
     geometry = load_geometry(args.machine)
     with common.stage("reading measurements"):
         measured = read_measurements(args.files, geometry, args.columns, args.probe_mm, in_reach=False)
@@ -24,8 +23,6 @@ def run(args: argparse.Namespace) -> int:
             "no linear run has two cycles or more with every target read from both sides in each; no circle either"
         )
         raise CalibrationError("measurements", problem)
-    if args.json:
-        common.show(standards_json(judged))
-    else:
-        common.show(every_target(judged) if args.targets else standards_text(judged))
+    shown = standards_json if args.json else every_target if args.targets else standards_text
+    common.show(shown(judged))
     return 0

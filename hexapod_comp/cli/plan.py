@@ -4,43 +4,36 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import Any
 
+import numpy as np
+
+from ..calibration.candidates import MeasuringBox
+from ..calibration.design import TIMES, Goal, Times, plan, propose
+from ..calibration.design_report import proposal_json, proposal_report, remarks
+from ..calibration.report import plan_json, plan_report
+from ..compensation.checks import check
+from ..errors import CalibrationError
+from ..formats.outputs import write_text
+from ..machine.geometry import HexapodGeometry, load_geometry
+from ..machine.model import MachineModel
+from ..measurements.campaign import Campaign, campaign_text, template
 from . import common
 from .fit import fit_settings
-
-if TYPE_CHECKING:
-    from ..calibration.design import Goal
-    from ..machine.geometry import HexapodGeometry
-    from ..measurements.campaign import Campaign
-
-OF_A_GOAL = ("tilt_deg", "instruments", "hours", "time", "out")
-"""Options that mean nothing without ``--goal-um``."""
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb; 1 when a goal cannot be met."""
-    from ..errors import CalibrationError
-    from ..machine.geometry import load_geometry
-
     geometry = load_geometry(args.machine)
-    if args.goal_um is not None:
-        return _propose(args, geometry)
-    for name in OF_A_GOAL:
-        if getattr(args, name) is not None:
-            raise CalibrationError(f"--{name.replace('_', '-')}", "needs a goal: --goal-um")
-    if args.campaign is None:
-        raise CalibrationError("plan", "needs a campaign to be judged, or --goal-um to propose one")
-    return _judge(args, geometry)
+    campaign = common.load_campaign(args, geometry)
+    if args.repeatability_um is not None:
+        campaign = replace(campaign, repeatability=args.repeatability_um * 1e-6)
+    return _judge(args, geometry, campaign) if args.goal_um is None else _propose(args, geometry, campaign)
 
 
-def _judge(args: argparse.Namespace, geometry: HexapodGeometry) -> int:
+def _judge(args: argparse.Namespace, geometry: HexapodGeometry, campaign: Campaign) -> int:
     """Say what a campaign determines."""
-    from ..calibration.design import plan
-    from ..calibration.report import plan_json, plan_report
-    from ..measurements.campaign import template
-
-    campaign = _campaign(args, geometry)
     with common.stage_line() as say:
         say("laying out the readings")
         measured = template(campaign, geometry, args.seed, args.campaign)
@@ -50,16 +43,9 @@ def _judge(args: argparse.Namespace, geometry: HexapodGeometry) -> int:
     return 0
 
 
-def _propose(args: argparse.Namespace, geometry: HexapodGeometry) -> int:
+def _propose(args: argparse.Namespace, geometry: HexapodGeometry, base: Campaign) -> int:
     """Propose a campaign for a goal; 1 when it is not met."""
-    from ..calibration.candidates import MeasuringBox
-    from ..calibration.design import propose
-    from ..calibration.design_report import proposal_json, proposal_report, remarks
-    from ..formats.outputs import write_text
-    from ..measurements.campaign import campaign_text
-
     goal = _goal(args)
-    base = _campaign(args, geometry)
     place = MeasuringBox(geometry, base.box, base.level, goal.tilt)
     with common.stage_line() as say:
         result = propose(place, goal, fit_settings(args), base, say)
@@ -73,23 +59,8 @@ def _propose(args: argparse.Namespace, geometry: HexapodGeometry) -> int:
     return 0 if result.met else 1
 
 
-def _campaign(args: argparse.Namespace, geometry: HexapodGeometry) -> Campaign:
-    """Return the campaign that the options name, with the repeatability that they state."""
-    from dataclasses import replace
-
-    campaign = common.load_campaign(args, geometry)
-    if args.repeatability_um is None:
-        return campaign
-    return replace(campaign, repeatability=args.repeatability_um * 1e-6)
-
-
 def _goal(args: argparse.Namespace) -> Goal:
     """Return the goal that the options name."""
-    import numpy as np
-
-    from ..calibration.design import TIMES, Goal, Times
-    from ..errors import CalibrationError
-
     times = dict(TIMES)
     for name, numbers in args.time or ():
         if name not in times:
@@ -103,11 +74,6 @@ def _goal(args: argparse.Namespace) -> Goal:
 
 def _detours(geometry: HexapodGeometry, campaign: Campaign) -> Iterator[str]:
     """Yield between which runs the machine cannot move straight, as ``check`` sees it."""
-    import numpy as np
-
-    from ..compensation.checks import check
-    from ..machine.model import MachineModel
-
     ends = [
         (run, slice(None, None, max(1, len(run.positions) - 1)) if run.is_line else slice(None))
         for run in campaign.runs

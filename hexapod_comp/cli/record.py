@@ -7,12 +7,12 @@ import math
 import sys
 import time
 
+from ..errors import InputFileError
 from . import common
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb; 0 when there is something to be replayed."""
-    from ..errors import InputFileError
     from ..ros import heard_signals
     from ..ros.recorder import BagRecorder
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
 
+from ..compensation.journal import Source
+from ..errors import InputFileError
+from ..formats.paths import input_file
+from ..machine.geometry import HexapodGeometry, load_geometry
+from ..machine.model import MachineModel
+from ..replay.bag import Files, Recording, read_recording
+from ..replay.replay import replay_recording, what_if
+from ..replay.report import Report, as_json, rows_of, text
+from ..virtual.named import find_model, is_random, is_word
 from . import common
-
-if TYPE_CHECKING:
-    from ..compensation.journal import Source
-    from ..machine.geometry import HexapodGeometry
-    from ..machine.model import MachineModel
-    from ..replay.bag import Files, Recording
-    from ..replay.report import Report
 
 NOTHING = (
     "nothing in it can be compared: no answer follows a snapshot of the journal without a page lost between; "
@@ -22,8 +23,6 @@ NOTHING = (
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb; 0 when the replay gives the same."""
-    from ..replay.bag import read_recording
-
     with common.progress_bar(0, " messages") as bar:
         recording = read_recording(args.bag, args.namespace, bar.update)
     report, geometry = _replayed(args, recording)
@@ -38,11 +37,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _replayed(args: argparse.Namespace, recording: Recording) -> tuple[Report, HexapodGeometry]:
     """Replay with what was in use, where that is at hand, and with what the options name, where that is another."""
-    from ..errors import InputFileError
-    from ..replay.bag import Files
-    from ..replay.replay import replay_recording, what_if
-    from ..replay.report import Report
-
     files = Files(recording, _given(args))
     other = _other(args, recording, files)
     as_it_was = other is None or files.missing() is None
@@ -61,7 +55,6 @@ def _replayed(args: argparse.Namespace, recording: Recording) -> tuple[Report, H
 
 
 def _show(args: argparse.Namespace, report: Report) -> None:
-    from ..replay.report import as_json, rows_of, text
 
     common.write_table(args, rows_of(report) if args.out is not None else ())
     common.show(as_json(report) if args.json else text(report))
@@ -69,10 +62,6 @@ def _show(args: argparse.Namespace, report: Report) -> None:
 
 def _given(args: argparse.Namespace) -> dict[str, Source]:
     """Return the texts of the files that the options name, by hash."""
-    from ..compensation.journal import Source
-    from ..formats.paths import input_file
-    from ..virtual.named import is_word
-
     files = {"geometry": args.machine, "model": None if is_word(args.model or "") else args.model}
     sources = [Source.read(input_file(name, kind)) for kind, name in files.items() if name is not None]
     return {source.sha256: source for source in sources}
@@ -80,9 +69,6 @@ def _given(args: argparse.Namespace) -> dict[str, Source]:
 
 def _other(args: argparse.Namespace, recording: Recording, files: Files) -> tuple[HexapodGeometry, MachineModel] | None:
     """Return the geometry and the model of the options, when one of them is another than was in use."""
-    from ..machine.geometry import load_geometry
-    from ..virtual.named import find_model, is_random
-
     first, model = recording.first, args.model or ""
     if not (set(_given(args)) - files.used or is_random(model) or (model == "ideal" and not files.used_ideal)):
         return None

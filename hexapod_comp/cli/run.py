@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from contextlib import nullcontext
 
+from ..formats.csv import read_poses
+from ..loop import report, session
+from ..loop.report import ErrorRow, SessionResult, busy_text, error_rows, pose_block, summary
+from ..loop.story import Calibration
+from ..machine.geometry import HexapodGeometry, load_geometry
+from ..machine.model import MachineModel
+from ..virtual.named import find_model, truth_name
 from . import common
-
-if TYPE_CHECKING:
-    from ..loop.report import ErrorRow, SessionResult
-    from ..loop.story import Calibration
-    from ..machine.geometry import HexapodGeometry
-    from ..machine.model import MachineModel
 
 TRUE = "truth"
 """The model that is no file: the machine's own errors."""
@@ -20,14 +21,6 @@ TRUE = "truth"
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb; 0 when every command was answered."""
-    from contextlib import nullcontext
-
-    from ..formats.csv import read_poses
-    from ..loop import report, session
-    from ..loop.report import busy_text, error_rows, pose_block, summary
-    from ..machine.geometry import load_geometry
-    from ..machine.model import MachineModel
-
     rate = session.checked_rate(args.rate_hz)
     geometry = load_geometry(args.machine)
     truth = hidden_errors(args, geometry)
@@ -53,16 +46,12 @@ def run(args: argparse.Namespace) -> int:
 
 def hidden_errors(args: argparse.Namespace, geometry: HexapodGeometry) -> MachineModel:
     """Return the machine's hidden errors, and leave the name that they go by in the options."""
-    from ..virtual.named import find_model, truth_name
-
     args.truth = truth_name(args.truth, geometry)
     return find_model(args.truth, geometry)
 
 
 def chosen_model(args: argparse.Namespace, geometry: HexapodGeometry, truth: MachineModel) -> MachineModel:
     """Return the model that the compensator runs."""
-    from ..virtual.named import find_model
-
     return truth if args.model == TRUE else find_model(args.model, geometry)
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 
+from ..machine.geometry import load_geometry
+from ..workspace.overview import as_json, overview, report
 from . import common
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
-    from ..machine.geometry import load_geometry
-    from ..workspace.overview import as_json, overview, report
     from ..workspace.pictures import overview_figure
 
     geometry = load_geometry(args.machine)

@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..formats import texts
+from ..machine.arrays import rms
+from ..machine.model import RealMachine
+from ..machine.temperatures import PARTS
+from ..measurements.campaign import template
+from ..measurements.readings import ANGULAR_KINDS, KINDS, MeasurementSet
+from ..measurements.writing import write_measurements
+from ..virtual.instruments import compensated, measure
+from ..virtual.named import find_model, truth_name
+from ..virtual.warm_up import growing, load_warm_up
 from . import common
-
-if TYPE_CHECKING:
-    from ..measurements.readings import MeasurementSet
+from .table import Table
 
 RESOLUTION = 10
 """Digits after the point of the instruments, m and rad: a tenth of a nanometre."""
@@ -18,13 +25,6 @@ RESOLUTION = 10
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
-    from ..machine.model import RealMachine
-    from ..measurements.campaign import template
-    from ..measurements.writing import write_measurements
-    from ..virtual.instruments import compensated, measure
-    from ..virtual.named import find_model, truth_name
-    from ..virtual.warm_up import growing, load_warm_up
-
     geometry, model = common.load_machine(args)
     args.truth = truth_name(args.truth, geometry)
     truth = find_model(args.truth, geometry)
@@ -54,11 +54,9 @@ def _report(measured: MeasurementSet, args: argparse.Namespace) -> str:
     lines = [f"{errors}, moved by {lengths}; seed {args.seed}"]
     if args.warm_up is not None:
         lines.append(f"{_warmth(measured)}, as {args.warm_up} has it")
-    rows = [
-        [kind, str(count), texts.number(rms, 3), texts.number(largest, 3), unit]
-        for kind, count, rms, largest, unit in _channels(measured)
-    ]
-    lines.append(texts.aligned(["channel", "readings", "rms", "max", ""], rows))
+    names = ("channel", "readings", "rms", "max", "")
+    rows = [dict(zip(names, row, strict=True)) for row in _channels(measured)]
+    lines.append(Table(rows).text())
     count = f"{len(measured)} readings of {len(measured.runs)} runs at {len(measured.stations)} stations"
     return "\n".join([*lines, f"{count}: {args.out}"])
 
@@ -74,8 +72,6 @@ def _warmth(measured: MeasurementSet) -> str:
 
 def _rises(measured: MeasurementSet) -> dict[str, float]:
     """Return how far each part's sensor went, K."""
-    from ..machine.temperatures import PARTS
-
     values = measured.stations.temperatures
     return dict(zip(PARTS, (values.max(axis=0) - values.min(axis=0)).tolist(), strict=True))
 
@@ -94,9 +90,6 @@ def _as_json(measured: MeasurementSet, args: argparse.Namespace) -> dict[str, An
 
 def _channels(measured: MeasurementSet) -> Iterator[tuple[str, int, float, float, str]]:
     """Yield each kind of channel that was read, how often, its RMS and largest reading, and their unit."""
-    from ..machine.arrays import rms
-    from ..measurements.readings import ANGULAR_KINDS, KINDS
-
     for number, kind in enumerate(KINDS):
         values = measured.value[measured.kind == number] * 1e6
         if len(values):

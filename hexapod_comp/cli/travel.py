@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ..machine.geometry import pose_text
+from ..machine.model import RealMachine
+from ..pose import Pose
+from ..workspace.travel import Travel, travel, travel_text
 from . import common
-
-if TYPE_CHECKING:
-    from ..workspace.travel import Travel
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb."""
-    from ..machine.geometry import pose_text
-    from ..machine.model import RealMachine
-    from ..pose import Pose
-    from ..workspace.travel import travel, travel_text
-
     geometry, model = common.load_machine(args)
     if args.pose is None:
         pose = geometry.tool_pose(geometry.home)

@@ -1,16 +1,27 @@
-"""The verbs: in which group each stands, what it does in one line, and its help with units and an example."""
+"""The verbs: each with its group, one line on what it does, its options, its help, and which options go together."""
 
+# ruff: noqa: I001 (one name a line would be fifty)
 from __future__ import annotations
 
 from typing import NamedTuple
 
+from .options import (
+    COMPENSATED, DIRECTION, ESTIMATION, FRAMES, JSON, LINE_HELP, LINE_SHAPE, MACHINE, MODEL, NAMESPACE, POSE_HELP,
+    SEPARATE, SHAPE, TRUTH, WORDS, Option, Rule, above_zero, bound, box, choice, count, csv_file, excluded_by,
+    exactly_one, finite, flag, folder, gone, html_file, joint_names, lengths, line, machine, needed_by, pictures, pose,
+    readings, reads, seed_of, some_of, span, table_out, tilts, times, together, under, value, whole, writes,
+)  # fmt: skip
+
 
 class Verb(NamedTuple):
-    """A verb in ``--help``."""
+    """A verb; its module of the same name has ``run(args)``."""
 
     group: str  # under which heading it is listed
     summary: str  # one line
+    options: tuple[Option, ...]
     text: str  # what stands below its options
+    rules: tuple[Rule, ...] = ()
+    alias: str = ""  # an old name, which still works
 
 
 DESCRIPTION = """Error compensation for hexapod machine tools: tool poses in, compensated strut lengths out.
@@ -22,10 +33,69 @@ shipped one (paper, paper_machine, …)."""
 EPILOG = """Verbs, options and files complete in the shell: pip install argcomplete, then
 eval "$(register-python-argcomplete hexapod_comp)"."""
 
+GONE = {"paper": "is `make papers` in the source tree now (python -m examples.papers)"}
+"""Verbs that went, and where to."""
+
+POSE_OPTIONS = {f"--{axis}-mm": "mm" for axis in "xyz"} | {
+    f"--{axis}-deg": "degrees" for axis in ("alpha", "beta", "gamma")
+}
+"""A pose number by number: the options of ik, and their units."""
+
+CORNERS = "X0,Y0,Z0,X1,Y1,Z1"
+
+INSTRUMENTS = (
+    "linear", "straightness", "rotation", "5-D", "6-D", "tracker", "tracker_6d", "ball_bar", "station", "r_test",
+)  # fmt: skip
+"""What plan can propose runs for; a test holds it to the planner's own list, which is slow to import."""
+
+LOOP = (
+    MACHINE,
+    TRUTH,
+    value("--rate-hz", float, "HZ", "commands per second (default 250)", default=250.0),
+    gone("--plot", "--pictures FOLDER"),
+    JSON,
+)
+"""What run and demo share."""
+
+DRAWN = {
+    "--joint-um": (10.0, "every coordinate of every joint, µm"),
+    "--strut-um": (10.0, "every strut's length offset, µm"),
+    "--pitch-ppm": (0.0, "every screw's pitch error, ppm"),
+    "--wave-um": (0.0, "every screw's periodic error (its amplitude, drawn from 0 up), µm"),
+}
+"""Bounds that assess draws machines within, and what they are by default."""
+
+BOUNDS = (
+    value("--joints-um", bound, "NUMBER", "every coordinate of every joint, ± µm (default 50)"),
+    value("--struts-um", bound, "NUMBER", "every strut's length, ± µm (default 50)"),
+    value("--pitch-ppm", bound, "NUMBER", "every screw's pitch, ± ppm (default 50)"),
+    value("--wave-um", span, "LOW,HIGH", "amplitude of the screws' periodic error, µm (default 1,3)"),
+    value("--harmonics-um", span, "LOW,HIGH", "the same of those two, three and four times a turn (default 0)"),
+    value("--wave-period-mm", above_zero, "NUMBER", "its period, mm (default: the geometry's lead, else 10)"),
+    value("--map-um", bound, "NUMBER", "smooth length error of every strut, RMS µm (default 1)"),
+    value("--backlash-um", span, "LOW,HIGH", "backlash of every strut, µm (default 2,4)"),
+    value("--wear-um", bound, "NUMBER", "how much more of it a screw has where it is worn most, µm (default 0)"),
+    value("--strut-expansion-ppm-per-k", span, "LOW,HIGH", "thermal expansion of the struts (default 0)"),
+    value("--body-expansion-ppm-per-k", span, "LOW,HIGH", "the same of base and platform (default 0)"),
+    value("--field-um", bound, "NUMBER", "largest displacement by a field in space, µm (default 0)"),
+    value("--field-urad", bound, "NUMBER", "its largest rotation, µrad (default 0)"),
+    value("--field-reversal-percent", bound, "NUMBER", "share of it that changes with direction (default 10)"),
+    value("--box", box, CORNERS, "where the field is: lowest and highest tool position, mm (default: what a level tool "
+          "reaches about home)"),
+    flag("--separate-joints", "struts that share a platform joint each get one of their own"),
+)  # fmt: skip
+"""How imperfect an imagined machine may be; defaults are those of ``random``."""
+
+# fmt: off
 VERBS = {
     "show": Verb(
         "kinematics",
         "a machine at a glance: frames, joints, reach, largest box",
+        (
+            reads("machine", "geometry file, or the name of a shipped one", "MACHINE", "geometry"),
+            pictures("out"),
+            JSON,
+        ),
         """Prints where joints and frames are (mm, degrees), how far the tool tilts at home, what the machine reaches
 and which limit stops it, and the largest box that fits into the reach. Campaigns without a box take that one. What
 looks wrong in the file is said at the end: a mirrored or turned home, swapped joints, a wrong unit, missing
@@ -43,6 +113,17 @@ example:
     "ik": Verb(
         "kinematics",
         "strut lengths (mm) for a tool pose (mm, degrees) or a CSV file",
+        (
+            reads("poses", "CSV file of poses; - for standard input", "POSES.csv", "poses", nargs="?"),
+            value("--pose", pose, SHAPE, POSE_HELP),
+            *(value(n, finite, "NUMBER", f"the pose number by number, {u}") for n, u in POSE_OPTIONS.items()),
+            value("--line", line, LINE_SHAPE, f"both ways along a straight line of the tool, {LINE_HELP}"),
+            value("--step-mm", above_zero, "MM", "distance of the poses on that line (default 5)", default=5.0),
+            DIRECTION,
+            *FRAMES,
+            table_out("the lengths"),
+            JSON,
+        ),
         """A file's columns are x_mm, y_mm, z_mm, optionally alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw)
 and sequence or name; other units by their suffix (_m, _um, _in, _rad). CSV in gives CSV out, L1_mm … L6_mm,
 which fk reads. With --model, L1_mm … L6_mm are the lengths to command, nominal_L1_mm … and
@@ -65,10 +146,27 @@ example:
   strut_6  498.955256
   $ hexapod_comp ik config/table1.csv --model paper_machine --out lengths.csv
   $ hexapod_comp ik --line=-200,0,450,200,0,450 --step-mm 5 --model paper_machine --out line.csv""",
+        (
+            exactly_one("poses", "--pose", "--x-mm --y-mm --z-mm", "--line"),
+            together("--x-mm", "--y-mm", "--z-mm"),
+            needed_by("--x-mm", "--alpha-deg", "--beta-deg", "--gamma-deg"),
+            excluded_by("--line", "--direction"),
+        ),
     ),
     "fk": Verb(
         "kinematics",
         "tool pose (mm, degrees) for six strut lengths (mm) or a CSV file",
+        (
+            reads("lengths_file", "CSV file; - for standard input", "LENGTHS.csv", "lengths", nargs="?"),
+            value("--lengths", lengths, "L1,…,L6", "six lengths, mm"),
+            value("--guess", pose, SHAPE, f"{POSE_HELP}; default home"),
+            flag("--cold", "no guess: pick the working assembly mode"),
+            flag("--all-modes", "list every assembly mode of the nominal machine"),
+            DIRECTION,
+            *FRAMES,
+            table_out("the poses"),
+            JSON,
+        ),
         """A file's columns are L1_mm … L6_mm (or _m, _um, _in), optionally sequence or name; CSV in gives CSV
 out, which ik and check read. With --model the lengths are commands, and the pose is where the real machine
 goes, midway between both directions of motion or, with --direction, in the one in which axes and struts moved last
@@ -82,10 +180,25 @@ example:
        x_mm      y_mm        z_mm  alpha_deg  beta_deg  gamma_deg
   -0.000130  0.000034  400.000021   5.000127  0.000074   0.000011
   $ hexapod_comp ik config/table1.csv | hexapod_comp fk -""",
+        (
+            exactly_one("lengths_file", "--lengths"),
+            needed_by("--lengths", "--all-modes"),
+            excluded_by("--model", "--all-modes"),
+            excluded_by("--all-modes", "--cold", "--guess"),
+            excluded_by("--cold", "--guess"),
+        ),
     ),
     "check": Verb(
         "kinematics",
         "which pose of a CSV file breaks which limit, with all margins",
+        (
+            reads("poses", "CSV file of poses (mm, degrees); - for standard input", "POSES.csv", "poses"),
+            flag("--stream", "rows are consecutive commands"),
+            value("--rate-hz", finite, "HZ", "commands per second (default 250)", default=250.0),
+            *FRAMES,
+            table_out("all margins"),
+            JSON,
+        ),
         """By default the rows are targets: the tool moves from one to the next with a rest at each, as `run`
 does, and the whole way is checked. With --stream the rows are consecutive commands at --rate-hz, and their steps
 and strut speeds are checked as they are. Limits hold for nominal and for compensated values (--model).
@@ -112,6 +225,11 @@ example:
     "travel": Verb(
         "kinematics",
         "how far the tool may go from a pose, each way, and what stops it",
+        (
+            value("--pose", pose, SHAPE, f"where the tool is, {POSE_HELP} (default: home)"),
+            *FRAMES,
+            JSON,
+        ),
         """Goes from the pose along x, y and z of the work frame, mm, and by each of its angles, degrees, the others
 as they are, forward and backward, until a limit stands: stroke, joint cones, clearance of the struts, condition number,
 correction, the field's box. Limits hold for nominal and for compensated values (--model); turns end at 180°.
@@ -123,6 +241,17 @@ example:
     "run": Verb(
         "loop",
         "send poses through the loop: two simulated nodes, or your own",
+        (
+            reads("poses", "CSV file of poses (mm, degrees)", "POSES.csv", "poses"),
+            *LOOP,
+            reads("--model", f"model that the compensator runs: file, shipped name, {WORDS}, or truth, the machine's "
+                  "own errors "
+                  "(default)", kind="model", default="truth"),
+            pictures(),
+            flag("--attach", "use nodes that already run; one pass, as they are"),
+            value("--namespace", None, "NAME", "namespace of those nodes", default=""),
+            flag("--no-compare", "leave out the simulated pass without compensation"),
+        ),
         """The tool moves from pose to pose within the machine's limits and rests at each. Its error is read from
 tool_pose_true. Columns of the file: x_mm, y_mm, z_mm, alpha_deg, beta_deg, gamma_deg (or qx, qy, qz, qw). Poses in
 the file and in the report are the tool's in the work frame, in mm and degrees. Errors are in µm and µrad. From six
@@ -138,6 +267,14 @@ example:
     "demo": Verb(
         "loop",
         "measure, fit and compensate a machine: what is left of its errors",
+        (
+            *LOOP,
+            reads("--model", "model that the compensator runs: fit, made of laser readings (default); truth; file, "
+                  "shipped name, "
+                  f"{WORDS}", kind="model", default="fit"),
+            seed_of("noise and poses"),
+            pictures("out"),
+        ),
         """A machine with hidden errors is measured with virtual lasers, noise included, in a box about its home. fit
 makes a model of the readings. Then both nodes run over DDS, through random poses of that box and along a milled path,
 without and with the model. The report lays what the tool really did beside what the fit promised, and beside it the
@@ -158,6 +295,14 @@ example:
     "watch": Verb(
         "loop",
         "show a running machine in the browser: 3-D, errors, refusals",
+        (
+            MACHINE,
+            NAMESPACE,
+            value("--host", None, "ADDRESS", "address to serve on (default 127.0.0.1: this computer alone; 0.0.0.0: "
+                  "all that "
+                  "reach it)", default="127.0.0.1"),
+            value("--port", whole(1, 65535), "N", "port to serve on (default 8080)", default=8080),
+        ),
         """Serves a page on this computer alone, unless --host says otherwise: the machine in 3-D, its struts coloured
 by correction, the tool's error (µm, µrad) as predicted and as left, what compensator and drive say of themselves,
 refusals, strut lengths (mm), and latencies (ms). It only listens in this ROS domain: nothing on the page moves or
@@ -170,6 +315,14 @@ example:
     "echo": Verb(
         "loop",
         "print a topic of a running machine with units, rate and age",
+        (
+            value("topic", None, "TOPIC", "name of a topic (default: list those that are published)", nargs="?"),
+            NAMESPACE,
+            value("--count", count, "N", "end after N messages"),
+            value("--seconds", above_zero, "S", "end after S seconds (default: at Ctrl-C)"),
+            flag("--hz", "print the rate once a second in place of the messages"),
+            JSON,
+        ),
         """Prints each message of TOPIC, whatever its type: struts in mm, corrections in µm, poses in mm and degrees,
 predicted errors in µm and µrad with their standard deviations, diagnostics by name. Its rate over the last 2 s and its
 age, from its stamp to its receipt, stand above it. --hz prints the rate alone, as `ros2 topic hz` does. Without TOPIC
@@ -186,6 +339,12 @@ example:
     "record": Verb(
         "loop",
         "record a running machine's topics, for replay",
+        (
+            folder("--out", "folder for the bag (MCAP); must not be there yet", dest="folder", required=True),
+            NAMESPACE,
+            value("--seconds", above_zero, "S", "end after so long (default: at Ctrl-C)"),
+            JSON,
+        ),
         """Hears commands, readings, estimates, diagnostics and the compensator's journal in this ROS domain, and writes
 them as ros2 bag does, into a folder with an MCAP file. It ends at Ctrl-C, or after --seconds. It may begin in the
 middle of a motion. Exit code: 0 there is something to replay, 1 no compensator was heard, 2 bad input.
@@ -197,6 +356,19 @@ example:
     "replay": Verb(
         "loop",
         "run a recorded bag through the compensator again: the same bits?",
+        (
+            reads("bag", "folder of a bag, .mcap or .db3 file", "BAG"),
+            value("--namespace", None, "NAME", "the machine meant, when the bag holds several"),
+            reads("--machine", "geometry file, or the name of a shipped one (default: what the recording carries)",
+                  kind="geometry"),
+            reads("--model", f"model file, the name of a shipped one, {WORDS} (default: what the recording carries)",
+                  kind="model"),
+            value("--tolerance-um", bound, "UM", "accept differences up to this, µm (default 0: the same bits)",
+                  default=0.0),
+            pictures(),
+            table_out("all corrections"),
+            JSON,
+        ),
         """BAG is a folder that `ros2 bag record` has written (MCAP or sqlite3), or one of its files. It must hold
 compensator/journal; with compensator/files the geometry and the model that were in use come along. strut_states and
 tool_pose_estimate are shown in the pictures. How far the tool was off its path, by tool_pose_estimate and
@@ -216,6 +388,31 @@ example:
     "plan": Verb(
         "calibration",
         "what a campaign will determine; or which one a goal needs",
+        (
+            reads("campaign", "campaign file, or the name of a shipped one; with --goal-um optional: whose box and "
+                  "noise count",
+                  "CAMPAIGN", "campaign", nargs="?"),
+            MACHINE,
+            value("--repeatability-um", bound, "UM", "standard deviation of where the machine stops, along each axis "
+                  "(default: "
+                  "the campaign's)"),
+            *under(
+                "proposing a campaign",
+                value("--goal-um", above_zero, "UM", "RMS tool error that may be left, the datum aligned: propose a "
+                      "campaign for it"),
+                value("--tilt-deg", bound, "DEG", "tilt of the tool at which it must hold too (default 0)"),
+                value("--instruments", None, "A,B,…", f"what there is to measure with: {', '.join(INSTRUMENTS)} "
+                      "(default linear)"),
+                value("--hours", above_zero, "H", "how long measuring may take (default 4)"),
+                value("--time", times, "NAME=MIN,MIN,S", "how long an instrument takes: minutes to put it up, "
+                      "minutes a run, "
+                      "seconds a stop; may be repeated", action="append"),
+                writes("--out", "write the proposed campaign to a file (YAML)", "CAMPAIGN"),
+            ),
+            *ESTIMATION,
+            seed_of("scattered poses"),
+            JSON,
+        ),
         """Takes a campaign file and says without a single reading which parameters the campaign would determine, which
 it leaves open, and what tool error (µm) a fit of --scheme joint will leave on a machine within the tolerances. How far
 the machine stops beside its usual place is in it, where the campaign or --repeatability-um states it.
@@ -228,10 +425,22 @@ fit read the file. Exit code: 0 fine, 1 the goal is not met, 2 bad input.
 example:
   $ hexapod_comp plan campaign_1d --lead-mm 10 --blocks pitch,wave,backlash
   $ hexapod_comp plan --goal-um 3 --tilt-deg 10 --instruments linear,tracker_6d --hours 4 --out mine.yaml""",
+        (
+            some_of("campaign", "--goal-um"),
+            needed_by("--goal-um", "--tilt-deg", "--instruments", "--hours", "--time", "--out"),
+        ),
     ),
     "imagine": Verb(
         "calibration",
         "draw a virtual machine with hidden errors, for any geometry",
+        (
+            MACHINE,
+            *under("how imperfect it may be", *BOUNDS),
+            seed_of("the machine", 1),
+            value("--name", None, "TEXT", "name of the model (default virtual-SEED)"),
+            writes("--out", "write the errors to a model file (YAML)", "MODEL", required=True),
+            JSON,
+        ),
         """Draws the errors of a virtual machine at random, evenly within the bounds, and writes them as a model file.
 simulate, run, demo and fit take it as --truth. The same seed gives the same machine, and a bound that is changed leaves
 the other errors alone. A bound of 0 leaves that error out.
@@ -246,6 +455,20 @@ example:
     "simulate": Verb(
         "calibration",
         "measure the virtual machine: a campaign's readings as a CSV file",
+        (
+            MACHINE,
+            MODEL,
+            TRUTH,
+            reads("--campaign", "campaign file, or the name of a shipped one (default campaign_5d.yaml for the "
+                  "machine paper, "
+                  "else campaign)", kind="campaign"),
+            reads("--warm-up", "file of how the machine warms meanwhile, warm_up for the shipped one: then x, y and "
+                  "z lines again "
+                  "and again", kind="warm_up"),
+            seed_of("all that is random"),
+            writes("--out", "write the readings to a CSV file", type=csv_file, required=True),
+            JSON,
+        ),
         """Moves the virtual machine through a campaign (lines, diagonals, scattered poses) and writes what its
 instruments read, noise and unknown zeros included. The CSV file is the one that fit reads: one reading a row, errors
 as measured minus commanded, in um and urad. --model measures the machine with that model's compensation: then the file
@@ -258,10 +481,44 @@ example:
   channel  readings     rms      max
    linear      1670  28.603  142.893  um
   1670 readings of 59 runs at 1670 stations: measured.csv""",
+        alias="measure",
     ),
     "fit": Verb(
         "calibration",
         "fit a model of the machine's errors to measurements",
+        (
+            *readings(),
+            choice("--scheme", ("joint", "lines"), "how to fit (default joint)", "joint"),
+            writes("--out", "write the model to a YAML file", "MODEL", required=True),
+            value("--name", None, "TEXT", "name of the model"),
+            value("--datum", pose, "POSE", f"tool pose in work that stays where it is, {POSE_HELP} (default: home)"),
+            writes("--report", "write the report to a file too"),
+            writes("--certificate", "write a calibration certificate, a page to be filed or printed (scheme joint)",
+                   "FILE.html", type=html_file),
+            reads("--details", "what the certificate says of instruments, place and people (YAML)"),
+            gone("--covariance", "always written, beside the model, as MODEL.posterior.npz"),
+            pictures(),
+            JSON,
+            reads("--truth", f"errors of the virtual machine that was measured: file, shipped name, {WORDS}",
+                  kind="model"),
+            flag("--force", "write a model that the readings do not bear out"),
+            reads("--update", "renew this model from few readings, what its fit knows as the prior", "MODEL"),
+            COMPENSATED,
+            *ESTIMATION,
+            *under(
+                "scheme joint",
+                value("--scale-ppm", bound, "PPM", "scale error of the instrument, 1 σ, ppm (scheme joint; default "
+                      "by its class: "
+                      "laser 0.5, tracker 10)"),
+                value("--alignment-mrad", bound, "MRAD", "angle between a laser's beam and its line, 1 σ, mrad "
+                      "(scheme joint; "
+                      "default 0.5)"),
+                flag("--not-robust", "trust readings that disagree with the rest (scheme joint)"),
+            ),
+            choice("--order", ("adjusted-r2", "aicc"), "what picks the polynomials' order (scheme lines; default "
+                   "adjusted-r2)"),
+            flag("--every-line", "report order, R² and residual of each line (scheme lines)"),
+        ),
         """Reads tidy CSV (one reading a row, what simulate writes), or with --columns the wide CSV files of other labs.
 
 --scheme joint fits structure, struts and field to all readings at once. It keeps only what helps on readings that
@@ -277,10 +534,29 @@ example:
   $ hexapod_comp simulate --campaign campaign_5d --seed 1 --out measured.csv
   $ hexapod_comp fit measured.csv --out model.yaml --pictures out
   $ hexapod_comp demo --model model.yaml""",
+        (
+            needed_by("--certificate", "--details"),
+            needed_by("--update", "--compensated"),
+            excluded_by("--scheme joint", "--order", "--every-line"),
+            excluded_by("--scheme lines", *(o.name for o in ESTIMATION), "--scale-ppm", "--alignment-mrad",
+                        "--not-robust", "--certificate"),
+            excluded_by("--update", "--scheme", *(o.name for o in ESTIMATION), "--not-robust", "--pictures", "--truth",
+                        "--datum", "--certificate", "--details"),
+        ),
     ),
     "verify": Verb(
         "calibration",
         "does a model still hold, by a few readings; what has changed",
+        (
+            reads("model", "model file that fit has written, MODEL.posterior.npz beside it", "MODEL"),
+            *readings(required=False),
+            COMPENSATED,
+            writes("--propose", "instead: write which readings to take, a tidy CSV file without values"),
+            value("--readings", int, "N", "how many of them (default 12)"),
+            value("--instruments", None, "A,B", "what takes them: linear, straightness, rotation, tracker, tracker_6d "
+                  "(default linear,rotation)"),
+            JSON,
+        ),
         """Weighs 6 to 20 check readings, spread over the box, against the model and what its fit knows of its
 parameters. If the machine has changed it says what has probably happened: the datum has moved, a strut's offset has
 changed (which, by how much), a temperature acts, the whole has aged, a single reading is wrong, or none of these. One
@@ -295,10 +571,20 @@ running and --compensated. fit --update renews the model from them. Errors are i
 example:
   $ hexapod_comp verify model.yaml check.csv
   $ hexapod_comp fit check.csv --update model.yaml --out renewed.yaml""",
+        (
+            some_of("files", "--propose"),
+            excluded_by("--propose", "files", "--compensated"),
+            needed_by("--propose", "--readings", "--instruments"),
+        ),
     ),
     "iso230": Verb(
         "calibration",
         "the figures of ISO 230-2, 230-4 and 230-6 of readings",
+        (
+            *readings(),
+            flag("--targets", "each run target by target, with notes"),
+            JSON,
+        ),
         """Judges every linear run with two cycles or more, all targets read from both sides in each (the standards ask
 for five cycles; a campaign says how many it makes). Lines along an axis of the work frame come under ISO 230-2:2014,
 all others, as body and face diagonals, under ISO 230-6:2002: A, E, R, M, B. Lengths read around a circle from its
@@ -311,6 +597,31 @@ example:
     "export": Verb(
         "calibration",
         "write a model for LinuxCNC or as a table; check what it leaves",
+        (
+            MACHINE,
+            MODEL,
+            folder("--linuxcnc", "folder for LinuxCNC's files; made if it is missing"),
+            writes("--table", "CSV file for the trilinear table", "FILE.csv", type=csv_file),
+            folder("--c", "folder for the compensator in C with this machine's constants", dest="c_folder"),
+            folder("--ros2-control", "folder for a ROS 2 package: this machine's compensation as a controller of "
+                   "ros2_control, and "
+                   "configurations"),
+            value("--rate", whole(1, 10_000), "HZ", "of ros2_control's loop (default 250)", default=250),
+            value("--joint-names", joint_names, "A,B,C,D,E,F", "the struts' joints in URDF, MJCF and ros2_control "
+                  "(default "
+                  "strut_1,…,strut_6)"),
+            writes("--urdf", "file for the machine as URDF: robot_state_publisher, RViz, ros2_control; needs no "
+                   "model", "FILE.urdf"),
+            writes("--mjcf", "file for the machine as MuJoCo's MJCF, loops closed; needs no model", "FILE.xml"),
+            choice("--units", ("mm", "inch"), "LinuxCNC's machine unit, [TRAJ]LINEAR_UNITS (default mm)", "mm"),
+            value("--box", box, CORNERS, "lowest and highest tool position, mm (default: the model's valid box, else "
+                  "its field's)"),
+            value("--step-mm", above_zero, "MM", "largest step of the table (default 25.4)", default=25.4),
+            value("--poses", whole(1000), "N", "random poses to check (default 1000, the least)", default=1000),
+            value("--tilt-deg", bound, "DEG", "tilt to check (default 5)", default=5.0),
+            seed_of("the random poses"),
+            JSON,
+        ),
         """--linuxcnc writes into a folder: genhexkins.hal (setp lines with the real joints), strut_1.comp …
 strut_6.comp (offset, pitch, screw wave, length map and backlash of each strut, at most 256 points) and comp.ini
 (lines to copy into the ini file). --table writes corrections of struts and of poses on a grid of positions of a level
@@ -322,10 +633,26 @@ the export cannot carry. The exit code is 1 when it would make the error larger.
 
 example:
   $ hexapod_comp export --machine paper.yaml --model paper_machine.yaml --linuxcnc linuxcnc --table table.csv""",
+        (some_of("--linuxcnc", "--table", "--c", "--ros2-control", "--urdf", "--mjcf"),),
     ),
     "assess": Verb(
         "analysis",
         "what random imperfections within bounds do to lengths and poses",
+        (
+            reads("poses", "CSV file of poses (mm, degrees; default: Table 1 of Song, Mou & King); - for standard "
+                  "input",
+                  "POSES.csv", "poses", nargs="?", default="table1.csv"),
+            *(value(n, bound, "BOUND", f"bound of {what} (default {usual:g})", default=usual)
+              for n, (usual, what) in DRAWN.items()),
+            value("--wave-period-mm", bound, "MM", "period of that error (default 10)", default=10.0),
+            flag("--separate-platform-joints", "struts that share a platform joint nominally each get one of their "
+                 "own"),
+            value("--machines", count, "N", "how many to draw (default 1)", default=1),
+            seed_of("the first machine"),
+            MACHINE,
+            table_out("every machine and pose"),
+            JSON,
+        ),
         """Draws machines within the bounds (uniform, ±). For the first one it prints the tables of Song, Mou & King:
 the ideal strut lengths (mm), the lengths that the real machine needs for the same poses, their difference (µm), and
 the pose (mm, degrees) that the real machine takes under ideal lengths. With --machines N it also prints percentiles
@@ -344,6 +671,35 @@ example:
     "classify": Verb(
         "analysis",
         "rank a machine's errors by what they do to the tool",
+        (
+            machine("positioning_unit.yaml"),
+            reads("--budget", "error budget, or the name of a shipped one (default error_budget.yaml)",
+                  kind="error_budget", default="error_budget.yaml"),
+            reads("--model", "in place of a budget: what the fit of this model leaves, and which measurement would "
+                  "remove most of "
+                  "it", kind="model"),
+            table_out("the ranking"),
+            pictures(),
+            JSON,
+            SEPARATE,
+            value("--cells", count, "N", "cells along the grid's longest edge (default 30)", default=30),
+            value("--clearance-mm", bound, "MM", "smallest distance between the axes of two struts, mm; 0: not "
+                  "limited (default: "
+                  "the geometry's)"),
+            value("--tilt-deg", tilts, "A,B,…", "tilts about the tool's x and y, from its attitude at home (default "
+                  "-4,0,4)",
+                  default=tilts("-4,0,4")),
+            choice("--method", ("exact", "linear", "iteration"), "of the ranking: exact (default), linear, or "
+                   "iteration, which is "
+                   "v. Daake et al.'s own", "exact"),
+            value("--compare", count, "N", "compare exact, linear and the iteration of v. Daake et al. at N poses"),
+            value("--allow-um", above_zero, "UM", "allowed error of the tool: says what the errors may be"),
+            value("--workers", whole(1, 256), "N", "processes (default 1, with all threads)", default=1),
+            value("--scheduler", None, "tcp://…", "Dask scheduler that does the work instead"),
+            seed_of("random poses and draws"),
+            flag("--no-page", "leave the interactive page out of --pictures"),
+            flag("--publish", "then keep the worst type's shells on workspace/shells until Ctrl-C"),
+        ),
         """Finds what the machine reaches (stroke, joint cones, strut clearance, condition number), and the effect of
 every single error of the budget at every grid point of it, by forward kinematics of the machine with that error.
 Prints the ranked table of v. Daake et al. with their figures beside it (µm, mdeg), what the budget adds up to, and
@@ -359,5 +715,9 @@ example:
   $ hexapod_comp classify --pictures out
   $ hexapod_comp classify --machine mine.yaml --model model.yaml --tilt-deg 0,5
   $ hexapod_comp classify --tilt-deg 0 --allow-um 50 --out ranking.csv""",
+        (
+            excluded_by("--model", "--budget", "--method", "--separate-joints", "--compare", "--allow-um", "--workers",
+                        "--scheduler", "--no-page", "--publish"),
+        ),
     ),
 }

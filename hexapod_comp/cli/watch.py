@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 
+from ..machine.geometry import load_geometry
+
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb until Ctrl-C."""
-    from ..machine.geometry import load_geometry
     from ..ros import heard_signals
     from ..viewer.page import WatchPage, watch
 

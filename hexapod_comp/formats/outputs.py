@@ -2,70 +2,57 @@
 
 from __future__ import annotations
 
-import argparse
 import errno
 import os
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
 from ..errors import InputFileError
 
-READ = (
-    "bag",
-    "budget",
-    "campaign",
-    "columns",
-    "details",
-    "files",
-    "lengths_file",
-    "machine",
-    "model",
-    "poses",
-    "truth",
-    "warm_up",
-    "update",
-)
-"""Arguments of all verbs that name what is read: files, shipped files, or a bag's folder."""
-
-WRITTEN = ("certificate", "mjcf", "out", "propose", "report", "table", "urdf")
-"""Arguments that name files to write."""
-
-FOLDERS = ("c_folder", "folder", "linuxcnc", "pictures", "ros2_control")
-"""Arguments that name folders to write into; they are made."""
-
 _protected: dict[tuple[int, int], str] = {}
 """What this command reads, by device and inode, and as what it was named; empty outside of a command."""
 
 
 @contextmanager
-def inputs_protected(args: argparse.Namespace) -> Iterator[None]:
-    """Refuse, as long as this context is open, to write what the arguments read; what they name is tried at once."""
+def protected(read: Mapping[str, Any], written: Mapping[str, Any], folders: Mapping[str, Any]) -> Iterator[None]:
+    """Refuse, as long as this context is open, to write what a command reads; try at once what it will write.
+
+    Each is a name, a list of names, or something else, which is no file, by the option that gives it. Refused are
+    outputs that are inputs, or another output, or whose place cannot take them: better now than after a long
+    calculation.
+    """
     try:
-        for name in READ:
-            given = getattr(args, name, None)
+        for given in read.values():
             for value in given if isinstance(given, list) else [given]:
                 if isinstance(value, str):
                     _protected.update((identity, value) for identity in _identities(value))
-        for name in (*WRITTEN, *FOLDERS):
-            value = getattr(args, name, None)
+        for value in (*written.values(), *folders.values()):
             if isinstance(value, str):
                 refuse_replacing_input(value)
-                (_refuse_no_folder if name in FOLDERS else _refuse_no_file)(value)
-        _refuse_two_in_one({name: getattr(args, name, None) for name in WRITTEN})
+        _refuse_unwritable({name: path for name, path in written.items() if isinstance(path, str)})
+        for path in folders.values():
+            while path and not os.path.exists(path):
+                path = os.path.dirname(path)
+            if path and not os.path.isdir(path):
+                raise InputFileError(path, "", "cannot be made a folder: it is a file")
         yield
     finally:
         _protected.clear()
 
 
-def _refuse_two_in_one(outputs: dict[str, str | None]) -> None:
-    """Raise where two options name one file; a pipe or a device takes both."""
+def _refuse_unwritable(files: Mapping[str, str]) -> None:
+    """Raise where no file of a name can be, or where two options name one; a pipe or a device takes both."""
     taken: dict[str, str] = {}
-    for name, path in outputs.items():
-        if path is None or (os.path.exists(path) and not os.path.isfile(path)):
+    for name, path in files.items():
+        if os.path.isdir(path):
+            raise InputFileError(path, "", "cannot be written: it is a folder, and a file is wanted")
+        if not os.path.isdir(os.path.dirname(path) or "."):
+            raise InputFileError(path, "", "cannot be written: its folder does not exist")
+        if os.path.exists(path) and not os.path.isfile(path):
             continue
         other = taken.setdefault(os.path.realpath(path), name)
         if other != name:
@@ -139,22 +126,6 @@ def make_folder(path: str | Path) -> None:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputFileError(path, "", f"this folder cannot be made: {error.strerror}") from error
-
-
-def _refuse_no_file(path: str) -> None:
-    """Raise where no file of this name can be."""
-    if os.path.isdir(path):
-        raise InputFileError(path, "", "cannot be written: it is a folder, and a file is wanted")
-    if not os.path.isdir(os.path.dirname(path) or "."):
-        raise InputFileError(path, "", "cannot be written: its folder does not exist")
-
-
-def _refuse_no_folder(path: str) -> None:
-    """Raise where a file is in the way of a folder, here or above."""
-    while path and not os.path.exists(path):
-        path = os.path.dirname(path)
-    if path and not os.path.isdir(path):
-        raise InputFileError(path, "", "cannot be made a folder: it is a file")
 
 
 def _identities(name: str) -> list[tuple[int, int]]:

@@ -376,7 +376,7 @@ WRONG = {
     "no types": ("--budget b.yaml {}", "b.yaml: errors: must name at least one error type"),
     "too far tilted": ("--tilt-deg 60", "the workspace is empty at the orientation (60, 60, 0)°"),
     "no tilts": ("--tilt-deg much", "argument --tilt-deg: must be finite numbers, not 'much'"),
-    "a tilt missing": ("--tilt-deg 1,,2", "argument --tilt-deg: must be finite numbers, not ''"),
+    "a tilt missing": ("--tilt-deg 1,,2", "argument --tilt-deg: must be finite numbers, not '1,,2'"),
     "not a tilt": ("--tilt-deg nan", "argument --tilt-deg: must be finite numbers"),
     "no cells": ("--cells 0", "argument --cells: must be a whole number from 1 to 10000000, not '0'"),
     "poses for a year": ("--compare 1000000000", "argument --compare: must be a whole number from 1 to 10000000"),
@@ -447,7 +447,7 @@ def test_an_interruption_leaves_no_half_written_file(
 
     where = {
         "survey": "hexapod_comp.workspace.study.look_at",
-        "report": "hexapod_comp.workspace.study.report",
+        "report": "hexapod_comp.cli.classify.report",
         "drawing": "hexapod_comp.workspace.pictures.ranking_figure",
     }
     monkeypatch.setattr(where[when], interrupted)

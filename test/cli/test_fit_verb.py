@@ -21,12 +21,12 @@ from calibration_helpers import paper, scattered
 from helpers import quick_pictures
 
 from hexapod_comp import cli
-from hexapod_comp.calibration import fit as fit_module
 from hexapod_comp.calibration.estimator import physical_covariance
 from hexapod_comp.calibration.fit import ModelFit
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.posterior import expected_error
 from hexapod_comp.calibration.posterior_file import load_posterior
+from hexapod_comp.cli import fit as fit_module
 from hexapod_comp.cli.fit import beyond_limits
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
@@ -305,7 +305,7 @@ def test_certificate(hexapod: Program, fitted: Calibration) -> None:
     text = Path("out.html").read_text()
     for name in ("model.yaml", "model.posterior.npz", fitted.measured):
         assert hashlib.sha256(Path(name).read_bytes()).hexdigest() in text, name
-    for part in ("Tuesday&#x27;s", "&lt;Jo&gt;", "ISO 230-2:2014", "ISO 230-6:2002", "observability indices: O1 "):
+    for part in ("Tuesday&#39;s", "&lt;Jo&gt;", "ISO 230-2:2014", "ISO 230-6:2002", "observability indices: O1 "):
         assert part in text, part
     assert "class=warning" not in text
 
@@ -316,9 +316,9 @@ def test_certificate(hexapod: Program, fitted: Calibration) -> None:
         ("--certificate out.pdf", "writes HTML, which any browser prints to PDF"),
         ("--certificate nowhere/out.html", "nowhere/out.html: cannot be written: its folder does not exist"),
         ("--certificate out.html --details gone.yaml", "there is no such file"),
-        ("--details {campaign}", "--details: is what a certificate says: --certificate is missing"),
+        ("--details {campaign}", "--details has no meaning without --certificate"),
         ("--certificate out.html --details {campaign}", "format: must be 'hexapod_comp/certificate'"),
-        ("--certificate out.html --scheme lines", "--certificate: has no meaning for scheme lines"),
+        ("--certificate out.html --scheme lines", "--certificate has no meaning with --scheme lines"),
     ],
 )
 def test_a_certificate_that_cannot_be_is_refused_before_the_fit(
@@ -813,8 +813,8 @@ def test_no_plan_brings_a_machine_below_its_repeatability(hexapod: Program, done
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        ("", "needs a campaign to be judged, or --goal-um"),
-        ("{campaign} --hours 2", "--hours: needs a goal"),
+        ("", "at least one of CAMPAIGN, --goal-um is needed"),
+        ("{campaign} --hours 2", "--hours has no meaning without --goal-um"),
         ("{campaign} --goal-um 1 --instruments laser", "instruments: must be one or more of linear"),
         ("{campaign} --goal-um 1 --hours 0.1", "hours: are too few"),
         ("{campaign} --goal-um 1 --time laser=1,1,1", "--time: is of one of linear"),

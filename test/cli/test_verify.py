@@ -75,10 +75,10 @@ def test_proposed_readings_are_written_to_be_filled_in(folder: Path, capsys: pyt
     assert all(row.split(",")[-2] == "" for row in rows), "no values yet"
     assert f"to be filled in: {proposed}" in capsys.readouterr().out
     for wrong, problem in (
-        ((), "check readings are missing"),
-        ((folder / "same.csv", "--propose", proposed), "says which readings to take"),
+        ((), "at least one of FILE, --propose is needed"),
+        ((folder / "same.csv", "--propose", proposed), "FILE has no meaning with --propose"),
         (("--propose", proposed, "--readings", "2"), "must be 6…60, not 2"),
-        (("--readings", "8"), "check readings are missing"),
+        (("--readings", "8"), "at least one of FILE, --propose is needed"),
         ((proposed,), "value"),
     ):
         assert run("verify", model_in(folder), *wrong) == 2

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from strategies import PAPER_FILE, paper_geometry, random_model, skewed_geometry
 
 from hexapod_comp.cli import export
-from hexapod_comp.cli.parsers import make_parser
+from hexapod_comp.cli.app import make_parser
 from hexapod_comp.errors import GeometryError, HexapodError, InputFileError, LimitError, ModelError, OutsideFieldError
 from hexapod_comp.export.linuxcnc import Genhexkins, make_genhexkins, table_misfit
 from hexapod_comp.export.linuxcnc_files import COMP_FILES, HAL_FILE, INI_FILE, read_genhexkins, write_genhexkins
@@ -447,7 +447,6 @@ def test_verb_tells_when_an_export_makes_it_worse(tmp_path: Path, monkeypatch: p
 @pytest.mark.parametrize(
     ("arguments", "error"),
     [
-        ((), "at least one is needed"),
         (("--linuxcnc", "x"), "tells of no box in which it was measured"),
         (("--linuxcnc", "/nonexistent/folder/x", "--box=-9,-9,390,9,9,410"), "cannot be made"),
         (("--table", "/nonexistent/x.csv", "--box=-9,-9,390,9,9,410"), "cannot be written"),

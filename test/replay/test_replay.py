@@ -27,6 +27,7 @@ import yaml
 pytest.importorskip("rosbags")
 
 import lz4.frame
+from hexapod_comp.cli.parsers import make_parser
 from replay_helpers import (
     BEGAN,
     CONFIG,
@@ -43,7 +44,6 @@ from rosbags.rosbag2 import CompressionMode
 
 from hexapod_comp.cli import main
 from hexapod_comp.cli import replay as verb
-from hexapod_comp.cli.parsers import make_parser
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.compensation.journal import (
     COMMAND,

@@ -1,0 +1,209 @@
+"""The command ``hexapod_comp <verb>``: parsers made from the table of verbs, and the module of the verb that is run."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import importlib
+import os
+import re
+import sys
+from collections.abc import Iterable, Sequence
+from itertools import groupby
+from typing import Any
+
+from ..errors import CommandError, HexapodError
+from ..formats.outputs import protected
+from ..formats.texts import run_with_plain_streams
+from .verbs import DESCRIPTION, EPILOG, GONE, VERBS, Verb
+
+PROGRAM = "hexapod_comp"
+
+ALIASES = {verb.alias: name for name, verb in VERBS.items() if verb.alias}
+"""Old names of verbs, which still work."""
+
+NEGATIVE = re.compile(r"-[.\d]")
+"""What follows an option and looks like this is its value, not another option."""
+
+ONE_THREAD = ("fit", "verify", "demo")
+"""Verbs whose matrices are too small for the threads of NumPy's BLAS, which on busy cores wait for each other."""
+
+USAGE_ERROR, INTERRUPTED = 2, 130
+"""Exit codes: bad input; Ctrl-C as shells count it, 128 + signal."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line, by default with the arguments of this process.
+
+    Returns
+    -------
+    int
+        Exit code: 0 fine, 1 the verb's own "no", 2 bad input or no room for the output, 130 interrupted, 141 nobody
+        reads the output any more.
+    """
+    arguments = sys.argv[1:] if argv is None else argv
+    return run_with_plain_streams(lambda: _run(arguments)) or 0
+
+
+def _run(arguments: Sequence[str]) -> int:
+    name = arguments[0] if arguments and not arguments[0].startswith("-") else ""
+    if name in GONE:
+        return _fail(f"{name} {GONE[name]}")
+    if name and name not in VERBS and name not in ALIASES:
+        return _fail(f"there is no verb {name!r}{_meant(name, [*VERBS, *ALIASES])}; {PROGRAM} --help lists them")
+    parser = make_parser()
+    if "_ARGCOMPLETE" in os.environ:
+        complete(parser)
+    try:
+        args = parser.parse_args(_with_negative_values(arguments))
+    except SystemExit as leaving:  # argparse has printed help or what is wrong
+        return leaving.code if isinstance(leaving.code, int) else USAGE_ERROR
+    if args.called != args.verb:
+        print(f"{PROGRAM}: note: {args.called} is now called {args.verb}", file=sys.stderr)
+    verb = VERBS[args.verb]
+    named = {role: {o.dest: getattr(args, o.dest) for o in verb.options if o.role == role} for role in ROLES}
+    try:
+        _refuse_what_does_not_go_together(verb, args)
+        with protected(*named.values()):
+            if args.verb in ONE_THREAD:  # NumPy reads this when it is loaded, and nothing has loaded it yet
+                os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+            return int(importlib.import_module(f".{args.verb}", __package__).run(args))
+    except (HexapodError, ImportError) as error:
+        if isinstance(error, ImportError) and error.name != "hexapod_comp.core._core":
+            raise
+        return _fail(str(error))
+    except MemoryError as error:
+        return _fail(f"this needs more memory than there is: {error}")
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+ROLES = ("reads", "writes", "folder")
+
+
+def _fail(problem: str) -> int:
+    print(f"{PROGRAM}: error: {problem}", file=sys.stderr)
+    return USAGE_ERROR
+
+
+def _meant(name: str, names: Iterable[str]) -> str:
+    """Return which name may have been meant, to follow a complaint."""
+    near = difflib.get_close_matches(name, list(names), 1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def _with_negative_values(arguments: Sequence[str]) -> list[str]:
+    """Join ``--pose -5,0,400`` to ``--pose=-5,0,400``: argparse takes -5,0,400 for an option."""
+    joined: list[str] = []
+    for argument in arguments:
+        after_option = joined and joined[-1].startswith("--") and "=" not in joined[-1]
+        if after_option and NEGATIVE.match(argument):
+            joined[-1] += f"={argument}"
+        else:
+            joined.append(argument)
+    return joined
+
+
+def _refuse_what_does_not_go_together(verb: Verb, args: argparse.Namespace) -> None:
+    """Raise CommandError where the options break a rule of the verb."""
+    options = {option.name: option for option in verb.options}
+
+    def given(name: str) -> bool:
+        option, _, word = name.partition(" ")
+        one = options[option]
+        return str(getattr(args, one.dest)) == word if word else one.given(args)
+
+    def label(name: str) -> str:
+        return options[name].label if name in options else name
+
+    for rule in verb.rules:
+        if problem := rule.problem(given, label):
+            raise CommandError("usage", problem)
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says which option was meant."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        options = [option for option in self._option_string_actions if option.startswith("--")]
+        names = [] if self._subparsers is not None else [one.partition("=")[0] for one in args if one.startswith("--")]
+        for name in names:
+            if name == "--":
+                break
+            if not any(option.startswith(name) for option in options):
+                self.error(f"there is no option {name}{_meant(name, options)}")
+        return super().parse_known_args(args, namespace)
+
+
+class _Version(argparse.Action):
+    """Print the version of the code that runs."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from ..formats.paths import version
+
+        print(f"{PROGRAM} {version()}")
+        parser.exit()
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser; it leaves the verb as ``verb``, and the name under which it was called as ``called``."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = _Parser(PROGRAM, description=DESCRIPTION, epilog=EPILOG, formatter_class=raw)
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and leave")
+    listed = []
+    for group, verbs in groupby(VERBS.items(), lambda item: item[1].group):
+        listed += [f"{group}:", *(f"  {name:<9} {verb.summary}" for name, verb in verbs)]
+    subparsers = parser.add_subparsers(
+        title="verbs",
+        description="\n".join(listed),
+        dest="called",
+        metavar="VERB",
+        required=True,
+        help="VERB --help gives its options, units and an example",
+    )
+    for name, verb in VERBS.items():
+        own = subparsers.add_parser(
+            name,
+            aliases=[verb.alias] * bool(verb.alias),
+            description=verb.summary,
+            epilog=verb.text,
+            formatter_class=raw,
+        )
+        groups: dict[str, Any] = {"": own}
+        for option in verb.options:
+            if option.heading not in groups:
+                groups[option.heading] = own.add_argument_group(option.heading)
+            action = groups[option.heading].add_argument(option.name, help=option.help, **option.keywords)
+            if option.keywords.get("default") == []:  # nargs "*" would take none where an option stands before them
+                action.required = False
+            action.declared = option
+        own.set_defaults(verb=name)
+    return parser
+
+
+def complete(parser: argparse.ArgumentParser) -> None:
+    """Answer the shell, which waits for completions, and leave; without argcomplete this does nothing."""
+    try:
+        import argcomplete
+    except ImportError:  # an extra; nobody reads what is printed now
+        return
+    from ..formats.paths import shipped_names
+
+    files = argcomplete.FilesCompleter()
+
+    def names(prefix: str, parsed_args: Any = None, action: Any = None, **_: object) -> list[str]:
+        """Complete with files, and with the shipped ones that the option takes."""
+        kind = action.declared.kind
+        shipped = ["ideal", "random"] * (kind == "model") + (
+            shipped_names(kind) if kind not in ("", "readings") else []
+        )
+        return [name for name in shipped if name.startswith(prefix)] + files(prefix)
+
+    (verbs,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    for verb in verbs.choices.values():
+        for action in verb._actions:
+            if (declared := getattr(action, "declared", None)) is not None and declared.role:
+                action.completer = names
+    argcomplete.autocomplete(
+        parser, exclude=list(ALIASES), default_completer=argcomplete.completers.SuppressCompleter()
+    )
