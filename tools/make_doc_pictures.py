@@ -18,15 +18,16 @@ from matplotlib.figure import Figure
 
 from examples.papers import daake
 from examples.papers.mou_king import LINE_Y
-from examples.papers.pictures import configuration_figure
+from examples.papers.pictures import configuration_figure, weights_figure
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.lines import fit_lines
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.pictures import fit_figure, strut_error_figure
+from hexapod_comp.core.batch import follow
+from hexapod_comp.formats.figures import WITH, WITHOUT
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
-from hexapod_comp.machine.pictures import direction_figure, weights_figure
 from hexapod_comp.measurements.campaign import load_campaign, template
 from hexapod_comp.measurements.readings import MeasurementSet
 from hexapod_comp.pose import Pose
@@ -42,6 +43,24 @@ EXAMPLE_WORK = Pose.from_angles([0.15, -0.12, 0.0], np.deg2rad([0.0, 0.0, 20.0])
 
 SEED, LEAD = 1, 0.01
 """Of the calibrations shown, as doc/calibration.md has them: the virtual instruments' seed; the screws' lead, m."""
+
+
+def direction_figure() -> Figure:
+    """Show the direction of motion that the code gives a noisy axis: there, at rest, and back."""
+    threshold = 2.0
+    there = np.concatenate([np.linspace(0.0, 12.0, 60), np.full(60, 12.0), np.linspace(12.0, 3.0, 60)])
+    values = there + 0.3 * np.random.default_rng(1).standard_normal(len(there))
+    low, sense = follow(threshold, values)
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
+    number, window = np.arange(len(values)), low
+    upper.fill_between(number, window, window + threshold, color=WITH, alpha=0.25, label="window")
+    upper.plot(values, color="black", lw=0.8, label="value, with noise")
+    upper.set(ylabel="µm")
+    upper.legend()
+    lower.step(number, sense, where="post", color=WITHOUT)
+    lower.set(xlabel="command", ylabel="direction", yticks=[-1, 0, 1])
+    return figure
 
 
 def machine_picture(geometry: HexapodGeometry) -> Figure:

@@ -29,9 +29,12 @@ LONGEST_CELL, LONGEST_TEXT = 300, 2000
 """Of a text in a table, and of any other; longer ones end in …"""
 
 
-def render(template: str, **values: Any) -> str:
-    """Return a page, or a part of one, from a template in hexapod_comp/templates."""
-    return _environment().get_template(template).render(values)
+def render(template: str | Path, **values: Any) -> str:
+    """Return a page, or a part of one, from a template in hexapod_comp/templates, or from a file that extends one."""
+    environment = _environment()
+    if isinstance(template, Path):
+        return environment.from_string(template.read_text(encoding="utf-8")).render(values)
+    return environment.get_template(template).render(values)
 
 
 @cache

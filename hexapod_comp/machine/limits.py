@@ -96,21 +96,10 @@ class Limits:
         self, cone_axes: np.ndarray, apart: np.ndarray, characteristic_length: float, home_sign: float
     ) -> Struct:
         """Return the limits as the core takes them, hc_limits; the arguments are the machine's."""
-        values = {
-            "stroke": self.stroke,
-            "cone_axes": cone_axes,
-            "cone_cosines": self.cone_cosines,
-            "apart": apart,
-            "condition": float(self.condition),
-            "correction": float(self.correction),
-            "step": float(self.step),
-            "clearance": float(self.clearance),
-            "characteristic_length": characteristic_length,
-            "home_sign": home_sign,
-            "speed": float(self.speed),
-            "acceleration": float(self.acceleration),
-        }
-        return Struct("hc_limits", values)
+        given = ("stroke", "cone_cosines", "condition", "correction", "step", "clearance", "speed", "acceleration")
+        values = {name: getattr(self, name) for name in given}
+        machine = {"cone_axes": cone_axes, "apart": apart, "home_sign": home_sign}
+        return Struct("hc_limits", values | machine | {"characteristic_length": characteristic_length})
 
     def margins(self, quantities: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Return what is left of each limit of single poses, and the values, by the limit's name."""
@@ -131,62 +120,47 @@ class Limits:
 
     def error(self, code: int, strut: int, stage: int, value: float) -> LimitError | KinematicsError:
         """Return the error for a finding: which limit, which strut, found and allowed value with units."""
-        if code in (Status.SPEED, Status.EARLY, Status.ACCELERATION):
-            return self._motion_error(code, strut, value)
-        which = STAGES[stage]
+        which, name, mm = STAGES[stage], STRUT_NAMES[strut] if strut >= 0 else "", value * 1e3
+        low, high = self.stroke[strut]
+        allowed = 0.0
         if code == Status.NOT_FINITE:
             return NotFiniteError(f"the {which} values at this pose are not finite")
-        name = STRUT_NAMES[strut] if strut >= 0 else ""
-        low, high = self.stroke[strut]
-        cone = (self.base_cone if code == Status.BASE_CONE else self.platform_cone)[strut]
-        stroke = (
-            low if value < low else high,
-            f"{name}: {which} length {value * 1e3:.4f} mm is outside the stroke {low * 1e3:.3f}…{high * 1e3:.3f} mm",
-        )
-        allowed, text = {
-            Status.STROKE_SHORT: stroke,
-            Status.STROKE_LONG: stroke,
-            Status.BASE_CONE: (cone, _cone_text(name, which, "base", value, cone)),
-            Status.PLATFORM_CONE: (cone, _cone_text(name, which, "platform", value, cone)),
-            Status.CLEARANCE: (
-                self.clearance,
-                f"{name}: {value * 1e3:.3f} mm from the nearest other strut ({which}), "
-                f"allowed {self.clearance * 1e3:g} mm",
-            ),
-            Status.CONDITION: (
-                self.condition,
-                f"condition number {value:.4g} of the {which} pose is above {self.condition:g}: near a singularity",
-            ),
-            Status.ASSEMBLY: (0.0, f"the {which} pose belongs to another assembly mode than home"),
-            Status.CORRECTION: (
-                self.correction,
-                f"{name}: correction {value * 1e6:.3f} µm is larger than ±{self.correction * 1e6:g} µm",
-            ),
-            Status.STEP: (
-                self.step,
-                f"{name}: the {which} length would change by {value * 1e3:.4f} mm in one command, "
-                f"allowed {self.step * 1e3:g} mm",
-            ),
-        }[code]
-        return LimitError(REASONS[code], text, value, float(allowed), strut if strut >= 0 else None, which)
-
-    def _motion_error(self, code: int, strut: int, value: float) -> LimitError:
-        """Return the error for a motion that is too fast; `value` is m/s, m/s², or s too early."""
-        name = STRUT_NAMES[strut]
         if code == Status.EARLY:
-            text = f"{name} cannot be there yet: {value * 1e3:.3g} ms too early for {self.speed * 1e3:g} mm/s"
+            text = f"{name} cannot be there yet: {mm:.3g} ms too early for {self.speed * 1e3:g} mm/s"
             return TooEarlyError(text, value, self.speed, strut)
-        quantity, unit = ("speed", "mm/s") if code == Status.SPEED else ("acceleration", "mm/s²")
-        allowed = getattr(self, quantity)
-        text = f"{name}: {quantity} {value * 1e3:.4g} {unit} by the stamps, allowed {allowed * 1e3:g} {unit}"
-        return LimitError(REASONS[code], text, value, allowed, strut, "compensated")
-
-
-def _cone_text(name: str, which: str, body: str, value: float, limit: float) -> str:
-    return (
-        f"{name}: {body} joint at {math.degrees(value):.3f}° ({which}), allowed {math.degrees(limit):g}° "
-        "from its neutral direction"
-    )
+        if code in (Status.STROKE_SHORT, Status.STROKE_LONG):
+            allowed = low if value < low else high
+            stroke = f"{low * 1e3:.3f}…{high * 1e3:.3f} mm"
+            text = f"{name}: {which} length {mm:.4f} mm is outside the stroke {stroke}"
+        elif code in (Status.BASE_CONE, Status.PLATFORM_CONE):
+            body, cones = ("base", self.base_cone) if code == Status.BASE_CONE else ("platform", self.platform_cone)
+            allowed = cones[strut]
+            found, most = math.degrees(value), math.degrees(allowed)
+            text = f"{name}: {body} joint at {found:.3f}° ({which}), allowed {most:g}° from its neutral direction"
+        elif code == Status.CLEARANCE:
+            allowed = self.clearance
+            text = f"{name}: {mm:.3f} mm from the nearest other strut ({which}), allowed {allowed * 1e3:g} mm"
+        elif code == Status.CONDITION:
+            allowed = self.condition
+            text = f"condition number {value:.4g} of the {which} pose is above {allowed:g}: near a singularity"
+        elif code == Status.ASSEMBLY:
+            text = f"the {which} pose belongs to another assembly mode than home"
+        elif code == Status.CORRECTION:
+            allowed = self.correction
+            text = f"{name}: correction {value * 1e6:.3f} µm is larger than ±{allowed * 1e6:g} µm"
+        elif code == Status.STEP:
+            allowed = self.step
+            text = (
+                f"{name}: the {which} length would change by {mm:.4f} mm in one command, allowed {allowed * 1e3:g} mm"
+            )
+        else:
+            which, (quantity, unit) = (
+                "compensated",
+                ("speed", "mm/s") if code == Status.SPEED else ("acceleration", "mm/s²"),
+            )
+            allowed = getattr(self, quantity)
+            text = f"{name}: {quantity} {mm:.4g} {unit} by the stamps, allowed {allowed * 1e3:g} {unit}"
+        return LimitError(REASONS[code], text, value, float(allowed), strut if strut >= 0 else None, which)
 
 
 def frozen_array(values: object, shape: tuple[int, ...], key: str) -> np.ndarray:

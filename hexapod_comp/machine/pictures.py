@@ -5,10 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
-from ..core.batch import follow
 from ..formats.figures import WITH, WITHOUT
 from ..pose import Pose
 from .geometry import HexapodGeometry
@@ -18,19 +15,6 @@ AXIS_COLOURS = ("#b22222", "#2e8b57", "#4169e1")
 
 CARDAN = "#007f7f"
 """Colour of the cardan axes that are fixed to a body."""
-
-
-def machine_figure(geometry: HexapodGeometry) -> Figure:
-    """Draw a machine at home: joints, struts and frames in space, joints and struts from above."""
-    figure = Figure(figsize=(12, 6), layout="constrained")
-    space: Any = figure.add_subplot(1, 2, 1, projection="3d")
-    above = figure.add_subplot(1, 2, 2)
-    draw_in_space(space, geometry)
-    space.set_box_aspect(None, zoom=1.15)
-    space.set(aspect="equal")
-    draw_flat(above, geometry, (0, 1))
-    above.set_title("from above")
-    return figure
 
 
 def draw_in_space(axes: Any, geometry: HexapodGeometry) -> None:
@@ -107,43 +91,3 @@ def _frame(axes: Any, name: str, pose: Pose, length: float) -> None:
         axes.plot(*np.stack([origin, tip]).T, color=colour, lw=1.5)
         axes.text(*tip, letter, color=colour, fontsize=7)
     axes.text(*(origin - 0.17 * length), name, style="italic", ha="right", va="top")
-
-
-def weights_figure() -> Figure:
-    """Draw the weights of the four lines around a tool: each the area of the rectangle opposite to it."""
-    figure = Figure(figsize=(4.8, 4.2), layout="constrained")
-    axes = figure.subplots()
-    y, z = 0.3, 0.4
-    corners = ((0.0, 0.0), (0.0, 1.0), (1.0, 1.0), (1.0, 0.0))
-    for index, (at_y, at_z) in enumerate(corners):
-        far_y, far_z = 1.0 - at_y, 1.0 - at_z
-        width, height, colour = abs(far_y - y), abs(far_z - z), f"C{index}"
-        corner = min(y, far_y), min(z, far_z)
-        axes.add_patch(Rectangle(corner, width, height, color=colour, alpha=0.3, lw=0.0))
-        weight = f"$W_{index + 1}$ = {width * height:.2f}"
-        axes.text(0.5 * (y + far_y), 0.5 * (z + far_z), weight, ha="center", va="center")
-        axes.plot(at_y, at_z, "o", color=colour, ms=9, clip_on=False)
-        axes.annotate(f"line {index + 1}", (at_y, at_z), (6, 6), textcoords="offset points", color=colour)
-    axes.plot(y, z, "k+", ms=14)
-    axes.annotate("tool", (y, z), (6, 4), textcoords="offset points")
-    axes.set(xlim=(-0.06, 1.2), ylim=(-0.06, 1.12), aspect="equal")
-    axes.set(xlabel="s, across in y", ylabel="t, across in z")
-    return figure
-
-
-def direction_figure() -> Figure:
-    """Show the direction of motion that the code gives a noisy axis: there, at rest, and back."""
-    threshold = 2.0
-    there = np.concatenate([np.linspace(0.0, 12.0, 60), np.full(60, 12.0), np.linspace(12.0, 3.0, 60)])
-    values = there + 0.3 * np.random.default_rng(1).standard_normal(len(there))
-    low, sense = follow(threshold, values)
-    figure = Figure(figsize=(7, 4), layout="constrained")
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
-    number, window = np.arange(len(values)), low
-    upper.fill_between(number, window, window + threshold, color=WITH, alpha=0.25, label="window")
-    upper.plot(values, color="black", lw=0.8, label="value, with noise")
-    upper.set(ylabel="µm")
-    upper.legend()
-    lower.step(number, sense, where="post", color=WITHOUT)
-    lower.set(xlabel="command", ylabel="direction", yticks=[-1, 0, 1])
-    return figure

@@ -227,7 +227,3 @@ class Temperatures:
     def at(self, name: str) -> float:
         """Return a temperature, °C, or the humidity."""
         return self.values.get(name, quantity_of(name).reference)
-
-    def above_reference(self, name: str) -> float:
-        """Return the difference to 20 °C, K, or to 50 %."""
-        return self.at(name) - quantity_of(name).reference

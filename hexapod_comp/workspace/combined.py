@@ -46,22 +46,12 @@ def root_sum_of_squares(vectors: np.ndarray) -> np.ndarray:
     return np.sqrt(np.stack([squares[:, :3].sum(axis=1), squares[:, 3:].max(axis=1)], axis=1))
 
 
-def covariance_vectors(rows: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return what a calibrated model's uncertainty does to the tool, as independent effects of one sigma each.
-
-    They stand where effects of single errors stand elsewhere: their :func:`root_sum_of_squares` is the RMS
-    error that is left after compensation at each pose, and :func:`monte_carlo` with normal deviates gives
-    percentiles. In contrast to :func:`hexapod_comp.calibration.posterior.expected_error`, pose by pose, and
-    with nothing taken away for the datum.
-    """
-    size = rows.shape[-1]
-    if covariance.shape != (size, size):
-        raise CalibrationError("covariance", f"must have shape ({size}, {size}), not {covariance.shape}")
-    return np.swapaxes(rows @ covariance_factor(covariance), 1, 2)
-
-
 def covariance_factor(covariance: np.ndarray) -> np.ndarray:
-    """Return A with A·Aᵀ = a covariance, shape (P, P)."""
+    """Return A with A·Aᵀ = a covariance, shape (P, P): independent errors of one sigma each.
+
+    What rows of derivatives make of them stands where effects of single errors stand elsewhere: its root sum of squares
+    is the RMS error that is left after compensation, and :func:`monte_carlo` with normal deviates gives percentiles.
+    """
     scale = np.sqrt(np.abs(np.diag(covariance)))
     scale = np.where(scale > 0.0, scale, 1.0)
     normalised = covariance / np.outer(scale, scale)  # parameters of µm and of rad/m in one matrix

@@ -268,8 +268,8 @@ def test_bad_temperatures_are_refused(name, value, message):
 
 
 def test_temperatures_not_heard_of_are_20_degrees():
-    assert Temperatures({"base": 22.5}).above_reference("base") == 2.5
-    assert Temperatures({"base": 22.5}).above_reference("platform") == 0.0
+    assert Temperatures({"base": 22.5}).at("base") == 22.5
+    assert Temperatures({"base": 22.5}).at("platform") == 20.0
 
 
 # What no model can be.
