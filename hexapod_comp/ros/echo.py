@@ -16,14 +16,13 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState, RelativeHumidity, Temperature, TimeReference
 from std_msgs.msg import Float64MultiArray
 
-from ..errors import HexapodError, printable
+from ..errors import CommandError, HexapodError, printable
 from ..machine.geometry import STRUT_NAMES
 from ..pose import Pose
-from .messages import nanoseconds_of
+from .messages import nanoseconds_of, read_message
 
 DISCOVERY_TIME = 3.0
 """How long a topic may take to be discovered, s; Fast DDS needs 0.1 to 1 s."""
@@ -187,15 +186,9 @@ class Echo:
             raise HexapodError(
                 f"{printable(topic)!r} is not a valid topic name: {str(error).partition(', at ')[0]}"
             ) from error
-        self._times: deque[float] = deque()
-        self._intervals = MessageIntervals()
+        self.intervals = MessageIntervals()  # times between the messages so far
         self._kind = _message_type(self._wait_for_type(spin_once))
         node.create_subscription(self._kind, self.topic, self._on_message, self._offered_qos(), raw=True)
-
-    @property
-    def intervals(self) -> MessageIntervals:
-        """Times between the messages so far."""
-        return self._intervals
 
     def _wait_for_type(self, spin_once: Callable[[float], None]) -> str:
         end = time.monotonic() + DISCOVERY_TIME
@@ -222,47 +215,48 @@ class Echo:
 
     def _on_message(self, data: bytes) -> None:
         came, now = time.monotonic(), self._node.get_clock().now().nanoseconds
-        message = deserialize_message(data, self._kind)
-        self._intervals.add(came)
-        self._times.append(came)
-        while came - self._times[0] > RATE_WINDOW:
-            self._times.popleft()
-        span = came - self._times[0]
-        stamp = nanoseconds_of(message.header.stamp) if hasattr(message, "header") else 0
-        self._receive(
-            EchoedMessage(
-                self.topic,
-                message_fields(self.topic, message),
-                stamp * 1e-9 if stamp else math.nan,
-                (now - stamp) * 1e-9 if stamp else math.nan,
-                (len(self._times) - 1) / span if span > 0.0 else math.nan,
-            )
-        )
+        self.intervals.add(came)
+        stamp = 0
+        try:
+            message = read_message(data, self._kind)
+            rows = message_fields(self.topic, message)
+            stamp = nanoseconds_of(message.header.stamp) if hasattr(message, "header") else 0
+        except CommandError as error:
+            rows = [MessageField("problem", str(error))]
+        seconds, age = (stamp * 1e-9, (now - stamp) * 1e-9) if stamp else (math.nan, math.nan)
+        self._receive(EchoedMessage(self.topic, rows, seconds, age, self.intervals.recent_rate))
 
 
 class MessageIntervals:
-    """Counts messages and the times between them, s."""
+    """Counts messages and the times between them, s: of all, and of those of the last :data:`RATE_WINDOW`."""
 
     def __init__(self) -> None:
         self.count = 0
         self.shortest, self.longest = math.inf, 0.0
-        self._first = self._last = math.nan
+        self._first = math.nan
+        self._recent: deque[float] = deque()
 
     def add(self, time: float) -> None:
         """Count a message that came at a time."""
-        if self.count == 0:
-            self._first = time
+        if self.count:
+            apart = time - self._recent[-1]
+            self.shortest, self.longest = min(self.shortest, apart), max(self.longest, apart)
         else:
-            self.shortest = min(self.shortest, time - self._last)
-            self.longest = max(self.longest, time - self._last)
-        self._last = time
+            self._first = time
         self.count += 1
+        self._recent.append(time)
+        while time - self._recent[0] > RATE_WINDOW:
+            self._recent.popleft()
 
     @property
     def rate(self) -> float:
         """Mean rate, Hz; NaN for fewer than two messages."""
-        span = self._last - self._first
-        return (self.count - 1) / span if span > 0.0 else math.nan
+        return _rate(self.count, self._recent[-1] - self._first) if self.count else math.nan
+
+    @property
+    def recent_rate(self) -> float:
+        """The same of the last messages."""
+        return _rate(len(self._recent), self._recent[-1] - self._recent[0]) if self.count else math.nan
 
     def text(self) -> str:
         """Return it for people, as ``ros2 topic hz`` does."""
@@ -275,6 +269,10 @@ class MessageIntervals:
         """Return it for programs."""
         apart = {"shortest_ms": self.shortest * 1e3, "longest_ms": self.longest * 1e3}
         return {"messages": self.count, "rate_hz": self.rate, **(apart if self.count > 1 else {})}
+
+
+def _rate(count: int, span: float) -> float:
+    return (count - 1) / span if span > 0.0 else math.nan
 
 
 def published_topics(node: Node) -> dict[str, str]:

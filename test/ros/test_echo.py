@@ -88,6 +88,41 @@ def test_rates_are_of_the_intervals():
     assert intervals.text() == "messages: 3, 5.00 Hz, 100.0 to 300.0 ms apart"
 
 
+def test_the_rate_is_of_the_last_messages_and_the_mean_of_all():
+    """Ten a second for 5 s, then two a second: the last 2 s have five messages."""
+    intervals = MessageIntervals()
+    assert math.isnan(intervals.recent_rate)
+    for time in [0.1 * n for n in range(51)] + [5.0 + 0.5 * n for n in range(1, 7)]:
+        intervals.add(time)
+    assert intervals.recent_rate == pytest.approx(2.0)
+    assert intervals.rate == pytest.approx(56 / 8.0)
+
+
+def test_what_cannot_be_read_is_said_and_does_not_end_it(ros_context):
+    """Bytes of none of the type, and a text of 1 MB: each is a message all the same."""
+    import rclpy
+    from rclpy.serialization import serialize_message
+
+    from hexapod_comp.ros.echo import Echo
+
+    node, received = rclpy.create_node("echoing", context=ros_context), []
+    node.create_publisher(String, "said", 1)
+    try:
+        echo = Echo(node, lambda seconds: None, "said", received.append)
+        for data in (
+            b"\x00",
+            bytes(serialize_message(String(data="x" * 1_000_000))),
+            serialize_message(String(data="x")),
+        ):
+            echo._on_message(bytes(data))
+    finally:
+        node.destroy_node()
+    assert "cannot be read" in received[0].text()
+    assert "must not have more than 262144 bytes" in received[1].record()["problem"]
+    assert received[2].record()["data"] == "x"
+    assert echo.intervals.count == 3
+
+
 @pytest.mark.parametrize("latched", [False, True], ids=["best_effort", "latched"])
 def test_the_verb_prints_what_is_published(ros_context, capfd, latched):
     """Best effort or latched: the subscription follows what is offered, or nothing would come."""
