@@ -9,10 +9,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import FittedParameters
 from hexapod_comp.calibration.posterior_file import save_with_posterior
@@ -63,6 +65,22 @@ def virtual_machine(seed: int, bounds: ImperfectionBounds = BOUNDS) -> RealMachi
 def measured(truth: RealMachine, plan: Campaign, seed: int) -> MeasurementSet:
     """Return what instruments read on a machine."""
     return measure(template(plan, truth.geometry), plan, truth, seed)
+
+
+class Fitted(NamedTuple):
+    """A machine, its model, and what the fit knows."""
+
+    truth: MachineModel
+    model: MachineModel
+    known: FittedParameters
+
+
+@cache
+def fitted(poses: int = 0) -> Fitted:
+    """Return a machine measured by 5-D lines, four diagonals and so many of a tracker's poses, and fitted."""
+    truth = virtual_machine(5)
+    fit = fit_model(measured(truth, campaign(poses=poses, tilt=np.radians(10.0)), 5), FEW)
+    return Fitted(truth.model, fit.model, FittedParameters.of(fit))
 
 
 def true_parameters(space: ParameterSpace, truth: MachineModel) -> np.ndarray:

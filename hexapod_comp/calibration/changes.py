@@ -8,11 +8,11 @@ densities is its Bayes factor. Each change has several scales s, equally likely:
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from ..errors import CalibrationError
 from ..machine.geometry import STRUT_NAMES
@@ -50,6 +50,7 @@ class Change:
     group: str = ""  # changes of a kind that are alike; all groups of a kind are equally likely beforehand
 
 
+@cache
 def _scales(ends: tuple[float, float], ratio: float = 10.0**0.5) -> np.ndarray:
     """Return scales between two ends, `ratio` apart: half a decade."""
     return np.geomspace(*ends, round(np.log(ends[1] / ends[0]) / np.log(ratio)) + 1)
@@ -167,18 +168,6 @@ class CheckReadings:
         residuals = seen @ linear.target - rows @ fitted.x
         return CheckReadings(residuals, rows, (seen * sigma**2) @ seen.T, seen * sigma, names, seen)
 
-    def part(self, contrasts: np.ndarray) -> CheckReadings:
-        """Return what some combinations of the places tell, shape (k, places), orthonormal and free of unknowns."""
-        kept, used = contrasts @ self.seen.T, np.flatnonzero(contrasts.any(axis=0))
-        return CheckReadings(
-            residuals=kept @ self.residuals,
-            rows=kept @ self.rows,
-            noise=kept @ self.noise @ kept.T,
-            single=kept @ self.single[:, used],
-            names=tuple(self.names[n] for n in used),
-            seen=kept @ self.seen[:, used],
-        )
-
     def covariance(self, of_parameters: np.ndarray) -> np.ndarray:
         """Return the readings' covariance when the parameters have one, shape (n, n)."""
         return self.noise + self.rows @ of_parameters @ self.rows.T
@@ -192,9 +181,14 @@ class CheckReadings:
         """Yield what may have happened with its effect (n, k): changes, one wrong reading, or more scatter in all."""
         for change in changes:
             yield change, self.rows @ change.columns
-        for name, column in zip(self.names, self.single.T, strict=True):
-            yield Change(READING, name, _scales(ASSUMED.wrong_reading)), column[:, None]
-        yield Change(OTHER, "each reading by itself", _scales(ASSUMED.scattered), group="scatter"), self.single
+        yield from wrong_readings(self.single, self.names)
+
+
+def wrong_readings(single: np.ndarray, names: Sequence[str]) -> Iterator[tuple[Change, np.ndarray]]:
+    """Yield that one of some readings is wrong, or all scatter, by the effect (n, places) of a standard deviation."""
+    for name, column in zip(names, single.T, strict=True):
+        yield Change(READING, name, _scales(ASSUMED.wrong_reading)), column[:, None]
+    yield Change(OTHER, "each reading by itself", _scales(ASSUMED.scattered), group="scatter"), single
 
 
 @dataclass(frozen=True)
@@ -208,7 +202,7 @@ class Hypothesis:
     log_prior: float = 0.0  # of each of its scales
 
     @staticmethod
-    def of(change: Change, effect: np.ndarray) -> Hypothesis:
+    def of(change: Change, effect: np.ndarray, log_prior: float = 0.0) -> Hypothesis:
         """Return a change with its effect (n, k) on whitened readings."""
         if effect.shape[1] == 1:  # most of them: no need to decompose
             gains = np.linalg.norm(effect, axis=0)
@@ -217,7 +211,7 @@ class Hypothesis:
             directions, gains, _ = np.linalg.svd(effect, full_matrices=False)
         felt = gains > ROUNDING * max(gains.max(initial=0.0), 1.0)
         least = float(gains.min(initial=np.inf)) if felt.sum() == effect.shape[1] else 0.0
-        return Hypothesis(change, directions[:, felt], gains[felt], least)
+        return Hypothesis(change, directions[:, felt], gains[felt], least, log_prior)
 
     def log_bayes_factors(self, z: np.ndarray) -> np.ndarray:
         """Return log evidence over that of no change for whitened readings (N, n), scale by scale: (N, m)."""
@@ -233,17 +227,16 @@ class Evidence:
     scales of each: else a bend would count for little beside all joints and screws.
     """
 
-    def __init__(self, covariance: np.ndarray, effects: Iterator[tuple[Change, np.ndarray]]) -> None:
-        self._whitening = solve_triangular(np.linalg.cholesky(covariance), np.eye(len(covariance)), lower=True)
-        seen = [Hypothesis.of(change, self._whitening @ effect) for change, effect in effects]
-        groups = Counter((h.change.family, h.change.group) for h in seen)
+    def __init__(self, covariance: np.ndarray, effects: Iterable[tuple[Change, np.ndarray]]) -> None:
+        self._whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+        self.hypotheses, effects = [], list(effects)
+        groups = Counter((change.family, change.group) for change, _ in effects)
         in_kind = Counter(family for family, _ in groups)
         odds = dict(zip(FAMILIES, ASSUMED.prior_odds, strict=True))
-        self.hypotheses = []
-        for h in seen:
-            family, group = h.change.family, h.change.group
-            share = odds[family] / (sum(odds.values()) * in_kind[family] * groups[family, group] * len(h.change.scales))
-            self.hypotheses.append(replace(h, log_prior=float(np.log(share))))
+        for change, effect in effects:
+            alike = in_kind[change.family] * groups[change.family, change.group] * len(change.scales)
+            log_prior = float(np.log(odds[change.family] / sum(odds.values()) / alike))
+            self.hypotheses.append(Hypothesis.of(change, self._whitening @ effect, log_prior))
 
     def log_weights(self, readings: np.ndarray) -> list[np.ndarray]:
         """Return the log weight of each hypothesis over that of no change for sets of readings (N, n): (N, m) each."""

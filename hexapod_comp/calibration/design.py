@@ -142,8 +142,8 @@ class ErrorLeft:
         gains = np.zeros(len(self.parts))
         for n, (part, gram) in enumerate(zip(self.parts, self.grams, strict=True)):
             if len(gram) and (allowed is None or allowed[n]):
-                half = solve_triangular(cholesky(np.eye(len(gram)) + gram, lower=True), self.shown[part], lower=True)
-                gains[n] = (half * half).sum()
+                shown = self.shown[part]
+                gains[n] = np.vdot(shown, np.linalg.solve(np.eye(len(gram)) + gram, shown))
         return gains
 
     def take(self, n: int) -> None:

@@ -19,7 +19,7 @@ from ..machine.passes import Poses
 from ..measurements.readings import ABSOLUTE_KINDS, BACKWARD, CHANNELS, KINDS, MeasurementSet
 from ..workspace.combined import NORMAL, covariance_factor, monte_carlo, root_sum_of_squares
 from .assumptions import ASSUMED
-from .changes import STRUT, TEMPERATURE, CheckReadings, Evidence, Explanation, possible_changes, widened
+from .changes import STRUT, TEMPERATURE, CheckReadings, Evidence, Explanation, possible_changes, widened, wrong_readings
 from .design import ErrorLeft, Greedy, information, laid_out
 from .posterior import POINTS, ErrorPredictor, FittedParameters
 
@@ -98,41 +98,46 @@ class Detectability:
 
     def __init__(self, fitted: FittedParameters, readings: MeasurementSet, contrasts: Sequence[np.ndarray]) -> None:
         wide = widened(fitted)
-        self.changes = possible_changes(wide.space, [block.name for block in fitted.space.blocks])
-        self.covariance, self.check, self.contrasts = wide.covariance, CheckReadings.of(wide, readings), contrasts
-        self.taken = np.zeros((0, len(readings)))
+        changes = possible_changes(wide.space, [block.name for block in fitted.space.blocks])
+        check, every = CheckReadings.of(wide, readings), np.vstack(contrasts)
+        numbers = every @ check.seen.T
+        self.of_candidate = np.split(np.arange(len(every)), np.cumsum([len(rows) for rows in contrasts])[:-1])
+        self.single, self.read = numbers @ check.single, every != 0.0
+        self.covariance = numbers @ check.covariance(wide.covariance) @ numbers.T
+        self.effects = [(c, numbers @ (check.rows @ c.columns)) for c in changes]
         sizes = {(STRUT, name): ASSUMED.crash for name in STRUT_NAMES} | {(TEMPERATURE, "struts"): ASSUMED.warmth}
-        wanted = [c for c in self.changes if (c.family, c.name) in sizes and c.columns is not None]
-        self.wanted = [(c.family, c.name) for c in wanted]
-        self.moved = np.array([sizes[c.family, c.name] * c.columns[:, 0] for c in wanted if c.columns is not None])
+        self.wanted = [(c.family, c.name) for c in changes if (c.family, c.name) in sizes]
+        self.moved = [sizes[c.family, c.name] * e[:, 0] for c, e in self.effects if (c.family, c.name) in sizes]
+        self.taken = np.zeros(0, dtype=int)
         self.now = self._value(self.taken)
 
     def gains(self, allowed: np.ndarray) -> np.ndarray:
         """Return by how much the log odds rise with each allowed candidate."""
         tries = [
-            self._value(np.vstack([self.taken, rows])) if ok else self.now
-            for rows, ok in zip(self.contrasts, allowed, strict=True)
+            self._value(np.concatenate([self.taken, numbers])) if ok else self.now
+            for numbers, ok in zip(self.of_candidate, allowed, strict=True)
         ]
         return np.array(tries) - self.now
 
     def take(self, n: int) -> None:
         """Read a candidate."""
-        self.taken = np.vstack([self.taken, self.contrasts[n]])
+        self.taken = np.concatenate([self.taken, self.of_candidate[n]])
         self.now = self._value(self.taken)
 
-    def _value(self, contrasts: np.ndarray) -> float:
-        check = self.check.part(contrasts)
-        evidence = Evidence(check.covariance(self.covariance), check.effects(self.changes))
-        log_sum = np.logaddexp.reduce
-        weights = np.array([log_sum(w, axis=1) for w in evidence.log_weights(self.moved @ check.rows.T)])
-        seen = [(h.change.family, h.change.name) for h in evidence.hypotheses]
+    def _value(self, chosen: np.ndarray) -> float:
+        """Return the log odds with some of all contrasts."""
+        single = self.single[chosen][:, self.read[chosen].any(axis=0)]
+        effects = [(change, effect[chosen]) for change, effect in self.effects]
+        effects += wrong_readings(single, [""] * single.shape[1])
+        evidence, log_sum = Evidence(self.covariance[np.ix_(chosen, chosen)], effects), np.logaddexp.reduce
+        of_scales = evidence.log_weights(np.array(self.moved)[:, chosen])
+        weights = np.array([log_sum(w, axis=1) for w in of_scales])
+        seen = [(change.family, change.name) for change, _ in effects]
         # Several struts at once are neither the right strut nor another one; any temperature is a temperature.
         right = np.array([[a == b or a[0] == b[0] == TEMPERATURE for b in self.wanted] for a in seen])
         wrong = np.array([[a[0] != b[0] or (a != b and a[1] in STRUT_NAMES) for b in self.wanted] for a in seen])
-        against = log_sum(np.where(wrong, weights, -np.inf), axis=0) - log_sum(
-            np.where(right, weights, -np.inf), axis=0
-        )
-        return -float(log_sum(against))
+        for_it, against = (log_sum(np.where(of, weights, -np.inf), axis=0) for of in (right, wrong))
+        return -float(log_sum(against - for_it))
 
 
 def propose_check(

@@ -6,12 +6,11 @@ deviations that the check itself states.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_helpers import BOX, FEW, campaign, measured, paper, virtual_machine
+from calibration_helpers import BOX, campaign, fitted, measured, paper
 from scipy.stats import multivariate_normal
 
 from hexapod_comp.calibration.changes import (
@@ -39,33 +38,14 @@ from hexapod_comp.calibration.check import (
 )
 from hexapod_comp.calibration.check_report import verification_json, verification_report
 from hexapod_comp.calibration.evaluation import held_out
-from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.follow_up import propose_check
-from hexapod_comp.calibration.posterior import FittedParameters
 from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.model import MachineModel, RealMachine, tool_move
 from hexapod_comp.machine.region import Region
-from hexapod_comp.measurements.readings import CHANNELS, FORWARD, MeasurementSet
+from hexapod_comp.measurements.readings import CHANNELS, FORWARD, KINDS, MeasurementSet
 from hexapod_comp.virtual.instruments import compensated, measure
 
 RUNS = ("diagonal 1", "diagonal 2", "diagonal 4", "x line at y 0.0, z 350.0", "y line at x 0.0, z 350.0")
-
-
-@dataclass(frozen=True)
-class Fitted:
-    """A machine, its model, and what the fit knows."""
-
-    truth: MachineModel
-    model: MachineModel
-    known: FittedParameters
-
-
-@cache
-def fitted() -> Fitted:
-    """Return a machine measured by 5-D lines and four diagonals, and fitted."""
-    truth = virtual_machine(5)
-    fit = fit_model(measured(truth, campaign(), 5), FEW)
-    return Fitted(truth.model, fit.model, FittedParameters.of(fit))
 
 
 def check(truth: MachineModel, seed: int = 9, places: str = "ends") -> MeasurementSet:
@@ -105,6 +85,27 @@ def test_twelve_proposed_readings_name_the_strut() -> None:
     assert (result.verdict, result.candidates[0].family, result.candidates[0].name) == (NAMED, STRUT, "strut_3")
     with pytest.raises(CalibrationError, match=r"readings: must be 6…60, not 5"):
         propose_check(fitted().known, 5)
+
+
+@pytest.mark.parametrize("instruments", [("straightness",), ("tracker",), ("tracker_6d",)])
+def test_other_instruments_propose_what_shows_the_struts(instruments: tuple[str, ...]) -> None:
+    """Straightnesses come by threes, for their slope is unknown; poses are whole. A change is seen where stated."""
+    proposed = propose_check(fitted().known, 15, instruments)
+    kinds = {CHANNELS[channel].partition("_")[0] for channel in proposed.channel}
+    wanted = {
+        "straightness": {"straightness"},
+        "tracker": {"position"},
+        "tracker_6d": {"position", "attitude"},
+    }
+    assert kinds == wanted[instruments[0]]
+    assert 12 <= len(proposed) <= 15
+    of_channel = np.stack([proposed.run, proposed.channel], axis=1)[proposed.kind == KINDS.index("straightness")]
+    assert set(np.unique(of_channel, axis=0, return_counts=True)[1]) <= {3}
+    same = measure(proposed, campaign(), RealMachine(paper(), fitted().truth), 9)
+    unchanged = verify_model(fitted().model, fitted().known, same)
+    assert unchanged.verdict == VALID
+    moved = measure(proposed, campaign(), RealMachine(paper(), crashed(2, 1.5 * unchanged.visible[STRUT])), 9)
+    assert verify_model(fitted().model, fitted().known, moved).verdict != VALID
 
 
 def test_evidence_is_the_ratio_of_two_normal_densities() -> None:

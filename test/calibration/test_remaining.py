@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from hexapod_comp.calibration.design import information
-from hexapod_comp.calibration.fit import fit_model
 from hexapod_comp.calibration.follow_up import Remaining, measurable, remaining
 from hexapod_comp.calibration.posterior import POINTS, ErrorPredictor, FittedParameters
 from hexapod_comp.machine.model import RealMachine
@@ -20,7 +19,7 @@ from hexapod_comp.machine.passes import Poses
 from hexapod_comp.measurements.campaign import template
 from hexapod_comp.pose import rotation_from_angles
 
-Fitted = tuple[RealMachine, FittedParameters]
+Known = tuple[RealMachine, FittedParameters]
 
 TRACKER = "tracker, 20 poses, tilted up to 10°"
 
@@ -32,20 +31,19 @@ def tilted() -> Poses:
     return rng.uniform(*small.BOX, (200, 3)), rotation_from_angles(angles)
 
 
-def fitted(campaign_poses: int = 0) -> Fitted:
-    """Fit machine B to a 5-D laser's lines, with so many of a tracker's poses."""
-    plan = small.campaign(poses=campaign_poses, tilt=np.radians(10.0))
-    fit = fit_model(small.measured(small.virtual_machine(4), plan, 4), small.FEW)
-    return RealMachine(small.paper(), fit.model), FittedParameters.of(fit)
+def fitted(poses: int = 0) -> Known:
+    """Return a machine fitted to a 5-D laser's lines, with so many of a tracker's poses."""
+    of_lines = small.fitted(poses)
+    return RealMachine(small.paper(), of_lines.model), of_lines.known
 
 
 @pytest.fixture(scope="module")
-def lines() -> Fitted:
+def lines() -> Known:
     return fitted()
 
 
 @pytest.fixture(scope="module")
-def result(lines: Fitted) -> Remaining:
+def result(lines: Known) -> Remaining:
     return remaining(*lines, tilted(), "tilted")
 
 
@@ -62,7 +60,7 @@ def test_the_measurement_that_is_recommended_does_what_is_foretold(result: Remai
     assert again.left[1].rms[0] == pytest.approx(foretold, rel=0.25)
 
 
-def test_what_is_left_is_what_the_prediction_knows(lines: Fitted, result: Remaining) -> None:
+def test_what_is_left_is_what_the_prediction_knows(lines: Known, result: Remaining) -> None:
     """Standard deviations that :mod:`test_prediction` draws; RMS over poses. A drawn machine's worst is beyond."""
     poses = tilted()
     standing, aligned = ErrorPredictor(*lines).predict(poses)
@@ -75,7 +73,7 @@ def test_what_is_left_is_what_the_prediction_knows(lines: Fitted, result: Remain
         assert part.rms[0] < part.worst < part.most < 10.0 * part.worst
 
 
-def test_known_and_measured_are_the_textbooks(lines: Fitted, result: Remaining) -> None:
+def test_known_and_measured_are_the_textbooks(lines: Known, result: Remaining) -> None:
     """Known: the conditional covariance. Measured: the inverse of the sum of both informations. In SI units."""
     machine, parameters = lines
     sigma = parameters.covariance
@@ -105,7 +103,7 @@ def test_nothing_that_is_measured_makes_it_worse(result: Remaining) -> None:
     assert len({share.name for share in result.measurements}) == len(result.measurements) == 3 * 4 + 1 + 2
 
 
-def test_readings_lose_what_their_instrument_does_not_know(lines: Fitted) -> None:
+def test_readings_lose_what_their_instrument_does_not_know(lines: Known) -> None:
     """A laser's zero: an offset that is the same on all of a line's readings is not seen, so the rows' sum is zero."""
     readings = template(replace(small.campaign("1-D", 0), cycles=1), small.paper())
     parameters = lines[1]
