@@ -31,7 +31,7 @@ from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.measurements.campaign import load_campaign, template
 from hexapod_comp.measurements.readings import MeasurementSet
-from hexapod_comp.measurements.writing import write_measurements
+from hexapod_comp.measurements.tidy import write_measurements
 from hexapod_comp.virtual.instruments import measure
 from hexapod_comp.virtual.named import find_model
 

@@ -19,7 +19,7 @@ from data import client
 
 import hexapod_comp as hc
 from hexapod_comp.measurements.campaign import template
-from hexapod_comp.measurements.writing import write_measurements
+from hexapod_comp.measurements.tidy import write_measurements
 from hexapod_comp.virtual.instruments import measure
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -18,20 +18,20 @@ from ..formats.paths import input_file, version
 from ..formats.texts import number
 from ..formats.yaml import read_yaml
 from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
-from ..measurements.iso230 import PositioningTest
-from ..measurements.iso230_circles import CircularTest
-from ..measurements.readings import ANGULAR_KINDS
-from ..measurements.standards import (
+from ..measurements.iso230 import (
     AXES_STANDARD,
     CIRCLE_COLUMNS,
     CIRCLES_STANDARD,
     COLUMNS,
     DIAGONALS_STANDARD,
+    CircularTest,
     Judged,
+    PositioningTest,
     judge,
     largest,
     notes_of,
 )
+from ..measurements.readings import ANGULAR_KINDS
 from ..workspace.overview import corners
 from .fit import ModelFit
 from .observations import Cells

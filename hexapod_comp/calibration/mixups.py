@@ -27,8 +27,8 @@ from ..machine.geometry import HexapodGeometry, load_geometry
 from ..machine.kinematics import Structure, strut_lengths_batch
 from ..machine.model import MachineModel
 from ..machine.passes import Passes
-from ..measurements.reach import GEOMETRIES
 from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, KINDS, LINE_KINDS, MeasurementSet, Run
+from ..measurements.runs import GEOMETRIES
 from ..pose import angles_from_rotation
 from ..virtual.instruments import compensated
 from .assumptions import ASSUMED

@@ -29,8 +29,8 @@ from ..machine.geometry import load_geometry
 from ..machine.model import MachineModel, RealMachine
 from ..machine.region import region_json, region_text
 from ..measurements.files import read_measurements
+from ..measurements.iso230 import judge, standards_json, standards_text
 from ..measurements.readings import MeasurementSet, spans
-from ..measurements.standards import judge, standards_json, standards_text
 from ..pose import Pose
 from ..virtual.named import find_model
 from . import common

@@ -7,7 +7,7 @@ import argparse
 from ..errors import CalibrationError
 from ..machine.geometry import load_geometry
 from ..measurements.files import read_measurements
-from ..measurements.standards import every_target, judge, standards_json, standards_text
+from ..measurements.iso230 import every_target, judge, standards_json, standards_text
 from . import common
 
 

@@ -12,7 +12,7 @@ from ..machine.model import RealMachine
 from ..machine.temperatures import PARTS
 from ..measurements.campaign import template
 from ..measurements.readings import ANGULAR_KINDS, KINDS, MeasurementSet
-from ..measurements.writing import write_measurements
+from ..measurements.tidy import write_measurements
 from ..virtual.instruments import compensated, measure
 from ..virtual.named import find_model, truth_name
 from ..virtual.warm_up import growing, load_warm_up

@@ -18,7 +18,7 @@ from ..machine.model import MachineModel
 from ..machine.model_file import load_model
 from ..measurements.files import read_measurements
 from ..measurements.readings import MeasurementSet
-from ..measurements.writing import write_measurements
+from ..measurements.tidy import write_measurements
 from ..virtual.instruments import compensated
 from . import common
 

@@ -14,7 +14,7 @@ from ..formats.paths import config_file, input_file
 from ..machine.geometry import HexapodGeometry
 from .readings import MeasurementSet
 from .runs import joined
-from .tidy_csv import read_tidy
+from .tidy import read_tidy
 from .wide_csv import read_wide
 
 

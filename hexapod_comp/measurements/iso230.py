@@ -1,19 +1,30 @@
-"""Figures of ISO 230-2:2014 for positioning along one line: targets approached again and again, from both sides.
+"""Figures of ISO 230-2:2014, 230-4:2005 and 230-6:2002, and which of measured runs each standard judges.
 
-Up (↑) is the approach in the positive direction. A deviation is the position reached minus the target. The
-symbols of the standard stand beside each figure; the formulas are those of its clause 3. ISO 230-6:2002 judges
-diagonals by the same formulas.
+Positioning along one line (230-2; 230-6 judges diagonals by the same formulas): targets approached again and again,
+from both sides. Up (↑) is the approach in the positive direction. A deviation is the position reached minus the target.
+The symbols of the standard stand beside each figure; the formulas are those of its clause 3.
+
+A circle run in both senses (230-4): how round the path is, how large, and how the two differ. A radial deviation is the
+radius reached minus the nominal one, positive outwards. What stands off the middle of an instrument is no error of the
+machine: each figure has its own centre, which is the standard's.
+
+Lines along an axis of the work frame come under ISO 230-2, lines across the axes under ISO 230-6, lengths from the
+middle of a circle, as of a ball bar, under ISO 230-4.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.optimize import linprog
 
 from ..errors import ModelError
+from ..formats.texts import aligned, number
+from .readings import BACKWARD, CHANNELS, FORWARD, LEAST_TRAVEL, LENGTH, MeasurementSet
 
 DIRECTIONS = ("up", "down")
 """Approach in the positive direction, and in the negative."""
@@ -302,3 +313,382 @@ def _figure_lines(test: PositioningTest) -> list[str]:
 def _micrometres(value: float) -> str:
     """Return a length in µm, ten characters wide, never −0."""
     return f"{round(value * 1e6, 3) + 0.0:10.3f}"
+
+
+SENSES = {"ccw": FORWARD, "cw": BACKWARD}
+"""Counter-clockwise and clockwise, seen against the circle's axis."""
+
+FEWEST = 5
+"""Readings of one sense below which a circle of its own and a deviation from it cannot be told apart: it has three
+unknowns."""
+
+FULL = np.radians(45.0)
+"""A circle without a larger gap between its readings is a full one."""
+
+SHORTEST = np.radians(90.0)
+"""A shorter arc tells no centre."""
+
+ROUNDS, SETTLED = 5, 1e-9
+"""Most times that a centre is moved, radii taken as linear in its shift; a shorter shift, m, ends it."""
+
+
+@dataclass(frozen=True, eq=False)
+class CircularTest:
+    """A circular test with its figures, as :func:`evaluate_circle` returns it."""
+
+    radius: float  # of the nominal path, m
+    readings: dict[str, int]  # how many in each sense that was run, by :data:`SENSES`
+    # by the standard's symbols, m: ``G_ccw`` and ``G_cw``, circular deviations; ``G_b``, the bidirectional one;
+    # ``F_max_ccw``, ``F_min_ccw`` and so on, radial deviations; ``D``, the mean bidirectional radial deviation. What
+    # the test cannot tell is left out.
+    figures: dict[str, float]
+    notes: tuple[str, ...]  # where the test departs from the standard's: one sentence each
+
+
+def evaluate_circle(
+    radius: float, angles: np.ndarray, deviations: np.ndarray, senses: np.ndarray, length_known: bool = True
+) -> CircularTest:
+    """Return the figures of ISO 230-4:2005 for one circle.
+
+    G is the least distance of two concentric circles with the whole path between them; for G(b) with both paths. F is
+    taken about the centre of the least-squares circle of its own path, D is by how much the radius of the
+    least-squares circle of both paths together exceeds the nominal one.
+    """
+    path = _checked(radius, angles, deviations, senses)
+    parts = {name: [column[path[2] == sense] for column in path[:2]] for name, sense in SENSES.items()}
+    parts = {name: part for name, part in parts.items() if len(part[0])}
+    figures = {f"G_{name}": _separation(radius, *part) for name, part in parts.items()}
+    if len(parts) == 2:
+        figures["G_b"] = _separation(radius, *path[:2])
+    full = all(_largest_gap(part[0]) <= FULL for part in parts.values())
+    if full and length_known:
+        for name, part in parts.items():
+            radial = _from_least_squares_centre(radius, *part)
+            figures |= {f"F_max_{name}": float(radial.max()), f"F_min_{name}": float(radial.min())}
+        if len(parts) == 2:
+            figures["D"] = float(_from_least_squares_centre(radius, *path[:2]).mean())
+    return CircularTest(radius, {n: len(p[0]) for n, p in parts.items()}, figures, _notes(parts, full, length_known))
+
+
+def _checked(
+    radius: float, angles: np.ndarray, deviations: np.ndarray, senses: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return angles, deviations and senses as arrays that can be judged."""
+    columns = [np.asarray(values, dtype=float) for values in (angles, deviations, senses)]
+    if columns[0].ndim != 1 or any(column.shape != columns[0].shape for column in columns):
+        problem = "angles, deviations and senses must be lists of one length"
+        raise ModelError("circle", problem, [column.shape for column in columns])
+    if not (np.isfinite(radius) and radius > 0.0):
+        raise ModelError("radius", "must be finite and above zero, m", radius)
+    for name, column in zip(("angles", "deviations"), columns, strict=False):
+        if not np.isfinite(column).all():
+            raise ModelError(name, "must be finite", float(column[~np.isfinite(column)][0]))
+    wrong = ~np.isin(columns[2], list(SENSES.values()))
+    if wrong.any():
+        raise ModelError("senses", f"must be {FORWARD} or {BACKWARD}", float(columns[2][wrong][0]))
+    for name, sense in SENSES.items():
+        members = columns[0][columns[2] == sense]
+        if 0 < len(members) < FEWEST or not len(columns[0]):
+            raise ModelError(f"circle, {name}", f"needs at least {FEWEST} readings", len(members))
+        if len(members) and 2.0 * np.pi - _largest_gap(members) < SHORTEST:
+            raise ModelError(f"circle, {name}", f"readings must span at least {np.degrees(SHORTEST):g}°")
+    return columns[0], columns[1], columns[2]
+
+
+def _largest_gap(angles: np.ndarray) -> float:
+    """Return the largest angle without a reading, rad."""
+    turned = np.sort(np.mod(angles, 2.0 * np.pi))
+    return float(np.diff(turned, append=turned[0] + 2.0 * np.pi).max())
+
+
+def _seen_from(
+    centre: np.ndarray, radius: float, angles: np.ndarray, deviations: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return radial deviations if the instrument stood at a centre, (n,), m, and unit vectors from there, (n, 2)."""
+    arms = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1) - centre
+    distances = np.linalg.norm(arms, axis=1)
+    return radius + deviations - distances, arms / distances[:, None]
+
+
+def _separation(radius: float, angles: np.ndarray, deviations: np.ndarray) -> float:
+    """Return the least radial distance of two concentric circles with all readings between them, m."""
+    centre = np.zeros(2)
+    for _ in range(ROUNDS):
+        radial, away = _seen_from(centre, radius, angles, deviations)
+        # Of inner and outer deviation and the centre's shift: the distance of the first two, all readings between.
+        scale = max(float(np.ptp(radial)), np.finfo(float).tiny)
+        ones, zeros = np.ones((len(radial), 1)), np.zeros((len(radial), 1))
+        bounds = np.vstack([np.hstack([ones, zeros, -away]), np.hstack([zeros, -ones, away])])
+        offset = (radial - radial.mean()) / scale
+        answer = linprog([-1.0, 1.0, 0.0, 0.0], bounds, np.concatenate([offset, -offset]), bounds=(None, None))
+        shift = scale * answer.x[2:]
+        centre = centre + shift
+        if np.linalg.norm(shift) < SETTLED:
+            break
+    return float(np.ptp(_seen_from(centre, radius, angles, deviations)[0]))
+
+
+def _from_least_squares_centre(radius: float, angles: np.ndarray, deviations: np.ndarray) -> np.ndarray:
+    """Return radial deviations seen from the centre of the least-squares circle, shape (n,), m."""
+    centre = np.zeros(2)
+    for _ in range(ROUNDS):
+        radial, away = _seen_from(centre, radius, angles, deviations)
+        columns = np.hstack([np.ones((len(radial), 1)), -away])
+        centre = centre + np.linalg.lstsq(columns, radial, rcond=None)[0][1:]
+    return _seen_from(centre, radius, angles, deviations)[0]
+
+
+def _notes(parts: dict[str, list[np.ndarray]], full: bool, length_known: bool) -> tuple[str, ...]:
+    """Return where a test departs from the standard's."""
+    notes = []
+    if len(parts) < 2:
+        notes.append(f"run {next(iter(parts))} only: no G(b), no D; the standard's test runs both senses")
+    if not full:
+        notes.append("no full circle: F and D need one, and G of an arc is smaller")
+    if full and not length_known:
+        notes.append("the instrument's length is not calibrated: no F, no D")
+    return tuple(notes)
+
+
+AXES_STANDARD, DIAGONALS_STANDARD, CIRCLES_STANDARD = "ISO 230-2:2014", "ISO 230-6:2002", "ISO 230-4:2005"
+
+ALONG = 1e-6
+"""A line whose direction has a component below this does not travel along that axis."""
+
+OFF_THE_MIDDLE = 0.01
+"""A length's centre further than this, m, from a circle's is no ball bar's: it is known to some millimetres."""
+
+BODY, FACE = "body", "face"
+
+LINEAR = CHANNELS.index("linear")
+
+COLUMNS = {"A": "A", "E": "E", "R": "R", "M": "M", "B": "B", "B_mean": "B̄"}
+"""Figures of both directions together, and how they are printed."""
+
+CIRCLE_COLUMNS = {
+    "G_ccw": "G ↺",
+    "G_cw": "G ↻",
+    "G_b": "G(b)",
+    "F_max_ccw": "Fmax ↺",
+    "F_min_ccw": "Fmin ↺",
+    "F_max_cw": "Fmax ↻",
+    "F_min_cw": "Fmin ↻",
+    "D": "D",
+}
+"""Figures of a circle, and how they are printed."""
+
+
+@dataclass(frozen=True)
+class LinearRun:
+    """A linear run as ISO 230-2 and 230-6 want it."""
+
+    name: str  # of the run
+    axes: tuple[int, ...]  # along which axes of the work frame it travels: one, or more for a diagonal
+    targets: np.ndarray  # (m,): commanded coordinates along the line, rising, m
+    deviations: np.ndarray  # (2, cycles, m): readings, forward and backward, m
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Figures of all runs that a standard judges, by the runs' names."""
+
+    axes: dict[str, PositioningTest]  # lines along an axis: ISO 230-2
+    diagonals: dict[str, dict[str, PositioningTest]]  # ``body`` and ``face`` diagonals: ISO 230-6
+    circles: dict[str, CircularTest]  # ISO 230-4
+
+    def __bool__(self) -> bool:
+        return bool(self.axes or self.diagonals or self.circles)
+
+
+def judge(measurements: MeasurementSet) -> Judged:
+    """Return the figures of the runs that a standard can judge: the others are left out."""
+    axes: dict[str, PositioningTest] = {}
+    diagonals: dict[str, dict[str, PositioningTest]] = {}
+    for run in linear_runs(measurements):
+        kind = None if len(run.axes) == 1 else BODY if len(run.axes) == 3 else FACE
+        group = axes if kind is None else diagonals.setdefault(kind, {})
+        group[run.name] = evaluate(run.targets, run.deviations)
+    return Judged(axes, diagonals, circular_tests(measurements))
+
+
+def linear_runs(measurements: MeasurementSet) -> list[LinearRun]:
+    """Return the linear runs that can be judged: two cycles or more, every target from both sides in each.
+
+    Runs with fewer cycles, gaps or without both directions are left out.
+    """
+    points = measurements.points()[measurements.station]
+    runs = []
+    for index, run in enumerate(measurements.runs):
+        chosen = np.flatnonzero((measurements.run == index) & (measurements.channel == LINEAR))
+        table: dict[tuple[int, int], dict[float, float]] = {}
+        for n in chosen:
+            pass_of = (int(measurements.direction[n]), int(measurements.cycle[n]))
+            target = round(float(points[n] @ run.axis), 9) + 0.0
+            table.setdefault(pass_of, {})[target] = float(measurements.value[n])
+        in_work = measurements.geometry.work.rotation.T @ run.axis
+        axes = tuple(np.flatnonzero(np.abs(in_work) > ALONG).tolist())
+        complete = _complete_run(run.name, axes, table)
+        if complete is not None:
+            runs.append(complete)
+    return runs
+
+
+def _complete_run(
+    name: str, axes: tuple[int, ...], table: dict[tuple[int, int], dict[float, float]]
+) -> LinearRun | None:
+    """Return a run from {(direction, cycle): {target: reading}} if nothing is missing in it."""
+    cycles = sorted({cycle for _, cycle in table})
+    passes = {(direction, cycle) for direction in (FORWARD, BACKWARD) for cycle in cycles}
+    if len(cycles) < 2 or set(table) != passes:
+        return None
+    targets = sorted(table[FORWARD, cycles[0]])
+    if any(sorted(readings) != targets for readings in table.values()):
+        return None
+    deviations = [[[table[d, c][t] for t in targets] for c in cycles] for d in (FORWARD, BACKWARD)]
+    return LinearRun(name, axes, np.array(targets), np.array(deviations))
+
+
+def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
+    """Return the figures of the runs of lengths whose points lie on a circle about their centre, by name.
+
+    Others are left out, as are runs with too few readings. Senses are those of the rows' order, seen against that axis
+    of the work frame which stands most upright on the circle.
+    """
+    points = measurements.points()[measurements.station]
+    tests = {}
+    for index, run in enumerate(measurements.runs):
+        chosen = np.flatnonzero((measurements.run == index) & (measurements.channel == LENGTH))
+        centres = measurements.centre[chosen]
+        if len(chosen) < 3 or np.ptp(centres, axis=0).max() > LEAST_TRAVEL:
+            continue
+        circle = _circle(points[chosen], measurements.geometry.work.rotation)
+        if circle is None or np.linalg.norm(circle.middle - centres[0]) > OFF_THE_MIDDLE:
+            continue
+        lengths = measurements.value[chosen] + np.linalg.norm(points[chosen] - centres, axis=1)
+        height = float(circle.axis @ (centres[0] - circle.middle))
+        given = lengths - np.hypot(circle.radius, height), _senses(circle.angles, measurements.cycle[chosen])
+        try:
+            tests[run.name] = evaluate_circle(circle.radius, circle.angles, *given, length_known=run.known_zero)
+        except ModelError:  # too few readings of one sense
+            continue
+    return tests
+
+
+class Circle(NamedTuple):
+    """A circle in ``base``: middle and axis, shape (3,), radius, m, and where its points are, (N,), rad."""
+
+    middle: np.ndarray
+    axis: np.ndarray
+    radius: float
+    angles: np.ndarray
+
+
+def _circle(points: np.ndarray, work_axes: np.ndarray) -> Circle | None:
+    """Return the circle on which points (N, 3) lie; its axis points along an axis of the work frame, columns (3, 3)."""
+    arms = points - points.mean(axis=0)
+    _, sizes, ways = np.linalg.svd(arms, full_matrices=False)
+    if sizes[1] < LEAST_TRAVEL:
+        return None  # a line
+    axis = ways[2] * np.sign(_longest(work_axes.T @ ways[2]))
+    first = work_axes[:, int(np.abs(work_axes.T @ axis).argmax()) - 2]  # x of a circle about z, and so on
+    first = first - axis * (axis @ first)
+    first /= np.linalg.norm(first)
+    flat = arms @ np.stack([first, np.cross(axis, first)], axis=1)
+    # |p − m|² = r² is linear in the middle m and in r² − |m|².
+    middle = np.linalg.lstsq(np.column_stack([2.0 * flat, np.ones(len(flat))]), (flat**2).sum(axis=1), rcond=None)[0]
+    around = flat - middle[:2]
+    distances = np.linalg.norm(around, axis=1)
+    if max(np.ptp(distances), np.abs(arms @ axis).max()) > LEAST_TRAVEL:
+        return None
+    place = points.mean(axis=0) + middle[0] * first + middle[1] * np.cross(axis, first)
+    return Circle(place, axis, float(distances.mean()), np.arctan2(around[:, 1], around[:, 0]))
+
+
+def _longest(vector: np.ndarray) -> float:
+    """Return the component that is largest in magnitude."""
+    return float(vector[np.abs(vector).argmax()])
+
+
+def _senses(angles: np.ndarray, cycles: np.ndarray) -> np.ndarray:
+    """Return in which sense each of some angles in a row was come to, (N,); a cycle's first, a pause: as the next."""
+    steps = np.angle(np.exp(1j * np.diff(angles, prepend=angles[0])))
+    steps[np.diff(cycles, prepend=cycles[0]) != 0] = 0.0
+    senses = np.where(np.abs(steps) < ALONG, 0, np.sign(steps)).astype(int)
+    for n in range(len(senses) - 2, -1, -1):
+        senses[n] = senses[n] or senses[n + 1]
+    return np.where(senses == 0, FORWARD, senses)
+
+
+def standards_text(judged: Judged) -> str:
+    """Return the figures of all runs, a table for each standard, µm."""
+    parts = []
+    if judged.axes:
+        parts.append(f"{AXES_STANDARD}, lines along the axes, both directions\n{table(judged.axes)}")
+    for kind, tests in judged.diagonals.items():
+        worst = ", ".join(f"{name} {number(value * 1e6, 3)} µm" for name, value in largest(tests).items())
+        title = f"{DIAGONALS_STANDARD}, {kind} diagonals, both directions"
+        parts.append(f"{title}\n{table(tests)}\nlargest of the {len(tests)}: {worst}")
+    if judged.circles:
+        parts.append(f"{CIRCLES_STANDARD}, circles\n{circle_table(judged.circles)}")
+        parts[-1] += "".join(f"\nnote: {note}" for note in notes_of(judged.circles))
+    return "\n\n".join(parts)
+
+
+def notes_of(tests: Mapping[str, PositioningTest] | Mapping[str, CircularTest]) -> list[str]:
+    """Return the notes of several tests, each once."""
+    return list(dict.fromkeys(note for test in tests.values() for note in test.notes))
+
+
+def circle_table(tests: Mapping[str, CircularTest]) -> str:
+    """Return the figures of several circles, one row each, µm; a dash where a test cannot tell."""
+    rows = []
+    for name, test in tests.items():
+        cells = [number(test.figures[key] * 1e6, 3) if key in test.figures else "–" for key in CIRCLE_COLUMNS]
+        rows.append((name, number(test.radius * 1e3, 1), str(sum(test.readings.values())), *cells, "um"))
+    return aligned(("run", "radius mm", "readings", *CIRCLE_COLUMNS.values(), ""), rows)
+
+
+def largest(tests: Mapping[str, PositioningTest]) -> dict[str, float]:
+    """Return ISO 230-6's figures of diagonals of one kind together, m: ``E_d`` and ``B_d``, the largest of them."""
+    both = [test.figures() for test in tests.values()]
+    return {f"{name}_d": max(figures[name] for figures in both) for name in ("E", "B")}
+
+
+def table(tests: Mapping[str, PositioningTest]) -> str:
+    """Return the figures of several bidirectional tests, one row each, µm."""
+    header = ("run", "targets", "cycles", *COLUMNS.values(), "")
+    rows = []
+    for name, test in tests.items():
+        figures = test.figures()
+        cells = [number(figures[key] * 1e6, 3) for key in COLUMNS]
+        rows.append((name, str(len(test.targets)), str(test.cycles), *cells, "um"))
+    return aligned(header, rows)
+
+
+def every_target(judged: Judged) -> str:
+    """Return each run target by target, with notes."""
+    parts = [f"{name}\n{report(test, AXES_STANDARD)}" for name, test in judged.axes.items()]
+    for tests in judged.diagonals.values():
+        parts += [f"{name}\n{report(test, DIAGONALS_STANDARD)}" for name, test in tests.items()]
+    if judged.circles:
+        parts.append(standards_text(Judged({}, {}, judged.circles)))
+    return "\n\n".join(parts)
+
+
+def standards_json(judged: Judged) -> dict[str, Any]:
+    """Return the figures as plain numbers by standard and run, with their unit in the keys: ``A_m``, ``E_up_m``, …"""
+    result: dict[str, Any] = {}
+    if judged.axes:
+        result["iso230_2"] = {name: with_units(test.figures()) for name, test in judged.axes.items()}
+    if judged.diagonals:
+        kinds = judged.diagonals.items()
+        figures = {kind: {name: with_units(test.figures()) for name, test in tests.items()} for kind, tests in kinds}
+        result["iso230_6"] = {**figures, "largest": {kind: with_units(largest(tests)) for kind, tests in kinds}}
+    if judged.circles:
+        result["iso230_4"] = {name: with_units(test.figures) for name, test in judged.circles.items()}
+    return result
+
+
+def with_units(figures: Mapping[str, float]) -> dict[str, float]:
+    """Return lengths with their unit in the keys."""
+    return {f"{name}_m": value for name, value in figures.items()}

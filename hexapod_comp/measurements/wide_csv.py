@@ -69,7 +69,7 @@ from ..machine.temperatures import REFERENCE_TEMPERATURE, TEMPERATURE_RANGE, Tem
 from ..pose import Pose
 from .readings import AXES, FROM_PREVIOUS, UNKNOWN, FileLine, MeasurementSet, Reading, attitude_error
 from .runs import assemble
-from .tidy_rows import LATEST
+from .tidy import LATEST
 
 COLUMNS_FORMAT = "hexapod_comp/columns"
 COLUMNS_VERSION = 1

@@ -21,8 +21,7 @@ from hexapod_comp.machine.model_file import save_model
 from hexapod_comp.measurements.campaign import circle_run
 from hexapod_comp.measurements.readings import AXES, LENGTH, UNKNOWN, MeasurementSet, Reading
 from hexapod_comp.measurements.runs import assemble
-from hexapod_comp.measurements.tidy_csv import read_tidy
-from hexapod_comp.measurements.writing import write_measurements
+from hexapod_comp.measurements.tidy import read_tidy, write_measurements
 from hexapod_comp.pose import Pose
 
 UM, MM = 1e-6, 1e-3

@@ -23,8 +23,7 @@ from hexapod_comp.machine.model import MachineModel, RealMachine
 from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.measurements.campaign import Campaign, CampaignRun, template
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
-from hexapod_comp.measurements.tidy_csv import read_tidy
-from hexapod_comp.measurements.writing import write_measurements
+from hexapod_comp.measurements.tidy import read_tidy, write_measurements
 from hexapod_comp.virtual.instruments import measure
 
 MOISTURE = 3e-4

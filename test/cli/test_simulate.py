@@ -19,7 +19,7 @@ from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.temperatures import Temperatures
 from hexapod_comp.measurements.campaign import Campaign, load_campaign, template
 from hexapod_comp.measurements.readings import KINDS, MeasurementSet
-from hexapod_comp.measurements.tidy_csv import read_tidy
+from hexapod_comp.measurements.tidy import read_tidy
 from hexapod_comp.virtual.instruments import compensated, measure, station_errors
 
 BOX = np.array([[-0.1, -0.1, 0.4], [0.1, 0.1, 0.55]])

@@ -22,7 +22,7 @@ from hexapod_comp.machine.struts import StrutErrors
 from hexapod_comp.machine.temperatures import PARTS
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import KINDS
-from hexapod_comp.measurements.tidy_csv import read_tidy
+from hexapod_comp.measurements.tidy import read_tidy
 from hexapod_comp.virtual.warm_up import SENSED, WarmUp, growing, load_warm_up
 
 ALIKE = WarmUp(

@@ -18,7 +18,7 @@ from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.machine.model_file import load_model
 from hexapod_comp.measurements.campaign import Campaign, template
 from hexapod_comp.measurements.readings import KINDS
-from hexapod_comp.measurements.writing import write_measurements
+from hexapod_comp.measurements.tidy import write_measurements
 from hexapod_comp.virtual.instruments import compensated, measure
 
 MICRON = (1e-6,) * len(KINDS)

@@ -21,11 +21,10 @@ from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.kinematics import Structure, strut_lengths
 from hexapod_comp.measurements.campaign import Campaign, template
+from hexapod_comp.measurements.iso230 import linear_runs
 from hexapod_comp.measurements.readings import CHANNELS, MeasurementSet
-from hexapod_comp.measurements.standards import linear_runs
-from hexapod_comp.measurements.tidy_csv import read_tidy
+from hexapod_comp.measurements.tidy import read_tidy, write_measurements
 from hexapod_comp.measurements.wide_csv import read_wide
-from hexapod_comp.measurements.writing import write_measurements
 from hexapod_comp.pose import Pose
 
 JUGGLEBOT = Path(__file__).resolve().parents[2] / "benchmarks" / "data" / "jugglebot"

@@ -30,8 +30,7 @@ from hexapod_comp.measurements.readings import (
     Reading,
 )
 from hexapod_comp.measurements.runs import assemble, joined
-from hexapod_comp.measurements.tidy_csv import read_tidy
-from hexapod_comp.measurements.writing import write_measurements
+from hexapod_comp.measurements.tidy import read_tidy, write_measurements
 from hexapod_comp.pose import Pose
 
 PAPER = paper_geometry()

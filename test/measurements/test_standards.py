@@ -18,10 +18,9 @@ from hexapod_comp.errors import InputFileError, ModelError
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.measurements.files import read_measurements
-from hexapod_comp.measurements.iso230_circles import CircularTest, evaluate_circle
+from hexapod_comp.measurements.iso230 import CircularTest, evaluate_circle, judge, standards_json, standards_text
 from hexapod_comp.measurements.readings import BACKWARD, FORWARD, Reading
 from hexapod_comp.measurements.runs import assemble
-from hexapod_comp.measurements.standards import judge, standards_json, standards_text
 from hexapod_comp.pose import Pose
 
 RADIUS = 0.1
