@@ -52,16 +52,16 @@ from __future__ import annotations
 
 import difflib
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from ..errors import InputFileError, PoseError
+from ..errors import InputFileError, ModelError, PoseError
 from ..formats.csv import AS_USUAL, ENCODINGS, MOST_SKIPPED, Layout, Table, read_pose_arrays
-from ..formats.schema import MOST_NEIGHBOURS, Section
+from ..formats.schema import MOST_NEIGHBOURS, PER_STRUT, Choice, Names, Numbers, Section, Text, Unit, Whole, read_whole
 from ..formats.yaml import read_yaml
 from ..machine.geometry import STRUT_NAMES, HexapodGeometry
 from ..machine.kinematics import Structure, solve_poses, strut_lengths_batch
@@ -95,48 +95,99 @@ class UncertaintyColumns:
     columns: tuple[str, ...]  # one for all axes, or three
     unit: float  # size of their unit in SI, divided by the coverage factor: what makes standard deviations of them
 
+    @staticmethod
+    def read(section: Section, name: str, dimension: str) -> float | UncertaintyColumns:
+        """Take one standard deviation for all rows, or where each row's stand; NaN where there is neither."""
+        if name not in section:
+            return float(section.quantity(name, dimension, default=np.nan))
+        part, (low, high) = section.section(name), COVERAGE_FACTORS
+        columns, unit = Names(1, 3).take(part, "columns"), part.unit("unit", dimension)
+        factor = float(part.array("coverage_factor"))
+        if not low <= factor <= high:
+            raise part.error("coverage_factor", f"must be {low:g}…{high:g}; 1 where the column is a deviation", factor)
+        part.finish()
+        return UncertaintyColumns(columns, unit / factor)
+
 
 @dataclass(frozen=True)
 class PoseColumns:
     """Where a pose stands."""
 
-    position: tuple[str, ...]  # columns of x, y, z
-    unit: float  # size of their unit, m
-    offset: np.ndarray  # (3,): added to the position, m
-    # columns of a quaternion (x, y, z, w) or of the paper's three angles; empty when there are none
-    turn: tuple[str, ...]
-    angle_unit: float  # size of the angles' unit, rad
-    # standard deviations of position (m) and attitude (rad), NaN when not known; or where each row's stand
+    position: Annotated[tuple[str, ...], Names(3)]
+    unit: Annotated[float, Unit("length")]
+    # Standard deviations of position (m) and attitude (rad), NaN when not known; or where each row's stand.
     uncertainty: tuple[float | UncertaintyColumns, float | UncertaintyColumns]
+    offset: Annotated[np.ndarray, Numbers("mm", (3,))] = field(default_factory=lambda: np.zeros(3))  # is added
+    quaternion: Annotated[tuple[str, ...], Names(4)] = ()
+    angles: Annotated[tuple[str, ...], Names(3)] = ()  # the paper's, where there is no quaternion
+    angle_unit: Annotated[float | None, Unit("angle")] = None
+
+    def __post_init__(self) -> None:
+        if bool(self.angles) != (self.angle_unit is not None):
+            raise ModelError("angle_unit", "belongs to angles: give both, or none of them")
+        if self.angles and self.quaternion:
+            raise ModelError("angles", "give either angles or a quaternion, not both", list(self.angles))
+
+    @property
+    def turn(self) -> tuple[str, ...]:
+        """Columns of the orientation, empty when there are none."""
+        return self.quaternion or self.angles
+
+    @staticmethod
+    def read(section: Section) -> PoseColumns:
+        """Return what a section holds."""
+        kinds = (("position_uncertainty", "length"), ("attitude_uncertainty", "angle"))
+        position, attitude = (UncertaintyColumns.read(section, *kind) for kind in kinds)
+        return read_whole(PoseColumns, section, uncertainty=(position, attitude))
 
 
 @dataclass(frozen=True)
 class PoseFile:
     """Commanded poses in a file of their own."""
 
-    path: Path  # beside the columns file
-    name: str  # column of the measured file that names the pose; empty: row by row
+    file: Annotated[str, Text()]  # beside the columns file
+    name: Annotated[str, Text()] = ""  # column of the measured file that names the pose; empty: row by row
+
+    def __post_init__(self) -> None:
+        if Path(self.file).name != self.file:
+            raise ModelError("commanded.file", "must be a file's name, beside the columns file", self.file)
 
 
 @dataclass(frozen=True)
-class Surroundings:
-    """Where temperatures, humidity and time of each row stand."""
+class Humidity:
+    """Where the relative humidity of each row stands."""
 
-    temperatures: dict[str, str]  # columns by part; ``everywhere`` for all that have none
-    humidity: tuple[str, float] | None  # column, and the size of its unit
-    times: tuple[str, ...]  # columns, joined by a space where there are several; empty when there are none
-    time_format: str  # as ``strptime`` has it; empty: numbers
-    time_unit: float  # size of the numbers' unit, s
+    column: Annotated[str, Text()]
+    unit: Annotated[float, Unit("ratio")]
+
+
+@dataclass(frozen=True)
+class Times:
+    """Where the time of each row stands."""
+
+    columns: Annotated[tuple[str, ...], Names()]  # joined by a space where there are several
+    format: Annotated[str, Text()] = ""  # as ``strptime`` has it; empty: numbers, in one column
+    unit: Annotated[float | None, Unit("time")] = None
+
+    def __post_init__(self) -> None:
+        if bool(self.format) == (self.unit is not None):
+            raise ModelError("time", "needs either format or unit")
+        if self.unit is not None and len(self.columns) != 1:
+            raise ModelError("time.columns", "must be a list of 1 column names where they are numbers", self.columns)
 
 
 @dataclass(frozen=True)
 class StrutColumns:
     """Where strut readings stand."""
 
-    readings: tuple[str, ...]  # six columns
-    length_per_unit: np.ndarray  # (6,): m per unit of the reading
-    zero: str  # one of :data:`ZEROS`
-    zero_length: np.ndarray  # (6,): lengths at reading zero, m, when given
+    readings: Annotated[tuple[str, ...], Names(6)]
+    length_per_unit: Annotated[np.ndarray, Numbers("mm", PER_STRUT)]  # m per unit of the reading
+    zero: Annotated[str, Choice(*ZEROS)] = "home"
+    zero_length: Annotated[np.ndarray | None, Numbers("mm", PER_STRUT)] = None  # at reading zero, m, when given
+
+    def __post_init__(self) -> None:
+        if (self.zero == "given") != (self.zero_length is not None):
+            raise ModelError("struts.zero_length", "belongs to zero: given", self.zero)
 
 
 @dataclass(frozen=True)
@@ -144,145 +195,44 @@ class Columns:
     """What the columns of a wide file mean; the parts are as in the file, None where left out."""
 
     layout: Layout
-    run: str
-    order: int
     commanded: PoseColumns | PoseFile | None
     measured: PoseColumns
-    surroundings: Surroundings
-    struts: StrutColumns | None
+    temperature: dict[str, str]  # columns by part; ``everywhere`` for all that have none
+    run: Annotated[str, Text()] = ""
+    order: Annotated[str, Choice(*ORDERS)] = "unknown"
+    humidity: Humidity | None = None
+    time: Times | None = None
+    struts: StrutColumns | None = None
+
+    def __post_init__(self) -> None:
+        if self.commanded is None and self.struts is None:
+            raise ModelError("commanded", "is missing, and so are struts, from which it could be computed")
+        if self.struts is not None and self.struts.zero == "measured" and not self.measured.turn:
+            raise ModelError("struts.zero", "measured needs measured orientations", "measured")
 
 
 def load_columns(path: str | Path) -> Columns:
     """Read a columns file."""
     top = read_yaml(path, COLUMNS_FORMAT, COLUMNS_VERSION)
-    columns = Columns(
-        layout=_layout(top),
-        run=top.text("run") if "run" in top else "",
-        order=ORDERS[top.choice("order", tuple(ORDERS), "unknown")],
-        commanded=_commanded(top.section("commanded"), Path(path)) if "commanded" in top else None,
-        measured=_pose_columns(top.section("measured")),
-        surroundings=_surroundings(top),
-        struts=_strut_columns(top.section("struts")) if "struts" in top else None,
-    )
-    if columns.commanded is None and columns.struts is None:
-        raise top.error("commanded", "is missing, and so are struts, from which it could be computed")
-    if columns.struts is not None and columns.struts.zero == "measured" and not columns.measured.turn:
-        raise top.error("struts.zero", "measured needs measured orientations", "measured")
-    top.finish()
-    return columns
-
-
-def _names(section: Section, key: str, count: int | None) -> tuple[str, ...]:
-    """Take so many column names, None: any number of them."""
-    names = section.take(key)
-    well = isinstance(names, list) and names and all(isinstance(n, str) and n for n in names)
-    if not well or len(names) != (count or len(names)):
-        raise section.error(key, f"must be a list of {f'{count} ' if count else ''}column names", names)
-    return tuple(names)
-
-
-def _layout(top: Section) -> Layout:
-    if "table" not in top:
-        return AS_USUAL
-    section = top.section("table")
-    encoding = section.choice("encoding", ENCODINGS) if "encoding" in section else ""
-    rows = []
-    for key in ("rows_above_header", "rows_below_header"):
-        rows.append(section.integer(key, 0))
-        if not 0 <= rows[-1] <= MOST_SKIPPED:
-            raise section.error(key, f"must be 0…{MOST_SKIPPED}", rows[-1])
-    section.finish()
-    return Layout(encoding, *rows)
-
-
-def _commanded(section: Section, path: Path) -> PoseColumns | PoseFile:
-    if "file" not in section:
-        return _pose_columns(section)
-    name = section.text("file")
-    if Path(name).name != name:
-        raise section.error("file", "must be a file's name, beside the columns file", name)
-    poses = PoseFile(path.with_name(name), section.text("name") if "name" in section else "")
-    section.finish()
-    return poses
-
-
-def _surroundings(top: Section) -> Surroundings:
-    temperatures: dict[str, str] = {}
-    humidity = None
-    times, time_format, time_unit = (), "", 1.0  # type: tuple[str, ...], str, float
+    layout, commanded, temperature = AS_USUAL, None, dict[str, str]()
+    if "table" in top:
+        section = top.section("table")
+        skipped = (Whole(0, MOST_SKIPPED).read(section, f"rows_{side}_header", 0) for side in ("above", "below"))
+        layout = Layout(Choice(*ENCODINGS).read(section, "encoding", ""), *skipped)
+        section.finish()
+    if "commanded" in top:
+        section = top.section("commanded")
+        commanded = read_whole(PoseFile, section) if "file" in section else PoseColumns.read(section)
     if "temperature" in top:
         section = top.section("temperature")
         section.unit("unit", "temperature")
-        for part in (EVERYWHERE, *Temperatures.NAMES):
-            if part in section:
-                temperatures[part] = section.text(part)
+        parts = (EVERYWHERE, *Temperatures.NAMES)
+        temperature = {part: section.text(part) for part in parts if part in section}
         section.finish()
-        if not temperatures:
+        if not temperature:
             raise section.error(EVERYWHERE, "is missing, and so is every part")
-    if "humidity" in top:
-        section = top.section("humidity")
-        humidity = section.text("column"), section.unit("unit", "ratio")
-        section.finish()
-    if "time" in top:
-        section = top.section("time")
-        if "format" in section:
-            times, time_format = _names(section, "columns", None), section.text("format")
-        else:
-            times, time_unit = _names(section, "columns", 1), section.unit("unit", "time")
-        section.finish()
-    return Surroundings(temperatures, humidity, times, time_format, time_unit)
-
-
-def _uncertainty(section: Section, name: str, dimension: str) -> float | UncertaintyColumns:
-    """Take one standard deviation for all rows, or where each row's stand; NaN where there is neither."""
-    if name not in section:
-        return float(section.quantity(name, dimension, default=np.nan))
-    part = section.section(name)
-    columns = _names(part, "columns", None)
-    if len(columns) not in (1, 3):
-        raise part.error("columns", "must be one column for all axes, or three", list(columns))
-    unit = part.unit("unit", dimension)
-    factor = float(part.array("coverage_factor"))
-    low, high = COVERAGE_FACTORS
-    if not low <= factor <= high:
-        raise part.error("coverage_factor", f"must be {low:g}…{high:g}; 1 where the column is a deviation", factor)
-    part.finish()
-    return UncertaintyColumns(columns, unit / factor)
-
-
-def _pose_columns(section: Section) -> PoseColumns:
-    turn: tuple[str, ...] = ()
-    angle_unit = 1.0
-    if "quaternion" in section:
-        turn = _names(section, "quaternion", 4)
-    elif "angles" in section:
-        turn = _names(section, "angles", 3)
-        angle_unit = section.unit("angle_unit", "angle")
-    columns = PoseColumns(
-        position=_names(section, "position", 3),
-        unit=section.unit("unit", "length"),
-        offset=section.quantity("offset", "length", (3,), np.zeros(3)),
-        turn=turn,
-        angle_unit=angle_unit,
-        uncertainty=(
-            _uncertainty(section, "position_uncertainty", "length"),
-            _uncertainty(section, "attitude_uncertainty", "angle"),
-        ),
-    )
-    section.finish()
-    return columns
-
-
-def _strut_columns(section: Section) -> StrutColumns:
-    zero = section.choice("zero", ZEROS, "home")
-    columns = StrutColumns(
-        readings=_names(section, "readings", 6),
-        length_per_unit=section.per_strut("length_per_unit", "length"),
-        zero=zero,
-        zero_length=section.per_strut("zero_length", "length") if zero == "given" else np.full(6, np.nan),
-    )
-    section.finish()
-    return columns
+    given = {"layout": layout, "commanded": commanded, "temperature": temperature}
+    return read_whole(Columns, top, **given, measured=PoseColumns.read(top.section("measured")))
 
 
 @dataclass(frozen=True)
@@ -304,12 +254,12 @@ def read_wide(
     notes: list[str] = []
     commands = None if columns.struts is None else _lengths(table, columns.struts, measured, geometry, used, notes)
     if isinstance(columns.commanded, PoseFile):
-        commanded = _poses_of_file(table, columns.commanded, used)
+        commanded = _poses_of_file(table, columns.commanded, Path(columns_path), used)
     elif columns.commanded is not None:
         commanded = _read_poses(table, columns.commanded, used)
     else:
         commanded = _nominal_poses(table, geometry, np.asarray(commands))
-    conditions = _conditions(table, columns.surroundings, used)
+    conditions = _conditions(table, columns, used)
     deviations = [_deviations(table, given, used) for given in columns.measured.uncertainty]
     unused = [name for name in table.header if name and name not in used]
     notes += table.notes
@@ -329,7 +279,7 @@ def _read_poses(table: Table, columns: PoseColumns, used: set[str]) -> _Poses:
     positions = _read_numbers(table, columns.position, columns.unit, used) + columns.offset
     if not columns.turn:
         return _Poses(positions, np.tile(np.eye(3), (len(positions), 1, 1)))
-    turns = _read_numbers(table, columns.turn, columns.angle_unit, used)
+    turns = _read_numbers(table, columns.turn, columns.angle_unit or 1.0, used)
     if len(columns.turn) == 3:
         return _Poses(positions, table.rotations(turns))
     rotations = np.empty((len(turns), 3, 3))
@@ -342,23 +292,24 @@ def _read_poses(table: Table, columns: PoseColumns, used: set[str]) -> _Poses:
     return _Poses(positions, rotations)
 
 
-def _poses_of_file(table: Table, file: PoseFile, used: set[str]) -> _Poses:
+def _poses_of_file(table: Table, file: PoseFile, columns_path: Path, used: set[str]) -> _Poses:
     """Return the commanded pose of each row from a file of poses."""
-    labels, positions, rotations = read_pose_arrays(file.path)
+    path = columns_path.with_name(file.file)
+    labels, positions, rotations = read_pose_arrays(path)
     if not file.name:
         if len(labels) != len(table.rows):
-            problem = f"has {len(table.rows)} rows, and {file.path.name} {len(labels)} poses; without commanded.name"
+            problem = f"has {len(table.rows)} rows, and {path.name} {len(labels)} poses; without commanded.name"
             raise InputFileError(table.path, "", f"{problem} they go row by row")
         return _Poses(positions, rotations)
     used.add(file.name)
     rows = {one.label: n for n, one in enumerate(labels)}
     if len(rows) != len(labels):
-        raise InputFileError(file.path, "", "has a name twice; commanded.name finds poses by their names")
+        raise InputFileError(path, "", "has a name twice; commanded.name finds poses by their names")
     numbers = []
     for (line, _), name in zip(table.rows, table.texts(file.name), strict=True):
         if name not in rows:
             near = difflib.get_close_matches(name, list(rows)[:MOST_NEIGHBOURS], 1)
-            problem = f"has no pose in {file.path.name}" + (f"; did you mean {near[0]!r}?" if near else "")
+            problem = f"has no pose in {path.name}" + (f"; did you mean {near[0]!r}?" if near else "")
             raise InputFileError(table.path, f"line {line}, column {file.name}", problem, name)
         numbers.append(rows[name])
     return _Poses(positions[numbers], rotations[numbers])
@@ -384,7 +335,7 @@ class _Conditions(NamedTuple):
     humidities: np.ndarray
 
 
-def _conditions(table: Table, columns: Surroundings, used: set[str]) -> _Conditions:
+def _conditions(table: Table, columns: Columns, used: set[str]) -> _Conditions:
     count = len(table.rows)
 
     def read(name: str | None, unit: float, otherwise: np.ndarray, low: float, high: float, allowed: str) -> np.ndarray:
@@ -398,34 +349,34 @@ def _conditions(table: Table, columns: Surroundings, used: set[str]) -> _Conditi
             raise InputFileError(table.path, f"line {line}, column {name}", problem, cells[table.header.index(name)])
         return values
 
-    named, (low, high) = columns.temperatures, TEMPERATURE_RANGE
+    named, (low, high) = columns.temperature, TEMPERATURE_RANGE
     bounds = low, high, f"{low:g}…{high:g} °C"
     everywhere = read(named.get(EVERYWHERE), 1.0, np.full(count, REFERENCE_TEMPERATURE), *bounds)
     parts = [read(named.get(part), 1.0, everywhere, *bounds) for part in Temperatures.NAMES]
     unknown = np.full(count, np.nan)
-    damp, size = columns.humidity or (None, 1.0)
-    humidities = read(damp, size, unknown, 0.0, 1.0, "0…100 %")
-    if columns.time_format:
-        times = _clock_times(table, columns, used)
+    damp = columns.humidity
+    humidities = unknown if damp is None else read(damp.column, damp.unit, unknown, 0.0, 1.0, "0…100 %")
+    if columns.time is not None and columns.time.format:
+        times = _clock_times(table, columns.time, used)
     else:
-        name = columns.times[0] if columns.times else None
-        times = read(name, columns.time_unit, unknown, -LATEST, LATEST, f"±{LATEST:g} s")
+        name, size = (None, 1.0) if columns.time is None else (columns.time.columns[0], columns.time.unit or 1.0)
+        times = read(name, size, unknown, -LATEST, LATEST, f"±{LATEST:g} s")
     return _Conditions(np.stack(parts, axis=1), times, humidities)
 
 
-def _clock_times(table: Table, columns: Surroundings, used: set[str]) -> np.ndarray:
+def _clock_times(table: Table, time: Times, used: set[str]) -> np.ndarray:
     """Return times that are written as dates and clocks, s; without a zone they are taken for UTC."""
-    used.update(columns.times)
-    texts = [" ".join(parts) for parts in zip(*(table.texts(name) for name in columns.times), strict=True)]
-    names, times = ", ".join(columns.times), np.empty(len(texts))
+    used.update(time.columns)
+    texts = [" ".join(parts) for parts in zip(*(table.texts(name) for name in time.columns), strict=True)]
+    names, times = ", ".join(time.columns), np.empty(len(texts))
     for n, ((line, _), text) in enumerate(zip(table.rows, texts, strict=True)):
         try:
-            moment = datetime.strptime(text, columns.time_format)
+            moment = datetime.strptime(text, time.format)
         except (ValueError, re.error) as error:
-            problem = f"is not written as time.format says, {columns.time_format!r}"
+            problem = f"is not written as time.format says, {time.format!r}"
             raise InputFileError(table.path, f"line {line}, column {names}", problem, text) from error
         times[n] = (moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)).timestamp()
-        if n and times[n] < times[n - 1] and not WITH_DATE.search(columns.time_format):
+        if n and times[n] < times[n - 1] and not WITH_DATE.search(time.format):
             problem = "is earlier than the row before; over midnight the date is needed too: columns: [date, time]"
             raise InputFileError(table.path, f"line {line}, column {names}", problem, text)
     return times
@@ -489,6 +440,6 @@ def _readings(
         state = temperatures, lengths, source, float(conditions.times[n])
         for kind, values, spreads in errors:
             for axis, value, spread in zip(AXES, values[n].tolist(), spreads[n].tolist(), strict=True):
-                place = (run, 1, columns.order, pose, f"{kind}_{axis}")
+                place = (run, 1, ORDERS[columns.order], pose, f"{kind}_{axis}")
                 readings.append(Reading(*place, value, spread, *state, humidity=float(conditions.humidities[n])))
     return readings
