@@ -6,14 +6,15 @@ It holds what the fit's report says, and no figure that is better than the repor
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..formats.files import MAX_ARCHIVE_BYTES, read_bytes
-from ..formats.pages import page, picture, shown, table
+from ..formats.pages import render
 from ..formats.paths import input_file, version
 from ..formats.texts import number
 from ..formats.yaml import read_yaml
@@ -26,7 +27,6 @@ from ..measurements.iso230 import (
     DIAGONALS_STANDARD,
     CircularTest,
     Judged,
-    PositioningTest,
     judge,
     largest,
     notes_of,
@@ -35,8 +35,11 @@ from ..measurements.readings import ANGULAR_KINDS
 from ..workspace.overview import corners
 from .fit import ModelFit
 from .observations import Cells
-from .posterior import ToolError, listed
+from .posterior import listed
 from .report import tilt_doubt
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FORMAT, VERSION = "hexapod_comp/certificate", 1
 
@@ -72,18 +75,10 @@ MOST_RUNS = 200
 
 @dataclass(frozen=True)
 class Details:
-    """What the readings do not tell.
+    """What the readings do not tell."""
 
-    Attributes
-    ----------
-    texts : dict of str to str
-        By the keys of :data:`DETAILS`.
-    instruments, remarks : tuple of str
-        Type, serial number and calibration of each instrument; anything else.
-    """
-
-    texts: dict[str, str]
-    instruments: tuple[str, ...] = ()
+    texts: dict[str, str]  # by the keys of DETAILS
+    instruments: tuple[str, ...] = ()  # type, serial number and calibration of each
     remarks: tuple[str, ...] = ()
 
 
@@ -112,227 +107,160 @@ def load_details(path: str | Path) -> Details:
 
 @dataclass(frozen=True)
 class Filed:
-    """What was written with the certificate.
+    """What was written with the certificate."""
 
-    Attributes
-    ----------
-    model : str
-        Name of the model.
-    files : tuple of Path
-        The model's file, and those beside it.
-    report : str
-        The fit's report, as printed. With what it opens, before it says which machine this is, the certificate opens.
-    """
-
-    model: str
-    files: tuple[Path, ...]
-    report: str
+    model: str  # name of the model
+    files: tuple[Path, ...]  # the model's file, and those beside it
+    report: str  # the fit's, as printed; with what it opens, before it names the machine, the certificate opens
 
 
 def certificate_text(fit: ModelFit, filed: Filed, details: Details | None = None) -> str:
-    """Return the certificate of a fit of scheme ``joint``, as HTML.
-
-    Parameters
-    ----------
-    fit : ModelFit
-        The fit.
-    filed : Filed
-        Model file and report, which must have been written.
-    details : Details, optional
-        What else is known of machine, instruments and place.
-
-    Raises
-    ------
-    InputFileError
-        A file cannot be read.
-    """
-    details = details or Details({})
-    title = f"Calibration certificate: {fit.measurements.geometry.name}"
-    parts = [
-        f"<h1>{shown(title)}</h1>",
-        *_warning(fit, filed.report),
-        _identity(fit, filed, details),
-        *_result(fit),
-        *_instruments(fit, details),
-        _measured(fit),
-        *_standards(fit),
-        *_pictures(fit),
-        _hidden(fit),
-        _files(fit, filed),
-        f"<h2>The fit's report</h2><pre>{_lines(filed.report)}</pre>",
-        SIGNATURES,
-    ]
-    return page(title, "".join(parts), STYLE)
-
-
-def _lines(text: str) -> str:
-    """Return a text of several lines from outside as HTML."""
-    return "\n".join(shown(line, 2000) for line in text.splitlines())
+    """Return the certificate of a fit of scheme ``joint``, as HTML; model file and report must have been written."""
+    m, details = fit.measurements, details or Details({})
+    seen = fit.observability
+    unseen = f"{seen.structure_rank} of {seen.structure_size} parameters of the structure are seen by these readings."
+    if fit.unseen_errors:
+        unseen += f" Errors that they do not show: {listed(fit.unseen_errors)}."
+    hashes = [hashlib.sha256(read_bytes(path, MAX_ARCHIVE_BYTES)).hexdigest() for path in filed.files]
+    beside = ["model", *("beside it" for _ in filed.files[1:])]
+    files = [(what, path.name, digest) for what, path, digest in zip(beside, filed.files, hashes, strict=True)]
+    before, after = judge(m), judge(m.with_values(left_out(fit)))
+    return render(
+        "certificate.html",
+        title=f"Calibration certificate: {m.geometry.name}",
+        warning=filed.report.partition(f"machine {m.geometry.name}: {len(m)} readings")[0].strip(),
+        identity=_identity(fit, filed, details),
+        box=corners(fit.space.work_box),
+        result=_result(fit),
+        notes=(*tilt_doubt(fit.tilted, seen), *fit.notes),
+        instruments=_instruments(fit),
+        named_instruments=[(n, text) for n, text in enumerate(details.instruments or ("",) * len(fit.channels), 1)],
+        temperatures=_temperatures(fit),
+        humidity=_humidity(fit),
+        measured=_measured(fit),
+        tests=list(_tests(before, after)) if before else [],
+        circles=_circles(before.circles, after.circles) if before and before.circles else None,
+        figures=_figures(fit),
+        runs=_runs(fit),
+        unseen=unseen,
+        datum=fit.held.report(),
+        files=files + [("readings", name, digest) for name, digest in m.files],
+        report=filed.report,
+        most_runs=MOST_RUNS,
+    )
 
 
-def _warning(fit: ModelFit, report: str) -> Iterator[str]:
-    """Yield what the report says before its headline: what is wrong."""
-    m = fit.measurements
-    opening = report.partition(f"machine {m.geometry.name}: {len(m)} readings")[0].strip()
-    if opening:
-        yield f"<p class=warning><b>Warning.</b> {_lines(opening)}</p>"
+Rows = list[tuple[object, ...]]
 
 
-def _identity(fit: ModelFit, filed: Filed, details: Details) -> str:
-    rows = [(label, details.texts.get(key, "")) for key, label in DETAILS.items()]
+def _identity(fit: ModelFit, filed: Filed, details: Details) -> Rows:
+    rows: Rows = [(label, details.texts.get(key, "")) for key, label in DETAILS.items()]
     rows[3:3] = [("machine in these files", fit.measurements.geometry.name), ("model", filed.model)]
     rows += [("remarks", text) for text in details.remarks]
     made = f"hexapod_comp {version()}, scheme joint, {fit.model.origin.date}"
-    return table(("", ""), [*rows, ("evaluated with", made)], "text")
+    return [*rows, ("evaluated with", made)]
 
 
-def _result(fit: ModelFit) -> Iterator[str]:
-    """Yield the machine's error before and after compensation."""
-    yield "<h2>Result</h2>"
+def _result(fit: ModelFit) -> Rows:
+    """Return the machine's error before and after compensation, µm and µrad; none where nothing is promised."""
     if fit.level is None:
-        yield "<p>These readings bear no promise of what error is left.</p>"
-        return
-    yield (
-        f"<p>Error of the tool in space at random places of the measured box, {corners(fit.space.work_box)}, both "
-        "directions of approach, the datum aligned: one shift and one turn of everything taken out, as a workpiece "
-        "zero does.</p>"
-    )
-    cases = {"level tool": fit.level, "tool tilted by 10°": fit.tilted}
-    rows = [row for name, error in cases.items() if error is not None for row in _before_after(name, error)]
-    header = ("quantity", "before, RMS", "after, RMS", "after, with 95 %", "after, U (k = 2)", "unit")
-    yield table(header, rows)
-    yield (
-        "<p>Before: the machine as fitted, told nominal strut lengths. After: <b>expected</b> of the same machine with "
-        "this model running, from what the readings leave uncertain; it has not been measured yet. U is twice "
-        "(coverage factor k = 2) the upper end of the 95 % interval where there is one. Measuring again with the model "
-        "running, at places that were not used here, confirms it.</p>"
-    )
-    notes = (*tilt_doubt(fit.tilted, fit.observability), *fit.notes)
-    if notes:
-        yield f"<ul>{''.join(f'<li><b>{shown(note, 1000)}</b></li>' for note in notes)}</ul>"
+        return []
+    rows: Rows = []
+    for name, error in {"level tool": fit.level, "tool tilted by 10°": fit.tilted}.items():
+        if error is None:
+            continue
+        between = f"{number(error.low * 1e6, 3)} … {number(error.high * 1e6, 3)}"
+        sizes = number(error.before * 1e6, 2), number(error.after * 1e6, 3)
+        rows.append((f"{name}: displacement", *sizes, between, number(COVERAGE * error.high * 1e6, 2), "µm"))
+        sizes, between, expanded = (
+            (number(error.rotation_before * 1e6, 1), number(error.rotation_after * 1e6, 2)),
+            "",
+            "",
+        )
+        if error.rotation_low is None or error.rotation_high is None:
+            between = "roll is not shown"
+        else:
+            between = f"{number(error.rotation_low * 1e6, 2)} … {number(error.rotation_high * 1e6, 2)}"
+            expanded = number(COVERAGE * error.rotation_high * 1e6, 1)
+        rows.append((f"{name}: rotation", *sizes, between, expanded, "µrad"))
+    return rows
 
 
-def _before_after(name: str, error: ToolError) -> Iterator[tuple[str, ...]]:
-    between = f"{number(error.low * 1e6, 3)} … {number(error.high * 1e6, 3)}"
-    expanded = number(COVERAGE * error.high * 1e6, 2)
-    yield f"{name}: displacement", number(error.before * 1e6, 2), number(error.after * 1e6, 3), between, expanded, "µm"
-    sizes = (number(error.rotation_before * 1e6, 1), number(error.rotation_after * 1e6, 2))
-    between, expanded = "roll is not shown", ""
-    if error.rotation_low is not None and error.rotation_high is not None:
-        between = f"{number(error.rotation_low * 1e6, 2)} … {number(error.rotation_high * 1e6, 2)}"
-        expanded = number(COVERAGE * error.rotation_high * 1e6, 1)
-    yield f"{name}: rotation", *sizes, between, expanded, "µrad"
-
-
-def _instruments(fit: ModelFit, details: Details) -> Iterator[str]:
-    """Yield what read the machine, how well, and in what environment."""
-    yield "<h2>Instruments and environment</h2>"
-    rows = []
+def _instruments(fit: ModelFit) -> Rows:
+    rows: Rows = []
     for channel in fit.channels:
         sizes = [number(v * 1e6, 2) for v in (channel.stated, COVERAGE * channel.stated, channel.estimated)]
         unit = "µrad" if channel.kind in ANGULAR_KINDS else "µm"
         rows.append((INSTRUMENTS.get(channel.kind, channel.kind), str(channel.readings), *sizes, unit))
-    yield table(("instrument", "readings", "u stated (k = 1)", "U stated (k = 2)", "u as fitted", "unit"), rows)
-    named = details.instruments or ("",) * len(rows)
-    yield table(("", "type, serial number, calibration"), [(str(n), text) for n, text in enumerate(named, 1)], "text")
-    yield table(("part", "lowest °C", "highest °C", "expansion in the model, ppm/K"), _temperatures(fit))
-    humidity = fit.measurements.stations.humidity
-    if np.isfinite(humidity).any():
-        ends = [number(100.0 * v, 1) for v in (np.nanmin(humidity), np.nanmax(humidity))]
-        grown = number(1e4 * fit.model.struts.moisture.max(), 2)
-        yield table(("", "lowest %", "highest %", "growth of struts, ppm per %"), [("relative humidity", *ends, grown)])
+    return rows
 
 
-def _temperatures(fit: ModelFit) -> Iterator[tuple[str, ...]]:
-    """Yield each part with its temperatures while it was measured, and its expansion."""
+def _temperatures(fit: ModelFit) -> Rows:
+    """Return each part with its temperatures while it was measured, and its expansion."""
     values, model = fit.measurements.stations.temperatures, fit.model
+    rows: Rows = []
     expansions = (*model.struts.expansion, model.base_expansion, model.platform_expansion)
-    parts = zip(Temperatures.NAMES, values.T, expansions, strict=True)
-    for name, of_part, expansion in parts:
+    for name, of_part, expansion in zip(Temperatures.NAMES, values.T, expansions, strict=True):
         known = (of_part != REFERENCE_TEMPERATURE).any()
         ends = [number(v, 2) if known else "20 or not recorded" for v in (of_part.min(), of_part.max())]
-        yield name, *ends, number(expansion * 1e6, 2)
+        rows.append((name, *ends, number(expansion * 1e6, 2)))
+    return rows
 
 
-def _measured(fit: ModelFit) -> str:
-    """Return what was measured: how many readings of each kind on which runs."""
+def _humidity(fit: ModelFit) -> Rows:
+    humidity = fit.measurements.stations.humidity
+    if not np.isfinite(humidity).any():
+        return []
+    ends = [number(100.0 * v, 1) for v in (np.nanmin(humidity), np.nanmax(humidity))]
+    return [("relative humidity", *ends, number(1e4 * fit.model.struts.moisture.max(), 2))]
+
+
+def _measured(fit: ModelFit) -> Rows:
+    """Return what was measured: how many readings on which runs."""
     m = fit.measurements
-    is_line = np.array([run.is_line for run in m.runs])
-    rows = [(name, str(count)) for name, count in (("lines", is_line.sum()), ("other runs", (~is_line).sum())) if count]
+    lines = sum(run.is_line for run in m.runs)
+    counts = {"lines": lines, "other runs": len(m.runs) - lines}
+    rows: Rows = [(name, str(count)) for name, count in counts.items() if count]
     rows += [("places, by direction", str(len(m.stations))), ("readings", str(len(m)))]
-    rows += [("readings that disagreed and got little weight", str(len(fit.outliers)))]
-    return f"<h2>What was measured</h2>{table(('', ''), rows)}"
+    return [*rows, ("readings that disagreed and got little weight", str(len(fit.outliers)))]
 
 
-def _standards(fit: ModelFit) -> Iterator[str]:
-    """Yield the figures of the standards before and after."""
-    before = judge(fit.measurements)
-    after = judge(fit.measurements.with_values(left_out(fit)))
-    yield "<h2>By the standards</h2>"
-    if not before:
-        yield (
-            "<p>No figures of ISO 230: they need lines with two cycles or more, every target read from both sides "
-            "in each, or circles.</p>"
-        )
-        return
-    yield (
-        "<p>Before: from the readings. After: from the same readings less what the model, fitted <b>without that "
-        "line or circle</b> (a circle whose given centre is not its middle: without that place), predicts there; noise "
-        "of the instrument included. The uncertainty of one reading stands above; scale errors that a whole instrument "
-        "has are not in these figures.</p>"
+def _tests(before: Judged, after: Judged) -> Iterator[dict[str, object]]:
+    """Yield the tests of ISO 230-2 and 230-6, each figure before → after, µm."""
+    pairs = (
+        [(f"{AXES_STANDARD}, lines along the axes, both directions", before.axes, after.axes)] if before.axes else []
     )
-    for title, old, new in _pairs(before, after):
-        yield f"<h3>{shown(title)}, µm</h3>"
-        yield from _standard(old, new)
-    if before.circles:
-        yield f"<h3>{CIRCLES_STANDARD}, circles, µm</h3>"
-        yield from _circles(before.circles, after.circles)
-
-
-def _pairs(
-    before: Judged, after: Judged
-) -> Iterator[tuple[str, dict[str, PositioningTest], dict[str, PositioningTest]]]:
-    if before.axes:
-        yield f"{AXES_STANDARD}, lines along the axes, both directions", before.axes, after.axes
     for kind, tests in before.diagonals.items():
-        yield f"{DIAGONALS_STANDARD}, {kind} diagonals, both directions", tests, after.diagonals[kind]
+        pairs.append((f"{DIAGONALS_STANDARD}, {kind} diagonals, both directions", tests, after.diagonals[kind]))
+    for title, old, new in pairs:
+        rows = []
+        for name, test in old.items():
+            figures = test.figures(), new[name].figures()
+            cells = [" → ".join(number(part[key] * 1e6, 2) for part in figures) for key in COLUMNS]
+            rows.append((name, f"{len(test.targets)} × {test.cycles}", *cells))
+        worst = [largest(tests) for tests in (old, new)]
+        ends = [f"{name[0]} {' → '.join(number(w[name] * 1e6, 2) for w in worst)} µm" for name in worst[0]]
+        yield {
+            "title": title,
+            "header": ("run", "targets × cycles", *COLUMNS.values()),
+            "rows": rows,
+            "largest": ", ".join(ends),
+            "notes": notes_of(old),
+        }
 
 
-def _standard(before: dict[str, PositioningTest], after: dict[str, PositioningTest]) -> Iterator[str]:
-    """Yield a table of runs: each figure before → after."""
-    header = ("run", "targets × cycles", *COLUMNS.values())
-    rows: list[Sequence[str]] = []
-    for name, test in list(before.items())[:MOST_RUNS]:
-        pairs = test.figures(), after[name].figures()
-        cells = [" → ".join(number(figures[key] * 1e6, 2) for figures in pairs) for key in COLUMNS]
-        rows.append((name, f"{len(test.targets)} × {test.cycles}", *cells))
-    yield table(header, rows)
-    if len(before) > MOST_RUNS:
-        yield f"<p>And {len(before) - MOST_RUNS} more runs.</p>"
-    worst = [largest(tests) for tests in (before, after)]
-    ends = [f"{name[0]} {' → '.join(number(w[name] * 1e6, 2) for w in worst)} µm" for name in worst[0]]
-    yield f"<p>Largest: {', '.join(ends)}.</p>"
-    yield from _departures(notes_of(before))
-
-
-def _departures(notes: Sequence[str]) -> Iterator[str]:
-    """Yield where tests depart from the standard's."""
-    if notes:
-        yield f"<p class=caption>Beside the standard's test: {shown('; '.join(notes), 1500)}.</p>"
-
-
-def _circles(before: dict[str, CircularTest], after: dict[str, CircularTest]) -> Iterator[str]:
-    """Yield a table of circles: each figure before → after, a dash where a test cannot tell."""
-    rows: list[Sequence[str]] = []
-    for name, test in list(before.items())[:MOST_RUNS]:
+def _circles(before: dict[str, CircularTest], after: dict[str, CircularTest]) -> dict[str, object]:
+    """Return the tests of circles: each figure before → after, µm, a dash where a test cannot tell."""
+    rows = []
+    for name, test in before.items():
         pairs = test.figures, after[name].figures
         cells = [
             " → ".join(number(figures[key] * 1e6, 2) for figures in pairs) if key in test.figures else "–"
             for key in CIRCLE_COLUMNS
         ]
         rows.append((name, number(test.radius * 1e3, 1), *cells))
-    yield table(("run", "radius mm", *CIRCLE_COLUMNS.values()), rows)
-    yield from _departures(notes_of(before))
+    header = ("run", "radius mm", *CIRCLE_COLUMNS.values())
+    return {"title": f"{CIRCLES_STANDARD}, circles", "header": header, "rows": rows, "notes": notes_of(before)}
 
 
 def left_out(fit: ModelFit) -> np.ndarray:
@@ -348,71 +276,25 @@ def left_out(fit: ModelFit) -> np.ndarray:
     return m.value - (np.bincount(cell, weights * m.value) / total)[cell] + errors[cell]
 
 
-def _pictures(fit: ModelFit) -> Iterator[str]:
-    """Yield the error maps and the residuals."""
+def _figures(fit: ModelFit) -> list[tuple[str, Figure]]:
+    """Return the error maps and the residuals, with their captions."""
     from .pictures import before_after_figure, residuals_by_run_figure
 
-    yield "<h2>Pictures</h2>"
+    figures = []
     if fit.model.region is not None:
         text = "Error in space before compensation, and what is expected after it, at three heights of the measured box"
-        yield picture(text, before_after_figure(fit))
+        figures.append((text, before_after_figure(fit)))
     text = "What the fit leaves of each reading, over its stated standard uncertainty; the band is ± U (k = 2)"
-    yield picture(text, residuals_by_run_figure(fit))
-    rows = list(_runs(fit))
-    yield table(("run", "readings", "RMS, σ", "largest, σ"), rows[:MOST_RUNS])
-    if len(rows) > MOST_RUNS:
-        yield f"<p>And {len(rows) - MOST_RUNS} more runs.</p>"
+    return [*figures, (text, residuals_by_run_figure(fit))]
 
 
-def _runs(fit: ModelFit) -> Iterator[tuple[str, ...]]:
-    """Yield each run with its residuals."""
-    sigmas, runs = fit.solution.residuals / fit.measurements.stated, fit.measurements.runs
-    for n, run in enumerate(runs):
+def _runs(fit: ModelFit) -> Rows:
+    """Return each run with its residuals."""
+    sigmas = fit.solution.residuals / fit.measurements.stated
+    rows: Rows = []
+    for n, run in enumerate(fit.measurements.runs):
         own = sigmas[fit.measurements.run == n]
         if len(own):
-            sizes = (number(float(np.sqrt((own**2).mean())), 2), number(float(np.abs(own).max()), 1))
-            yield f"{n + 1}: {run.name}", str(len(own)), *sizes
-
-
-def _hidden(fit: ModelFit) -> str:
-    """Return what the readings cannot show."""
-    seen = fit.observability
-    text = f"{seen.structure_rank} of {seen.structure_size} parameters of the structure are seen by these readings."
-    if fit.unseen_errors:
-        text += f" Errors that they do not show: {listed(fit.unseen_errors)}."
-    return f"<h2>What the readings do not show</h2><p>{shown(text, 2000)}</p><p>{_lines(fit.held.report())}</p>"
-
-
-def _files(fit: ModelFit, filed: Filed) -> str:
-    """Return names and hashes of model and readings."""
-    rows: Iterable[tuple[str, str, str]] = [
-        *(("model" if n == 0 else "beside it", path.name, _sha256(path)) for n, path in enumerate(filed.files)),
-        *(("readings", name, digest) for name, digest in fit.measurements.files),
-    ]
-    return f"<h2>Files</h2>{table(('', 'name', 'SHA-256'), rows, 'text hashes')}"
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(read_bytes(path, MAX_ARCHIVE_BYTES)).hexdigest()
-
-
-SIGNATURES = """<table class="text sign"><tbody><tr><th scope=row>evaluated by, date</th><td></td></tr>
-<tr><th scope=row>released by, date</th><td></td></tr></tbody></table>"""
-
-STYLE = """
- th[scope=row], th:first-child { text-align: left }
- th[scope=row] { white-space: normal; overflow-wrap: break-word; max-width: 28em }
- .warning { border: 3px solid #a01515; padding: 8px 12px; max-width: none; white-space: pre-line }
- .text td:nth-child(2) { min-width: 22em } .sign { margin-top: 48px } .sign td { min-width: 22em; height: 40px }
- .hashes td:last-child { font-family: monospace; word-break: break-all; min-width: 0 }
- pre { font-size: 11px; line-height: 1.3; overflow-x: auto; white-space: pre }
- @media (max-width: 700px) { .text td:nth-child(2), .sign td { min-width: 9em } table { font-size: 12px }
-  th, td { padding: 2px 4px } }
- @page { size: A4; margin: 14mm }
- @media print {
-  body { font-size: 10pt } main { max-width: none; padding: 0 } h1 { font-size: 16pt }
-  h2 { font-size: 12pt; margin-top: 18pt; break-after: avoid } h3 { font-size: 10.5pt; break-after: avoid }
-  table { font-size: 7.5pt } th, td { padding: 1pt 4pt } tr, figure { break-inside: avoid } .wide { overflow: visible }
-  figcaption, .caption { font-size: 8pt } pre { font-size: 6pt; white-space: pre-wrap } p { max-width: none }
- }
-"""
+            sizes = number(float(np.sqrt((own**2).mean())), 2), number(float(np.abs(own).max()), 1)
+            rows.append((f"{n + 1}: {run.name}", str(len(own)), *sizes))
+    return rows

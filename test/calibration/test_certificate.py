@@ -61,7 +61,7 @@ def filed(fit: ModelFit, tmp_path: Path) -> Filed:
 @pytest.fixture
 def unpictured(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the pictures, which take most of the time."""
-    monkeypatch.setattr(certificate, "_pictures", lambda fit: iter(()))
+    monkeypatch.setattr(certificate, "_figures", lambda fit: [])
 
 
 def cells(text: str) -> list[list[str]]:
