@@ -23,9 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hexapod_comp.calibration.evaluation import INCH, Worth, worth
+from hexapod_comp.calibration.evaluation import INCH, Worth, worth, worth_text
 from hexapod_comp.calibration.lines import fit_lines
-from hexapod_comp.calibration.lines_report import worth_text
 from hexapod_comp.machine.geometry import HexapodGeometry, load_geometry
 from hexapod_comp.machine.model import MachineModel, ModelOrigin, RealMachine
 from hexapod_comp.machine.model_file import load_model, save_model

@@ -8,6 +8,7 @@ which is all that a linear laser sees.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -151,3 +152,40 @@ def worth(
     before = held_out(truth, None, box, points, seed, repeatability, level=level)
     after = held_out(truth, model, box, points, seed, repeatability, sensed=sensed, level=level)
     return Worth(before, after, paper_metric(truth, model, box, seed=seed, sensed=sensed, level=level))
+
+
+def worth_text(worth: Worth) -> str:
+    """Return what a model is worth on a virtual machine: the paper's measure next to the honest one."""
+    before, after, paper = worth.before, worth.after, worth.paper
+    compared = {
+        f"metric of Mou & King, mean |displacement error| along {paper.lines} lines": (paper.before, paper.after, "µm"),
+        "error vector in space, RMS, datum aligned": (before.aligned.rms, after.aligned.rms, "µm"),
+        "its largest": (before.aligned.largest, after.aligned.largest, "µm"),
+        "error vector in space, RMS, as it is": (before.raw.rms, after.raw.rms, "µm"),
+        "rotation, RMS, datum aligned": (before.rotation.rms, after.rotation.rms, "µrad"),
+    }
+    lines = [f"On the virtual machine, without → with the model (held out: {after.points} points, both ways):"]
+    for name, (without, left, unit) in compared.items():
+        removed = f" ({100.0 * (1.0 - left / without):.1f} % less)" if without > 0.0 else ""
+        lines.append(f"  {name}: {without * 1e6:.2f} → {left * 1e6:.2f} {unit}{removed}")
+    if worth.promised is not None:
+        low, high = (f"{end * 1e6:.2f}" for end in worth.promised)
+        lines.insert(3, f"  promised by the fit: {low} to {high} µm, {'kept' if worth.kept else 'NOT KEPT'}")
+    return "\n".join(lines)
+
+
+def worth_json(worth: Worth) -> dict[str, Any]:
+    """Return the same as plain numbers; SI units are in the keys."""
+    error = {
+        name: {
+            "points": one.points,
+            "rms_m": one.raw.rms,
+            "aligned_rms_m": one.aligned.rms,
+            "aligned_max_m": one.aligned.largest,
+            "rotation_rms_rad": one.rotation.rms,
+        }
+        for name, one in (("error_without", worth.before), ("error_with", worth.after))
+    }
+    along = {"without_m": worth.paper.before, "with_m": worth.paper.after, "lines": worth.paper.lines}
+    promised = {"promised_m": worth.promised, "kept": worth.kept}
+    return {**error, **promised, "mean_displacement_error_along_lines": along}

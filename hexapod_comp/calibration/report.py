@@ -1,18 +1,21 @@
-"""What a fit of scheme ``joint``, or a plan for one, prints."""
+"""What fits print, for people and as JSON: scheme ``joint``, or a plan for one, and scheme ``lines``."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
 from ..formats.texts import aligned, number
-from ..measurements.readings import ANGULAR_KINDS, CHANNELS, SAME_ATTITUDE
+from ..machine.field import COMPONENTS
+from ..measurements.readings import ANGULAR_KINDS, AXES, CHANNELS, SAME_ATTITUDE
 from .assumptions import ASSUMED
 from .design import Plan
 from .fit import ChannelFit, ModelFit, Outlier
 from .lead import ScrewLead
+from .lines import LineFit, LinesFit
 from .posterior import BlockSight, Observability, ToolError, UnseenError, listed
 from .thermal import warming_json, warming_text
 from .verdict import TILT
@@ -32,13 +35,14 @@ TRUST = 0.1
 
 def fit_report(fit: ModelFit) -> str:
     """Return the report of a fit, for people: what is left, what was found, what the readings could not show."""
+    doubts = (*fit.verdict.refusals, *fit.verdict.doubts)
     parts = [
         *_gross_errors(fit),
-        *_doubts(fit),
+        *(["IN DOUBT:\n" + "\n".join(f"  {doubt}" for doubt in doubts)] if doubts else []),
         _headline(fit),
         *_expected(fit.level, fit.tilted, fit.observability),
         fit.held.report(),
-        *_notes(fit),
+        *(["\n".join(f"note: {note}" for note in fit.notes)] if fit.notes else []),
         _channel_table(fit),
         *_chi_square_tables(fit),
         _decision_table(fit),
@@ -47,17 +51,6 @@ def fit_report(fit: ModelFit) -> str:
         *_outliers(fit),
     ]
     return "\n\n".join(parts) + "\n"
-
-
-def _doubts(fit: ModelFit) -> Iterator[str]:
-    """Yield what is wrong, before anything else."""
-    if fit.verdict.doubts or fit.verdict.refusals:
-        yield "IN DOUBT:\n" + "\n".join(f"  {doubt}" for doubt in (*fit.verdict.refusals, *fit.verdict.doubts))
-
-
-def _notes(fit: ModelFit) -> Iterator[str]:
-    if fit.notes:
-        yield "\n".join(f"note: {note}" for note in fit.notes)
 
 
 def _headline(fit: ModelFit) -> str:
@@ -297,4 +290,71 @@ def plan_json(plan: Plan) -> dict:
         "parameters": plan.space.size,
         "repeatability_m": plan.stops,
         **_expected_json(plan.level, plan.tilted, plan.observability, plan.unseen_errors),
+    }
+
+
+# Scheme lines
+
+WAYS = {1: "forward", -1: "backward", 0: "both"}
+
+
+def lines_report(fit: LinesFit, every_line: bool = False) -> str:
+    """Return the report of a fit of scheme ``lines``: a row for each family and component, or each polynomial too."""
+    field = fit.model.field
+    nodes = " × ".join(str(len(along)) for along in field.grid)
+    header = ("lines along", "of", "polynomials", "order", "R² least", "adjusted R² median", "σ median", "largest", "")
+    families: dict[tuple[int, int], list[LineFit]] = {}
+    for line in fit.lines:
+        families.setdefault((line.axis, line.component), []).append(line)
+    rows = []
+    for (axis, component), members in sorted(families.items()):
+        orders, spread = [line.order for line in members], np.array([line.residual_std for line in members]) * 1e6
+        order = f"{min(orders)}…{max(orders)}" if min(orders) < max(orders) else str(orders[0])
+        worst, median = min(line.r2 for line in members), float(np.median([line.adjusted_r2 for line in members]))
+        cells = (number(worst, 3), number(median, 3), f"{np.median(spread):.2f}", f"{spread.max():.2f}")
+        rows.append((AXES[axis], COMPONENTS[component], str(len(members)), order, *cells, _micro(component)))
+    blocks = [f"{fit.model.name}: {len(fit.lines)} polynomials on a grid of {nodes} nodes", aligned(header, rows)]
+    if every_line:
+        titles = ("of", "direction", "points", "order", "R²", "adjusted R²", "σ", "σ repeated", "unit", "")
+        blocks.append(aligned(titles, map(_line_row, fit.lines)))
+    blocks += [fit.held.report(), *(f"note: {note}" for note in fit.notes)]
+    return "\n\n".join(blocks) + "\n"
+
+
+def _line_row(line: LineFit) -> tuple[str, ...]:
+    """Return a polynomial, σ of its residuals, and of repeated readings where there are any."""
+    repeated = "–" if np.isnan(line.repeat_std) else f"{line.repeat_std * 1e6:.2f}"
+    sizes = number(line.r2, 4), number(line.adjusted_r2, 4), f"{line.residual_std * 1e6:.2f}", repeated
+    counts = str(len(line.values)), str(line.order)
+    return COMPONENTS[line.component], WAYS[line.direction], *counts, *sizes, _micro(line.component), line.name
+
+
+def _micro(component: int) -> str:
+    return "µm" if component < 3 else "µrad"
+
+
+def lines_json(fit: LinesFit) -> dict[str, Any]:
+    """Return a fit of scheme ``lines`` as plain numbers; SI units are in the keys."""
+
+    def one(line: LineFit) -> dict[str, Any]:
+        unit = "m" if line.component < 3 else "rad"
+        return {
+            "name": line.name,
+            "component": COMPONENTS[line.component],
+            "direction": WAYS[line.direction],
+            "points": len(line.values),
+            f"coefficients_{unit}": line.coefficients.tolist(),
+            "r2": line.r2,
+            "adjusted_r2": line.adjusted_r2,
+            f"residual_std_{unit}": line.residual_std,
+            f"repeat_std_{unit}": line.repeat_std,
+        }
+
+    return {
+        "machine": fit.model.machine,
+        "scheme": "lines",
+        "grid_m": [axis.tolist() for axis in fit.model.field.grid],
+        "lines": [one(line) for line in fit.lines],
+        "datum": fit.held.as_json(),
+        "notes": fit.notes,
     }

@@ -11,15 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..calibration import lines_report
 from ..calibration.blocks import HARMONICS
-from ..calibration.evaluation import Worth, worth
+from ..calibration.evaluation import Worth, worth, worth_json, worth_text
 from ..calibration.fit import ModelFit, fit_model
 from ..calibration.lines import fit_lines
 from ..calibration.parameters import TOLERANCES, FitSettings
 from ..calibration.posterior import FittedParameters
 from ..calibration.posterior_file import SUFFIX, save_with_posterior
-from ..calibration.report import as_json, fit_report
+from ..calibration.report import as_json, fit_report, lines_json, lines_report
 from ..compensation.checks import check
 from ..errors import CalibrationError, CommandError
 from ..formats.outputs import write_text
@@ -167,8 +166,8 @@ def _lines(args: argparse.Namespace, measured: MeasurementSet) -> Fitted:
         predicted = predicted_error_figure(RealMachine(measured.geometry, fit.model), None)
         return {"lines.png": fitted_lines_figure(fit), "strut_errors.png": of_struts, "predicted_error.png": predicted}
 
-    text = lines_report.report(fit, every_line=args.every_line)
-    return Fitted(fit.model, text, lambda: lines_report.as_json(fit), pictures, fit.misfit)
+    text = lines_report(fit, every_line=args.every_line)
+    return Fitted(fit.model, text, lambda: lines_json(fit), pictures, fit.misfit)
 
 
 def beyond_limits(measured: MeasurementSet, model: MachineModel) -> str:
@@ -202,13 +201,13 @@ def _write(args: argparse.Namespace, result: Fitted, measured: MeasurementSet, t
     judged = judge(measured)
     parts = [result.text, region_text(result.model.measured, measured.geometry) + "\n"]
     parts += [standards_text(judged) + "\n"] if judged else []
-    parts += [lines_report.worth_text(tried) + "\n"] if tried else []
+    parts += [worth_text(tried) + "\n"] if tried else []
     text = "\n".join(parts)
     if result.misfit:
         text = f"{FORCED}: {result.misfit}. {ADVICE}\n\n{text}"
     beside = save_with_posterior(result.saved, result.fitted, args.out)
     if args.json:
-        more = {"standards": standards_json(judged), "worth": lines_report.worth_json(tried) if tried else None}
+        more = {"standards": standards_json(judged), "worth": worth_json(tried) if tried else None}
         more["measured_box"] = region_json(result.model.measured, measured.geometry)
         files = {"misfit": result.misfit, "written": args.out, "written_beside": beside}
         common.show({**result.content(), **more, **files})
