@@ -129,7 +129,7 @@ def strut_lengths_batch(
     structure: Structure, positions: np.ndarray, rotations: np.ndarray, threads: int | None = None
 ) -> np.ndarray:
     """Return the strut lengths at N poses, shape (N, 6), m, using all cores."""
-    positions, rotations = _batch_poses(positions, rotations)
+    positions, rotations = batch_poses(positions, rotations)
     lengths = np.empty((len(positions), 6))
 
     def run(rows: slice) -> None:
@@ -154,7 +154,7 @@ def jacobian(machine: Machine, pose: Pose) -> np.ndarray:
 
 def jacobian_batch(structure: Structure, positions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     """Return :func:`jacobian` at N poses, shape (N, 6, 6); NaN where a pose is."""
-    positions, rotations = _batch_poses(positions, rotations)
+    positions, rotations = batch_poses(positions, rotations)
     matrices = np.empty((len(positions), 6, 6))
     batch.jacobians(*structure.joints, positions, rotations, matrices)
     return matrices
@@ -354,13 +354,15 @@ def six_lengths(lengths: ArrayLike) -> np.ndarray:
     return lengths
 
 
-def _batch_poses(positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    positions = np.ascontiguousarray(positions, dtype=float)
-    rotations = np.ascontiguousarray(rotations, dtype=float)
+def batch_poses(positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return poses as the core takes them: contiguous, a single rotation (3, 3) for all of them spread."""
+    positions, rotations = np.ascontiguousarray(positions, dtype=float), np.asarray(rotations, dtype=float)
+    if rotations.shape == (3, 3):
+        rotations = np.broadcast_to(rotations, (len(positions), 3, 3))
     if positions.ndim != 2 or positions.shape[1] != 3 or rotations.shape != (len(positions), 3, 3):
         problem = f"poses must have shapes (N, 3) and (N, 3, 3), not {positions.shape} and {rotations.shape}"
-        raise KinematicsError(problem)
-    return positions, rotations
+        raise KinematicsError(problem, positions.shape)
+    return positions, np.ascontiguousarray(rotations)
 
 
 def _refuse_not_finite(positions: np.ndarray, rotations: np.ndarray) -> None:

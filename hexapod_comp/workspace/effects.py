@@ -17,7 +17,15 @@ from scipy.spatial.transform import Rotation
 from ..core import batch
 from ..errors import KinematicsError, SingularError
 from ..machine.geometry import HexapodGeometry
-from ..machine.kinematics import ForwardBatch, Structure, jacobian_batch, over_chunks, solve_poses, strut_lengths
+from ..machine.kinematics import (
+    ForwardBatch,
+    Structure,
+    batch_poses,
+    jacobian_batch,
+    over_chunks,
+    solve_poses,
+    strut_lengths,
+)
 from .budget import BASE_JOINT, LENGTH, PLATFORM_JOINT, TOOL, SingleErrors
 
 EXACT, LINEAR, ITERATION = "exact", "linear", "iteration"
@@ -84,7 +92,7 @@ def _of_each(
     wanted: Callable[[np.ndarray], np.ndarray],
 ) -> np.ndarray:
     """Return what is wanted of every error's effects, shape (N, E, width)."""
-    positions, rotations = _poses(positions, rotations)
+    positions, rotations = batch_poses(positions, rotations)
     each, result = _way(method), np.empty((len(positions), len(errors), width))
 
     def run(rows: slice) -> None:
@@ -109,7 +117,7 @@ def extremes(
     Of more poses than memory takes, hand over one part after the other and join the results with :func:`merged`:
     they are the same to the last bit however the poses are parted. `first` is the number of the first pose.
     """
-    positions, rotations = _poses(positions, rotations)
+    positions, rotations = batch_poses(positions, rotations)
     each, parts = _way(method), {}
 
     def run(rows: slice) -> None:
@@ -282,18 +290,6 @@ def _sizes(vectors: np.ndarray) -> np.ndarray:
     x, y, z = vectors[:3]
     a, b, c = np.abs(vectors[3:])
     return np.stack([np.sqrt(x * x + y * y + z * z), np.maximum(np.maximum(a, b), c)])
-
-
-def _poses(positions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return poses as the core takes them: contiguous, a single rotation (3, 3) for all of them spread."""
-    positions = np.ascontiguousarray(positions, dtype=float)
-    rotations = np.asarray(rotations, dtype=float)
-    if rotations.shape == (3, 3):
-        rotations = np.broadcast_to(rotations, (len(positions), 3, 3))
-    if positions.ndim != 2 or positions.shape[1] != 3 or rotations.shape != (len(positions), 3, 3):
-        problem = f"poses must have shapes (N, 3) and (N, 3, 3), not {positions.shape} and {rotations.shape}"
-        raise KinematicsError(problem, positions.shape)
-    return positions, np.array(rotations, order="C")
 
 
 # The iteration of v. Daake et al. (chapter 1), a check and a yardstick that shares nothing with the core: tangents to

@@ -23,209 +23,6 @@ from .ranking import RankingRow, beside, ranked, ranking_rows, ranking_text
 from .reach import Reach, poses_at, reach
 from .shells import Shell, shell
 
-EACH = ("alone", "only", "without", "equal")  # What an allocation says of each type
-
-
-def report(study: Study, names: Sequence[str]) -> str:
-    """Return the report of a study; `names` are those of its orientations."""
-    ranking = ranking_text(study.rows, beside(study.geometry, study.errors))
-    parts = [_headline(study), _reach_table(study, names), ranking, _combined_text(study)]
-    parts += [_allocation_text(study, allocation) for allocation in study.allocations]
-    if study.agreement is not None:
-        parts.append(_agreement_text(study))
-    return "\n\n".join(parts) + "\n"
-
-
-def _headline(study: Study) -> str:
-    return (
-        f"machine {study.geometry.name}: {len(study.errors)} single errors of {len(study.errors.kinds)} types "
-        f"at {study.extremes.poses} poses"
-    )
-
-
-def _reach_table(study: Study, names: Sequence[str]) -> str:
-    """Return volume, size and limits of the workspace at each orientation."""
-    rows = []
-    for name, one in zip(names, study.reaches, strict=True):
-        size = " × ".join(f"{side * 1e3:.0f}" for side in np.ptp(one.box, axis=0))
-        limits = ", ".join(f"{cause} {100.0 * share:.0f} %" for cause, share in one.shares().items())
-        rows.append((name, number(one.volume * 1e6, 1), size, str(one.parts), limits))
-    head = ("tilted from home", "volume cm³", "box in work mm", "pieces", "limited by (share of the boundary)")
-    return aligned(head, rows)
-
-
-def _combined_text(study: Study) -> str:
-    """Return what the whole budget adds up to."""
-    combined, drawn = study.combined, study.combined.monte_carlo
-    rows = [
-        ("worst case", *_both(combined.worst_case), ""),
-        ("root sum of squares", *_both(combined.root_sum_of_squares), ""),
-    ]
-    for n, percentile in enumerate(drawn.percentiles):
-        low, high = drawn.worst_low[n], drawn.worst_high[n]
-        cells = _both(drawn.worst_values[n])
-        bounds = f"({_both(low)[0]}…{_both(high)[0]} µm with {100.0 * drawn.confidence:.0f} %)"
-        rows.append((f"{percentile:g} % of {drawn.draws} machines", *cells, bounds))
-    head = ("whole budget, worst pose", "transl. µm", "rot. m°", "")
-    return aligned(head, rows) + "\nmachines: all errors uniform within their bounds, each machine's worst pose"
-
-
-def _both(values: np.ndarray) -> tuple[str, str]:
-    return number(float(values[0]) * 1e6, 2), number(float(np.degrees(values[1])) * 1e3, 2)
-
-
-def _allocation_text(study: Study, allocation: Allocation) -> str:
-    """Return what each error may be."""
-    how = {"rss": "root sum of squares", "worst_case": "worst case"}[allocation.method]
-    head = (
-        f"allowed {allocation.allowed * 1e6:g} µm, {how}: the budget adds up to {allocation.combined * 1e6:.2f} µm; "
-        f"all errors may be {allocation.scale:.3g} times as large.\nWhat each type adds up to alone, and the others "
-        "without it; and what its size may be, when the others stay or when all use up equal parts:"
-    )
-    header = ("type", "now ±", "alone µm", "the others µm", "may be, the others as now", "may be, equal parts", "")
-    rows = []
-    for n, (name, size) in enumerate(study.budget.sizes.items()):
-        unit, factor = {"length": ("µm", 1e6), "ratio": ("ppm", 1e6)}[BY_NAME[name].dimension]
-        now = size * factor
-        sums = (number(value * 1e6, 2) for value in (allocation.only[n], allocation.without[n]))
-        left = _may_be(now, allocation.alone[n], "nothing is left")
-        rows.append((study.errors.kinds[n], number(now, 2), *sums, left, _may_be(now, allocation.equal[n]), unit))
-    return head + "\n" + aligned(header, rows)
-
-
-def _may_be(now: float, factor: float, none: str = "") -> str:
-    """Return what a size may grow or must shrink to."""
-    return none if np.isnan(factor) else "anything" if np.isinf(factor) else number(now * factor, 2)
-
-
-def _agreement_text(study: Study) -> str:
-    agreement = study.agreement
-    if agreement is None:
-        return ""
-    return (
-        f"methods, {agreement.effects} effects, difference to exact over the type's largest effect: "
-        f"linear {100.0 * agreement.linear:.3f} %, the paper's iteration {100.0 * agreement.tangential:.4f} % "
-        f"(its passive legs drift by {100.0 * agreement.drift:.3f} % of the active leg's travel)"
-    )
-
-
-def as_json(study: Study) -> dict[str, Any]:
-    """Return a study as plain numbers; units are in the keys."""
-    drawn = study.combined.monte_carlo
-    return {
-        "machine": study.geometry.name,
-        "frame": "work",
-        "budget_si": study.budget.sizes,
-        "poses": study.extremes.poses,
-        "ranking": ranking_rows(study.rows, beside(study.geometry, study.errors)),
-        "reach": [
-            {"volume_m3": item.volume, "box_m": item.box, "limits": item.shares(), "regions": item.regions()}
-            for item in study.reaches
-        ],
-        "combined_m_rad": {
-            "worst_case": study.combined.worst_case,
-            "root_sum_of_squares": study.combined.root_sum_of_squares,
-            "percentiles": dict(zip(drawn.percentiles, drawn.worst_values, strict=True)),
-        },
-        "allocations_m": [
-            {**vars(item), **{name: dict(zip(study.errors.kinds, getattr(item, name), strict=True)) for name in EACH}}
-            for item in study.allocations
-        ],
-        "agreement": study.agreement,
-    }
-
-
-WAIT = 10  # For a cluster to answer, s
-PART = 65_536  # Poses per part: some seconds of work, and a few megabytes to send
-
-
-@dataclass(frozen=True)
-class Part:
-    """Poses of one orientation that are looked at together."""
-
-    geometry: HexapodGeometry  # The machine
-    errors: SingleErrors  # The errors
-    points: np.ndarray  # (N, 3): tool tips in the work frame, m
-    rotation: np.ndarray  # (3, 3): orientation of the tool in the work frame
-    method: str  # As for :func:`~hexapod_comp.workspace.effects.extremes`
-    first: int  # Number of the first pose
-    threads: int | None  # Threads to use
-
-
-def look_at(part: Part) -> Extremes:
-    """Return the extremes over a part; the function that workers run."""
-    poses = poses_at(part.geometry, part.points, part.rotation)
-    return extremes(part.geometry, part.errors, *poses, part.method, part.first, part.threads)
-
-
-def survey(
-    reaches: Iterable[Reach],
-    errors: SingleErrors,
-    method: str = EXACT,
-    workers: int = 1,
-    scheduler: str | None = None,
-    progress: Callable[[int], object] = lambda count: None,
-) -> Extremes:
-    """Return the extremes of every error's effect over all grid points within some reaches."""
-    alone = workers <= 1 and scheduler is None
-    parts = _parts(reaches, errors, method, None if alone else 1)
-    if scheduler is not None:
-        extremes = _on_cluster(parts, scheduler)
-    elif alone:
-        extremes = map(look_at, parts)
-    else:
-        extremes = _in_processes(parts, workers)
-    return merged(_counted(extremes, progress))
-
-
-def _parts(reaches: Iterable[Reach], errors: SingleErrors, method: str, threads: int | None) -> Iterator[Part]:
-    first = 0
-    for one in reaches:
-        points = one.points()
-        for start in range(0, len(points), PART):
-            chosen = points[start : start + PART]
-            yield Part(one.geometry, errors, chosen, one.rotation, method, first, threads)
-            first += len(chosen)
-
-
-def _counted(extremes: Iterable[Extremes], progress: Callable[[int], object]) -> Iterator[Extremes]:
-    for part in extremes:
-        progress(part.poses)
-        yield part
-
-
-def _in_processes(parts: Iterable[Part], workers: int) -> Iterator[Extremes]:
-    """Yield the parts' extremes in order, from local processes; an interruption ends these."""
-    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
-    try:
-        yield from pool.map(look_at, parts)
-    except BrokenProcessPool as error:
-        raise HexapodError("a worker process died (out of memory?); take fewer --workers") from error
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _on_cluster(parts: Iterable[Part], scheduler: str) -> Iterator[Extremes]:
-    """Yield the parts' extremes in order, from a Dask cluster."""
-    if not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d{1,5}", scheduler):
-        raise HexapodError(f"a scheduler's address is like tcp://host:8786, not {scheduler!r}")
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise HexapodError("a cluster needs Dask: pip install distributed") from error
-    try:
-        client: Any = Client(scheduler, timeout=WAIT, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise HexapodError(f"no Dask scheduler answers at {scheduler!r}: {error}") from error
-    with client:
-        try:
-            client.wait_for_workers(1, timeout=WAIT)
-        except (TimeoutError, asyncio.TimeoutError) as error:
-            raise HexapodError(f"the Dask scheduler at {scheduler!r} has no workers") from error
-        for future in client.map(look_at, list(parts), pure=False):
-            yield future.result()
-
-
 COMBINED_POSES = 500  # Random poses of the workspace at which budgets are combined
 WAYS = (RSS, WORST_CASE)  # How errors add up where tolerances are allocated
 DRAWS = 4000  # Machines of the Monte Carlo
@@ -399,3 +196,203 @@ def mesh_effects(study: Study, body: Shell) -> tuple[np.ndarray, np.ndarray]:
     positions, rotations = (np.concatenate([pose[k] for pose in poses]) for k in range(2))
     values = effects(study.geometry, study.errors, positions, rotations, EXACT)
     return points, np.moveaxis(values.reshape(*points.shape[:3], len(study.errors), 2), (3, 4), (0, 1))
+
+
+# Extremes over any number of poses, part by part: the same bits in this process, in several, or on a cluster.
+
+WAIT = 10  # For a cluster to answer, s
+PART = 65_536  # Poses per part: some seconds of work, and a few megabytes to send
+
+
+@dataclass(frozen=True)
+class Part:
+    """Poses of one orientation that are looked at together."""
+
+    geometry: HexapodGeometry  # The machine
+    errors: SingleErrors  # The errors
+    points: np.ndarray  # (N, 3): tool tips in the work frame, m
+    rotation: np.ndarray  # (3, 3): orientation of the tool in the work frame
+    method: str  # As for :func:`~hexapod_comp.workspace.effects.extremes`
+    first: int  # Number of the first pose
+    threads: int | None  # Threads to use
+
+
+def look_at(part: Part) -> Extremes:
+    """Return the extremes over a part; the function that workers run."""
+    poses = poses_at(part.geometry, part.points, part.rotation)
+    return extremes(part.geometry, part.errors, *poses, part.method, part.first, part.threads)
+
+
+def survey(
+    reaches: Iterable[Reach],
+    errors: SingleErrors,
+    method: str = EXACT,
+    workers: int = 1,
+    scheduler: str | None = None,
+    progress: Callable[[int], object] = lambda count: None,
+) -> Extremes:
+    """Return the extremes of every error's effect over all grid points within some reaches."""
+    alone = workers <= 1 and scheduler is None
+    parts = _parts(reaches, errors, method, None if alone else 1)
+    if scheduler is not None:
+        found: Iterable[Extremes] = _on_cluster(parts, scheduler)
+    else:
+        found = map(look_at, parts) if alone else _in_processes(parts, workers)
+
+    def counted() -> Iterator[Extremes]:
+        for part in found:
+            progress(part.poses)
+            yield part
+
+    return merged(counted())
+
+
+def _parts(reaches: Iterable[Reach], errors: SingleErrors, method: str, threads: int | None) -> Iterator[Part]:
+    first = 0
+    for one in reaches:
+        points = one.points()
+        for start in range(0, len(points), PART):
+            chosen = points[start : start + PART]
+            yield Part(one.geometry, errors, chosen, one.rotation, method, first, threads)
+            first += len(chosen)
+
+
+def _in_processes(parts: Iterable[Part], workers: int) -> Iterator[Extremes]:
+    """Yield the parts' extremes in order, from local processes; an interruption ends these."""
+    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+    try:
+        yield from pool.map(look_at, parts)
+    except BrokenProcessPool as error:
+        raise HexapodError("a worker process died (out of memory?); take fewer --workers") from error
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _on_cluster(parts: Iterable[Part], scheduler: str) -> Iterator[Extremes]:
+    """Yield the parts' extremes in order, from a Dask cluster."""
+    if not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d{1,5}", scheduler):
+        raise HexapodError(f"a scheduler's address is like tcp://host:8786, not {scheduler!r}")
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise HexapodError("a cluster needs Dask: pip install distributed") from error
+    try:
+        client: Any = Client(scheduler, timeout=WAIT, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise HexapodError(f"no Dask scheduler answers at {scheduler!r}: {error}") from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=WAIT)
+        except (TimeoutError, asyncio.TimeoutError) as error:
+            raise HexapodError(f"the Dask scheduler at {scheduler!r} has no workers") from error
+        for future in client.map(look_at, list(parts), pure=False):
+            yield future.result()
+
+
+# What a classification prints.
+
+EACH = ("alone", "only", "without", "equal")  # What an allocation says of each type
+
+
+def report(study: Study, names: Sequence[str]) -> str:
+    """Return the report of a study; `names` are those of its orientations."""
+    ranking = ranking_text(study.rows, beside(study.geometry, study.errors))
+    counts = f"{len(study.errors)} single errors of {len(study.errors.kinds)} types at {study.extremes.poses} poses"
+    headline = f"machine {study.geometry.name}: {counts}"
+    parts = [headline, _reach_table(study, names), ranking, _combined_text(study)]
+    parts += [_allocation_text(study, allocation) for allocation in study.allocations]
+    if study.agreement is not None:
+        parts.append(_agreement_text(study))
+    return "\n\n".join(parts) + "\n"
+
+
+def _reach_table(study: Study, names: Sequence[str]) -> str:
+    """Return volume, size and limits of the workspace at each orientation."""
+    rows = []
+    for name, one in zip(names, study.reaches, strict=True):
+        size = " × ".join(f"{side * 1e3:.0f}" for side in np.ptp(one.box, axis=0))
+        limits = ", ".join(f"{cause} {100.0 * share:.0f} %" for cause, share in one.shares().items())
+        rows.append((name, number(one.volume * 1e6, 1), size, str(one.parts), limits))
+    head = ("tilted from home", "volume cm³", "box in work mm", "pieces", "limited by (share of the boundary)")
+    return aligned(head, rows)
+
+
+def _combined_text(study: Study) -> str:
+    """Return what the whole budget adds up to."""
+    combined, drawn = study.combined, study.combined.monte_carlo
+    rows = [
+        ("worst case", *_both(combined.worst_case), ""),
+        ("root sum of squares", *_both(combined.root_sum_of_squares), ""),
+    ]
+    for n, percentile in enumerate(drawn.percentiles):
+        low, high = drawn.worst_low[n], drawn.worst_high[n]
+        cells = _both(drawn.worst_values[n])
+        bounds = f"({_both(low)[0]}…{_both(high)[0]} µm with {100.0 * drawn.confidence:.0f} %)"
+        rows.append((f"{percentile:g} % of {drawn.draws} machines", *cells, bounds))
+    head = ("whole budget, worst pose", "transl. µm", "rot. m°", "")
+    return aligned(head, rows) + "\nmachines: all errors uniform within their bounds, each machine's worst pose"
+
+
+def _both(values: np.ndarray) -> tuple[str, str]:
+    return number(float(values[0]) * 1e6, 2), number(float(np.degrees(values[1])) * 1e3, 2)
+
+
+def _allocation_text(study: Study, allocation: Allocation) -> str:
+    """Return what each error may be."""
+    how = {"rss": "root sum of squares", "worst_case": "worst case"}[allocation.method]
+    head = (
+        f"allowed {allocation.allowed * 1e6:g} µm, {how}: the budget adds up to {allocation.combined * 1e6:.2f} µm; "
+        f"all errors may be {allocation.scale:.3g} times as large.\nWhat each type adds up to alone, and the others "
+        "without it; and what its size may be, when the others stay or when all use up equal parts:"
+    )
+    header = ("type", "now ±", "alone µm", "the others µm", "may be, the others as now", "may be, equal parts", "")
+    rows = []
+    for n, (name, size) in enumerate(study.budget.sizes.items()):
+        unit, factor = {"length": ("µm", 1e6), "ratio": ("ppm", 1e6)}[BY_NAME[name].dimension]
+        now = size * factor
+        sums = (number(value * 1e6, 2) for value in (allocation.only[n], allocation.without[n]))
+        left = _may_be(now, allocation.alone[n], "nothing is left")
+        rows.append((study.errors.kinds[n], number(now, 2), *sums, left, _may_be(now, allocation.equal[n]), unit))
+    return head + "\n" + aligned(header, rows)
+
+
+def _may_be(now: float, factor: float, none: str = "") -> str:
+    """Return what a size may grow or must shrink to."""
+    return none if np.isnan(factor) else "anything" if np.isinf(factor) else number(now * factor, 2)
+
+
+def _agreement_text(study: Study) -> str:
+    agreement = study.agreement
+    if agreement is None:
+        return ""
+    return (
+        f"methods, {agreement.effects} effects, difference to exact over the type's largest effect: "
+        f"linear {100.0 * agreement.linear:.3f} %, the paper's iteration {100.0 * agreement.tangential:.4f} % "
+        f"(its passive legs drift by {100.0 * agreement.drift:.3f} % of the active leg's travel)"
+    )
+
+
+def as_json(study: Study) -> dict[str, Any]:
+    """Return a study as plain numbers; units are in the keys."""
+    drawn = study.combined.monte_carlo
+    return {
+        "machine": study.geometry.name,
+        "frame": "work",
+        "budget_si": study.budget.sizes,
+        "poses": study.extremes.poses,
+        "ranking": ranking_rows(study.rows, beside(study.geometry, study.errors)),
+        "reach": [
+            {"volume_m3": item.volume, "box_m": item.box, "limits": item.shares(), "regions": item.regions()}
+            for item in study.reaches
+        ],
+        "combined_m_rad": {
+            "worst_case": study.combined.worst_case,
+            "root_sum_of_squares": study.combined.root_sum_of_squares,
+            "percentiles": dict(zip(drawn.percentiles, drawn.worst_values, strict=True)),
+        },
+        "allocations_m": [
+            {**vars(item), **{name: dict(zip(study.errors.kinds, getattr(item, name), strict=True)) for name in EACH}}
+            for item in study.allocations
+        ],
+        "agreement": study.agreement,
+    }
