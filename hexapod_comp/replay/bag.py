@@ -161,23 +161,20 @@ def read_recording(
         if packing == "file":
             files = [_unpacked_file(path, file, Path(folder), Allowance(size)) for file in files]
         counts, texts = Counter[tuple[str, str]](), list[Message]()
-        kept = Allowance(size)
-        for message in _messages(path, files, packing, Allowance(size)):
+        for message in _messages(path, files, packing, size):
             counts[message.topic, message.kind] += 1
             if message.topic.endswith((JOURNAL, FILES)):
-                kept.take(len(message.raw))
                 texts.append(message)
         if not counts:
             raise InputFileError(path, "", "is a bag without messages")
         node = _choose(path, counts, namespace)
         wanted = _wanted(path, counts, node)
-        collected = _Collected(path, node, Allowance(size))
-        others = (m for m in _messages(path, files, packing, Allowance(size)) if wanted.get(m.topic) in TOPICS)
+        collected = _Collected(path, node)
+        others = (m for m in _messages(path, files, packing, size) if wanted.get(m.topic) in TOPICS)
         for part in ((m for m in texts if m.topic in wanted), others):  # the journal first: it names the struts
             for message in part:
                 key = f"{message.topic} at {message.time} ns"
-                content = _deserialized(path, key, store, message)
-                collected.take(wanted[message.topic], message.time, content, len(message.raw))
+                collected.take(wanted[message.topic], message.time, _deserialized(path, key, store, message))
                 progress(1)
     heard = counts[f"{_namespace(node)}/{COMMANDS}", POSE]
     return collected.recording(notes, heard)
@@ -245,12 +242,14 @@ def _unpacked_file(path: Path, file: Path, folder: Path, allowance: Allowance) -
     return target
 
 
-def _messages(path: Path, files: list[Path], packing: str, allowance: Allowance) -> Iterator[Message]:
+def _messages(path: Path, files: list[Path], packing: str, size: int) -> Iterator[Message]:
     """Yield the messages of all files of a bag, each as it was sent."""
+    allowance, told = Allowance(size), Allowance(size)
     for file in files:
         try:
             for message in messages(file, allowance):
                 refuse_too_much_at_once(len(message.raw), "a message")
+                told.take(len(message.raw))  # rows of a database may share one piece of the file
                 if packing == "message":
                     message = message._replace(raw=allowance.unpacked(zstd_stream(message.raw)))
                 yield message
@@ -339,20 +338,16 @@ class _Columns:
 class _Collected:
     """Messages on their way into a Recording."""
 
-    def __init__(self, path: str | Path, node: str, allowance: Allowance) -> None:
-        self._path, self._node, self._allowance = path, node, allowance
+    def __init__(self, path: str | Path, node: str) -> None:
+        self._path, self._node = path, node
         self._columns = {name: _Columns() for name in TOPICS}
         self._pages: list[tuple[int, Page]] = []
         self._sources: dict[str, Source] = {}
         self._odd: dict[str, int] = {}
         self._joints: tuple[str, ...] = STRUT_NAMES
 
-    def take(self, name: str, time: int, message: Any, length: int) -> None:
-        """Take one message of some length, bytes: pages of a database may hold many of one piece of file."""
-        try:
-            self._allowance.take(length)
-        except UnpackingError as error:
-            raise InputFileError(self._path, f"{name} at {time} ns", str(error)) from error
+    def take(self, name: str, time: int, message: Any) -> None:
+        """Take one message."""
         if name in (JOURNAL, FILES):
             self._take_text(name, time, message.data)
             return

@@ -27,7 +27,6 @@ from hexapod_comp.machine.model import MachineModel
 from hexapod_comp.replay.bag import FILES, JOURNAL, Files, _Collected, read_recording
 from hexapod_comp.replay.replay import replay_recording, what_if
 from hexapod_comp.replay.report import Report, as_json, rows_of, text
-from hexapod_comp.replay.storage import Allowance
 
 VALUES = [[], {}, None, "x", 1e308, {"a": [1.0]}]
 
@@ -136,7 +135,7 @@ def test_any_value_in_any_place_of_the_journal(machine: RecordedMachine, monkeyp
     ]
 
     def replayed(now: list[tuple[str, int, str]]) -> None:
-        collected = _Collected("bag", "/compensator", Allowance(10**6))
+        collected = _Collected("bag", "/compensator")
         for name, time, content in now:
             collected._take_text(name, time, content)
         recording = collected.recording([], 0)

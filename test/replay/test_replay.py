@@ -27,6 +27,7 @@ import yaml
 pytest.importorskip("rosbags")
 
 import lz4.frame
+from helpers import quick_pictures
 from hexapod_comp.cli.parsers import make_parser
 from replay_helpers import (
     BEGAN,
@@ -449,7 +450,8 @@ def test_another_model_shows_what_it_would_have_corrected(tmp_path, capsys):
     told = json.loads(capsys.readouterr().out)
     assert told["outcomes"]["identical"] == 200
     np.testing.assert_allclose(told["other"]["largest_difference_m"], 30e-6, rtol=0.0, atol=1e-15)
-    assert call(bag, "--model", model, "--out", tmp_path / "run.csv", "--pictures", tmp_path / "pictures") == 0
+    with quick_pictures():
+        assert call(bag, "--model", model, "--out", tmp_path / "run.csv", "--pictures", tmp_path / "pictures") == 0
     with open(tmp_path / "run.csv", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == 200
@@ -484,7 +486,8 @@ def test_bag_without_files_asks_for_them(tmp_path, capsys):
 
 def test_verb_writes_report_pictures_and_json(run, tmp_path, capsys):
     bag = write_bag(tmp_path / "run", run.messages)
-    assert call(bag, "--pictures", tmp_path / "pictures") == 0
+    with quick_pictures():
+        assert call(bag, "--pictures", tmp_path / "pictures") == 0
     said = capsys.readouterr().out
     assert "1201 commands taken, 1200 answered, 1 refused; the recorder heard 1201" in said
     assert "replayed 1200 of 1200 answers: identical bit for bit" in said
