@@ -11,7 +11,7 @@ import importlib
 import sqlite3
 import struct
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -32,6 +32,9 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 3, 4, 5, 6, 15
 """Kinds of MCAP records that are read."""
+
+HEAD, MESSAGE_HEAD = struct.Struct("<BQ"), struct.Struct("<HIQQ")
+"""Kind and length of a record; channel, number, recorder's time and publisher's time of a message."""
 
 KINDS = range(1, 16)
 """All kinds that there are."""
@@ -130,35 +133,29 @@ class _Records:
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, tuple[str, str]] = {}
 
-    def of(self, stream: BinaryIO) -> Iterator[Message]:
-        """Yield the messages of a stream of records, and of the chunks in it."""
-        while len(head := stream.read(9)) == 9:
-            kind, length = struct.unpack("<BQ", head)
-            if kind not in KINDS:
-                raise ValueError(f"holds a record of an unknown kind, {kind}")
-            refuse_too_much_at_once(length, "a record")
-            if len(body := stream.read(length)) < length:
-                raise ValueError("ends within a record")
+    def of(self, records: Iterable[tuple[int, bytes, int, int]]) -> Iterator[Message]:
+        """Yield the messages of records, and of the chunks in them."""
+        for kind, buffer, at, end in records:
             if kind == MESSAGE:
-                number, _, time = struct.unpack_from("<HIQ", body)
+                number, _, time, _ = MESSAGE_HEAD.unpack_from(buffer, at)
                 if time >= LATEST:
                     raise ValueError(f"has a message of the time {time} ns")
                 if number in self._channels:
-                    yield Message(*self._channels[number], time, body[22:])
+                    yield Message(*self._channels[number], time, buffer[at + MESSAGE_HEAD.size : end])
             elif kind == CHUNK:
-                yield from self.of(BytesIO(self._chunk(body)))
+                yield from self.of(_in_chunk(self._chunk(buffer[at:end])))
             elif kind == SCHEMA:
-                (number,) = struct.unpack_from("<H", body)
-                self._schemas[number] = _text(body, 2)[0]
+                (number,) = struct.unpack_from("<H", buffer, at)
+                self._schemas[number] = _text(buffer, at + 2)[0]
             elif kind == CHANNEL:
-                number, schema = struct.unpack_from("<HH", body)
-                topic, at = _text(body, 4)
-                if _text(body, at)[0] == "cdr":
+                number, schema = struct.unpack_from("<HH", buffer, at)
+                topic, after = _text(buffer, at + 4)
+                if _text(buffer, after)[0] == "cdr":
                     self._channels[number] = topic, self._schemas[schema]
             elif kind == DATA_END:
                 return
-        if head:
-            raise ValueError("ends within a record")
+            elif kind not in KINDS:
+                raise ValueError(f"holds a record of an unknown kind, {kind}")
 
     def _chunk(self, body: bytes) -> bytes:
         *_, size, checksum = struct.unpack_from("<QQQI", body)
@@ -170,6 +167,27 @@ class _Records:
         if len(records) != size or (checksum and crc32(records) != checksum):
             raise ValueError("holds a chunk that is damaged")
         return records
+
+
+def _in_file(stream: BinaryIO) -> Iterator[tuple[int, bytes, int, int]]:
+    """Yield the records of a file: kind, bytes, where in them it begins and ends."""
+    while head := stream.read(HEAD.size):
+        kind, length = HEAD.unpack(head)
+        refuse_too_much_at_once(length, "a record")
+        if len(body := stream.read(length)) < length:
+            raise ValueError("ends within a record")
+        yield kind, body, 0, length
+
+
+def _in_chunk(records: bytes) -> Iterator[tuple[int, bytes, int, int]]:
+    """Yield the records of a chunk."""
+    at = 0
+    while at < len(records):
+        kind, length = HEAD.unpack_from(records, at)
+        begin, at = at + HEAD.size, at + HEAD.size + length
+        if at > len(records):
+            raise ValueError("ends within a record")
+        yield kind, records, begin, at
 
 
 def _text(body: bytes, at: int) -> tuple[str, int]:
@@ -191,7 +209,7 @@ def _mcap(file: Path, allowance: Allowance) -> Iterator[Message]:
     with open(file, "rb") as stream:
         if (head := stream.read(len(MCAP_MAGIC))) != MCAP_MAGIC:
             raise ValueError("is no MCAP file" if head else "seems to be empty")
-        yield from _Records(allowance).of(stream)
+        yield from _Records(allowance).of(_in_file(stream))
 
 
 def cut_off(file: Path) -> bool:
