@@ -22,10 +22,10 @@ from typing import Any, NamedTuple
 
 import pytest
 import yaml
-from hexapod_comp.cli.parsers import make_parser
 from launch_stand_in import LaunchFile
 from node_helpers import HOME, Bench
 
+from hexapod_comp.cli.app import make_parser
 from hexapod_comp.formats.paths import config_file
 from hexapod_comp.linuxcnc import parameters as linuxcnc_bridge
 from hexapod_comp.ros import interface, strut_drive

@@ -28,7 +28,6 @@ pytest.importorskip("rosbags")
 
 import lz4.frame
 from helpers import quick_pictures
-from hexapod_comp.cli.parsers import make_parser
 from replay_helpers import (
     BEGAN,
     CONFIG,
@@ -45,6 +44,7 @@ from rosbags.rosbag2 import CompressionMode
 
 from hexapod_comp.cli import main
 from hexapod_comp.cli import replay as verb
+from hexapod_comp.cli.app import make_parser
 from hexapod_comp.compensation.compensator import Compensator
 from hexapod_comp.compensation.journal import (
     COMMAND,
