@@ -165,9 +165,7 @@ def achieved(campaign: Campaign, plan: Proposal, settings: FitSettings, seed: in
         poses, count = (stations.positions, stations.rotations), len(stations)
         commands, _ = model_commands([believed] * count, poses, stations.sense)
         left = drive([truth] * count, poses, stations.sense, commands).errors(poses, space.probe).aligned()
-        promise = expected_error(
-            fit.space, fit.solution.x, covariance, tilt, allowed=fit.allowed, beyond=fit.verdict.unexplained
-        )
+        promise = expected_error(fit.space, fit.solution.x, covariance, tilt, beyond=fit.verdict.unexplained)
         assert promise is not None
         errors.append((float(np.sqrt((left.displacement**2).sum(axis=1).mean())), (promise.low, promise.high)))
     return max(errors)

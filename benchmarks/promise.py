@@ -251,7 +251,7 @@ def one_machine(kind: str, seed: int) -> Outcome:
 def _by_covariance(fit: ModelFit) -> float:
     """Return the upper end of the interval that the covariance alone gives, m."""
     covariance = fit.covariance / fit.verdict.unexplained.factor**2
-    error = expected_error(fit.space, fit.solution.x, covariance, allowed=fit.allowed)
+    error = expected_error(fit.space, fit.solution.x, covariance)
     return np.nan if error is None else error.high
 
 

@@ -41,7 +41,7 @@ from .posterior import (
     observe,
 )
 from .promise import Scatter, Unexplained
-from .verdict import TILT
+from .trust import TILT
 
 
 def information(space: ParameterSpace, readings: MeasurementSet, x: np.ndarray) -> tuple[np.ndarray, Cells]:
@@ -216,7 +216,7 @@ def plan(measurements: MeasurementSet, campaign: Campaign, settings: FitSettings
     posterior = solve(space, problem, tolerances, noise_factors(campaign), rounds=0)
     covariance, prior = physical_covariance(space, posterior), space.prior_covariance(tolerances)
     beyond = Unexplained(displacement=Scatter(stops=campaign.stops, most_stops=campaign.stops))
-    level, tilted = (expected_error(space, x, covariance, tilt, prior, None, beyond) for tilt in (0.0, TILT))
+    level, tilted = (expected_error(space, x, covariance, tilt, prior, beyond) for tilt in (0.0, TILT))
     sight = observe(space, problem, posterior, measurements.tilt())
     unseen = unseen_errors(measurements, settings)
     return Plan(measurements, space, sight, unseen, level, tilted, campaign.stops)

@@ -18,15 +18,14 @@ from ..pose import Pose
 from .assumptions import ASSUMED
 from .blocks import WAVES
 from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
-from .estimator import Estimation, LinearProblem, Posterior, Solution, iterate, physical_covariance
+from .estimator import Estimation, LinearProblem, Solution, iterate, physical_covariance
 from .lead import ScrewLead, look_for_lead
 from .mixups import SWAPPED, mixups, swapped_directions
 from .parameters import FitSettings, ParameterSpace
-from .posterior import Allowed, Observability, ToolError, UnseenError, listed, observe, without_trace
-from .residuals import Residuals
+from .posterior import Observability, ToolError, UnseenError, listed, observe, without_trace
 from .selection import Decision, select
 from .thermal import HeatSeen, TimeConstants, seek_time_constants, with_courses
-from .verdict import Verdict, judge
+from .trust import Verdict, judge, with_drift
 
 LARGEST_NOISE = 0.02
 """A machine that leaves more than this of its readings, m or rad, is not the one that was measured."""
@@ -114,8 +113,6 @@ class ModelFit:
         Largest first.
     notes : tuple of str
         What a reader must know.
-    allowed : Allowed
-        What the readings do not rule out.
     held : HeldDatum
         Where the tool is held: the model is the solution's machine, shifted and turned as a whole.
     warming : HeatSeen
@@ -135,7 +132,6 @@ class ModelFit:
     verdict: Verdict
     outliers: tuple[Outlier, ...]
     notes: tuple[str, ...]
-    allowed: Allowed
     held: HeldDatum
     warming: HeatSeen
     lead: ScrewLead | None
@@ -152,7 +148,7 @@ class ModelFit:
 
     @property
     def tilted(self) -> ToolError | None:
-        """The same for a tool tilted by :data:`~.verdict.TILT`; None too where nothing can be promised."""
+        """The same for a tool tilted by :data:`~.trust.TILT`; None too where nothing can be promised."""
         return self.verdict.tilted
 
     @property
@@ -227,8 +223,9 @@ def _fit(measurements: MeasurementSet, begun: _Begun, progress: Callable[[str], 
     """Choose blocks, fit them, and judge what comes of it."""
     everything, nominal, lead, constants = begun
     settings = everything.space.settings
-    decisions, (problem, possible), answer = _choose(everything, nominal, settings, progress)
+    decisions, answer = _choose(everything, nominal, settings, progress)
     space, estimation, solution = answer
+    solution, drift = with_drift(estimation, solution)
     channels = tuple(_channels(estimation, solution))
     notes = [
         *_about_lead(lead),
@@ -237,17 +234,9 @@ def _fit(measurements: MeasurementSet, begun: _Begun, progress: Callable[[str], 
         *_check_noise(channels),
     ]
     progress("what is it worth?")
-    way = _way(space, solution, everything.space, possible)
-    allowed = everything.space, everything.space.physical(way), physical_covariance(everything.space, possible)
-
-    def with_all() -> tuple[Residuals, np.ndarray]:
-        x = everything.space.physical(possible.y - way)
-        known = Solution(problem, possible, x, solution.residuals, solution.weights, solution.steps, solution.change)
-        return Residuals.of(everything, known), way
-
     noise = {KINDS.index(c.kind): c.estimated for c in channels}
     mixed = mixups(everything, nominal, [d.block for d in decisions if d.kept], progress)
-    verdict = judge(estimation, solution, allowed, with_all, settings, noise, mixed)
+    verdict = judge(estimation, solution, drift, settings, noise, mixed)
     no_trace = unseen_errors(measurements, settings)
     if rolls := [error for error in no_trace if error.name.startswith("roll")]:
         verdict = verdict.without_rotation(listed(rolls))
@@ -266,7 +255,6 @@ def _fit(measurements: MeasurementSet, begun: _Begun, progress: Callable[[str], 
         verdict=verdict,
         outliers=tuple(_outliers(estimation, solution)),
         notes=(*measurements.notes, *notes, *verdict.remarks),
-        allowed=allowed,
         held=held,
         warming=HeatSeen.of(measurements, estimation, solution, constants, verdict.unexplained.factor),
         lead=lead,
@@ -299,27 +287,25 @@ def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callab
 
 def _choose(
     everything: Estimation, problem: LinearProblem, settings: FitSettings, progress: Callable[[str], object]
-) -> tuple[list[Decision], tuple[LinearProblem, Posterior], tuple[ParameterSpace, Estimation, Solution]]:
-    """Return what is fitted, what the data allow with all blocks in and by which problem, and the fit."""
+) -> tuple[list[Decision], tuple[ParameterSpace, Estimation, Solution]]:
+    """Return what is fitted, and the fit."""
     space, measurements = everything.space, everything.measurements
-    decisions, possible, kept = select(space, problem, np.ones(len(KINDS)), progress)
+    decisions, _, kept = select(space, problem, np.ones(len(KINDS)), progress)
     y = np.zeros(space.size)
     y[kept.used] = kept.y
     start = _Start(space, space.physical(y), kept.tolerances, kept.noise)
     if not any(d.kept for d in decisions):  # too few runs to leave one out, or none that shows anything: from the start
         start = _Start(space, 0.0 * y, space.start_tolerances(), np.ones(len(KINDS)))
     answer = _solve(measurements, decisions, settings, start, progress)
-    if (
-        answer[-1].weights.min() < ASSUMED.huber / ASSUMED.outlier
-    ):  # the choice was made with readings that turned out to be wrong
+    if answer[-1].weights.min() < ASSUMED.huber / ASSUMED.outlier:  # it was made with readings that are wrong
         start = _Start.of(answer[0], answer[-1])
         x, _, noise = _carried_over(start, space)
         problem, _ = everything.linearise(x, answer[-1].weights)
-        again, possible, _ = select(space, problem, noise, progress)
+        again, _, _ = select(space, problem, noise, progress)
         if [d.kept for d in again] != [d.kept for d in decisions]:
             answer = _solve(measurements, again, settings, start, progress)
         decisions = again
-    return decisions, (problem, possible), answer
+    return decisions, answer
 
 
 class _Start(NamedTuple):
@@ -358,16 +344,6 @@ def _carried_over(start: _Start, space: ParameterSpace) -> tuple[np.ndarray, np.
                 x[block.part] = start.x[old.part]
                 tolerances[n] = start.tolerances[m]
     return x, tolerances, start.noise
-
-
-def _way(space: ParameterSpace, solution: Solution, everything: ParameterSpace, possible: Posterior) -> np.ndarray:
-    """Return the way from an answer's parameters y to the most probable ones with all blocks in, shape (size,)."""
-    way = possible.y.copy()
-    for block in everything.blocks:
-        own = space.block(block.name)
-        if own is not None:
-            way[block.part] -= solution.posterior.y[own.part]
-    return way
 
 
 def unseen_errors(measurements: MeasurementSet, settings: FitSettings) -> tuple[UnseenError, ...]:

@@ -61,7 +61,7 @@ class FitSettings:
         Give readings that disagree with the rest less weight.
     scale, alignment : float or None
         Standard deviations of what no reading shows: of the instruments' scale, m/m, and of the angle between a laser's
-        beam and its line, rad. None: of their class (:func:`~hexapod_comp.calibration.misfit.stated_scale`).
+        beam and its line, rad. None: of their class (:func:`~hexapod_comp.calibration.trust.stated_scale`).
     """
 
     blocks: tuple[str, ...] = BLOCKS

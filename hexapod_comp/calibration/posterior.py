@@ -260,10 +260,6 @@ class ToolError:
     rotation_unknown: str = ""  # why they are None
 
 
-Allowed = tuple[ParameterSpace, np.ndarray, np.ndarray]
-"""A larger space, the way from a fit's parameters to its most probable ones, and their covariance."""
-
-
 def box_stations(space: ParameterSpace, tilt: float = 0.0) -> Stations | None:
     """Return random reachable stations in the measured box, in the work frame, each passed there and back.
 
@@ -308,13 +304,12 @@ def expected_error(
     covariance: np.ndarray,
     tilt: float = 0.0,
     prior: np.ndarray | None = None,
-    allowed: Allowed | None = None,
     beyond: Unexplained | None = None,
 ) -> ToolError | None:
     """Return the tool error that drawn machines of a covariance leave over the measured box, both directions.
 
-    The error before is that of x, or of machines of a `prior` covariance. What is `allowed` in a larger space with
-    nothing ruled out widens the interval upwards, and so does what is `beyond`. None where no pose is within reach.
+    The error before is that of x, or of machines of a `prior` covariance. What is `beyond` all parameters
+    widens the interval upwards. None where no pose is within reach.
     """
     stations = box_stations(space, tilt)
     if stations is None:
@@ -327,36 +322,20 @@ def expected_error(
         before = [float(np.sqrt((part**2).sum(axis=1).mean())) for part in parts]
     else:
         before = [rms(_sizes(square, _drawn(prior))) for square in squares]
-    sizes = possible = [_sizes(square, _drawn(covariance)) for square in squares]
-    if allowed is not None:
-        wide, shift, wide_covariance = allowed
-        drawn = shift[:, None] + _drawn(wide_covariance)
-        wide_squares = FirstOrder.of(wide, prediction, stations).aligned().mean_squares()
-        possible = [_sizes(square, drawn) for square in wide_squares]
+    sizes = [_sizes(square, _drawn(covariance)) for square in squares]
     return ToolError(
         float(np.hypot(before[0], beyond.displacement.stops)),
-        *beyond.promised(sizes[0], possible[0], errors.places),
+        *beyond.promised(sizes[0], errors.places),
         float(np.hypot(before[1], beyond.rotation.stops)),
-        *beyond.promised_rotation(sizes[1], possible[1]),
+        *beyond.promised_rotation(sizes[1]),
     )
 
 
 def left_errors(
-    space: ParameterSpace,
-    prediction: Prediction,
-    stations: Stations,
-    covariance: np.ndarray,
-    allowed: Allowed | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return errors that a model may leave at stations, by drawn machines, and those that readings do not rule out.
-
-    Both of shape (M, 6, D), m and rad, the datum not aligned.
-    """
-    left = derivatives(space, prediction, stations) @ _drawn(covariance)
-    if allowed is None:
-        return left, left
-    wide, shift, wide_covariance = allowed
-    return left, derivatives(wide, prediction, stations) @ (shift[:, None] + _drawn(wide_covariance))
+    space: ParameterSpace, prediction: Prediction, stations: Stations, covariance: np.ndarray
+) -> np.ndarray:
+    """Return errors that a model may leave at stations, by drawn machines, (M, 6, D), m and rad; datum not aligned."""
+    return derivatives(space, prediction, stations) @ _drawn(covariance)
 
 
 def errors_in_space(

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..machine.arrays import rms
+from .assumptions import ASSUMED
 
 TWICE, LACK_MARGIN = 2.0, 1.5
 """An end of an interval stands so far out: in standard deviations, and in sizes of a lack."""
@@ -48,58 +49,38 @@ class Promise(NamedTuple):
 
 @dataclass(frozen=True)
 class Unexplained:
-    """What widens a promise.
+    """What widens a promise."""
 
-    Attributes
-    ----------
-    factor : float
-        On the standard deviations of all parameters, from 1: what leaving out `without` shows.
-    without : str
-        What was left out in turn where that showed most; empty where the factor is 1.
-    allowed : float
-        The same on what the readings allow with all blocks in, of which the fit has chosen some.
-    prior, prior_rotation : float
-        Standard deviation of the logarithm of the tool error to expect, and of the tool's rotation: the sizes of the
-        priors are estimated from the same readings.
-    displacement, rotation : Scatter
-        What the tool does that no parameter describes.
-    drift : float
-        Change of the scale from the first to the last reading, m/m; 0 where there is none.
-    scale : float
-        Stated standard deviation of the scale of all readings, m/m.
-    """
-
-    factor: float = 1.0
-    without: str = ""
-    allowed: float = 1.0
-    prior: float = 0.0
-    prior_rotation: float = 0.0
-    displacement: Scatter = NO_SCATTER
+    factor: float = 1.0  # on the standard deviations of all parameters: what runs left out in turn show clearly
+    upper: float = 1.0  # on the upper end of an interval: what they may show, with 97.5 %
+    prior: float = 0.0  # standard deviation of the logarithm of the tool error to expect: priors' sizes are estimates
+    prior_rotation: float = 0.0  # the same of the tool's rotation
+    displacement: Scatter = NO_SCATTER  # what the tool does that no parameter describes
     rotation: Scatter = NO_SCATTER
-    drift: float = 0.0
-    scale: float = 0.0
+    drift: float = 0.0  # change of the scale from the first to the last reading, m/m; 0 where none is in the fit
+    drift_error: float = 0.0  # its standard deviation
+    scale: float = 0.0  # stated standard deviation of the scale of all readings, m/m
 
-    def promised(self, left: np.ndarray, possible: np.ndarray, points: np.ndarray) -> Promise:
+    def promised(self, left: np.ndarray, points: np.ndarray) -> Promise:
         """Return what is promised of the tool's displacement; what is unexplained raises the upper end.
 
         Parameters
         ----------
-        left, possible : ndarray, shape (D,)
-            RMS errors of draws by the fit's covariance, and with all that the readings allow, m.
+        left : ndarray, shape (D,)
+            RMS errors of draws by the fit's covariance, m.
         points : ndarray, shape (n, 3)
             The places, m: a scale that is off acts on their distances.
         """
-        after, low, high = self._interval(left, possible, self.prior, self.displacement)
+        after, low, high = self._interval(left, self.prior, self.displacement)
         radius = rms(np.linalg.norm(points - points.mean(axis=0), axis=1))
-        stretch = radius * np.array([self.scale, 0.5 * self.drift])
-        off = float(stretch @ stretch)
+        off = radius**2 * (self.scale**2 + 0.25 * (self.drift**2 + self.drift_error**2))
         return Promise(float(np.sqrt(after**2 + off)), low, float(np.sqrt(high**2 + TWICE**2 * off)))
 
-    def promised_rotation(self, left: np.ndarray, possible: np.ndarray) -> Promise:
+    def promised_rotation(self, left: np.ndarray) -> Promise:
         """Return what is promised of the tool's rotation, from draws as for :meth:`promised`, rad."""
-        return self._interval(left, possible, self.prior_rotation, self.rotation)
+        return self._interval(left, self.prior_rotation, self.rotation)
 
-    def _interval(self, left: np.ndarray, possible: np.ndarray, prior: float, scatter: Scatter) -> Promise:
+    def _interval(self, left: np.ndarray, prior: float, scatter: Scatter) -> Promise:
         """Return what is promised without any error of scale.
 
         Whether the machine or its instrument scatters more than stated nobody can say: the lower end is without it.
@@ -108,7 +89,7 @@ class Unexplained:
         if low > 0.0:
             down, up = (np.exp(np.hypot(np.log(end / size), TWICE * prior)) for end in (low, high))
             low, high = size / down, size * up
-        high = max(self.factor * high, self.allowed * float(np.percentile(possible, 97.5)))
+        high = self.upper * high
         after = np.linalg.norm([self.factor * size, scatter.lack, scatter.stops])
         high = np.linalg.norm([high, LACK_MARGIN * scatter.lack, scatter.most_stops])
         return Promise(float(after), float(low), float(high))
@@ -118,9 +99,10 @@ class Unexplained:
         listed = []
         if self.factor > DOUBTFUL_FACTOR:
             listed.append(f"{self._outcome()}: lines, or what they were read with, disagree with each other")
-        if self.drift:
+        if self.drift > ASSUMED.clear_drift * self.drift_error:
             size = f"{self.drift * 1e6:.2g} ppm, as steel's does in {self.drift / STEEL:.2g} K"
-            listed.append(f"the scale of the linear readings changes by {size}, from the first to the last")
+            problem = f"the scale of the linear readings changes by {size}, from the first to the last"
+            listed.append(f"{problem}: the model is that of the middle of the campaign")
         return listed
 
     def remarks(self) -> list[str]:
@@ -142,18 +124,18 @@ class Unexplained:
         """Return this as plain numbers; units are in the keys."""
         return {
             "factor": self.factor,
-            "without": self.without,
-            "factor_allowed": self.allowed,
+            "factor_of_upper_end": self.upper,
             "prior_log_deviation": self.prior,
             "prior_rotation_log_deviation": self.prior_rotation,
             **{f"{name}_m": value for name, value in self.displacement._asdict().items()},
             **{f"{name}_rad": value for name, value in self.rotation._asdict().items()},
             "drift_m_per_m": self.drift,
+            "drift_error_m_per_m": self.drift_error,
             "scale_m_per_m": self.scale,
         }
 
     def _outcome(self) -> str:
-        problem = f"left out in turn, each {self.without} changes the tool more than noise explains"
+        problem = "left out in turn, each run changes the tool more than noise explains"
         return f"{problem}: standard errors are {self.factor:.1f} times as large"
 
 

@@ -18,7 +18,7 @@ from .lead import ScrewLead
 from .lines import LineFit, LinesFit
 from .posterior import BlockSight, Observability, ToolError, UnseenError, listed
 from .thermal import warming_json, warming_text
-from .verdict import TILT
+from .trust import TILT
 
 MOST_LISTED, MOST_OF_RUN = 10, 3
 """Runs with outliers, and outliers of a run, beyond these are counted, not listed."""
@@ -214,8 +214,8 @@ def as_json(fit: ModelFit) -> dict:
         "settled": fit.solution.change < ASSUMED.settled,
         "doubts": (*fit.verdict.refusals, *fit.verdict.doubts),
         "unexplained": fit.verdict.unexplained.as_json(),
-        "chi_squares": [vars(c) for c in fit.verdict.chi_squares],
-        "chi_squares_of_runs": [vars(c) for c in fit.verdict.worst_runs],
+        "chi_squares": [c._asdict() for c in fit.verdict.chi_squares],
+        "chi_squares_of_runs": [c._asdict() for c in fit.verdict.worst_runs],
         "outliers": [_outlier_json(o) for o in fit.outliers],
         "notes": fit.notes,
         "warming": warming_json(fit.warming),

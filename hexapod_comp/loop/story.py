@@ -214,16 +214,13 @@ def promises(fit: ModelFit, poses: Sequence[Pose], path: Path) -> tuple[tuple[fl
     rest, prediction = slice(0, len(poses)), predict(space, fit.solution.x, stations)
     lengths = np.linalg.norm(ways, axis=1, keepdims=True)
     along = ways / np.where(lengths > 0.0, lengths, 1.0)
-    sizes = []
     covariance = physical_covariance(space, fit.solution.posterior)
-    for errors in left_errors(space, prediction, stations, covariance, fit.allowed):
-        aligned = without_datum(tool[0], errors[:, :3], rest)
-        across = aligned - along[:, :, None] * np.einsum("ni,nid->nd", along, aligned)[:, None]
-        sizes.append([np.sqrt((e**2).sum(axis=1).mean(axis=0)) for e in (aligned[rest], across[len(poses) :])])
-    (rest_left, path_left), (rest_possible, path_possible) = sizes
+    aligned = without_datum(tool[0], left_errors(space, prediction, stations, covariance)[:, :3], rest)
+    across = aligned - along[:, :, None] * np.einsum("ni,nid->nd", along, aligned)[:, None]
+    rest_left, path_left = (np.sqrt((e**2).sum(axis=1).mean(axis=0)) for e in (aligned[rest], across[len(poses) :]))
     beyond = fit.verdict.unexplained
-    at_rest = beyond.promised(rest_left, rest_possible, tool[0][rest])
-    return at_rest[1:], beyond.promised(path_left, path_possible, tool[0][len(poses) :])[1:]
+    at_rest = beyond.promised(rest_left, tool[0][rest])
+    return at_rest[1:], beyond.promised(path_left, tool[0][len(poses) :])[1:]
 
 
 def left_by_drives(

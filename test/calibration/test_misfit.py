@@ -16,12 +16,12 @@ from foreign_machines import machines
 
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model, mixed_up
-from hexapod_comp.calibration.misfit import stated_scale
 from hexapod_comp.calibration.mixups import FAMILIES, SWAPPED, family_of_run
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.posterior import expected_error
 from hexapod_comp.calibration.promise import Scatter, Unexplained
 from hexapod_comp.calibration.report import as_json, fit_report
+from hexapod_comp.calibration.trust import stated_scale
 from hexapod_comp.errors import CalibrationError, ModelError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.machine.model import RealMachine

@@ -1,0 +1,486 @@
+"""How far a settled fit may be trusted: the tool error that it promises, its χ², and what puts it in doubt.
+
+A covariance of parameters is right if the model is. Three terms say by how much it may not be. A *cluster jackknife*
+over runs: what the tool's error changes by when each run is left out, by the linear problem, beside what the covariance
+expects of it, for errors of a run are not independent. A *discrepancy*: what is left beyond the instruments' noise, and
+alike there and back, is an error of the machine that no parameter describes (Kennedy & O'Hagan 2001). And a *drift*: a
+scale of all lengths that changes over the campaign is a parameter with a prior of its own, taken into the fit where the
+evidence is for it. The scale of an instrument, which no reading shows, is stated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg.lapack import dtrtrs
+from scipy.special import gammaincinv
+
+from ..machine.arrays import different_rows
+from ..measurements.readings import (
+    ANGULAR_KINDS,
+    BACKWARD,
+    DEFAULT_UNCERTAINTY,
+    FORWARD,
+    KINDS,
+    UNKNOWN,
+    MeasurementSet,
+)
+from .assumptions import ASSUMED
+from .blocks import EXPECTED
+from .estimator import (
+    DesignMatrix,
+    Estimation,
+    Solution,
+    at_once,
+    physical_covariance,
+    whitened_precision,
+)
+from .mixups import FAMILIES, family_of_run
+from .parameters import FitSettings, ParameterSpace
+from .posterior import ToolError, box_errors, expected_error
+from .promise import Scatter, Unexplained
+
+TILT = np.radians(10.0)
+"""Tilt at which the report states the tool error of a tilted tool."""
+
+NOT_TILTED = "a field was needed, and measured with a level tool alone: nothing is promised for a tilted one"
+FIELDS = ("field displacement", "field rotation")
+
+
+class ChiSquare(NamedTuple):
+    """How one part of the readings was met."""
+
+    kind: str  # of KINDS
+    part: str  # a family of lines, a direction, or a run's name
+    readings: int
+    value: float  # squared residuals over the stated variance, per degree of freedom
+
+
+@dataclass(frozen=True)
+class Drift:
+    """A scale of all lengths that changes over the campaign, as a polynomial in time."""
+
+    columns: np.ndarray  # (C, terms): what it adds to cells, over their noise, in standard deviations of its prior
+    values: np.ndarray  # (terms,), in these standard deviations; empty where the evidence is against a drift
+    covariance: np.ndarray  # (terms, terms)
+
+    @property
+    def change(self) -> tuple[float, float]:
+        """Change of the scale from the first to the last reading and its standard deviation, m/m; (0, 0): none."""
+        if not len(self.values):
+            return 0.0, 0.0
+        return 2.0 * ASSUMED.drift * float(abs(self.values[0])), 2.0 * ASSUMED.drift * float(
+            self.covariance[0, 0] ** 0.5
+        )
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a fit promises, and whether its model may be written."""
+
+    level: ToolError | None  # of a level tool, allowing for what is unexplained; None where nothing can be promised
+    tilted: ToolError | None  # of one tilted by TILT
+    unexplained: Unexplained  # what readings show that no parameter describes
+    chi_squares: tuple[ChiSquare, ...]  # by kind of channel, of families of lines and of directions
+    worst_runs: tuple[ChiSquare, ...]  # of single runs, the worst first
+    refusals: tuple[str, ...]  # why the model is not to be written without force
+    doubts: tuple[str, ...]  # what else is wrong
+    remarks: tuple[str, ...]  # what else a reader must know
+
+    def without_rotation(self, why: str) -> Verdict:
+        """Return the same with no interval for the tool's rotation, which the priors alone would give."""
+        level, tilted = (
+            None if error is None else replace(error, rotation_low=None, rotation_high=None, rotation_unknown=why)
+            for error in (self.level, self.tilted)
+        )
+        return replace(self, level=level, tilted=tilted)
+
+
+class Residuals:
+    """A settled fit's residuals, cell by cell, over the noise that was estimated, and what they say of the tool."""
+
+    def __init__(self, estimation: Estimation, solution: Solution) -> None:
+        self.estimation, self.solution = estimation, solution
+        problem, posterior, cells, m = solution.problem, solution.posterior, estimation.cells, estimation.measurements
+        scale = 1.0 / posterior.noise[problem.kind]
+        self.rows: DesignMatrix = problem.rows.using(posterior.used, scale)  # derivatives by the parameters in use
+        self.residual = scale * problem.target - self.rows.times(posterior.y)
+        self.run, self.direction = m.run[cells.first], m.direction[cells.first]
+
+    @cached_property
+    def taken(self) -> np.ndarray:
+        """Share of each cell that parameters and unknowns of the instruments take up, shape (C,)."""
+        every = np.arange(len(self.residual))
+        return self.shared(every, every) + self.estimation.shares_of_nuisance()
+
+    @cached_property
+    def metrics(self) -> tuple[np.ndarray, np.ndarray]:
+        """M of displacement and rotation: yᵀ·M·y is the tool's mean squared error in the box; zero without a box."""
+        space, used = self.estimation.space, self.solution.posterior.used
+        errors = box_errors(space, self.solution.x)
+        if errors is None:
+            return np.zeros((len(used),) * 2), np.zeros((len(used),) * 2)
+        displacement, rotation = (space.whitened(space.whitened(m).T) for m in errors.mean_squares())
+        return displacement[np.ix_(used, used)], rotation[np.ix_(used, used)]
+
+    @property
+    def expected(self) -> float:
+        """Mean squared error of the tool to expect by the covariance, m²."""
+        return float(np.vdot(self.metrics[0], self.solution.posterior.covariance))
+
+    def shared(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Return by how much fitting makes cells unlike each other, pair by pair: what both give to the parameters."""
+        return self.rows.between(self.solution.posterior.covariance, first, second)
+
+
+def judge(
+    estimation: Estimation,
+    solution: Solution,
+    drift: Drift,
+    settings: FitSettings,
+    noise: Mapping[int, float],
+    mixed_up: Sequence[str] = (),
+) -> Verdict:
+    """Return what a settled fit promises and what is wrong with it; `noise` was found for each kind, m or rad."""
+    measurements, space = estimation.measurements, estimation.space
+    residuals = Residuals(estimation, solution)
+    beyond = unexplained(residuals, drift, stated_scale(measurements, settings))
+    covariance = physical_covariance(space, solution.posterior)
+    # A field that was measured with a level tool alone says nothing of a tilted one.
+    level_only = space.block(FIELDS[0]) is not None and measurements.tilt() < 0.5 * TILT
+    level, tilted = (
+        None if level_only and tilt else expected_error(space, solution.x, covariance, tilt, beyond=beyond)
+        for tilt in (0.0, TILT)
+    )
+    families, runs = chi_squares(residuals)
+    far_off, doubtful = (measurements.misfit(noise, n) for n in (ASSUMED.refused_noise, ASSUMED.doubtful_noise))
+    refusals, doubts, remarks = [far_off], ["" if far_off else doubtful, *beyond.doubts()], [*beyond.remarks()]
+    if solution.change >= ASSUMED.settled:
+        moved = f"a parameter still moves by {solution.change:.2g} standard deviations"
+        doubts.append(f"the fit has not settled: after {solution.steps} steps {moved}")
+    if level is not None and level.after > level.before:
+        refusals.append("the model is not expected to help: the readings determine too little of this machine")
+    if _held_by_priors(residuals):
+        many = f"{len(measurements)} readings do not determine the {space.size} parameters"
+        refusals.append(f"{many}: what they say of the tool comes from the priors")
+    refusals += mixed_up
+    remarks += [_unstated(measurements), NOT_TILTED if level_only else ""]
+    listed = (tuple(filter(None, part)) for part in (refusals, doubts, remarks))
+    return Verdict(level, tilted, beyond, families, runs, *listed)
+
+
+def unexplained(r: Residuals, drift: Drift, scale: float) -> Unexplained:
+    """Return what a settled fit leaves unexplained; `scale` is the standard deviation of that of all readings, m/m."""
+    ratio, freedom = jackknife(r, drift)
+    factor, upper = 1.0, 1.0
+    if freedom > 0.0:
+        low, high = (2.0 * gammaincinv(0.5 * freedom, p) / freedom for p in (0.025, 1.0 - ASSUMED.by_chance))
+        upper = float(np.sqrt(max(1.0, ratio / low)))
+        factor = float(np.sqrt(ratio)) if ratio > high else 1.0
+    prior, prior_of_rotation = (_of_priors(r, metric) for metric in r.metrics)
+    displacement, rotation = discrepancy(r)
+    return Unexplained(factor, upper, prior, prior_of_rotation, displacement, rotation, *drift.change, scale)
+
+
+def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
+    """Return the standard deviation of the scale of all readings, m/m, as stated or as their instruments' class has it.
+
+    The best instrument for lengths counts. A beam that is off its line by an angle θ reads θ²/2 too little.
+    """
+    kinds = {KINDS[k] for k in np.unique(measurements.kind)}
+    known = [value for kind, value in ASSUMED.scales if kind in kinds]
+    scale = settings.scale if settings.scale is not None else min(known, default=0.0)
+    angle = settings.alignment if settings.alignment is not None else ASSUMED.alignment
+    return float(np.hypot(scale, 0.5 * angle**2 if "linear" in kinds else 0.0))
+
+
+# The jackknife, and drift
+
+
+def jackknife(r: Residuals, drift: Drift) -> tuple[float, float]:
+    """Return by how much more than expected leaving out each run changes the tool's squared error, and the freedom.
+
+    With rows R and residuals r of a run left out, the parameters change by −C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·r, whose covariance is
+    C·Rᵀ·(1 − R·C·Rᵀ)⁻¹·R·C if the model is right: no fit is repeated. M turns both into the tool's error. By
+    Satterthwaite the sum over runs is about a χ² of as many degrees of freedom as its variance says.
+    """
+    posterior, groups, spread = r.solution.posterior, r.estimation.cells.fold, r.solution.posterior.spread
+    if not r.expected > 0.0 or len(np.unique(groups)) < 2:
+        return 1.0, 0.0
+    values, vectors = np.linalg.eigh(spread[:, None] * r.metrics[0] * spread)
+    kept = np.cumsum(values) > ASSUMED.negligible * r.expected  # ascending: what no prior lets happen is left out
+    terms, cross = len(drift.values), r.rows.transposed_times(drift.columns)
+    effects = np.pad(vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0)), ((0, terms), (0, 0)))
+    precision = np.block(
+        [
+            [whitened_precision(r.solution.problem, posterior), spread[:, None] * cross],
+            [cross.T * spread, np.eye(terms) + drift.columns.T @ drift.columns],
+        ]
+    )
+    covariance = np.linalg.inv(precision)
+    reached = covariance @ effects
+    before = effects.T @ reached
+
+    def change(members: np.ndarray) -> tuple[float, float, float]:
+        rows = np.hstack([r.rows.select(members).dense() * spread, drift.columns[members]])
+        left = r.residual[members]
+        if 2 * len(left) < len(precision):
+            matrix, sides, own = np.eye(len(left)) - rows @ covariance @ rows.T, (rows @ reached, left), 0.0
+        else:
+            matrix, sides, own = precision - rows.T @ rows, (effects, rows.T @ left), before
+        factor = np.linalg.cholesky(matrix)
+        half, moment = (dtrtrs(factor, side, lower=1)[0] for side in sides)
+        grown, moved = half.T @ half - own, half.T @ moment
+        expected = float(np.trace(grown))
+        return float(moved @ moved), expected, expected**2 / float(np.vdot(grown, grown))
+
+    order = np.argsort(groups, kind="stable")
+    members = np.split(order, np.flatnonzero(np.diff(groups[order])) + 1)
+    shown, expected, freedom = np.transpose(at_once(change, members))
+    return float(shown.sum() / expected.sum()), float(expected.sum() ** 2 / (expected**2 / freedom).sum())
+
+
+def with_drift(estimation: Estimation, solution: Solution) -> tuple[Solution, Drift]:
+    """Return a fit with a drift of the scale as additional parameters, where the evidence is for it.
+
+    A machine that warms, or a laser's air that changes: over the campaign all lengths from the middle of the box grow
+    by a polynomial in time. Exact for the linear problem, with the blocks' priors and the noise as they are.
+    """
+    r, m, cells = Residuals(estimation, solution), estimation.measurements, estimation.cells
+    posterior, problem = solution.posterior, solution.problem
+    at_rest = np.zeros((len(r.residual), 0))
+    none = Drift(at_rest, np.zeros(0), np.zeros((0, 0)))
+    lengths = ~np.isin(cells.kind, [KINDS.index(kind) for kind in (*ANGULAR_KINDS, "straightness")])
+    if len(np.unique(r.run[lengths])) < ASSUMED.drift_runs:
+        return solution, none
+    count = np.bincount(cells.of_reading)
+    place = np.bincount(cells.of_reading, np.arange(len(m))) / count
+    time = 2.0 * place / max(len(m) - 1, 1) - 1.0
+    points = m.points()[cells.station]
+    growth = np.where(lengths, np.einsum("ci,ci->c", cells.directions[:, :3], points - points.mean(axis=0)), 0.0)
+    legendre = np.polynomial.legendre.legvander(time, ASSUMED.drift_terms)[:, 1:]
+    trust = np.bincount(cells.of_reading, solution.weights * estimation.uncertainty**-2)
+    trust = np.sqrt(trust / np.bincount(cells.of_reading, estimation.uncertainty**-2)) / posterior.noise[cells.kind]
+    columns = trust[:, None] * estimation.free_of_nuisance(ASSUMED.drift * growth[:, None] * legendre)
+    cross = r.rows.transposed_times(columns)
+    gain = posterior.covariance @ cross
+    precision = np.eye(columns.shape[1]) + columns.T @ columns - cross.T @ gain
+    covariance = np.linalg.inv(precision)
+    shown = columns.T @ r.residual
+    values = covariance @ shown
+    if shown @ values < np.linalg.slogdet(precision)[1]:
+        return solution, none
+    moved = -gain @ values
+    change = r.rows.times(moved) + columns @ values
+    y, x = posterior.y + moved, np.zeros(estimation.space.size)
+    x[posterior.used] = y
+    scale = np.sqrt(np.bincount(cells.of_reading, solution.weights * estimation.uncertainty**-2))
+    known = replace(posterior, y=y, covariance=posterior.covariance + gain @ covariance @ gain.T)
+    of_cells = posterior.noise[problem.kind]
+    target = problem.target - of_cells * (columns @ values)
+    residuals = solution.residuals - (of_cells * change / scale)[cells.of_reading]
+    settled = replace(
+        solution,
+        problem=replace(problem, target=target),
+        posterior=known,
+        x=estimation.space.physical(x),
+        residuals=residuals,
+    )
+    return settled, Drift(columns, values, covariance)
+
+
+# The discrepancy
+
+
+class _OfKind(NamedTuple):
+    """Variances that one kind of readings shows beyond its stated noise, m² or rad²; 0 where it may be chance."""
+
+    alike: float  # shared by readings there and back, with the part that the parameters have swallowed
+    most_alike: float  # what would have shown
+    stops: float  # of what never repeats
+    most_stops: float
+    cells: int
+
+
+def discrepancy(r: Residuals) -> tuple[Scatter, Scatter]:
+    """Return what residuals show of the tool's displacement, and of its rotation, that no parameter describes.
+
+    A field that is not as smooth as its terms shows that first where it is large beside the readings' noise, in its
+    rotations as a rule; in displacements there is as much, in proportion to the sizes that were fitted, unless so much
+    would have shown there as well.
+    """
+    parts = [_of_kind(r, k) for k in np.unique(r.estimation.cells.kind)]
+    angular = [KINDS[k] in ANGULAR_KINDS for k in np.unique(r.estimation.cells.kind)]
+    found = []
+    for way in (False, True):
+        some = [part for part, turns in zip(parts, angular, strict=True) if turns == way]
+        # The mean variance of an axis, three times.
+        mean = np.average([p[:-1] for p in some], 0, [p.cells for p in some]) if some else np.zeros(4)
+        alike, most_alike, stops, most_stops = np.sqrt(3.0 * mean).tolist()
+        found.append((Scatter(alike, stops, most_stops), most_alike))
+    (displacement, hidden), (rotation, hidden_rotation) = found
+    space, sizes = r.estimation.space, r.solution.posterior.tolerances
+    fields = {b.name: size for b, size in zip(space.blocks, sizes, strict=True) if b.name in FIELDS and size > 0.0}
+    if len(fields) == len(FIELDS):
+        ratio = float(fields[FIELDS[0]] / fields[FIELDS[1]])
+        shifted = max(displacement.lack, min(rotation.lack * ratio, hidden))
+        turned = max(rotation.lack, min(displacement.lack / ratio, hidden_rotation))
+        displacement, rotation = displacement._replace(lack=shifted), rotation._replace(lack=turned)
+    hysteresis = _unread_backlash(r)
+    return displacement._replace(lack=float(np.hypot(displacement.lack, hysteresis))), rotation
+
+
+def _of_kind(r: Residuals, kind: int) -> _OfKind:
+    """Return what one kind of readings shows."""
+    m, estimated = r.estimation.measurements, float(r.solution.posterior.noise[kind] ** 2)
+    readings, cells = int((m.kind == kind).sum()), int((r.estimation.cells.kind == kind).sum())
+    there, back = _pairs(r, kind)
+    repeated, freedom = _repeated(r, kind)
+    own = error = 0.0
+    paired = len(there) >= ASSUMED.least_pairs
+    if paired:
+        shared, kept = _likeness(r, there, back)
+        # Residuals of cells count in their means' noise, which is smaller than a reading's.
+        alike, clear = (
+            v * estimated / kept * cells / readings for v in (shared, ASSUMED.clear_misfit / np.sqrt(len(there)))
+        )
+        own, error = (1.0 - shared) * estimated - 1.0, estimated * np.sqrt(2.0 / readings + 1.0 / len(there))
+    if freedom >= ASSUMED.least_pairs:  # repeats tell better what does not repeat
+        own, error = repeated - 1.0, repeated * np.sqrt(2.0 / freedom)
+    own = own if own > ASSUMED.clear_misfit * error else 0.0
+    if not paired:  # what is beyond noise, and may repeat, is taken for the machine's
+        alike, clear = estimated - 1.0 - own, ASSUMED.clear_misfit * estimated * np.sqrt(2.0 / readings)
+    variance = m.stated_of(kind) ** 2
+    return _OfKind(
+        alike=variance * alike if alike > clear else 0.0,
+        most_alike=variance * max(alike, clear),
+        stops=variance * own,
+        most_stops=variance * (own + 2.0 * error) if own else 0.0,
+        cells=cells,
+    )
+
+
+def _repeated(r: Residuals, kind: int) -> tuple[float, float]:
+    """Return the variance of readings about their cell's mean, in the stated noise's, and its degrees of freedom."""
+    m, solution, cell = r.estimation.measurements, r.solution, r.estimation.cells.of_reading
+    members = np.flatnonzero(m.kind == kind)
+    cell, weights = cell[members], solution.weights[members]
+    values = solution.residuals[members] / r.estimation.uncertainty[members]
+    total = np.bincount(cell, weights)
+    mean = np.bincount(cell, weights * values)[cell] / total[cell]
+    freedom = float(len(members) - len(np.unique(cell)))
+    return float(((weights * (values - mean)) ** 2).sum()) / max(freedom, 1.0), freedom
+
+
+def _pairs(r: Residuals, kind: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the cells of a kind that were read forward, and those read backward at the same places."""
+    cells, stations = r.estimation.cells, r.estimation.measurements.stations
+    poses = np.hstack([stations.positions, stations.rotations.reshape(-1, 9)]).round(9)
+    pose = different_rows(poses)[1][cells.station]
+    key = different_rows(np.stack([r.run, cells.channel, pose], axis=1))[1]
+    ways = [np.flatnonzero((cells.kind == kind) & (r.direction == way)) for way in (FORWARD, BACKWARD)]
+    _, first, second = np.intersect1d(key[ways[0]], key[ways[1]], return_indices=True)
+    return ways[0][first], ways[1][second]
+
+
+def _likeness(r: Residuals, there: np.ndarray, back: np.ndarray) -> tuple[float, float]:
+    """Return the variance that pairs of cells share, in their estimated noise's, and what fitting has left of it.
+
+    Fitting makes the noise of a pair unlike each other, by what both give to the parameters and to the run's unknowns;
+    and it takes up that part of what they share. Residuals are cut at 2 σ, for an instrument that slips puts many
+    readings off; (P(|x| < 2))² of the covariance of normal ones is left.
+    """
+    # Means of repeated readings are off by more than their noise where each has an error of its own.
+    size = 2.0 * max(1.0, MEDIAN_TO_SIGMA * float(np.median(np.abs(r.residual[there]))))
+    cut = np.clip(r.residual, -size, size)
+    groups = r.estimation.cells.group
+    sizes = np.bincount(groups + 1)[groups[there] + 1]
+    unlike = r.shared(there, back) + np.where(groups[there] < 0, 0.0, 1.0 / sizes)
+    shared = (cut[there] * cut[back] / 0.911 + unlike).mean()
+    return float(shared), float(max(1.0 - (r.taken[there] + unlike).mean(), ASSUMED.least_left))
+
+
+def _unread_backlash(r: Residuals) -> float:
+    """Return the RMS displacement, m, by half the backlash of a machine of which no reading tells a direction."""
+    m, space = r.estimation.measurements, r.estimation.space
+    if (m.direction != UNKNOWN).any() or space.block("backlash") is not None:
+        return 0.0
+    alone = ParameterSpace((space.geometry, space.region), replace(space.settings, blocks=("backlash",)))
+    errors, block = box_errors(alone, np.zeros(alone.size)), alone.block("backlash")
+    if errors is None or block is None:
+        return 0.0
+    sizes = np.diag(errors.mean_squares()[0])[block.part] * block.tolerance**2
+    return float(np.sqrt(sizes.sum()))
+
+
+# Priors, and χ²
+
+
+def _of_priors(r: Residuals, metric: np.ndarray) -> float:
+    """Return how well the logarithm of a tool error to expect is known, as the sizes of priors are estimates.
+
+    A size that n parameters determine is known to 1/√(2n) of itself, and moves the squared error by its prior's share
+    of it: with C = (N + T⁻²)⁻¹, tr(M·C·T⁻²·C)/tr(M·C). Of a length map or a field, coarse terms determine the size and
+    fine ones are taken to be in proportion.
+    """
+    posterior = r.solution.posterior
+    expected = float(np.vdot(metric, posterior.covariance))
+    if not expected > 0.0:
+        return 0.0
+    held = np.einsum("ij,ji->i", posterior.covariance @ metric, posterior.covariance) / posterior.spread**2
+    variance = 0.0
+    for block in r.estimation.space.blocks:
+        members = (posterior.used >= block.part.start) & (posterior.used < block.part.stop)
+        share = held[members].sum() / expected
+        variance += 0.5 * share**2 / max(posterior.determined[members].sum(), 1.0)
+        general = block.name not in (*EXPECTED, "structure") and not block.name.startswith("wave")
+        variance += (share * ASSUMED.fine_terms) ** 2 if general else 0.0
+    return float(np.sqrt(variance))
+
+
+def _held_by_priors(r: Residuals) -> bool:
+    """Return whether what a fit expects of the tool comes from the priors rather than from the readings."""
+    metric, posterior, m = r.metrics[0], r.solution.posterior, r.estimation.measurements
+    if not metric.any():
+        return False
+    prior, left = (np.sqrt(np.trace(metric @ part)) for part in (np.diag(posterior.spread**2), posterior.covariance))
+    noise = r.estimation.uncertainty * posterior.noise[m.kind]
+    lengths = ~np.isin(m.kind, [KINDS.index(kind) for kind in ANGULAR_KINDS])
+    return bool(left > ASSUMED.held * prior and (not lengths.any() or left > np.median(noise[lengths])))
+
+
+def _unstated(m: MeasurementSet) -> str:
+    """Return a remark on lengths whose noise is assumed, for the machine's own may hide in it; empty if none is."""
+    unstated = np.unique(m.kind[~np.isfinite(m.uncertainty)])
+    listed = [
+        f"{KINDS[k]} {DEFAULT_UNCERTAINTY[KINDS[k]] * 1e6:g} µm" for k in unstated if KINDS[k] not in ANGULAR_KINDS
+    ]
+    if not listed:
+        return ""
+    problem = f"no uncertainty is stated ({', '.join(listed)} assumed)"
+    return f"{problem}: what the machine's own repeatability has of that is not in the expected tool error"
+
+
+def chi_squares(r: Residuals) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare, ...]]:
+    """Return χ² by kind of channel for families of lines and for directions, and run by run, the worst first."""
+    m, solution, of_reading = r.estimation.measurements, r.solution, r.estimation.cells.of_reading
+    freedom = 1.0 - (r.taken / np.bincount(of_reading))[of_reading]
+    squares = (solution.weights * solution.residuals / r.estimation.uncertainty) ** 2
+    groups = (
+        (family_of_run(m)[m.run], dict(enumerate(FAMILIES))),
+        (m.direction, {FORWARD: "forward", BACKWARD: "backward"}),
+        (m.run, dict(enumerate(run.name for run in m.runs))),
+    )
+    parts: list[list[ChiSquare]] = [[], [], []]
+    for part, (numbers, names) in zip(parts, groups, strict=True):
+        for k in np.unique(m.kind):
+            for number, name in names.items():
+                members = (m.kind == k) & (numbers == number)
+                if freedom[members].sum() > ASSUMED.least_free:
+                    value = float(squares[members].sum() / freedom[members].sum())
+                    part.append(ChiSquare(KINDS[k], name, int(members.sum()), value))
+    return (*parts[0], *parts[1]), tuple(sorted(parts[2], key=lambda part: -part.value))
