@@ -110,7 +110,10 @@ class Assumptions:
     refused_noise: float = assumed(10.0, "", "noise found over noise stated that refuses a fit", "χ² of 100")
     doubtful_noise: float = assumed(3.0, "", "the same that puts it in doubt", "χ² of 9")
     by_chance: float = assumed(0.002, "", "how rarely runs of a right model differ more than is called clear", "3 σ")
-    negligible: float = assumed(1e-4, "", "share of the tool's squared error that is left out of the jackknife", "time")
+    jackknife_prior: float = assumed(70.0, "", "freedom with which a covariance is believed", "± 17 % of its variance")
+    without_effect: float = assumed(
+        1e-4, "", "share of the tool's squared error that is left out of the jackknife", "time"
+    )
     drift: float = assumed(11.5e-6, "m/m", "prior of the scale's change over a campaign", "steel by 1 K")
     drift_terms: int = assumed(2, "", "degree of a drift in time", "exponential settling has no more")
     drift_runs: int = assumed(6, "", "runs that read lengths from which on a drift is looked for", "two each way")

@@ -32,6 +32,7 @@ from ..measurements.readings import (
 from .assumptions import ASSUMED
 from .blocks import EXPECTED
 from .estimator import (
+    MEDIAN_TO_SIGMA,
     DesignMatrix,
     Estimation,
     Solution,
@@ -176,14 +177,17 @@ def judge(
 def unexplained(r: Residuals, drift: Drift, scale: float) -> Unexplained:
     """Return what a settled fit leaves unexplained; `scale` is the standard deviation of that of all readings, m/m."""
     ratio, freedom = jackknife(r, drift)
-    factor, upper = 1.0, 1.0
-    if freedom > 0.0:
-        low, high = (2.0 * gammaincinv(0.5 * freedom, p) / freedom for p in (0.025, 1.0 - ASSUMED.by_chance))
-        upper = float(np.sqrt(max(1.0, ratio / low)))
-        factor = float(np.sqrt(ratio)) if ratio > high else 1.0
+    # The variance's scale has an inverse χ² prior about 1, which the runs' own freedom outvotes.
+    believed = ASSUMED.jackknife_prior
+    both = believed + freedom
+    upper = np.sqrt(max(1.0, (believed + freedom * ratio) / (2.0 * gammaincinv(0.5 * both, 0.025))))
+    clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - ASSUMED.by_chance) / freedom
+    factor = np.sqrt(ratio) if clear else 1.0
     prior, prior_of_rotation = (_of_priors(r, metric) for metric in r.metrics)
     displacement, rotation = discrepancy(r)
-    return Unexplained(factor, upper, prior, prior_of_rotation, displacement, rotation, *drift.change, scale)
+    return Unexplained(
+        float(factor), float(upper), prior, prior_of_rotation, displacement, rotation, *drift.change, scale
+    )
 
 
 def stated_scale(measurements: MeasurementSet, settings: FitSettings) -> float:
@@ -212,7 +216,7 @@ def jackknife(r: Residuals, drift: Drift) -> tuple[float, float]:
     if not r.expected > 0.0 or len(np.unique(groups)) < 2:
         return 1.0, 0.0
     values, vectors = np.linalg.eigh(spread[:, None] * r.metrics[0] * spread)
-    kept = np.cumsum(values) > ASSUMED.negligible * r.expected  # ascending: what no prior lets happen is left out
+    kept = np.cumsum(values) > ASSUMED.without_effect * r.expected  # ascending: what no prior lets happen is left out
     terms, cross = len(drift.values), r.rows.transposed_times(drift.columns)
     effects = np.pad(vectors[:, kept] * np.sqrt(np.maximum(values[kept], 0.0)), ((0, terms), (0, 0)))
     precision = np.block(
