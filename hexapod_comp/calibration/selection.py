@@ -55,6 +55,8 @@ def log_bayes_factor(space: ParameterSpace, posterior: Posterior, name: str) -> 
     """Return log p(readings | with a block) − log p(without) (Savage–Dickey), all hyperparameters alike."""
     part = next(block.part for block in space.blocks if block.name == name)
     members = np.flatnonzero((posterior.used >= part.start) & (posterior.used < part.stop))
+    if not len(members):  # the readings say nothing of it
+        return 0.0
     spread = posterior.spread[members]
     relative = posterior.covariance[np.ix_(members, members)] / (spread[:, None] * spread)
     factor, failed = dpotrf(relative, lower=1)
