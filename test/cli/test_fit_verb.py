@@ -734,7 +734,7 @@ def test_plan_and_fit_agree(done: Calibration, hexapod: Program) -> None:
     planned = json.loads(hexapod("plan", done.campaign, *JOINT, "--json")[1])["expected_tool_error"]["after_m"]
     fit = done.fit
     as_solved = physical_covariance(fit.space, fit.solution.posterior)
-    explained = expected_error(fit.space, fit.solution.x, as_solved, allowed=fit.allowed)
+    explained = expected_error(fit.space, fit.solution.x, as_solved)
     assert explained is not None
     assert fit.level is not None
     assert 0.5 < planned / explained.after < 2.0
