@@ -149,7 +149,7 @@ def test_fit_reports_all_its_sections(done: Calibration) -> None:
         "tilted 10°: ",
         "Do not trust this model with a tilted tool",
         "residuals; held out",
-        "blocks; gain",
+        "blocks; evidence",
         "structure parameters are observable",
         "observability indices: O1 ",
         "not seen (left near nominal): base 1",
@@ -643,7 +643,7 @@ def test_fit_of_too_short_lines_says_which_and_what_is_needed(hexapod: Program, 
     measured = tmp_path / "m.csv"
     assert hexapod("simulate", "--campaign", tmp_path / "c.yaml", "--out", measured)[0] == 0
     outcome = hexapod("fit", measured, "--scheme", "lines", "--out", tmp_path / "m.yaml")
-    assert_refused(outcome, r"z line at x -203\.2, y -203\.2 .*has 5 points in a direction; 6 are needed")
+    assert_refused(outcome, r"z line at x -203\.2, y -203\.2 .*has 5 points.*, over 203\.2 mm; 6 are needed")
 
 
 # measure, wrongly.
