@@ -27,7 +27,7 @@ from node_helpers import HOME, Bench
 
 from hexapod_comp.cli.app import make_parser
 from hexapod_comp.formats.paths import config_file
-from hexapod_comp.linuxcnc import parameters as linuxcnc_bridge
+from hexapod_comp.linuxcnc import bridge as linuxcnc_bridge
 from hexapod_comp.ros import interface, strut_drive
 from hexapod_comp.ros.parameters import Taken
 from hexapod_comp.ros.status import ERROR

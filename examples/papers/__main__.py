@@ -14,8 +14,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from hexapod_comp.cli.arguments import count, seed
-
+from hexapod_comp.cli.options import count, seed
 from hexapod_comp.errors import HexapodError
 from hexapod_comp.formats.csv import csv_text
 from hexapod_comp.formats.outputs import make_folder, write_text

@@ -6,12 +6,12 @@ import calibration_helpers as small
 import numpy as np
 import pytest
 from foreign_machines import machines
-from hexapod_comp.cli.arguments import INSTRUMENTS
 
 from hexapod_comp.calibration.candidates import MeasuringBox, candidates
 from hexapod_comp.calibration.design import TIMES, ErrorLeft, Goal, Proposal, Times, plan, propose
 from hexapod_comp.calibration.design_report import proposal_report, verdict
 from hexapod_comp.calibration.parameters import FitSettings
+from hexapod_comp.cli.verbs import INSTRUMENTS
 from hexapod_comp.errors import CalibrationError
 from hexapod_comp.machine.geometry import load_geometry
 from hexapod_comp.measurements.campaign import LISTED_INSTRUMENTS, Campaign, campaign_text, load_campaign, template
