@@ -92,21 +92,11 @@ class JournalError(HexapodError):
 
 @dataclass(frozen=True)
 class Source:
-    """A file that decides commands: geometry or model.
+    """A file that decides commands: geometry or model."""
 
-    Attributes
-    ----------
-    name : str
-        Where it was read from.
-    text : str or None
-        All of it; None where it was too long to be copied. Empty for the ideal model.
-    sha256 : str
-        Of the text as UTF-8, hexadecimal.
-    """
-
-    name: str
+    name: str  # where it was read from
     text: str | None
-    sha256: str
+    sha256: str  # of the text as UTF-8, hexadecimal
 
     @classmethod
     def of(cls, name: str, text: str) -> Source:
@@ -143,80 +133,41 @@ IDEAL_SOURCE = Source.of(IDEAL, "")
 
 @dataclass(frozen=True)
 class Entry:
-    """One change, or one refused command.
+    """One change, or one refused command."""
 
-    Attributes
-    ----------
-    after : int
-        Commands answered before it since the session began.
-    what : str
-        ``temperature``, ``humidity``, ``model``, ``enable``, ``tool``, ``ramp_rate``, ``reset`` or ``refused``.
-    values : dict of str to object
-        ``name``, ``value`` (°C) and ``time`` (s; NaN: not known) of a temperature; ``value`` (a fraction) and ``time``
-        of a humidity; ``name`` and ``sha256`` of a model; ``on``; ``name`` of a tool; ``value`` (m/s) of a ramp rate;
-        ``measured`` (m, or None) of a reset; ``stamp`` (ns), ``reason`` and ``text`` of a refused command.
-    """
-
-    after: int
+    after: int  # commands answered before it since the session began
     what: str
+    # ``name``, ``value`` (°C) and ``time`` (s; NaN: not known) of a temperature; ``value`` (a fraction) and
+    # ``time`` of a humidity; ``name`` and ``sha256`` of a model; ``on``; ``name`` of a tool; ``value`` (m/s) of
+    # a ramp rate; ``measured`` (m, or None) of a reset; ``stamp`` (ns), ``reason`` and ``text`` of a refused
+    # command
     values: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Everything that decides the next answer.
+    """Everything that decides the next answer."""
 
-    Attributes
-    ----------
-    state : dict
-        As :meth:`Compensator.snapshot`, arrays in place of lists.
-    model, geometry : dict of str to str
-        ``name`` and ``sha256`` of what was in use.
-    frames : dict of str to str
-        frame_id of poses in the machine's ``base``, its ``work`` frame, and its other work frames by their names.
-    made_with : dict of str to str
-        Versions that the last bit may depend on.
-    joints : tuple of str
-        Names of the struts in messages, in strut order.
-    """
-
-    state: dict[str, Any]
+    state: dict[str, Any]  # as :meth:`Compensator.snapshot`, arrays in place of lists
     model: dict[str, str]
     geometry: dict[str, str]
+    # frame_id of poses in the machine's ``base``, its ``work`` frame, and its other work frames by their names
     frames: dict[str, str]
     made_with: dict[str, str]
-    joints: tuple[str, ...] = STRUT_NAMES
+    joints: tuple[str, ...] = STRUT_NAMES  # names of the struts in messages, in strut order
 
 
 @dataclass(frozen=True)
 class Page:
-    """One message of the journal.
+    """One message of the journal."""
 
-    Attributes
-    ----------
-    session : str
-        Differs from one configuration of a node to the next.
-    number : int
-        Of this page in its session, from 1.
-    begins : int
-        Commands answered before this page since the session began.
-    commands : ndarray of COMMAND
-        Commands answered since the page before, and the answers.
-    entries : tuple of Entry
-        What else happened since then.
-    refused_more : int
-        Refused commands that the page does not name.
-    snapshot : Snapshot or None
-        Taken after all of that.
-    """
-
-    session: str
+    session: str  # differs from one configuration of a node to the next
     number: int
-    begins: int
+    begins: int  # commands answered before this page since the session began
     commands: np.ndarray
-    entries: tuple[Entry, ...]
+    entries: tuple[Entry, ...]  # what else happened since then
     refused_more: int
-    snapshot: Snapshot | None
+    snapshot: Snapshot | None  # taken after all of that
 
     def steps(self) -> Iterator[Entry | None]:
         """Yield what happened, in its order: entries, and None for each answered command."""
@@ -231,19 +182,7 @@ class Page:
 
 
 class Journal:
-    """Writes the pages of one compensator, whose ``on_change`` it takes.
-
-    Parameters
-    ----------
-    compensator : Compensator
-        Watched from now on.
-    sources : mapping of str to Source
-        ``geometry`` and ``model`` in use; looked up whenever they are named.
-    frames : dict of str to str
-        See :class:`Snapshot`.
-    joints : sequence of str, optional
-        See :class:`Snapshot`.
-    """
+    """Writes the pages of one compensator, whose ``on_change`` it takes."""
 
     def __init__(
         self,
@@ -383,13 +322,7 @@ def sources_text(sources: Mapping[str, Source]) -> str:
 
 
 def read_sources(text: str) -> dict[str, Source]:
-    """Read what :func:`sources_text` has written.
-
-    Raises
-    ------
-    JournalError
-        It is something else, or a text does not have its hash.
-    """
+    """Read what :func:`sources_text` has written."""
     sources = {}
     try:
         for key, entry in _object(_content(text)["files"], "files").items():
@@ -405,13 +338,7 @@ def read_sources(text: str) -> dict[str, Source]:
 
 
 def read_page(text: str) -> Page:
-    """Read what :meth:`Journal.page` has written.
-
-    Raises
-    ------
-    JournalError
-        It is something else, or of another version.
-    """
+    """Read what :meth:`Journal.page` has written."""
     content = _content(text)
     try:
         page = Page(
