@@ -100,7 +100,8 @@ class LoopClient:
         for status in message.status:
             if status.name.startswith(self._status_name):
                 self.diagnostics = {entry.key: entry.value for entry in status.values}
-                self._counted_before = self._counted_before or self._counts()
+                if "commands" in self.diagnostics:  # a node that is not configured yet has none
+                    self._counted_before = self._counted_before or self._counts()
 
     @property
     def has_true_pose(self) -> bool:

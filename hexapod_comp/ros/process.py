@@ -136,9 +136,9 @@ def _run_until(
         ending.callback(_end_within, ENDED_WITHIN, stderr)
         if node.wants_autostart and node.unconfigured and not autostart(node, heard):
             return 1
-        # What is loaded by now stays, and the collector need not look at it while the machine moves: in 45,000 objects a
-        # full collection takes 17 ms, the time of eight commands. The allocator is left alone: told to give large blocks
-        # back at once it held 2 to 11 MB less after sixty messages of up to 6 MB, which is not worth a call into glibc.
+        # What is loaded by now stays, and the collector need not look at it while the machine moves: in 45,000 objects
+        # a full collection takes 17 ms, the time of eight commands. The allocator is left alone: told to give large
+        # blocks back it held 2 to 11 MB less after sixty messages of up to 6 MB, not worth a call into glibc.
         gc.collect()
         gc.freeze()
         while not heard and rclpy.ok():
