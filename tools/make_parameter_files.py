@@ -15,7 +15,7 @@ import yaml
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from hexapod_comp.linuxcnc import parameters as linuxcnc_bridge  # noqa: E402
+from hexapod_comp.linuxcnc import bridge as linuxcnc_bridge  # noqa: E402
 from hexapod_comp.ros import interface, strut_drive  # noqa: E402
 from hexapod_comp.ros.parameters import Parameter, shown  # noqa: E402
 
