@@ -11,20 +11,16 @@ Exits 1 when a bar is missed.
 
 from __future__ import annotations
 
-import argparse
 import json
-import multiprocessing
-import os
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
+from benchmarks import drawn
 from benchmarks.smooth_imperfections import with_wavy_field
 from hexapod_comp.calibration.evaluation import Worth, worth
 from hexapod_comp.calibration.fit import fit_model
@@ -210,9 +206,7 @@ def shown(row: Row) -> str:
 
 def main() -> int:
     """Run the cases and print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--machines", type=int, default=20, help="machines of each case (default 20)")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: all cores)")
+    parser = drawn.options(__doc__, 20)
     parser.add_argument("--case", action="append", help="only cases whose name starts so; may be repeated")
     parser.add_argument("--kind", help="only these kinds of machine, such as AB")
     parser.add_argument("--json", action="store_true", help="JSON instead of a table")
@@ -222,22 +216,13 @@ def main() -> int:
         for n, case in enumerate(CASES)
         if (not args.case or case.name.startswith(tuple(args.case))) and case.machine in (args.kind or case.machine)
     ]
-    # One process per core: a library's own threads would only be in each other's way.
-    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-    pool = ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn"))
     rows = []
     if not args.json:
         print(HEADER + "\n" + "|---" * 3 + "|---:" * 9 + "|", flush=True)
-    with pool, tqdm(total=len(chosen) * args.machines, disable=None) as bar:
-        for n in chosen:
-            done = []
-            for machine in pool.map(one_machine, [n] * args.machines, range(1, args.machines + 1)):
-                done.append(machine)
-                bar.update()
-            rows.append(summed_up(CASES[n], done))
-            if not args.json:
-                tqdm.write(shown(rows[-1]))
-                sys.stdout.flush()
+    for n, done in drawn.results(one_machine, chosen, args):
+        rows.append(summed_up(CASES[n], done))
+        if not args.json:
+            drawn.show(shown(rows[-1]))
     if args.json:
         print(json.dumps([asdict(row) for row in rows], indent=1))
     return 0 if all(row.met for row in rows) else 1

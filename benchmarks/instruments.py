@@ -10,17 +10,13 @@ Exits 1 when a bar is missed.
 
 from __future__ import annotations
 
-import argparse
-import multiprocessing
-import os
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
+from benchmarks import drawn
 from benchmarks.calibration import CONFIG, LEAD, truth_of
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model
@@ -152,26 +148,16 @@ HEADER = "instruments|kind|level before, µm|after|removed|least|bar|tilted befo
 
 def main() -> int:
     """Run the cases and print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--machines", type=int, default=20, help="machines of each case (default 20)")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: all cores)")
+    parser = drawn.options(__doc__, 20)
     parser.add_argument("--case", action="append", help="only cases whose name starts so; may be repeated")
     args = parser.parse_args()
     chosen = [n for n, case in enumerate(CASES) if not args.case or case.name.startswith(tuple(args.case))]
-    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
     print("| " + HEADER.replace("|", " | ") + " |\n" + "|---" * 14 + "|", flush=True)
     met = []
-    pool = ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn"))
-    with pool, tqdm(total=len(chosen) * args.machines, disable=None) as bar:
-        for n in chosen:
-            done = []
-            for judged in pool.map(one_machine, [n] * args.machines, range(1, args.machines + 1)):
-                done.append(judged)
-                bar.update()
-            row, good = shown(CASES[n], done)
-            met.append(good)
-            tqdm.write(row)
-            sys.stdout.flush()
+    for n, done in drawn.results(one_machine, chosen, args):
+        row, good = shown(CASES[n], done)
+        met.append(good)
+        drawn.show(row)
     return 0 if all(met) else 1
 
 

@@ -11,7 +11,6 @@ Exits 1 when a cause is named of readings that were taken rightly.
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
 import os
 import sys
@@ -26,6 +25,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks import drawn
 from benchmarks.calibration import LEAD
 from benchmarks.promise import FOREIGN, KNOWN, OWN, setting
 from hexapod_comp.calibration.fit import mixed_up
@@ -74,10 +74,7 @@ def first_named(kind: str, seed: int, made: str) -> str:
 
 def main() -> int:
     """Run the kinds and print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--machines", type=int, default=4, help="machines of each kind (default 4)")
-    parser.add_argument("--first", type=int, default=600, help="seed of the first machine (default 600)")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: all cores)")
+    parser = drawn.options(__doc__, 4, 600, "kind")
     parser.add_argument("--kind", action="append", choices=(*OWN, *FOREIGN), help="only this; may be repeated")
     args = parser.parse_args()
     os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")

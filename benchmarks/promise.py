@@ -14,19 +14,15 @@ Exits 1 when a bar is missed: 93 % kept or refused; of the own class none refuse
 
 from __future__ import annotations
 
-import argparse
 import json
-import multiprocessing
-import os
 import sys
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
+from benchmarks import drawn
 from benchmarks.calibration import LARGE, LEAD, SMALL
 from benchmarks.smooth_imperfections import with_wavy_field
 from hexapod_comp.calibration.blocks import WAVES
@@ -281,32 +277,21 @@ def summed_up(kind: str, outcomes: list[Outcome]) -> Row:
 
 def main() -> int:
     """Run the kinds and print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--machines", type=int, default=12, help="machines of each kind (default 12)")
-    parser.add_argument("--first", type=int, default=100, help="seed of the first machine (default 100)")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: all cores)")
+    parser = drawn.options(__doc__, 12, 100, "kind")
     parser.add_argument("--kind", action="append", choices=(*OWN, *FOREIGN), help="only this; may be repeated")
     parser.add_argument("--json", action="store_true", help="JSON instead of a table")
     args = parser.parse_args()
-    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-    pool = ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn"))
     kinds = [kind for kind in (*OWN, *FOREIGN) if not args.kind or kind in args.kind]
     rows = []
     if not args.json:
         print("| kind | machines | kept | refused | broken | left | expected | upper end | width |")
         print("|---" + "|---:" * 8 + "|", flush=True)
-    with pool, tqdm(total=len(kinds) * args.machines, disable=None) as bar:
-        for kind in kinds:
-            outcomes = []
-            for outcome in pool.map(one_machine, [kind] * args.machines, range(args.first, args.first + args.machines)):
-                outcomes.append(outcome)
-                bar.update()
-            rows.append(summed_up(kind, outcomes))
-            if not args.json:
-                r = rows[-1]
-                sizes = f"{r.left_um:.2f} µm | {r.expected_um:.2f} µm | {r.high_um:.2f} µm | {r.width:.2f}"
-                tqdm.write(f"| {kind} | {r.machines} | {r.kept} | {r.refused} | {r.broken} | {sizes} |")
-                sys.stdout.flush()
+    for kind, outcomes in drawn.results(one_machine, kinds, args):
+        rows.append(summed_up(kind, outcomes))
+        if not args.json:
+            r = rows[-1]
+            sizes = f"{r.left_um:.2f} µm | {r.expected_um:.2f} µm | {r.high_um:.2f} µm | {r.width:.2f}"
+            drawn.show(f"| {kind} | {r.machines} | {r.kept} | {r.refused} | {r.broken} | {sizes} |")
     if args.json:
         print(json.dumps([asdict(row) for row in rows], indent=1))
     share = 1.0 - sum(row.broken for row in rows) / sum(row.machines for row in rows)

@@ -1,0 +1,48 @@
+"""What the benchmarks share that judge many drawn machines: options, one process a core, results case by case."""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from typing import TypeVar
+
+from tqdm import tqdm
+
+Case = TypeVar("Case")
+Result = TypeVar("Result")
+
+
+def options(doc: str | None, machines: int, first: int = 1, of: str = "case") -> argparse.ArgumentParser:
+    """Return the parser of a benchmark: how many machines, the seed of the first, and how many processes."""
+    parser = argparse.ArgumentParser(description=(doc or "").splitlines()[0])
+    parser.add_argument("--machines", type=int, default=machines, help=f"machines of each {of} (default {machines})")
+    parser.add_argument("--first", type=int, default=first, help=f"seed of the first machine (default {first})")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: all cores)")
+    return parser
+
+
+def results(
+    of_machine: Callable[[Case, int], Result], cases: Sequence[Case], args: argparse.Namespace
+) -> Iterator[tuple[Case, list[Result]]]:
+    """Yield each case with what came of its machines, as soon as all of them are done."""
+    # One process per core: a library's own threads would only be in each other's way.
+    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    seeds = range(args.first, args.first + args.machines)
+    pool = ProcessPoolExecutor(args.workers, mp_context=multiprocessing.get_context("spawn"))
+    with pool, tqdm(total=len(cases) * len(seeds), disable=None) as bar:
+        for case in cases:
+            done = []
+            for result in pool.map(of_machine, [case] * len(seeds), seeds):
+                done.append(result)
+                bar.update()
+            yield case, done
+
+
+def show(row: str) -> None:
+    """Print a row of a table above the progress."""
+    tqdm.write(row)
+    sys.stdout.flush()
