@@ -39,19 +39,10 @@ def strut_length_errors(
 ) -> np.ndarray:
     """Return ΔL = L_actual − L_ideal (Mou & King) along a line in x, forward and backward, shape (2, n, 6), m.
 
+    The line stands at places `along_x`, (n,), of the tool, at `y` and `z`, m in the work frame.
+
     L_ideal are the nominal lengths of the commanded pose; L_actual those of the pose to which the machine,
     told L_ideal, really goes as the model has it. To first order the strut correction is −ΔL.
-
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        The machine as designed.
-    model : MachineModel
-        What is believed of its errors.
-    along_x : ndarray, shape (n,)
-        Places of the tool in the work frame, m.
-    y, z : float
-        Where the line stands, m.
     """
     points = np.stack([along_x, np.full_like(along_x, y), np.full_like(along_x, z)], axis=1)
     level = np.tile(np.eye(3), (len(points), 1, 1))
@@ -72,19 +63,7 @@ def strut_error_figure(
 ) -> Figure:
     """Show Mou & King's Figures 3 and 4: the six struts' length errors along x, forward (a) and backward (b).
 
-    Parameters
-    ----------
-    geometry : HexapodGeometry
-        The machine as designed.
-    models : mapping of str to MachineModel
-        One row of two panels each, under its title; Mou & King have a row from 1-D and one from 5-D data.
-    y, z : float, optional
-        Where the line stands in the work frame, m; the middle of the first model's box by default.
-
-    Raises
-    ------
-    CalibrationError
-        No model, or one without a box: nobody knows how far the line goes.
+    One row of two panels for each model, under its title; `y` and `z`, m in work, by default the middle of the box.
     """
     if not models or any(model.measured is None for model in models.values()):
         raise CalibrationError("picture of strut errors", "needs models, each with the box in which it holds")
@@ -111,22 +90,7 @@ def _strut_curves(axes: Axes, along: np.ndarray, lengths: np.ndarray) -> None:
 
 
 def fitted_lines_figure(fit: LinesFit, axis: int = 0, component: int | None = None) -> Figure:
-    """Show the polynomials of one family and component among the readings that they were fitted to.
-
-    Parameters
-    ----------
-    fit : LinesFit
-        Result of scheme ``lines``.
-    axis : int
-        Along which the lines run.
-    component : int, optional
-        Index into :data:`hexapod_comp.machine.field.COMPONENTS`; the displacement along the lines by default.
-
-    Raises
-    ------
-    CalibrationError
-        The component was not measured on these lines.
-    """
+    """Show the polynomials of one family and component among the readings that they were fitted to."""
     component = axis if component is None else component
     lines = [line for line in fit.lines if (line.axis, line.component) == (axis, component)]
     if not lines:
@@ -240,11 +204,6 @@ def _maps(fit: ModelFit) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     """Return x, y, three heights, m in work, and errors before and after, µm, shape (3, y, x), in the measured box.
 
     After: as large in all as the fit promises, or larger.
-
-    Raises
-    ------
-    CalibrationError
-        The readings span no box.
     """
     if fit.model.region is None:
         raise CalibrationError("picture of the error in space", "needs readings that span a box")
@@ -260,13 +219,7 @@ def _maps(fit: ModelFit) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
 
 
 def left_error_figure(fit: ModelFit) -> Figure:
-    """Show where in the measured box what error is left after compensation: the RMS to expect, at three heights.
-
-    Raises
-    ------
-    CalibrationError
-        The readings span no box.
-    """
+    """Show where in the measured box what error is left after compensation: the RMS to expect, at three heights."""
     x, y, heights, _, left = _maps(fit)
     figure = Figure(figsize=(11, 3.9), layout="constrained")
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
@@ -281,13 +234,7 @@ def left_error_figure(fit: ModelFit) -> Figure:
 
 
 def before_after_figure(fit: ModelFit) -> Figure:
-    """Map the error in space before and after compensation at three heights, in the same colours, by powers of ten.
-
-    Raises
-    ------
-    CalibrationError
-        The readings span no box.
-    """
+    """Map the error in space before and after compensation at three heights, in the same colours, by powers of ten."""
     x, y, heights, *maps = _maps(fit)
     figure = Figure(figsize=(11, 7.2), layout="constrained")
     rows = figure.subplots(2, 3, sharex=True, sharey=True)
@@ -330,18 +277,6 @@ def predicted_error_figure(machine: RealMachine, fitted: FittedParameters | None
     """Map the tool's predicted error without compensation at half the measured box's height, level tool, datum aligned.
 
     Six components along and about the axes of ``work``; contour lines are their standard deviations.
-
-    Parameters
-    ----------
-    machine : RealMachine
-        Geometry and model.
-    fitted : FittedParameters or None
-        What the model's fit knows; None: no standard deviations.
-
-    Raises
-    ------
-    ModelError
-        The model tells of no box.
     """
     box = commanded_box(machine.geometry, machine.model)
     x, y = (np.linspace(box[0, axis], box[1, axis], MAP_NODES) for axis in range(2))
