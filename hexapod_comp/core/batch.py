@@ -56,11 +56,14 @@ def entry(function: str, arguments: str) -> Callable[..., Any]:
     counts: dict[str, int] = {}
     for argument in arguments.split():
         role, name, shape, kind = ARGUMENT.match(argument).groups()  # type: ignore[union-attr]
-        sizes = tuple(int(size) if size.isdigit() else size for size in shape.split(",")) if shape else ()
+        sizes: tuple[Any, ...] = (
+            tuple(int(size) if size.isdigit() else size for size in shape.split(",")) if shape else ()
+        )
         if sizes and role != ">" and isinstance(sizes[0], str):
             counts.setdefault(sizes[0], position)
         asked = role != ">" and not name.isupper()
-        plan.append((role, name, sizes, KINDS[kind], position if asked else -1))
+        rest = None if all(isinstance(size, int) for size in sizes) else sizes[1:]
+        plan.append((role, name, sizes, rest, KINDS[kind], TYPES[KINDS[kind]], position if asked else -1))
         position += asked
 
     def run(*values: Any) -> Any:
@@ -68,13 +71,19 @@ def entry(function: str, arguments: str) -> Callable[..., Any]:
             raise TypeError(f"{function}: takes {position} arguments, not {len(values)}")
         rows = {letter: len(values[at]) for letter, at in counts.items()}
         passed, made = [], []
-        for role, name, sizes, kind, at in plan:
+        for role, name, sizes, rest, kind, pointer, at in plan:
             if sizes:
-                shape = [rows[size] if isinstance(size, str) else size for size in sizes]
+                shape = (
+                    sizes if rest is None else (rows[sizes[0]], *rest) if sizes[0] in rows else (6, rows["N"])
+                )  # motions
                 if role == ">":
-                    made.append(np.empty(shape, kind))
-                array = made[-1] if role == ">" else values[at]
-                passed.append((written if role else given)(name, array, *shape, kind=kind))
+                    made.append(array := np.empty(shape, kind))
+                else:
+                    array = values[at]
+                    flags = array.flags
+                    if array.dtype != kind or array.shape != shape or not flags.c_contiguous or not flags.writeable:
+                        (written if role else given)(name, array, *shape, kind=kind)  # says what is wrong
+                passed.append(ffi.from_buffer(pointer, array))
             elif at < 0:
                 passed.append(rows[name])
             elif name == "strut" and not 0 <= values[at] < 6:
