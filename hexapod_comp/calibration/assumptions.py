@@ -39,6 +39,10 @@ class Assumptions:
     draws: int = assumed(160, "", "draws that show what parameters do along a line", "a line has some twenty ways")
     together: int = assumed(1000, "", "rows of small folds left out together", "a processor's cache")
 
+    # Observations (observations.py)
+    frame_stations: int = assumed(4, "", "tracker runs with fewer stations share a frame", "six unknowns need three")
+    frame_rank: float = assumed(1e-9, "", "what moves readings less does not count as a frame's", "rounding")
+
     # Selection (selection.py)
     least_evidence: float = assumed(2.0, "", "log Bayes factor that keeps a block", "one number 2 σ from zero")
     first_rounds: int = assumed(10, "", "rounds of hyperparameters with all blocks in", "they go on in the fit")

@@ -145,8 +145,24 @@ class DesignMatrix:
         return DesignMatrix((count, self.shape[1]), parts), targets, groups
 
     def project_out(self, unknowns: Sequence[Nuisance]) -> None:
-        """Take off, in place, what unknowns of instruments may explain; the cells of each stand in one part."""
+        """Take off, in place, what unknowns of instruments may explain.
+
+        The cells of each stand in one part, or in parts of the same parameters, as a tracker's positions and attitudes.
+        """
         owner = np.array([self._part[unknown.members[0]] for unknown in unknowns])
+        for n, unknown in enumerate(unknowns):
+            own = self._part[unknown.members]
+            if (own == own[0]).all():
+                continue
+            owner[n] = -1
+            pieces = [(np.flatnonzero(own == p), self.parts[p]) for p in np.unique(own)]
+            places = [self._place[unknown.members[at]] for at, _ in pieces]
+            values = np.concatenate([part.values[at] for at, (_, part) in zip(places, pieces, strict=True)])
+            order = np.concatenate([at for at, _ in pieces])
+            unknown._replace(basis=unknown.basis[order]).project_out(values, np.arange(len(values)))
+            ends = np.cumsum([len(at) for at in places])[:-1]
+            for at, (_, part), cleared in zip(places, pieces, np.split(values, ends), strict=True):
+                part.values[at] = cleared
 
         def clear(part: int) -> None:
             for n in np.flatnonzero(owner == part).tolist():
@@ -449,13 +465,18 @@ class Estimation:
         self.cells = Cells.of(measurements)
         self.uncertainty = measurements.stated
         self._zeros, self._lengths = self.cells.groups(measurements)
+        self._frames = [] if space.settings.tracker_frame == "known" else self.cells.frames(measurements)
         self._components = np.abs(self.cells.directions) > ROUNDING
+        for frame in self._frames:  # turning the frame turns them
+            self._components[frame.members] = np.repeat(
+                [self._components[frame.members, k : k + 3].any() for k in (0, 3)], 3
+            )
         for lengths in self._lengths:
             self._components[lengths.members, :3] = True  # their directions change with the answer
         self._groups = self._group_alike()
         needed = len(space.blocks[0].labels)
         free = len(self.cells.station) - len(self._zeros) - sum(along is not None for _, along in self._zeros)
-        free -= sum(lengths.count for lengths in self._lengths)
+        free -= sum(lengths.count for lengths in self._lengths) + 6 * len(self._frames)
         if alone and free < needed:
             problem = f"{len(measurements)} readings at {len(self.cells.station)} distinct places leave {free} "
             raise CalibrationError("measurements", problem + f"numbers for the structure's {needed} parameters")
@@ -543,13 +564,17 @@ class Estimation:
     def _unknowns(
         self, directions: np.ndarray, errors: np.ndarray, values: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, list[Nuisance]]:
-        """Return what cells with errors (C, 6) should read, and what is unknown; renews `directions` of lengths."""
+        """Return what cells with errors (C, 6) should read, and what is unknown; renews `directions` that change."""
         expected = np.einsum("ci,ci->c", directions, errors)
         unknowns = [of_zero(members, scale[members], along) for members, along in self._zeros]
         for lengths in self._lengths:
             n = lengths.members
             expected[n], directions[n, :3], parts = lengths.seen(errors[n, :3], values[n], scale[n])
             unknowns += parts
+        for frame in self._frames:
+            n = frame.members
+            expected[n], directions[n], part = frame.seen(directions[n], errors[n], values[n], scale[n])
+            unknowns.append(part)
         return expected, unknowns
 
     def _problem(
@@ -560,7 +585,7 @@ class Estimation:
         normal, moment, square = np.zeros((kinds, size, size)), np.zeros((kinds, size)), scatter.copy()
         freedom = np.bincount(self.measurements.kind, minlength=kinds).astype(float)
         for part in unknowns:
-            freedom[kind[part.members[0]]] -= part.share.sum()
+            freedom -= np.bincount(kind[part.members], part.basis**2 @ part.share, kinds)
         products = at_once(lambda part: part.values.T @ part.values, rows.parts)
         for group, (_, columns, values), product in zip(self._groups, rows.parts, products, strict=True):
             normal[group.kind][np.ix_(columns, columns)] += product

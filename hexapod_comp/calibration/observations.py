@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import CalibrationError
 from ..machine.arrays import different_rows, rms
 from ..measurements.readings import ABSOLUTE_KINDS, KINDS, LEAST_TRAVEL, LENGTH, MeasurementSet
+from .assumptions import ASSUMED
 
 CENTRE = 5e-3
 """Standard deviation of where a centre is, beside its place in the file, along each axis, m."""
@@ -149,6 +150,47 @@ class Lengths:
 
 
 @dataclass(frozen=True)
+class Frame:
+    """Where a tracker stands: readings of one set-up, in a frame that is only roughly the work frame.
+
+    A frame off by the rotation R and the shift d about c shows the point p + e at c + Rᵀ·(p + e − c − d), and the
+    attitude error r as that of Rᵀ·exp(r). R and d are fitted wherever the machine's parameters stand; nothing is known
+    of them beforehand, however far they are from the nominal ones.
+    """
+
+    members: np.ndarray  # (n,): cells
+    points: np.ndarray  # (n, 3): commanded place of the measured point, m in base
+
+    def seen(
+        self, directions: np.ndarray, errors: np.ndarray, value: np.ndarray, scale: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, Nuisance]:
+        """Return what these cells should read, along which directions (n, 6) errors move it, and the six unknowns.
+
+        `directions` (n, 6) are those of a right frame, `errors` (n, 6) those of the machine, `value` and `scale` (n,)
+        what was read and one over its standard deviation.
+        """
+        centre = self.points.mean(axis=0)
+        size = float(np.linalg.norm(self.points - centre, axis=1).max()) or 1.0  # m; turns are counted by it
+        shift, turn, attitude = np.zeros(3), Rotation.identity(), Rotation.from_rotvec(errors[:, 3:])
+        for _ in range(ROUNDS):
+            away = self.points + errors[:, :3] - centre - shift
+            shown = centre + turn.inv().apply(away) - self.points
+            turned = (turn.inv() * attitude).as_rotvec()
+            expected = (directions[:, :3] * shown).sum(axis=1) + (directions[:, 3:] * turned).sum(axis=1)
+            moving = directions[:, 3:] + 0.5 * np.cross(turned, directions[:, 3:])  # of a rotation vector, by a turn
+            along = np.hstack([turn.apply(directions[:, :3]), turn.apply(moving)])
+            turning = np.cross(away, along[:, :3]) + along[:, 3:]
+            u, s, v = np.linalg.svd(-scale[:, None] * np.hstack([along[:, :3], turning / size]), full_matrices=False)
+            rank = int((s > ASSUMED.frame_rank * s[0]).sum())
+            step = v[:rank].T @ (u[:, :rank].T @ (scale * (value - expected)) / s[:rank])
+            shift = shift + step[:3]
+            turn = Rotation.from_rotvec(step[3:] / size) * turn
+            if np.abs(step).max() < SETTLED:
+                break
+        return expected, along, Nuisance(self.members, u[:, :rank], np.ones(rank))
+
+
+@dataclass(frozen=True)
 class Cells:
     """Readings of one channel at one station are one cell: they differ by noise only."""
 
@@ -203,6 +245,15 @@ class Cells:
             sloping = KINDS[c.kind[members[0]]] == "straightness" and np.ptp(c.along[members]) > 0.0
             zeros.append((members, c.along[members] if sloping else None))
         return zeros, lengths
+
+    def frames(self, measurements: MeasurementSet) -> list[Frame]:
+        """Return the set-ups of trackers: runs of position and attitude; those of few stations are one set-up."""
+        m, absolute = measurements, np.flatnonzero(self.group < 0)
+        run, points = m.run[self.first[absolute]], m.points()
+        for n in np.unique(run):
+            if len(np.unique(self.station[absolute[run == n]])) < ASSUMED.frame_stations:
+                run[run == n] = -1
+        return [Frame(own, points[self.station[own]]) for n in np.unique(run) for own in [absolute[run == n]]]
 
 
 def _left_out_whole(measurements: MeasurementSet) -> np.ndarray:

@@ -59,6 +59,9 @@ class FitSettings:
         Standard deviations to start from, by block.
     robust : bool
         Give readings that disagree with the rest less weight.
+    tracker_frame : str
+        ``free``: where a tracker's frame is, is not known: six unknowns for each of its runs. ``known``: it is the work
+        frame, so that the readings show where the machine stands in it.
     scale, alignment : float or None
         Standard deviations of what no reading shows: of the instruments' scale, m/m, and of the angle between a laser's
         beam and its line, rad. None: of their class (:func:`~hexapod_comp.calibration.trust.stated_scale`).
@@ -78,6 +81,7 @@ class FitSettings:
     robust: bool = True
     scale: float | None = None
     alignment: float | None = None
+    tracker_frame: str = "free"
 
     def __post_init__(self) -> None:
         unknown = set(self.blocks) - set(BLOCKS)
@@ -102,6 +106,8 @@ class FitSettings:
         for name, given, most, unit in (("scale", self.scale, 1e-2, "m/m"), ("alignment", self.alignment, 0.1, "rad")):
             if given is not None and not 0.0 <= given <= most:
                 raise ModelError(name, f"must be 0…{most:g} {unit}", given)
+        if self.tracker_frame not in ("free", "known"):
+            raise ModelError("tracker_frame", "must be free or known", self.tracker_frame)
         if not 1 <= self.field_degree <= 8:
             raise ModelError("field_degree", "must be 1…8", self.field_degree)
 

@@ -245,4 +245,4 @@ def _settings(path: Path, given: Any) -> FitSettings:
             raise InputFileError(path, f"head.settings.{name}", f"must be {allowed}", value)
     lists = {name: tuple(tuple(v) if isinstance(v, list) else v for v in value)
              for name, value in given.items() if isinstance(value, list)}  # fmt: skip
-    return FitSettings(**{**given, **lists})
+    return FitSettings(**{"tracker_frame": "known", **given, **lists})  # files of 0.2 do not say: it was taken so

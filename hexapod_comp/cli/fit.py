@@ -54,6 +54,7 @@ IN_SI = {
     "alignment_mrad": ("alignment", 1e-3),
     "thermometer": ("thermometer", 1),
     "time_constants_s": ("time_constants", 1),
+    "tracker_frame": ("tracker_frame", 1),
 }
 """What options are called among the settings of a fit, and their units."""
 

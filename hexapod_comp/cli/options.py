@@ -89,6 +89,20 @@ def under(heading: str, *options: Option) -> tuple[Option, ...]:
     return tuple(Option(o.name, o.help, o.keywords, o.role, o.kind, heading) for o in options)
 
 
+class Assumptions(argparse.Action):
+    """Print the constants of calibration."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from ..calibration.assumptions import ASSUMED
+        from ..calibration.parameters import TOLERANCES
+
+        for name, value, what, source in ASSUMED.rows():
+            print(f"{name} = {value}: {what} ({source})")
+        for block, tolerance in TOLERANCES.items():
+            print(f"tolerance of {block} = {tolerance:g}: first guess of its size (the fit goes on from there)")
+        parser.exit()
+
+
 class Renamed(argparse.Action):
     """Refuse an option of an older version, and say what it is called now."""
 
@@ -384,6 +398,8 @@ ESTIMATION = under(
           "moisture, late (default all)"),
     SEPARATE,
     value("--tolerance-um", bound, "UM", "how well joints are built, to start from, µm (default 100)"),
+    choice("--tracker-frame", ("free", "known"), "free: a tracker stands anywhere, six unknowns a run (default); "
+           "known: its frame is the work frame"),
     value("--field-degree", count, "N", "degree of the field (default 6)"),
     value("--expansion-ppm", expansions, "S[,B,P]", "thermal expansion of struts, or of struts, base and platform, "
           "ppm/K; a warm-up starts there (default 0)"),

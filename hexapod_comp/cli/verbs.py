@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 from .options import (
     COMPENSATED, DIRECTION, ESTIMATION, FRAMES, JSON, LINE_HELP, LINE_SHAPE, MACHINE, MODEL, NAMESPACE, POSE_HELP,
-    SEPARATE, SHAPE, TRUTH, WORDS, Option, Rule, above_zero, bound, box, choice, count, csv_file, excluded_by,
+    SEPARATE, SHAPE, TRUTH, WORDS, Assumptions, Option, Rule,
+    above_zero, bound, box, choice, count, csv_file, excluded_by,
     exactly_one, finite, flag, folder, gone, html_file, joint_names, lengths, line, machine, needed_by, pictures, pose,
     readings, reads, seed_of, some_of, span, table_out, tilts, times, together, under, value, whole, writes,
 )  # fmt: skip
@@ -502,6 +503,8 @@ example:
             reads("--truth", f"errors of the virtual machine that was measured: file, shipped name, {WORDS}",
                   kind="model"),
             flag("--force", "write a model that the readings do not bear out"),
+            Option("--assumptions", "print what all fits assume, with units and sources",
+                   {"action": Assumptions, "nargs": 0}),
             reads("--update", "renew this model from few readings, what its fit knows as the prior", "MODEL"),
             COMPENSATED,
             *ESTIMATION,

@@ -20,7 +20,7 @@ from hexapod_comp.calibration.datum import HeldDatum, unseen_part
 from hexapod_comp.calibration.estimator import Estimation
 from hexapod_comp.calibration.fit import ModelFit, fit_model
 from hexapod_comp.calibration.lines import fit_lines
-from hexapod_comp.calibration.parameters import FitSettings
+from hexapod_comp.calibration.parameters import FitSettings, ParameterSpace
 from hexapod_comp.calibration.posterior import ErrorPredictor, FittedParameters
 from hexapod_comp.calibration.posterior_file import load_posterior, save_with_posterior
 from hexapod_comp.errors import CalibrationError, InputFileError, ModelError
@@ -77,9 +77,11 @@ def laser_fit() -> ModelFit:
     return fit_model(small.measured(small.virtual_machine(4), small.campaign(), 4), small.FEW)
 
 
-def projection(readings) -> np.ndarray:
+def projection(readings, tracker_frame: str = "known") -> np.ndarray:
     """Return what readings do not show at home, by the fit's own weights at a tolerance of 0.1 mm."""
-    estimation = Estimation(readings, laser_fit().space, alone=False)
+    space = laser_fit().space
+    space = ParameterSpace((space.geometry, space.region), replace(space.settings, tracker_frame=tracker_frame))
+    estimation = Estimation(readings, space, alone=False)
     return unseen_part(estimation, 1e-4, np.ones(len(KINDS)), small.paper().home)
 
 
@@ -89,6 +91,7 @@ def test_a_tracker_is_believed_and_one_pose_of_it_shows_no_more_than_its_place()
     full = small.scattered(small.paper(), poses)
     positions = full.select(full.kind == KINDS.index("position"))
     assert np.abs(projection(full)).max() == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(projection(full, "free"), np.eye(6), atol=1e-9)
     assert np.abs(projection(positions)).max() == pytest.approx(0.0, abs=1e-12)
     one = positions.select(positions.station == 0)
     part = projection(one)
@@ -100,9 +103,10 @@ def test_a_tracker_is_believed_and_one_pose_of_it_shows_no_more_than_its_place()
         np.testing.assert_allclose(shift + np.cross(turn, arm), 0.0, atol=1e-10)
 
 
-def test_a_fit_with_poses_of_a_tracker_is_not_touched() -> None:
+def test_a_fit_with_poses_of_a_tracker_in_a_known_frame_is_not_touched() -> None:
     truth = small.virtual_machine(4)
-    fit = fit_model(small.measured(truth, small.campaign(poses=6), 4), small.FEW)
+    known = replace(small.FEW, tracker_frame="known")
+    fit = fit_model(small.measured(truth, small.campaign(poses=6), 4), known)
     assert fit.held.held == 0
     np.testing.assert_array_equal(fit.model.base_deviation, fit.space.model(fit.solution.x.round(11)).base_deviation)
     assert "the readings saw it" in str(fit.model.origin.datum)

@@ -78,10 +78,10 @@ def test_a_slope_of_a_linear_reading_is_not_forgotten():
     assert np.abs(linearised(tilted)[1].target - linearised(ours)[1].target).max() > 1.0
 
 
-def test_absolute_poses_keep_their_zero():
+def test_absolute_poses_in_a_known_frame_keep_their_zero():
     poses = [Pose([x, y, 0.45], np.eye(3)) for x in np.linspace(-0.1, 0.1, 4) for y in np.linspace(-0.1, 0.1, 4)]
     absolute = small.scattered(small.paper(), poses)
-    space = ParameterSpace(absolute, FitSettings(blocks=()))
+    space = ParameterSpace(absolute, FitSettings(blocks=(), tracker_frame="known"))
     shifted = Estimation(absolute.with_values(absolute.value + 1e-5), space)
     problem, residuals = shifted.linearise(np.zeros(space.size), np.ones(len(absolute)))
     np.testing.assert_allclose(residuals, 1e-5, atol=1e-12)

@@ -125,7 +125,8 @@ def test_what_is_below_the_noise_was_read(poses: int) -> None:
     readings = small.scattered(small.paper(), [Pose(p, turn) for p, turn in zip(places, turns, strict=True)])
     assert np.degrees(readings.tilt()) == pytest.approx(np.degrees(Rotation.from_matrix(turns).magnitude()).max())
     readings = replace(readings, uncertainty=np.full(len(readings), 1e-3))
-    estimation = Estimation(readings, ParameterSpace(readings, FIELD))
+    known = replace(FIELD, tracker_frame="known")
+    estimation = Estimation(readings, ParameterSpace(readings, known))
     found = {error.name: error for error in without_trace(estimation)}
     field, low, high = estimation.space.field, *estimation.space.box[:, 0]
     u = 2.0 * (places[:, 0] - low) / (high - low) - 1.0
