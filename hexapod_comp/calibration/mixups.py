@@ -392,14 +392,14 @@ def _moved_machines() -> Iterator[tuple[str, Moved]]:
     for a, b in combinations(range(3), 2):
         order = np.eye(3)
         order[[a, b]] = order[[b, a]]
-        yield f"{AXES[a]} and {AXES[b]}: exchanged", partial(_in_frame, frame=order)
+        yield f"{AXES[a]} and {AXES[b]}: exchanged", partial(in_frame, frame=order)
     for a, axis in enumerate(AXES):
         mirror = np.diag(1.0 - 2.0 * np.eye(3)[a])
-        yield f"{axis}: mirrored", partial(_in_frame, frame=mirror)
-        yield f"{axis}: mirrored, rotations as well", partial(_in_frame, frame=mirror, axial=True)
+        yield f"{axis}: mirrored", partial(in_frame, frame=mirror)
+        yield f"{axis}: mirrored, rotations as well", partial(in_frame, frame=mirror, axial=True)
         for quarters, name in TURNS:
             turn = Rotation.from_rotvec(0.5 * np.pi * quarters * np.eye(3)[a]).as_matrix().round()
-            yield f"the work frame: turned about {axis} {name}", partial(_in_frame, frame=turn)
+            yield f"the work frame: turned about {axis} {name}", partial(in_frame, frame=turn)
     for axes in permutations(AXES):
         if axes != ("y", "x", "z"):  # R = Ry(β)·Rx(α)·Rz(γ)
             yield f"angles: turned about {', '.join(axes)} in turn", partial(_in_order, order="".join(axes).upper())
@@ -408,7 +408,7 @@ def _moved_machines() -> Iterator[tuple[str, Moved]]:
         yield f"the geometry of {geometry.name}", partial(_of_machine, geometry=geometry)
 
 
-def _in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> MeasurementSet:
+def in_frame(m: MeasurementSet, frame: np.ndarray, axial: bool = False) -> MeasurementSet:
     """Return a set whose poses, lines and channels stand in axes that are columns of a signed permutation.
 
     A mirrored file has the signs of its columns reversed, rotations among them, unless these are `axial` vectors.
@@ -510,7 +510,7 @@ def _checked_otherwise(m: MeasurementSet, model: MachineModel) -> Iterator[tuple
         for a, b in combinations(range(3), 2):
             order = np.eye(3)
             order[[a, b]] = order[[b, a]]
-            yield f"{AXES[a]} and {AXES[b]}: exchanged", partial(_in_frame, m, order)
+            yield f"{AXES[a]} and {AXES[b]}: exchanged", partial(in_frame, m, order)
     else:
         off = replace(m, stations=replace(m.stations, commands=_nominal(m.geometry, m)))
         yield "taken with the compensation off", lambda: off

@@ -15,7 +15,7 @@ from foreign_machines import machines
 
 from hexapod_comp.calibration.evaluation import held_out
 from hexapod_comp.calibration.fit import fit_model, mixed_up
-from hexapod_comp.calibration.mixups import FAMILIES, SWAPPED, family_of_run
+from hexapod_comp.calibration.mixups import FAMILIES, SWAPPED, family_of_run, in_frame
 from hexapod_comp.calibration.parameters import FitSettings
 from hexapod_comp.calibration.posterior import expected_error
 from hexapod_comp.calibration.promise import Scatter, Unexplained
@@ -280,6 +280,28 @@ def test_exchanged_channels_are_named_where_the_plain_model_lacks_much(tmp_path)
     both = np.isin(m.channel, (x, y))
     named = mixed_up(replace(m, channel=np.where(both, x + y - m.channel, m.channel)), FitSettings())
     assert named[0].startswith("rotation_x and rotation_y: exchanged")
+
+
+@pytest.mark.parametrize(
+    ("frame", "name"),
+    [
+        (np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), "the work frame: turned about z by -90°"),
+        (np.diag([1.0, -1.0, 1.0]), "y: mirrored"),
+    ],
+)
+def test_another_frame_is_named(readings, frame, name):
+    """What undoes a turn is the turn back, and a mirror undoes itself; none is taken for a reversed sign."""
+    named = mixed_up(in_frame(readings, frame), FEW)
+    assert [text.rpartition(" fits")[0] for text in named] == [name]
+
+
+def test_a_backlash_that_no_reading_tells_is_promised(readings):
+    """Half of it moves every strut either way, whatever the model says; the lower end is without it."""
+    still = replace(readings.stations, sense=np.zeros_like(readings.stations.sense))
+    fit = fit_model(replace(readings, direction=np.zeros_like(readings.direction), stations=still), FEW)
+    left = held_out(virtual_machine(3), fit.model, BOX).aligned.rms
+    assert fit.space.block("backlash") is None
+    assert fit.level.low < left < fit.level.high
 
 
 def test_nothing_is_suspected_without_a_cause(readings):
