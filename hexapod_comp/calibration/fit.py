@@ -18,11 +18,11 @@ from ..pose import Pose
 from .assumptions import ASSUMED
 from .blocks import WAVES
 from .datum import HeldDatum, hold, refuse_unreachable, unseen_part
-from .estimator import Estimation, LinearProblem, Solution, iterate, physical_covariance
+from .estimator import Estimation, LinearProblem, Posterior, Solution, iterate, physical_covariance
 from .lead import ScrewLead, look_for_lead
 from .mixups import SWAPPED, mixups, swapped_directions
 from .parameters import FitSettings, ParameterSpace
-from .posterior import Observability, ToolError, UnseenError, listed, observe, without_trace
+from .posterior import Observability, ToolError, UnseenError, box_errors, listed, observe, without_trace
 from .selection import Decision, select
 from .thermal import HeatSeen, TimeConstants, seek_time_constants, with_courses
 from .trust import Verdict, judge, with_drift
@@ -223,7 +223,7 @@ def _fit(measurements: MeasurementSet, begun: _Begun, progress: Callable[[str], 
     """Choose blocks, fit them, and judge what comes of it."""
     everything, nominal, lead, constants = begun
     settings = everything.space.settings
-    decisions, answer = _choose(everything, nominal, settings, progress)
+    decisions, possible, answer = _choose(everything, nominal, settings, progress)
     space, estimation, solution = answer
     solution, drift = with_drift(estimation, solution)
     channels = tuple(_channels(estimation, solution))
@@ -236,7 +236,9 @@ def _fit(measurements: MeasurementSet, begun: _Begun, progress: Callable[[str], 
     progress("what is it worth?")
     noise = {KINDS.index(c.kind): c.estimated for c in channels}
     mixed = mixups(everything, nominal, [d.block for d in decisions if d.kept], progress)
-    verdict = judge(estimation, solution, drift, settings, noise, mixed)
+    verdict = judge(
+        estimation, solution, drift, settings, noise, mixed, _possible(space, solution, everything.space, possible)
+    )
     no_trace = unseen_errors(measurements, settings)
     if rolls := [error for error in no_trace if error.name.startswith("roll")]:
         verdict = verdict.without_rotation(listed(rolls))
@@ -287,10 +289,10 @@ def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callab
 
 def _choose(
     everything: Estimation, problem: LinearProblem, settings: FitSettings, progress: Callable[[str], object]
-) -> tuple[list[Decision], tuple[ParameterSpace, Estimation, Solution]]:
-    """Return what is fitted, and the fit."""
+) -> tuple[list[Decision], Posterior, tuple[ParameterSpace, Estimation, Solution]]:
+    """Return what is fitted, what the readings allow with all blocks in, and the fit."""
     space, measurements = everything.space, everything.measurements
-    decisions, _, kept = select(space, problem, np.ones(len(KINDS)), progress)
+    decisions, possible, kept = select(space, problem, np.ones(len(KINDS)), progress)
     y = np.zeros(space.size)
     y[kept.used] = kept.y
     start = _Start(space, space.physical(y), kept.tolerances, kept.noise)
@@ -301,11 +303,11 @@ def _choose(
         start = _Start.of(answer[0], answer[-1])
         x, _, noise = _carried_over(start, space)
         problem, _ = everything.linearise(x, answer[-1].weights)
-        again, _, _ = select(space, problem, noise, progress)
+        again, possible, _ = select(space, problem, noise, progress)
         if [d.kept for d in again] != [d.kept for d in decisions]:
             answer = _solve(measurements, again, settings, start, progress)
         decisions = again
-    return decisions, answer
+    return decisions, possible, answer
 
 
 class _Start(NamedTuple):
@@ -344,6 +346,23 @@ def _carried_over(start: _Start, space: ParameterSpace) -> tuple[np.ndarray, np.
                 x[block.part] = start.x[old.part]
                 tolerances[n] = start.tolerances[m]
     return x, tolerances, start.noise
+
+
+def _possible(space: ParameterSpace, solution: Solution, everything: ParameterSpace, possible: Posterior) -> float:
+    """Return the tool's mean squared error, m², that the readings allow with all blocks in, seen from the answer."""
+    way, x = np.zeros(everything.size), np.zeros(everything.size)
+    way[possible.used] = possible.y
+    own = np.zeros(space.size)
+    own[solution.posterior.used] = solution.posterior.y
+    for block in everything.blocks:
+        if (kept := space.block(block.name)) is not None:
+            x[block.part] = own[kept.part]
+            way[block.part] -= own[kept.part]
+    errors = box_errors(everything, everything.physical(x))
+    if errors is None:
+        return 0.0
+    metric, shift = errors.mean_squares()[0], everything.physical(way)
+    return float(np.vdot(metric, physical_covariance(everything, possible)) + shift @ metric @ shift)
 
 
 def unseen_errors(measurements: MeasurementSet, settings: FitSettings) -> tuple[UnseenError, ...]:

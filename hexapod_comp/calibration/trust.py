@@ -145,11 +145,12 @@ def judge(
     settings: FitSettings,
     noise: Mapping[int, float],
     mixed_up: Sequence[str] = (),
+    possible: float = 0.0,
 ) -> Verdict:
     """Return what a settled fit promises and what is wrong with it; `noise` was found for each kind, m or rad."""
     measurements, space = estimation.measurements, estimation.space
     residuals = Residuals(estimation, solution)
-    beyond = unexplained(residuals, drift, stated_scale(measurements, settings))
+    beyond = unexplained(residuals, drift, stated_scale(measurements, settings), possible)
     covariance = physical_covariance(space, solution.posterior)
     # A field that was measured with a level tool alone says nothing of a tilted one.
     level_only = space.block(FIELDS[0]) is not None and measurements.tilt() < 0.5 * TILT
@@ -174,13 +175,15 @@ def judge(
     return Verdict(level, tilted, beyond, families, runs, *listed)
 
 
-def unexplained(r: Residuals, drift: Drift, scale: float) -> Unexplained:
+def unexplained(r: Residuals, drift: Drift, scale: float, possible: float = 0.0) -> Unexplained:
     """Return what a settled fit leaves unexplained; `scale` is the standard deviation of that of all readings, m/m."""
     ratio, freedom = jackknife(r, drift)
     # The variance's scale has an inverse χ² prior about 1, which the runs' own freedom outvotes.
     believed = ASSUMED.jackknife_prior
     both = believed + freedom
     upper = np.sqrt(max(1.0, (believed + freedom * ratio) / (2.0 * gammaincinv(0.5 * both, 0.025))))
+    if r.expected > 0.0:  # a block that was left out is not proved to be absent: `possible` has all in, m²
+        upper = max(upper, np.sqrt(possible / r.expected))
     clear = freedom > 0.0 and ratio > 2.0 * gammaincinv(0.5 * freedom, 1.0 - ASSUMED.by_chance) / freedom
     factor = np.sqrt(ratio) if clear else 1.0
     prior, prior_of_rotation = (_of_priors(r, metric) for metric in r.metrics)
