@@ -36,53 +36,25 @@ WARM = 0.2
 
 @dataclass(frozen=True)
 class ChannelFit:
-    """How one kind of channel was met.
+    """How one kind of channel was met."""
 
-    Attributes
-    ----------
-    kind : str
-        Of :data:`hexapod_comp.measurements.readings.KINDS`.
-    readings : int
-        How many.
-    stated, estimated : float
-        Standard deviation of a reading: as the file or the default says (root mean square), and as fitted.
-    chi_square : float
-        Squared residuals over the stated variance, per degree of freedom.
-    held_out : float
-        RMS error at readings whose line or pose was left out, their noise included, m or rad.
-    """
-
-    kind: str
+    kind: str  # of KINDS
     readings: int
-    stated: float
-    estimated: float
-    chi_square: float
-    held_out: float
+    stated: float  # standard deviation of a reading, as the file or the default says (root mean square)
+    estimated: float  # the same as fitted
+    chi_square: float  # squared residuals over the stated variance, per degree of freedom
+    held_out: float  # RMS error at readings whose line or pose was left out, their noise included, m or rad
 
 
 @dataclass(frozen=True)
 class Outlier:
-    """A reading that disagrees with all others.
+    """A reading that disagrees with all others."""
 
-    Attributes
-    ----------
-    source : FileLine
-        Where it stands.
-    channel : int
-        Index of its channel.
-    residual : float
-        m or rad.
-    sigmas : float
-        The same in standard deviations.
-    run : str
-        Its run.
-    """
-
-    source: FileLine
-    channel: int
-    residual: float
-    sigmas: float
-    run: str
+    source: FileLine  # Where it stands
+    channel: int  # Index of its channel
+    residual: float  # m or rad
+    sigmas: float  # The same in standard deviations
+    run: str  # Its run
 
 
 @dataclass(frozen=True)
@@ -366,27 +338,13 @@ def _possible(space: ParameterSpace, solution: Solution, everything: ParameterSp
 
 
 def unseen_errors(measurements: MeasurementSet, settings: FitSettings) -> tuple[UnseenError, ...]:
-    """Return the machine errors that the readings do not show, whatever blocks are allowed in a fit.
-
-    Parameters
-    ----------
-    measurements : MeasurementSet
-        The readings; their values do not matter.
-    settings : FitSettings
-        Of the fit.
-    """
+    """Return the machine errors that the readings do not show, whatever blocks are allowed in a fit."""
     space = ParameterSpace(measurements, replace(settings, blocks=("field displacement", "field rotation")))
     return without_trace(Estimation(measurements, space))
 
 
 def _check_backlash(space: ParameterSpace, solution: Solution) -> list[str]:
-    """Return remarks on negative backlash; refuse the fit when most struts have it.
-
-    Raises
-    ------
-    CalibrationError
-        Forward and backward are swapped: a nut cannot lead its screw.
-    """
+    """Return remarks on negative backlash; refuse the fit when most struts have it."""
     block = space.block("backlash")
     if block is None:
         return []
@@ -425,13 +383,7 @@ def _ignored(measurements: MeasurementSet, space: ParameterSpace) -> list[str]:
 
 
 def _check_noise(channels: tuple[ChannelFit, ...]) -> list[str]:
-    """Return remarks on readings that scatter more than they should; refuse those that no machine explains.
-
-    Raises
-    ------
-    CalibrationError
-        What is left of a kind of reading is larger than any machine's error.
-    """
+    """Return remarks on readings that scatter more than they should; refuse those that no machine explains."""
     for c in channels:
         if c.estimated > LARGEST_NOISE:
             unit = "rad" if c.kind in ANGULAR_KINDS else "m"

@@ -37,13 +37,7 @@ class Prediction:
 
 
 def predict(space: ParameterSpace, x: np.ndarray, stations: Stations) -> Prediction:
-    """Return where the machine of a parameter vector goes at each station.
-
-    Raises
-    ------
-    KinematicsError
-        The machine cannot take one of the poses.
-    """
+    """Return where the machine of a parameter vector goes at each station."""
     positive, sense = without_negative(space.blocks, x, stations.sense)
     model = space.model(positive, with_field=False)
     air = stations.temperatures, stations.times, stations.humidity

@@ -33,7 +33,8 @@ def test_every_option_that_names_a_file_is_declared_as_read_or_written():
     for name, verb in VERBS.items():
         for option in verb.options:
             text = option.keywords.get("type") in (None, csv_file, html_file) and "choices" not in option.keywords
-            takes_text = text and option.help != SUPPRESS and option.keywords.get("action") != "store_true"
+            nothing = option.keywords.get("action") == "store_true" or option.keywords.get("nargs") == 0
+            takes_text = text and option.help != SUPPRESS and not nothing
             assert not takes_text or bool(option.role) != (option.dest in WORDS), (name, option.name)
 
 
