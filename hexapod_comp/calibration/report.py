@@ -137,7 +137,7 @@ def _chi_square_tables(fit: ModelFit) -> Iterator[str]:
 
 def _decision_table(fit: ModelFit) -> str:
     rows = [(d.block, "yes" if d.kept else "no", number(d.evidence, 1)) for d in fit.decisions]
-    head = "blocks; evidence: log of how many times likelier the readings are with the block than without it"
+    head = "blocks; evidence: logarithm of the Bayes factor with the block to without it"
     return head + "\n" + aligned(("block", "kept", "evidence"), rows)
 
 
