@@ -299,7 +299,11 @@ def _elsewhere(m: MeasurementSet, model: _Fitted, blocks: Collection[str]) -> li
     small = _of(few, settings, blocks, model)
     clear = []
     for name, moved in _moved_machines():
-        if (other := _of(moved(few), settings, blocks, model)) is not None and small is not None:
+        try:
+            there = moved(few)
+        except HexapodError:  # no machine stands there
+            continue
+        if (other := _of(there, settings, blocks, model)) is not None and small is not None:
             gain = other.evidence - small.evidence
             if gain > np.log(ASSUMED.mixup_odds):
                 clear.append((gain, name, moved))
