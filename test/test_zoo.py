@@ -247,7 +247,7 @@ def test_the_truth_lies_within_every_published_deviation(
         assert fitted is not None
     else:
         monkeypatch.setattr("hexapod_comp.calibration.fit.mixups", lambda *_: [])
-        monkeypatch.setattr("hexapod_comp.calibration.trust.expected_error", lambda *_: None)
+        monkeypatch.setattr("hexapod_comp.calibration.trust.expected_error", lambda *_, **__: None)
         truth = RealMachine(geometry, load_model(animal.file("truth.yaml"), geometry))
         side = float(np.ptp(machine.box, axis=0).min())
         laser = "1-D" if instruments == "both" else None
