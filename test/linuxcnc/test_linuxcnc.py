@@ -98,7 +98,8 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
     Path(files["campaign.yaml"]).write_text(CAMPAIGN)
     options = ["--truth", files["truth.yaml"], "--campaign", files["campaign.yaml"], "--seed", "5"]
     assert cli.main(["simulate", *options, "--out", files["measured.csv"]]) == 0
-    assert cli.main(["fit", files["measured.csv"], "--blocks", "structure", "--out", files["model.yaml"]]) == 0
+    fitted = ["--blocks", "structure", "--tracker-frame", "known"]  # the virtual tracker stands in the work frame
+    assert cli.main(["fit", files["measured.csv"], *fitted, "--out", files["model.yaml"]]) == 0
     truth = RealMachine(load_geometry(CONFIG / "paper.yaml"), model)
     return Calibrated(truth, Path(files["model.yaml"]).read_text(), files["model.yaml"])
 
