@@ -25,12 +25,10 @@ from ..pose import rotation_from_angles
 from ..workspace.reach import Examiner
 
 FEW_POINTS, USUAL_POINTS = (5, 13), (13,)
-
+# Points of a line, by instrument: few at little cost, or enough to see the screws' waves
 POINTS = {"linear": (8, 21), "5-D": FEW_POINTS, "6-D": FEW_POINTS}
-"""Points of a line, by instrument: few at little cost, or enough to see the screws' waves."""
-
+# The same where each is read once, on the way there or back: more places for as many readings
 ALTERNATE_POINTS = {"linear": (4, 6, 10), "5-D": (4, 8), "6-D": (4, 8)}
-"""The same where each is read once, on the way there or back: more places for as many readings."""
 
 
 @dataclass(frozen=True)
@@ -84,10 +82,7 @@ def candidates(place: MeasuringBox, instruments: Sequence[str]) -> list[Campaign
 
 
 def _lines(place: MeasuringBox) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield name, ends (2, 3), m, and attitude of each line, as far as the limits let it go.
-
-    Level: along x, y and z through edges, middle and middles of faces; body and face diagonals. Tilted: fewer.
-    """
+    """Yield name, ends (2, 3), m, and attitude of each line, as far as the limits let it go."""
     low, size = place.box[0], np.ptp(place.box, axis=0)
     level, tilted = [], []
     for axis, (a, b) in enumerate(CROSS_AXES):

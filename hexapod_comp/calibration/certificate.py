@@ -1,7 +1,4 @@
-"""A calibration certificate: one page to be filed, which says what was measured, and what the machine was and will be.
-
-It holds what the fit's report says, and no figure that is better than the report's.
-"""
+"""A calibration certificate: one page to be filed, whose figures are those of the fit's report."""
 
 from __future__ import annotations
 
@@ -42,10 +39,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FORMAT, VERSION = "hexapod_comp/certificate", 1
-
-COVERAGE = 2.0
-"""Coverage factor k of expanded uncertainties: about 95 %."""
-
+COVERAGE = 2.0  # coverage factor k of expanded uncertainties: about 95 %
+# What no readings tell: keys of a details file, and what they are called. What is not given is left to be written by
+# hand.
 DETAILS = {
     "number": "certificate number",
     "customer": "customer",
@@ -55,9 +51,8 @@ DETAILS = {
     "operator": "measured by",
     "environment": "environment",
 }
-"""What no readings tell: keys of a details file, and what they are called. What is not given is left to be written by
-hand."""
 
+# What reads each kind of channel
 INSTRUMENTS = {
     "linear": "linear laser",
     "straightness": "straightness optics",
@@ -67,10 +62,8 @@ INSTRUMENTS = {
     "length": "length from a point: ball bar, probe, station",
     "displacement": "displacement at a ball: R-test",
 }
-"""What reads each kind of channel."""
 
-MOST_RUNS = 200
-"""Runs beyond these are counted, not listed."""
+MOST_RUNS = 200  # runs beyond these are counted, not listed
 
 
 @dataclass(frozen=True)
@@ -83,13 +76,7 @@ class Details:
 
 
 def load_details(path: str | Path) -> Details:
-    """Read a details file: YAML, every entry text and optional, ``instruments`` and ``remarks`` lists of texts.
-
-    Raises
-    ------
-    InputFileError
-        Naming key, value and what is allowed.
-    """
+    """Read a details file: YAML, every entry text and optional, ``instruments`` and ``remarks`` lists of texts."""
     section = read_yaml(input_file(path, "details"), FORMAT, VERSION)
 
     def texts(key: str) -> tuple[str, ...]:
@@ -264,10 +251,7 @@ def _circles(before: dict[str, CircularTest], after: dict[str, CircularTest]) ->
 
 
 def left_out(fit: ModelFit) -> np.ndarray:
-    """Return each reading less what the model, fitted without that reading's line or pose, predicts, (N,), m or rad.
-
-    A run's unknown zero is taken off.
-    """
+    """Return each reading less what the model, fitted without that reading's line or pose, predicts, (N,), m or rad."""
     m, solution = fit.measurements, fit.solution
     cell = Cells.of(m).of_reading
     weights = solution.weights / m.stated**2

@@ -1,8 +1,7 @@
-"""What may have happened to a machine since its fit, and how well check readings bear each change out.
+"""What may have happened to a machine since its fit, and the Bayes factor of each change by check readings.
 
-The fit's posterior says how the readings of an unchanged machine scatter about its model: N(0, S), S = J·Σ·Jᵀ + noise.
-A change moves the parameters by A·θ, θ ~ N(0, s²), so that under it they are N(0, S + s²·J·A·Aᵀ·Jᵀ). The ratio of both
-densities is its Bayes factor. Each change has several scales s, equally likely: a strut may move by 5 µm or by 300.
+The readings of an unchanged machine scatter about its model by N(0, S), S = J·Σ·Jᵀ + noise. A change moves parameters
+by A·θ, θ ~ N(0, s²), with several scales s, equally likely: under it they are N(0, S + s²·J·A·Aᵀ·Jᵀ).
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from .parameters import BLOCKS, ParameterSpace
 from .posterior import FittedParameters
 
 DATUM, STRUT, TEMPERATURE, AGEING, READING, OTHER = "datum", "strut", "temperature", "ageing", "reading", "other"
-
+# Kinds of change, and what each is called. All but the last two are parameters that few readings can repair.
 FAMILIES = {
     DATUM: "the datum has moved",
     STRUT: "a strut's offset has changed",
@@ -32,10 +31,8 @@ FAMILIES = {
     READING: "a single reading is wrong",
     OTHER: "it has changed in a way that none of these explains",
 }
-"""Kinds of change, and what each is called. All but the last two are parameters that few readings can repair."""
 
-ROUNDING = 1e-9
-"""Directions of readings or effects that are smaller, beside the largest, are rounding."""
+ROUNDING = 1e-9  # directions of readings or effects that are smaller, beside the largest, are rounding
 
 
 @dataclass(frozen=True)
@@ -139,13 +136,7 @@ class CheckReadings:
 
     @staticmethod
     def of(fitted: FittedParameters, measurements: MeasurementSet, x: np.ndarray | None = None) -> CheckReadings:
-        """Return readings beside a fit in a space that has all blocks; linearised at `x` where that is given.
-
-        Raises
-        ------
-        CalibrationError
-            Readings of another point than the fit's, such that tell nothing, or so many that they are a calibration.
-        """
+        """Return readings beside a fit in a space that has all blocks; linearised at `x` where that is given."""
         space = fitted.space
         away = float(np.abs(measurements.probe - space.probe).max())
         if away > ROUNDING:
@@ -221,11 +212,7 @@ class Hypothesis:
 
 
 class Evidence:
-    """Changes, given with their effects (n, k) on readings that have a covariance where nothing has changed.
-
-    The kinds have their prior odds, the groups of a kind share them equally, as do the changes of a group and the
-    scales of each: else a bend would count for little beside all joints and screws.
-    """
+    """Changes, given with their effects (n, k) on readings that have a covariance where nothing has changed."""
 
     def __init__(self, covariance: np.ndarray, effects: Iterable[tuple[Change, np.ndarray]]) -> None:
         self._whitening = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -246,10 +233,7 @@ class Evidence:
         return [h.log_bayes_factors(z) + h.log_prior for h in self.hypotheses]
 
     def probability_unchanged(self, readings: np.ndarray) -> float:
-        """Return in which share of checks a machine that has not changed reads as strangely as this, or more so.
-
-        Strange is what some change explains much better: the evidence of all of them together.
-        """
+        """Return in which share of checks a machine that has not changed reads as strangely as this, or more so."""
         z = np.random.default_rng(11).standard_normal((ASSUMED.unchanged_draws, len(readings)))
         z = np.vstack([self._whitening @ readings, z])
         changed = np.logaddexp.reduce(np.concatenate(self._of_whitened(z), axis=1), axis=1)

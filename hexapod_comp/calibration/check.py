@@ -1,9 +1,4 @@
-"""Is a model still valid? A few check readings, weighed against what may have happened since the fit; and its renewal.
-
-Probabilities follow from the Bayes factors of :mod:`.changes`, the rate of false alarms from machines drawn unchanged.
-A model is renewed with its old posterior as the prior, widened by each change that parameters can follow: the answer is
-the mixture over these, each with its probability.
-"""
+"""Is a model still valid? A few check readings, weighed against what may have happened since the fit."""
 
 from __future__ import annotations
 
@@ -37,8 +32,7 @@ from .follow_up import Settling, settle
 from .mixups import misread
 from .posterior import ErrorPredictor, FittedParameters
 
-VALID, NAMED, UNDECIDED, UNEXPLAINED = "valid", "named", "undecided", "unexplained"
-"""Verdicts."""
+VALID, NAMED, UNDECIDED, UNEXPLAINED = "valid", "named", "undecided", "unexplained"  # verdicts
 
 
 @dataclass(frozen=True)

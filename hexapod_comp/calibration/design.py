@@ -1,10 +1,8 @@
 """What to measure: candidates, what each would show, and the best of them by a criterion.
 
-A measurement adds information whatever it will read. In parameters z of unit variance so far, its readings A, each of
-unit noise and free of what the instrument does not know, turn their covariance C into C − CAᵀ(I + ACAᵀ)⁻¹AC. So it can
-be chosen before anyone measures: each time the candidate that gains most for what it costs (:class:`Greedy`), by a
-criterion. Here that is the tool error that a fit will leave (:class:`ErrorLeft`): :func:`propose` finds a campaign for
-a goal, :func:`plan` judges one that somebody else has chosen. What to read after a fit is in :mod:`.follow_up`.
+In parameters z of unit variance so far, readings A of unit noise, free of nuisances, turn their covariance C into
+C − CAᵀ(I + ACAᵀ)⁻¹AC, whatever they will read. So :class:`Greedy` chooses, before anyone measures, the candidate that
+gains most for what it costs.
 """
 
 from __future__ import annotations
@@ -108,11 +106,7 @@ class Greedy(Generic[C]):
 
 
 class ErrorLeft:
-    """Criterion: the mean square tr(M·C) of the tool's error, in parameters z of unit variance before.
-
-    A candidate's gain is tr((I + ACAᵀ)⁻¹·AC·M·CAᵀ), so only A·C is kept up to date, in the directions of z that
-    candidates see at all. What sees less than `ASSUMED.faint` of a standard deviation is left out.
-    """
+    """Criterion: the mean square tr(M·C) of the tool's error, in parameters z of unit variance before."""
 
     def __init__(self, seen: Sequence[np.ndarray], square: np.ndarray) -> None:
         values, vectors = np.linalg.eigh(square)
@@ -171,10 +165,7 @@ def laid_out(
     tilts: Sequence[float] = (0.0,),
     instrument: str = "6-D",
 ) -> tuple[MeasurementSet, float]:
-    """Return what could be read in a fit's box: `lines` across each direction with diagonals, and scattered poses.
-
-    These tilt by the first of `tilts`, degrees, that is within reach, which is returned; the last's error is raised.
-    """
+    """Return what could be read in a fit's box: `lines` across each direction with diagonals, and scattered poses."""
     box, side, geometry = space.work_box, float(np.ptp(space.work_box, axis=0).min()), space.geometry
     if side <= 0.0:
         raise CalibrationError("fit", "has measured no box in which readings could be laid out")
@@ -245,6 +236,7 @@ class Times:
         return self.run + self.stop * run.count(cycles) / len(run.channels)
 
 
+# What a practised machinist needs, by instrument: those for which there are runs to choose from
 TIMES = {
     "linear": Times(1200.0, 480.0, 4.0),
     "straightness": Times(1200.0, 900.0, 4.0),
@@ -257,7 +249,6 @@ TIMES = {
     "station": Times(1800.0, 600.0, 5.0),
     "r_test": Times(1200.0, 600.0, 5.0),
 }
-"""What a practised machinist needs, by instrument: those for which there are runs to choose from."""
 
 
 @dataclass(frozen=True)
@@ -391,13 +382,7 @@ def propose(
     base: Campaign | None = None,
     progress: Callable[[str], object] = lambda text: None,
 ) -> Proposal:
-    """Return the runs to measure for a goal, in measuring order; `base` tells noise, beam slope, stops and cycles.
-
-    Raises
-    ------
-    CalibrationError, GeometryError
-        Nothing can be measured there or in that time, or the tool does not tilt so far.
-    """
+    """Return the runs to measure for a goal, in measuring order; `base` tells noise, beam slope, stops and cycles."""
     progress("what could be measured")
     runs = candidates(place, goal.instruments)
     space = ParameterSpace((place.geometry, region(place, runs)), settings)

@@ -1,9 +1,4 @@
-"""What a model is worth: the virtual machine told what the model says, seen where nothing was fitted.
-
-Two measures. The honest one is the error vector of the tool in space at random points of the workspace, passed in
-random directions. That of Mou & King (1998) is the mean absolute displacement error along lines parallel to the grid,
-which is all that a linear laser sees.
-"""
+"""What a model is worth: the virtual machine told what the model says, seen where nothing was fitted."""
 
 from __future__ import annotations
 
@@ -44,17 +39,7 @@ def held_out(
     sensed: Temperatures | None = None,
     level: np.ndarray | None = None,
 ) -> HeldOut:
-    """Return the error of the tool at random points of a box (2, 3), m in work, passed both ways in random directions.
-
-    `model` None is the machine as it is. `repeatability` is the standard deviation, along each axis, of where it really
-    stops, m; `tilt` the largest of the tool about x and y, rad; `sensed` what the compensator believes the temperatures
-    to be; `level` the attitude of a level tool in the work frame. Equal seeds give equal passes, whatever the model.
-
-    Raises
-    ------
-    ModelError
-        Fewer than three points, which tell no rotation, or as :meth:`hexapod_comp.virtual.trial.Trial.commands`.
-    """
+    """Return the error of the tool at random points of a box (2, 3), m in work, passed both ways."""
     if points < 3:
         raise ModelError("points", "must be at least three", points)
     rng = np.random.default_rng(seed)
@@ -86,19 +71,7 @@ def paper_metric(
     sensed: Temperatures | None = None,
     level: np.ndarray | None = None,
 ) -> PaperMetric:
-    """Return the mean absolute displacement error along lines parallel to the grid, without and with a model.
-
-    Mou & King: the predicted values "were compared with the laser interferometer readings at various points within
-    the selected workspace". So: `lines` along each of x, y and z at random places between the grid's, from end to end
-    of the box, forward and backward, each with its zero where an interferometer is zeroed: at the first reading, the
-    line's start. That reading, zero by definition, does not count. The others stand every `step`, m, half a step off
-    those that a fit has seen. The laser that checks is perfect.
-
-    Raises
-    ------
-    ModelError
-        A line has fewer than two readings, or as for :func:`held_out`.
-    """
+    """Return the mean absolute displacement error along lines parallel to the grid, without and with a model."""
     rng, level, box = np.random.default_rng(seed), np.eye(3) if level is None else level, np.asarray(box, dtype=float)
     errors: list[list[np.ndarray]] = [[], []]
     for axis in range(3):

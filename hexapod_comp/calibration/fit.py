@@ -27,11 +27,9 @@ from .selection import Decision, select
 from .thermal import HeatSeen, TimeConstants, seek_time_constants, with_courses
 from .trust import Verdict, judge, with_drift
 
-LARGEST_NOISE = 0.02
-"""A machine that leaves more than this of its readings, m or rad, is not the one that was measured."""
-
+LARGEST_NOISE = 0.02  # A machine that leaves more than this of its readings, m or rad, is not the one that was measured
+# Readings taken further than this from the reference temperature, K, need an expansion: 1 µm on half a metre
 WARM = 0.2
-"""Readings taken further than this from the reference temperature, K, need an expansion: 1 µm on half a metre."""
 
 
 @dataclass(frozen=True)
@@ -236,10 +234,7 @@ def _fit(measurements: MeasurementSet, begun: _Begun, progress: Callable[[str], 
 
 
 def _begin(measurements: MeasurementSet, settings: FitSettings, progress: Callable[[str], object]) -> _Begun:
-    """Return what a fit starts from.
-
-    The lead is not looked for where no screw wave may be fitted, or where the geometry says that screws differ.
-    """
+    """Return what a fit starts from; the lead is left alone where no screw wave is fitted or screws differ."""
     measurements = with_courses(measurements)
     constants = seek_time_constants(measurements, ParameterSpace(measurements, settings), progress)
     if constants.values:

@@ -1,9 +1,4 @@
-"""What to read once there is a fit: for a check, to decide between explanations of one, and what remains unknown.
-
-The planner's criteria (:mod:`.design`) are here how clearly changes are told from each other (:class:`Detectability`),
-how far apart two explanations of readings are (:func:`settle`), and the tool error that is left after a fit
-(:func:`remaining`).
-"""
+"""What to read once there is a fit: for a check, to decide between explanations of one, and what remains unknown."""
 
 from __future__ import annotations
 
@@ -79,6 +74,7 @@ def _divergence(difference: np.ndarray, right: np.ndarray, wrong: np.ndarray) ->
     return 0.5 * float(np.trace(solved[:, :-1]) - len(right) + difference @ solved[:, -1] + logs)
 
 
+# What each instrument of a check reads: on diagonals the displacement alone; of rotations pitch and yaw, no roll
 READ_BY = {
     "linear": ("linear",),
     "straightness": ("straightness_x", "straightness_y", "straightness_z"),
@@ -86,15 +82,10 @@ READ_BY = {
     "tracker": ("position_x", "position_y", "position_z"),
     "tracker_6d": ("position_x", "position_y", "position_z", "attitude_x", "attitude_y", "attitude_z"),
 }
-"""What each instrument of a check reads: on diagonals the displacement alone; of rotations pitch and yaw, no roll."""
 
 
 class Detectability:
-    """Criterion: how clearly a crash of each strut, and growth of all, would be told from all else, before any reading.
-
-    The log odds of the right change over all others, the sum over these of their inverses: what is told worst counts
-    most. Candidates are contrasts of readings, free of their zeros, whatever they will read.
-    """
+    """Criterion: log odds of a crash of each strut, and growth of all, over all other changes, before any reading."""
 
     def __init__(self, fitted: FittedParameters, readings: MeasurementSet, contrasts: Sequence[np.ndarray]) -> None:
         wide = widened(fitted)
@@ -170,11 +161,7 @@ def propose_check(
 
 
 def _contrasts(every: MeasurementSet) -> list[tuple[np.ndarray, np.ndarray, int]]:
-    """Return candidates of a check: contrasts, (k, readings), the readings that they add, and which must come before.
-
-    Contrasts are orthonormal and free of the zero that a channel of a run has, and of the slope that a straightness
-    has besides: on lines the ends and then the middle, of a straightness all three at once. Poses have no zeros.
-    """
+    """Return candidates: orthonormal contrasts free of zeros and slopes, the readings each adds, and its parents."""
     along, result = every.along(), []
 
     def row(members: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -1,35 +1,14 @@
 """Scheme ``lines``, Mou & King's: a polynomial along each measured grid line, forward and backward apart.
 
-Every line of a full rectangular grid gets one polynomial per direction and component, by linear regression
-on the mean of its cycles; between the lines :class:`hexapod_comp.machine.field.GridField` weights bilinearly. The
-inverse kinematics then makes strut lengths of it, as everywhere.
+A laser's zero is not known against the next line's, nor the slope of a straightness beam. So displacement along a line
+and rotations are zero, in the mean of both directions, where the line passes home's coordinate along it (backlash stays
+in, half to each direction), and a straightness is taken without its least-squares line. How the planes through home
+stand and bend (1-D data), or the squareness of the axes and the twists of the planes (5-D data) remain in the machine.
 
-**What a line does not say.** A laser reads from a zero that nobody knows against the next line's, and a
-straightness beam lies off the axis by a slope that nobody knows. So
-
-- displacement along the line and rotations are taken as zero, in the mean of both directions, where the line
-  passes home's coordinate along it. Backlash stays in, half to each direction;
-- a straightness is taken without its least-squares straight line, common to both directions.
-
-How the planes through home stand and bend (1-D data), or the squareness of the axes, the twists of the
-planes and, without a roll channel, the roll (5-D data) so remain in the machine.
-
-Where screws turn with cardan joints, what that does to the readings is known from the geometry and taken off first.
-
-**What several families say about one component.** The three families of a field add up, but the lines along
-x, y and z all cross in the grid's nodes and see the same errors there. With 5-D data dx is the linear
-displacement on x-lines and a straightness on y- and z-lines. Were all three added as read, a term such as
-x·y², which x-lines see as a displacement that differs from line to line and y-lines as a bow that differs
-from line to line, would count twice. But the x-lines leave open only what does not depend on x, their zeros:
-dx(x, y, z) = X(x; y, z) + f(y, z) with X from the x-lines. So each component belongs first to one family,
-read line by line as Mou & King do; the others are asked only for what it leaves over: its prediction is taken off
-their readings, and since the rest is the same for all lines that differ only in the first family's
-coordinate, these are averaged and share one polynomial. A displacement belongs first to the lines along it
-(the only ones without an unknown slope); a rotation to the first of x, y, z that reads it as pitch or yaw.
-Mou & King do not say how their 5-D model did this. On twenty virtual machines (±100 µm on joints and struts, screw
-waves, backlash) the RMS error in space after alignment of the datum fell from 27.9 µm to 19.0 µm with own
-displacements alone, to 18.3 µm with everything added as read, to 18.1 µm so; with strut maps of 5 µm as well
-from 29.2 µm to 21.0, 20.6 and 20.1 µm. Adding as read also raised what is left along lines by a tenth.
+The three families of a field add up, but all cross in the grid's nodes and see the same errors there. So each component
+belongs first to one family (a displacement to the lines along it; a rotation to the first of x, y, z that reads it as
+pitch or yaw); the others share one polynomial for what it leaves over, averaged over lines that differ only in the
+first family's coordinate. On twenty virtual machines that left 18.1 µm of 27.9; 18.3 where all was added as read.
 """
 
 from __future__ import annotations
@@ -56,24 +35,17 @@ from ..virtual.instruments import station_errors
 from .assumptions import ASSUMED
 from .datum import HeldDatum, hold
 
-OrderRule = Literal["adjusted-r2", "aicc"] | int
-"""How the order of a polynomial is chosen, or the order itself."""
+OrderRule = Literal["adjusted-r2", "aicc"] | int  # how the order of a polynomial is chosen, or the order itself
 
+# Commands further off the nominal lengths than this, m, are a compensation's; than that, worth a remark
 COMPENSATED, FOLLOWED = 10e-6, 0.1e-6
-"""Commands further off the nominal lengths than this, m, are a compensation's; than that, worth a remark."""
-
+# A line of 17 points gets at most 5 coefficients, one of 9 gets 3: no more than the readings can carry
 POINTS_PER_COEFFICIENT = 3
-"""A line of 17 points gets at most 5 coefficients, one of 9 gets 3: no more than the readings can carry."""
-
-FEWEST_POINTS = 2 * POINTS_PER_COEFFICIENT
-"""Below this not even a straight line is left."""
-
+FEWEST_POINTS = 2 * POINTS_PER_COEFFICIENT  # below this not even a straight line is left
+# Repeated readings may scatter so many times as much as stated, and so far may readings lie off their polynomial, which
+# leaves out the screws' waves (on the shipped machine 15 times a rotation's noise)
 MISFIT, LINES_MISFIT = 10.0, 100.0
-"""Repeated readings may scatter so many times as much as stated, and so far may readings lie off their polynomial,
-which leaves out the screws' waves (on the shipped machine 15 times a rotation's noise)."""
-
-DIRECTIONS = (1, -1)
-"""Forward, backward: the order of a field's polynomials."""
+DIRECTIONS = (1, -1)  # forward, backward: the order of a field's polynomials
 
 
 @dataclass(frozen=True)
@@ -117,29 +89,7 @@ def fit_lines(
     name: str = "",
     datum: Pose | None = None,
 ) -> LinesFit:
-    """Fit Mou & King's polynomials to the readings on a rectangular grid of lines.
-
-    Parameters
-    ----------
-    measurements : MeasurementSet
-        Lines parallel to the axes of ``base``, all of each measured family; everything else is left out and
-        noted. Runs along one line are merged, each after its own zero.
-    order : {'adjusted-r2', 'aicc'} or int
-        How the order of each line's polynomial is chosen: by the highest adjusted R² or the lowest corrected
-        Akaike criterion, with at most a third of the line's points as coefficients. Or the order itself; lines
-        whose points do not carry it get the highest that they do, and are noted.
-    date, name : str, optional
-        ISO 8601 date and name of the model; today, and the scheme's, by default.
-    datum : Pose, optional
-        ``pose_platform_in_base`` at which the model moves the tool by nothing; home by default. Lines do not show where
-        the machine stands as a whole.
-
-    Raises
-    ------
-    CalibrationError
-        No grid lines, a line or channel missing, readings that do not reach the grid's edge, fewer points
-        than a straight line needs, lines at different attitudes, a work frame turned against ``base``.
-    """
+    """Fit Mou & King's polynomials to the readings on a rectangular grid of lines."""
     _check_order(order)
     readings, notes = _grid_readings(measurements)
     grid = _grid_of(readings)
@@ -263,10 +213,7 @@ def _grid_readings(measurements: MeasurementSet) -> tuple[Readings, list[str]]:
 
 
 def _of_the_model(measurements: MeasurementSet) -> np.ndarray:
-    """Return readings without what the turning of the screws does to them, shape (N,), m or rad.
-
-    Where the geometry has a lead, whoever applies the model undoes that anyway: in the field it would count twice.
-    """
+    """Return readings without what the turning of the screws does to them, shape (N,), m or rad."""
     m = measurements
     if not m.geometry.screw_lead.any():
         return m.value
@@ -501,11 +448,7 @@ def _places(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _without_run_zeros(group: Readings, u: np.ndarray, ways: Sequence[int]) -> np.ndarray:
-    """Return values in which the runs have a common zero (and slope, where a beam's is unknown).
-
-    The runs' unknowns are found in one regression together with a polynomial per direction, so that runs
-    need not cover the same places. What is common to all runs is settled later, by the datum.
-    """
+    """Return values in which the runs have a common zero (and slope, where a beam's is unknown)."""
     runs, run = np.unique(group.run, return_inverse=True)
     if len(runs) == 1:
         return group.value
@@ -527,10 +470,7 @@ def _averaged(values: np.ndarray, number: np.ndarray, places: int) -> np.ndarray
 
 
 def _spread(values: np.ndarray, number: np.ndarray, line: np.ndarray) -> float:
-    """Return the standard deviation of readings about their mean at a place of one line; NaN where none is repeated.
-
-    Lines that share a polynomial differ by what it leaves of the machine: that is no repeatability of anything.
-    """
+    """Return the standard deviation of readings about their mean at a place of one line; NaN where none is repeated."""
     repeats = np.unique(np.stack([line, number]), axis=1, return_inverse=True)[1].ravel()
     freedom = len(values) - (int(repeats.max()) + 1)
     left = values - _averaged(values, repeats, int(repeats.max()) + 1)[repeats]
@@ -560,10 +500,7 @@ def _zeroed(fits: list[LineFit], u: float) -> list[LineFit]:
 def _regress(
     u: np.ndarray, values: np.ndarray, order: OrderRule, name: str, reach: float
 ) -> tuple[np.ndarray, float, float, float]:
-    """Return coefficients in powers of u, R², adjusted R² and the standard deviation of the residuals.
-
-    Legendre's polynomials keep the regression well conditioned (Mou & King have powers of x: the same functions).
-    """
+    """Return coefficients in powers of u, R², adjusted R² and the standard deviation of the residuals."""
     count = len(u)
     if count < FEWEST_POINTS:
         span = f"{count} points in a direction, over {1e3 * reach:.4g} mm"

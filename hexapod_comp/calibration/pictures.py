@@ -25,25 +25,15 @@ from .lines import LineFit, LinesFit
 from .posterior import COMPONENTS as PREDICTED
 from .posterior import ErrorPredictor, FittedParameters, PredictedError, errors_in_space
 
-SAMPLES = 161
-"""Points of a curve."""
-
-MAP_NODES = 21
-"""Points along x and y of a map."""
-
+SAMPLES = 161  # points of a curve
+MAP_NODES = 21  # points along x and y of a map
 ARROWS = {1: "→", -1: "←"}
 
 
 def strut_length_errors(
     geometry: HexapodGeometry, model: MachineModel, along_x: np.ndarray, y: float, z: float
 ) -> np.ndarray:
-    """Return ΔL = L_actual − L_ideal (Mou & King) along a line in x, forward and backward, shape (2, n, 6), m.
-
-    The line stands at places `along_x`, (n,), of the tool, at `y` and `z`, m in the work frame.
-
-    L_ideal are the nominal lengths of the commanded pose; L_actual those of the pose to which the machine,
-    told L_ideal, really goes as the model has it. To first order the strut correction is −ΔL.
-    """
+    """Return ΔL = L_actual − L_ideal (Mou & King) along a line in x, forward and backward, shape (2, n, 6), m."""
     points = np.stack([along_x, np.full_like(along_x, y), np.full_like(along_x, z)], axis=1)
     level = np.tile(np.eye(3), (len(points), 1, 1))
     nominal = Structure.of(geometry)
@@ -61,10 +51,7 @@ def strut_error_figure(
     y: float | None = None,
     z: float | None = None,
 ) -> Figure:
-    """Show Mou & King's Figures 3 and 4: the six struts' length errors along x, forward (a) and backward (b).
-
-    One row of two panels for each model, under its title; `y` and `z`, m in work, by default the middle of the box.
-    """
+    """Show Mou & King's Figures 3 and 4: the six struts' length errors along x, forward (a) and backward (b)."""
     if not models or any(model.measured is None for model in models.values()):
         raise CalibrationError("picture of strut errors", "needs models, each with the box in which it holds")
     box = commanded_box(geometry, next(iter(models.values())))
@@ -154,10 +141,7 @@ def _residual_panel(axes: Axes, fit: ModelFit) -> None:
 
 
 def _strut_panel(axes: Axes, fit: ModelFit) -> None:
-    """Show what each strut does with its commands, offset and backlash aside.
-
-    The screws' waves, closer than a picture shows and on top of each other, are numbers beside the names.
-    """
+    """Show what each strut does with its commands, offset and backlash aside."""
     struts = fit.model.struts
     even = replace(struts, cosine=np.zeros_like(struts.cosine), sine=np.zeros_like(struts.sine))
     machine = RealMachine(fit.measurements.geometry, replace(fit.model, struts=even))
@@ -201,10 +185,7 @@ def _tool_error_panel(axes: Axes, fit: ModelFit) -> None:
 
 
 def _maps(fit: ModelFit) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return x, y, three heights, m in work, and errors before and after, µm, shape (3, y, x), in the measured box.
-
-    After: as large in all as the fit promises, or larger.
-    """
+    """Return x, y, three heights, m in work, and errors before and after, µm, shape (3, y, x), in the measured box."""
     if fit.model.region is None:
         raise CalibrationError("picture of the error in space", "needs readings that span a box")
     low, high = fit.space.work_box
@@ -274,10 +255,7 @@ def residuals_by_run_figure(fit: ModelFit) -> Figure:
 
 
 def predicted_error_figure(machine: RealMachine, fitted: FittedParameters | None) -> Figure:
-    """Map the tool's predicted error without compensation at half the measured box's height, level tool, datum aligned.
-
-    Six components along and about the axes of ``work``; contour lines are their standard deviations.
-    """
+    """Map the tool's predicted error at half the measured box's height, level tool, datum aligned; contours are σ."""
     box = commanded_box(machine.geometry, machine.model)
     x, y = (np.linspace(box[0, axis], box[1, axis], MAP_NODES) for axis in range(2))
     height = float(box[:, 2].mean())

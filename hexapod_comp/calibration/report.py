@@ -20,17 +20,11 @@ from .posterior import BlockSight, Observability, ToolError, UnseenError, listed
 from .thermal import warming_json, warming_text
 from .trust import TILT
 
-MOST_LISTED, MOST_OF_RUN = 10, 3
-"""Runs with outliers, and outliers of a run, beyond these are counted, not listed."""
-
+MOST_LISTED, MOST_OF_RUN = 10, 3  # runs with outliers, and outliers of a run, beyond these are counted, not listed
+# Standard deviations beyond which a reading is taken for mistyped: no instrument's own errors are as large
 GROSS = 50.0
-"""Standard deviations beyond which a reading is taken for mistyped: no instrument's own errors are as large."""
-
-MOST_RUNS = 5
-"""Runs that are listed as met worst."""
-
-TRUST = 0.1
-"""A tilted tool that keeps more than this share of its error is warned of, when parameters are not seen."""
+MOST_RUNS = 5  # runs that are listed as met worst
+TRUST = 0.1  # A tilted tool that keeps more than this share of its error is warned of, when parameters are not seen
 
 
 def fit_report(fit: ModelFit) -> str:

@@ -1,9 +1,4 @@
-"""What a parametrised machine does at measured stations, and the design matrix: how every parameter moves it.
-
-The error of the measured point is e = (dx, dy, dz, rx, ry, rz), actual minus commanded, along and about the
-axes of ``base``. Values come from the model that the compensator runs; derivatives from the loop closures,
-differentiated by hand, block by block (:mod:`.blocks`).
-"""
+"""What a parametrised machine does at measured stations, and the design matrix: how every parameter moves it."""
 
 from __future__ import annotations
 
@@ -66,10 +61,7 @@ class Slopes:
         return np.concatenate([block.part.start + block.moving(components) for block in self._blocks])
 
     def write(self, rows: np.ndarray, at: np.ndarray, directions: np.ndarray, components: np.ndarray) -> None:
-        """Write derivatives of errors at stations `at`, (n,), along directions (n, 6) that have some components only.
-
-        `rows` have the columns that :meth:`columns` names.
-        """
+        """Write derivatives of errors at stations `at`, (n,), along directions (n, 6) with some components only."""
         errors, stop = self._linkage.errors(at, directions, components), 0
         for design in self._designs:
             values = design(errors)

@@ -9,20 +9,14 @@ from numpy.typing import ArrayLike
 
 
 def changed_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which rows of a matrix differ from the one before, the first among them, and the last such of each row.
-
-    The second numbers the first; a row that comes again later is another one.
-    """
+    """Return which rows of a matrix differ from the one before, the first among them, and the last such of each row."""
     new = np.ones(len(rows), dtype=bool)
     new[1:] = (rows[1:] != rows[:-1]).any(axis=1)
     return np.flatnonzero(new), np.cumsum(new) - 1
 
 
 def different_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where each different row of a matrix stands first, in the rows' order by size, and the number of each row.
-
-    As NumPy's ``unique`` along an axis, ten times as fast.
-    """
+    """Return where each different row of a matrix stands first, in sorted order, and the number of each row."""
     order = np.lexsort(rows.T[::-1])
     first, of_sorted = changed_rows(rows[order])
     number = np.empty(len(rows), dtype=int)

@@ -1,9 +1,4 @@
-"""Forward kinematics without a guess: every assembly mode of a 6-3 machine, and the pick of the working one.
-
-An elimination of degree 16 finds where to look, a minimiser closes the loops from there; the triangles become poses,
-which are continued to real structures, and the working one is picked. The modes of other machines, of which there may
-be forty, are sought by Newton from some thousand poses all around.
-"""
+"""Forward kinematics without a guess: every assembly mode of a 6-3 machine, and the pick of the working one."""
 
 from __future__ import annotations
 
@@ -22,9 +17,8 @@ from .kinematics import Structure, jacobian, six_lengths, solve_one, solve_poses
 
 SAMPLES = 32
 HALF_DEGREE = 8
-
+# Cyclic successors of each joint: sides[i] lies between i and SECOND[i], sides[THIRD[i]] between THIRD[i] and i
 SECOND, THIRD = np.array([1, 2, 0]), np.array([2, 0, 1])
-"""Cyclic successors of each joint: sides[i] lies between i and SECOND[i], sides[THIRD[i]] between THIRD[i] and i."""
 
 
 def joint_circles(base_joints: np.ndarray, lengths: np.ndarray, allowed: float) -> np.ndarray | None:
@@ -83,10 +77,7 @@ def _quadratic(points: np.ndarray, circles: np.ndarray, sides: np.ndarray) -> tu
 
 
 def _coupling(circles2: np.ndarray, circles3: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Fourier coefficients over φ2, index k + 1 for k = −1, 0, 1, of quadratics in φ3.
-
-    |T2(φ2) − T3(φ3)|² − side² = α(φ2)·t3 + β(φ2) + ᾱ(φ2)/t3; α and β have shape (N, 3), m².
-    """
+    """Return the Fourier coefficients over φ2, index k + 1 for k = −1, 0, 1, of quadratics in φ3."""
     centres2 = circles2[:, 0]
     m2 = circles2[:, 1] - 1j * circles2[:, 2]
     m3 = circles3[:, 1] - 1j * circles3[:, 2]
@@ -111,10 +102,7 @@ def _samples(circles: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _eliminate_third(a: np.ndarray, b: np.ndarray, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """Return R(φ2) = |a·β − b·α|² − 4·Im(a·ᾱ)², the resultant over t3, as coefficients k = −2..2, (..., 5).
-
-    It is the resultant of a·t² + b·t + ā and α·t² + β·t + ᾱ with b, β real.
-    """
+    """Return R(φ2) = |a·β − b·α|² − 4·Im(a·ᾱ)², the resultant over t3, as coefficients k = −2..2, (..., 5)."""
     g = a * beta - b * alpha
     h = (a * alpha[..., ::-1].conj() - a.conj() * alpha) / 2j
     return _product(g, g[..., ::-1].conj()) - 4.0 * _product(h, h)
@@ -129,11 +117,7 @@ def _product(f: np.ndarray, g: np.ndarray) -> np.ndarray:
 
 
 def _eliminate_second(a: np.ndarray, b: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Return |a|⁴·R(t₊)·R(t₋) over the two roots of a·t² + b·t + ā, without dividing by a; like a, (...).
-
-    With S_m = aᵐ·(t₊ᵐ + t₋ᵐ), which obeys S_m = −b·S_{m−1} − |a|²·S_{m−2}, the product is
-    Σ_j r_j²·ā^{2+j}·a^{2−j} + Σ_{j<k} r_j·r_k·ā^{2+j}·a^{2−k}·S_{k−j}, j and k from −2 to 2.
-    """
+    """Return |a|⁴·R(t₊)·R(t₋) over the two roots of a·t² + b·t + ā, without dividing by a; like a, (...)."""
     powers = a[..., None] ** np.arange(5)
     left, right = r * powers.conj(), r * powers[..., ::-1]
     square = (a * a.conj()).real
@@ -164,11 +148,7 @@ NEAR = 0.01  # Triangles closer than this, relative to the sum of the sides, may
 def closed_triangles(
     circles: np.ndarray, sides: np.ndarray, starts: np.ndarray, allowed: float, distinct: float
 ) -> np.ndarray:
-    """Return the distinct closed triangles that the minimiser reaches.
-
-    At a root of multiplicity m rounding spreads the solutions over ε^{1/m}, 1e-4 for m = 4, so distance
-    alone does not tell copies from neighbours.
-    """
+    """Return the distinct closed triangles that the minimiser reaches."""
     angles, points, errors = _settled(circles, sides, starts)
     left = errors.argsort()
     left = left[: int((errors <= allowed).sum())]
@@ -188,11 +168,7 @@ def closed_triangles(
 def _closed_between(
     circles: np.ndarray, sides: np.ndarray, angles: np.ndarray, other: np.ndarray, allowed: float
 ) -> np.ndarray:
-    """Return for each of (N, 3) solutions whether the loops also close between it and the other, (3,).
-
-    Then the two are one multiple root. A start between two modes either stays open or runs to one of them;
-    between two copies it closes on the spot. It is not taken halfway, where symmetry likes to put a third.
-    """
+    """Return for each of (N, 3) solutions whether the loops also close between it and the other, (3,)."""
     turn = other - angles
     turn -= 2.0 * np.pi * np.rint(turn / (2.0 * np.pi))
     starts = angles + 0.38 * turn
@@ -209,25 +185,18 @@ def _settled(circles: np.ndarray, sides: np.ndarray, starts: np.ndarray) -> tupl
 
 
 CLOSURE = 1e-12  # Largest error of a strut length or of a platform side in a mode, relative to the longest strut
-
+# Modes whose platform joints all lie closer than this, relative to the longest strut, are one double mode: rounding
+# moves the two of a pair by about √1e-16 = 1e-8
 DISTINCT = 1e-6
-"""Modes whose platform joints all lie closer than this, relative to the longest strut, are one double mode:
-rounding moves the two of a pair by about √1e-16 = 1e-8."""
-
+# Largest distance of two platform joints that count as one, relative to the characteristic length; enough for
+# deviations of 1 mm on a machine with a 300 mm platform
 PAIR_GAP = 0.02
-"""Largest distance of two platform joints that count as one, relative to the characteristic length; enough
-for deviations of 1 mm on a machine with a 300 mm platform."""
-
 EXACT_GAP = 1e-13  # Pairs closer than this, relative to the characteristic length, coincide to rounding
-
+# Modes of the pairs' midpoints that fail to close by up to this many gaps are tried on a real structure
 NEARLY_CLOSED = 20.0
-"""Modes of the pairs' midpoints that fail to close by up to this many gaps are tried on a real structure."""
-
 MOST_MODES = 16  # A 6-3 machine has at most sixteen modes unless it can move with all struts locked
-
+# A 6-6 machine has at most forty modes (Raghavan 1993) unless it can move with all struts locked
 MOST_GENERAL_MODES = 40
-"""A 6-6 machine has at most forty modes (Raghavan 1993) unless it can move with all struts locked."""
-
 ORIENTATIONS = 2000  # Attitudes from which the modes of a machine that is not 6-3 are sought, two positions each
 AMBIGUITY = 1.2  # A cold start is refused when the second-nearest candidate is within this factor of the nearest
 
@@ -246,13 +215,7 @@ def assembly_modes(structure: Structure, lengths: np.ndarray) -> list[Pose]:
 
 
 def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.ndarray) -> Pose:
-    """Return the pose in which the machine must be standing, for cold starts: no guess but its home.
-
-    Of the modes to which :func:`mode_objections` has none the nearest to home is taken, by |Δposition| +
-    characteristic length · angle, unless the next is nearly as near.
-    A machine that stands outside its own limits, which lengths alone cannot show, is refused or, where another
-    mode keeps the limits, taken to be in that one.
-    """
+    """Return the pose in which the machine must be standing, for cold starts: no guess but its home."""
     modes = assembly_modes(structure, lengths)
     if not modes:
         raise UnreachableError("no pose of the machine has these strut lengths", 0)
@@ -266,10 +229,7 @@ def working_mode(geometry: HexapodGeometry, structure: Structure, lengths: np.nd
 
 
 def mode_objections(geometry: HexapodGeometry, structure: Structure, pose: Pose) -> list[str]:
-    """Return what keeps a pose from being the working mode; empty when nothing does.
-
-    The machine can work only with det J of home's sign, the platform on home's side, and its limits kept.
-    """
+    """Return what keeps a pose from being the working mode; empty when nothing does."""
     limits = geometry.limits
     measured = batch.examine(*structure.joints, geometry.limit_numbers.at, pose.position, pose.rotation)
     broken = {
@@ -328,10 +288,7 @@ def _nearest_to_home(geometry: HexapodGeometry, structure: Structure, modes: lis
 
 
 def _home_side(geometry: HexapodGeometry, structure: Structure) -> tuple[np.ndarray, np.ndarray]:
-    """Return the base joints' centroid, m, and their mean plane's normal towards home; each (3,), ``base``.
-
-    The normal is zero where home lies in that plane: then there is no side to be on.
-    """
+    """Return the base joints' centroid, m, and their mean plane's normal towards home; each (3,), ``base``."""
     centre = structure.base_joints.mean(axis=0)
     normal = np.linalg.svd(structure.base_joints - centre)[2][2]
     home = geometry.home.position + geometry.home.rotation @ structure.platform_joints.mean(axis=0)
@@ -360,11 +317,7 @@ def _corners(structure: Structure) -> np.ndarray:
 
 
 def _closed_triangles(structure: Structure, lengths: np.ndarray, allowed: float, distinct: float) -> np.ndarray:
-    """Return the platform corners T1..T3, (M, 3, 3), m, of all modes of the machine with its pairs' midpoints.
-
-    A platform side may be wrong by `allowed`, m: more than rounding keeps modes that only just fail to close.
-    Triangles whose corners all lie closer than `distinct`, m, are one.
-    """
+    """Return the platform corners T1..T3, (M, 3, 3), m, of all modes of the machine with its pairs' midpoints."""
     circles = joint_circles(structure.base_joints, lengths, allowed)
     if circles is None:
         return np.empty((0, 3, 3))
@@ -422,12 +375,7 @@ def _sought_poses(structure: Structure, lengths: np.ndarray) -> list[Pose]:
 
 
 def _starts_around(structure: Structure, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (N, 3), m, and rotations (N, 3, 3) that have the struts' lengths about right; home comes first.
-
-    At a given attitude the platform's origin is as far from b − R·t as strut's lengths say: six spheres. Their
-    common chords say where in the plane across which the centres spread least; the mean square of the lengths says
-    how far off it, to either side.
-    """
+    """Return positions (N, 3), m, and rotations (N, 3, 3) that have the struts' lengths about right."""
     rotations = Rotation.random(ORIENTATIONS, random_state=0).as_matrix()
     centres = structure.base_joints - structure.platform_joints @ np.swapaxes(rotations, 1, 2)
     middle = centres.mean(axis=1)
@@ -462,10 +410,7 @@ def _frames(triangles: np.ndarray) -> np.ndarray:
 
 
 def _starts_near(structure: Structure, pose: Pose, gap: float) -> list[Pose]:
-    """Return guesses at a pose and, where it is nearly singular, to both sides along the weakest motion.
-
-    Near a singular pose a deviation ε of the joints moves modes by √ε, and parts or joins them in pairs.
-    """
+    """Return guesses at a pose and, where it is nearly singular, to both sides along the weakest motion."""
     size = structure.characteristic_length
     matrix = jacobian(structure, pose)
     matrix[:, 3:] /= size

@@ -14,10 +14,8 @@ if TYPE_CHECKING:
     from .geometry import HexapodGeometry
 
 COINCIDENT = 1e-6  # Bodies whose middles are nearer than this, m, say nothing of how they face each other
-
+# Share of the struts' squared lengths, seen along the machine's axis, that another order of joints must save
 LEAST_GAIN = 0.01
-"""Share of the struts' squared lengths, seen along the machine's axis, that another order of joints must save."""
-
 MOST_TURN = np.radians(45.0)  # Turn of the platform against the base at home beyond which it is worth a question, rad
 USUAL_RADII = (0.01, 5.0)  # Of base and platform, m: outside, a unit may be wrong
 
@@ -84,10 +82,7 @@ def _order(base: np.ndarray, platform: np.ndarray) -> Iterator[str]:
 
 
 def twist_per_lead(geometry: HexapodGeometry, positions: np.ndarray, rotations: np.ndarray) -> float:
-    """Return by which share of their lead screws are off that turn with cardan joints, largest over poses and struts.
-
-    For a machine that does not say how its joints' axes stand: taken across the strut at home, the same at both ends.
-    """
+    """Return which largest share of their lead the screws are off that turn with cardan joints."""
     neutral = np.asarray(geometry.base_cone_axes)
     across = np.cross(neutral, np.eye(3)[np.abs(neutral).argmin(axis=1)])
     across /= np.linalg.norm(across, axis=1)[:, None]

@@ -1,11 +1,4 @@
-"""The error field of Mou & King: polynomials along grid lines, four lines weighted bilinearly.
-
-A field gives the error of the measured point (the reflector) as six components along and about the axes of
-``base``: dx, dy, dz in metres, rx, ry, rz in radians. Three families of lines, one along each axis, run
-through the nodes of a rectangular grid; every line carries one polynomial per component and direction of
-motion. The paper's 1-D field is the case where lines along x carry only dx, along y only dy, along z only
-dz; a field whose lines carry all six is evaluated by the same code. Families add up.
-"""
+"""The error field of Mou & King: polynomials along grid lines, four lines weighted bilinearly."""
 
 from __future__ import annotations
 
@@ -21,13 +14,10 @@ from ..errors import ModelError
 from .terms import settle, term
 
 COMPONENTS = ("dx", "dy", "dz", "rx", "ry", "rz")  # Order of the six error components
-
+# Of the components, anywhere on a line, m and rad: the three rotations count as small
 LARGEST = np.repeat([0.05, 0.1], 3)
-"""Of the components, anywhere on a line, m and rad: the three rotations count as small."""
-
+# The two axes across which the lines along x, y, z are arranged; also the order of their node indices
 CROSS_AXES = ((1, 2), (0, 2), (0, 1))
-"""The two axes across which the lines along x, y, z are arranged; also the order of their node indices."""
-
 OUTSIDE_POLICIES = ("hold", "refuse")
 
 

@@ -1,8 +1,4 @@
-"""The nominal machine: where the twelve joints should be, how far everything may go, its tools, and its file.
-
-Frames: ``base`` is fixed, ``platform`` moves; joints are given each in the frame of the body that carries
-them. Struts are numbered 1..6 in the file's order and named ``strut_1`` … ``strut_6``.
-"""
+"""The nominal machine: where the twelve joints should be, how far everything may go, its tools, and its file."""
 
 from __future__ import annotations
 
@@ -28,9 +24,8 @@ from ..pose import Pose
 from .limits import STRUT_NAMES as STRUT_NAMES
 from .limits import Limits, frozen_array
 
+# Frames that every machine has: its base, and the work frame and the tool that are used unless others are named
 BASE, WORK, TOOL = "base", "work", "tool"
-"""Frames that every machine has: its base, and the work frame and the tool that are used unless others are named."""
-
 MOST = 100  # Tools, and work frames, of one machine
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")  # They become ``frame_id`` in messages and links of a URDF
 TAKEN = re.compile("base|work|platform|tool|world|(platform|strut)_.*")  # What the package calls other frames
@@ -84,12 +79,10 @@ def refuse_names(tools: Mapping[str, Pose], work_frames: Mapping[str, Pose]) -> 
                 raise GeometryError(f"{key}.{name}", "is a tool and a work frame; their names must differ")
 
 
+# Factors by which joints in a wrong unit are too small, and what the number would be right as
 JOINTS_TIMES = {25.4: "in inches", 1.0 / 25.4: "in mm, not inches", 10.0: "in cm", 1e3: "in m", 1e-3: "in mm, not m"}
-"""Factors by which joints in a wrong unit are too small, and what the number would be right as."""
-
 GEOMETRY_FORMAT = "hexapod_comp/geometry"
 GEOMETRY_VERSION = 1
-
 COINCIDENT = 1e-6  # Joints closer than this, m, are one
 LONGEST_AXIS = 1e9  # Largest component of an axis: only its direction counts, and the square of a huge one overflows
 

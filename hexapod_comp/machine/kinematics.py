@@ -1,8 +1,4 @@
-"""Kinematics of the ideal and of the imperfect structure: strut lengths, Jacobian, forward solution.
-
-Checked entry points to the core's kinematics. They take joints, so the same call serves the nominal
-structure and the real one.
-"""
+"""Kinematics of the ideal and of the imperfect structure: strut lengths, Jacobian, forward solution."""
 
 from __future__ import annotations
 
@@ -29,12 +25,10 @@ from ..errors import (
 from ..pose import Pose
 from .geometry import STRUT_NAMES, HexapodGeometry
 
+# Work of the calling thread, s, before others help: they take 0.1 ms to start, and some ms to end on busy cores
 ALONE = 0.01
-"""Work of the calling thread, s, before others help: they take 0.1 ms to start, and some ms to end on busy cores."""
-
+# Work on a slice of a batch, s: long beside taking the next one, short beside waiting for somebody's last one
 SLICE = 1e-3
-"""Work on a slice of a batch, s: long beside taking the next one, short beside waiting for somebody's last one."""
-
 FIRST_SLICE = 256  # Poses in a batch's first slice; each of the next has twice as many until one takes its time
 
 
@@ -80,8 +74,8 @@ class Structure:
         )
 
 
+# Whose kinematics are asked for: the nominal machine's, or those of a structure, as :attr:`RealMachine.structure`
 Machine: TypeAlias = "HexapodGeometry | Structure"
-"""Whose kinematics are asked for: the nominal machine's, or those of a structure, as :attr:`RealMachine.structure`."""
 
 
 def structure_of(machine: Machine) -> Structure:
@@ -161,11 +155,7 @@ def jacobian_batch(structure: Structure, positions: np.ndarray, rotations: np.nd
 
 
 def condition_number(machine: Machine, pose: Pose) -> tuple[float, float]:
-    """Return (condition number, sign of det J) at a pose.
-
-    The condition number is ‖J‖·‖J⁻¹‖/6 in Frobenius norms with rotations scaled by the characteristic
-    length: 1 for an isotropic machine, ∞ at a singular pose.
-    """
+    """Return (condition number, sign of det J) at a pose."""
     structure = structure_of(machine)
     number, sign = np.empty(1), np.empty(1)
     given = *structure.joints, pose.position[None], pose.rotation[None], structure.characteristic_length
@@ -249,12 +239,7 @@ def _guesses(guess: Pose | tuple[np.ndarray, np.ndarray], count: int) -> tuple[n
 
 
 def over_chunks(run: Callable[[slice], None], count: int, threads: int | None = None, first: int = FIRST_SLICE) -> None:
-    """Call `run` on slices that cover ``range(count)``; for functions without the GIL.
-
-    The calling thread begins alone. Others help only when it has worked for :data:`ALONE` of processor time and what
-    is left would take it as long again, so that no batch is slower for the help, whatever its rows cost. It goes on
-    to take slices as they do, and waits only for those that others have begun.
-    """
+    """Call `run` on slices that cover ``range(count)``; for functions without the GIL."""
     workers = threads or len(os.sched_getaffinity(0))
     size, done, took, began = first, 0, 0.0, time.thread_time()
     while done < count:
@@ -312,11 +297,7 @@ def solve_one(
 
 
 def _closest_pose(structure: Structure, lengths: np.ndarray, guess: Pose) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose near `guess` whose lengths are closest to those asked for.
-
-    Where Newton wandered off, a trust-region minimiser tells the two causes apart: it either finds the
-    closure, or stops where no further approach is possible.
-    """
+    """Return the pose near `guess` whose lengths are closest to those asked for."""
 
     from scipy.optimize import least_squares  # 39 MB with the next one that a running node does not need
     from scipy.spatial.transform import Rotation

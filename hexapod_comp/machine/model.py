@@ -1,9 +1,4 @@
-"""The model of the real machine, run forwards (what will the tool do?) and backwards (what to command?).
-
-Three blocks, each optional: structure (where the joints really are), struts (their own errors), field (the
-rest, interpolated on a grid). One sign rule: actual = commanded ∘ error; strut correction = commanded strut
-length − nominal strut length.
-"""
+"""The model of the real machine, run forwards (what will the tool do?) and backwards (what to command?)."""
 
 from __future__ import annotations
 
@@ -158,18 +153,12 @@ class MachineModel:
 FOLLOWED = 9  # Three axes of the measured point, then six struts
 
 
+# The sense of all axes and all struts that were approached in one direction; midway: not known
 DIRECTIONS = {"forward": 1.0, "midway": 0.0, "backward": -1.0}
-"""The sense of all axes and all struts that were approached in one direction; midway: not known."""
 
 
 class MotionState:
-    """Directions of motion with a reversal threshold, so that noise at standstill does not flip a backlash.
-
-    Each of the nine followed values drags a window as wide as the threshold behind it, like a nut its lost motion; only
-    a value that leaves its window has a direction.
-
-    Given arrays are used in place; without them the state is that before the first value.
-    """
+    """Directions of motion with a reversal threshold, so that noise at standstill does not flip a backlash."""
 
     __slots__ = ("low", "sense")
 
@@ -411,11 +400,7 @@ class MachinesByTemperature:
         self._known: dict[tuple[float, ...], RealMachine] = {}
 
     def at(self, values: np.ndarray, behind: np.ndarray | None = None, humidity: float = math.nan) -> RealMachine:
-        """Return the machine at the temperatures of struts 1–6, base and platform, °C, shape (8,), and a humidity.
-
-        A humidity that is not known, NaN, is 50 %. Late parts are `behind` the temperatures, K, shape (8, time
-        constants); by default they are at rest.
-        """
+        """Return the machine at the temperatures of struts 1–6, base and platform, °C, shape (8,), and a humidity."""
         swells = math.isfinite(humidity) and bool(self._model.struts.moisture.any())
         air = {HUMIDITY: humidity} if swells else {}
         key = (*values.tolist(), *air.values(), *(() if behind is None else behind.ravel().tolist()))
@@ -427,10 +412,7 @@ class MachinesByTemperature:
         return self._known[key]
 
     def at_each(self, temperatures: np.ndarray, times: np.ndarray, humidities: np.ndarray) -> list[RealMachine]:
-        """Return the machine at rows of temperatures, °C, shape (N, 8), read at some times, s, and humidities, (N,).
-
-        Where a time is not known, late parts are at rest.
-        """
+        """Return the machine at rows of temperatures, °C, shape (N, 8), read at some times, s, and humidities, (N,)."""
         constants = self._model.late_growth.time_constants
         air = np.column_stack([temperatures, np.nan_to_num(humidities, nan=-1.0)])
         behind = None
@@ -461,10 +443,7 @@ SETTLED = 1e-12  # The tool is not moved when it is by less, m and rad
 
 
 def tool_move(geometry: HexapodGeometry, model: MachineModel, pose: Pose) -> np.ndarray:
-    """Return what a machine does to its tool at a pose when the struts are told nominal lengths.
-
-    All parts are at 20 °C and directions of motion not known: midway between both ways of approach.
-    """
+    """Return what a machine does to its tool at a pose when the struts are told nominal lengths."""
     from scipy.spatial.transform import Rotation  # 14 MB that a running node does not need
 
     machine = RealMachine(geometry, model)
@@ -477,10 +456,7 @@ def tool_move(geometry: HexapodGeometry, model: MachineModel, pose: Pose) -> np.
 def with_datum_held(
     geometry: HexapodGeometry, model: MachineModel, pose: Pose, part: np.ndarray | None = None
 ) -> MachineModel:
-    """Return a model whose whole machine is shifted and turned so that it does not move the tool at a pose.
-
-    The base is moved, joints and cardan axes: all errors that a datum does not take up stay as they are.
-    """
+    """Return a model whose whole machine is shifted and turned so that it does not move the tool at a pose."""
     from scipy.spatial.transform import Rotation
 
     part = np.eye(6) if part is None else part

@@ -1,11 +1,4 @@
-"""Model files: the machine model as YAML, readable by people, refused when anything in it is in doubt.
-
-doc/model_file.md describes the format. Its terms are the rows of the model's own dataclasses (:mod:`.terms`); here
-stand provenance, and the blocks that are more than rows: harmonics, late growth, and the lines of a field.
-
-Numbers are written with as many digits as bring back the very same float where the unit's factor allows it, and to one
-rounding (relative 2e-16) elsewhere; what was read from a file is written back unchanged.
-"""
+"""Model files: the machine model as YAML, readable by people, refused when anything in it is in doubt."""
 
 from __future__ import annotations
 
@@ -38,27 +31,20 @@ from .terms import check_magnitude, check_magnitudes, read_terms, table_text, wr
 
 MODEL_FORMAT = "hexapod_comp/model"
 MODEL_VERSION = 1
-
 IDEAL = "ideal"  # What :func:`load_model` and parameters call the model of a machine without errors
 DIRECTIONS = ("forward", "backward")  # Order of the directions of motion in a field's arrays
-
+# Keys of late growth, and where they stand in its array
 LATE: dict[str, Any] = {"late_struts": slice(0, 6), "late_base": 6, "late_platform": 7}
-"""Keys of late growth, and where they stand in its array."""
-
 WAVE, PERIOD, UM = Numbers("um", PER_STRUT), Numbers("mm", PER_STRUT), Numbers("um")
-
 LOOKED_AT = 33  # Points along each line of a field at which its polynomials are looked at
-
+# The extended forms that every supported Python reads alike
 ISO_8601 = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d(\.\d{3}(\d{3})?)?)?(Z|[+-]\d\d:\d\d)?)?")
-"""The extended forms that every supported Python reads alike."""
-
 SHA_256 = re.compile(r"[0-9a-f]{64}")
-
+# The block that names a fit's posterior: that file names the hash of all the rest
 POSTERIOR_LINES = re.compile(r"^posterior:\n(?:[ \t]+.*\n)*", re.MULTILINE)
-"""The block that names a fit's posterior: that file names the hash of all the rest."""
 
+# Key of a field line inside its family: direction, node index along each of the two cross axes
 Line = tuple[int, int, int]
-"""Key of a field line inside its family: direction, node index along each of the two cross axes."""
 
 
 def load_model(path: str | Path, geometry: HexapodGeometry) -> MachineModel:
@@ -412,11 +398,7 @@ def _field_block(field: GridField) -> dict[str, Any]:
 
 
 def _family_lines(axis: str, family: np.ndarray) -> Iterator[dict[str, Any]]:
-    """Yield the family's lines, each with the components that any line of the family has.
-
-    Rows keep their full number of powers, and a family of zeros keeps one component, so that reading
-    brings back the same shape.
-    """
+    """Yield the family's lines, each with the components that any line of the family has."""
     if not family.shape[4]:
         return
     components = np.flatnonzero(family.any(axis=(0, 1, 2, 4))).tolist() or ["xyz".index(axis)]

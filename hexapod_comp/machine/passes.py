@@ -1,8 +1,4 @@
-"""Poses that a machine is sent through, each in a direction.
-
-For everything that judges models: directions of motion are given, not followed, so that any number of poses
-can be tried in any order.
-"""
+"""Poses that a machine is sent through, each in a direction."""
 
 from __future__ import annotations
 
@@ -18,8 +14,8 @@ from .kinematics import Structure, strut_lengths_batch
 LEAST_SPEED = 1e-9  # Below this share of the speed of travel an axis or a strut stands still
 BOTH_WAYS = (1.0, -1.0)  # Forward, backward
 
+# Positions, shape (N, 3), m, and rotations, shape (N, 3, 3), of ``pose_platform_in_base``
 Poses = tuple[np.ndarray, np.ndarray]
-"""Positions, shape (N, 3), m, and rotations, shape (N, 3, 3), of ``pose_platform_in_base``."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +59,7 @@ class Passes:
         return self.positions + self.rotations @ point
 
     def senses(self) -> np.ndarray:
-        """Return the directions of motion of axes and struts, shape (N, 9), each −1, 0 or 1.
-
-        An axis or a strut that does not move has none (0: the mean of both ways).
-        """
+        """Return the directions of motion of axes and struts, shape (N, 9), each −1, 0 or 1."""
         struts = self.positions[:, None] + self.geometry.platform_joints @ np.swapaxes(self.rotations, 1, 2)
         struts -= self.geometry.base_joints
         struts /= np.linalg.norm(struts, axis=2, keepdims=True)
@@ -118,10 +111,7 @@ def random_passes(
     rng: np.random.Generator,
     level: np.ndarray | None = None,
 ) -> Passes:
-    """Return passes through random points of a box of the work frame: all one way, then all back.
-
-    Tilts start from a level tool, shape (3, 3) in the work frame; by default parallel to it.
-    """
+    """Return passes through random points of a box of the work frame: all one way, then all back."""
     positions = rng.uniform(box[0], box[1], (points, 3))
     directions = random_directions(rng, points)
     tilts = np.append(rng.uniform(-tilt, tilt, (points, 2)), np.zeros((points, 1)), axis=1)

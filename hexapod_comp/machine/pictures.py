@@ -10,11 +10,8 @@ from ..formats.figures import WITH, WITHOUT
 from ..pose import Pose
 from .geometry import HexapodGeometry
 
-AXIS_COLOURS = ("#b22222", "#2e8b57", "#4169e1")
-"""Of x, y and z; their letters stand beside them."""
-
-CARDAN = "#007f7f"
-"""Colour of the cardan axes that are fixed to a body."""
+AXIS_COLOURS = ("#b22222", "#2e8b57", "#4169e1")  # of x, y and z; their letters stand beside them
+CARDAN = "#007f7f"  # colour of the cardan axes that are fixed to a body
 
 
 def draw_in_space(axes: Any, geometry: HexapodGeometry) -> None:

@@ -1,8 +1,4 @@
-"""Where a model was measured: one box, for the promise, the certificate, exports, pictures, checks and the compensator.
-
-It is a box of places of one point of the platform, the one that instruments measured: how the tool was turned there
-does not matter, so that readings that are added can only make it larger.
-"""
+"""Where a model was measured."""
 
 from __future__ import annotations
 
@@ -59,11 +55,7 @@ class Region:
         return in_base - rotation @ self.point, np.tile(rotation, (len(places), 1, 1))
 
     def commanded(self, geometry: HexapodGeometry) -> np.ndarray:
-        """Return the box of level tool positions in ``work`` for which the point is inside, shape (2, 3), m.
-
-        In a work frame that is turned against `frame` it is the largest box of the work frame, alike in proportions to
-        the one around it, that fits inside.
-        """
+        """Return the box of level tool positions in ``work`` for which the point is inside, shape (2, 3), m."""
         level = geometry.work.rotation @ geometry.tool.rotation.T  # of the platform, when the tool is level
         beside = level @ (geometry.tool.position - self.point)  # the tool's tip from the point, in base
         middle = self.frame.position + self.frame.rotation @ self.box.mean(axis=0)

@@ -1,13 +1,4 @@
-"""What a real strut does with its command: offset, pitch, screw waves, length map, backlash, growth, rotation.
-
-One strut, command c (what its encoder counts, m) to actual length L (m):
-
-    L = (1 + g) · (c + o + p·(c − c₀) + Σ (Aₙ·cos(nkc) + Bₙ·sin(nkc)) + map(c) − s·b(c)/2 + l·θ/2π)
-
-with offset o, pitch error p about the length c₀, screw waves Aₙ, Bₙ of period 2π/k and its harmonics n = 1…4, length
-map, backlash b by the sense of motion s, which may change along a worn screw, screw lead l times the rotation θ that
-the cardan joints force on the screw since home, and growth g, by heat and by humidity. The compensator solves it for c.
-"""
+"""What a real strut does with its command: offset, pitch, screw waves, length map, backlash, growth, rotation."""
 
 from __future__ import annotations
 
@@ -27,16 +18,12 @@ from .terms import settle, term
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
+# Largest slope of the strut error against the command: below it, undoing the error is a contraction
 STEEPEST_ERROR = 0.2
-"""Largest slope of the strut error against the command: below it, undoing the error is a contraction."""
-
 STRUT_LENGTH = 0.1  # Largest error of a strut's length, m: an encoder's zero is found within a hand's breadth
-
+# Largest growth from dry air to damp: three times that of nylon; carbon fibre in resin has some hundred ppm
 MOISTURE = 0.1
-"""Largest growth from dry air to damp: three times that of nylon; carbon fibre in resin has some hundred ppm."""
-
 TINY = float(np.finfo(float).tiny)
-
 WAVE_PARTS, MAP_PARTS = ("cosine", "sine"), ("map_knots", "map_values", "map_backlash")
 
 
@@ -149,10 +136,7 @@ class StrutErrors:
         return CubicSpline(self.map_knots, np.vstack([self.map_values, self.map_backlash]), axis=1, bc_type="natural")
 
     def spline_coefficients(self) -> np.ndarray:
-        """Return the cubic pieces of the map and of the backlash's change, shape (6, n − 1, 8).
-
-        Of each four, the highest power comes first; they are about each left knot.
-        """
+        """Return the cubic pieces of the map and of the backlash's change, shape (6, n − 1, 8)."""
         if not len(self.map_knots):
             return np.zeros((6, 0, 8))
         lengths, backlash = np.split(np.transpose(self._spline().c, (2, 1, 0)), 2)

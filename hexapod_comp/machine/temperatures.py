@@ -1,14 +1,4 @@
-"""Temperatures of a machine's parts, what follows them late, and the humidity by which struts swell.
-
-A part grows by a·s + Σ b_k·d_k. Here s is what its thermometer reads above 20 °C; F_k is s through a first-order lag
-of time constant τ_k, and d_k = F_k − s says how far it is behind. At rest d_k = 0 and a is the part's expansion. With
-b_k = a the part follows with τ_k; with b_k below zero it runs ahead, as struts do of a base that they warm. Whatever
-one source warms through first-order lags can be written so: with time constants T of the sensor and τ of the part,
-the part's share that comes late is b = a·(1 − T/τ). The growth is linear in a and b_k for given time constants.
-
-A sensor is taken to run in a straight line from one reading to the next; that is exact, causal, and the same for a
-fit as for a compensator. Before the first reading nothing is known of it: the part counts as at rest.
-"""
+"""Temperatures of a machine's parts, what follows them late, and the humidity by which struts swell."""
 
 from __future__ import annotations
 
@@ -113,10 +103,9 @@ REFERENCE_TEMPERATURE = 20.0  # Temperature at which geometry and model hold, °
 TEMPERATURE_RANGE = (-40.0, 120.0)  # Sensor readings outside this, °C, are not a machine shop's
 HUMIDITY = "humidity"  # Name of the air's relative humidity among a machine's readings
 REFERENCE_HUMIDITY = 0.5  # Relative humidity at which geometry and model hold, a fraction
-
+# Relative humidity outside this is not a machine shop's: percent for a fraction, a fraction for percent, or a broken
+# sensor's zero
 HUMIDITY_RANGE = (0.01, 1.0)
-"""Relative humidity outside this is not a machine shop's: percent for a fraction, a fraction for percent, or a broken
-sensor's zero."""
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,4 @@
-"""The table of a machine's model: a row is a field of one of its dataclasses, and is all that is said of an error term.
-
-It says section, name and unit in a model file, shape, default, allowed range and meaning. From it the field is checked
-and frozen (:func:`settle`), read and written (:func:`read_terms`, :func:`write_terms`), refused where no machine has
-such a magnitude (:func:`check_magnitude`), and described in doc/model_file.md. A new error term is one row, and its
-arithmetic in the core.
-"""
+"""The table of a machine's model: each field of a model carries its name in files, unit, shape and allowed range."""
 
 from __future__ import annotations
 
@@ -18,8 +12,8 @@ import numpy as np
 from ..errors import ModelError
 from ..formats.schema import DIMENSIONS, PER_STRUT, UNITS, Numbers, Section, Shape
 
+# Units in which bounds are shown, and their number in an SI unit, where it is not the file's own
 SHOWN = {"um": ("mm", 1e3), "urad": ("mrad", 1e3), "ppm_per_percent": ("ppm per % of relative humidity", 1e4)}
-"""Units in which bounds are shown, and their number in an SI unit, where it is not the file's own."""
 
 
 @dataclass(frozen=True)
@@ -76,13 +70,7 @@ def rows(schema: Any) -> Iterator[tuple[str, Row, Any]]:
 
 
 def settle(value: Any) -> None:
-    """Make a dataclass's terms read-only arrays, or numbers.
-
-    Raises
-    ------
-    ModelError
-        A value is not finite, too small, or of another shape.
-    """
+    """Make a dataclass's terms read-only arrays, or numbers."""
     for name, row, _ in rows(type(value)):
         array = np.array(getattr(value, name), dtype=float)
         shape = (6,) if isinstance(row.numbers.shape, str) else row.numbers.shape
@@ -101,13 +89,7 @@ def settle(value: Any) -> None:
 
 
 def check_magnitudes(value: Any, place: str | None = None) -> None:
-    """Refuse terms, all or those of one section, that no machine has: an error of units, or a fit gone astray.
-
-    Raises
-    ------
-    ModelError
-        Naming the term, what is allowed, and the largest value found.
-    """
+    """Refuse terms, all or those of one section, that no machine has: an error of units, or a fit gone astray."""
     for name, row, _ in rows(type(value)):
         if place in (None, row.place):
             check_magnitude(row.where(name), getattr(value, name), row.largest, row.bound)

@@ -16,10 +16,8 @@ SHARE_OF_LIMIT = 0.8  # Moves use this much of the allowed strut speed and step,
 PEAK_OF_QUINTIC = 1.875  # Largest slope of the quintic 10t³ − 15t⁴ + 6t⁵
 BEND_OF_QUINTIC = 10.0 / 3.0**0.5  # Its largest second derivative
 TRACK_WINDOW = 25  # How many commands the tool may lag behind the newest one; at 250 Hz a tenth of a second
-
+# Points by which a track is aligned; steps of that, each a motion onto the nearest places; last step, m and rad
 MOST_ALIGNED, ALIGNING_STEPS, SETTLED = 5000, 200, 1e-9
-"""Points by which a track is aligned; steps of that, each a motion onto the nearest places; last step, m and rad."""
-
 COARSE = 20  # Sections of a move over which the struts' slopes are taken
 
 
@@ -40,11 +38,7 @@ class Path:
 
 
 def move(geometry: HexapodGeometry, start: Pose, end: Pose, rate: float, feed: float | None = None) -> Path:
-    """Return a smooth straight move between two tool poses that keeps strut speeds and steps.
-
-    Position runs straight, rotation along the shortest arc, both with the quintic 10t³ − 15t⁴ + 6t⁵, which
-    starts and ends at rest.
-    """
+    """Return a smooth straight move between two tool poses that keeps strut speeds and steps."""
     positions = np.array([start.position, end.position])
     return moves(geometry, positions, np.array([start.rotation, end.rotation]), rate, feed)[0]
 

@@ -1,9 +1,4 @@
-"""What the air does to a laser's length.
-
-An interferometer counts wavelengths, and the wavelength in air is the one in vacuum divided by the refractive
-index n: about 1.00027, falling by 0.95·10⁻⁶ per K, rising by 2.7·10⁻⁶ per kPa. Readings are corrected here
-once, and only when the instrument has not done so itself. Humidity bends the laser, not the steel.
-"""
+"""What the air does to a laser's length."""
 
 from __future__ import annotations
 
@@ -14,33 +9,22 @@ import numpy as np
 
 from ..errors import ModelError
 
-Values: TypeAlias = "float | np.ndarray"
-"""One number, or one a reading."""
+Values: TypeAlias = "float | np.ndarray"  # one number, or one a reading
 
+# Vacuum wavelength of a helium-neon laser, m. The index moves by 1·10⁻¹² per 0.1 pm: any He-Ne will do.
 VACUUM_WAVELENGTH = 632.9908e-9
-"""Vacuum wavelength of a helium-neon laser, m. The index moves by 1·10⁻¹² per 0.1 pm: any He-Ne will do."""
-
-USUAL_CO2_PPM = 450.0
-"""CO₂ in the air of a workshop, 10⁻⁶; 100 more raise n by 1.5·10⁻⁸."""
-
-ZERO_CELSIUS = 273.15
-"""0 °C in K."""
-
+USUAL_CO2_PPM = 450.0  # CO₂ in the air of a workshop, 10⁻⁶; 100 more raise n by 1.5·10⁻⁸
+ZERO_CELSIUS = 273.15  # 0 °C in K
+# Lowest and highest of what is taken for the air of a workshop: where Ciddor's equation holds, above ice
 AIR_RANGES = {
     "temperature": (0.0, 60.0, "0…60 °C"),
     "pressure": (50e3, 120e3, "50…120 kPa, given in Pa"),
     "humidity": (0.0, 1.0, "0…1, as a fraction"),
 }
-"""Lowest and highest of what is taken for the air of a workshop: where Ciddor's equation holds, above ice."""
 
-WAVELENGTH_RANGE = (300e-9, 1700e-9)
-"""Vacuum wavelengths for which Ciddor's equation holds, m."""
-
-CO2_RANGE = (0.0, 2000.0)
-"""CO₂ for which Ciddor's equation holds, 10⁻⁶."""
-
-LARGEST_INDEX = 1.001
-"""No air of :data:`AIR_RANGES` comes near it: an index above is a mistake."""
+WAVELENGTH_RANGE = (300e-9, 1700e-9)  # vacuum wavelengths for which Ciddor's equation holds, m
+CO2_RANGE = (0.0, 2000.0)  # CO₂ for which Ciddor's equation holds, 10⁻⁶
+LARGEST_INDEX = 1.001  # no air of :data:`AIR_RANGES` comes near it: an index above is a mistake
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,13 +60,7 @@ def _check_range(key: str, values: Values, low: float, high: float, allowed: str
 
 
 def ciddor_index(air: Air, vacuum_wavelength: float = VACUUM_WAVELENGTH, co2_ppm: float = USUAL_CO2_PPM) -> np.ndarray:
-    """Return the phase refractive index of air after Ciddor.
-
-    Ciddor, *Refractive index of air: new equations for the visible and near infrared*, Applied Optics 35,
-    1566 (1996), eqs. 1–5: standard refractivities of dry air and of water vapour, each in proportion to its
-    density by the BIPM 1981/91 equation. Gas constant and molar masses cancel. Its own uncertainty is 2 to
-    5·10⁻⁸; 0.1 K of air temperature is twice that.
-    """
+    """Return the phase refractive index of air after Ciddor."""
     low, high = WAVELENGTH_RANGE
     _check_range("vacuum wavelength", vacuum_wavelength, low, high, f"{low:g}…{high:g} m")
     _check_range("CO2", co2_ppm, *CO2_RANGE, f"{CO2_RANGE[0]:g}…{CO2_RANGE[1]:g} ppm")
@@ -125,10 +103,6 @@ def _molar_density(pressure: Values, temperature: Values, vapour: Values) -> Val
 
 
 def correct_displacement(raw: Values, air: Air, assumed_index: Values = 1.0) -> np.ndarray:
-    """Return the displacement L that an interferometer measured, from what it showed.
-
-    It counts by how much the optical path n·L has grown, and divides by the index that it assumes. So
-    L = raw·n_assumed/n.
-    """
+    """Return the displacement L that an interferometer measured, from what it showed."""
     _check_range("assumed index", assumed_index, 1.0, LARGEST_INDEX, f"1…{LARGEST_INDEX:g}")
     return np.asarray(raw) * (assumed_index / ciddor_index(air))

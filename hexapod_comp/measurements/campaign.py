@@ -1,10 +1,4 @@
-"""What to measure: the lines, diagonals and poses of a calibration campaign, and the instruments used on them.
-
-A campaign is a plan: :func:`template` lists its readings as a :class:`MeasurementSet` without values, which
-``hexapod_comp plan`` examines and ``hexapod_comp simulate`` fills in from the virtual machine. Besides grid lines,
-diagonals and scattered poses a campaign may list runs one by one, in measuring order: lines, circles, spheres, tilts
-about a place, and poses, each under one instrument.
-"""
+"""What to measure: the lines, diagonals and poses of a calibration campaign, and the instruments used on them."""
 
 from __future__ import annotations
 
@@ -42,46 +36,31 @@ from .runs import assemble
 
 CAMPAIGN_FORMAT = "hexapod_comp/campaign"
 CAMPAIGN_VERSION = 1
-
+# Lasers on grid lines: linear only; with two straightnesses, pitch and yaw; with roll as well
 INSTRUMENTS = ("1-D", "5-D", "6-D")
-"""Lasers on grid lines: linear only; with two straightnesses, pitch and yaw; with roll as well."""
-
+# What reads a line: a linear laser; straightness, or pitch and yaw, with their optics; all of these; and roll. Along a
+# line that is not parallel to an axis of the work frame the last two read its length alone.
 LINE_INSTRUMENTS = ("linear", "straightness", "rotation", "5-D", "6-D")
-"""What reads a line: a linear laser; straightness, or pitch and yaw, with their optics; all of these; and roll. Along a
-line that is not parallel to an axis of the work frame the last two read its length alone."""
-
+# What reads scattered poses: a tracker's position alone, and with the attitude
 POSE_INSTRUMENTS = ("tracker", "tracker_6d")
-"""What reads scattered poses: a tracker's position alone, and with the attitude."""
-
+# What reads a length from a centre: a telescoping ball bar, there and back; a tracking interferometer; a probe that
+# touches spheres
 LENGTH_INSTRUMENTS = ("ball_bar", "station", "probe")
-"""What reads a length from a centre: a telescoping ball bar, there and back; a tracking interferometer; a probe that
-touches spheres."""
-
+# What reads where the tool's ball is beside three sensors, while the tool tilts about it
 BALL_INSTRUMENTS = ("r_test",)
-"""What reads where the tool's ball is beside three sensors, while the tool tilts about it."""
-
 LISTED_INSTRUMENTS = (*LINE_INSTRUMENTS, *POSE_INSTRUMENTS, *LENGTH_INSTRUMENTS, *BALL_INSTRUMENTS)
-
+# Planes of circles, in the work frame: a circle goes from the first axis to the second
 PLANES = {"xy": (0, 1), "yz": (1, 2), "zx": (2, 0)}
-"""Planes of circles, in the work frame: a circle goes from the first axis to the second."""
-
-MOST_POINTS = 10_000
-"""Of one run."""
-
+MOST_POINTS = 10_000  # of one run
+# Larger campaigns are refused: at one reading a second this one takes six days, and a unit may be wrong
 MOST_READINGS = 500_000
-"""Larger campaigns are refused: at one reading a second this one takes six days, and a unit may be wrong."""
-
-DIAGONALS = (0, 4, 16)
-"""None, the box's four body diagonals, or these and the two diagonals of each of its six faces."""
-
+DIAGONALS = (0, 4, 16)  # none, the box's four body diagonals, or these and the two diagonals of each of its six faces
+# How many cells the longest edge of a machine's own box has, and how many steps a cell, where a file does not say
 CELLS_OF_A_BOX, STEPS_OF_A_CELL = 4, 4
-"""How many cells the longest edge of a machine's own box has, and how many steps a cell, where a file does not say."""
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # points that turn by it are spread evenly: neighbours are never alike
 
-GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
-"""Points that turn by it are spread evenly: neighbours are never alike."""
-
+# Gives a machine's own box, (2, 3), m in the work frame, and the tool's attitude there, (3, 3)
 OwnBox = Callable[[], tuple[np.ndarray, np.ndarray]]
-"""Gives a machine's own box, (2, 3), m in the work frame, and the tool's attitude there, (3, 3)."""
 
 
 # Runs that a campaign lists.
@@ -209,10 +188,7 @@ def circle_run(
     rotation: np.ndarray,
     known_zero: bool = False,
 ) -> CampaignRun:
-    """Return a ball bar's run, so many readings each way, on a full circle about its fixed ball, m in the work frame.
-
-    The circle starts at the first of the `axes`, unit vectors across each other, and goes to the second.
-    """
+    """Return a ball bar's run, `count` readings each way, on a full circle about its fixed ball, m in work."""
     angles = np.linspace(0.0, 2.0 * np.pi, points)
     places = centre + radius * (np.cos(angles)[:, None] * axes[0] + np.sin(angles)[:, None] * axes[1])
     centres = np.tile(np.asarray(centre, dtype=float), (points, 1))
@@ -230,10 +206,7 @@ def tilts(points: int, largest: float) -> np.ndarray:
 def line_readings(
     name: str, poses: Sequence[Pose], channels: Iterable[str], cycles: int, alternate: bool = False
 ) -> Iterator[Reading]:
-    """Yield the readings of passes forward and backward over a line, values of zero; all each way, or alternate ones.
-
-    Forward is along the first of x, y, z of the work frame that moves, whichever way the poses are listed.
-    """
+    """Yield the readings of passes forward and backward over a line, values of zero."""
     way = poses[-1].position - poses[0].position
     if way[np.flatnonzero(np.abs(way) > LEAST_TRAVEL)[0]] < 0.0:
         poses = poses[::-1]
@@ -343,8 +316,8 @@ class PosesEntry:
         return CampaignRun(name, instrument, self.poses, rotation_from_angles(angles), centres, self.zero == "known")
 
 
+# What an instrument's entry lists where it lists no poses
 SHORT_FORMS: dict[str, Any] = {"ball_bar": CircleEntry, "probe": SphereEntry, "r_test": TiltsEntry}
-"""What an instrument's entry lists where it lists no poses."""
 
 
 def read_runs(top: Section) -> tuple[CampaignRun, ...]:
@@ -444,10 +417,7 @@ class Campaign:
 
 
 def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
-    """Read a campaign file (YAML, see config/campaign_5d.yaml), or a shipped one by its name.
-
-    Where the file gives no box, `own_box` is asked: see :func:`hexapod_comp.workspace.reach.machine_box`.
-    """
+    """Read a campaign file (YAML, see config/campaign_5d.yaml), or a shipped one by its name."""
     path = input_file(path, "campaign")
     top = read_yaml(path, CAMPAIGN_FORMAT, CAMPAIGN_VERSION)
     instrument = top.choice("instrument", (*INSTRUMENTS, "none"), "none")
@@ -466,10 +436,7 @@ def load_campaign(path: str | Path, own_box: OwnBox | None = None) -> Campaign:
 
 
 def _grid(top: Section, own_box: OwnBox | None, with_lines: bool) -> dict[str, Any]:
-    """Return box, the tool's attitude in it, and the distances of lines and of readings, where the file has none.
-
-    A campaign without lines of its own, of scattered poses or of runs that it lists, needs no distances.
-    """
+    """Return box, the tool's attitude in it, and the distances of lines and of readings, where the file has none."""
     mm, given = Numbers("mm"), dict[str, Any]()
     if own_box is None or top.quantity_key("box", "length") is not None:
         given["box"] = top.quantity("box", "length", (2, 3))

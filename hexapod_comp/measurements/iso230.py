@@ -1,16 +1,4 @@
-"""Figures of ISO 230-2:2014, 230-4:2005 and 230-6:2002, and which of measured runs each standard judges.
-
-Positioning along one line (230-2; 230-6 judges diagonals by the same formulas): targets approached again and again,
-from both sides. Up (↑) is the approach in the positive direction. A deviation is the position reached minus the target.
-The symbols of the standard stand beside each figure; the formulas are those of its clause 3.
-
-A circle run in both senses (230-4): how round the path is, how large, and how the two differ. A radial deviation is the
-radius reached minus the nominal one, positive outwards. What stands off the middle of an instrument is no error of the
-machine: each figure has its own centre, which is the standard's.
-
-Lines along an axis of the work frame come under ISO 230-2, lines across the axes under ISO 230-6, lengths from the
-middle of a circle, as of a ball bar, under ISO 230-4.
-"""
+"""Figures of ISO 230-2:2014, 230-4:2005 and 230-6:2002, and which of measured runs each standard judges."""
 
 from __future__ import annotations
 
@@ -26,25 +14,13 @@ from ..errors import ModelError
 from ..formats.texts import aligned, number
 from .readings import BACKWARD, CHANNELS, FORWARD, LEAST_TRAVEL, LENGTH, MeasurementSet
 
-DIRECTIONS = ("up", "down")
-"""Approach in the positive direction, and in the negative."""
-
+DIRECTIONS = ("up", "down")  # approach in the positive direction, and in the negative
 ARROWS = {"up": "↑", "down": "↓"}
-
-STANDARD_CYCLES = 5
-"""How often the standard has each target approached from each side."""
-
-TARGETS_PER_METRE = 5
-"""Fewest targets per metre, and fewest at all, that the standard asks for."""
-
-LONGEST_TRAVEL = 2.0
-"""Longest travel, m, for which the standard prescribes this test."""
-
-EVEN_SPACING = 1e-6
-"""Targets whose spacings differ by less than this, m, count as evenly spaced."""
-
-SURE_REVERSAL = 3.0
-"""A mean reversal above so many of its standard errors is no chance."""
+STANDARD_CYCLES = 5  # how often the standard has each target approached from each side
+TARGETS_PER_METRE = 5  # fewest targets per metre, and fewest at all, that the standard asks for
+LONGEST_TRAVEL = 2.0  # longest travel, m, for which the standard prescribes this test
+EVEN_SPACING = 1e-6  # targets whose spacings differ by less than this, m, count as evenly spaced
+SURE_REVERSAL = 3.0  # A mean reversal above so many of its standard errors is no chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,10 +135,7 @@ class PositioningTest:
         return {name: one for name, one in pairs if one is not None}
 
     def figures(self) -> dict[str, float]:
-        """Return the axis' figures, m, by the standard's symbols: ``A``, ``A_up``, …, ``B_mean``, ``M``.
-
-        What the test cannot tell is left out.
-        """
+        """Return the axis' figures, m, by the standard's symbols: ``A``, ``A_up``, …, ``B_mean``, ``M``."""
         values: dict[str, float] = {}
         parts = {"": self.both, **{f"_{name}": one for name, one in self.directions.items()}}
         for suffix, part in parts.items():
@@ -315,21 +288,14 @@ def _micrometres(value: float) -> str:
     return f"{round(value * 1e6, 3) + 0.0:10.3f}"
 
 
-SENSES = {"ccw": FORWARD, "cw": BACKWARD}
-"""Counter-clockwise and clockwise, seen against the circle's axis."""
-
+SENSES = {"ccw": FORWARD, "cw": BACKWARD}  # counter-clockwise and clockwise, seen against the circle's axis
+# Readings of one sense below which a circle of its own and a deviation from it cannot be told apart: it has three
+# unknowns
 FEWEST = 5
-"""Readings of one sense below which a circle of its own and a deviation from it cannot be told apart: it has three
-unknowns."""
-
-FULL = np.radians(45.0)
-"""A circle without a larger gap between its readings is a full one."""
-
-SHORTEST = np.radians(90.0)
-"""A shorter arc tells no centre."""
-
+FULL = np.radians(45.0)  # A circle without a larger gap between its readings is a full one
+SHORTEST = np.radians(90.0)  # A shorter arc tells no centre
+# Most times that a centre is moved, radii taken as linear in its shift; a shorter shift, m, ends it
 ROUNDS, SETTLED = 5, 1e-9
-"""Most times that a centre is moved, radii taken as linear in its shift; a shorter shift, m, ends it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,12 +314,7 @@ class CircularTest:
 def evaluate_circle(
     radius: float, angles: np.ndarray, deviations: np.ndarray, senses: np.ndarray, length_known: bool = True
 ) -> CircularTest:
-    """Return the figures of ISO 230-4:2005 for one circle.
-
-    G is the least distance of two concentric circles with the whole path between them; for G(b) with both paths. F is
-    taken about the centre of the least-squares circle of its own path, D is by how much the radius of the
-    least-squares circle of both paths together exceeds the nominal one.
-    """
+    """Return the figures of ISO 230-4:2005 for one circle."""
     path = _checked(radius, angles, deviations, senses)
     parts = {name: [column[path[2] == sense] for column in path[:2]] for name, sense in SENSES.items()}
     parts = {name: part for name, part in parts.items() if len(part[0])}
@@ -451,20 +412,14 @@ def _notes(parts: dict[str, list[np.ndarray]], full: bool, length_known: bool) -
 
 
 AXES_STANDARD, DIAGONALS_STANDARD, CIRCLES_STANDARD = "ISO 230-2:2014", "ISO 230-6:2002", "ISO 230-4:2005"
-
-ALONG = 1e-6
-"""A line whose direction has a component below this does not travel along that axis."""
-
+ALONG = 1e-6  # A line whose direction has a component below this does not travel along that axis
+# A length's centre further than this, m, from a circle's is no ball bar's: it is known to some millimetres
 OFF_THE_MIDDLE = 0.01
-"""A length's centre further than this, m, from a circle's is no ball bar's: it is known to some millimetres."""
-
 BODY, FACE = "body", "face"
-
 LINEAR = CHANNELS.index("linear")
-
+# Figures of both directions together, and how they are printed
 COLUMNS = {"A": "A", "E": "E", "R": "R", "M": "M", "B": "B", "B_mean": "B̄"}
-"""Figures of both directions together, and how they are printed."""
-
+# Figures of a circle, and how they are printed
 CIRCLE_COLUMNS = {
     "G_ccw": "G ↺",
     "G_cw": "G ↻",
@@ -475,7 +430,6 @@ CIRCLE_COLUMNS = {
     "F_min_cw": "Fmin ↻",
     "D": "D",
 }
-"""Figures of a circle, and how they are printed."""
 
 
 @dataclass(frozen=True)
@@ -512,10 +466,7 @@ def judge(measurements: MeasurementSet) -> Judged:
 
 
 def linear_runs(measurements: MeasurementSet) -> list[LinearRun]:
-    """Return the linear runs that can be judged: two cycles or more, every target from both sides in each.
-
-    Runs with fewer cycles, gaps or without both directions are left out.
-    """
+    """Return the linear runs that can be judged: two cycles or more, every target from both sides in each."""
     points = measurements.points()[measurements.station]
     runs = []
     for index, run in enumerate(measurements.runs):
@@ -549,11 +500,7 @@ def _complete_run(
 
 
 def circular_tests(measurements: MeasurementSet) -> dict[str, CircularTest]:
-    """Return the figures of the runs of lengths whose points lie on a circle about their centre, by name.
-
-    Others are left out, as are runs with too few readings. Senses are those of the rows' order, seen against that axis
-    of the work frame which stands most upright on the circle.
-    """
+    """Return the figures of the runs of lengths whose points lie on a circle about their centre, by name."""
     points = measurements.points()[measurements.station]
     tests = {}
     for index, run in enumerate(measurements.runs):

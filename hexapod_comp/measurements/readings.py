@@ -1,17 +1,4 @@
-"""Measured data of a machine, whatever instrument they come from, in one form.
-
-Every reading is one number that the error of the measured point gives: its displacement along a direction,
-or its rotation about one. With e = (dx, dy, dz, rx, ry, rz) = actual minus commanded, along and about the
-axes of ``base``,
-
-    value = w · e + what the instrument does not know (each run's own zero, the slope of its beam)
-
-so a laser line, a straightness, an angle, a body diagonal and a tracker's pose differ only in w and in what
-is unknown. A ball bar, a tracking interferometer and a probe that touches a sphere all read how far the point is
-from a *centre* that is only roughly known: w is the unit vector n from there, and unknown are the length's zero and
-where the centre is. Readings of one *run* share these unknowns; readings taken at the same command, from the same
-direction, under the same temperatures (where these change: at the same time) share a *station*.
-"""
+"""Measured data of a machine, whatever instrument they come from, in one form."""
 
 from __future__ import annotations
 
@@ -29,6 +16,9 @@ from ..machine.temperatures import REFERENCE_TEMPERATURE, Temperatures
 from ..pose import Pose
 
 AXES = ("x", "y", "z")
+# What a reading is of. ``linear`` is along the run's line, ``length`` from a centre; the others are along or about an
+# axis of the work frame. Straightness and rotation belong to lines and have unknown zeros, displacement has one
+# wherever the poses are; position and attitude are absolute.
 CHANNELS = (
     "linear",
     *(f"straightness_{a}" for a in AXES),
@@ -38,50 +28,27 @@ CHANNELS = (
     "length",
     *(f"displacement_{a}" for a in AXES),
 )
-"""What a reading is of. ``linear`` is along the run's line, ``length`` from a centre; the others are along or about
-an axis of the work frame. Straightness and rotation belong to lines and have unknown zeros, displacement has one
-wherever the poses are; position and attitude are absolute."""
 
-LINE_KINDS = ("linear", "straightness", "rotation")
-"""Kinds of channel that are read along a line."""
-
-ABSOLUTE_KINDS = ("position", "attitude")
-"""Kinds of channel without an unknown zero."""
-
+LINE_KINDS = ("linear", "straightness", "rotation")  # kinds of channel that are read along a line
+ABSOLUTE_KINDS = ("position", "attitude")  # kinds of channel without an unknown zero
+# Kinds of channel: those of one kind share an instrument and its noise
 KINDS = (*LINE_KINDS, *ABSOLUTE_KINDS, "length", "displacement")
-"""Kinds of channel: those of one kind share an instrument and its noise."""
-
-LENGTH = CHANNELS.index("length")
-"""The channel of distances from a centre."""
-
+LENGTH = CHANNELS.index("length")  # the channel of distances from a centre
+# Kind of each channel, as an index
 KIND_OF = np.array([KINDS.index(channel.partition("_")[0]) for channel in CHANNELS])
-"""Kind of each channel, as an index."""
-
+# Standard deviation of a reading where neither the file nor repeated readings tell, m or rad
 DEFAULT_UNCERTAINTY = dict(zip(KINDS, (1e-6, 1e-6, 1e-6, 10e-6, 10e-6, 1e-6, 1e-6), strict=True))
-"""Standard deviation of a reading where neither the file nor repeated readings tell, m or rad."""
-
 ANGULAR_KINDS = ("rotation", "attitude")
-
+# How a station was approached; FROM_PREVIOUS: from the command in the row before
 FORWARD, BACKWARD, UNKNOWN, FROM_PREVIOUS = 1, -1, 0, 2
-"""How a station was approached; FROM_PREVIOUS: from the command in the row before."""
-
-SAME_ATTITUDE = 1e-6
-"""Attitudes that differ by less, rad, are one."""
-
-LEAST_SIDE = 1e-6
-"""A box of which a side is shorter, m, is a line or a plane."""
-
+SAME_ATTITUDE = 1e-6  # attitudes that differ by less, rad, are one
+LEAST_SIDE = 1e-6  # A box of which a side is shorter, m, is a line or a plane
+# No instrument reads better, m or rad; also keeps readings without noise from having infinite weight
 LEAST_NOISE = 1e-9
-"""No instrument reads better, m or rad; also keeps readings without noise from having infinite weight."""
-
+# Trackers and cameras apart, no instrument is so many times worse than its kind is assumed to be: a unit is wrong
 COARSEST = 300.0
-"""Trackers and cameras apart, no instrument is so many times worse than its kind is assumed to be: a unit is wrong."""
-
-LARGEST_READING = 1.0
-"""No machine errs by more, m or rad."""
-
-LEAST_TRAVEL = 1e-6
-"""Components of a line shorter than this, m, are no travel along that axis."""
+LARGEST_READING = 1.0  # no machine errs by more, m or rad
+LEAST_TRAVEL = 1e-6  # components of a line shorter than this, m, are no travel along that axis
 
 
 class FileLine(NamedTuple):

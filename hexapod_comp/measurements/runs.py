@@ -1,8 +1,4 @@
-"""Readings in whatever order they come, assembled into one :class:`~.readings.MeasurementSet`.
-
-Runs are recognised as lines, equal commands become one station, poses that a machine cannot have taken are refused,
-with how they may have been meant.
-"""
+"""Readings in whatever order they come, assembled into one :class:`~.readings.MeasurementSet`."""
 
 from __future__ import annotations
 
@@ -38,17 +34,12 @@ from .readings import (
     Stations,
 )
 
+# Machines whose readings may have been mixed up: the shipped ones
 GEOMETRIES = ("paper.yaml", "example_6_6.yaml", "jugglebot.yaml", "positioning_unit.yaml")
-"""Machines whose readings may have been mixed up: the shipped ones."""
-
-ENOUGH = 10
-"""Fewer poses than that are possible in many ways."""
-
-UNITS = (("inches", 25.4), ("m", 1e3))
-"""Units in which coordinates may stand that are said to be mm."""
-
+ENOUGH = 10  # fewer poses than that are possible in many ways
+UNITS = (("inches", 25.4), ("m", 1e3))  # units in which coordinates may stand that are said to be mm
+# No compensation changes a strut's length by a larger share of what the nominal machine needs
 LARGEST_CORRECTION = 0.02
-"""No compensation changes a strut's length by a larger share of what the nominal machine needs."""
 
 
 def impossible(geometry: HexapodGeometry, poses: Poses, commands: np.ndarray) -> Iterator[tuple[int, str]]:
@@ -97,32 +88,16 @@ def _others(geometry: HexapodGeometry, poses: Poses) -> Iterator[tuple[str, Hexa
         yield how, machine, machine.platform_poses(tips, tools)
 
 
-SAME = 1e-9
-"""Commands nearer to each other than this, m, are the same command."""
-
-SHORTEST_LENGTH = 1e-3
-"""A length shorter than this, m, has no direction: its centre is known to some millimetres only."""
-
-NUMBER_OF = {channel: number for number, channel in enumerate(CHANNELS)}
-"""Index into :data:`CHANNELS`."""
-
-OF_LINES = np.isin(np.array(KINDS)[KIND_OF], LINE_KINDS)
-"""Whether each channel is read along a line."""
-
+SAME = 1e-9  # commands nearer to each other than this, m, are the same command
+SHORTEST_LENGTH = 1e-3  # A length shorter than this, m, has no direction: its centre is known to some millimetres only
+NUMBER_OF = {channel: number for number, channel in enumerate(CHANNELS)}  # index into :data:`CHANNELS`
+OF_LINES = np.isin(np.array(KINDS)[KIND_OF], LINE_KINDS)  # whether each channel is read along a line
+# The channels across a line, by their axis of the work frame
 STRAIGHTNESS = np.array([NUMBER_OF[f"straightness_{axis}"] for axis in AXES])
-"""The channels across a line, by their axis of the work frame."""
-
-OWN_LINE = 0.99
-"""A line whose direction has such a share of an axis, or more, runs along it."""
-
-NO_COMMANDS = (math.nan,) * 6
-"""Commanded strut lengths of a reading without any."""
-
-LARGEST_READING = 10.0
-"""No machine errs by more, and no instrument's zero lies further off, m or rad."""
-
-SMALLEST_UNCERTAINTY = 1e-12
-"""No instrument reads better, m or rad; and the square of its inverse is still a number."""
+OWN_LINE = 0.99  # A line whose direction has such a share of an axis, or more, runs along it
+NO_COMMANDS = (math.nan,) * 6  # commanded strut lengths of a reading without any
+LARGEST_READING = 10.0  # no machine errs by more, and no instrument's zero lies further off, m or rad
+SMALLEST_UNCERTAINTY = 1e-12  # no instrument reads better, m or rad; and the square of its inverse is still a number
 
 
 def assemble(
@@ -266,10 +241,7 @@ def _line(reading: Reading) -> str:
 
 
 def _recognise(readings: list[Reading], arrays: _Arrays, points: np.ndarray, work_axes: np.ndarray) -> Run:
-    """Return a run from its readings and their commanded points (n, 3), with its line if it has line channels.
-
-    Which way along the line is forward is a matter of the work frame, whose axes are the rows of `work_axes`.
-    """
+    """Return a run from its readings and their commanded points (n, 3), with its line if it has line channels."""
     first, name = readings[0], readings[0].run
     of_line = OF_LINES[arrays.channel]
     if of_line.any() and not of_line.all():

@@ -1,63 +1,4 @@
-"""Tidy CSV files of measurements, one reading a row: the door through which every instrument's data come in.
-
-Columns
--------
-``run``
-    Name. Readings of one run share the instrument's set-up: one unknown zero per channel. The same name in
-    two files means two runs; they are then called ``name [file]``.
-``direction``
-    ``forward``: travelling along the first of x, y, z of the work frame that moves; ``backward``; ``sequence``:
-    from the row before to this one (rows in the order of measuring); empty: not known.
-``x_mm``, ``y_mm``, ``z_mm``; ``alpha_deg``, ``beta_deg``, ``gamma_deg`` or ``qx``, ``qy``, ``qz``, ``qw``
-    Commanded pose of the tool in the work frame, as in every pose file (:func:`hexapod_comp.formats.csv.read_poses`).
-``channel``, ``value``, ``unit``
-    What was read (below), how much, and in what: m, mm, um, in; rad, mrad, urad, deg, arcsec; empty for quaternions.
-``cycle`` (optional)
-    Which of several passes, from 1. The same reading twice in a pass is refused.
-``uncertainty`` (optional)
-    Standard deviation, in the value's unit; may be empty.
-``temperature_degC`` (optional)
-    Of the air, and of the whole machine unless ``strut_1_degC`` … ``strut_6_degC``, ``base_degC``,
-    ``platform_degC`` say otherwise. Without any, 20 °C. Where one part alone has a column, its sensor stands for all.
-``time_s`` (optional)
-    When the row was read, on one clock for all files: what shows how late parts follow their sensors.
-``centre_x_mm``, ``centre_y_mm``, ``centre_z_mm`` (for lengths)
-    From where the length is read, in the work frame, known to some millimetres: the fixed ball of a ball bar, the
-    station, the sphere. Centres of one run belong to one body, such as a ball plate: only as a whole it may stand
-    elsewhere.
-``zero`` (optional)
-    ``known`` where lengths are known as a whole, with a calibrated bar or sphere; else their run has an unknown zero.
-``instrument_index``, ``pressure_kPa``, ``humidity_percent`` (optional)
-    The refractive index with which the instrument turned its counts into lengths; 1 when it counts vacuum
-    wavelengths. A row that has one is corrected to the air of that row (Ciddor), which needs its temperature,
-    pressure and relative humidity. Empty: the instrument has corrected itself, nothing is done. The humidity also acts
-    on struts that swell, with or without an index.
-
-Channels
---------
-``linear``
-    Displacement read minus commanded displacement, along the line, positive as ``forward``.
-``straightness_x`` … ``_z``, ``rotation_x`` … ``_z``
-    Displacement along, rotation about an axis of the work frame (right-hand), minus that commanded.
-``roll``, ``pitch``, ``yaw``
-    Of lines parallel to an axis of the work frame. Roll is about the line. On x lines pitch is about y, yaw about
-    z; on y lines about x and z; on z lines about x and y. All are positive as a right hand turns about the
-    positive axis: an instrument that counts otherwise needs its sign changed first.
-``position_x`` … ``_z``
-    Measured coordinates of the point in the work frame, not their errors: what a tracker reads.
-``quaternion_x`` … ``_w``
-    Measured orientation of the tool in the work frame, four rows for one pose.
-``attitude_x`` … ``_z``
-    Or its error: the rotation vector from the commanded to the measured orientation, along the work frame's axes.
-``length``
-    Distance read from the centre to the measured point, from any zero: a ball bar's change of length, an
-    interferometer's count, or always the same (0, say) at the poses at which a probe touches a sphere.
-``displacement_x`` … ``_z``
-    Displacement along an axis of the work frame minus that commanded, from any zero: an R-test at the tool's ball.
-``strut_1`` … ``strut_6``
-    Strut lengths that the machine was told, or that its encoders show, six rows for one pose: they then hold for
-    all readings of that run, cycle, direction and pose. Without them the machine was told nominal lengths.
-"""
+"""Tidy CSV files of measurements, one reading a row: the door through which every instrument's data come in."""
 
 from __future__ import annotations
 
@@ -97,33 +38,22 @@ from .readings import (
 )
 from .runs import assemble
 
+# Words of the column ``direction``
 DIRECTIONS = {"forward": FORWARD, "backward": BACKWARD, "sequence": FROM_PREVIOUS, "": UNKNOWN}
-"""Words of the column ``direction``."""
-
-TURNS = ("roll", "pitch", "yaw")
-"""Rotations named after the line on which they are read."""
-
-TURN_AXES = ((0, 1, 2), (1, 0, 2), (2, 0, 1))
-"""Axes of roll, pitch and yaw on a line along x, y, z."""
-
+TURNS = ("roll", "pitch", "yaw")  # rotations named after the line on which they are read
+TURN_AXES = ((0, 1, 2), (1, 0, 2), (2, 0, 1))  # axes of roll, pitch and yaw on a line along x, y, z
 QUATERNION_CHANNELS = tuple(f"quaternion_{c}" for c in "xyzw")
-
+# What each channel of a file is measured in
 DIMENSIONS = {
     **{channel: "angle" if channel.partition("_")[0] in ANGULAR_KINDS else "length" for channel in CHANNELS},
     **dict.fromkeys(TURNS, "angle"),
     **dict.fromkeys(QUATERNION_CHANNELS, ""),
     **dict.fromkeys(STRUT_NAMES, "length"),
 }
-"""What each channel of a file is measured in."""
 
-ALONG_LINES = (*LINE_KINDS, *TURNS)
-"""Channels that light reads along a line, and that the air therefore bends."""
-
-LATEST = 1e11
-"""Largest time, s: seconds since 1970 of the next three thousand years; nanoseconds are not seconds."""
-
-FURTHEST_CENTRE = 100.0
-"""No instrument stands further away, m."""
+ALONG_LINES = (*LINE_KINDS, *TURNS)  # channels that light reads along a line, and that the air therefore bends
+LATEST = 1e11  # largest time, s: seconds since 1970 of the next three thousand years; nanoseconds are not seconds
+FURTHEST_CENTRE = 100.0  # no instrument stands further away, m
 
 
 class TidyRow(NamedTuple):
@@ -336,8 +266,7 @@ def _unit_size(table: Table, line: int, channel: str, unit: str) -> float:
     return units[unit]
 
 
-PARALLEL = 1e-9
-"""Largest cross component of a unit vector that still is parallel to an axis."""
+PARALLEL = 1e-9  # largest cross component of a unit vector that still is parallel to an axis
 
 
 def read_tidy(
@@ -555,12 +484,7 @@ def _minus(row: TidyRow, commanded: float) -> float:
 
 
 def write_measurements(measurements: MeasurementSet, path: str | Path) -> None:
-    """Write a set as the file that :func:`~.tidy.read_tidy` reads back, to the last bit.
-
-    Commanded poses are written to 10⁻¹³ m and 10⁻¹² degrees; values that are not a number are left empty, to be filled
-    in. The measured point is not a column: where it is not the tool's tip, a comment in the file says where it is, and
-    it has to be given again for reading.
-    """
+    """Write a set as the file that :func:`~.tidy.read_tidy` reads back, to the last bit."""
     comment = ""
     if not np.array_equal(measurements.probe, measurements.geometry.tool.position):
         point = ", ".join(_scaled(float(value), 3) for value in measurements.probe)

@@ -1,52 +1,4 @@
-"""Wide CSV files of other laboratories: one pose a row, in columns that a small YAML file explains.
-
-A columns file (format ``hexapod_comp/columns``, see config/jugglebot_columns.yaml, examples/tracker)::
-
-    format: hexapod_comp/columns
-    version: 1
-    table:                          # optional: how the file is written, where that does not show
-      encoding: latin-1             # or utf-8, utf-16, windows-1252; detected without it
-      rows_above_header: 5          # to skip: titles; empty lines and comments count too
-      rows_below_header: 1          # to skip: a row of units
-    run: poses                      # optional; the CSV file's name otherwise
-    order: sequence                 # rows in the order of measuring: directions follow from it; or unknown (default)
-    commanded:                      # pose of the tool in the work frame; without this section it is the nominal
-      position: [cx, cy, cz]        # forward kinematics of the strut readings
-      unit: mm
-      offset_mm: [0, 0, 565]        # optional, added to the position
-      quaternion: [qx, qy, qz, qw]  # or angles: [alpha, beta, gamma] with angle_unit; neither: level
-                                    # or, instead of all that, poses in a file of their own beside this one:
-      file: commanded.csv           # as every pose file (x_mm, …), a row for each row measured, in the same order,
-      name: Point ID                # or found by what stands in this column, as its `name` or `sequence`
-    measured:                       # likewise; without quaternion or angles only positions were measured
-      position: [mx, my, mz]
-      unit: mm
-      quaternion: [mqx, mqy, mqz, mqw]
-      position_uncertainty_um: 200  # optional standard deviations
-      attitude_uncertainty_mrad: 1
-      position_uncertainty:         # or one for each row:
-        columns: [U95]              # for x, y and z alike; or three columns
-        unit: mm
-        coverage_factor: 2          # what the file gives, in standard deviations of one axis: 2 or 1.96 for 95 % of an
-                                    # axis, 2.80 for a sphere that holds 95 % of the points
-    temperature:                    # optional, in each row; 20 °C without it
-      unit: degC
-      everywhere: T air             # the air, and the machine unless a part (strut_1, …, base, platform) has its own
-    humidity:                       # optional: for struts that swell
-      column: rH
-      unit: percent
-    time:                           # optional: as Python's strptime reads the columns, joined by a space;
-      columns: [Date, Time]         # or one column of numbers, and unit: s in place of format
-      format: "%d.%m.%Y %H:%M:%S"
-    struts:                         # optional: what the machine was told, or its encoders read
-      readings: [l1, l2, l3, l4, l5, l6]
-      length_per_unit_mm: [75.7, 71.2, 72.3, 70.8, 70.6, 71.3]
-      zero: home                    # length at reading zero: home, those of the machine's home pose; given, in
-                                    # zero_length_mm; or measured, those that fit the measured poses in the mean
-
-With ``zero: measured`` the six lengths at reading zero come from all rows of the file: data held out of a fit
-have had their say in six numbers. A fit finds strut offsets anyway; this only starts it near them.
-"""
+"""Wide CSV files of other laboratories: one pose a row, in columns that a small YAML file explains."""
 
 from __future__ import annotations
 
@@ -73,19 +25,12 @@ from .tidy import LATEST
 
 COLUMNS_FORMAT = "hexapod_comp/columns"
 COLUMNS_VERSION = 1
-
 ORDERS = {"sequence": FROM_PREVIOUS, "unknown": UNKNOWN}
-
 EVERYWHERE = "everywhere"
-
+# Smallest and largest; an interval of 99.99 % is 3.9 standard deviations wide on each side
 COVERAGE_FACTORS = (0.5, 10.0)
-"""Smallest and largest; an interval of 99.99 % is 3.9 standard deviations wide on each side."""
-
-WITH_DATE = re.compile("%[djcxsDF]")
-"""What makes a format of times tell the days apart."""
-
-ZEROS = ("home", "given", "measured")
-"""Where the lengths at reading zero come from."""
+WITH_DATE = re.compile("%[djcxsDF]")  # what makes a format of times tell the days apart
+ZEROS = ("home", "given", "measured")  # where the lengths at reading zero come from
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,4 @@
-"""Single errors of a machine, each with its size, and the budget file that lists them (v. Daake et al.).
-
-A single error is one number that is not what it should be: a strut's length, a joint's coordinate, the
-tool's offset. A budget says how large the errors of each type are; every strut and every coordinate of a
-type then makes a single error of its own.
-"""
+"""Single errors of a machine, each with its size, and the budget file that lists them (v. Daake et al.)."""
 
 from __future__ import annotations
 
@@ -21,11 +16,8 @@ from ..machine.geometry import HexapodGeometry, first_of_same
 
 BUDGET_FORMAT = "hexapod_comp/error_budget"
 BUDGET_VERSION = 1
-
 LENGTH, BASE_JOINT, PLATFORM_JOINT, TOOL = range(4)  # What a single error moves
-
 AXES = ("x", "y", "z")
-
 LARGEST = 0.1  # An error as large is a wrong unit; m, or relative
 
 
@@ -107,6 +99,8 @@ def _tool(size: float, joints: np.ndarray) -> Iterable[Row]:
         yield TOOL, np.zeros(6, dtype=bool), tuple(size * np.eye(3)[axis]), f"tool {AXES[axis]}"
 
 
+# Types that a budget may have. Screw pitch as v. Daake et al. have it, a bound of the length error; as a slope it grows
+# with the way from home. A strut is off by half its backlash. Thermal growth is relative: expansion times kelvins.
 SOURCE_TYPES = (
     SourceType("strut_length", "length", "strut length", _lengths(0)),
     SourceType("screw_pitch", "length", "screw pitch", _lengths(0)),
@@ -120,9 +114,6 @@ SOURCE_TYPES = (
     SourceType("thermal_growth", "ratio", "thermal growth", _lengths(2)),
     SourceType("tool_offset", "length", "tool offset", _tool),
 )
-"""Types that a budget may have. Screw pitch as v. Daake et al. have it, a bound of the length error; as a slope it
-grows with the way from home. A strut is off by half its backlash. Thermal growth is relative: expansion
-times kelvins."""
 
 BY_NAME = {source.name: source for source in SOURCE_TYPES}
 

@@ -1,10 +1,4 @@
-"""All errors at once: worst case, root sum of squares, Monte Carlo; and what each error may be.
-
-Everything here starts from effects to first order, ``effect_vectors(…, method=LINEAR)``: one vector
-(displacement, rotation vector) per pose and error. A machine whose errors are u times their sizes, u within
-±1, is then off by Σ u_e·v_e. Results have two columns: displacement of the tool, m, and the largest of its
-three rotations, rad.
-"""
+"""All errors at once: worst case, root sum of squares, Monte Carlo; and what each error may be."""
 
 from __future__ import annotations
 
@@ -26,32 +20,18 @@ LARGEST_FACTOR = 1e9  # A source that may grow by more has no effect that counts
 
 
 def worst_case(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Return the largest effect that errors within their bounds can have together, shape (N, 2).
-
-    max |Σ u_e·v_e| over all u in ±1: not bounded, but found. All errors of one strut push the tool to and fro in one
-    direction and count as one; those of a joint that several struts share, and of the tool, have directions of
-    their own. The sums fill a body in space whose corner farthest out is sought (:func:`_farthest`).
-    """
+    """Return the largest effect that errors within their bounds can have together, shape (N, 2)."""
     return _worst(_along_struts(errors, vectors).sum(axis=3))
 
 
 def root_sum_of_squares(vectors: np.ndarray) -> np.ndarray:
-    """Return the root sum of squares of all effects, shape (N, 2).
-
-    For independent errors whose standard deviations are the sizes in `vectors`, this is the RMS of the
-    displacement, and the standard deviation of the rotation about the worst of the axes. For bounds it is what
-    tolerance analysis calls the statistical sum; uniform errors have an RMS √3 times smaller.
-    """
+    """Return the root sum of squares of all effects, shape (N, 2)."""
     squares = (vectors**2).sum(axis=1)
     return np.sqrt(np.stack([squares[:, :3].sum(axis=1), squares[:, 3:].max(axis=1)], axis=1))
 
 
 def covariance_factor(covariance: np.ndarray) -> np.ndarray:
-    """Return A with A·Aᵀ = a covariance, shape (P, P): independent errors of one sigma each.
-
-    What rows of derivatives make of them stands where effects of single errors stand elsewhere: its root sum of squares
-    is the RMS error that is left after compensation, and :func:`monte_carlo` with normal deviates gives percentiles.
-    """
+    """Return A with A·Aᵀ = a covariance, shape (P, P): independent errors of one sigma each."""
     scale = np.sqrt(np.abs(np.diag(covariance)))
     scale = np.where(scale > 0.0, scale, 1.0)
     normalised = covariance / np.outer(scale, scale)  # parameters of µm and of rad/m in one matrix
@@ -88,11 +68,7 @@ def monte_carlo(
     seed: int = 1,
     distribution: str = UNIFORM,
 ) -> MonteCarlo:
-    """Draw machines within their errors and return percentiles of the tool's error.
-
-    Each machine keeps its errors at all poses. The confidence bounds are order statistics: they hold for any
-    distribution.
-    """
+    """Draw machines within their errors and return percentiles of the tool's error."""
     ranks = np.array([_ranks(draws, percentile, confidence) for percentile in percentiles])
     deviates = _deviates(vectors.shape[1], draws, distribution, seed)
     worst = np.zeros((2, draws))
@@ -118,10 +94,7 @@ def _deviates(count: int, draws: int, distribution: str, seed: int) -> np.ndarra
 
 
 def _ranks(draws: int, percentile: float, confidence: float) -> tuple[int, int, int]:
-    """Return the indices, in ascending order of draws, of a percentile and of its confidence bounds.
-
-    The number of draws below the true percentile is binomial, whatever they are distributed like.
-    """
+    """Return the indices, in ascending order of draws, of a percentile and of its confidence bounds."""
     if not 0.0 < percentile < 100.0:
         raise ModelError("percentiles", "must lie within (0, 100)", percentile)
     if not 0.0 < confidence < 1.0:
@@ -228,11 +201,7 @@ def _squares(errors: SingleErrors, vectors: np.ndarray, quantity: int) -> np.nda
 
 
 def _along_struts(errors: SingleErrors, vectors: np.ndarray) -> np.ndarray:
-    """Return what the errors of one direction do together, type by type, shape (N, G, 6, K).
-
-    The errors of a strut all have one direction at a pose; those of the tool, and of a joint of several struts, have
-    one each.
-    """
+    """Return what the errors of one direction do together, type by type, shape (N, G, 6, K)."""
     count = errors.struts.sum(axis=1)
     members = [np.flatnonzero(errors.struts[:, strut] & (count == 1)) for strut in range(6)]
     members = [chosen for chosen in members if len(chosen)] + [np.array([n]) for n in np.flatnonzero(count != 1)]
@@ -255,12 +224,7 @@ def _worst(groups: np.ndarray) -> np.ndarray:
 
 
 def _farthest(ways: np.ndarray) -> np.ndarray:
-    """Return the largest |Σ ± w| of vectors in space over all signs, (N, G, 3) → (N,).
-
-    The sums' convex hull is a zonotope. Each corner lies on a face that two vectors span, and all others have there
-    the sign that leads outwards: G²·2 sums instead of 2^G. Vectors in one plane would leave that sign open: a
-    billionth of their length, each its own way, decides.
-    """
+    """Return the largest |Σ ± w| of vectors in space over all signs, (N, G, 3) → (N,)."""
     count = ways.shape[1]
     if count < 2:
         return np.linalg.norm(ways.sum(axis=1), axis=1)

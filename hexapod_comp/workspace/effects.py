@@ -1,9 +1,4 @@
-"""Effect of every single error at every pose on the tool (v. Daake et al.), exact or to first order.
-
-The effect of an error is where the tool of the machine with that one error stands, told the nominal strut
-lengths of a pose, beside where it should stand: Euclidean distance, and the largest of the three components of
-the rotation vector about the axes of the work frame.
-"""
+"""Effect of every single error at every pose on the tool (v. Daake et al.), exact or to first order."""
 
 from __future__ import annotations
 
@@ -30,16 +25,12 @@ from .budget import BASE_JOINT, LENGTH, PLATFORM_JOINT, TOOL, SingleErrors
 
 EXACT, LINEAR, ITERATION = "exact", "linear", "iteration"
 METHODS = (EXACT, LINEAR, ITERATION)
-
 BLOCK = 4096  # Poses handled together: long beside what an error costs once, small enough for a processor's own memory
 
 
 @dataclass(frozen=True)
 class Extremes:
-    """Largest and smallest effect of each error type, and where they happen.
-
-    Columns: largest and smallest translation, largest and smallest rotation.
-    """
+    """Largest and smallest effect of each error type, and where they happen."""
 
     errors: SingleErrors  # The E errors of K types
     values: np.ndarray  # (K, 4): m, m, rad, rad; NaN for a type without any effect to be had
@@ -62,10 +53,7 @@ def effect_vectors(
     method: str = EXACT,
     threads: int | None = None,
 ) -> np.ndarray:
-    """Return displacement of the tool, m, and rotation vector, rad, by every error at every pose, shape (N, E, 6).
-
-    Actual minus nominal, along the axes of the work frame; NaN where a pose, or the machine with the error, cannot be.
-    """
+    """Return displacement of the tool, m, and rotation vector, rad, by every error at every pose, shape (N, E, 6)."""
     return _of_each(geometry, errors, positions, rotations, method, threads, 6, lambda vectors: vectors)
 
 
@@ -112,11 +100,7 @@ def extremes(
     first: int = 0,
     threads: int | None = None,
 ) -> Extremes:
-    """Return the largest and smallest effects of each error type over some poses (v. Daake et al., Table 1).
-
-    Of more poses than memory takes, hand over one part after the other and join the results with :func:`merged`:
-    they are the same to the last bit however the poses are parted. `first` is the number of the first pose.
-    """
+    """Return the largest and smallest effects of each error type over some poses (v. Daake et al., Table 1)."""
     positions, rotations = batch_poses(positions, rotations)
     each, parts = _way(method), {}
 
@@ -347,10 +331,7 @@ class _State:
         return np.stack(columns, axis=2)
 
     def follow(self, change: np.ndarray) -> None:
-        """Move the tools along the tangents on which the legs change by so much, shape (N, 6).
-
-        v. Daake et al., eq. 3–4: V·R = A.
-        """
+        """Move the tools along the tangents on which the legs change by so much, shape (N, 6)."""
         try:
             motions = np.linalg.solve(self.motion_matrices(), change[:, :, None])[:, :, 0]
         except np.linalg.LinAlgError:
@@ -367,11 +348,7 @@ def tangential_effects(
     step: float = STEP,
     tolerance: float = TOLERANCE,
 ) -> TangentialResult:
-    """Return the effect of one single error at some poses by the paper's iteration.
-
-    A leg of wrong length travels to it in steps, all other legs held. A joint travels to its wrong place in
-    steps; its legs are active and take back the length that the joint's travel gives them.
-    """
+    """Return the effect of one single error at some poses by the paper's iteration."""
     for name, value in (("step", step), ("tolerance", tolerance)):
         if not 0.0 < value < math.inf:
             raise KinematicsError(f"{name} must be above zero, m, not {value}", value)
@@ -385,8 +362,8 @@ def tangential_effects(
     return _walk(geometry.work.rotation, state, errors.struts[index], path, tolerance)
 
 
+# Leg lengths to hold, shape (N, 6), and the base and platform joints
 Waypoint = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Leg lengths to hold, shape (N, 6), and the base and platform joints."""
 
 
 def _path(

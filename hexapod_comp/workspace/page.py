@@ -1,8 +1,4 @@
-"""One HTML page that shows the workspace study in any browser, without a network: shells to turn and to choose.
-
-Everything is in the file: plotly's script, the meshes, and every value, as two bytes each. The page's own
-security policy forbids it to load anything.
-"""
+"""One HTML page that shows the workspace study in any browser, without a network: shells to turn and to choose."""
 
 from __future__ import annotations
 
@@ -22,9 +18,8 @@ from .pictures import VIEW_AZIMUTH, VIEW_ELEVATION, WEDGE, outline
 from .shells import ROTATION, TRANSLATION, Quantity, Shell
 from .study import LAYERS, Study, mesh_effects
 
+# Of values, two each, and coordinates, four each; as text a third more: with plotly's 5 MB the page stays below 15
 MOST_BYTES = 7_000_000
-"""Of values, two each, and coordinates, four each; as text a third more: with plotly's 5 MB the page stays below 15."""
-
 LEVELS = 65535  # Steps of a stored value between the ends of its colour scale
 
 
@@ -124,10 +119,7 @@ def _content(geometry: HexapodGeometry, data: PageData) -> dict[str, object]:
 
 
 def _coded(data: PageData) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values as steps of their scales, uint16, and the scales, (E, Q, 2) in shown units.
-
-    The errors of one type have one scale for all frames, so that colours can be compared.
-    """
+    """Return the values as steps of their scales, uint16, and the scales, (E, Q, 2) in shown units."""
     factors = np.array([quantity.factor for quantity in data.quantities])
     low = data.values.min(axis=(0, 3, 4, 5)) * factors
     high = data.values.max(axis=(0, 3, 4, 5)) * factors

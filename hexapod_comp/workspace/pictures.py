@@ -1,8 +1,4 @@
-"""Pictures of the workspace study: coloured shells, what limits them, the ranked table as bars.
-
-Functions take plain arrays (points, values) and return a matplotlib figure, as those of
-:mod:`hexapod_comp.loop.pictures` do.
-"""
+"""Pictures of the workspace study: coloured shells, what limits them, the ranked table as bars."""
 
 from __future__ import annotations
 
@@ -33,20 +29,13 @@ from .shells import ROTATION, TRANSLATION, Layer, Quantity, shell
 from .study import RINGS, SECTORS
 
 COLOURS = "viridis"  # Colour map of effects: even steps for the eye, also in grey and to the colour-blind
-
+# Of the findings, in their order
 CAUSE_COLOURS = ("#ffffff", "#20639b", "#c1432e", "#e3a72f", "#3c8d5a", "#7b4ea3", "#444444", "#d77fb3", "#000000")
-"""Of the findings, in their order."""
-
 VIEW_AZIMUTH, VIEW_ELEVATION = -60.0, 20.0  # Where the eye stands, degrees
-
-BOX = "#d77f00"
-"""Colour of the largest box."""
-
-SHADOW = "#dbe4ee"
-"""Colour of a reach that a machine stands in."""
-
+BOX = "#d77f00"  # colour of the largest box
+SHADOW = "#dbe4ee"  # colour of a reach that a machine stands in
+# How far the outermost of several shells is cut open towards the eye, degrees; inner ones less, the innermost not
 WEDGE = 130.0
-"""How far the outermost of several shells is cut open towards the eye, degrees; inner ones less, the innermost not."""
 
 
 @dataclass(frozen=True)

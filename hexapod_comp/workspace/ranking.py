@@ -18,15 +18,13 @@ from .effects import Extremes
 
 MICRO = 1e6
 MILLIDEGREE = np.pi / 180e3
-
+# A machine with longer struts at home, m, is no positioning unit of the kind that v. Daake et al. classify.
 LONGEST_OF_UNIT = 0.4
-"""A machine with longer struts at home, m, is no positioning unit of the kind that v. Daake et al. classify."""
-
+# Types that v. Daake et al. put into one row, by their titles.
 JOINED = {
     "base-/platform joint (x/y)": ("base joint x/y", "platform joint x/y"),
     "base-/platform joint (z)": ("base joint z", "platform joint z"),
 }
-"""Types that v. Daake et al. put into one row, by their titles."""
 
 QUANTITIES = ("translation_max", "translation_min", "rotation_max", "rotation_min")
 
@@ -71,13 +69,13 @@ def _paper_row(title: str, size_um: float, um: tuple[float, float], mdeg: tuple[
     return PaperRow(title, size_um / MICRO, np.array([v / MICRO for v in um] + [v * MILLIDEGREE for v in mdeg]))
 
 
+# V. Daake et al., Table 1. Their machine's geometry is not printed: another machine cannot give the same digits.
 PAPER_TABLE = (
     _paper_row("screw pitch", 20.0, (34.4, 22.4), (15.41, 10.71)),
     _paper_row("base-/platform joint (x/y)", 10.0, (13.68, 0.0), (6.16, 0.0)),
     _paper_row("base-/platform joint (z)", 10.0, (11.2, 11.18), (5.36, 3.84)),
     _paper_row("quantization", 7.0, (10.85, 7.84), (4.39, 3.81)),
 )
-"""v. Daake et al., Table 1. Their machine's geometry is not printed: another machine cannot give the same digits."""
 
 _SAME_AS_PAPER = {"quantisation": "quantization"}
 
@@ -131,11 +129,7 @@ def paper_row(title: str) -> PaperRow | None:
 
 
 def beside(geometry: HexapodGeometry, errors: SingleErrors) -> dict[str, PaperRow]:
-    """Return the rows of v. Daake et al., Table 1, that say something about a machine, by the rows' own titles here.
-
-    Theirs is a positioning unit whose legs each have joints of their own. Its figures are laid beside those of such
-    a unit, type by type, where the errors are as large as theirs; beside another machine they would mislead.
-    """
+    """Return the rows of v. Daake et al., Table 1, that say something about a machine, by the rows' own titles here."""
     longest = strut_lengths(Structure.of(geometry), geometry.home).max()
     if longest > LONGEST_OF_UNIT or (first_of_same(geometry.platform_joints) != np.arange(6)).any():
         return {}

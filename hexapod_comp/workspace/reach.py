@@ -1,9 +1,4 @@
-"""Where a machine can go at a given orientation, how large that is, and what stops it at the boundary.
-
-Poses are ``pose_tool_in_work``, as in the verbs: positions are those of the tool tip in the work frame. At one
-orientation the reach is a body; a regular grid finds it, and bisection along the grid's lines finds where each
-line leaves it, and which limit stands there.
-"""
+"""Where a machine can go at a given orientation, how large that is, and what stops it at the boundary."""
 
 from __future__ import annotations
 
@@ -23,6 +18,7 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.kinematics import over_chunks
 from ..pose import Pose, angles_from_rotation, rotation_from_angles
 
+# What limits a pose, in words; the index is its :class:`~hexapod_comp.core.Status`
 FINDINGS = (
     "within",
     "stroke, shortest",
@@ -34,14 +30,11 @@ FINDINGS = (
     "assembly mode",
     "not a finite number",
 )
-"""What limits a pose, in words; the index is its :class:`~hexapod_comp.core.Status`."""
 
+# Cells along the longest edge with which the reach is looked for, one after the other until it is found
 SEARCH_CELLS = (24, 48, 96)
-"""Cells along the longest edge with which the reach is looked for, one after the other until it is found."""
-
+# Cells along the longest edge that may be asked for: eight million poses are some ten seconds, and half a gigabyte
 CELLS = (4, 200)
-"""Cells along the longest edge that may be asked for: eight million poses are some ten seconds, and half a gigabyte."""
-
 HALVINGS = 24  # Of a grid cell: a boundary is found to a fraction of a nanometre
 
 
@@ -116,10 +109,7 @@ class Reach:
 
     @property
     def volumes(self) -> np.ndarray:
-        """Volume found along x, along y and along z, m³, shape (3,): their spread tells what to make of it.
-
-        Each grid line stands for a column; what lies between its crossings of the boundary is within reach.
-        """
+        """Volume found along x, along y and along z, m³, shape (3,): their spread tells what to make of it."""
         edge = self.boundary
         here = edge.positions[np.arange(len(edge.axis)), edge.axis]
         return np.bincount(edge.axis, edge.outward * here, 3) * self.spacing**2
@@ -160,17 +150,11 @@ class Reach:
         return poses_at(self.geometry, self.points(), self.rotation)
 
     def shares(self) -> dict[str, float]:
-        """Return how much of the boundary each limit makes, by name, largest first.
-
-        Of the area as seen along the three axes: a face askew counts up to √3 times as much as a straight one.
-        """
+        """Return how much of the boundary each limit makes, by name, largest first."""
         return _shares(self.boundary.findings)
 
     def regions(self) -> dict[str, dict[str, float]]:
-        """Return the shares of each region of the boundary: top, bottom, and six sectors of its side.
-
-        Top and bottom are what is seen from the centre more than 45° above or below the horizontal.
-        """
+        """Return the shares of each region of the boundary: top, bottom, and six sectors of its side."""
         away = self.boundary.positions - self.centre
         steep = np.abs(away[:, 2]) > np.hypot(away[:, 0], away[:, 1])
         sector = np.floor(np.rad2deg(np.arctan2(away[:, 1], away[:, 0])) % 360.0 / 60.0).astype(int) % 6
@@ -215,11 +199,7 @@ def reaches(geometry: HexapodGeometry, rotations: np.ndarray, cells: int = 40) -
 
 
 def possible_box(geometry: HexapodGeometry, rotation: np.ndarray) -> np.ndarray:
-    """Return a box outside which no pose of an orientation can lie, m in the work frame, shape (2, 3).
-
-    At constant orientation each strut holds the tool tip within a ball about a fixed point; the box holds what
-    all six balls have in common.
-    """
+    """Return a box outside which no pose of an orientation can lie, m in the work frame, shape (2, 3)."""
     at_origin, turned = geometry.platform_poses(np.zeros((1, 3)), rotation[None])
     struts = at_origin[0] + geometry.platform_joints @ turned[0].T - geometry.base_joints
     centres, longest = -struts @ geometry.work.rotation, geometry.limits.stroke[:, 1:]
@@ -313,12 +293,9 @@ def _empty(rotation: np.ndarray, problem: str) -> GeometryError:
 
 BOX_CELLS = 30  # Of the reach's grid along its longest edge; a face is then moved to where the limit really stands
 FACE_HALVINGS = 10  # Of a grid cell, for each face: a thousandth of it
-
+# Share of its sides by which the box stays away from the limits on each side: compensation moves struts too
 ROOM = 0.01
-"""Share of its sides by which the box stays away from the limits on each side: compensation moves struts too."""
-
 EDGE_SAMPLES = 15  # Points along each edge of a box that is examined
-
 FACES = ("−x", "+x", "−y", "+y", "−z", "+z")
 
 
@@ -331,11 +308,7 @@ class ReachedBox(NamedTuple):
 
 
 def largest_box(reached: Reach) -> ReachedBox:
-    """Return the box of largest volume, parallel to the work frame, in the piece of a reach that home belongs to.
-
-    Every grid point within it is within all limits; then each face moves out as far as the limits let it, and all come
-    in again by :data:`ROOM`.
-    """
+    """Return the box of largest volume, parallel to the work frame, in the piece of a reach that home belongs to."""
     piece = _home_piece(reached)
     corners = _largest_cells(piece)
     if corners is None:
@@ -354,11 +327,7 @@ def largest_box(reached: Reach) -> ReachedBox:
 
 
 def machine_box(geometry: HexapodGeometry, cells: int = BOX_CELLS) -> ReachedBox:
-    """Return the largest box in which a machine can be measured: with the tool parallel to the work frame.
-
-    Where the tool cannot be parallel to the work frame at home, as with one that is turned by 90°, it stays as it is at
-    home.
-    """
+    """Return the largest box in which a machine can be measured: with the tool parallel to the work frame."""
     level, home = np.eye(3), home_orientation(geometry)
     tip = geometry.tool_pose(geometry.home).position
     finding, _ = Examiner(geometry).findings(tip[None], level[None])
@@ -378,10 +347,7 @@ def _home_piece(reached: Reach) -> np.ndarray:
 
 
 def _largest_cells(within: np.ndarray) -> tuple[tuple[int, int, int], tuple[int, int, int]] | None:
-    """Return the grid indices of the corners of the largest box of points that are all within; None without one.
-
-    For all ranges along z at once, and each start along x, ranges along x grow; along y the longest run is wanted.
-    """
+    """Return the grid indices of the corners of the largest box of points that are all within; None without one."""
     nx, ny, nz = within.shape
     ranges = [(a, b) for a in range(nz) for b in range(a + 1, nz)]
     slabs = (

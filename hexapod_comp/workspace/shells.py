@@ -1,10 +1,4 @@
-"""Shells of the workspace at constant orientation (v. Daake et al., Figure 2), as meshes to colour.
-
-A shell is found by rays from one point well inside: along each the boundary is bracketed and bisected. That
-gives the whole boundary only where every point of it can be seen from there (the reach is star-shaped). It is
-not taken for granted: rays that enter the reach again behind a gap are marked, and the volume inside the shell
-is compared with that of the reach, which the grid finds without such an assumption.
-"""
+"""Shells of the workspace at constant orientation (v. Daake et al., Figure 2), as meshes to colour."""
 
 from __future__ import annotations
 
@@ -49,18 +43,14 @@ TRANSLATION = Quantity("translation of the tool", "µm", 1e6)
 ROTATION = Quantity("rotation of the tool, largest of three", "m°", 1e3 * 180.0 / np.pi)
 
 
+# Points along a ray at which gaps are looked for: one smaller than a hundredth of the reach can stay unseen
 SAMPLES = 96
-"""Points along a ray at which gaps are looked for: one smaller than a hundredth of the reach can stay unseen."""
-
 LEAST_RINGS, LEAST_SECTORS = 5, 8  # A coarser mesh is no picture of a body
 
 
 @dataclass(frozen=True)
 class Shell:
-    """The boundary of a reach as a mesh of rings from bottom to top.
-
-    Both poles are rings of one point, and the last azimuth repeats the first, so that the mesh is closed.
-    """
+    """The boundary of a reach as a mesh of rings from bottom to top."""
 
     geometry: HexapodGeometry  # The machine
     rotation: np.ndarray  # (3, 3): orientation of the tool in the work frame
@@ -77,10 +67,7 @@ class Shell:
         return mesh_volume(self.points)
 
     def scaled(self, fraction: float) -> np.ndarray:
-        """Return the mesh shrunk towards the centre, shape (H, A, 3), m in the work frame.
-
-        Every point of it is within reach, since it lies on a ray before the boundary.
-        """
+        """Return the mesh shrunk towards the centre, shape (H, A, 3), m in the work frame."""
         if not 0.0 < fraction <= 1.0:
             raise GeometryError("fraction", "of the reach must lie in (0, 1]", fraction)
         return self.centre + fraction * (self.points - self.centre)
@@ -108,10 +95,7 @@ def shell(reach: Reach, rings: int = 37, sectors: int = 72) -> Shell:
 
 
 def mesh_volume(points: np.ndarray) -> float:
-    """Return the volume inside a closed mesh of rings from bottom to top, (H, A, 3) m, in m³.
-
-    The sum of the tetrahedra from one point to the triangles; the last azimuth must repeat the first.
-    """
+    """Return the volume inside a closed mesh of rings from bottom to top, (H, A, 3) m, in m³."""
     p = points - points.reshape(-1, 3).mean(axis=0)
     a, b, c, d = p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]
     return float((np.cross(a, b) * c + np.cross(a, c) * d).sum() / 6.0)
@@ -136,10 +120,7 @@ def _check_mesh(rings: int, sectors: int) -> None:
 def _cast(
     reach: Reach, origin: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Follow rays from a point within reach to where they first leave it.
-
-    Returns boundary points (N, 3), findings, struts, and whether the ray enters the reach again.
-    """
+    """Follow rays from a point within reach to where they first leave it."""
     examiner = Examiner(reach.geometry)
     corners = np.array([[axis[0], axis[-1]] for axis in reach.axes])
     farthest = np.linalg.norm(np.abs(corners - origin[:, None]).max(axis=1))  # all of the grid, hence of the reach

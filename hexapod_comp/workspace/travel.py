@@ -17,7 +17,6 @@ from ..machine.model import RealMachine
 from ..pose import Pose
 
 COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")
-
 STEPS = 500  # Into so many steps the longest strut is divided; what is narrower than one may be stepped over
 TURN_STEP, LONGEST_TURN = math.radians(0.5), math.pi  # The same for turns, rad, and how far they are followed
 
@@ -55,13 +54,7 @@ class Travel:
 def travel(
     machine: RealMachine, tool_pose: Pose, frame: Pose | None = None, compensates: bool = True
 ) -> tuple[Travel, ...]:
-    """Return how far the tool may go from a pose, by each of its six coordinates, forward and backward.
-
-    All limits of single poses count, on nominal and on compensated values: stroke, joint cones, clearance, condition
-    number, assembly mode, correction, and the field's box where the model refuses what lies outside. Those of motions,
-    step, speed and acceleration, do not. Directions of motion are not known, as for
-    :func:`~hexapod_comp.compensation.checks.check` with ``poses``.
-    """
+    """Return how far the tool may go from a pose, by each of its six coordinates, forward and backward."""
     start = _Outset(machine, tool_pose, machine.geometry.work if frame is None else frame, compensates)
     return tuple(start.travel(coordinate, sign) for coordinate in COORDINATES for sign in (1, -1))
 
