@@ -19,17 +19,13 @@ from .verbs import DESCRIPTION, EPILOG, GONE, VERBS, Verb
 
 PROGRAM = "hexapod_comp"
 
-ALIASES = {verb.alias: name for name, verb in VERBS.items() if verb.alias}
-"""Old names of verbs, which still work."""
+ALIASES = {verb.alias: name for name, verb in VERBS.items() if verb.alias}  # old names of verbs, which still work
+NEGATIVE = re.compile(r"-[.\d]")  # what follows an option and looks like this is its value, not another option
 
-NEGATIVE = re.compile(r"-[.\d]")
-"""What follows an option and looks like this is its value, not another option."""
-
+# Verbs whose matrices are too small for the threads of NumPy's BLAS, which on busy cores wait for each other
 ONE_THREAD = ("fit", "verify", "demo")
-"""Verbs whose matrices are too small for the threads of NumPy's BLAS, which on busy cores wait for each other."""
 
-USAGE_ERROR, INTERRUPTED = 2, 130
-"""Exit codes: bad input; Ctrl-C as shells count it, 128 + signal."""
+USAGE_ERROR, INTERRUPTED = 2, 130  # exit codes: bad input; Ctrl-C as shells count it, 128 + signal
 
 
 def main(argv: Sequence[str] | None = None) -> int:

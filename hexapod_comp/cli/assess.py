@@ -16,13 +16,12 @@ from . import common
 from .table import Table
 
 POSE_COLUMNS = ("alpha_deg", "beta_deg", "gamma_deg", "x_mm", "y_mm", "z_mm")
-MOST_RESULTS = 10_000_000
-"""Machines times poses: more results are refused, they would need gigabytes."""
+MOST_RESULTS = 10_000_000  # machines times poses: more results are refused, they would need gigabytes
 
 PERCENTILES = {"median": 50.0, "95 %": 95.0, "max": 100.0}
+# Of what percentiles over the machines are shown: title, unit and its size
 STATISTICS = {"strut_change": ("|dL|", "um", 1e6), "displacement": ("|dp|", "um", 1e6),
               "rotation": ("angle", "deg", 180.0 / math.pi)}  # fmt: skip
-"""Of what percentiles over the machines are shown: title, unit and its size."""
 
 ERRORS = ("x_um", "y_um", "z_um", "rx_urad", "ry_urad", "rz_urad")
 

@@ -14,11 +14,8 @@ from ..machine.model import MachineModel
 from ..machine.region import region_json, region_text
 from . import common
 
-MOST_ROWS = 100
-"""Rows of margins printed; --out writes all."""
-
-MOST_BREACHES = 20
-"""Broken limits printed; --json prints all."""
+MOST_ROWS = 100  # rows of margins printed; --out writes all
+MOST_BREACHES = 20  # broken limits printed; --json prints all
 
 
 class Shown(NamedTuple):

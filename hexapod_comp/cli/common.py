@@ -126,10 +126,8 @@ def save_pictures(args: argparse.Namespace, pictures: Callable[[], Mapping[str, 
 
 @contextlib.contextmanager
 def ended_in_order() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end this context as Ctrl-C does, so that what was started is ended, with 128 + signal.
-
-    A second one ends the process at once. A hang-up that nohup ignores stays ignored.
-    """
+    """Let SIGTERM and SIGHUP end this context as Ctrl-C does, so that what was started is ended, with 128 + signal."""
+    # A second one ends the process at once. A hang-up that nohup ignores stays ignored.
 
     def leave(caught: int, frame: object) -> None:
         signal.signal(caught, signal.SIG_DFL)

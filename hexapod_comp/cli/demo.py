@@ -14,8 +14,7 @@ from ..machine.model import MachineModel
 from . import common
 from .run import TRUE, chosen_model, draw, hidden_errors
 
-FITTED = "fit"
-"""The model that is yet to be made, of readings."""
+FITTED = "fit"  # the model that is yet to be made, of readings
 
 
 def run(args: argparse.Namespace) -> int:

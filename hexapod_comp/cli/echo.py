@@ -10,8 +10,7 @@ import time
 from ..formats.json import json_text
 from . import common
 
-HZ_PERIOD = 1.0
-"""How often --hz prints a line, s."""
+HZ_PERIOD = 1.0  # how often --hz prints a line, s
 
 
 def run(args: argparse.Namespace) -> int:

@@ -19,8 +19,8 @@ from ..machine.model_file import IDEAL, model_text
 from ..virtual.named import is_random
 from . import common
 
+# An error that grows by less than this, m, has not grown: the files' digits and LinuxCNC's floats count for more
 HARMLESS = 10e-9
-"""An error that grows by less than this, m, has not grown: the files' digits and LinuxCNC's floats count for more."""
 
 
 def run(args: argparse.Namespace) -> int:
@@ -94,8 +94,7 @@ def _show_exact(args: argparse.Namespace, model: MachineModel, written: list[str
     return 0
 
 
-Result = tuple[str, "ExportCheck", list[str]]
-"""Name of a way to use an export, what it leaves, and notes."""
+Result = tuple[str, "ExportCheck", list[str]]  # name of a way to use an export, what it leaves, and notes
 
 
 def _titles(model: MachineModel, box: np.ndarray) -> list[str]:

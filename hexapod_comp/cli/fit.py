@@ -38,14 +38,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 REFUSED = "NOT WRITTEN: this model is not to be trusted"
+# Top of the report where readings do not bear the model out
 FORCED = "WRITTEN BY FORCE: this model is not to be trusted"
-"""Top of the report where readings do not bear the model out."""
 
 ADVICE = "Do units, lead, geometry and the instrument's uncertainty fit?"
 
+# Limits that a model breaks by itself; others, such as the stroke's end, a measured pose may be next to
 OF_THE_MODEL = ("correction", "assembly", "not_converged")
-"""Limits that a model breaks by itself; others, such as the stroke's end, a measured pose may be next to."""
 
+# What options are called among the settings of a fit, and their units
 IN_SI = {
     "lead_mm": ("lead", 1e-3),
     "field_degree": ("field_degree", 1),
@@ -56,7 +57,6 @@ IN_SI = {
     "time_constants_s": ("time_constants", 1),
     "tracker_frame": ("tracker_frame", 1),
 }
-"""What options are called among the settings of a fit, and their units."""
 
 
 def fit_settings(args: argparse.Namespace) -> FitSettings:

@@ -21,11 +21,8 @@ from . import common
 from .table import Table
 from .verbs import POSE_OPTIONS
 
-MOST_NOTES = 10
-"""Broken limits named on stderr."""
-
-MOST_STEPS = 100_000
-"""Poses on a line, each way."""
+MOST_NOTES = 10  # broken limits named on stderr
+MOST_STEPS = 100_000  # poses on a line, each way
 
 
 @dataclass(frozen=True)
@@ -85,10 +82,8 @@ def _poses(args: argparse.Namespace) -> Targets:
 
 
 def _line(args: argparse.Namespace, geometry: HexapodGeometry) -> Targets:
-    """Return the poses along a straight line of the tool, forward and then, in the same order, backward.
-
-    Each axis and each strut has the direction of its own motion; one that stands still has none.
-    """
+    """Return the poses along a straight line of the tool, forward and then, in the same order, backward."""
+    # Each axis and each strut has the direction of its own motion; one that stands still has none.
     start, end, angles = args.line
     way, step = np.array(end) - np.array(start), args.step_mm * 1e-3
     length = float(np.linalg.norm(way))

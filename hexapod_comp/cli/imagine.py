@@ -18,6 +18,7 @@ from ..virtual.named import imagine, usual_bounds
 from ..workspace.reach import machine_box
 from . import common
 
+# What each option is called among the bounds, and its unit in SI
 IN_SI = {
     "joints_um": ("joint", 1e-6),
     "struts_um": ("strut_offset", 1e-6),
@@ -34,7 +35,6 @@ IN_SI = {
     "field_urad": ("field_rotation", 1e-6),
     "field_reversal_percent": ("field_reversal", 1e-2),
 }
-"""What each option is called among the bounds, and its unit in SI."""
 
 
 def run(args: argparse.Namespace) -> int:

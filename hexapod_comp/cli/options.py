@@ -18,8 +18,7 @@ from ..formats.texts import number_hint
 POSE_HELP = "mm and degrees: x,y,z or x,y,z,alpha,beta,gamma"
 LINE_HELP = "mm and degrees: x,y,z of its start, x,y,z of its end, and the tool's alpha,beta,gamma (default 0,0,0)"
 SHAPE, LINE_SHAPE = "X,Y,Z[,A,B,C]", "X,Y,Z,X,Y,Z[,A,B,C]"
-WORDS = "ideal, random or random:SEED"
-"""Models that are no files."""
+WORDS = "ideal, random or random:SEED"  # models that are no files
 
 
 @dataclass(frozen=True)
@@ -390,6 +389,7 @@ def readings(required: bool = True) -> tuple[Option, ...]:
     )
 
 
+# What a fit of scheme joint, or a plan for one, can be given
 ESTIMATION = under(
     "scheme joint",
     value("--lead-mm", bound, "MM", "period of the screws' errors (default: the geometry's; else what the readings "
@@ -408,4 +408,3 @@ ESTIMATION = under(
     value("--time-constants-s", time_constants, "S[,S]", "how late parts follow their sensors (default: sought from "
           "the readings)"),
 )  # fmt: skip
-"""What a fit of scheme joint, or a plan for one, can be given."""

@@ -15,8 +15,7 @@ from ..machine.model import MachineModel
 from ..virtual.named import find_model, truth_name
 from . import common
 
-TRUE = "truth"
-"""The model that is no file: the machine's own errors."""
+TRUE = "truth"  # the model that is no file: the machine's own errors
 
 
 def run(args: argparse.Namespace) -> int:

@@ -19,8 +19,7 @@ from ..virtual.warm_up import growing, load_warm_up
 from . import common
 from .table import Table
 
-RESOLUTION = 10
-"""Digits after the point of the instruments, m and rad: a tenth of a nanometre."""
+RESOLUTION = 10  # digits after the point of the instruments, m and rad: a tenth of a nanometre
 
 
 def run(args: argparse.Namespace) -> int:

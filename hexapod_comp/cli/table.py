@@ -9,11 +9,10 @@ from typing import Any
 from ..formats import csv
 from ..formats.texts import aligned, number
 
+# Digits after the point in CSV files, by unit: a picometre, and less than that at the platform's edge
 DECIMALS = {"mm": 9, "deg": 9, "um": 6, "urad": 6}
-"""Digits after the point in CSV files, by unit: a picometre, and less than that at the platform's edge."""
 
-SHOWN = {"mm": 6, "deg": 6}
-"""The same for people, who otherwise get three."""
+SHOWN = {"mm": 6, "deg": 6}  # the same for people, who otherwise get three
 
 
 def unit_of(name: str) -> str:

@@ -34,21 +34,21 @@ shipped one (paper, paper_machine, …)."""
 EPILOG = """Verbs, options and files complete in the shell: pip install argcomplete, then
 eval "$(register-python-argcomplete hexapod_comp)"."""
 
-GONE = {"paper": "is `make papers` in the source tree now (python -m examples.papers)"}
-"""Verbs that went, and where to."""
+GONE = {"paper": "is `make papers` in the source tree now (python -m examples.papers)"}  # verbs that went, and where to
 
+# A pose number by number: the options of ik, and their units
 POSE_OPTIONS = {f"--{axis}-mm": "mm" for axis in "xyz"} | {
     f"--{axis}-deg": "degrees" for axis in ("alpha", "beta", "gamma")
 }
-"""A pose number by number: the options of ik, and their units."""
 
 CORNERS = "X0,Y0,Z0,X1,Y1,Z1"
 
+# What plan can propose runs for; a test holds it to the planner's own list, which is slow to import
 INSTRUMENTS = (
     "linear", "straightness", "rotation", "5-D", "6-D", "tracker", "tracker_6d", "ball_bar", "station", "r_test",
 )  # fmt: skip
-"""What plan can propose runs for; a test holds it to the planner's own list, which is slow to import."""
 
+# What run and demo share
 LOOP = (
     MACHINE,
     TRUTH,
@@ -56,16 +56,16 @@ LOOP = (
     gone("--plot", "--pictures FOLDER"),
     JSON,
 )
-"""What run and demo share."""
 
+# Bounds that assess draws machines within, and what they are by default
 DRAWN = {
     "--joint-um": (10.0, "every coordinate of every joint, µm"),
     "--strut-um": (10.0, "every strut's length offset, µm"),
     "--pitch-ppm": (0.0, "every screw's pitch error, ppm"),
     "--wave-um": (0.0, "every screw's periodic error (its amplitude, drawn from 0 up), µm"),
 }
-"""Bounds that assess draws machines within, and what they are by default."""
 
+# How imperfect an imagined machine may be; defaults are those of `random`
 BOUNDS = (
     value("--joints-um", bound, "NUMBER", "every coordinate of every joint, ± µm (default 50)"),
     value("--struts-um", bound, "NUMBER", "every strut's length, ± µm (default 50)"),
@@ -85,7 +85,6 @@ BOUNDS = (
           "reaches about home)"),
     flag("--separate-joints", "struts that share a platform joint each get one of their own"),
 )  # fmt: skip
-"""How imperfect an imagined machine may be; defaults are those of ``random``."""
 
 # fmt: off
 VERBS = {

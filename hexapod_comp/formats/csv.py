@@ -37,42 +37,30 @@ QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
 LENGTH_COLUMNS = tuple(f"L{i}" for i in range(1, 7))
 NOMINAL_COLUMNS = tuple(f"nominal_L{i}" for i in range(1, 7))
 CORRECTION_COLUMNS = tuple(f"correction_L{i}" for i in range(1, 7))
-ALONG_COLUMNS = ("along", *POSITION_COLUMNS)
-"""What ``ik --line`` says of where a pose is, besides its angles."""
+ALONG_COLUMNS = ("along", *POSITION_COLUMNS)  # what `ik --line` says of where a pose is, besides its angles
 
+# What `ik --model` says of the tool's error, each for x, y, z and rx, ry, rz
 PREDICTED_ERRORS = tuple(f"{error}_{{}}{known}" for error in ("error", "error_aligned") for known in ("", "_sd"))
-"""What ``ik --model`` says of the tool's error, each for x, y, z and rx, ry, rz."""
 
-MAX_ROWS = 2_000_000
-"""Longer files are refused: an hour's path at 500 Hz fits, a device that never ends does not."""
+MAX_ROWS = 2_000_000  # longer files are refused: an hour's path at 500 Hz fits, a device that never ends does not
+MAX_COLUMNS = 1000  # wider files are refused: other laboratories' have some dozen columns
+MAX_CELLS = 40_000_000  # larger tables are refused: each cell takes some 60 bytes
 
-MAX_COLUMNS = 1000
-"""Wider files are refused: other laboratories' have some dozen columns."""
-
-MAX_CELLS = 40_000_000
-"""Larger tables are refused: each cell takes some 60 bytes."""
-
+# Longer lines are refused, in characters: a file without line ends would be read into memory whole
 MAX_LINE = 1_000_000
-"""Longer lines are refused, in characters: a file without line ends would be read into memory whole."""
 
+# What a file may be written in. Without a word it is UTF-16 where its mark says so, else UTF-8; what is neither is read
+# as Windows-1252, of which Latin-1 is a part: only letters of names differ.
 ENCODINGS = ("utf-8", "utf-16", "windows-1252", "latin-1")
-"""What a file may be written in. Without a word it is UTF-16 where its mark says so, else UTF-8; what is neither is
-read as Windows-1252, of which Latin-1 is a part: only letters of names differ."""
 
-MOST_SKIPPED = 1000
-"""Rows above or below the header that may be skipped."""
+MOST_SKIPPED = 1000  # rows above or below the header that may be skipped
 
+# What may stand between columns; the first of them that is in the header does
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
-"""What may stand between columns; the first of them that is in the header does."""
 
-QUOTED = re.compile(r'"[^"]*"')
-"""What stands in quotes separates nothing."""
-
-FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""A spreadsheet takes a cell that begins so for a formula, and runs it."""
-
-MARK = "'"
-"""Set before such a cell when it is written: spreadsheets show the text, and :func:`unmarked` takes it off again."""
+QUOTED = re.compile(r'"[^"]*"')  # what stands in quotes separates nothing
+FORMULA = ("=", "+", "-", "@", "\t", "\r")  # a spreadsheet takes a cell that begins so for a formula, and runs it
+MARK = "'"  # set before such a cell when it is written: spreadsheets show the text, and unmarked takes it off again
 
 
 def csv_text(rows: Iterable[Sequence[Any]]) -> str:
@@ -385,15 +373,13 @@ def _bounded_lines(path: str | Path, stream: io.TextIOWrapper) -> Iterator[str]:
         yield line
 
 
+# Digits by which a unit of such a size moves the decimal point
 SHIFTS = {10.0**digits: digits for digits in range(-9, 10)}
-"""Digits by which a unit of such a size moves the decimal point."""
 
 
 def si_from_text(text: str, number: float, unit: float) -> float:
-    """Return a number in SI: where the unit moves the decimal point only, the float that is nearest to the text.
-
-    So 203.2 mm is the very 0.2032 of source code, and what was written with all its digits comes back.
-    """
+    """Return a number in SI: where the unit moves the decimal point only, the float that is nearest to the text."""
+    # So 203.2 mm is the very 0.2032 of source code, and what was written with all its digits comes back.
     digits = SHIFTS.get(unit)
     if digits is None:
         return unit * number
@@ -459,11 +445,9 @@ def _rotations_from_quaternions(path: str | Path, rows: list[Row], quaternions: 
 
 
 def read_lengths(path: str | Path) -> tuple[list[Row], np.ndarray]:
-    """Read strut lengths from a CSV file (or ``-``) with the columns ``L1_mm`` … ``L6_mm`` (or ``_m``, …).
-
-    The columns that ``ik --model`` and ``ik --line`` add are known and passed over: ``nominal_L…``, ``correction_L…``,
-    ``error_…``, ``direction``, ``along`` and the pose.
-    """
+    """Read strut lengths from a CSV file (or ``-``) with the columns ``L1_mm`` … ``L6_mm`` (or ``_m``, …)."""
+    # The columns that `ik --model` and `ik --line` add are known and passed over: `nominal_L…`, `correction_L…`,
+    # `error_…`, `direction`, `along` and the pose.
     table = Table(input_file(path, "lengths"))
     lengths = table.numbers(table.required(LENGTH_COLUMNS, "length"))
     shifts, turns = (

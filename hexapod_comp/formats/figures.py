@@ -9,14 +9,13 @@ from matplotlib.figure import Figure
 from ..errors import printable
 from .outputs import make_folder, new_file
 
+# Colours of the machine without and with compensation, the same in every picture
 WITHOUT, WITH = "#c1432e", "#20639b"
-"""Colours of the machine without and with compensation, the same in every picture."""
 
+# Of the six struts: Okabe and Ito's, which the colour-blind can tell apart too
 SIX_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#000000")
-"""Of the six struts: Okabe and Ito's, which the colour-blind can tell apart too."""
 
-NOTHING = 1e-3
-"""Lower end of logarithmic error axes, µm: below a nanometre nothing is claimed."""
+NOTHING = 1e-3  # lower end of logarithmic error axes, µm: below a nanometre nothing is claimed
 
 
 def picture_text(text: str, limit: int = 200) -> str:

@@ -18,22 +18,17 @@ from pathlib import Path
 from ..errors import InputFileError, printable
 from .texts import MICRO_ERRORS
 
+# Opens a path with flags and returns a descriptor, or refuses it, as Python's `open` takes one
 Opener = Callable[[str, int], int]
-"""Opens a path with flags and returns a descriptor, or refuses it, as Python's ``open`` takes one."""
 
 MEGABYTE = 1_000_000
 
-MAX_FILE_BYTES = 8 * MEGABYTE
-"""YAML files, HAL files, pages of a journal; the largest model has some 100 kB."""
+MAX_FILE_BYTES = 8 * MEGABYTE  # YAML files, HAL files, pages of a journal; the largest model has some 100 kB
+MAX_CSV_BYTES = 500 * MEGABYTE  # an hour's path at 500 Hz has some 270 MB
+MAX_ARCHIVE_BYTES = 200 * MEGABYTE  # what a fit knows of its parameters: the covariance of some 5000
 
-MAX_CSV_BYTES = 500 * MEGABYTE
-"""An hour's path at 500 Hz has some 270 MB."""
-
-MAX_ARCHIVE_BYTES = 200 * MEGABYTE
-"""What a fit knows of its parameters: the covariance of some 5000."""
-
+# Names of what the caller has opened already (`-`, `<(command)`): these may be pipes
 OPEN_STREAMS = re.compile(r"/dev/(stdin|fd/\d+)|/proc/(self|\d+)/fd/\d+")
-"""Names of what the caller has opened already (``-``, ``<(command)``): these may be pipes."""
 
 KINDS = {stat.S_IFIFO: "FIFO", stat.S_IFCHR: "device", stat.S_IFBLK: "device", stat.S_IFSOCK: "socket"}
 
@@ -97,11 +92,10 @@ def read_text(path: str | Path, opener: Opener | None = None, most: int = MAX_FI
 def parsing(
     path: str | Path, problem: str, kinds: type[Exception] | tuple[type[Exception], ...] = Exception
 ) -> Iterator[None]:
-    """Turn what a parser raises on hostile bytes into an InputFileError with a problem.
-
-    Libraries raise whatever their parts happen to: struct.error, KeyError, AssertionError, zlib.error, RecursionError.
-    So by default every exception is caught here; around calls of a library only, never around this package's code.
-    """
+    """Turn what a parser raises on hostile bytes into an InputFileError with a problem."""
+    # Libraries raise whatever their parts happen to: struct.error, KeyError, AssertionError, zlib.error,
+    # RecursionError. So by default every exception is caught here; around calls of a library only, never around this
+    # package's code.
     try:
         yield
     except InputFileError:

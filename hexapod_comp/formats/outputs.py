@@ -13,18 +13,16 @@ from typing import IO, Any
 
 from ..errors import InputFileError
 
+# What this command reads, by device and inode, and as what it was named; empty outside of a command
 _protected: dict[tuple[int, int], str] = {}
-"""What this command reads, by device and inode, and as what it was named; empty outside of a command."""
 
 
 @contextmanager
 def protected(read: Mapping[str, Any], written: Mapping[str, Any], folders: Mapping[str, Any]) -> Iterator[None]:
-    """Refuse, as long as this context is open, to write what a command reads; try at once what it will write.
-
-    Each is a name, a list of names, or something else, which is no file, by the option that gives it. Refused are
-    outputs that are inputs, or another output, or whose place cannot take them: better now than after a long
-    calculation.
-    """
+    """Refuse, as long as this context is open, to write what a command reads; try at once what it will write."""
+    # Each is a name, a list of names, or something else, which is no file, by the option that gives it. Refused are
+    # outputs that are inputs, or another output, or whose place cannot take them: better now than after a long
+    # calculation.
     try:
         for given in read.values():
             for value in given if isinstance(given, list) else [given]:

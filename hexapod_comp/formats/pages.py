@@ -22,11 +22,8 @@ if TYPE_CHECKING:
 
 TEMPLATES = Path(__file__).resolve().parents[1] / "templates"
 
-RESOLUTION = 110
-"""Of embedded pictures, dots per inch."""
-
-LONGEST_CELL, LONGEST_TEXT = 300, 2000
-"""Of a text in a table, and of any other; longer ones end in …"""
+RESOLUTION = 110  # of embedded pictures, dots per inch
+LONGEST_CELL, LONGEST_TEXT = 300, 2000  # of a text in a table, and of any other; longer ones end in …
 
 
 def render(template: str | Path, **values: Any) -> str:

@@ -15,26 +15,18 @@ from ..errors import InputFileError
 
 PACKAGE = "hexapod_comp"
 
-FORMAT = re.compile(r"^format: hexapod_comp/(\w+)", re.MULTILINE)
-"""What a YAML file says that it is."""
+FORMAT = re.compile(r"^format: hexapod_comp/(\w+)", re.MULTILINE)  # what a YAML file says that it is
 
+# Kinds of files that go by their suffixes; all others are YAML files that say what they are
 SUFFIXES = {"poses": (".csv",), "lengths": (".csv",), "readings": (".csv",)}
-"""Kinds of files that go by their suffixes; all others are YAML files that say what they are."""
 
+# What stands in the header of CSV files of a kind
 COLUMNS = {"poses": re.compile(r'(?:^|[",;\t])\s*x_'), "lengths": re.compile(r'(?:^|[",;\t])\s*L1_')}
-"""What stands in the header of CSV files of a kind."""
 
-NUMBERS = re.compile(r"[-+.\d]+(,[-+.\d]+)+")
-"""What was meant to be read as it stands, not a file's name."""
-
-TYPED = {"poses": "--pose", "lengths": "--lengths"}
-"""Options that take what files of a kind hold."""
-
-MOST_LISTED = 12
-"""Names in a message about a file that is missing."""
-
-MOST_LOOKED_AT = 500
-"""Files of a folder that are looked into for those of a kind."""
+NUMBERS = re.compile(r"[-+.\d]+(,[-+.\d]+)+")  # what was meant to be read as it stands, not a file's name
+TYPED = {"poses": "--pose", "lengths": "--lengths"}  # options that take what files of a kind hold
+MOST_LISTED = 12  # names in a message about a file that is missing
+MOST_LOOKED_AT = 500  # files of a folder that are looked into for those of a kind
 
 
 def config_file(name: str | os.PathLike[str], kind: str = "", beside: bool = False) -> Path:
@@ -70,11 +62,9 @@ def confined_file(name: str | os.PathLike[str], folder: Path | None, kind: str =
 
 
 def confined_opener(folder: Path | None) -> Callable[[str, int], int]:
-    """Return what opens a file for Python's ``open`` only where :func:`confined_file` finds it.
-
-    Between the look at a name and its opening the file may be replaced, by a pipe or by a link that leads elsewhere. So
-    nothing is waited for, and what counts is the open file.
-    """
+    """Return what opens a file for Python's ``open`` only where :func:`confined_file` finds it."""
+    # Between the look at a name and its opening the file may be replaced, by a pipe or by a link that leads elsewhere.
+    # So nothing is waited for, and what counts is the open file.
 
     def opened(path: str, flags: int) -> int:
         descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_NOCTTY)
@@ -133,12 +123,10 @@ def _is_a(path: Path, kind: str) -> bool:
 
 @cache
 def config_folder() -> Path:
-    """Return the folder of the shipped configuration files.
-
-    It is sought from this file upwards, so it always belongs to the code that runs: ``config`` beside
-    the package in a source tree (also with an editable or symlinked installation), else
-    ``share/hexapod_comp/config`` in the prefix into which pip or colcon installed both.
-    """
+    """Return the folder of the shipped configuration files."""
+    # It is sought from this file upwards, so it always belongs to the code that runs: `config` beside the package in a
+    # source tree (also with an editable or symlinked installation), else `share/hexapod_comp/config` in the prefix into
+    # which pip or colcon installed both.
     package = Path(__file__).resolve().parents[1]
     if (package.parent / "package.xml").is_file():
         return package.parent / "config"

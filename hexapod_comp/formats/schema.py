@@ -36,9 +36,10 @@ import numpy as np
 from ..errors import GeometryError, InputFileError
 from .texts import number_hint
 
+# Keys looked through for the one that a misspelt key may mean: in a hostile file that would take minutes
 MOST_NEIGHBOURS = 1000
-"""Keys looked through for the one that a misspelt key may mean: in a hostile file that would take minutes."""
 
+# Unit suffixes per kind of quantity, and their size in SI (temperatures stay in degrees Celsius)
 UNITS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "in": 0.0254},
     "angle": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": np.pi / 180.0, "arcsec": np.pi / 648000.0},
@@ -52,22 +53,15 @@ UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3},
     "pressure": {"Pa": 1.0, "hPa": 1e2, "kPa": 1e3},
 }
-"""Unit suffixes per kind of quantity, and their size in SI (temperatures stay in degrees Celsius)."""
 
-DIMENSIONS = {unit: dimension for dimension, units in UNITS.items() for unit in units}
-"""Kind of quantity of each unit."""
+DIMENSIONS = {unit: dimension for dimension, units in UNITS.items() for unit in units}  # kind of quantity of each unit
+LARGEST = 1e12  # no number of a file is larger, in whatever unit: products of several stay finite
 
-LARGEST = 1e12
-"""No number of a file is larger, in whatever unit: products of several stay finite."""
-
+# They look alike, and either may be on a keyboard: both stand for the u of um and urad
 MICROS = "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"
-"""They look alike, and either may be on a keyboard: both stand for the u of um and urad."""
 
-PER_STRUT = "per strut"
-"""Shape of six numbers that may be given as one for all."""
-
-Shape = tuple[int | None, ...]
-"""Lengths of an array's axes; None leaves one free."""
+PER_STRUT = "per strut"  # shape of six numbers that may be given as one for all
+Shape = tuple[int | None, ...]  # lengths of an array's axes; None leaves one free
 
 
 @cache
@@ -78,10 +72,8 @@ def spellings(dimension: str) -> dict[str, float]:
 
 
 def in_si(values: Any, factor: float) -> Any:
-    """Return numbers in SI from their unit's size, moving the decimal point where that is all there is to do.
-
-    So 12.3 µm in a file is the very float that 12.3e-6 is in source code, not its neighbour.
-    """
+    """Return numbers in SI from their unit's size, moving the decimal point where that is all there is to do."""
+    # So 12.3 µm in a file is the very float that 12.3e-6 is in source code, not its neighbour.
     digits = round(math.log10(factor))
     if digits == 0 or 10.0**digits != factor:
         return values * factor

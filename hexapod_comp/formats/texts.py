@@ -14,11 +14,11 @@ from typing import Any, TextIO
 
 from ..errors import InputFileError
 
+# What a terminal obeys instead of showing it: all control characters but tab and line break, changes of direction
 CODES = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
-"""What a terminal obeys instead of showing it: all control characters but tab and line break, changes of direction."""
 
+# Exit codes where output cannot be written, and where its reader has gone: 128 + signal, as shells count
 UNWRITABLE, BROKEN_PIPE = 2, 141
-"""Exit codes where output cannot be written, and where its reader has gone: 128 + signal, as shells count."""
 
 
 def number(value: float, digits: int) -> str:
@@ -35,12 +35,11 @@ def plain_number(text: str) -> float:
     return value if math.isfinite(value) and text.isascii() and "_" not in text else math.nan
 
 
-DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
-"""A number as much of the world writes it."""
+DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")  # a number as much of the world writes it
 
 
+# A number whose comma may be a decimal one, or stand between thousands
 THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
-"""A number whose comma may be a decimal one, or stand between thousands."""
 
 
 def number_hint(text: str) -> str:
@@ -61,8 +60,8 @@ def _micro(error: UnicodeError) -> tuple[str, int]:
     raise error
 
 
+# Handler of decoding errors: UTF-8 in which a micro sign may be that of Windows-1252
 MICRO_ERRORS = "hexapod_comp_micro"
-"""Handler of decoding errors: UTF-8 in which a micro sign may be that of Windows-1252."""
 
 codecs.register_error(MICRO_ERRORS, _micro)
 
@@ -78,11 +77,10 @@ def aligned(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 class PlainStream:
-    """A text stream that shows codes for the terminal in place of obeying them, in any encoding.
+    """A text stream that shows codes for the terminal in place of obeying them, in any encoding."""
 
-    What is printed may quote files and arguments: names of machines, of runs, labels. When it cannot be written, it
-    goes nowhere from then on, so that nothing complains again at the program's end.
-    """
+    # What is printed may quote files and arguments: names of machines, of runs, labels. When it cannot be written, it
+    # goes nowhere from then on, so that nothing complains again at the program's end.
 
     def __init__(self, stream: TextIO | None, needed: bool) -> None:
         self.terminal = stream or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - as long as the process

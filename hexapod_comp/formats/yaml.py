@@ -12,15 +12,15 @@ from ..errors import InputFileError, shorten
 from .files import read_text
 from .schema import Section
 
+# Deeper nested YAML is refused: a model needs five levels, and the parser's own stack ends at some thousand
 MAX_DEPTH = 32
-"""Deeper nested YAML is refused: a model needs five levels, and the parser's own stack ends at some thousand."""
 
+# YAML of more values, keys and lists is refused: each takes 10 µs and 600 bytes. A field of 20 × 20 lines along each
+# axis, forward and backward, with six polynomials of the fifth order, has 120,000.
 MAX_NODES = 200_000
-"""YAML of more values, keys and lists is refused: each takes 10 µs and 600 bytes. A field of 20 × 20 lines along each
-axis, forward and backward, with six polynomials of the fifth order, has 120,000."""
 
+# Numbers that YAML 1.1 takes for something else than people do: 0400 is 256, 1:30 is 90, 0x10 is 16
 AMBIGUOUS_NUMBER = re.compile(r"[-+]?0[0-9A-Za-z]|.*[:_]")
-"""Numbers that YAML 1.1 takes for something else than people do: 0400 is 256, 1:30 is 90, 0x10 is 16."""
 
 
 class _StrictLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -102,11 +102,9 @@ def yaml_content(text: str, name: str | Path, most_nodes: int = MAX_NODES) -> An
 
 
 def _refuse_tricks(text: str, most_nodes: int) -> None:
-    """Raise on what lets a short file stand for something else, before anything is made of it.
-
-    Nested references (``*name``) stand for more values than memory holds, and so do short lists; nesting overflows the
-    parser's stack and ends the process, a tag (``!!float``) makes the loader read a value as another type.
-    """
+    """Raise on what lets a short file stand for something else, before anything is made of it."""
+    # Nested references (`*name`) stand for more values than memory holds, and so do short lists; nesting overflows the
+    # parser's stack and ends the process, a tag (`!!float`) makes the loader read a value as another type.
     depth = nodes = 0
     for event in yaml.parse(text, Loader=_StrictLoader):
         if isinstance(event, yaml.AliasEvent):
@@ -121,8 +119,7 @@ def _refuse_tricks(text: str, most_nodes: int) -> None:
             raise _complaint(f"is nested more than {MAX_DEPTH} deep", event)
 
 
-LONGEST_LINE = 2**30
-"""Characters: LibYAML, unlike PyYAML's own writer, takes no infinity."""
+LONGEST_LINE = 2**30  # characters: LibYAML, unlike PyYAML's own writer, takes no infinity
 
 
 class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]

@@ -53,8 +53,8 @@ timeout | 0.1 | 0.001 to 3600 s | always | without an accepted correction for th
 on_loss | zero | zero, hold | configure | then ramp the corrections to `zero`, or `hold` them
 """)
 
+# Commanded axes, and the tool length that LinuxCNC's kinematics take off them
 AXES = ("x", "y", "z", "a", "b", "c", "tool-offset")
-"""Commanded axes, and the tool length that LinuxCNC's kinematics take off them."""
 
 FEEDBACK = tuple(f"joint-fb.{n}" for n in range(6))
 SWITCHES = ("machine-on", "enable")
@@ -90,11 +90,10 @@ PROGRAM = Program(
     "-p units:=inch",
 )
 
+# Time that one update may ramp for, s: a process that was stopped for longer goes on, it does not catch up
 LONGEST_STEP = 0.02
-"""Time that one update may ramp for, s: a process that was stopped for longer goes on, it does not catch up."""
 
-ON_LOSS = ("zero", "hold")
-"""What the output may do when corrections stop coming: ramp to zero, or stay where it is."""
+ON_LOSS = ("zero", "hold")  # what the output may do when corrections stop coming: ramp to zero, or stay where it is
 
 ZERO = (0.0,) * 6
 
@@ -102,18 +101,12 @@ ZERO = (0.0,) * 6
 class GuardStatus(IntEnum):
     """What the output is doing."""
 
-    OFF = 0
-    """Not enabled, at zero."""
-    RAMPING = 1
-    """On its way to the newest correction."""
-    COMPENSATING = 2
-    """At the newest correction."""
-    HOLDING = 3
-    """Corrections have stopped coming; it stays."""
-    RETURNING = 4
-    """On its way to zero: corrections have stopped coming, or it is not enabled."""
-    WAITING = 5
-    """Enabled, at zero: no corrections are coming, yet or any more."""
+    OFF = 0  # not enabled, at zero
+    RAMPING = 1  # on its way to the newest correction
+    COMPENSATING = 2  # at the newest correction
+    HOLDING = 3  # corrections have stopped coming; it stays
+    RETURNING = 4  # on its way to zero: corrections have stopped coming, or it is not enabled
+    WAITING = 5  # enabled, at zero: no corrections are coming, yet or any more
 
 
 class CorrectionGuard:
@@ -271,22 +264,20 @@ class BridgeStatus:
         }
 
 
+# A compensator that has been lost for so long is asked to start anew, s: it has forgotten its feedback by then
 RESET_AFTER = 0.15
-"""A compensator that has been lost for so long is asked to start anew, s: it has forgotten its feedback by then."""
 
-RESET_PERIOD = 0.5
-"""The compensator is asked to start anew no more often than this, s."""
+RESET_PERIOD = 0.5  # the compensator is asked to start anew no more often than this, s
 
+# The compensator's last diagnostics tell how it is for so long, s: it sends some every second
 COMPLAINT_COUNTS_FOR = 1.2
-"""The compensator's last diagnostics tell how it is for so long, s: it sends some every second."""
 
 
 class CompensatorReset:
-    """Calls ``compensator/reset`` when it helps.
+    """Calls ``compensator/reset`` when it helps."""
 
-    Only a compensator that complains is asked: requests to one that is stopped get lost, and DDS then keeps back those
-    that follow for seconds.
-    """
+    # Only a compensator that complains is asked: requests to one that is stopped get lost, and DDS then keeps back
+    # those that follow for seconds.
 
     def __init__(self, node: MachineNode, status: BridgeStatus, options: dict[str, Any]) -> None:
         self._node, self._status, self._options = node, status, options
@@ -351,23 +342,15 @@ class StopInput:
         self._beat_at = time.monotonic()
 
 
-GUARDED = ("limit", "ramp_rate", "timeout", "on_loss")
-"""The guard's parameters."""
+GUARDED = ("limit", "ramp_rate", "timeout", "on_loss")  # the guard's parameters
+CHECK_PERIOD = 0.05  # how often the node looks whether its state has changed, s
+NEVER = 1e9  # what the pin `age` shows before the first correction, s
+STANDING = 2e-3  # struts slower than this stand, m/s: no drive lags behind by more than some micrometres then
 
-CHECK_PERIOD = 0.05
-"""How often the node looks whether its state has changed, s."""
-
-NEVER = 1e9
-"""What the pin ``age`` shows before the first correction, s."""
-
-STANDING = 2e-3
-"""Struts slower than this stand, m/s: no drive lags behind by more than some micrometres then."""
-
+# No axis stands beyond this, in LinuxCNC's units or degrees; and nothing made of such numbers overflows
 LARGEST_PIN = 1e6
-"""No axis stands beyond this, in LinuxCNC's units or degrees; and nothing made of such numbers overflows."""
 
-LONGEST_FAREWELL = 1.0
-"""Corrections that can be ramped out within this time are, before the process ends, s."""
+LONGEST_FAREWELL = 1.0  # corrections that can be ramped out within this time are, before the process ends, s
 
 
 class LinuxcncBridgeNode(MachineNode):
@@ -511,12 +494,10 @@ class LinuxcncBridgeNode(MachineNode):
             self._sent.tick(now)
 
     def _send_states(self, feedback: Sequence[float], stamp: Time, now: float) -> None:
-        """Publish measured struts; while no corrections come, only when they stand.
-
-        A compensator starts from the measured struts, and takes their way to its commands for a correction to be
-        ramped out. Moving struts lag: one that starts while they move is better left without them, unless it cannot
-        start where it was told to be last.
-        """
+        """Publish measured struts; while no corrections come, only when they stand."""
+        # A compensator starts from the measured struts, and takes their way to its commands for a correction to be
+        # ramped out. Moving struts lag: one that starts while they move is better left without them, unless it cannot
+        # start where it was told to be last.
         out, since = self._states_out, self._states.age(now)
         self._states.tick(now)
         followed = since < self._options["timeout"]

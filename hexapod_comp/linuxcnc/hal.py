@@ -26,14 +26,9 @@ from typing import Any
 
 from ..errors import HexapodError
 
-DEBIAN_PACKAGES = Path("/usr/lib/python3/dist-packages")
-"""Where Debian's LinuxCNC puts its Python modules."""
-
-METRES = {"mm": 1e-3, "inch": 0.0254}
-"""LinuxCNC's length units, m."""
-
-COUNTS = 2**32
-"""A u32 pin goes on from zero after this many."""
+DEBIAN_PACKAGES = Path("/usr/lib/python3/dist-packages")  # where Debian's LinuxCNC puts its Python modules
+METRES = {"mm": 1e-3, "inch": 0.0254}  # LinuxCNC's length units, m
+COUNTS = 2**32  # a u32 pin goes on from zero after this many
 
 
 class HalError(HexapodError):
@@ -184,8 +179,7 @@ def _half(degrees: float) -> tuple[float, float]:
 
 LIBRARY = "liblinuxcnchal.so.0"
 
-ROW = re.compile(r"^\s*(\d+)\s+User\s+(\S+)\s+(\d+)\s", re.MULTILINE)
-"""``halcmd show comp``: number, type, name, process."""
+ROW = re.compile(r"^\s*(\d+)\s+User\s+(\S+)\s+(\d+)\s", re.MULTILINE)  # `halcmd show comp`: number, type, name, process
 
 
 def dead_components(listing: str, name: str) -> list[int]:

@@ -44,8 +44,7 @@ PINS = (
     *pins("out", "bit", "valid"),
 )
 
-HEARD_WITHIN = 0.1
-"""Longest sleep, s: how soon a signal ends the component."""
+HEARD_WITHIN = 0.1  # longest sleep, s: how soon a signal ends the component
 
 
 class WatchedMachine:

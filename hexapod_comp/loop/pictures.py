@@ -19,14 +19,11 @@ from .story import Calibration
 
 matplotlib.rcParams.update({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3})
 
+# The two passes with their colours, red and blue as every eye tells them apart, and markers
 SIDES = ((0, WITHOUT, "o"), (1, WITH, "D"))
-"""The two passes with their colours, red and blue as every eye tells them apart, and markers."""
 
-FLOOR = 0.01
-"""Lower end of the error axes, µm: a tenth of the drives' steps."""
-
-DRAWN_DEVIATION = 0.04
-"""The path's deviation without compensation is drawn as this share of its width."""
+FLOOR = 0.01  # lower end of the error axes, µm: a tenth of the drives' steps
+DRAWN_DEVIATION = 0.04  # the path's deviation without compensation is drawn as this share of its width
 
 
 def session_figure(

@@ -21,16 +21,13 @@ DOMAINS = range(1, 102)
 RESERVED_OFFSET = 5
 FIRST_PARTICIPANT_OFFSET = 10
 
-STOP_TIMEOUT = 5.0
-"""A process that has not ended this long after SIGTERM is killed, s."""
+STOP_TIMEOUT = 5.0  # a process that has not ended this long after SIGTERM is killed, s
 
 
 def reserve_domain() -> tuple[int, socket.socket]:
-    """Return a free ROS domain id and the socket that keeps it reserved while it is open.
-
-    The socket takes a port that belongs to the domain and that DDS leaves unused, so a second session
-    on this machine goes elsewhere, and the system frees it even after a crash.
-    """
+    """Return a free ROS domain id and the socket that keeps it reserved while it is open."""
+    # The socket takes a port that belongs to the domain and that DDS leaves unused, so a second session on this machine
+    # goes elsewhere, and the system frees it even after a crash.
     start = os.getpid() % len(DOMAINS)
     for domain in (*DOMAINS[start:], *DOMAINS[:start]):
         base = 7400 + 250 * domain
@@ -57,10 +54,9 @@ def _bind(port: int) -> socket.socket | None:
 
 
 class PrivateDomain:
-    """Context manager: this process and its children see no other ROS domain, and nobody sees theirs.
+    """Context manager: this process and its children see no other ROS domain, and nobody sees theirs."""
 
-    A demonstration that spoke in the user's own domain could move a real machine.
-    """
+    # A demonstration that spoke in the user's own domain could move a real machine.
 
     def __enter__(self) -> int:
         self._before = dict(os.environ)
@@ -123,10 +119,8 @@ class NodeProcess:
         return self.log.read_text(encoding="utf-8", errors="replace") if self.log.exists() else ""
 
     def stop(self) -> tuple[int, str]:
-        """End the process with SIGTERM; return its exit code and all it printed. Kill it when it does not listen.
-
-        Not SIGINT: a shell's background jobs ignore that until the node has set its own handler.
-        """
+        """End the process with SIGTERM; return its exit code and all it printed. Kill it when it does not listen."""
+        # Not SIGINT: a shell's background jobs ignore that until the node has set its own handler.
         if self._process.poll() is None:
             self.send(signal.SIGTERM)
         try:

@@ -18,11 +18,10 @@ if TYPE_CHECKING:
     pass
 
 
-FEWEST_ALIGNED = 6
-"""A datum takes six numbers away, two poses' worth: from fewer poses hardly anything would be left."""
+FEWEST_ALIGNED = 6  # a datum takes six numbers away, two poses' worth: from fewer poses hardly anything would be left
 
+# A computer is called busy when more of its answers are late, or when its processes wait for more of the time
 LATE_SHARE, WAITED_SHARE = 0.02, 0.2
-"""A computer is called busy when more of its answers are late, or when its processes wait for more of the time."""
 
 
 @dataclass
@@ -136,11 +135,9 @@ class SessionResult:
         return replace(self, poses=[record.seen_from(frame) for record in self.poses], path=path)
 
     def aligned(self) -> SessionResult | None:
-        """Return the same once the datum is aligned: each pass by the rigid motion that fits its poses best.
-
-        A path is moved by its pass's poses, as a workpiece whose zero was set by them. None with fewer than
-        :data:`FEWEST_ALIGNED` poses, with poses in a line, or when nobody told where the tool was.
-        """
+        """Return the same once the datum is aligned: each pass by the rigid motion that fits its poses best."""
+        # A path is moved by its pass's poses, as a workpiece whose zero was set by them. None with fewer than
+        # FEWEST_ALIGNED poses, with poses in a line, or when nobody told where the tool was.
         before = _datum(self.poses, [record.true_without for record in self.poses])
         after = _datum(self.poses, [record.true_with for record in self.poses])
         if after is None:
@@ -177,8 +174,8 @@ def pose_error(target: Pose, actual: Pose | None) -> tuple[float, float] | None:
     return distance, rotation_angle(target.rotation.T @ actual.rotation)
 
 
+# How a tool error is taken: where the machine stands, or less the one rigid motion that a new zero takes up
 AS_IT_IS, ALIGNED = "as it is", "datum aligned"
-"""How a tool error is taken: where the machine stands, or less the one rigid motion that a new zero takes up."""
 
 
 @dataclass(frozen=True)

@@ -31,13 +31,12 @@ if TYPE_CHECKING:
     from ..ros.client import LoopClient, Sent
 
 
+# Longest wait for both nodes, s: they start in under three seconds, on a busy computer in twenty
 CONNECT_TIMEOUT = 60.0
-"""Longest wait for both nodes, s: they start in under three seconds, on a busy computer in twenty."""
 
 SETTLE_TIMEOUT = 5.0
 
-MOVE_FEED = 0.25
-"""Largest tool speed between poses, m/s; on most machines the struts' speed limits it first."""
+MOVE_FEED = 0.25  # largest tool speed between poses, m/s; on most machines the struts' speed limits it first
 
 
 @contextmanager
@@ -222,13 +221,12 @@ def _count(client: LoopClient, result: SessionResult) -> None:
             result.refusals[key.removeprefix("refused.")] = int(value)
 
 
-RATES = (1.0, 1000.0)
-"""Commands per second that make sense over DDS from Python, Hz."""
+RATES = (1.0, 1000.0)  # commands per second that make sense over DDS from Python, Hz
 
 
+# What a simulated machine's compensator lets pass, m and s: drives and clocks are sound, but wait for a processor at
+# times, and the usual 2 mm are 20 ms of that
 PATIENCE = {"following_error_limit": 0.02, "max_command_age": 5.0}
-"""What a simulated machine's compensator lets pass, m and s: drives and clocks are sound, but wait for a processor at
-times, and the usual 2 mm are 20 ms of that."""
 
 
 def checked_rate(rate: float) -> float:
@@ -279,10 +277,8 @@ def witnessed(
     compare: bool,
     namespace: str = "",
 ) -> SessionResult:
-    """Run poses of the work frame and a path in ``base`` through the loop, with a progress bar.
-
-    The result is in the work frame, as the user's file has it; the nodes are told, and tell, ``base``.
-    """
+    """Run poses of the work frame and a path in ``base`` through the loop, with a progress bar."""
+    # The result is in the work frame, as the user's file has it; the nodes are told, and tell, `base`.
     client = _client(namespace)
     try:
         connect(client, nodes)

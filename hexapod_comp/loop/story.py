@@ -33,38 +33,29 @@ from ..workspace.reach import machine_box
 from .report import ALIGNED, ErrorRow, PathRecord, PoseRecord, SessionResult, Track, error_rows
 from .session import MOVE_FEED
 
-LONGEST_SIDE = 0.2
-"""Longest side of the measured box, m: what the demonstration crosses in two seconds."""
+LONGEST_SIDE = 0.2  # longest side of the measured box, m: what the demonstration crosses in two seconds
+PROPORTIONS = np.array([1.0, 1.0, 0.5])  # sides of that box to each other, along x, y and z of the work frame
 
-PROPORTIONS = np.array([1.0, 1.0, 0.5])
-"""Sides of that box to each other, along x, y and z of the work frame."""
-
+# Distances of the grid's lines, and of the readings along them, as shares of the longest side
 LINES_APART, READINGS_APART = 0.25, 0.0625
-"""Distances of the grid's lines, and of the readings along them, as shares of the longest side."""
 
-FEWEST_STEPS = 8
-"""Readings stand so close that the shortest side has as many steps: polynomials along it need nine."""
+FEWEST_STEPS = 8  # readings stand so close that the shortest side has as many steps: polynomials along it need nine
+POSES = 12  # held-out poses of the measured box
 
-POSES = 12
-"""Held-out poses of the measured box."""
-
+# Largest side of the milled figure, m, and the time that a side takes at full speed, s: as slow as the drives need
 PATH_SIDE, PATH_TIME = 0.018, 0.9
-"""Largest side of the milled figure, m, and the time that a side takes at full speed, s: as slow as the drives need."""
 
-ON_PATH = 150
-"""Places of a path for which a promise is worked out."""
+ON_PATH = 150  # places of a path for which a promise is worked out
 
+# What the drives leave over DDS, where no command comes on time to the millisecond, over what they leave without
 DRIVES = 2.0
-"""What the drives leave over DDS, where no command comes on time to the millisecond, over what they leave without."""
 
-EXACT = ((0.0, 0.0), (0.0, 0.0))
-"""What the true model promises: drives apart, nothing is left."""
+EXACT = ((0.0, 0.0), (0.0, 0.0))  # what the true model promises: drives apart, nothing is left
 
 REMARK = """as it is: with where the machine stands as a whole. Laser lines cannot see that, and a workpiece zero set
 with the model on takes it up. Datum aligned: less the one rigid motion that such a zero makes."""
 
-REST = 0.3
-"""The machine is given so long to come to rest, s: sixty of the drives' lags."""
+REST = 0.3  # the machine is given so long to come to rest, s: sixty of the drives' lags
 
 
 @dataclass(frozen=True)
@@ -195,11 +186,9 @@ def demo_path(geometry: HexapodGeometry, place: Place, rate: float) -> Path:
 
 
 def promises(fit: ModelFit, poses: Sequence[Pose], path: Path) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return between what the tool's RMS error lies at rest and along a path, m, with 95 %, the datum aligned.
-
-    As the fit's own expected tool error, at these very poses and with their own datum instead of the whole box's. Along
-    the path only what is across it counts.
-    """
+    """Return between what the tool's RMS error lies at rest and along a path, m, with 95 %, the datum aligned."""
+    # As the fit's own expected tool error, at these very poses and with their own datum instead of the whole box's.
+    # Along the path only what is across it counts.
     geometry, space = fit.space.geometry, fit.space
     in_base = [geometry.work @ pose for pose in poses]
     at = np.linspace(1, len(path) - 1, ON_PATH).astype(int)

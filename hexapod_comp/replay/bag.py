@@ -30,41 +30,34 @@ from .storage import Allowance, Message, UnpackingError, cut_off, messages, refu
 
 POSE, STRUTS, TEXT = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState", "std_msgs/msg/String"
 
+# A machine's topics in its namespace that are shown, and their types
 TOPICS = {
     "strut_states": STRUTS,
     "tool_pose_estimate": POSE,
     "tool_pose_true": POSE,
 }
-"""A machine's topics in its namespace that are shown, and their types."""
 
-COMMANDS = "tool_pose_command"
-"""Topic of commands: counted, not read. What the compensator took, its journal says."""
-
-JOURNAL, FILES = "/journal", "/files"
-"""How the topics of a compensator's journal end, after the node's name."""
+COMMANDS = "tool_pose_command"  # topic of commands: counted, not read. What the compensator took, its journal says.
+JOURNAL, FILES = "/journal", "/files"  # how the topics of a compensator's journal end, after the node's name
 
 METADATA = "metadata.yaml"
 
 STORAGE = (".mcap", ".db3")
 
+# Bytes and YAML nodes of a bag's metadata: a topic has some fifty nodes, and so have ten of the files that a long
+# recording is split into
 MOST_METADATA, MOST_NODES = 4 * MEGABYTE, 100_000
-"""Bytes and YAML nodes of a bag's metadata: a topic has some fifty nodes, and so have ten of the files that a long
-recording is split into."""
 
 CUT_OFF = (
     "it has no end, as when the recorder is killed; `mcap recover FILE --output NEW.mcap` makes a whole file of it"
 )
 
-SPARE = 4
-"""Bytes that some writers leave behind a message."""
-
-MOST_FRAMES = 256
-"""A command's frame is a number of one byte."""
+SPARE = 4  # bytes that some writers leave behind a message
+MOST_FRAMES = 256  # a command's frame is a number of one byte
 
 RECORD = "record at least compensator/journal and compensator/files"
 
-IDEAL = IDEAL_SOURCE.sha256
-"""Hash of the model that is none."""
+IDEAL = IDEAL_SOURCE.sha256  # hash of the model that is none
 
 
 @dataclass(frozen=True)
@@ -181,10 +174,8 @@ def read_recording(
 
 
 def _typestore() -> Any:
-    """Return rosbags' message types, with a clear word where it is missing.
-
-    These types have been the same since they exist: the definitions in the bag, if any, are not needed.
-    """
+    """Return rosbags' message types, with a clear word where it is missing."""
+    # These types have been the same since they exist: the definitions in the bag, if any, are not needed.
     try:
         from rosbags import typesys
     except ImportError as error:
@@ -260,11 +251,9 @@ def _messages(path: Path, files: list[Path], packing: str, size: int) -> Iterato
 
 
 def _unreadable(path: Path, file: Path | None, error: Exception, key: str = "") -> InputFileError:
-    """Return the error for what is raised on damaged bytes.
-
-    That is whatever the parts of a file happen to raise: struct.error, KeyError, errors of two decompressors and of a
-    database, of rosbags; hence ``except Exception`` where it is called.
-    """
+    """Return the error for what is raised on damaged bytes."""
+    # That is whatever the parts of a file happen to raise: struct.error, KeyError, errors of two decompressors and of a
+    # database, of rosbags; hence `except Exception` where it is called.
     if isinstance(error, UnpackingError):
         return InputFileError(path, key, str(error))
     text = " ".join(str(part) for part in error.args) or type(error).__name__

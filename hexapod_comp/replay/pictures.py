@@ -19,8 +19,7 @@ EVENT_COLOURS = {
     "reset": "#555555",
 }  # fmt: skip
 
-MOST_LABELS = 12
-"""More changes than this are drawn without their names."""
+MOST_LABELS = 12  # more changes than this are drawn without their names
 
 
 def write_pictures(report: Report, geometry: HexapodGeometry | None, folder: str | Path) -> list[Path]:

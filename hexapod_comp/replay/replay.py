@@ -19,12 +19,11 @@ from ..machine.geometry import HexapodGeometry
 from ..machine.model import MachineModel
 from .bag import Files, Recording
 
+# What came of an answer: the same bits; others; not replayed because the recorder has lost a page before it; not
+# replayed because no snapshot lies before it
 IDENTICAL, DIFFERENT, LOST, BEFORE = range(4)
-"""What came of an answer: the same bits; others; not replayed because the recorder has lost a page before it; not
-replayed because no snapshot lies before it."""
 
-Progress = Callable[[int], object]
-"""Called with the number of answers just compared."""
+Progress = Callable[[int], object]  # called with the number of answers just compared
 
 
 @dataclass(frozen=True)
@@ -120,11 +119,9 @@ def replay_recording(
 def what_if(
     recording: Recording, geometry: HexapodGeometry, model: MachineModel, progress: Progress = lambda commands: None
 ) -> Replay:
-    """Run the recorded commands through another model, or another geometry.
-
-    Temperatures, humidity, switching and starts are those of the recording; its own models are not. The corrections
-    begin at the other model's: nothing ramps. All answers are run; nothing is left out after lost pages.
-    """
+    """Run the recorded commands through another model, or another geometry."""
+    # Temperatures, humidity, switching and starts are those of the recording; its own models are not. The corrections
+    # begin at the other model's: nothing ramps. All answers are run; nothing is left out after lost pages.
     run = _Run(recording, progress)
     compensator = Compensator(geometry, model)
     compensator.restore(_begin(compensator, recording.first))

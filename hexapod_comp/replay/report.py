@@ -18,19 +18,18 @@ from ..pose import Pose
 from .bag import Recording
 from .replay import BEFORE, DIFFERENT, IDENTICAL, LOST, Event, Replay
 
+# Names of outcomes in CSV and JSON
 OUTCOMES = {
     IDENTICAL: "identical",
     DIFFERENT: "different",
     LOST: "not replayed",
     BEFORE: "before the journal",
 }
-"""Names of outcomes in CSV and JSON."""
 
+# Differences below this, m, are those of another processor's or library's rounding, not of another model
 ROUNDING = 1e-12
-"""Differences below this, m, are those of another processor's or library's rounding, not of another model."""
 
-LONGEST_GAP = 0.1
-"""Between commands further apart, s, nobody can tell what the struts should have done."""
+LONGEST_GAP = 0.1  # between commands further apart, s, nobody can tell what the struts should have done
 
 
 @dataclass
@@ -199,10 +198,8 @@ def _figures(report: Report) -> Iterator[str]:
 
 
 def tool_distances(report: Report) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
-    """Yield by how much the tool was off its path: a topic, distances as they are, and with the datum aligned, m.
-
-    A late tool is not off. The second is None where the tool moved in a line or not at all.
-    """
+    """Yield by how much the tool was off its path: a topic, distances as they are, and with the datum aligned, m."""
+    # A late tool is not off. The second is None where the tool moved in a line or not at all.
     when = report.seconds
     if report.work_frames is None or len(when) < 2:
         return

@@ -20,30 +20,27 @@ from zlib import crc32
 from ..errors import HexapodError
 from ..formats.files import MEGABYTE
 
-AT_ONCE = 128 * MEGABYTE
-"""Most bytes of one record, message or chunk; recorders make chunks of one to four MB."""
+AT_ONCE = 128 * MEGABYTE  # most bytes of one record, message or chunk; recorders make chunks of one to four MB
 
+# A bag may unpack to this many bytes, and to this many more for each of its own. A machine that stands still, the same
+# lengths a thousand times a second, unpacks to thirty times the bag.
 FREE, RATIO = 256 * MEGABYTE, 100
-"""A bag may unpack to this many bytes, and to this many more for each of its own. A machine that stands still, the
-same lengths a thousand times a second, unpacks to thirty times the bag."""
 
+# First and last bytes of an MCAP file; a recorder that is killed does not write the last ones
 MCAP_MAGIC = b"\x89MCAP0\r\n"
-"""First and last bytes of an MCAP file; a recorder that is killed does not write the last ones."""
 
-SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 3, 4, 5, 6, 15
-"""Kinds of MCAP records that are read."""
+SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 3, 4, 5, 6, 15  # kinds of MCAP records that are read
 
+# Kind and length of a record; channel, number, recorder's time and publisher's time of a message
 HEAD, MESSAGE_HEAD = struct.Struct("<BQ"), struct.Struct("<HIQQ")
-"""Kind and length of a record; channel, number, recorder's time and publisher's time of a message."""
 
-KINDS = range(1, 16)
-"""All kinds that there are."""
+KINDS = range(1, 16)  # all kinds that there are
 
 LATEST = 1 << 63
 
+# Views, virtual tables and computed columns: they give rows that no file holds; no recorder writes any
 EXPANDING = """SELECT name FROM sqlite_master WHERE type = 'view' OR sql LIKE 'create virtual%'
 UNION SELECT m.name FROM sqlite_master m, pragma_table_xinfo(m.name) x WHERE m.type = 'table' AND x.hidden > 1"""
-"""Views, virtual tables and computed columns: they give rows that no file holds; no recorder writes any."""
 
 
 class UnpackingError(HexapodError):

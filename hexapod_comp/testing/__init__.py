@@ -18,16 +18,14 @@ if TYPE_CHECKING:
     from .bench import Bench
 
 
+# Fixtures whose tests leave nodes behind; add your own that make nodes without `hexapod_context`
 NODE_FIXTURES = {"hexapod_context"}
-"""Fixtures whose tests leave nodes behind; add your own that make nodes without ``hexapod_context``."""
 
 
 @pytest.fixture(scope="session")
 def hexapod_domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    """Keep a session's nodes on this computer, in a domain of their own, their logs in a temporary folder.
-
-    Yields the domain id. Processes that tests start inherit all of it through the environment.
-    """
+    """Keep a session's nodes on this computer, in a domain of their own, their logs in a temporary folder."""
+    # Yields the domain id. Processes that tests start inherit all of it through the environment.
     from ..formats.paths import config_file
     from ..loop.processes import reserve_domain
 
@@ -70,11 +68,9 @@ def private_context(domain: int) -> Iterator[Context]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Destroy what a test with ROS leaves behind before the next one starts.
-
-    rclpy's nodes are in reference cycles, and die when the collector runs. If that is while the next test's
-    nodes are being discovered, Fast DDS waits for a callback that waits for the GIL, for ever.
-    """
+    """Destroy what a test with ROS leaves behind before the next one starts."""
+    # rclpy's nodes are in reference cycles, and die when the collector runs. If that is while the next test's nodes are
+    # being discovered, Fast DDS waits for a callback that waits for the GIL, for ever.
     result = yield
     if not NODE_FIXTURES.isdisjoint(getattr(item, "fixturenames", ())):
         gc.collect()

@@ -77,8 +77,7 @@ TRANSITIONS = {
     "cleanup": Transition.TRANSITION_CLEANUP,
 }
 
-LOG_LINE = re.compile(r"\[\w+\] \[[\d.]+\] \[[\w.]+\]: (.*)")
-"""How ROS logs: [WARN] [time] [node]: text."""
+LOG_LINE = re.compile(r"\[\w+\] \[[\d.]+\] \[[\w.]+\]: (.*)")  # how ROS logs: [WARN] [time] [node]: text
 
 
 @dataclass
@@ -199,10 +198,8 @@ class Bench:
         spin_until(self.executor, condition, timeout, what)
 
     def barrier(self) -> None:
-        """Return when every node has handled what was sent to it before.
-
-        All events of a process pass one queue, so the answer to a question comes after them.
-        """
+        """Return when every node has handled what was sent to it before."""
+        # All events of a process pass one queue, so the answer to a question comes after them.
         for node in filter(_has_lifecycle, self.nodes):
             self.call(GetState, f"{node.get_name()}/get_state")
 
@@ -285,10 +282,8 @@ class Bench:
         return message
 
     def ask(self, pose: Pose | PoseStamped, frame_id: str = "base") -> Answer:
-        """Send one command and wait for its answer.
-
-        A pose that is refused as too old, since a busy computer had no time for it, is sent once more.
-        """
+        """Send one command and wait for its answer."""
+        # A pose that is refused as too old, since a busy computer had no time for it, is sent once more.
         began, too_old = time.monotonic(), self._too_old()
         message = self.send(pose, frame_id)
         self.until(
@@ -331,10 +326,8 @@ class Bench:
         return message_pose(self.seen["tool_pose_true"][-1])
 
     def feed(self, lengths: np.ndarray, names: tuple[str, ...] = STRUT_NAMES, later: float = 0.0) -> JointState:
-        """Publish measured struts, stamped now, or so many seconds from now, and return the message.
-
-        By a later stamp struts may have moved further since the last reading.
-        """
+        """Publish measured struts, stamped now, or so many seconds from now, and return the message."""
+        # By a later stamp struts may have moved further since the last reading.
         message = JointState(name=list(names), position=[float(v) for v in lengths], velocity=[0.0] * 6)
         message.header.stamp = self.stamp(later)
         self.publish("strut_states", message)
