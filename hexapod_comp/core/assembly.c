@@ -22,15 +22,14 @@ static double close_triangle(triangle *t, const double angles[3])
 {
     vec tangents[3];
     double cost = 0.0;
-    int i;
-    for (i = 0; i < 3; i++) {
+    for (int i = 0; i < 3; i++) {
         double c, s;
         const vec centre = row_of(t->circles[i][0]), p = row_of(t->circles[i][1]), q = row_of(t->circles[i][2]);
         sine_cosine(angles[i], &s, &c);
         t->points[i] = add(add(centre, scale(c, p)), scale(s, q));
         tangents[i] = subtract(scale(c, q), scale(s, p));
     }
-    for (i = 0; i < 3; i++) {
+    for (int i = 0; i < 3; i++) {
         const int j = (i + 1) % 3;
         const vec apart = subtract(t->points[i], t->points[j]);
         t->errors[i] = (dot(apart, apart) - t->sides[i] * t->sides[i]) / (2.0 * t->sides[i]);
@@ -65,13 +64,12 @@ static double settle(const double (*circles)[3][3], const double sides[3], doubl
     const double rounding = 2e-16 * (sides[0] + sides[1] + sides[2]);
     triangle t = {circles, sides, {{0.0, 0.0, 0.0}}, {0.0, 0.0, 0.0}, {{0.0}}};
     double cost = close_triangle(&t, angles), damping = 1e-6;
-    int count, i;
-    for (count = 0; count < MOST_STEPS && cost > rounding * rounding && damping <= 1e6; count++) {
+    for (int count = 0; count < MOST_STEPS && cost > rounding * rounding && damping <= 1e6; count++) {
         const vec step = damped_step(&t, damping);
         const double trial[3] = {angles[0] - step.x, angles[1] - step.y, angles[2] - step.z};
         const double next_cost = close_triangle(&t, trial);
         if (next_cost < cost) {
-            for (i = 0; i < 3; i++) {
+            for (int i = 0; i < 3; i++) {
                 angles[i] = trial[i];
             }
             cost = next_cost;
@@ -81,7 +79,7 @@ static double settle(const double (*circles)[3][3], const double sides[3], doubl
             close_triangle(&t, angles);
         }
     }
-    for (i = 0; i < 3; i++) {
+    for (int i = 0; i < 3; i++) {
         store(t.points[i], points + 3 * i);
     }
     return fmax(fabs(t.errors[0]), fmax(fabs(t.errors[1]), fabs(t.errors[2])));
@@ -92,8 +90,7 @@ static double settle(const double (*circles)[3][3], const double sides[3], doubl
 void hc_settle_many(const double *circles, const double *sides, size_t count, double *angles, double *points,
                     double *errors)
 {
-    size_t n;
-    for (n = 0; n < count; n++) {
+    for (size_t n = 0; n < count; n++) {
         errors[n] = settle((const double(*)[3][3])circles, sides, angles + 3 * n, points + 9 * n);
     }
 }

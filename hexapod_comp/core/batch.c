@@ -9,14 +9,10 @@ void hc_jacobian_many(const double *base, const double *platform, size_t count, 
                       const double *rotations, double *jacobians)
 {
     const double(*b)[3] = (const double(*)[3])base, (*t)[3] = (const double(*)[3])platform;
-    size_t n;
-    int i;
-    for (n = 0; n < count; n++) {
+    for (size_t n = 0; n < count; n++) {
         const hc_pose pose = pose_of(positions + 3 * n, rotations + 9 * n);
         const six_struts now = struts_of(b, t, &pose);
-        for (i = 0; i < 6; i++) {
-            jacobian_row(b[i], pose.position, now.strut[i], jacobians + 36 * n + 6 * (size_t)i);
-        }
+        fill_jacobian(b, &pose, &now, (double(*)[6])(jacobians + 36 * n));
     }
 }
 
@@ -25,8 +21,7 @@ void hc_condition_many(const double *base, const double *platform, size_t count,
                        const double *rotations, double characteristic_length, double *conditions, double *signs)
 {
     const double(*b)[3] = (const double(*)[3])base, (*t)[3] = (const double(*)[3])platform;
-    size_t n;
-    for (n = 0; n < count; n++) {
+    for (size_t n = 0; n < count; n++) {
         const hc_pose pose = pose_of(positions + 3 * n, rotations + 9 * n);
         const six_struts now = struts_of(b, t, &pose);
         conditions[n] = condition_at(b, &pose, &now, characteristic_length, &signs[n]);
@@ -40,9 +35,7 @@ void hc_motions_many(size_t count, const double *positions, const double *rotati
                      const double *to_rotations, const double *point, const double *axes, double *motions)
 {
     const vec t = row_of(point);
-    size_t n;
-    int k;
-    for (n = 0; n < count; n++) {
+    for (size_t n = 0; n < count; n++) {
         const hc_pose from = pose_of(positions + 3 * n, rotations + 9 * n);
         const hc_pose to = pose_of(to_positions + 3 * n, to_rotations + 9 * n);
         const mat r = three_rows(from.rotation), s = three_rows(to.rotation);
@@ -55,7 +48,7 @@ void hc_motions_many(size_t count, const double *positions, const double *rotati
                                  ? 0.5 * arc_tangent(sine, 1.0 - versine) / sine
                                  : 0.5 + sine * sine / 12.0; /* the series' next term is below 1e-17 */
         const vec turn_by = scale(share, twice);
-        for (k = 0; k < 3; k++) {
+        for (int k = 0; k < 3; k++) {
             const vec along_axis = vector(axes[k], axes[3 + k], axes[6 + k]);
             motions[(size_t)k * count + n] = dot(along_axis, shift);
             motions[(size_t)(3 + k) * count + n] = dot(along_axis, turn_by);
@@ -68,12 +61,10 @@ void hc_screw_twists(const double *base, const double *platform, const double *b
                      size_t count, const double *positions, const double *rotations, double *twists)
 {
     const double(*b)[3] = (const double(*)[3])base, (*t)[3] = (const double(*)[3])platform;
-    size_t n;
-    int i;
-    for (n = 0; n < count; n++) {
+    for (size_t n = 0; n < count; n++) {
         const hc_pose pose = pose_of(positions + 3 * n, rotations + 9 * n);
         const six_struts now = struts_of(b, t, &pose);
-        for (i = 0; i < 6; i++) {
+        for (int i = 0; i < 6; i++) {
             twists[6 * n + (size_t)i] = screw_twist(base_axes + 3 * i, platform_axes + 3 * i, &pose, &now, i);
         }
     }
@@ -84,8 +75,7 @@ void hc_strut_errors(const hc_state *state, int strut, double sense, size_t coun
                      double *slopes)
 {
     const hc_strut *of = &state->model->struts[strut];
-    size_t n;
-    for (n = 0; n < count; n++) {
+    for (size_t n = 0; n < count; n++) {
         errors[n] = error_at(state->model, strut, commands[n], screw_turn(of, commands[n]), sense, &slopes[n]);
     }
 }
@@ -94,8 +84,7 @@ void hc_strut_errors(const hc_state *state, int strut, double sense, size_t coun
 void hc_strut_commands(const hc_state *state, int strut, double sense, double shift, size_t count, const double *lengths,
                        double *commands)
 {
-    size_t n;
-    for (n = 0; n < count; n++) {
+    for (size_t n = 0; n < count; n++) {
         commands[n] = command_for_length(state, strut, lengths[n], sense, shift);
     }
 }
@@ -104,8 +93,7 @@ void hc_strut_commands(const hc_state *state, int strut, double sense, double sh
 void hc_follow(double threshold, size_t count, const double *values, double *low, double *sense)
 {
     double windows[9] = {NAN}, directions[9] = {0.0};
-    size_t n;
-    for (n = 0; n < count; n++) {
+    for (size_t n = 0; n < count; n++) {
         sense[n] = follow(values[n], threshold, windows, directions, 0);
         low[n] = windows[0];
     }
@@ -116,14 +104,13 @@ void hc_follow(double threshold, size_t count, const double *values, double *low
 void hc_backwards_many(const hc_state *state, size_t count, const double *positions, const double *rotations,
                        const double *senses, double *model_positions, double *model_rotations, double *commands, int *solved)
 {
-    size_t n;
-    int i, outside;
-    for (n = 0; n < count; n++) {
+    int outside;
+    for (size_t n = 0; n < count; n++) {
         const hc_pose pose = pose_of(positions + 3 * n, rotations + 9 * n);
         double low[9], sense[9];
         hc_pose q;
         six_struts now;
-        for (i = 0; i < 9; i++) {
+        for (int i = 0; i < 9; i++) {
             low[i] = NAN; /* no window yet: the direction is the one given */
             sense[i] = senses[9 * n + (size_t)i];
         }
@@ -138,8 +125,7 @@ void hc_forwards_many(const hc_state *state, size_t count, const double *command
                       double *model_positions, double *model_rotations, double *positions, double *rotations,
                       int *outcomes, double *conditions)
 {
-    size_t n;
-    for (n = 0; n < count; n++) {
+    for (size_t n = 0; n < count; n++) {
         hc_pose q = pose_of(model_positions + 3 * n, model_rotations + 9 * n), actual;
         const solution found_here = run_forwards(state, commands + 6 * n, senses + 9 * n, &q);
         outcomes[n] = (int)found_here.status;

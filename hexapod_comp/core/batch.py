@@ -24,7 +24,9 @@ KINDS: dict[str | None, np.dtype] = {
     "byte": np.dtype(np.int8),
     "quantities": QUANTITIES,
 }
-TYPES = dict(zip(KINDS.values(), ("double[]", "int[]", "signed char[]", "hc_quantities[]"), strict=True))
+TYPES = dict(
+    zip(KINDS.values(), map(ffi.typeof, ("double[]", "int[]", "signed char[]", "hc_quantities[]")), strict=True)
+)
 ARGUMENT = re.compile(r"([!>]?)(\w+)(?:\[([\w,]+)\])?(?::(\w+))?$")
 
 
@@ -52,18 +54,17 @@ def entry(function: str, arguments: str) -> Callable[..., Any]:
     ``>name[N]`` one that is made here and returned; ``N`` the number of rows, which is not given but found; ``strut``
     an index; any other a number or a struct. It returns what was made here, or else what C returns.
     """
-    call, plan, position = getattr(lib, function), [], 0
+    call, from_buffer = getattr(lib, function), ffi.from_buffer
+    plan, position = [], 0
     counts: dict[str, int] = {}
     for argument in arguments.split():
         role, name, shape, kind = ARGUMENT.match(argument).groups()  # type: ignore[union-attr]
-        sizes: tuple[Any, ...] = (
-            tuple(int(size) if size.isdigit() else size for size in shape.split(",")) if shape else ()
-        )
-        if sizes and role != ">" and isinstance(sizes[0], str):
-            counts.setdefault(sizes[0], position)
+        sizes: list[Any] = [int(size) if size.isdigit() else size for size in shape.split(",")] if shape else []
         asked = role != ">" and not name.isupper()
-        rest = None if all(isinstance(size, int) for size in sizes) else sizes[1:]
-        plan.append((role, name, sizes, rest, KINDS[kind], TYPES[KINDS[kind]], position if asked else -1))
+        if sizes and asked and isinstance(sizes[0], str):
+            counts.setdefault(sizes[0], position)
+        fixed = tuple(sizes) if all(isinstance(size, int) for size in sizes) else None
+        plan.append((name, role, sizes, fixed, KINDS[kind], TYPES[KINDS[kind]], position if asked else -1))
         position += asked
 
     def run(*values: Any) -> Any:
@@ -71,19 +72,18 @@ def entry(function: str, arguments: str) -> Callable[..., Any]:
             raise TypeError(f"{function}: takes {position} arguments, not {len(values)}")
         rows = {letter: len(values[at]) for letter, at in counts.items()}
         passed, made = [], []
-        for role, name, sizes, rest, kind, pointer, at in plan:
+        for name, role, sizes, fixed, kind, pointer, at in plan:
             if sizes:
-                shape = (
-                    sizes if rest is None else (rows[sizes[0]], *rest) if sizes[0] in rows else (6, rows["N"])
-                )  # motions
+                shape = tuple([rows.get(size, size) for size in sizes]) if fixed is None else fixed
                 if role == ">":
-                    made.append(array := np.empty(shape, kind))
-                else:
-                    array = values[at]
-                    flags = array.flags
-                    if array.dtype != kind or array.shape != shape or not flags.c_contiguous or not flags.writeable:
-                        (written if role else given)(name, array, *shape, kind=kind)  # says what is wrong
-                passed.append(ffi.from_buffer(pointer, array))
+                    made.append(np.empty(shape, kind))
+                array = made[-1] if role == ">" else values[at]
+                try:
+                    if (array.dtype is not kind and array.dtype != kind) or array.shape != shape:
+                        raise ValueError(name)
+                    passed.append(from_buffer(pointer, array, bool(role)))
+                except (ValueError, BufferError):
+                    passed.append((written if role else given)(name, array, *shape, kind=kind))  # says what is wrong
             elif at < 0:
                 passed.append(rows[name])
             elif name == "strut" and not 0 <= values[at] < 6:
@@ -112,7 +112,6 @@ jacobians = entry("hc_jacobian_many", f"{JOINTS} N {POSES} !matrices[N,6,6]")
 conditions = entry("hc_condition_many", f"{JOINTS} N {POSES} characteristic_length !numbers[N] !signs[N]")
 motions = entry("hc_motions_many", f"N {POSES} to_positions[N,3] to_rotations[N,3,3] point[3] axes[3,3] !moved[6,N]")
 screw_twists = entry("hc_screw_twists", f"{JOINTS} base_axes[6,3] platform_axes[6,3] N {POSES} >twists[N,6]")
-orthonormalise = entry("hc_orthonormalise", "!rotation[3,3]")
 rotate = entry("hc_rotate", "!rotation[3,3] x y z")
 rotation_flaw = entry("hc_rotation_flaw", "rotation[3,3]")
 solve_linear = entry("hc_solve_linear", "!matrix[6,6] !right[6]")

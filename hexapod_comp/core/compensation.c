@@ -9,14 +9,10 @@ static int run_backwards(const hc_state *state, const hc_pose *platform, double 
                          six_struts *now, double commands[6], int *outside)
 {
     const hc_model *model = state->model;
-    const vec point = add(row_of(platform->position), lever(platform, model->field.probe));
-    int solved, i;
-    follow(point.x, model->axis_threshold, low, sense, 0);
-    follow(point.y, model->axis_threshold, low, sense, 1);
-    follow(point.z, model->axis_threshold, low, sense, 2);
-    solved = undo_field(&model->field, platform, sense, q, outside);
+    follow_point(point_at(platform, model->field.probe), model->axis_threshold, low, sense);
+    const int solved = undo_field(&model->field, platform, sense, q, outside);
     *now = struts_of(state->base_joints, state->platform_joints, q);
-    for (i = 0; i < 6; i++) {
+    for (int i = 0; i < 6; i++) {
         const double direction = follow(now->length[i], model->strut_threshold, low, sense, 3 + i);
         commands[i] = command_for_length(state, i, now->length[i], direction, screw_shift(model, q, now, i));
     }
@@ -28,18 +24,17 @@ static void shrink_ramp(const hc_last *last, hc_last *next, double ramp_rate)
     const double by_stamp = next->time - last->time;
     const double pause = by_stamp == by_stamp ? by_stamp : next->received - last->received;
     double step = 0.0, largest = 0.0, keep;
-    int i;
     if (pause == pause && last->nominal[0] == last->nominal[0]) { /* the first command stands where the struts are */
         step = ramp_rate * fmin(fmax(pause, 0.0), LONGEST_RAMP_STEP);
     }
-    for (i = 0; i < 6; i++) {
+    for (int i = 0; i < 6; i++) {
         if (last->changed && last->correction[i] == last->correction[i]) {
             next->ramp[i] = last->correction[i] - next->correction[i];
         }
         largest = fmax(largest, fabs(next->ramp[i]));
     }
     keep = largest <= step ? 0.0 : 1.0 - step / largest;
-    for (i = 0; i < 6; i++) {
+    for (int i = 0; i < 6; i++) {
         next->ramp[i] *= keep;
     }
 }
@@ -47,12 +42,8 @@ static void shrink_ramp(const hc_last *last, hc_last *next, double ramp_rate)
 /* Time since the last command by the stamps and by the receipt, s; -1: not known */
 static hc_time elapsed(const hc_last *last, const hc_last *next)
 {
-    hc_time since;
-    since.made = next->time - last->time;
-    since.received = next->received - last->received;
-    since.made = since.made >= 0.0 ? since.made : -1.0;
-    since.received = since.received >= 0.0 ? since.received : -1.0;
-    return since;
+    const double made = next->time - last->time, received = next->received - last->received;
+    return (hc_time){made >= 0.0 ? made : -1.0, received >= 0.0 ? received : -1.0};
 }
 
 /* The struts' speed by both clocks; writes how far they are ahead of what is allowed. */
@@ -61,8 +52,8 @@ static finding check_speed(const hc_last *last, hc_last *next, double limit)
     const hc_time since = elapsed(last, next);
     const double late = last->published - last->received, held_up = late == late ? late : 0.0;
     double speed = 0.0, wait = 0.0;
-    int hurried = -1, early = -1, i;
-    for (i = 0; i < 6; i++) {
+    int hurried = -1, early = -1;
+    for (int i = 0; i < 6; i++) {
         const double moved = fabs(next->command[i] - last->command[i]), change = moved == moved ? moved : 0.0;
         if (since.made >= 0.0) {
             const double ahead = fmax(0.0, last->ahead_by_stamp[i] + change - limit * since.made);
@@ -95,8 +86,7 @@ static finding check_acceleration(const hc_last *last, hc_last *next, double lim
     const double period = fmax(since.made >= 0.0 ? since.made : since.received, SHORTEST_PERIOD);
     const double keep = exponential(-period / SMOOTHED_OVER, 0.0);
     finding worst = found(HC_OK, -1, limit);
-    int i;
-    for (i = 0; i < 6; i++) {
+    for (int i = 0; i < 6; i++) {
         const double before = last->smooth_speed[i], speed = (next->command[i] - last->command[i]) / period;
         const double smooth = speed == speed ? keep * before + (1.0 - keep) * speed : 0.0;
         const double acceleration = fabs(smooth - before) / period;
@@ -111,15 +101,12 @@ static finding check_acceleration(const hc_last *last, hc_last *next, double lim
 /* Correction, steps, speed and acceleration; `compensated` tells the stage */
 static finding check_command(const hc_last *last, hc_last *next, const hc_limits *limits, int *compensated)
 {
-    finding f;
-    int i;
-    *compensated = 1;
-    for (i = 0; i < 6; i++) {
+    for (int i = 0; i < 6; i++) {
         if (!(fabs(next->correction[i]) <= limits->correction)) {
             return found(HC_CORRECTION, i, next->correction[i]);
         }
     }
-    f = check_change(next->nominal, last->nominal, limits->step);
+    finding f = check_change(next->nominal, last->nominal, limits->step);
     if (f.status != HC_OK) {
         *compensated = 0;
         return f;
@@ -141,18 +128,14 @@ static finding work_out(const hc_state *state, const hc_pose *platform, hc_time 
     const hc_last *last = &state->last;
     const hc_limits *limits = &model->limits;
     six_struts now = struts_of(model->base.joints, model->platform.joints, platform);
-    finding f;
     double unused;
-    int i;
     *next = *last;
     answer->platform = *platform;
     answer->compensated = 0;
     answer->outside_field = 0;
     next->platform = *platform;
-    for (i = 0; i < 6; i++) {
-        next->nominal[i] = now.length[i];
-    }
-    f = check_stage(model->base.joints, platform, &now, next->nominal, limits, &answer->condition);
+    copy_six(now.length, next->nominal);
+    finding f = check_stage(model->base.joints, platform, &now, next->nominal, limits, &answer->condition);
     if (f.status != HC_OK) {
         return f;
     }
@@ -161,7 +144,7 @@ static finding work_out(const hc_state *state, const hc_pose *platform, hc_time 
                        &answer->outside_field)) {
         return found(HC_NOT_CONVERGED, -1, NAN);
     }
-    for (i = 0; i < 6; i++) {
+    for (int i = 0; i < 6; i++) {
         next->correction[i] = (double)last->enabled * (next->command[i] - next->nominal[i]);
     }
     next->time = time.made;
@@ -170,7 +153,7 @@ static finding work_out(const hc_state *state, const hc_pose *platform, hc_time 
     next->changed = 0;
     next->resumes = HC_FROM_LAST;
     shrink_ramp(last, next, state->ramp_rate);
-    for (i = 0; i < 6; i++) {
+    for (int i = 0; i < 6; i++) {
         next->correction[i] += next->ramp[i];
         next->command[i] = next->nominal[i] + next->correction[i];
     }
@@ -181,7 +164,6 @@ static finding work_out(const hc_state *state, const hc_pose *platform, hc_time 
     if (f.status != HC_OK) {
         return f;
     }
-    answer->compensated = 1;
     return check_stage(state->base_joints, &next->model, &now, next->command, limits, &unused);
 }
 
@@ -189,42 +171,34 @@ static finding work_out(const hc_state *state, const hc_pose *platform, hc_time 
 static void take_standing(const hc_state *state, const hc_last *trial, hc_last *last)
 {
     double standing[6];
-    int i;
-    for (i = 0; i < 6; i++) {
+    for (int i = 0; i < 6; i++) {
         standing[i] = last->command[i] - trial->nominal[i];
         if (!(fabs(standing[i]) <= state->model->limits.correction)) {
             return;
         }
     }
-    for (i = 0; i < 6; i++) {
-        last->correction[i] = standing[i];
-    }
+    copy_six(standing, last->correction);
     last->changed = 1;
 }
 
 static void fill_answer(const hc_last *last, finding f, hc_answer *answer)
 {
-    int i;
     answer->status = f.status;
     answer->strut = f.strut;
     answer->value = f.value;
-    for (i = 0; i < 6; i++) {
-        answer->nominal[i] = last->nominal[i];
-        answer->correction[i] = last->correction[i];
-        answer->command[i] = last->command[i];
-    }
+    copy_six(last->nominal, answer->nominal);
+    copy_six(last->correction, answer->correction);
+    copy_six(last->command, answer->command);
 }
 
 /* After a change of tool: what would move a nominal strut is refused, whatever else is wrong with it */
 static finding same_place(const hc_last *last, const hc_last *next, finding f, hc_answer *answer)
 {
     finding worst = found(HC_TOOL_CHANGED, -1, 0.0);
-    int i;
-    for (i = 0; i < 6; i++) {
+    for (int i = 0; i < 6; i++) {
         const double way = next->nominal[i] - last->nominal[i];
         if (!(fabs(way) <= fabs(worst.value))) {
-            worst.strut = i;
-            worst.value = way;
+            worst = found(HC_TOOL_CHANGED, i, way);
         }
     }
     if (fabs(worst.value) <= SAME_PLACE) {
@@ -300,17 +274,17 @@ static solution run_forwards(const hc_state *state, const double commands[6], co
     const judge by = judge_of(&model->limits);
     double lengths[6], shifts[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
     solution found = {HC_NOT_CONVERGED, 0, NAN};
-    int turning = 0, count, i;
-    for (i = 0; i < 6; i++) {
+    int turning = 0;
+    for (int i = 0; i < 6; i++) {
         turning = turning || model->struts[i].lead != 0.0;
     }
-    for (count = 0; count < LEAD_ITERATIONS; count++) {
+    for (int count = 0; count < LEAD_ITERATIONS; count++) {
         six_struts now;
         double change = 0.0;
         if (turning) {
             now = struts_of(state->base_joints, state->platform_joints, q);
         }
-        for (i = 0; i < 6; i++) {
+        for (int i = 0; i < 6; i++) {
             const double shift = screw_shift(model, q, &now, i);
             change = fmax(change, fabs(shift - shifts[i]));
             shifts[i] = shift;
@@ -343,9 +317,8 @@ hc_status hc_estimate(hc_state *state, const double lengths[6], hc_estimated *es
 
 static void place_joints(const hc_body *body, double growth, double joints[6][3])
 {
-    int i, k;
-    for (i = 0; i < 6; i++) {
-        for (k = 0; k < 3; k++) {
+    for (int i = 0; i < 6; i++) {
+        for (int k = 0; k < 3; k++) {
             const double nominal = body->joints[i][k], deviation = body->deviation[i][k];
             joints[i][k] = nominal + (deviation + growth * (nominal + deviation));
         }
@@ -358,8 +331,7 @@ static double part_growth(const hc_state *state, int part, double expansion)
     const hc_late *late = &state->model->late;
     const int sensor = late->sensors[part];
     double growth = expansion * (state->temperatures[sensor] - REFERENCE_TEMPERATURE);
-    int k;
-    for (k = 0; k < late->count && finite_number(state->began[sensor]); k++) {
+    for (int k = 0; k < late->count && finite_number(state->began[sensor]); k++) {
         growth += late->expansion[part][k] * state->behind[sensor][k];
     }
     return growth;
@@ -368,8 +340,7 @@ static double part_growth(const hc_state *state, int part, double expansion)
 /* The structure and the struts' growth at the present temperatures and humidity */
 static void place_machine(hc_state *state)
 {
-    int i;
-    for (i = 0; i < 6; i++) {
+    for (int i = 0; i < 6; i++) {
         const hc_strut *strut = &state->model->struts[i];
         state->growth[i] = part_growth(state, i, strut->expansion)
                            + strut->moisture * (state->humidity - REFERENCE_HUMIDITY);
@@ -384,14 +355,13 @@ static void follow_late(hc_state *state, int index, double value, double time)
     const hc_late *late = &state->model->late;
     const double change = value - state->temperatures[index];
     const double elapsed = fmax(0.0, time - state->newest[index]);
-    int k;
     if (!finite_number(state->began[index])) {
         state->began[index] = time;
         state->newest[index] = time;
         return;
     }
     state->newest[index] = fmax(state->newest[index], time);
-    for (k = 0; k < late->count; k++) {
+    for (int k = 0; k < late->count; k++) {
         const double ages = elapsed / late->time_constants[k];
         const double gone = -exponential(-ages, 1.0);
         const double kept = ages > 0.0 ? gone / ages : 1.0;
@@ -405,8 +375,8 @@ static int followed(const hc_state *state, double values[9])
     hc_last copy = state->last;
     six_struts now;
     double commands[6];
-    int outside, i;
-    for (i = 0; i < 6; i++) {
+    int outside;
+    for (int i = 0; i < 6; i++) {
         if (!finite_number(copy.nominal[i])) {
             return 0;
         }
@@ -414,10 +384,8 @@ static int followed(const hc_state *state, double values[9])
     if (!run_backwards(state, &copy.platform, copy.motion_low, copy.motion_sense, &copy.model, &now, commands, &outside)) {
         return 0;
     }
-    store(add(row_of(copy.platform.position), lever(&copy.platform, state->model->field.probe)), values);
-    for (i = 0; i < 6; i++) {
-        values[3 + i] = now.length[i];
-    }
+    store(point_at(&copy.platform, state->model->field.probe), values);
+    copy_six(now.length, values + 3);
     return 1;
 }
 
@@ -426,11 +394,11 @@ static int followed(const hc_state *state, double values[9])
 static void renew(hc_state *state, const hc_state *changed)
 {
     double before[9], after[9];
-    int comparable = followed(state, before), i;
+    int comparable = followed(state, before);
     *state = *changed;
     place_machine(state);
     comparable = followed(state, after) && comparable;
-    for (i = 0; i < 9 && comparable; i++) {
+    for (int i = 0; i < 9 && comparable; i++) {
         state->last.motion_low[i] += after[i] - before[i];
     }
     state->last.changed = 1;
@@ -439,10 +407,8 @@ static void renew(hc_state *state, const hc_state *changed)
 hc_status hc_set_temperature(hc_state *state, int index, double value, double time)
 {
     hc_state changed = *state;
-    if (index < 0 || index > 7 || !(value >= LOWEST_TEMPERATURE && value <= HIGHEST_TEMPERATURE)) {
-        return HC_TEMPERATURE;
-    }
-    if (state->model->late.count && !finite_number(time)) {
+    if (index < 0 || index > 7 || !(value >= LOWEST_TEMPERATURE && value <= HIGHEST_TEMPERATURE)
+        || (state->model->late.count && !finite_number(time))) {
         return HC_TEMPERATURE;
     }
     if (state->model->late.count) {
@@ -467,8 +433,7 @@ hc_status hc_set_humidity(hc_state *state, double value)
 /* All parts are at rest at their temperatures. */
 static void rest(hc_state *state)
 {
-    int i;
-    for (i = 0; i < 8; i++) {
+    for (int i = 0; i < 8; i++) {
         state->began[i] = NAN;
         state->newest[i] = NAN;
         state->behind[i][0] = 0.0;
@@ -481,8 +446,8 @@ static hc_state with_model(const hc_state *state, const hc_model *model)
 {
     const hc_late *late = &state->model->late;
     hc_state changed = *state;
-    int k, same = late->count == model->late.count;
-    for (k = 0; k < late->count && same; k++) {
+    int same = late->count == model->late.count;
+    for (int k = 0; k < late->count && same; k++) {
         same = late->time_constants[k] == model->late.time_constants[k];
     }
     changed.model = model;
@@ -498,30 +463,33 @@ static void must_ramp(hc_last *last)
     last->changed = last->correction[0] == last->correction[0];
 }
 
+/* No command yet: neither a step nor a speed to judge the next one by. */
+static void forget_command(hc_last *last)
+{
+    for (int i = 0; i < 6; i++) {
+        last->nominal[i] = NAN;
+        last->command[i] = NAN;
+        last->ahead_by_stamp[i] = 0.0;
+        last->smooth_speed[i] = 0.0;
+    }
+    last->time = NAN;
+}
+
 hc_status hc_check(const hc_state *state, const hc_model *model, hc_answer *answer)
 {
+    const hc_time unknown = {NAN, NAN};
     hc_state trial = with_model(state, model);
     hc_last next;
-    hc_time unknown;
-    finding f;
-    int i, home = 0;
-    for (i = 0; i < 6; i++) {
+    int home = 0;
+    forget_command(&trial.last); /* that the struts move now is no acceleration of the correction's */
+    for (int i = 0; i < 6; i++) {
         home = home || !finite_number(state->last.nominal[i]);
-        trial.last.nominal[i] = NAN;
         trial.last.correction[i] = NAN;
-        trial.last.command[i] = NAN;
         trial.last.ramp[i] = 0.0;
-        trial.last.ahead_by_stamp[i] = 0.0;
-        trial.last.ahead_by_receipt[i] = 0.0;
-        trial.last.smooth_speed[i] = 0.0; /* that the struts move now is no acceleration of the correction's */
     }
-    trial.last.time = NAN;
-    trial.last.received = NAN;
-    unknown.made = NAN;
-    unknown.received = NAN;
     trial.last.enabled = 1;
     trial.last.changed = 0;
-    f = work_out(&trial, home ? &model->home : &state->last.platform, unknown, &next, answer);
+    const finding f = work_out(&trial, home ? &model->home : &state->last.platform, unknown, &next, answer);
     fill_answer(&next, f, answer);
     return f.status;
 }
@@ -564,34 +532,25 @@ hc_status hc_enable(hc_state *state, int enabled)
 /* The correction stays, as what the struts stand at */
 static void forget(hc_state *state)
 {
-    hc_last *last = &state->last;
-    int i;
-    for (i = 0; i < 9; i++) {
-        last->motion_low[i] = NAN;
-        last->motion_sense[i] = 0.0;
+    for (int i = 0; i < 9; i++) {
+        state->last.motion_low[i] = NAN;
+        state->last.motion_sense[i] = 0.0;
     }
-    for (i = 0; i < 6; i++) {
-        last->nominal[i] = NAN;
-        last->command[i] = NAN;
-        last->ahead_by_stamp[i] = 0.0;
-        last->smooth_speed[i] = 0.0;
-    }
-    last->time = NAN;
-    last->resumes = HC_FROM_LAST;
-    must_ramp(last);
+    forget_command(&state->last);
+    state->last.resumes = HC_FROM_LAST;
+    must_ramp(&state->last);
     state->estimate = state->model->home;
 }
 
 hc_status hc_reset(hc_state *state, const double measured[6])
 {
-    int i;
-    for (i = 0; measured && i < 6; i++) {
+    for (int i = 0; measured && i < 6; i++) {
         if (!finite_number(measured[i])) {
             return HC_NOT_FINITE;
         }
     }
     forget(state);
-    for (i = 0; measured && i < 6; i++) {
+    for (int i = 0; measured && i < 6; i++) {
         state->last.command[i] = measured[i];
         state->last.resumes = HC_FROM_MEASURED;
     }
@@ -600,15 +559,14 @@ hc_status hc_reset(hc_state *state, const double measured[6])
 
 void hc_init(hc_state *state, const hc_model *model, double ramp_rate)
 {
-    int i;
     state->model = model;
     state->ramp_rate = ramp_rate;
-    for (i = 0; i < 8; i++) {
+    for (int i = 0; i < 8; i++) {
         state->temperatures[i] = REFERENCE_TEMPERATURE;
     }
     state->humidity = REFERENCE_HUMIDITY;
     rest(state);
-    for (i = 0; i < 6; i++) {
+    for (int i = 0; i < 6; i++) {
         state->last.correction[i] = NAN;
         state->last.ramp[i] = 0.0;
         state->last.ahead_by_receipt[i] = 0.0;
@@ -629,30 +587,11 @@ const char *hc_version(void)
 
 const char *hc_reason(hc_status status)
 {
-    switch (status) {
-    case HC_OK: return "";
-    case HC_STROKE_SHORT: return "stroke";
-    case HC_STROKE_LONG: return "stroke";
-    case HC_BASE_CONE: return "base_cone";
-    case HC_PLATFORM_CONE: return "platform_cone";
-    case HC_CLEARANCE: return "clearance";
-    case HC_CONDITION: return "condition";
-    case HC_ASSEMBLY: return "assembly";
-    case HC_NOT_FINITE: return "not_finite";
-    case HC_CORRECTION: return "correction";
-    case HC_STEP: return "step";
-    case HC_SPEED: return "speed";
-    case HC_EARLY: return "speed";
-    case HC_ACCELERATION: return "acceleration";
-    case HC_NOT_CONVERGED: return "not_converged";
-    case HC_OUTSIDE_FIELD: return "outside_field";
-    case HC_QUATERNION: return "quaternion";
-    case HC_SINGULAR: return "singular";
-    case HC_UNREACHABLE: return "unreachable";
-    case HC_OTHER_ASSEMBLY: return "other_assembly_mode";
-    case HC_TEMPERATURE: return "bad_model";
-    case HC_HUMIDITY: return "bad_model";
-    case HC_TOOL_CHANGED: return "tool_changed";
-    }
-    return "unknown";
+    static const char names[][20] = {
+        "", "stroke", "stroke", "base_cone", "platform_cone", "clearance", "condition", "assembly",
+        "not_finite", "correction", "step", "speed", "speed", "acceleration",
+        "not_converged", "outside_field", "quaternion",
+        "singular", "unreachable", "other_assembly_mode",
+        "bad_model", "bad_model", "tool_changed"}; /* in the order of hc_status */
+    return (size_t)status < sizeof names / sizeof names[0] ? names[status] : "unknown";
 }

@@ -50,78 +50,30 @@
 #define UNROLLED
 #endif
 
-typedef struct {
-    double x, y, z;
-} vec;
+typedef struct { double x, y, z; } vec;
+typedef struct { vec row[3]; } mat;
 
-typedef struct {
-    vec row[3];
-} mat;
+INLINED vec vector(double x, double y, double z) { return (vec){x, y, z}; }
+INLINED vec row_of(const double a[3]) { return (vec){a[0], a[1], a[2]}; }
+INLINED mat three_rows(const double r[3][3]) { return (mat){{row_of(r[0]), row_of(r[1]), row_of(r[2])}}; }
 
-INLINED vec vector(double x, double y, double z)
-{
-    vec v;
-    v.x = x;
-    v.y = y;
-    v.z = z;
-    return v;
-}
-
-INLINED vec row_of(const double a[3])
-{
-    return vector(a[0], a[1], a[2]);
-}
-
-INLINED mat three_rows(const double r[3][3])
-{
-    mat m;
-    m.row[0] = row_of(r[0]);
-    m.row[1] = row_of(r[1]);
-    m.row[2] = row_of(r[2]);
-    return m;
-}
-
-INLINED double dot(vec a, vec b)
-{
-    return a.x * b.x + a.y * b.y + a.z * b.z;
-}
-
-INLINED double norm(vec a)
-{
-    return sqrt(dot(a, a));
-}
-
-INLINED vec cross(vec a, vec b)
-{
-    return vector(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x);
-}
-
-INLINED vec add(vec a, vec b)
-{
-    return vector(a.x + b.x, a.y + b.y, a.z + b.z);
-}
-
-INLINED vec subtract(vec a, vec b)
-{
-    return vector(a.x - b.x, a.y - b.y, a.z - b.z);
-}
-
-INLINED vec scale(double factor, vec a)
-{
-    return vector(factor * a.x, factor * a.y, factor * a.z);
-}
+INLINED vec add(vec a, vec b) { return (vec){a.x + b.x, a.y + b.y, a.z + b.z}; }
+INLINED vec subtract(vec a, vec b) { return (vec){a.x - b.x, a.y - b.y, a.z - b.z}; }
+INLINED vec scale(double factor, vec a) { return (vec){factor * a.x, factor * a.y, factor * a.z}; }
+INLINED vec cross(vec a, vec b) { return (vec){a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
+INLINED double dot(vec a, vec b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+INLINED double norm(vec a) { return sqrt(dot(a, a)); }
 
 /* k.x a + k.y b + k.z c */
 INLINED vec combine(vec k, vec a, vec b, vec c)
 {
-    return vector(k.x * a.x + k.y * b.x + k.z * c.x, k.x * a.y + k.y * b.y + k.z * c.y,
-                  k.x * a.z + k.y * b.z + k.z * c.z);
+    return vector(k.x * a.x + k.y * b.x + k.z * c.x, k.x * a.y + k.y * b.y + k.z * c.y, k.x * a.z + k.y * b.z + k.z * c.z);
 }
 
-INLINED vec combine_rows(vec k, const vec rows[3])
-{
-    return combine(k, rows[0], rows[1], rows[2]);
-}
+INLINED vec combine_rows(vec k, const vec rows[3]) { return combine(k, rows[0], rows[1], rows[2]); }
+
+/* The matrix times v: the dot products of three rows with it. */
+INLINED vec times(const vec rows[3], vec v) { return vector(dot(rows[0], v), dot(rows[1], v), dot(rows[2], v)); }
 
 INLINED void store(vec v, double to[3])
 {
@@ -130,9 +82,12 @@ INLINED void store(vec v, double to[3])
     to[2] = v.z;
 }
 
-static int finite_number(double a)
+INLINED void copy_six(const double from[6], double to[6])
 {
-    return a - a == 0.0;
+    store(row_of(from), to);
+    store(row_of(from + 3), to + 3);
 }
+
+static inline int finite_number(double a) { return a - a == 0.0; }
 
 #endif

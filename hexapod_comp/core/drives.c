@@ -51,13 +51,11 @@ static void place_motor(hc_drives *drives, int i)
  * command turned round too late) is stopped there dead. `sense` (9): directions of motion, 3 to 8 are written. */
 void hc_run_drives(hc_drives *drives, const double commands[6], long ticks, double sense[9])
 {
-    int i;
-    for (i = 0; i < 6; i++) {
+    for (int i = 0; i < 6; i++) {
         const double low = drives->stops[i][0], high = drives->stops[i][1];
         const double target = held(commands[i], low, high);
         int hit = 0;
-        long n;
-        for (n = 0; n < ticks; n++) {
+        for (long n = 0; n < ticks; n++) {
             if (!drives->stuck[i]) {
                 move_reference(drives, target, &drives->position[i], &drives->speed[i]);
             }
@@ -79,8 +77,5 @@ void hc_follow_point(const double *position, const double *rotation, const doubl
                      double sense[9])
 {
     const hc_pose pose = pose_of(position, rotation);
-    const vec point = add(row_of(position), lever(&pose, probe));
-    follow(point.x, threshold, low, sense, 0);
-    follow(point.y, threshold, low, sense, 1);
-    follow(point.z, threshold, low, sense, 2);
+    follow_point(point_at(&pose, probe), threshold, low, sense);
 }

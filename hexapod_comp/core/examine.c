@@ -4,32 +4,24 @@
  */
 #include "core.h"
 
-/* All limited quantities of a pose but its lengths. */
-static void examine(const double base[6][3], const hc_pose *pose, const six_struts *now, const hc_limits *limits,
-                    hc_quantities *found)
+/* All limited quantities of a pose with its lengths, nominal or compensated. */
+static void examine(const double base[6][3], const hc_pose *pose, const six_struts *now, const double lengths[6],
+                    const hc_limits *limits, hc_quantities *found)
 {
+    copy_six(lengths, found->lengths);
     joint_cosines(pose, now, limits, found->cosines);
     nearest_struts(base, now, limits, found->distances, found->nearest);
     found->condition = condition_at(base, pose, now, limits->characteristic_length, &found->sign);
-}
-
-static void examine_nominal(const double base[6][3], const double platform[6][3], const hc_pose *pose,
-                            const hc_limits *limits, hc_quantities *found)
-{
-    const six_struts now = struts_of(base, platform, pose);
-    int i;
-    for (i = 0; i < 6; i++) {
-        found->lengths[i] = now.length[i];
-    }
-    examine(base, pose, &now, limits, found);
 }
 
 /* The limited quantities of one pose, nominal. */
 void hc_examine(const double *base, const double *platform, const hc_limits *limits, const double *position,
                 const double *rotation, hc_quantities *found)
 {
+    const double(*b)[3] = (const double(*)[3])base;
     const hc_pose pose = pose_of(position, rotation);
-    examine_nominal((const double(*)[3])base, (const double(*)[3])platform, &pose, limits, found);
+    const six_struts now = struts_of(b, (const double(*)[3])platform, &pose);
+    examine(b, &pose, &now, now.length, limits, found);
 }
 
 /* n x 2 quantities, nominal and compensated, of poses that follow each other or are `independent`, each with the
@@ -39,23 +31,22 @@ void hc_examine_many(const hc_state *state, size_t count, const double *position
                      int independent, double *low, double *sense, hc_quantities *found, int *flags)
 {
     const hc_model *model = state->model;
-    size_t n;
-    int i, outside;
-    for (n = 0; n < count; n++) {
+    for (size_t n = 0; n < count; n++) {
         const hc_pose pose = pose_of(positions + 3 * n, rotations + 9 * n);
-        hc_quantities *nominal = found + 2 * n, *compensated = found + 2 * n + 1;
+        six_struts now = struts_of(model->base.joints, model->platform.joints, &pose);
+        double commands[6];
         hc_pose q;
-        six_struts now;
-        for (i = 0; independent && i < 9; i++) {
+        int outside;
+        for (int i = 0; independent && i < 9; i++) {
             low[i] = NAN;
         }
-        examine_nominal(model->base.joints, model->platform.joints, &pose, &model->limits, nominal);
-        if (!run_backwards(state, &pose, low, sense, &q, &now, compensated->lengths, &outside)) {
+        examine(model->base.joints, &pose, &now, now.length, &model->limits, found + 2 * n);
+        if (!run_backwards(state, &pose, low, sense, &q, &now, commands, &outside)) {
             flags[n] = HC_NOT_CONVERGED;
             continue;
         }
         flags[n] = outside ? HC_OUTSIDE_FIELD : HC_OK;
-        examine(state->base_joints, &q, &now, &model->limits, compensated);
+        examine(state->base_joints, &q, &now, commands, &model->limits, found + 2 * n + 1);
     }
 }
 
@@ -66,8 +57,7 @@ void hc_check_poses(const double *base, const double *platform, const hc_limits 
                     signed char *struts)
 {
     const double(*b)[3] = (const double(*)[3])base, (*t)[3] = (const double(*)[3])platform;
-    size_t n;
-    for (n = 0; n < count; n++) {
+    for (size_t n = 0; n < count; n++) {
         const size_t turned_as = n < rotation_count ? n : rotation_count - 1;
         const hc_pose pose = pose_of(positions + 3 * n, rotations + 9 * turned_as);
         const six_struts now = struts_of(b, t, &pose);

@@ -13,23 +13,13 @@ typedef struct {
 
 static place locate(double value, const double *nodes, int count)
 {
-    place at;
-    at.index = 0;
-    at.weight = 0.0;
-    at.outside = value < nodes[0];
-    if (value <= nodes[0]) {
-        return at;
-    }
-    if (value >= nodes[count - 1]) {
-        at.index = count - 2;
-        at.weight = 1.0;
-        at.outside = value > nodes[count - 1];
-        return at;
-    }
+    place at = {0, 0.0, value < nodes[0] || value > nodes[count - 1]};
     while (at.index < count - 2 && value >= nodes[at.index + 1]) {
         at.index++;
     }
-    at.weight = (value - nodes[at.index]) / (nodes[at.index + 1] - nodes[at.index]);
+    if (value > nodes[0]) {
+        at.weight = value >= nodes[count - 1] ? 1.0 : (value - nodes[at.index]) / (nodes[at.index + 1] - nodes[at.index]);
+    }
     return at;
 }
 
@@ -46,8 +36,7 @@ static void add_family(const hc_field *field, int axis, double u, double sense, 
     const int across = field->node_count[axis == 2 ? 1 : 2], size = 6 * field->powers[axis];
     const int upper = field->node_count[axis == 0 ? 1 : 0];
     const double s = first->weight, t = second->weight;
-    int direction, k, power;
-    for (direction = 0; direction < 2; direction++) {
+    for (int direction = 0; direction < 2; direction++) {
         const double share = direction == 0 ? 0.5 * (1.0 + sense) : 0.5 * (1.0 - sense);
         const int cell = (direction * upper + first->index) * across + second->index;
         const double *c00 = field->lines[axis] + cell * size, *c01 = c00 + size;
@@ -58,65 +47,65 @@ static void add_family(const hc_field *field, int axis, double u, double sense, 
         if (share == 0.0) {
             continue;
         }
-        for (power = size - 6; power >= 0; power -= 6) {
-            for (k = 0; k < 6; k++) { /* side by side in memory, for the compiler to take two or four at once */
+        for (int power = size - 6; power >= 0; power -= 6) {
+            for (int k = 0; k < 6; k++) { /* side by side in memory, for the compiler to take two or four at once */
                 const int at = power + k;
                 value[k] = value[k] * u + (w00 * c00[at] + w01 * c01[at] + w10 * c10[at] + w11 * c11[at]);
             }
         }
-        for (k = 0; k < 6; k++) {
+        for (int k = 0; k < 6; k++) {
             error[k] += value[k];
         }
     }
 }
 
-/* field_one: six error components at a point; returns whether it lies outside the box */
+/* Six error components at a point; returns whether it lies outside the box. */
 static int field_at(const hc_field *field, vec point, const double sense[3], double error[6])
 {
-    place x, y, z;
-    int k;
-    if (!(finite_number(point.x) && finite_number(point.y) && finite_number(point.z))) {
-        for (k = 0; k < 6; k++) {
-            error[k] = NAN;
-        }
+    const double coordinates[3] = {point.x, point.y, point.z};
+    const int finite = finite_number(point.x) && finite_number(point.y) && finite_number(point.z);
+    place at[3];
+    for (int k = 0; k < 6; k++) {
+        error[k] = finite ? 0.0 : NAN;
+    }
+    if (!finite) {
         return 1;
     }
-    x = locate(point.x, field->nodes[0], field->node_count[0]);
-    y = locate(point.y, field->nodes[1], field->node_count[1]);
-    z = locate(point.z, field->nodes[2], field->node_count[2]);
-    for (k = 0; k < 6; k++) {
-        error[k] = 0.0;
+    for (int axis = 0; axis < 3; axis++) {
+        at[axis] = locate(coordinates[axis], field->nodes[axis], field->node_count[axis]);
     }
-    if (field->powers[0]) {
-        add_family(field, 0, along(point.x, field->nodes[0], field->node_count[0]), sense[0], &y, &z, error);
+    for (int axis = 0; axis < 3; axis++) {
+        if (field->powers[axis]) {
+            const double u = along(coordinates[axis], field->nodes[axis], field->node_count[axis]);
+            add_family(field, axis, u, sense[axis], &at[axis == 0 ? 1 : 0], &at[axis == 2 ? 1 : 2], error);
+        }
     }
-    if (field->powers[1]) {
-        add_family(field, 1, along(point.y, field->nodes[1], field->node_count[1]), sense[1], &x, &z, error);
+    return at[0].outside || at[1].outside || at[2].outside;
+}
+
+/* Turn a rotation by the field's three small rotations, times `sign`: exactly not where there are none. */
+static void turn_by_field(double rotation[3][3], const double error[6], double sign)
+{
+    if (error[3] != 0.0 || error[4] != 0.0 || error[5] != 0.0) {
+        rotate(rotation, sign * error[3], sign * error[4], sign * error[5]);
     }
-    if (field->powers[2]) {
-        add_family(field, 2, along(point.z, field->nodes[2], field->node_count[2]), sense[2], &x, &y, error);
-    }
-    return x.outside || y.outside || z.outside;
 }
 
 /* Solve q o E(q) = target for q by fixed points; returns whether it was solved. */
 static int undo_field(const hc_field *field, const hc_pose *target, const double sense[3], hc_pose *q, int *outside)
 {
-    const vec target_point = add(row_of(target->position), lever(target, field->probe));
+    const vec target_point = point_at(target, field->probe);
     vec point = target_point;
     double error[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
-    int solved = 0, count;
-    for (count = 0; count < FIELD_ITERATIONS && !solved; count++) {
-        vec next;
+    int solved = 0;
+    for (int count = 0; count < FIELD_ITERATIONS && !solved; count++) {
         *outside = field_at(field, point, sense, error);
-        next = subtract(target_point, vector(error[0], error[1], error[2]));
+        const vec next = subtract(target_point, vector(error[0], error[1], error[2]));
         solved = fabs(point.x - next.x) + fabs(point.y - next.y) + fabs(point.z - next.z) < 1e-15;
         point = next;
     }
     *q = *target;
-    if (error[3] != 0.0 || error[4] != 0.0 || error[5] != 0.0) {
-        rotate(q->rotation, -error[3], -error[4], -error[5]);
-    }
+    turn_by_field(q->rotation, error, -1.0);
     store(subtract(point, lever(q, field->probe)), q->position);
     return solved;
 }
@@ -124,12 +113,10 @@ static int undo_field(const hc_field *field, const hc_pose *target, const double
 /* Write q o E(q). */
 static void apply_field(const hc_field *field, const hc_pose *q, const double sense[3], hc_pose *actual)
 {
-    const vec point = add(row_of(q->position), lever(q, field->probe));
+    const vec point = point_at(q, field->probe);
     double error[6];
     field_at(field, point, sense, error);
     *actual = *q;
-    if (error[3] != 0.0 || error[4] != 0.0 || error[5] != 0.0) {
-        rotate(actual->rotation, error[3], error[4], error[5]);
-    }
+    turn_by_field(actual->rotation, error, 1.0);
     store(subtract(add(point, vector(error[0], error[1], error[2])), lever(actual, field->probe)), actual->position);
 }

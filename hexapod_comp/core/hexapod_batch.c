@@ -3,19 +3,11 @@
  * See hexapod_batch.h. The core with what Python computes on arrays, as one unit.
  */
 #include "hexapod_comp.c"
-
 #include "hexapod_batch.h"
-
 #include "single.c"
-
 #include "lanes.c"
-
 #include "batch.c"
-
 #include "examine.c"
-
 #include "travel.c"
-
 #include "assembly.c"
-
 #include "drives.c"

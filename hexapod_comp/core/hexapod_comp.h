@@ -23,36 +23,15 @@ extern "C" {
 /* What became of a command or an estimate. hc_reason() names each as the Python package does. */
 typedef enum {
     HC_OK = 0,
-    HC_STROKE_SHORT,
-    HC_STROKE_LONG,
-    HC_BASE_CONE,
-    HC_PLATFORM_CONE,
-    HC_CLEARANCE,
-    HC_CONDITION,
-    HC_ASSEMBLY,
-    HC_NOT_FINITE,
-    HC_CORRECTION,
-    HC_STEP,
-    HC_SPEED,
-    HC_EARLY,
-    HC_ACCELERATION,
-    HC_NOT_CONVERGED,
-    HC_OUTSIDE_FIELD,
-    HC_QUATERNION,
-    HC_SINGULAR,
-    HC_UNREACHABLE,
-    HC_OTHER_ASSEMBLY,
-    HC_TEMPERATURE,
-    HC_HUMIDITY,
-    HC_TOOL_CHANGED
+    HC_STROKE_SHORT, HC_STROKE_LONG, HC_BASE_CONE, HC_PLATFORM_CONE, HC_CLEARANCE, HC_CONDITION, HC_ASSEMBLY, /* of a pose */
+    HC_NOT_FINITE, HC_CORRECTION, HC_STEP, HC_SPEED, HC_EARLY, HC_ACCELERATION, /* of a command */
+    HC_NOT_CONVERGED, HC_OUTSIDE_FIELD, HC_QUATERNION,
+    HC_SINGULAR, HC_UNREACHABLE, HC_OTHER_ASSEMBLY, /* of strut lengths */
+    HC_TEMPERATURE, HC_HUMIDITY, HC_TOOL_CHANGED
 } hc_status;
 
 /* Where the next command starts: at the last one; at measured struts; or, since the tool has changed, where it must be. */
-typedef enum {
-    HC_FROM_LAST = 0,
-    HC_FROM_MEASURED,
-    HC_WITH_NEW_TOOL
-} hc_start;
+typedef enum { HC_FROM_LAST = 0, HC_FROM_MEASURED, HC_WITH_NEW_TOOL } hc_start;
 
 /* Position, m, and rotation matrix. */
 typedef struct {
@@ -222,7 +201,7 @@ hc_status hc_command(hc_state *state, const double pose[7], hc_time time, const 
 /* The same with a pose that is one: position and rotation matrix. */
 hc_status hc_command_pose(hc_state *state, const hc_pose *pose, hc_time time, const hc_pose *frame, hc_answer *answer);
 
-/* Take notice that the last command had gone out at a time, s, on the clock of its receipt. */
+/* Note when the last command went out, s, on the clock of its receipt. */
 void hc_published(hc_state *state, double time);
 
 /* The same for a controller that plans struts: nominal lengths of the machine without errors, m. The pose is sought from the

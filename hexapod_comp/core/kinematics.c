@@ -28,12 +28,11 @@ INLINED vec strut_between(vec b, vec t, vec p, const mat *r)
 INLINED six_struts struts_at(const double base[6][3], const double platform[6][3], vec p, const mat *r)
 {
     six_struts all;
-    int i;
     UNROLLED
-    for (i = 0; i < 6; i++) {
+    for (int i = 0; i < 6; i++) {
         const vec t = row_of(platform[i]);
         all.strut[i] = strut_between(row_of(base[i]), t, p, r);
-        all.moment[i] = cross(vector(dot(r->row[0], t), dot(r->row[1], t), dot(r->row[2], t)), all.strut[i]);
+        all.moment[i] = cross(times(r->row, t), all.strut[i]);
         all.length[i] = norm(all.strut[i]);
     }
     return all;
@@ -54,12 +53,11 @@ INLINED blocks eliminate(const vec s[6], const vec m[6])
 {
     blocks f;
     vec left[3];
-    int k;
     f.determinant_upper = inverse_columns(s[0], s[2], s[4], f.upper);
     UNROLLED
-    for (k = 0; k < 3; k++) {
+    for (int k = 0; k < 3; k++) {
         const vec row = s[2 * k + 1];
-        f.ratio[k] = vector(dot(row, f.upper[0]), dot(row, f.upper[1]), dot(row, f.upper[2]));
+        f.ratio[k] = times(f.upper, row);
         left[k] = subtract(m[2 * k + 1], combine(f.ratio[k], m[0], m[2], m[4]));
     }
     f.determinant_lower = inverse_columns(left[0], left[1], left[2], f.lower);
@@ -70,20 +68,8 @@ INLINED blocks eliminate(const vec s[6], const vec m[6])
 INLINED void substitute(const vec m[6], const blocks *f, const double right[6], vec *v, vec *w)
 {
     const vec even = vector(right[0], right[2], right[4]);
-    const vec carried = vector(dot(f->ratio[0], even), dot(f->ratio[1], even), dot(f->ratio[2], even));
-    const vec reduced = subtract(vector(right[1], right[3], right[5]), carried);
-    vec rest;
-    *w = combine_rows(reduced, f->lower);
-    rest = subtract(even, vector(dot(m[0], *w), dot(m[2], *w), dot(m[4], *w)));
-    *v = combine_rows(rest, f->upper);
-}
-
-/* _column_square: one column of the inverse, squared, its sign left aside */
-INLINED double column_square(const vec m[6], const blocks *f, vec v, vec w, double square)
-{
-    const vec rest = combine_rows(vector(dot(m[0], w), dot(m[2], w), dot(m[4], w)), f->upper);
-    v = add(v, rest);
-    return dot(v, v) + square * dot(w, w);
+    *w = combine_rows(subtract(vector(right[1], right[3], right[5]), times(f->ratio, even)), f->lower);
+    *v = combine_rows(subtract(even, vector(dot(m[0], *w), dot(m[2], *w), dot(m[4], *w))), f->upper);
 }
 
 /* Condition number and sign of det J; sign 0 where pivoting is needed. */
@@ -91,18 +77,17 @@ INLINED double block_condition(const six_struts *now, double characteristic_leng
 {
     const double square = characteristic_length * characteristic_length;
     const blocks f = eliminate(now->strut, now->moment);
-    const vec zero = vector(0.0, 0.0, 0.0);
+    const vec *a = f.ratio, *m = now->moment, zero = vector(0.0, 0.0, 0.0);
     const double *l = now->length;
-    const vec *a = f.ratio;
     const vec column[3] = {{a[0].x, a[1].x, a[2].x}, {a[0].y, a[1].y, a[2].y}, {a[0].z, a[1].z, a[2].z}};
     double inverse = 0.0, moments = 0.0, condition;
-    int k;
     UNROLLED
-    for (k = 0; k < 6; k++) {
+    for (int k = 0; k < 6; k++) {
+        /* column k of the inverse, its sign left aside */
         const vec w = k % 2 ? f.lower[k / 2] : combine_rows(column[k / 2], f.lower);
-        const vec v = k % 2 ? zero : f.upper[k / 2];
-        inverse += l[k] * l[k] * column_square(now->moment, &f, v, w, square);
-        moments += dot(now->moment[k], now->moment[k]) / (l[k] * l[k]);
+        const vec v = add(k % 2 ? zero : f.upper[k / 2], combine_rows(vector(dot(m[0], w), dot(m[2], w), dot(m[4], w)), f.upper));
+        inverse += l[k] * l[k] * (dot(v, v) + square * dot(w, w));
+        moments += dot(m[k], m[k]) / (l[k] * l[k]);
     }
     condition = sqrt((6.0 + moments / square) * inverse) / 6.0;
     *sign = f.determinant_upper * f.determinant_lower > 0.0 ? -1.0 : 1.0; /* no branch: lanes.c */
@@ -121,37 +106,28 @@ INLINED double closure_error(const double now[6], const double wanted[6])
     return (dot(a, a) + dot(b, b)) / allowed;
 }
 
-/* _jacobian_row: write row i, return the strut's length */
-static double jacobian_row(const double base[3], const double position[3], vec s, double row[6])
+/* dL/d(v, w): row i is (u_i, R t_i x u_i). */
+static void fill_jacobian(const double base[6][3], const hc_pose *pose, const six_struts *now, double rows[6][6])
 {
-    const double length = sqrt(s.x * s.x + s.y * s.y + s.z * s.z);
-    const double ux = s.x / length, uy = s.y / length, uz = s.z / length;
-    const double rx = s.x + base[0] - position[0];
-    const double ry = s.y + base[1] - position[1];
-    const double rz = s.z + base[2] - position[2];
-    row[0] = ux;
-    row[1] = uy;
-    row[2] = uz;
-    row[3] = ry * uz - rz * uy;
-    row[4] = rz * ux - rx * uz;
-    row[5] = rx * uy - ry * ux;
-    return length;
+    for (int i = 0; i < 6; i++) {
+        const vec s = now->strut[i], u = vector(s.x / now->length[i], s.y / now->length[i], s.z / now->length[i]);
+        store(u, rows[i]);
+        store(cross(subtract(add(s, row_of(base[i])), row_of(pose->position)), u), rows[i] + 3);
+    }
 }
 
 /* Solve a 6 x 6 system in place with pivoting; return the sign of the determinant, 0 for a singular matrix. */
 static double solve_six(double a[6][6], double right[6])
 {
     double sign = 1.0;
-    int i, j, k;
-    for (k = 0; k < 6; k++) {
+    for (int k = 0; k < 6; k++) {
         int pivot = k;
-        double value, inverse;
-        for (i = k + 1; i < 6; i++) {
+        for (int i = k + 1; i < 6; i++) {
             if (fabs(a[i][k]) > fabs(a[pivot][k])) {
                 pivot = i;
             }
         }
-        value = a[pivot][k];
+        const double value = a[pivot][k], inverse = 1.0 / value;
         if (!(fabs(value) > SMALLEST_PIVOT)) {
             return 0.0;
         }
@@ -160,27 +136,24 @@ static double solve_six(double a[6][6], double right[6])
             sign = -sign;
             right[k] = right[pivot];
             right[pivot] = kept;
-            for (j = k; j < 6; j++) {
+            for (int j = k; j < 6; j++) {
                 const double element = a[k][j];
                 a[k][j] = a[pivot][j];
                 a[pivot][j] = element;
             }
         }
-        if (value < 0.0) {
-            sign = -sign;
-        }
-        inverse = 1.0 / value;
-        for (i = k + 1; i < 6; i++) {
+        sign = value < 0.0 ? -sign : sign;
+        for (int i = k + 1; i < 6; i++) {
             const double factor = a[i][k] * inverse;
-            for (j = k + 1; j < 6; j++) {
+            for (int j = k + 1; j < 6; j++) {
                 a[i][j] -= factor * a[k][j];
             }
             right[i] -= factor * right[k];
         }
     }
-    for (k = 5; k >= 0; k--) {
+    for (int k = 5; k >= 0; k--) {
         double total = right[k];
-        for (j = k + 1; j < 6; j++) {
+        for (int j = k + 1; j < 6; j++) {
             total -= a[k][j] * right[j];
         }
         right[k] = total / a[k][k];
@@ -191,19 +164,18 @@ static double solve_six(double a[6][6], double right[6])
 static double frobenius_condition(double a[6][6], double *sign)
 {
     double square = 0.0, inverse_square = 0.0;
-    int i, j, k;
     *sign = 0.0;
-    for (k = 0; k < 6; k++) {
+    for (int k = 0; k < 6; k++) {
         double factors[6][6], column[6];
-        for (i = 0; i < 6; i++) {
+        for (int i = 0; i < 6; i++) {
             column[i] = i == k ? 1.0 : 0.0;
             square += a[i][k] * a[i][k];
-            for (j = 0; j < 6; j++) {
+            for (int j = 0; j < 6; j++) {
                 factors[i][j] = a[i][j];
             }
         }
         *sign = solve_six(factors, column);
-        for (i = 0; i < 6; i++) {
+        for (int i = 0; i < 6; i++) {
             inverse_square += column[i] * column[i];
         }
     }
@@ -220,31 +192,27 @@ static six_struts struts_of(const double base[6][3], const double platform[6][3]
     return struts_at(base, platform, row_of(pose->position), &r);
 }
 
-/* condition_one: Frobenius condition number at a pose, rotations scaled by the characteristic length */
+/* Frobenius condition number at a pose, rotations scaled by the characteristic length */
 static double condition_at(const double base[6][3], const hc_pose *pose, const six_struts *now,
                            double characteristic_length, double *sign)
 {
     const double condition = block_condition(now, characteristic_length, sign);
     double jacobian[6][6];
-    int i, j;
     if (*sign != 0.0) {
         return condition;
     }
-    for (i = 0; i < 6; i++) {
-        jacobian_row(base[i], pose->position, now->strut[i], jacobian[i]);
-        for (j = 3; j < 6; j++) {
-            jacobian[i][j] /= characteristic_length;
-        }
+    fill_jacobian(base, pose, now, jacobian);
+    for (int k = 0; k < 18; k++) {
+        jacobian[k / 3][3 + k % 3] /= characteristic_length;
     }
     return frobenius_condition(jacobian, sign);
 }
 
-/* lengths_possible: whether every pair of struts can close its triangle */
+/* Whether every pair of struts can close its triangle */
 static int lengths_possible(const double base[6][3], const double platform[6][3], const double lengths[6])
 {
-    int i, j;
-    for (i = 0; i < 6; i++) {
-        for (j = 0; j < i; j++) {
+    for (int i = 0; i < 6; i++) {
+        for (int j = 0; j < i; j++) {
             const double on_base = norm(subtract(row_of(base[i]), row_of(base[j])));
             const double on_platform = norm(subtract(row_of(platform[i]), row_of(platform[j])));
             const double slack = 1e-12 * (on_base + on_platform);
@@ -286,17 +254,13 @@ typedef struct {
 
 static judge judge_of(const hc_limits *limits)
 {
-    judge by;
-    by.characteristic_length = limits->characteristic_length;
-    by.home_sign = limits->home_sign;
-    by.condition = limits->condition;
-    return by;
+    return (judge){limits->characteristic_length, limits->home_sign, limits->condition};
 }
 
 static int certified(const certificate *c, double step, const double lengths[6], const judge *by)
 {
-    int i, positive = 1;
-    for (i = 0; i < 6; i++) {
+    int positive = 1;
+    for (int i = 0; i < 6; i++) {
         positive = positive && lengths[i] > 0.0;
     }
     return step < STEP_TOLERANCE && positive && closes(c->misfit, c->flaw) && c->condition <= by->condition
@@ -310,38 +274,35 @@ typedef struct {
     double condition;
 } solution;
 
-/* _newton, with pivoting */
+/* Newton with pivoting, for what block elimination cannot solve. */
 static hc_status newton(const double base[6][3], const double platform[6][3], const double lengths[6], hc_pose *pose,
                         int *iterations)
 {
     double jacobian[6][6], step[6];
-    int i, k;
     for (*iterations = 1; *iterations <= MAX_ITERATIONS; ++*iterations) {
         const six_struts now = struts_of(base, platform, pose);
         double turn, shrink, size;
-        for (i = 0; i < 6; i++) {
-            step[i] = lengths[i] - jacobian_row(base[i], pose->position, now.strut[i], jacobian[i]);
+        for (int i = 0; i < 6; i++) {
+            step[i] = lengths[i] - now.length[i];
         }
+        fill_jacobian(base, pose, &now, jacobian);
         if (solve_six(jacobian, step) == 0.0) {
             return HC_SINGULAR;
         }
-        turn = sqrt(step[3] * step[3] + step[4] * step[4] + step[5] * step[5]);
+        size = turn = norm(row_of(step + 3));
         if (!(turn < HUGE_VAL)) {
             return HC_SINGULAR;
         }
         shrink = turn <= MAX_ROTATION_STEP ? 1.0 : MAX_ROTATION_STEP / turn;
-        size = turn;
-        for (k = 0; k < 3; k++) {
+        for (int k = 0; k < 3; k++) {
             pose->position[k] += shrink * step[k];
             size = fmax(size, fabs(step[k]));
         }
         rotate(pose->rotation, shrink * step[3], shrink * step[4], shrink * step[5]);
         if (size < STEP_TOLERANCE) {
-            mat r;
-            six_struts settled;
             orthonormalise(pose->rotation);
-            r = three_rows((const double(*)[3])pose->rotation);
-            settled = struts_at(base, platform, row_of(pose->position), &r);
+            const mat r = three_rows((const double(*)[3])pose->rotation);
+            const six_struts settled = struts_at(base, platform, row_of(pose->position), &r);
             return closes(closure_error(settled.length, lengths), rotation_error(&r)) ? HC_OK : HC_NOT_CONVERGED;
         }
     }
@@ -349,35 +310,28 @@ static hc_status newton(const double base[6][3], const double platform[6][3], co
     return HC_NOT_CONVERGED;
 }
 
-/* _usable: finite lengths above zero and a finite guess */
+/* Finite lengths above zero and a finite guess */
 static int usable(const double lengths[6], const hc_pose *guess)
 {
-    int i, j;
-    for (i = 0; i < 6; i++) {
+    for (int i = 0; i < 6; i++) {
         if (!(lengths[i] > 0.0 && lengths[i] < HUGE_VAL)) {
             return 0;
         }
     }
-    for (i = 0; i < 3; i++) {
-        if (!finite_number(guess->position[i])) {
+    for (int k = 0; k < 9; k++) {
+        if (!(finite_number(guess->position[k / 3]) && finite_number(guess->rotation[k / 3][k % 3]))) {
             return 0;
-        }
-        for (j = 0; j < 3; j++) {
-            if (!finite_number(guess->rotation[i][j])) {
-                return 0;
-            }
         }
     }
     return 1;
 }
 
-/* _solve_carefully: with pivoting, and with the reason of a failure */
+/* With pivoting, and with the reason of a failure */
 static solution solve_carefully(const double base[6][3], const double platform[6][3], const double lengths[6],
                                 const judge *by, hc_pose *pose)
 {
     hc_pose trial = *pose;
     solution found = {HC_OK, 0, NAN};
-    six_struts now;
     double sign;
     if (!usable(lengths, pose)) {
         found.status = HC_NOT_FINITE;
@@ -392,7 +346,7 @@ static solution solve_carefully(const double base[6][3], const double platform[6
     if (found.status != HC_OK) {
         return found;
     }
-    now = struts_of(base, platform, &trial);
+    const six_struts now = struts_of(base, platform, &trial);
     found.condition = condition_at(base, &trial, &now, by->characteristic_length, &sign);
     if (!(found.condition <= by->condition)) {
         found.status = HC_SINGULAR;
@@ -413,9 +367,8 @@ INLINED double newton_step(const double base[6][3], const double platform[6][3],
     const blocks f = eliminate(now.strut, now.moment);
     double misfit[6], ratio, shrink;
     vec v, w;
-    int i;
     UNROLLED
-    for (i = 0; i < 6; i++) {
+    for (int i = 0; i < 6; i++) {
         misfit[i] = now.length[i] * (lengths[i] - now.length[i]);
     }
     substitute(now.moment, &f, misfit, &v, &w);
@@ -426,7 +379,7 @@ INLINED double newton_step(const double base[6][3], const double platform[6][3],
     return sqrt(dot(v, v) + dot(w, w));
 }
 
-/* solve_pose_one: the six loop closures by Newton from a guess, which is overwritten only by a solution */
+/* The six loop closures by Newton from a guess, which is overwritten only by a solution */
 static solution solve_pose(const double base[6][3], const double platform[6][3], const double lengths[6],
                            const judge *by, hc_pose *pose)
 {
@@ -435,7 +388,6 @@ static solution solve_pose(const double base[6][3], const double platform[6][3],
     solution found = {HC_OK, 0, NAN};
     certificate c;
     double step = HUGE_VAL;
-    int i;
     while (step >= STEP_TOLERANCE && found.iterations < MAX_ITERATIONS) {
         step = newton_step(base, platform, lengths, &p, &r);
         found.iterations++;
@@ -447,8 +399,6 @@ static solution solve_pose(const double base[6][3], const double platform[6][3],
     }
     found.condition = c.condition;
     store(p, pose->position);
-    for (i = 0; i < 3; i++) {
-        store(r.row[i], pose->rotation[i]);
-    }
+    set_rotation(pose->rotation, &r);
     return found;
 }

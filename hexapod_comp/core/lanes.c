@@ -37,27 +37,32 @@ INLINED vec lane_position(const lanes *a, int n)
 
 INLINED mat lane_rotation(const lanes *a, int n)
 {
-    mat r;
-    r.row[0] = vector(a->rotation[0][n], a->rotation[1][n], a->rotation[2][n]);
-    r.row[1] = vector(a->rotation[3][n], a->rotation[4][n], a->rotation[5][n]);
-    r.row[2] = vector(a->rotation[6][n], a->rotation[7][n], a->rotation[8][n]);
-    return r;
+    return (mat){{vector(a->rotation[0][n], a->rotation[1][n], a->rotation[2][n]),
+                  vector(a->rotation[3][n], a->rotation[4][n], a->rotation[5][n]),
+                  vector(a->rotation[6][n], a->rotation[7][n], a->rotation[8][n])}};
+}
+
+INLINED void store_lane(vec v, double to[3][LANES], int n)
+{
+    to[0][n] = v.x;
+    to[1][n] = v.y;
+    to[2][n] = v.z;
 }
 
 INLINED void set_lane(lanes *a, int n, vec p, const mat *r)
 {
-    a->position[0][n] = p.x;
-    a->position[1][n] = p.y;
-    a->position[2][n] = p.z;
-    a->rotation[0][n] = r->row[0].x;
-    a->rotation[1][n] = r->row[0].y;
-    a->rotation[2][n] = r->row[0].z;
-    a->rotation[3][n] = r->row[1].x;
-    a->rotation[4][n] = r->row[1].y;
-    a->rotation[5][n] = r->row[1].z;
-    a->rotation[6][n] = r->row[2].x;
-    a->rotation[7][n] = r->row[2].y;
-    a->rotation[8][n] = r->row[2].z;
+    store_lane(p, a->position, n);
+    store_lane(r->row[0], a->rotation, n);
+    store_lane(r->row[1], a->rotation + 3, n);
+    store_lane(r->row[2], a->rotation + 6, n);
+}
+
+INLINED void lane_lengths(const lanes *a, int n, double lengths[6])
+{
+    UNROLLED
+    for (int i = 0; i < 6; i++) {
+        lengths[i] = a->lengths[i][n];
+    }
 }
 
 INLINED vec chosen(int first, vec a, vec b)
@@ -67,12 +72,11 @@ INLINED vec chosen(int first, vec a, vec b)
 
 WIDE static void measure_lanes(const double base[6][3], const double platform[6][3], lanes *restrict a)
 {
-    int n, i;
-    for (n = 0; n < LANES; n++) {
+    for (int n = 0; n < LANES; n++) {
         const vec p = lane_position(a, n);
         const mat r = lane_rotation(a, n);
         UNROLLED
-        for (i = 0; i < 6; i++) {
+        for (int i = 0; i < 6; i++) {
             a->lengths[i][n] = norm(strut_between(row_of(base[i]), row_of(platform[i]), p, &r));
         }
     }
@@ -81,19 +85,15 @@ WIDE static void measure_lanes(const double base[6][3], const double platform[6]
 /* Take a Newton step in every lane that has not settled. */
 WIDE static void step_lanes(const double base[6][3], const double platform[6][3], lanes *restrict a)
 {
-    int n, i;
-    for (n = 0; n < LANES; n++) {
+    for (int n = 0; n < LANES; n++) {
         const vec p = lane_position(a, n);
         const mat r = lane_rotation(a, n);
         const int moves = a->step[n] >= STEP_TOLERANCE;
         vec next = p;
         mat turned_on_to = r;
-        double lengths[6], step;
-        UNROLLED
-        for (i = 0; i < 6; i++) {
-            lengths[i] = a->lengths[i][n];
-        }
-        step = newton_step(base, platform, lengths, &next, &turned_on_to);
+        double lengths[6];
+        lane_lengths(a, n, lengths);
+        const double step = newton_step(base, platform, lengths, &next, &turned_on_to);
         next = chosen(moves, next, p);
         turned_on_to.row[0] = chosen(moves, turned_on_to.row[0], r.row[0]);
         turned_on_to.row[1] = chosen(moves, turned_on_to.row[1], r.row[1]);
@@ -108,18 +108,12 @@ WIDE static void step_lanes(const double base[6][3], const double platform[6][3]
 WIDE static void certify_lanes(const double base[6][3], const double platform[6][3], double characteristic_length,
                                lanes *restrict a)
 {
-    int n, i;
-    for (n = 0; n < LANES; n++) {
+    for (int n = 0; n < LANES; n++) {
         const vec p = lane_position(a, n);
-        mat r = lane_rotation(a, n);
+        const mat turned_to = lane_rotation(a, n), r = straightened(&turned_to);
         double lengths[6];
-        certificate found_here;
-        UNROLLED
-        for (i = 0; i < 6; i++) {
-            lengths[i] = a->lengths[i][n];
-        }
-        r = straightened(&r);
-        found_here = certify(base, platform, lengths, p, &r, characteristic_length);
+        lane_lengths(a, n, lengths);
+        const certificate found_here = certify(base, platform, lengths, p, &r, characteristic_length);
         set_lane(a, n, p, &r);
         a->condition[n] = found_here.condition;
         a->sign[n] = found_here.sign;
@@ -130,11 +124,10 @@ WIDE static void certify_lanes(const double base[6][3], const double platform[6]
 
 static void fill_lane(lanes *a, int n, const double position[3], const double rotation[9])
 {
-    int k;
-    for (k = 0; k < 3; k++) {
+    for (int k = 0; k < 3; k++) {
         a->position[k][n] = position[k];
     }
-    for (k = 0; k < 9; k++) {
+    for (int k = 0; k < 9; k++) {
         a->rotation[k][n] = rotation[k];
     }
 }
@@ -145,51 +138,28 @@ void hc_strut_lengths_many(const double *base, const double *platform, size_t co
 {
     const double(*b)[3] = (const double(*)[3])base, (*t)[3] = (const double(*)[3])platform;
     lanes a;
-    size_t first;
-    int n, i;
-    for (first = 0; first < count; first += LANES) {
+    for (size_t first = 0; first < count; first += LANES) {
         const int here = count - first < LANES ? (int)(count - first) : LANES;
         const double *p = positions + 3 * first, *r = rotations + 9 * first;
-        double *found_here = lengths + 6 * first;
-        for (n = 0; n < LANES; n++) {
+        for (int n = 0; n < LANES; n++) {
             const int row = n < here ? n : here - 1; /* the last pose once more in what is left of the lanes */
             fill_lane(&a, n, p + 3 * row, r + 9 * row);
         }
         measure_lanes(b, t, &a);
-        for (n = 0; n < here; n++) {
-            for (i = 0; i < 6; i++) {
-                found_here[6 * n + i] = a.lengths[i][n];
-            }
+        for (int n = 0; n < here; n++) {
+            lane_lengths(&a, n, lengths + 6 * (first + (size_t)n));
         }
     }
-}
-
-/* Whether a lane's pose is the answer; then write it. */
-static int take_lane(const lanes *a, int n, const double lengths[6], const judge *by, double position[3],
-                     double rotation[9])
-{
-    const certificate c = {a->condition[n], a->sign[n], a->misfit[n], a->flaw[n]};
-    int k;
-    if (!certified(&c, a->step[n], lengths, by)) {
-        return 0;
-    }
-    for (k = 0; k < 3; k++) {
-        position[k] = a->position[k][n];
-    }
-    for (k = 0; k < 9; k++) {
-        rotation[k] = a->rotation[k][n];
-    }
-    return 1;
 }
 
 /* Newton in all lanes until none moves. */
 static void settle_lanes(const double base[6][3], const double platform[6][3], lanes *a)
 {
-    int n, moving = 1;
+    int moving = 1;
     while (moving) {
         step_lanes(base, platform, a);
         moving = 0;
-        for (n = 0; n < LANES; n++) {
+        for (int n = 0; n < LANES; n++) {
             moving = moving || (a->step[n] >= STEP_TOLERANCE && a->count[n] < MAX_ITERATIONS);
         }
     }
@@ -205,14 +175,12 @@ void hc_solve_pose_many(const double *base, const double *platform, size_t count
     const double(*b)[3] = (const double(*)[3])base, (*t)[3] = (const double(*)[3])platform;
     const judge by = {characteristic_length, home_sign, largest_condition};
     lanes a;
-    size_t first;
-    int n, i;
-    for (first = 0; first < count; first += LANES) {
+    for (size_t first = 0; first < count; first += LANES) {
         const int here = count - first < LANES ? (int)(count - first) : LANES;
-        for (n = 0; n < LANES; n++) {
+        for (int n = 0; n < LANES; n++) {
             const size_t row = first + (size_t)(n < here ? n : here - 1);
             fill_lane(&a, n, positions + 3 * row, rotations + 9 * row);
-            for (i = 0; i < 6; i++) {
+            for (int i = 0; i < 6; i++) {
                 a.lengths[i][n] = lengths[6 * row + (size_t)i];
             }
             a.step[n] = HUGE_VAL;
@@ -220,16 +188,19 @@ void hc_solve_pose_many(const double *base, const double *platform, size_t count
         }
         settle_lanes(b, t, &a);
         certify_lanes(b, t, characteristic_length, &a);
-        for (n = 0; n < here; n++) {
+        for (int n = 0; n < here; n++) {
             const size_t row = first + (size_t)n;
-            solution found_here = {HC_OK, (int)a.count[n], a.condition[n]};
-            if (!take_lane(&a, n, lengths + 6 * row, &by, positions + 3 * row, rotations + 9 * row)) {
-                hc_pose pose = pose_of(positions + 3 * row, rotations + 9 * row);
+            const certificate c = {a.condition[n], a.sign[n], a.misfit[n], a.flaw[n]};
+            hc_pose pose = pose_of(positions + 3 * row, rotations + 9 * row);
+            solution found_here = {HC_OK, (int)a.count[n], c.condition};
+            if (certified(&c, a.step[n], lengths + 6 * row, &by)) {
+                const mat r = lane_rotation(&a, n);
+                store(lane_position(&a, n), pose.position);
+                set_rotation(pose.rotation, &r);
+            } else {
                 found_here = solve_carefully(b, t, lengths + 6 * row, &by, &pose);
-                if (found_here.status == HC_OK) {
-                    write_pose(&pose, positions + 3 * row, rotations + 9 * row);
-                }
             }
+            write_pose(&pose, positions + 3 * row, rotations + 9 * row); /* as it was, where there is no solution */
             outcomes[row] = (int)found_here.status;
             iterations[row] = found_here.iterations;
             conditions[row] = found_here.condition;

@@ -4,7 +4,7 @@
  */
 #include "core.h"
 
-/* _turned: the Cayley rotation of w times R, exp(w) to second order and exactly orthogonal */
+/* The Cayley rotation of w times R, exp(w) to second order and exactly orthogonal */
 INLINED mat turned(const mat *r, vec w)
 {
     const double x = 0.5 * w.x, y = 0.5 * w.y, z = 0.5 * w.z;
@@ -41,50 +41,47 @@ INLINED double rotation_error(const mat *r)
 /* Replace R by exp(w) R. */
 static void rotate(double r[3][3], double wx, double wy, double wz)
 {
-    const double square = wx * wx + wy * wy + wz * wz;
-    double sine, versine;
-    int j;
-    if (square < 1e-12) {
-        sine = 1.0 - square / 6.0;
-        versine = 0.5 - square / 24.0;
-    } else {
+    const vec w = vector(wx, wy, wz);
+    const double square = dot(w, w);
+    double sine = 1.0 - square / 6.0, versine = 0.5 - square / 24.0;
+    if (square >= 1e-12) {
         const double angle = sqrt(square);
         double half, cosine;
         sine_cosine(0.5 * angle, &half, &cosine);
         sine = 2.0 * half * cosine / angle;
         versine = 2.0 * half * half / square;
     }
-    for (j = 0; j < 3; j++) {
-        const double x = r[0][j], y = r[1][j], z = r[2][j];
-        const double cx = wy * z - wz * y, cy = wz * x - wx * z, cz = wx * y - wy * x;
-        r[0][j] = x + sine * cx + versine * (wy * cz - wz * cy);
-        r[1][j] = y + sine * cy + versine * (wz * cx - wx * cz);
-        r[2][j] = z + sine * cz + versine * (wx * cy - wy * cx);
+    for (int j = 0; j < 3; j++) {
+        const vec column = vector(r[0][j], r[1][j], r[2][j]), once = cross(w, column), twice = cross(w, once);
+        const vec out = add(add(column, scale(sine, once)), scale(versine, twice));
+        r[0][j] = out.x;
+        r[1][j] = out.y;
+        r[2][j] = out.z;
+    }
+}
+
+static void set_rotation(double r[3][3], const mat *to)
+{
+    for (int i = 0; i < 3; i++) {
+        store(to->row[i], r[i]);
     }
 }
 
 static void orthonormalise(double r[3][3])
 {
-    const mat rows = three_rows((const double(*)[3])r);
-    const mat out = straightened(&rows);
-    int i;
-    for (i = 0; i < 3; i++) {
-        store(out.row[i], r[i]);
-    }
+    const mat rows = three_rows((const double(*)[3])r), out = straightened(&rows);
+    set_rotation(r, &out);
 }
 
-/* compose: the pose product */
+/* The pose product a o b. */
 static hc_pose compose(const hc_pose *a, const hc_pose *b)
 {
+    const mat rows = three_rows(b->rotation);
     hc_pose out;
-    int i, j;
-    for (i = 0; i < 3; i++) {
-        out.position[i] = a->position[i] + a->rotation[i][0] * b->position[0] + a->rotation[i][1] * b->position[1]
-                          + a->rotation[i][2] * b->position[2];
-        for (j = 0; j < 3; j++) {
-            out.rotation[i][j] = a->rotation[i][0] * b->rotation[0][j] + a->rotation[i][1] * b->rotation[1][j]
-                                 + a->rotation[i][2] * b->rotation[2][j];
-        }
+    for (int i = 0; i < 3; i++) {
+        const double *r = a->rotation[i], *p = b->position;
+        out.position[i] = a->position[i] + r[0] * p[0] + r[1] * p[1] + r[2] * p[2];
+        store(combine_rows(row_of(r), rows.row), out.rotation[i]);
     }
     return out;
 }
@@ -93,24 +90,18 @@ static hc_pose compose(const hc_pose *a, const hc_pose *b)
 static inline hc_pose pose_of(const double *position, const double *rotation)
 {
     hc_pose pose;
-    int i, j;
-    for (i = 0; i < 3; i++) {
-        pose.position[i] = position[i];
-        for (j = 0; j < 3; j++) {
-            pose.rotation[i][j] = rotation[3 * i + j];
-        }
+    store(row_of(position), pose.position);
+    for (int i = 0; i < 3; i++) {
+        store(row_of(rotation + 3 * i), pose.rotation[i]);
     }
     return pose;
 }
 
 static inline void write_pose(const hc_pose *pose, double *position, double *rotation)
 {
-    int i, j;
-    for (i = 0; i < 3; i++) {
-        position[i] = pose->position[i];
-        for (j = 0; j < 3; j++) {
-            rotation[3 * i + j] = pose->rotation[i][j];
-        }
+    store(row_of(pose->position), position);
+    for (int i = 0; i < 3; i++) {
+        store(row_of(pose->rotation[i]), rotation + 3 * i);
     }
 }
 
@@ -118,11 +109,16 @@ static inline void write_pose(const hc_pose *pose, double *position, double *rot
 static vec lever(const hc_pose *pose, const double o[3])
 {
     const mat r = three_rows(pose->rotation);
-    const vec v = row_of(o);
-    return vector(dot(r.row[0], v), dot(r.row[1], v), dot(r.row[2], v));
+    return times(r.row, row_of(o));
 }
 
-/* read_pose: a position and a quaternion as a pose */
+/* Where a point of the platform is. */
+static vec point_at(const hc_pose *pose, const double point[3])
+{
+    return add(row_of(pose->position), lever(pose, point));
+}
+
+/* A position and a quaternion as a pose */
 static hc_status read_pose(const double n[7], hc_pose *pose)
 {
     const double x = n[3], y = n[4], z = n[5], w = n[6];

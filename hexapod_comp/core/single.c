@@ -10,9 +10,8 @@ double hc_rotation_flaw(const double *r)
 {
     const vec x = row_of(r), y = row_of(r + 3), z = row_of(r + 6);
     double flaw = 0.0;
-    int i, j;
-    for (i = 0; i < 3; i++) {
-        for (j = 0; j <= i; j++) {
+    for (int i = 0; i < 3; i++) {
+        for (int j = 0; j <= i; j++) {
             const double product = r[i] * r[j] + r[3 + i] * r[3 + j] + r[6 + i] * r[6 + j];
             const double part = fabs(product - (i == j ? 1.0 : 0.0));
             if (!(part <= flaw)) {
@@ -39,25 +38,24 @@ void hc_quaternion(const double *rotation, double q[4])
 {
     const double(*r)[3] = (const double(*)[3])rotation;
     const double trace = r[0][0] + r[1][1] + r[2][2];
-    double largest = trace, root;
-    int i = 3, j, k, n;
-    for (n = 0; n < 3; n++) {
+    double largest = trace;
+    int i = 3;
+    for (int n = 0; n < 3; n++) {
         if (r[n][n] > largest) {
             i = n;
             largest = r[n][n];
         }
     }
     if (i == 3) {
-        root = 2.0 * sqrt(1.0 + trace);
+        const double root = 2.0 * sqrt(1.0 + trace);
         q[0] = (r[2][1] - r[1][2]) / root;
         q[1] = (r[0][2] - r[2][0]) / root;
         q[2] = (r[1][0] - r[0][1]) / root;
         q[3] = 0.25 * root;
         return;
     }
-    j = (i + 1) % 3;
-    k = (i + 2) % 3;
-    root = 2.0 * sqrt(1.0 + r[i][i] - r[j][j] - r[k][k]);
+    const int j = (i + 1) % 3, k = (i + 2) % 3;
+    const double root = 2.0 * sqrt(1.0 + r[i][i] - r[j][j] - r[k][k]);
     q[i] = 0.25 * root;
     q[j] = (r[j][i] + r[i][j]) / root;
     q[k] = (r[k][i] + r[i][k]) / root;
@@ -68,12 +66,6 @@ void hc_quaternion(const double *rotation, double q[4])
 void hc_rotate(double *rotation, double x, double y, double z)
 {
     rotate((double(*)[3])rotation, x, y, z);
-}
-
-/* Remove the rounding that products leave in a rotation. */
-void hc_orthonormalise(double *rotation)
-{
-    orthonormalise((double(*)[3])rotation);
 }
 
 /* Solve a 6 x 6 system in place; returns the sign of its determinant, 0 for a singular matrix. */
@@ -99,14 +91,13 @@ hc_status hc_check_stage(const double *base, const double *platform, const doubl
 /* The smallest distance between the segments a-b and c-d. */
 double hc_segment_distance(const double a[3], const double b[3], const double c[3], const double d[3])
 {
-    return segment_distance(a, b, c, d);
+    return segment_distance(row_of(a), row_of(b), row_of(c), row_of(d));
 }
 
 /* Directions of motion and windows (9) after values of the measured point's axes and of the struts (9). */
 void hc_follow_nine(const double *values, double axis_threshold, double strut_threshold, double *low, double *sense)
 {
-    int i;
-    for (i = 0; i < 9; i++) {
+    for (int i = 0; i < 9; i++) {
         follow(values[i], i < 3 ? axis_threshold : strut_threshold, low, sense, i);
     }
 }
@@ -127,11 +118,10 @@ double hc_actual_length(const hc_state *state, int strut, double command, double
  * all in proportion. */
 void hc_write_lengths(const double *lengths, double period, double fastest, double *position, double *velocity)
 {
-    int i;
-    for (i = 0; i < 6 && period > 0.0; i++) {
+    for (int i = 0; i < 6 && period > 0.0; i++) {
         period = fmax(period, fabs(lengths[i] - position[i]) / fastest);
     }
-    for (i = 0; i < 6; i++) {
+    for (int i = 0; i < 6; i++) {
         velocity[i] = period > 0.0 ? (lengths[i] - position[i]) / period : 0.0;
         position[i] = lengths[i];
     }

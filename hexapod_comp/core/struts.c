@@ -4,7 +4,7 @@
  */
 #include "core.h"
 
-/* follow: direction of motion with a reversal threshold */
+/* Direction of motion with a reversal threshold. */
 static double follow(double value, double threshold, double low[9], double sense[9], int index)
 {
     if (low[index] != low[index]) {
@@ -19,14 +19,20 @@ static double follow(double value, double threshold, double low[9], double sense
     return sense[index];
 }
 
+/* Follow a point along the three axes. */
+static void follow_point(vec point, double threshold, double low[9], double sense[9])
+{
+    follow(point.x, threshold, low, sense, 0);
+    follow(point.y, threshold, low, sense, 1);
+    follow(point.z, threshold, low, sense, 2);
+}
+
 /* Angle about a strut from the base's cardan axis to the platform's, rad, both seen along the strut. Where it stays within
  * 90 degrees its sine is the one in LinuxCNC's genhexkins. */
 static double screw_twist(const double base_axis[3], const double platform_axis[3], const hc_pose *pose,
                           const six_struts *now, int i)
 {
-    const vec s = now->strut[i];
-    const double length = now->length[i];
-    const vec u = vector(s.x / length, s.y / length, s.z / length);
+    const vec s = now->strut[i], u = vector(s.x / now->length[i], s.y / now->length[i], s.z / now->length[i]);
     const vec b = row_of(base_axis), p = lever(pose, platform_axis);
     return arc_tangent(dot(b, cross(p, u)), dot(b, p) - dot(b, u) * dot(p, u));
 }
@@ -36,21 +42,16 @@ static double screw_twist(const double base_axis[3], const double platform_axis[
 static double screw_shift(const hc_model *model, const hc_pose *pose, const six_struts *now, int i)
 {
     const hc_strut *strut = &model->struts[i];
-    double twist, turns;
     if (strut->lead == 0.0) {
         return 0.0;
     }
-    twist = screw_twist(model->base.axes[i], model->platform.axes[i], pose, now, i);
-    turns = (twist - strut->twist_home) / (2.0 * PI);
+    const double twist = screw_twist(model->base.axes[i], model->platform.axes[i], pose, now, i);
+    const double turns = (twist - strut->twist_home) / (2.0 * PI);
     return -strut->lead * (turns - floor(turns + 0.5));
 }
 
-/* Cosine and sine of the angle that a screw has turned. */
-typedef struct {
-    double cosine, sine;
-} turn;
+typedef struct { double cosine, sine; } turn; /* of the angle that a screw has turned */
 
-/* screw_turn */
 static turn screw_turn(const hc_strut *strut, double command)
 {
     turn at = {1.0, 0.0};
@@ -60,26 +61,22 @@ static turn screw_turn(const hc_strut *strut, double command)
     return at;
 }
 
-/* turned_on: increased by a small angle */
+/* Increased by a small angle. */
 static turn turned_on(turn at, double angle)
 {
     const double square = angle * angle;
     const double c = 1.0 - square * (0.5 - square * (1.0 / 24.0));
     const double s = angle * (1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0)));
-    turn on;
-    on.cosine = at.cosine * c - at.sine * s;
-    on.sine = at.sine * c + at.cosine * s;
-    return on;
+    return (turn){at.cosine * c - at.sine * s, at.sine * c + at.cosine * s};
 }
 
-/* wave_error: error and slope of the periodic error; harmonics by the addition theorem */
+/* Error and slope of the periodic error; harmonics by the addition theorem */
 static double wave_error(const hc_strut *strut, turn at, double *slope)
 {
     const double (*wave)[2] = strut->wave;
     double error = wave[0][0] * at.cosine + wave[0][1] * at.sine;
     double c = at.cosine, s = at.sine, steep = wave[0][1] * c - wave[0][0] * s;
-    int n;
-    for (n = 2; n <= strut->harmonics; n++) {
+    for (int n = 2; n <= strut->harmonics; n++) {
         const double a = wave[n - 1][0], b = wave[n - 1][1], next = c * at.cosine - s * at.sine;
         s = s * at.cosine + c * at.sine;
         c = next;
@@ -90,7 +87,7 @@ static double wave_error(const hc_strut *strut, turn at, double *slope)
     return error;
 }
 
-/* error_at: error and slope of what depends on the command: offset, pitch, waves, map, and the backlash's change */
+/* Error and slope of what depends on the command: offset, pitch, waves, map, and the backlash's change */
 static double error_at(const hc_model *model, int i, double command, turn at, double sense, double *slope)
 {
     const hc_strut *strut = &model->struts[i];
@@ -105,20 +102,16 @@ static double error_at(const hc_model *model, int i, double command, turn at, do
     if (map->knot_count > 1) {
         const int last = map->knot_count - 1;
         const double inside = fmin(map->knots[last], fmax(map->knots[0], command));
-        const double *piece, half = -0.5 * sense;
-        double x, c[4];
-        int low = 0, high = last, n;
+        int low = 0, high = last;
         while (high - low > 1) {
             const int middle = low + (high - low) / 2;
-            if (map->knots[middle] <= inside) {
-                low = middle;
-            } else {
-                high = middle;
-            }
+            const int above = map->knots[middle] <= inside;
+            low = above ? middle : low;
+            high = above ? high : middle;
         }
-        x = inside - map->knots[low];
-        piece = map->pieces + (i * last + low) * 8;
-        for (n = 0; n < 4; n++) {
+        const double x = inside - map->knots[low], half = -0.5 * sense, *piece = map->pieces + (i * last + low) * 8;
+        double c[4];
+        for (int n = 0; n < 4; n++) {
             c[n] = piece[n] + half * piece[4 + n];
         }
         error += ((c[0] * x + c[1]) * x + c[2]) * x + c[3];
@@ -143,19 +136,17 @@ static double command_for_length(const hc_state *state, int i, double length, do
     const hc_strut *strut = &state->model->struts[i];
     const double wanted = length / (1.0 + state->growth[i]) + 0.5 * sense * strut->backlash + shift;
     double command = wanted - strut->offset;
-    turn at;
-    int count;
     command -= strut->pitch * (command - strut->reference);
-    at = screw_turn(strut, command);
-    for (count = 0; count < COMMAND_ITERATIONS; count++) {
-        double slope, angle;
+    turn at = screw_turn(strut, command);
+    for (int count = 0; count < COMMAND_ITERATIONS; count++) {
+        double slope;
         const double error = error_at(state->model, i, command, at, sense, &slope);
         const double step = (wanted - command - error) / (1.0 + slope);
         command += step;
         if (fabs(step) < 1e-9) {
             break;
         }
-        angle = strut->wavenumber * step;
+        const double angle = strut->wavenumber * step;
         at = fabs(angle) < SMALL_ANGLE ? turned_on(at, angle) : screw_turn(strut, command);
     }
     return command;

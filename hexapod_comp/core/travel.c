@@ -11,31 +11,23 @@
 void hc_go(const hc_state *state, const hc_pose *tool, const hc_pose *frame, const double shift[3], const double turn[3],
            double step, double longest, hc_way *way)
 {
-    const hc_model *model = state->model;
     const hc_time unknown = {NAN, NAN};
-    int halvings = 0, i;
     way->inside = -step;
     way->outside = HUGE_VAL;
     way->refused.status = HC_OK;
-    while (halvings < HALVINGS && way->inside < longest && way->outside > 0.0) {
-        hc_pose at = *tool, in_base, platform;
+    for (int halvings = 0; halvings < HALVINGS && way->inside < longest && way->outside > 0.0;) {
+        const int beyond = way->outside < HUGE_VAL;
+        const double distance = beyond ? 0.5 * (way->inside + way->outside) : fmin(way->inside + step, longest);
+        hc_pose at = *tool;
         hc_last next;
         hc_answer answer;
-        finding f;
-        double distance;
-        if (way->outside < HUGE_VAL) {
-            distance = 0.5 * (way->inside + way->outside);
-            halvings++;
-        } else {
-            distance = fmin(way->inside + step, longest);
-        }
-        for (i = 0; i < 3; i++) {
+        halvings += beyond;
+        for (int i = 0; i < 3; i++) {
             at.position[i] += distance * shift[i];
         }
         rotate(at.rotation, distance * turn[0], distance * turn[1], distance * turn[2]);
-        in_base = compose(frame, &at);
-        platform = compose(&in_base, &model->tool_inverse);
-        f = work_out(state, &platform, unknown, &next, &answer);
+        const hc_pose in_base = compose(frame, &at), platform = compose(&in_base, &state->model->tool_inverse);
+        const finding f = work_out(state, &platform, unknown, &next, &answer);
         if (f.status == HC_OK) {
             way->inside = distance;
         } else {
