@@ -30,7 +30,7 @@ BESIDE_LINUXCNC = $(MAKE) --no-print-directory VENV=.venv-linuxcnc PYTHON='$(LIN
 # Which versions of Python `make test-all` takes, of those that are here.
 VERSIONS ?= 3.10 3.11 3.12 3.13 3.14
 
-.PHONY: help demo test test-all test-docs docs wheel constraints test-linuxcnc linuxcnc linuxcnc-rt bench papers fuzz fuzz-core clean \
+.PHONY: help demo test test-all test-docs test-packaging docs wheel constraints test-linuxcnc linuxcnc linuxcnc-rt bench papers fuzz fuzz-core clean \
     run-linuxcnc-tests ros
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
@@ -38,14 +38,15 @@ VERSIONS ?= 3.10 3.11 3.12 3.13 3.14
 help:
 	@echo 'make demo    measure, fit and run a machine with hidden errors; figures, out/demo.png'
 	@echo 'make test    ruff, mypy, import-linter, codespell and the tests, in three processes for two cores'
-	@echo 'make test-all     the same with every Python found here, each in .venv-3.x; VERSIONS="3.10 3.13" for some'
+	@echo 'make test-all     the same and the long tests (ALL_TESTS=1) with every Python found here, each in .venv-3.x; VERSIONS="3.10 3.13" for some'
+	@echo 'make test-packaging  build wheel, source archive and colcon workspace, and hold them to the source'
 	@echo 'make test-docs    run the sessions of the pages, minutes, and hold their output to what is shown'
 	@echo 'make docs    the pages of doc/ as a site with a search and the Python reference, in out/doc'
 	@echo 'make wheel   source archive and one wheel for all these Pythons (manylinux2014), in dist/'
 	@echo 'make constraints  renew constraints.txt and locked/: versions and hashes of all that is installed'
 	@echo 'make papers  every table and figure of the three papers beside what is computed: out/papers.html'
 	@echo 'make bench   speed beside NumPy, SciPy, MuJoCo, Pinocchio, LinuxCNC and a relay node'
-	@echo 'make fuzz    a nightly run of the fuzzing tests: 100,000 cases and more'
+	@echo 'make fuzz    a nightly run: fuzzing tests with 100,000 cases and more, all machines of the zoo'
 	@echo 'make fuzz-core    any bytes for the C core, half an hour; needs clang'
 	@echo 'make linuxcnc       .venv-linuxcnc, to run beside LinuxCNC'
 	@echo 'make linuxcnc-rt MODEL=mine.yaml  the compensator as a realtime component of LinuxCNC (MACHINE=paper)'
@@ -66,17 +67,21 @@ test: $(VENV)/with-ros,test $(CORE)
 	$(BIN)/codespell
 	@# Three processes, each with a ROS domain of its own: the first takes the tests that wait for nodes (test/conftest.py).
 	@# The matrices of the tests are small: more threads of OpenBLAS would only wait for each other.
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile --ignore=test/linuxcnc/test_linuxcnc.py \
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile --ignore=test/packaging --ignore=test/linuxcnc/test_linuxcnc.py \
 	    --ignore=test/linuxcnc/test_linuxcnc_rt.py
 
 test-all:
 	@PYTHON='$(PYTHON)' tools/pythons | { passed=; failed=; while read -r version python; do \
 	    case ' $(VERSIONS) ' in *" $$version "*) ;; *) continue;; esac; \
 	    echo "== Python $$version: $$python"; \
-	    if $(MAKE) --no-print-directory VENV=.venv-$$version PYTHON="$$python" test </dev/null; \
+	    if ALL_TESTS=1 $(MAKE) --no-print-directory VENV=.venv-$$version PYTHON="$$python" test </dev/null; \
 	    then passed="$$passed $$version"; else failed="$$failed $$version"; fi; done; \
 	    echo "make: tests passed with Python:$${passed:- none}; failed:$${failed:- none}"; \
 	    [ -n "$$passed" ] && [ -z "$$failed" ]; }
+
+# They build in folders of their own; not in `make test`, which judges the source.
+test-packaging: $(VENV)/with-ros,test $(CORE)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest test/packaging
 
 # make test holds every command of the pages to what exists; this runs those whose output is shown.
 test-docs: $(VENV)/with-ros,test $(CORE)
@@ -118,6 +123,7 @@ papers: $(VENV)/with-ros $(CORE)
 
 fuzz: $(VENV)/with-ros,test $(CORE)
 	@$(BIN)/python -m benchmarks.fuzz
+	ALL_TESTS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 test/test_zoo.py
 
 fuzz-core: $(VENV)/with-ros
 	@$(BIN)/python -m benchmarks.fuzz_core

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,9 @@ from hexapod_comp.machine.geometry import HexapodGeometry, Limits
 from hexapod_comp.machine.kinematics import Structure, strut_lengths
 from hexapod_comp.machine.model import RealMachine
 from hexapod_comp.pose import Pose
+
+long_test = pytest.mark.skipif(not os.environ.get("ALL_TESTS"), reason="make test-all runs it (ALL_TESTS=1)")
+"""Decorator for tests that wait for nodes longer than ten seconds."""
 
 DATA = Path(__file__).parent / "data"
 

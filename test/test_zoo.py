@@ -1,4 +1,4 @@
-"""Every machine of the zoo through every verb and the node pair, from files to files as a user goes.
+"""Machines of the zoo through every verb and the node pair, from files to files as a user goes; all with ALL_TESTS=1.
 
 Simulate, fit, check, ik and fk, export, run, replay, classify: what each says is judged by the kinematics of
 :mod:`foreign_machines`, which are not the package's. One campaign and one fit a machine; where tests run
@@ -29,6 +29,7 @@ from foreign_machines import (
     aligned_rms,
     commands,
     goes_to,
+    machine_names,
     machines,
     rotation,
     tool_errors,
@@ -98,7 +99,7 @@ def hexapod(*words: object, code: int = 0) -> str:
     return out.getvalue()
 
 
-@pytest.fixture(scope="module", params=list(machines()))
+@pytest.fixture(scope="module", params=machine_names())
 def animal(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Animal:
     """Give joints and struts of a machine 50 µm, its screws 50 ppm; measure it, and fit what it has."""
     machine = machines()[request.param]

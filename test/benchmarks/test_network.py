@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers import long_test
 
 pytest.importorskip("rclpy")
 
@@ -50,6 +51,7 @@ def test_the_cable_leaves_other_frames_alone(other):
     assert without_udp_checksum(other) == other
 
 
+@long_test
 def test_two_hosts_and_a_cable_that_is_cut():
     """The machine goes on, the loss is said, nothing is breached; the bars on time are the benchmark's."""
     why_not = refusal()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers import long_test
 
 pytest.importorskip("rclpy")
 
@@ -16,6 +17,7 @@ from benchmarks.soak import BINS, Soak, soak
 SECONDS = 5.0
 
 
+@long_test
 def test_five_seconds_at_1_khz():
     found = soak(SECONDS, 1000.0)
     counted = sum(int(found.diagnostics["compensator"][name]) for name in ("commands_missed", "refused"))

@@ -5,7 +5,7 @@ from pathlib import Path
 import calibration_helpers as small
 import numpy as np
 import pytest
-from foreign_machines import machines
+from foreign_machines import machine_names, machines
 
 from hexapod_comp.calibration.candidates import MeasuringBox, candidates
 from hexapod_comp.calibration.design import TIMES, ErrorLeft, Goal, Proposal, Times, plan, propose
@@ -102,7 +102,7 @@ def test_no_time_at_all() -> None:
         proposed(1.0 * UM, 0.0, ("linear",), 0.2)
 
 
-@pytest.mark.parametrize("name", list(machines()))
+@pytest.mark.parametrize("name", machine_names())
 def test_every_machine_of_the_zoo(name: str, tmp_path: Path) -> None:
     """All candidates are within the limits, as the reader of campaigns judges them, before a file and after it."""
     machine = machines()[name]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from foreign_machines import UM, Errors, aligned_rms, machines, tool_errors
+from foreign_machines import UM, Errors, aligned_rms, machine_names, machines, tool_errors
 
 from hexapod_comp import cli
 from hexapod_comp.machine.geometry import load_geometry
@@ -19,7 +19,7 @@ PLAIN = ("--wave-um", "0", "--map-um", "0", "--backlash-um", "0")
 """Leaves what the tests' own reader and kinematics have: structure, offsets and pitch."""
 
 
-@pytest.mark.parametrize("name", list(machines()))
+@pytest.mark.parametrize("name", machine_names())
 def test_any_machine(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The figures of the report are those of the file, at random places of the box that the report names.
 

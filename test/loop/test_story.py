@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_machines import Errors, aligned_rms, goes_to, machines, tool_errors
+from foreign_machines import Errors, aligned_rms, goes_to, machine_names, machines, tool_errors
 
 from hexapod_comp import cli
 from hexapod_comp.compensation.checks import check
@@ -45,7 +45,7 @@ def small(coarse: None, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(story, name, value)
 
 
-@pytest.mark.parametrize("name", list(machines()))
+@pytest.mark.parametrize("name", machine_names())
 def test_the_promise_for_the_poses_is_kept(name: str, tmp_path: Path, coarse: None) -> None:
     """Structure, offsets and pitch at random, in a machine that is of the tests' own kinematics.
 
